@@ -28,6 +28,8 @@ EXTRAS = {
         *("pytest", "pytest-xdist", "hypothesis", "ruff", "mypy", "import-linter"),
         *("playwright", "trimesh", "hatchling", "nbclient", "nbformat", "ipykernel"),
     ),
+    "slurm": ("submitit",),
+    "ray": ("ray",),
     "docs": ("mkdocs-material",),
 }
 CORE = (

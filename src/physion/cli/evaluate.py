@@ -8,7 +8,6 @@ seeds.
 from __future__ import annotations
 
 import json as json_module
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +19,7 @@ from physion.cli.output import Stages, console, write_text
 from physion.cli.plans.choose_models import choose_models
 from physion.cli.plans.tables import evaluations_table, print_estimates
 from physion.cli.text_table import text_table
-from physion.compute.local import LocalExecutor
+from physion.compute.settings import ExecutorSettings
 from physion.readout.plans.evaluation_plan import EvaluationPlan, EvaluationResults
 from physion.readout.plans.keys import key_of
 from physion.readout.plans.results import summarise_accuracy
@@ -61,8 +60,11 @@ class Options:
     """Readouts, optimiser and cross-validation."""
     rollout_error: bool = False
     """Also write how far imagined motion is from the true one over time, for particle models."""
-    workers: int = os.cpu_count() or 1
-    """Number of processes for simulations."""
+    compute: Annotated[ExecutorSettings, tyro.conf.arg(name="")] = field(
+        default_factory=ExecutorSettings
+    )
+    """Where tasks run, and their limits: on Slurm and Ray one evaluation of the plan is a task, on
+    this machine a simulation."""
     verify: bool = True
     """Compare files with their SHA-256 in the index before they are used."""
     dry_run: bool = False
@@ -96,7 +98,9 @@ def main(options: Options) -> int:
                 outcome = f"failed: {reason}" if reason else "evaluated"
                 stages.note(f"{task.label}: {outcome}; {len(left)} left")
 
-        results = plan.run(LocalExecutor(workers=options.workers), stages, show)
+        executor = options.compute.open()
+        cells = None if options.compute.executor == "local" else executor
+        results = plan.run(None if cells else executor, stages, show, cells=cells)
     _print(plan, results, options)
     return 1 if results.failed or results.problems else 0
 

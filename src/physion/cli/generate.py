@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json as json_module
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,8 +10,8 @@ from typing import Annotated, Literal
 import tyro
 
 from physion.cli.output import Stages, console
-from physion.compute.local import LocalExecutor
 from physion.compute.run_tasks import RunReport
+from physion.compute.settings import ExecutorSettings
 from physion.errors import BadInputError
 from physion.scenes.sampling.registry import scenarios
 from physion.trials.making.generate import make_trials
@@ -43,8 +42,10 @@ class Options:
         default_factory=GenerateSettings
     )
     """How trials are chosen, rendered and stored."""
-    workers: int = os.cpu_count() or 1
-    """Processes."""
+    compute: Annotated[ExecutorSettings, tyro.conf.arg(name="")] = field(
+        default_factory=ExecutorSettings
+    )
+    """Where tasks run, and their limits."""
     json: bool = False
     """Print one JSON object."""
 
@@ -66,7 +67,7 @@ def main(options: Options) -> int:
             options.folder,
             plan_dataset(options.name, names, counts, presets),
             options.settings,
-            executor=LocalExecutor(workers=options.workers),
+            executor=options.compute.open(),
             progress=stages,
         )
     _print(report, options.json)

@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -22,8 +21,9 @@ import tyro
 from physion.cli.official.read import read_trials
 from physion.cli.output import Stages, console, write_text
 from physion.cli.text_table import text_table
-from physion.compute.local import LocalExecutor
+from physion.compute.executor import Executor
 from physion.compute.progress import tracked
+from physion.compute.settings import ExecutorSettings
 from physion.data import PACKAGED
 from physion.errors import BadInputError
 from physion.physics.engine import DEFAULT_ENGINE, can_simulate, engines
@@ -100,8 +100,10 @@ class Options:
     the ceiling are computed; 0 leaves these columns out."""
     engines: Annotated[tuple[str, ...], tyro.conf.arg(aliases=("--engine",))] = (DEFAULT_ENGINE,)
     """Engines that simulate the trials (see physion ls engines), a row for each: physion,mujoco."""
-    workers: int = os.cpu_count() or 1
-    """Number of processes."""
+    compute: Annotated[ExecutorSettings, tyro.conf.arg(name="")] = field(
+        default_factory=ExecutorSettings
+    )
+    """Where tasks run, and their limits."""
 
 
 def main(options: Options) -> int:
@@ -122,7 +124,7 @@ def main(options: Options) -> int:
         for trial in trials
         if can_simulate(name, trial.scene)
     }
-    replays, failures = _replay(tasks, options.workers)
+    replays, failures = _replay(tasks, options.compute.open())
     failures = [str(failure) for failure in logs.failures] + failures
     rows = summarise(replays)
     result = ReplayResult(rows, replays, copies, len(trials) * len(names) - len(tasks), failures)
@@ -143,9 +145,9 @@ def _engine_names(given: Sequence[str]) -> list[str]:
     return names
 
 
-def _replay(tasks: Mapping[str, ReplayTask], workers: int) -> tuple[list[Replay], list[str]]:
+def _replay(tasks: Mapping[str, ReplayTask], executor: Executor) -> tuple[list[Replay], list[str]]:
     """Run the tasks; return the replays, by scenario, engine and log, and the failures."""
-    results = LocalExecutor(workers=workers).map(replay_trial, tasks)
+    results = executor.map(replay_trial, tasks)
     done: dict[str, Replay] = {}
     failures = []
     with Stages() as stages:

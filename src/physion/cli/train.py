@@ -19,6 +19,7 @@ import tyro
 from physion.cli.output import Stages, console
 from physion.cli.plans.choose_models import choose_models
 from physion.cli.plans.tables import estimates_table, print_estimates
+from physion.compute.settings import ExecutorSettings
 from physion.readout.plans.estimates import estimate_plan, time_left
 from physion.readout.plans.selection import Selection, count_seeds, parse_protocols
 from physion.readout.plans.tasks import TrainingTask
@@ -59,6 +60,11 @@ class Options:
         default_factory=TrainingOverrides
     )
     """Optimiser and schedule."""
+    compute: Annotated[ExecutorSettings, tyro.conf.arg(name="")] = field(
+        default_factory=ExecutorSettings
+    )
+    """Where tasks run, and their limits. On Slurm and Ray a training of the plan is a task; on this
+    machine one runs after the other."""
     verify: bool = True
     """Compare files with their SHA-256 in the index before they are used."""
     dry_run: bool = False
@@ -90,7 +96,8 @@ def main(options: Options) -> int:
                 outcome = f"failed: {reason}" if reason else "trained"
                 stages.note(f"{task.label}: {outcome}{time_left(plan, left)}")
 
-        results = plan.run(stages, show)
+        cells = None if options.compute.executor == "local" else options.compute.open()
+        results = plan.run(stages, show, cells=cells)
     if plan.is_first_process:
         _print(plan, results, options.json)
     return 1 if results.failed else 0

@@ -54,7 +54,7 @@ class TaskOutcome(Generic[R]):
 
 
 class Executor(Protocol):
-    """Runner of tasks; see `physion.compute.local` for the implementations."""
+    """Runner of tasks; see `executors` for the implementations."""
 
     def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[TaskOutcome[R]]:
         """Run ``function`` on every task and yield outcomes as they come, in any order.
@@ -71,5 +71,7 @@ executors: Registry[type] = Registry(
     {
         "local": "physion.compute.local:LocalExecutor",
         "serial": "physion.compute.local:SerialExecutor",
+        "slurm": "physion.compute.slurm:SlurmExecutor",
+        "ray": "physion.compute.ray:RayExecutor",
     },
 )

@@ -8,16 +8,17 @@ import multiprocessing
 import os
 import signal
 import time
-import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 from typing import Any, TypeVar
 
 from physion.compute.executor import TaskOutcome
+from physion.compute.task import run_task
 from physion.errors import PhysionError
 
 T = TypeVar("T")
@@ -37,7 +38,7 @@ class SerialExecutor:
     def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[TaskOutcome[R]]:
         """Yield outcomes in the order of the tasks; see `physion.compute.executor.Executor`."""
         for key, task in tasks.items():
-            yield _run_task(key, function, task)
+            yield run_task(key, function, task)
 
 
 class LocalExecutor:
@@ -55,20 +56,27 @@ class LocalExecutor:
         How often a task is started before it counts as failed because its process died.
     timeout
         Seconds after which the process of a task is killed, which counts as a death.
+    logs
+        Folder for a file of each task with what it prints; by default this process's output.
     """
 
     def __init__(
-        self, workers: int | None = None, *, tries: int = TRIES, timeout: float | None = None
+        self,
+        workers: int | None = None,
+        *,
+        tries: int = TRIES,
+        timeout: float | None = None,
+        logs: Path | None = None,
     ) -> None:
         self.workers = workers if workers is not None else available_cores()
         if self.workers < 1 or tries < 1:
             raise PhysionError(f"{workers} workers and {tries} tries: both must be at least 1")
-        self.tries, self.timeout = tries, timeout
+        self.tries, self.timeout, self.logs = tries, timeout, logs
 
     def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[TaskOutcome[R]]:
         """Yield outcomes as they come; see `physion.compute.executor.Executor`."""
         waiting = deque(_QueuedTask(key, task) for key, task in tasks.items())
-        workers = [_Worker(function) for _ in range(min(self.workers, len(tasks)))]
+        workers = [_Worker(function, self.logs) for _ in range(min(self.workers, len(tasks)))]
         failed_starts = 0
         try:
             while workers:
@@ -84,7 +92,7 @@ class LocalExecutor:
                         if failed_starts >= self.tries:
                             raise _startup_error(worker)
                         if waiting:
-                            workers.append(_Worker(function))
+                            workers.append(_Worker(function, self.logs))
                 # Before yielding, so that workers are busy while the caller handles the outcomes.
                 workers = _assign(workers, waiting)
                 yield from done
@@ -134,11 +142,11 @@ class _QueuedTask:
 class _Worker:
     """Parent's handle of one worker process, which has at most one task at a time."""
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Callable[..., Any], logs: Path | None) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, far = context.Pipe()
         self.process: BaseProcess = context.Process(
-            target=_serve, args=(far, function), daemon=True
+            target=_serve, args=(far, function, logs), daemon=True
         )
         with _one_thread(), _interrupts_blocked():
             self.process.start()
@@ -222,7 +230,7 @@ def _startup_error(worker: _Worker) -> PhysionError:
     )
 
 
-def _serve(pipe: Connection, function: Callable[..., Any]) -> None:
+def _serve(pipe: Connection, function: Callable[..., Any], logs: Path | None) -> None:
     """Run the tasks that come through the pipe, in the worker process, until it is closed."""
     # Ctrl-C is sent to all processes of the group; only the parent reacts to it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -232,7 +240,7 @@ def _serve(pipe: Connection, function: Callable[..., Any]) -> None:
         pipe.send(_READY)
         while True:
             key, task = pipe.recv()
-            outcome = _run_task(key, function, task)
+            outcome = run_task(key, function, task, logs)
             try:
                 pipe.send(outcome)
             except (BrokenPipeError, ConnectionResetError):
@@ -241,17 +249,6 @@ def _serve(pipe: Connection, function: Callable[..., Any]) -> None:
                 pipe.send(TaskOutcome(key, error=f"the result cannot be sent: {error}"))
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return
-
-
-def _run_task(key: str, function: Callable[[T], R], task: T) -> TaskOutcome[R]:
-    """Run the function; return its result, or its exception as a failed outcome."""
-    try:
-        return TaskOutcome(key, function(task))
-    except Exception as error:
-        number = error.errno if isinstance(error, OSError) else None
-        text = " ".join(str(error).split()) or "no message"
-        line = text if isinstance(error, PhysionError) else f"{type(error).__name__}: {text}"
-        return TaskOutcome(key, error=line, traceback=traceback.format_exc(), errno=number)
 
 
 @contextlib.contextmanager

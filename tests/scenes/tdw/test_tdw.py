@@ -417,3 +417,29 @@ def test_deep_metadata_is_one_line(tmp_path: Path, text: str) -> None:
     (tmp_path / "deep" / "metadata.json").write_text(text)
     (failure,) = read_scenes(tmp_path).failures
     assert "metadata.json cannot be read" in failure.message and "\n" not in failure.message
+
+
+@pytest.mark.parametrize(
+    ("limit", "command", "complaint"),
+    [
+        ("MAX_THINGS", thing(7, "cube", xyz(0, 1, 0))[0], "more than 2 objects"),
+        (
+            "MAX_CHANGES",
+            {"$type": "apply_force_to_object", "force": xyz(1, 0, 0), "id": 2},
+            "more than 2 pushes, joints and events",
+        ),
+        ("MAX_NAME", thing(7, "cube" * 100, xyz(0, 1, 0))[0], "more than 200 characters"),
+    ],
+)
+def test_trials_are_bounded(
+    tmp_path: Path,
+    limit: str,
+    command: Command,
+    complaint: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    if limit != "MAX_NAME":
+        monkeypatch.setattr(f"physion.scenes.tdw.commands.{limit}", 2)
+    write_log(tmp_path / "config", [[[*two_cubes(), command, command, command]]])
+    (failure,) = read_scenes(tmp_path).failures
+    assert complaint in failure.message and "\n" not in failure.message

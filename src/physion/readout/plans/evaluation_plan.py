@@ -14,8 +14,9 @@ from typing import Any, TypeGuard
 from physion.compute.executor import Executor
 from physion.compute.progress import Progress
 from physion.digests import is_whole
+from physion.errors import BadInputError
 from physion.readout.folds import plan_folds, select_scenario
-from physion.readout.plans.failures import describe_failure, stop_if_fatal
+from physion.readout.plans.failures import describe_failure, read_outcome, stop_if_fatal
 from physion.readout.plans.keys import code_key, dataset_key, key_of
 from physion.readout.plans.model_facts import KnownModels, ModelFacts
 from physion.readout.plans.records import Records
@@ -103,19 +104,42 @@ class EvaluationPlan:
         executor: Executor | None = None,
         progress: Progress | None = None,
         on_task: OnTask | None = None,
+        *,
+        cells: Executor | None = None,
     ) -> EvaluationResults:
         """Do the tasks that are not done; one that fails does not stop the others.
 
         ``on_task`` is called after each with the task, the reason if it failed, and those left.
+        With ``cells`` each evaluation is a task of this executor; otherwise they run here, and
+        ``executor`` runs their simulations.
 
         Raises
         ------
         PhysionError
             If the plan has one task and it fails, or if nothing more can be written.
         """
-        pending = self.pending
         results = {key: self._stored(values) for key, values in self.done.items()}
         failed: dict[str, str] = {}
+        if cells is None:
+            self._run_here(executor, results, failed, progress, on_task)
+        else:
+            self._run_cells(cells, results, failed, progress, on_task)
+        return EvaluationResults(
+            [(task, results[task.key]) for task in self.tasks if task.key in results],
+            self._whole_tables(results),
+            [(task, failed[task.key]) for task in self.tasks if task.key in failed],
+        )
+
+    def _run_here(
+        self,
+        executor: Executor | None,
+        results: dict[str, Evaluation],
+        failed: dict[str, str],
+        progress: Progress | None,
+        on_task: OnTask | None,
+    ) -> None:
+        """Do the pending tasks in this process; add their results and reasons of failures."""
+        pending = self.pending
         if progress is not None and len(pending) > 1:
             progress("plan", 0, len(pending))
         for number, task in enumerate(pending, start=1):
@@ -130,10 +154,59 @@ class EvaluationPlan:
                 progress("plan", number, len(pending))
             if on_task is not None:
                 on_task(task, failed.get(task.key, ""), pending[number:])
-        return EvaluationResults(
-            [(task, results[task.key]) for task in self.tasks if task.key in results],
-            self._whole_tables(results),
-            [(task, failed[task.key]) for task in self.tasks if task.key in failed],
+
+    def _run_cells(
+        self,
+        executor: Executor,
+        results: dict[str, Evaluation],
+        failed: dict[str, str],
+        progress: Progress | None,
+        on_task: OnTask | None,
+    ) -> None:
+        """Do the pending tasks as tasks of an executor; add their results and failures."""
+        left = {task.key: task for task in self.pending}
+        cells = {
+            key: EvaluationCell(
+                self.dataset.folder.absolute(), self.dataset.verify, self._folder.absolute(),
+                self._selection, self.settings, self.rollout_errors, key,
+            )
+            for key in left
+        }  # fmt: skip
+        total = len(left)
+        if progress is not None:
+            progress("plan", 0, total)
+        for outcome in executor.map(evaluate_cell, cells):
+            task = left.pop(outcome.key)
+            values = read_outcome(outcome, self._folder, len(results), len(self.tasks))
+            if values is None:
+                failed[task.key] = str(outcome.error)
+            else:
+                stored = self._stored(values)
+                results[task.key] = dataclasses.replace(stored, problems=values["problems"])
+            if progress is not None:
+                progress("plan", total - len(left), total)
+            if on_task is not None:
+                on_task(task, failed.get(task.key, ""), list(left.values()))
+
+    def do(self, key: str) -> dict[str, Any]:
+        """Do one task of the plan, or find it done; return its files and problems.
+
+        Raises
+        ------
+        BadInputError
+            If the plan has no such task: data, model or code are not those of the plan's maker.
+        """
+        if key in self.done:
+            return {"files": list(self.done[key]["files"]), "problems": {}}
+        for task in self.tasks:
+            if task.key == key:
+                made = self._evaluate(task, None, None)
+                paths = [path for path in (made.path, made.rollout_errors) if path is not None]
+                files = [path.relative_to(self._folder).as_posix() for path in paths]
+                return {"files": files, "problems": dict(made.problems)}
+        raise BadInputError(
+            "this machine has other data, another model or another version of the package than the "
+            "one that planned the evaluation"
         )
 
     def expected_seconds(self, task: EvaluationTask) -> float | None:
@@ -288,3 +361,26 @@ class EvaluationPlan:
         joined = self._ask(tasks[0], "")
         self._record(key, tasks[0], joined, 0.0)
         return joined
+
+
+@dataclass(frozen=True)
+class EvaluationCell:
+    """One evaluation of a plan as a task of an executor: arguments of the plan, and its key."""
+
+    dataset: Path
+    verify: bool
+    folder: Path
+    selection: Selection
+    settings: EvaluationSettings
+    rollout_errors: bool
+    key: str
+
+
+def evaluate_cell(cell: EvaluationCell) -> dict[str, Any]:
+    """Do one evaluation of a plan; return its files, relative to its folder, and its problems."""
+    dataset = Dataset(cell.dataset, verify=cell.verify)
+    errors = cell.rollout_errors
+    plan = EvaluationPlan(
+        dataset, cell.folder, cell.selection, cell.settings, rollout_errors=errors
+    )
+    return plan.do(cell.key)

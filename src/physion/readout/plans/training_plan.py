@@ -9,10 +9,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from physion.compute.executor import Executor
 from physion.compute.progress import Progress
 from physion.errors import BadInputError
 from physion.models.settings import TrainingSettings
-from physion.readout.plans.failures import describe_failure, stop_if_fatal
+from physion.readout.plans.failures import describe_failure, read_outcome, stop_if_fatal
 from physion.readout.plans.keys import code_key, dataset_key, key_of
 from physion.readout.plans.model_facts import KnownModels
 from physion.readout.plans.records import Records
@@ -100,11 +101,16 @@ class TrainingPlan:
         return all(fabric.is_global_zero for fabric in self._fabrics.values())
 
     def run(
-        self, progress: Progress | None = None, on_task: OnTask | None = None
+        self,
+        progress: Progress | None = None,
+        on_task: OnTask | None = None,
+        *,
+        cells: Executor | None = None,
     ) -> TrainingResults:
         """Do the tasks that are not done; one that fails does not stop the others.
 
         ``on_task`` is called after each with the task, the reason if it failed, and those left.
+        With ``cells`` each training is a task of this executor, otherwise they run here.
 
         Raises
         ------
@@ -116,12 +122,30 @@ class TrainingPlan:
         pending = self.pending
         for task in {self.models.key(task.choice): task for task in reversed(pending)}.values():
             self._trainer(task)
-        steps = [self.steps(task) for task in pending]
         trained = {
             key: {**values["trained"], "folder": str(self._folder / values["trained"]["folder"])}
             for key, values in self.done.items()
         }
         failed: dict[str, str] = {}
+        if cells is None:
+            self._run_here(trained, failed, progress, on_task)
+        else:
+            self._run_cells(cells, trained, failed, progress, on_task)
+        return TrainingResults(
+            [(task, trained[task.key]) for task in self.tasks if task.key in trained],
+            [(task, failed[task.key]) for task in self.tasks if task.key in failed],
+        )
+
+    def _run_here(
+        self,
+        trained: dict[str, dict[str, Any]],
+        failed: dict[str, str],
+        progress: Progress | None,
+        on_task: OnTask | None,
+    ) -> None:
+        """Do the pending tasks in this process; add what they gave, and reasons of failures."""
+        pending = self.pending
+        steps = [self.steps(task) for task in pending]
         for number, task in enumerate(pending):
             within = _within(progress, sum(steps[:number]), sum(steps))
             meter = Meter(self.shared.encoder_batch, within if len(pending) > 1 else progress)
@@ -134,9 +158,58 @@ class TrainingPlan:
                 failed[task.key] = describe_failure(error)
             if on_task is not None:
                 on_task(task, failed.get(task.key, ""), pending[number + 1 :])
-        return TrainingResults(
-            [(task, trained[task.key]) for task in self.tasks if task.key in trained],
-            [(task, failed[task.key]) for task in self.tasks if task.key in failed],
+
+    def _run_cells(
+        self,
+        executor: Executor,
+        trained: dict[str, dict[str, Any]],
+        failed: dict[str, str],
+        progress: Progress | None,
+        on_task: OnTask | None,
+    ) -> None:
+        """Do the pending tasks as tasks of an executor; add what they gave, and failures."""
+        left = {task.key: task for task in self.pending}
+        folder = self._folder.absolute()
+        cells = {
+            key: TrainingCell(
+                self.dataset.folder.absolute(), self.dataset.verify, folder, self._selection,
+                self.overrides, self.shared, key,
+            )
+            for key in left
+        }  # fmt: skip
+        total = len(left)
+        if progress is not None:
+            progress("plan", 0, total)
+        for outcome in executor.map(train_cell, cells):
+            task = left.pop(outcome.key)
+            values = read_outcome(outcome, self._folder, len(trained), len(self.tasks))
+            if values is None:
+                failed[task.key] = str(outcome.error)
+            else:
+                place = Path(values["folder"]).relative_to(folder)
+                trained[task.key] = {**values, "folder": str(self._folder / place)}
+            if progress is not None:
+                progress("plan", total - len(left), total)
+            if on_task is not None:
+                on_task(task, failed.get(task.key, ""), list(left.values()))
+
+    def do(self, key: str) -> dict[str, Any]:
+        """Do one task of the plan, or find it done; return the fields of its `TrainedModel`.
+
+        Raises
+        ------
+        BadInputError
+            If the plan has no such task: data, model or code are not those of the plan's maker.
+        """
+        if key in self.done:
+            values = self.done[key]["trained"]
+            return {**values, "folder": str(self._folder / values["folder"])}
+        for task in self.tasks:
+            if task.key == key:
+                return self._train(task, Meter(self.shared.encoder_batch, None))
+        raise BadInputError(
+            "this machine has other data, another model or another version of the package than the "
+            "one that planned the training"
         )
 
     def steps(self, task: TrainingTask) -> int:
@@ -237,6 +310,29 @@ class TrainingPlan:
         settings = [self.overrides.batch, self.overrides.accumulate, self.overrides.precision]
         run_on = dataclasses.asdict(self.shared)
         return key_of("speed", self.models.choice_key(choice), settings, run_on, self._data)
+
+
+@dataclass(frozen=True)
+class TrainingCell:
+    """One training of a plan as a task of an executor: arguments of the plan, and the task's key.
+
+    Each process makes the plan again, so that only these few values travel.
+    """
+
+    dataset: Path
+    verify: bool
+    folder: Path
+    selection: Selection
+    overrides: TrainingOverrides
+    shared: SharedTrainConfig
+    key: str
+
+
+def train_cell(cell: TrainingCell) -> dict[str, Any]:
+    """Do one training of a plan; return the fields of its `TrainedModel`."""
+    dataset = Dataset(cell.dataset, verify=cell.verify)
+    plan = TrainingPlan(dataset, cell.folder, cell.selection, cell.overrides, cell.shared)
+    return plan.do(cell.key)
 
 
 def _within(progress: Progress | None, earlier: int, total: int) -> Progress | None:

@@ -15,7 +15,7 @@ from physion.dataclass_json import shown
 from physion.errors import BadInputError, PhysionError
 from physion.numerics.rotations import multiply_quaternions
 from physion.scenes.sampling.parameters import as_quaternion, euler_rotation
-from physion.scenes.scene import BodyEvent, Push, Quat, SurfaceMaterial, Vec3
+from physion.scenes.scene import MAX_THINGS, BodyEvent, Push, Quat, SurfaceMaterial, Vec3
 from physion.scenes.tdw.log_lines import Command
 
 IGNORED_COMMANDS = frozenset(
@@ -62,6 +62,10 @@ VANISHING_SCALE = 1e-4
 """Bodies with a smaller scale are placeholders of the official generator (a missing attachment, or
 the end of a size gradient). They are left out, with a note."""
 
+MAX_CHANGES = 100_000
+"""Most pushes, joints and events of a trial; the official ones have a few hundred."""
+MAX_NAME = 200
+"""Longest name of a model."""
 UNSET_MATERIAL = SurfaceMaterial(0.6, 0.6, 0.0)
 """Unity's default material, for objects without one."""
 
@@ -171,6 +175,8 @@ class CommandReader:
             return
         try:
             method(command)
+            if len(self.pushes) + len(self.events) + len(self.joints) > MAX_CHANGES:
+                raise BadInputError(f"there are more than {MAX_CHANGES} pushes, joints and events")
         except PhysionError as error:
             raise BadInputError(f"{where}: {kind}: {error}") from error
         except KeyError as error:
@@ -236,6 +242,10 @@ class CommandReader:
 
     def do_add_object(self, command: Command) -> None:
         id_ = int(command["id"])
+        if len(self.objects) >= MAX_THINGS:
+            raise BadInputError(f"there are more than {MAX_THINGS} objects")
+        if len(str(command["name"])) > MAX_NAME:
+            raise BadInputError(f"a name of a model has more than {MAX_NAME} characters")
         if self.frame and id_ in self.objects:
             raise BadInputError(f"object {id_} was already created; use a new id at later frames")
         thing = LoggedObject(

@@ -24,6 +24,8 @@ from physion.trials.official.names import decode_picture
 
 MAX_BYTES = 2**27
 """Largest array that is read, in bytes of memory."""
+MAX_FILE_BYTES = 2**31
+"""Most memory that the arrays of a file may take together."""
 MAX_TEXT = 2**20
 _SUFFIXES = ("", "_cam0")
 _FILTERS = {
@@ -42,6 +44,8 @@ class OfficialFile(GuardedHdf5, AbstractContextManager["OfficialFile"]):
 
     def __init__(self, file: h5py.File, where: str) -> None:
         super().__init__(file, where, filters=_FILTERS, max_chunk_bytes=MAX_BYTES)
+        self._sizes: dict[str, int] = {}
+        self._total = 0
 
     @classmethod
     def open(cls, path: Path) -> OfficialFile:
@@ -169,3 +173,9 @@ class OfficialFile(GuardedHdf5, AbstractContextManager["OfficialFile"]):
             raise self.bad(path, f"has type {dataset.dtype}")
         self.check_size(path, dataset.shape, itemsize, MAX_BYTES)
         self.check_storage(path, dataset)
+        if path not in self._sizes:
+            self._sizes[path] = int(np.prod(dataset.shape, dtype=object)) * itemsize
+            self._total += self._sizes[path]
+        if self._total > MAX_FILE_BYTES:
+            limit = f"more than {MAX_FILE_BYTES} bytes of memory"
+            raise self.bad(path, f"is one array too many: those of the file take {limit}")

@@ -1,0 +1,180 @@
+"""Executor on Ray: a cluster by its address, or Ray started on this machine.
+
+This process holds the names of tasks and small results; files are written by the tasks.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from physion.compute.executor import TaskOutcome
+from physion.compute.local import TRIES, available_cores
+from physion.compute.task import run_task
+from physion.errors import BadInputError, MissingExtraError, PhysionError
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+_WAITING_PER_CORE = 2
+"""Tasks given to Ray for each core of the cluster; the others wait in this process."""
+_THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+class RayExecutor:
+    """Executor that runs tasks on Ray.
+
+    A task whose worker or node ends is started again on another; an exception of the function is
+    not retried.
+
+    Parameters
+    ----------
+    address
+        Of a cluster, or ``auto``; empty: Ray is started on this machine and stopped afterwards.
+    workers
+        Cores of a Ray that is started here; by default all.
+    cpus, gpus, memory_gb
+        What a task takes; fractions of a graphics card let tasks share it.
+    tries
+        How often a task is started before it counts as failed because its worker ended.
+    timeout
+        Seconds after which a task is stopped, which counts as the end of its worker.
+    logs
+        Folder for a log of each task, which all nodes see.
+    """
+
+    def __init__(
+        self,
+        address: str = "",
+        *,
+        workers: int | None = None,
+        cpus: float = 1,
+        gpus: float = 0,
+        memory_gb: float | None = None,
+        tries: int = TRIES,
+        timeout: float | None = None,
+        logs: Path | None = None,
+    ) -> None:
+        if tries < 1 or cpus < 0 or gpus < 0:
+            raise BadInputError("Ray needs at least one try, and no negative number of cores")
+        self.address, self.tries, self.timeout = address, tries, timeout
+        self.workers = workers if workers is not None else available_cores()
+        self.logs = None if logs is None else logs.absolute()
+        self._shares: dict[str, Any] = {"num_cpus": cpus, "num_gpus": gpus}
+        if memory_gb is not None:
+            self._shares["memory"] = int(memory_gb * 2**30)
+        try:
+            import ray
+        except ImportError as error:
+            raise MissingExtraError("the executor ray", "ray") from error
+        self._ray: Any = ray
+
+    def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[TaskOutcome[R]]:
+        """Yield outcomes as they come; see `physion.compute.executor.Executor`."""
+        if not tasks:
+            return
+        ray = self._ray
+        started = not ray.is_initialized()
+        if started:
+            self._start()
+        running: dict[Any, _Started] = {}
+        try:
+            remote = ray.remote(max_retries=0, **self._shares)(run_task)
+            stored = ray.put(function)
+            waiting = deque(_Queued(key) for key in tasks)
+            window = self._window()
+            while waiting or running:
+                while waiting and len(running) < window:
+                    queued = waiting.popleft()
+                    ref = remote.remote(queued.key, stored, tasks[queued.key], self.logs)
+                    running[ref] = _Started(queued, time.monotonic())
+                ready, _ = ray.wait(list(running), num_returns=1, timeout=self._pause(running))
+                for ref in ready:
+                    done = running.pop(ref)
+                    outcome: TaskOutcome[R] | None = self._collect(ref, done)
+                    if outcome is None:
+                        waiting.append(replace(done.queued, tries=done.queued.tries + 1))
+                    else:
+                        yield outcome
+                self._stop_late(running)
+        finally:
+            for ref in running:
+                ray.cancel(ref, force=True)
+            if started:
+                ray.shutdown()
+
+    def _window(self) -> int:
+        """Return how many tasks Ray is given at a time."""
+        cores = self._ray.cluster_resources().get("CPU", 1)
+        if self.timeout is None:
+            return max(1, int(cores) * _WAITING_PER_CORE)
+        # No more than can run, so that the time of a task does not count its waiting.
+        return max(1, int(cores / max(self._shares["num_cpus"], 1)))
+
+    def _start(self) -> None:
+        """Connect to the cluster, or start Ray on this machine."""
+        options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+        options["runtime_env"] = {"env_vars": _THREADS}
+        if self.address:
+            options["address"] = self.address
+        else:
+            options |= {"num_cpus": self.workers, "include_dashboard": False}
+        try:
+            self._ray.init(**options)
+        except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
+            text = " ".join(str(error).split())
+            raise PhysionError(f"Ray cannot be reached at {self.address!r}: {text}") from error
+
+    def _collect(self, ref: Any, done: _Started) -> TaskOutcome[Any] | None:
+        """Return the outcome of a finished call; None if its task is to be started again."""
+        tries = done.queued.tries
+        try:
+            outcome: TaskOutcome[Any] = self._ray.get(ref)
+        except self._ray.exceptions.RayError as error:
+            if tries < self.tries:
+                return None
+            if done.late:
+                reason = f"still running after {self.timeout:.0f} s, so it was stopped"
+            else:
+                reason = f"its worker ended: {' '.join(str(error).split())}"
+            return TaskOutcome(done.queued.key, error=reason, tries=tries)
+        return replace(outcome, tries=tries)
+
+    def _pause(self, running: Mapping[Any, _Started]) -> float | None:
+        """Return how long to wait for a result until the next task exceeds its limit."""
+        if self.timeout is None:
+            return None
+        first = min(started.since for started in running.values())
+        return max(0.0, first + self.timeout - time.monotonic()) + 0.1
+
+    def _stop_late(self, running: dict[Any, _Started]) -> None:
+        """Stop the tasks that exceed their limit; their calls then fail."""
+        if self.timeout is None:
+            return
+        for started in running.values():
+            if not started.late and time.monotonic() - started.since >= self.timeout:
+                started.late = True
+        for ref, started in running.items():
+            if started.late:
+                self._ray.cancel(ref, force=True)
+
+
+@dataclass(frozen=True)
+class _Queued:
+    """Name of a task, and the number of this try."""
+
+    key: str
+    tries: int = 1
+
+
+@dataclass
+class _Started:
+    """A task that Ray has, since when, and whether it was stopped for its time."""
+
+    queued: _Queued
+    since: float
+    late: bool = False

@@ -1,0 +1,68 @@
+"""The executor of Ray, started on this machine."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from physion.compute.ray import RayExecutor
+from physion.compute.task import log_path
+from support.paths import FIND_TESTS, ROOT
+from support.tasks import die_on_two, die_once, fail_on_three, square
+
+ray = pytest.importorskip("ray", reason="the extra 'ray' is not installed")
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cluster() -> Iterator[None]:
+    """One Ray with two cores for all tests; an executor uses the one that is connected."""
+    with pytest.MonkeyPatch.context() as patch:
+        path = f"{FIND_TESTS['PYTHONPATH']}{os.pathsep}{ROOT / 'src'}"
+        patch.setenv("PYTHONPATH", path)
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        environment = {"env_vars": {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}}
+        ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, runtime_env=environment)
+        yield
+        ray.shutdown()
+
+
+def numbers(*values: int) -> dict[str, int]:
+    return {f"task {value}": value for value in values}
+
+
+def test_every_task_has_one_outcome_and_a_log(tmp_path: Path) -> None:
+    outcomes = list(RayExecutor(logs=tmp_path).map(square, numbers(*range(20))))
+    assert {o.key: o.value for o in outcomes} == {f"task {n}": n * n for n in range(20)}
+    assert len(outcomes) == 20
+    assert log_path(tmp_path, "task 4").read_text().startswith("squaring 4\n")
+    assert list(RayExecutor().map(square, {})) == []
+
+
+def test_an_exception_fails_its_task_alone_and_is_not_tried_again() -> None:
+    outcomes = {o.key: o for o in RayExecutor().map(fail_on_three, numbers(1, 2, 3, 4))}
+    bad = outcomes.pop("task 3")
+    assert bad.error == "three is not liked" and bad.tries == 1 and "fail_on_three" in bad.traceback
+    assert sorted(o.value for o in outcomes.values()) == [1, 2, 4]
+
+
+def test_a_poison_task_is_put_aside_and_a_lost_one_runs_again(tmp_path: Path) -> None:
+    outcomes = {o.key: o for o in RayExecutor(tries=2).map(die_on_two, numbers(*range(4)))}
+    bad = outcomes.pop("task 2")
+    assert bad.tries == 2 and "worker ended" in str(bad.error)
+    assert sorted(o.value for o in outcomes.values()) == [0, 1, 3]
+    (outcome,) = RayExecutor().map(die_once, {"a": str(tmp_path / "marker")})
+    assert outcome.value == "second try" and outcome.tries == 2
+
+
+def test_a_task_without_end_is_stopped() -> None:
+    outcomes = {
+        o.key: o
+        for o in RayExecutor(tries=1, timeout=5.0).map(time.sleep, {"long": 600, "short": 0})
+    }
+    assert "still running after 5 s" in str(outcomes["long"].error)
+    assert outcomes["short"].error is None

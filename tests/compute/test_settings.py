@@ -1,0 +1,56 @@
+"""The options of the command line give the executor that they name, with its limits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from physion.compute.local import LocalExecutor
+from physion.compute.settings import ExecutorSettings
+from physion.compute.task import log_path
+from physion.errors import BadInputError
+from support import slurm
+from support.tasks import fail_on_three, square
+
+
+def test_local_has_its_limits_and_logs(tmp_path: Path) -> None:
+    executor = ExecutorSettings(workers=1, tries=2, task_minutes=0.5, task_logs=tmp_path).open()
+    assert isinstance(executor, LocalExecutor)
+    assert (executor.workers, executor.tries, executor.timeout) == (1, 2, 30.0)
+    assert [o.value for o in executor.map(square, {"a b": 3})] == [9]
+    assert log_path(tmp_path, "a b").read_text() == "squaring 3\na b: done\n"
+
+
+def test_the_log_of_a_failed_task_has_its_traceback(tmp_path: Path) -> None:
+    executor = LocalExecutor(1, logs=tmp_path)
+    (outcome,) = executor.map(fail_on_three, {"bad": 3})
+    assert outcome.error == "three is not liked"
+    assert "fail_on_three" in log_path(tmp_path, "bad").read_text()
+
+
+def test_slurm_gets_minutes_of_all_tasks_of_a_job(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("submitit", reason="the extra 'slurm' is not installed")
+    slurm.install(tmp_path, monkeypatch)
+    settings = ExecutorSettings(
+        "slurm", task_minutes=3, tasks_per_job=5, task_gpus=2, task_memory_gb=1.5,
+        partition="fast", slurm=("account=physics",), task_logs=tmp_path / "logs",
+    )  # fmt: skip
+    asked = settings.open().settings.parameters()  # type: ignore[attr-defined]
+    assert (asked["time"], asked["gpus_per_node"], asked["mem"]) == (15, 2, "1536MB")
+    assert (asked["partition"], asked["additional_parameters"]) == ("fast", {"account": "physics"})
+
+
+@pytest.mark.parametrize(
+    ("settings", "word"),
+    [
+        (ExecutorSettings("slurm", task_gpus=0.5), "whole"),
+        (ExecutorSettings("slurm", slurm=("account",)), "NAME=VALUE"),
+        (ExecutorSettings(task_minutes=0), "--task-minutes"),
+    ],
+)
+def test_what_an_executor_cannot_take_is_refused(settings: ExecutorSettings, word: str) -> None:
+    with pytest.raises(BadInputError, match=word):
+        settings.open()
