@@ -42,7 +42,7 @@ class RayExecutor:
     tries
         How often a task is started before it counts as failed because its worker ended.
     timeout
-        Seconds after which a task is stopped, which counts as the end of its worker.
+        Seconds, with the start of its worker, after which a task is stopped.
     logs
         Folder for a log of each task, which all nodes see.
     """

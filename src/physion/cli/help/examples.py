@@ -69,8 +69,8 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
 """Command lines by verb, or verb and sub-verb; tests parse each."""
 
 
-def describe(text: str | None, words: Sequence[str]) -> str:
+def describe(text: str | None, names: Sequence[str]) -> str:
     """Return the description of a verb, which is ``text``, followed by its examples."""
-    examples = EXAMPLES.get(" ".join(words), ())
+    examples = EXAMPLES.get(" ".join(names), ())
     lines = "\n".join(f"  {example}" for example in examples)
     return f"{(text or '').strip()}\n\nExamples:\n{lines}" if lines else text or ""

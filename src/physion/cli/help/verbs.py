@@ -41,7 +41,7 @@ def module_of(verb: str) -> ModuleType:
 
 
 def find_module(args: Sequence[str]) -> tuple[ModuleType, int]:
-    """Return the module of the verb that ``args`` start with, and how many words name it."""
+    """Return the module of the verb that ``args`` start with, and 1, or 2 for a sub-verb."""
     module = module_of(args[0])
     if args[1:2] and args[1] in getattr(module, "SUBVERBS", {}):
         return import_module(module.SUBVERBS[args[1]]), 2
