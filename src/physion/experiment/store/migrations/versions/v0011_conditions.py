@@ -1,12 +1,12 @@
-"""Version 10: between-subject conditions."""
+"""Version 11: between-subject conditions."""
 
 from __future__ import annotations
 
 import sqlalchemy as sa
 from alembic import op
 
-revision = "0010"
-down_revision = "0009"
+revision = "0011"
+down_revision = "0010"
 
 
 def upgrade() -> None:
