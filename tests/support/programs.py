@@ -36,3 +36,8 @@ def find_chromium() -> str:
     """The browser of the browser tests."""
     names = ("chromium", "chromium-browser", "google-chrome")
     return find_program(*names, variable="PHYSION_BROWSER", what="Chromium")
+
+
+def find_firefox() -> str:
+    """The second browser of the browser tests."""
+    return find_program("firefox-esr", "firefox", variable="PHYSION_FIREFOX", what="Firefox")

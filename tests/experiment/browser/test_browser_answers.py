@@ -83,7 +83,7 @@ def test_responses_of_others_are_not_refusals(
 
         visit.context.route("**/api/answers", stand_between)
         visit.answer("yes")
-        visit.page.get_by_text("No connection.").wait_for()
+        visit.page.get_by_text("No connection.").wait_for(state="attached")
         visit.answer("no")
         visit.answer("yes")
         visit.heading("About you")

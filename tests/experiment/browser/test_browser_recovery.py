@@ -108,16 +108,34 @@ def test_a_reload_without_browser_storage(chromium: Any, site: tuple[Study, str]
         assert visit.unexpected() == []
 
 
+WATCH_STATUS = """() => {
+  window.statusSeen = new Set();
+  const look = () => {
+    const status = document.getElementById("status");
+    const trial = document.querySelector(".trial:not(.has-verdict)");
+    if (status.textContent && trial) {
+      const part = trial.querySelector(".answer:disabled") ? "movie" : "answer";
+      window.statusSeen.add(`${part} ${getComputedStyle(status).visibility}`);
+    }
+    requestAnimationFrame(look);
+  };
+  look();
+}"""
+"""Records in which part of a trial the message about the connection can be seen."""
+
+
 def test_twenty_seconds_offline(chromium: Any, site: tuple[Study, str]) -> None:
     study, url = site
     with Visit(chromium, url, "offline") as visit:
         to_the_test(visit, "Offline")
         visit.wait_for_answer()
+        visit.page.evaluate(WATCH_STATUS)
         visit.context.set_offline(True)
         visit.answer("no")
         visit.page.get_by_text("Trial 2 of 4").wait_for()
         visit.answer("no")
         visit.page.get_by_text("No connection.").wait_for()
+        assert visit.page.locator("#status").bounding_box()["height"] < 45, "one line"
         visit.picture("lost")
         visit.page.get_by_text("Trial 3 of 4").wait_for()
         visit.page.wait_for_timeout(15_000)
@@ -128,6 +146,8 @@ def test_twenty_seconds_offline(chromium: Any, site: tuple[Study, str]) -> None:
         visit.page.get_by_text("The connection is back.").wait_for()
         visit.answer("yes")
         visit.answer("yes")
+        seen = set(visit.page.evaluate("[...window.statusSeen]"))
+        assert {"movie hidden", "answer visible"} <= seen and "movie visible" not in seen
         visit.heading("About you")
         assert visit.page.evaluate("localStorage.getItem('physion:answers')") is None
         visit.finish()

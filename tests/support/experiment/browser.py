@@ -10,6 +10,8 @@ import contextlib
 import importlib.util
 import os
 import re
+import shlex
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -25,7 +27,7 @@ from physion.experiment.study.identity import Secrets, participant_hash
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Plausibility, Recruitment, Study, Timing
 from support.experiment.tiny_study import make_tiny_study
-from support.programs import absent, find_chromium
+from support.programs import absent, find_chromium, find_firefox
 
 SIZE = {"width": 1280, "height": 800}
 SHORT = Timing(fixation_ms=(60, 120), cue_ms=500, flash_hz=2.0)
@@ -43,6 +45,25 @@ def chromium() -> Iterator[Any]:
     path = find_chromium()
     with driver.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def firefox(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A running Firefox, likewise; `firefox_bridge` stands between it and Playwright."""
+    if importlib.util.find_spec("playwright") is None:
+        absent("playwright is absent: install the extra 'dev'")
+    driver = importlib.import_module("playwright.sync_api")
+    bridge = Path(__file__).with_name("firefox_bridge.py")
+    start = tmp_path_factory.mktemp("firefox") / "start"
+    command = shlex.join([sys.executable, str(bridge), find_firefox()])
+    start.write_text(f'#!/bin/sh\nexec {command} "$@"\n')
+    start.chmod(0o700)
+    with driver.sync_playwright() as playwright:
+        browser = playwright.firefox.launch(
+            channel="moz-firefox", executable_path=start, timeout=120_000
+        )
         yield browser
         browser.close()
 

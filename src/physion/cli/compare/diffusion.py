@@ -80,8 +80,9 @@ def _unflagged(options: Options) -> Responses:
 
     if not options.responses:
         raise BadInputError("give the answers of people: --responses FILE")
-    kind = "simulated" if options.simulated else "people"
-    responses = read_any_responses(options.responses, options.sessions, kind)
+    responses = read_any_responses(
+        options.responses, options.sessions, "simulated" if options.simulated else "people"
+    )
     file = options.expected or find_expected(options.responses)
     expected = None if file is None else read_expected(file)
     check_expected(responses, expected)

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 LOG = logging.getLogger(__name__)
 Handler = Callable[[Request], Awaitable[Response]]
+Allowed = Permission | Literal["any role"]
 PUBLIC: Literal["public"] = "public"
 """In place of a permission: a page that needs no login."""
 ANY_ROLE: Literal["any role"] = "any role"
@@ -55,7 +56,7 @@ def build_router(study: Study, secrets: Secrets, store: Store) -> APIRouter:
         await context.close()
 
     router = APIRouter(lifespan=lifespan, include_in_schema=False)
-    for method, path, permission, page in (
+    table: tuple[tuple[str, str, Allowed | Literal["public"], Handler], ...] = (
         ("GET", "", "progress", pages.overview),
         ("GET", "/", "progress", pages.overview),
         ("GET", "/login", PUBLIC, pages.login_page),
@@ -74,15 +75,14 @@ def build_router(study: Study, secrets: Secrets, store: Store) -> APIRouter:
         ("POST", "/export", "export", exports.make),
         ("GET", "/log", "log", manage.log),
         ("GET", "/static/{name}", PUBLIC, pages.static),
-    ):
+    )
+    for method, path, permission, page in table:
         handler = page if permission == PUBLIC else _guarded(context, permission, page)
         router.add_api_route(path, handler, methods=[method], response_model=None)
     return router
 
 
-def _guarded(
-    context: PageContext, permission: Permission | Literal["any role"], page: Handler
-) -> Handler:
+def _guarded(context: PageContext, permission: Allowed, page: Handler) -> Handler:
     """Return a handler that calls ``page`` for accounts whose role has the permission.
 
     Others are sent to the login, or shown that their role does not allow the page.
