@@ -11,6 +11,7 @@ from physion.analysis.people.check_responses import check_responses
 from physion.analysis.people.completeness import expected_by_session
 from physion.analysis.people.exclusions import flag_sessions
 from physion.analysis.people.participants import clean, scenario_set, scenarios_in
+from physion.analysis.people.people import accuracy_by_scenario
 from physion.analysis.people.response_schema import TRIAL_COLUMNS, check_table
 from physion.analysis.people.results import analyse_people
 from physion.errors import BadInputError
@@ -115,3 +116,22 @@ def test_all_analyses_take_sessions_of_several_blocks(tmp_path: Path) -> None:
     sessions_of(people).to_csv(tmp_path / "sessions.csv", index=False)
     checked, _ = check_responses([tmp_path / "trials.csv"], tmp_path / "sessions.csv")
     assert checked.errors == 0 and checked.people == {"collide": 12, "support": 12}
+
+
+def test_sessions_are_drawn_with_all_their_scenarios() -> None:
+    """People who are good in one scenario are good in the other: their mean varies more."""
+    rows = []
+    for person in range(40):
+        for row in session_rows(person):
+            right = person % 2 == 0
+            label = bool(row["label"])
+            rows.append({**row, "response": "yes" if label == right else "no"})
+    test = clean(table(rows)).test
+    mean = accuracy_by_scenario(test).set_index("scenario").loc["mean"]
+    assert mean["people"] == 40 and mean["accuracy"] == 0.5
+    # The mean of 40 people who are right always or never has a standard error of 0.079.
+    assert 0.13 < mean["accuracy_high"] - 0.5 < 0.18
+    apart = test.assign(session=test["session"] + test["scenario"])
+    independent = accuracy_by_scenario(apart).set_index("scenario").loc["mean"]
+    assert independent["people"] == 80
+    assert 0.09 < independent["accuracy_high"] - 0.5 < 0.13

@@ -7,13 +7,16 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
+from alembic import command
+from sqlalchemy import text
 
 from physion.errors import BadInputError
 from physion.experiment.protocol.messages import Jump, PageDone
+from physion.experiment.store.database import _load_migrations, open_database
 from physion.experiment.store.store import Store
 from physion.experiment.store.tables import SESSIONS
 from physion.experiment.study.courses.blocks import block_scenarios, order_number
-from physion.experiment.study.identity import Secrets
+from physion.experiment.study.identity import Secrets, hash_token
 from physion.experiment.study.media_links import read_media_path
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.recruitment import links, make_pass
@@ -201,3 +204,41 @@ def test_only_the_first_block_may_have_practice(blocks_study: Study, tmp_path: o
     assert (state.stage, state.trial, state.block) == ("test", 2, 1)
     assert run(store.state(walk(store, token, "done"))).trials == {"familiarization": 1, "test": 4}
     store.close()
+
+
+def test_sessions_of_older_databases_have_one_block_and_no_condition(
+    blocks_study: Study, tmp_path: object
+) -> None:
+    """A session whose practice was done before the tables knew blocks goes on in the test."""
+    study = replace(blocks_study, blocks=Blocks())
+    url = f"sqlite:///{tmp_path}/a.sqlite"
+    engine = open_database(url)
+    config, _ = _load_migrations()
+    with engine.execution_options(physion_writes=True).begin() as connection:
+        config.attributes["connection"] = connection
+        command.upgrade(config, "0006")
+        values = {
+            "digest": study.digest, "stimuli": study.stimuli_digest, "token": hash_token("token"),
+        }  # fmt: skip
+        for statement in OLD_ROWS:
+            connection.execute(text(statement), values)
+    engine.dispose()
+    store = Store.open(study, Secrets.load(study.folder), url)
+    state = run(store.state("token"))
+    assert (state.stage, state.trial, state.block, state.condition) == ("test", 2, 0, "")
+    assert (state.scenario, len(state.blocks)) == ("drop", 1)
+    assert give(store, "token", 2).state.trial == 3
+    store.close()
+
+
+OLD_ROWS = (
+    "INSERT INTO studies VALUES (:digest, 'tiny', '1', :stimuli, '{}', 1.0)",
+    "INSERT INTO participants VALUES ('ada', 1.0)",
+    "INSERT INTO sessions (session, participant, scenario, kind, source, study, reference, "
+    "order_seed, order_number, buttons, language, started_at, consented_at, instructed_at, "
+    "ready_at, answered_familiarization, answered_test, loads, last_seen, device) VALUES "
+    "('one', 'ada', 'drop', 'person', 'link', :digest, 'AAAA-BBBB', 5, 0, 'yes-no', 'en', 1.0, "
+    "1.0, 1.0, 1.0, 1, 2, 1, 1.0, '{}')",
+    "INSERT INTO tokens VALUES (:token, 'one', 1.0)",
+)
+"""Rows of a session as version 6 stored them."""
