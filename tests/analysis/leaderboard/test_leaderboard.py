@@ -221,7 +221,7 @@ def test_kappa_is_the_mean_over_participants_then_scenarios(files: list[Path]) -
     assert good["kappa"] == pytest.approx(np.mean(by_scenario), abs=1e-12)
     assert good["kappa_low"] < good["kappa"] < good["kappa_high"]
     # One stimulus alone differs from the outcome given by "good": without it nothing varies.
-    assert "r_beyond_outcome: no interval" in good["reason"]
+    assert "r beyond the outcome: no interval" in good["reason"]
     assert table["reason"].drop("good").eq("").all()
     people = test.groupby("stimulus")["yes"].mean()
     p = read_predictions([files[0]]).set_index("stimulus")["p_contact"]

@@ -148,6 +148,7 @@ def test_r_of_one_person_is_that_with_the_average_of_the_others() -> None:
     assert np.mean(included) > found + 0.03
     row = row_of(compared().anchors, TWO_PEOPLE, POOLED)
     assert row["r_low"] < row["r"] < row["r_high"]
+    assert row["r_same"] == row["r"] and "same outcome" not in row["reason"]
 
 
 def test_people_who_all_agree_have_an_r_of_one() -> None:

@@ -65,11 +65,12 @@ def pearson_r(sample: Sample) -> Array:
     "r_same",
     label="r, same outcome",
     definition="Pearson r without the stimuli whose simulated outcome is not the official one, "
-    "since people and model saw different events there",
+    "since people and model saw different events there; people all saw the official one",
     better="higher",
     scale="correlation",
     needs="people",
     in_scores=True,
+    two_people=r_of_two_people,
 )
 def r_same_outcome(sample: Sample) -> Array:
     """Return Pearson's r over the stimuli whose shown outcome is the official one."""

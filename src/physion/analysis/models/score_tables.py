@@ -155,14 +155,15 @@ def _record(
         variance = jackknife(values[1:], strata)
         low, high = variance.interval(float(values[0]), level, metrics.get(key).scale)
         if np.isfinite(values[0]) and np.isnan(low) and len(rows) > 1:
-            reasons.append(f"{key}: no interval, too few stimuli or undefined without one of them")
+            name = metrics.get(key).label or key
+            reasons.append(f"{name}: no interval, too few stimuli or undefined without one of them")
         record |= {key: float(values[0]), f"{key}_low": low, f"{key}_high": high}
     if len(rows) > 1 and record["accuracy_low"] == record["accuracy_high"]:
         reasons.append("accuracy: all answers alike, so the interval has no width")
     if len(rows) == 1:
         reasons.append("intervals: one stimulus")
     if np.isfinite(values_of["r"][0]) and np.isnan(values_of["r_same"][0]):
-        reasons.append("r_same: too few or constant where the outcomes agree")
+        reasons.append("r, same outcome: too few or constant where the outcomes agree")
     record["ceiling"] = agreement.ceiling(rows["p_yes"], rows["count"])
     record["floor"] = agreement.rmsd_floor(rows["p_yes"], rows["count"])
     if np.isfinite(values_of["r"][0]) and np.isnan(record["ceiling"]):
