@@ -19,7 +19,19 @@ from support.programs import absent
 
 PACKAGE = ROOT / "src" / "physion"
 TOP = {
-    *(".ci", "benchmarks", "docs", "examples", "src", "tests", ".gitignore", "CHANGELOG.md"),
+    *(
+        ".ci",
+        ".devcontainer",
+        ".dockerignore",
+        "Dockerfile",
+        "benchmarks",
+        "docs",
+        "examples",
+        "src",
+        "tests",
+        ".gitignore",
+        "CHANGELOG.md",
+    ),
     *("CITATION.cff", "CONTRIBUTING.md", "LICENSE", "PKG-INFO", "README.md", "eslint.config.js"),
     *("mkdocs.yml", "package.json", "pyproject.toml", "requirements.lock", "tsconfig.json"),
 }

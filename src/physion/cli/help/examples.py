@@ -64,6 +64,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "verify": ("physion verify trials --again 20",),
     "ls": ("physion ls models", "physion ls presets"),
     "doctor": ("physion doctor --reproduce",),
+    "bench": ("physion bench", "physion bench --scenario drop --count 10 --json"),
     "completion": ("physion completion bash > ~/.local/share/bash-completion/completions/physion",),
 }
 """Command lines by verb, or verb and sub-verb; tests parse each."""

@@ -21,6 +21,7 @@ VERBS = {
     "verify": "check every byte, label and motion of a dataset",
     "ls": "list scenarios, presets, shapes, props, materials, models, readers, engines",
     "doctor": "check this machine and print what to install",
+    "bench": "measure this machine: simulation, rendering, trials",
     "completion": "print a script that completes verbs and options in the shell",
 }
 
@@ -31,6 +32,7 @@ MODULES = {
     "compare": "compare.compare",
     "experiment": "experiment.experiment",
     "completion": "help.completion",
+    "bench": "bench.bench",
 }
 """Modules of verbs that are Python keywords, have sub-verbs or stand in a folder."""
 

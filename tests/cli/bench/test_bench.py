@@ -1,0 +1,35 @@
+"""`physion bench` measures simulation, rendering and trials of a scenario."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+
+from physion.cli.bench.bench import COLUMNS
+from physion.cli.main import main
+from physion.version import MADE_WITH
+
+
+@pytest.mark.slow
+def test_every_quantity_of_a_scenario_is_measured(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "--scenario", "drop", "--count", "1", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["package"] == MADE_WITH and found["count"] == 1
+    (row,) = found["scenarios"]
+    assert row.keys() == COLUMNS.keys() and row.pop("scenario") == "drop"
+    assert row.pop("agreement") in (0.0, 1.0)
+    assert all(math.isfinite(value) and value > 0 for value in row.values())
+    assert row["passes_ms"] > row["color_ms"]
+
+
+@pytest.mark.parametrize(
+    ("options", "word"), [(["--count", "0"], "--count"), (["--scenario", "dorp"], "drop")]
+)
+def test_bad_options_are_one_line(
+    options: list[str], word: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["bench", *options]) == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1 and word in message
