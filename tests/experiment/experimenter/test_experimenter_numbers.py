@@ -109,7 +109,8 @@ def test_spans_of_time_in_words() -> None:
 
 def test_states_of_sessions() -> None:
     facts = {"finished_at": None, "withdrawn_at": None, "consented_at": 1.0, "last_seen": 100.0,
-             "voided_at": None}  # fmt: skip
+             "voided_at": None, "screened_out_at": None}  # fmt: skip
+    assert session_state(facts | {"screened_out_at": 5.0}, 1e9) == "screened_out"
     assert session_state(facts, 1000.0) == "going" and session_state(facts, 1001.0) == "left"
     assert session_state(facts | {"withdrawn_at": 5.0}, 1000.0) == "withdrawn"
     assert session_state(facts | {"finished_at": 5.0, "voided_at": 6.0}, 10.0) == "void"

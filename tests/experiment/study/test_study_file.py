@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from physion.errors import BadInputError
 from physion.experiment.study.study import (
+    Attention,
     Bonus,
     Comprehension,
     EarlyEnd,
@@ -67,6 +68,7 @@ STUDIES = st.builds(
     demographics=st.booleans(),
     comprehension_questions=st.sampled_from([(), COMPREHENSION]),
     comprehension=st.builds(Comprehension, st.integers(1, 100)),
+    attention=st.builds(Attention, st.integers(0, 100), st.integers(0, 1000)),
     practice=st.builds(Practice, st.integers(0, 1000), st.integers(0, 20),
                        st.sampled_from(["end", "flag"])),
     questions=st.sampled_from([(), OWN_QUESTIONS]),

@@ -230,5 +230,5 @@ def rows_of(study: Study, raw_id: str) -> tuple[Any, list[Any], list[Any]]:
             )
     finally:
         engine.dispose()
-    order = {"familiarization": 0, "test": 1}
+    order = {"familiarization": 0, "test": 1, "attention": 1}
     return session, sorted(answers, key=lambda row: (order[row.phase], row.trial)), events

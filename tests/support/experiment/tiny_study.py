@@ -38,6 +38,7 @@ def make_tiny_study(
     *,
     test: int = 6,
     familiarization: int = 10,
+    obvious: int = 0,
     scenarios: tuple[str, ...] = ("collide",),
     size: int = 128,
     password: str = PASSWORD,
@@ -52,8 +53,8 @@ def make_tiny_study(
     ----------
     folder
         The study folder to create.
-    test, familiarization
-        Number of trials per scenario in each phase.
+    test, familiarization, obvious
+        Number of trials per scenario in each phase; ``obvious`` ones are attention checks.
     scenarios
         Names of the scenarios.
     size
@@ -72,7 +73,11 @@ def make_tiny_study(
     (folder / "media").mkdir(parents=True, exist_ok=True)
     stimuli, number = [], 0
     for scenario in scenarios:
-        for phase, count in (("familiarization", familiarization), ("test", test)):
+        for phase, count in (
+            ("familiarization", familiarization),
+            ("test", test),
+            ("attention", obvious),
+        ):
             for place in range(count):
                 stimuli.append(_stimulus(folder, scenario, phase, place, number, size))
                 number += 1

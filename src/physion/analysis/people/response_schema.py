@@ -55,7 +55,13 @@ TRIAL_COLUMNS: tuple[Column, ...] = (
     _must("scenario", "text", "Scenario of the trial"),
     _must("stimulus", "text", "Name of the trial that was shown"),
     _must("phase", "choice", "With feedback (familiarization) or without (test)", choices=PHASES),
-    _must("trial", "integer", "Place in the order of its phase in the session, from 0", low=0),
+    _must(
+        "trial",
+        "integer",
+        "Place in the order of its phase in the session, from 0; attention "
+        "checks, which are not in this table, have places too",
+        low=0,
+    ),
     Column(
         "response",
         "choice",
@@ -152,8 +158,9 @@ SESSION_COLUMNS: tuple[Column, ...] = (
     Column("practice_repeats", "integer",
            "How often the practice was repeated; in the last block begun, if there are several",
            low=0),
-    Column("failed_checks", "text", "Checks of the lab that the session failed: practice; empty: "
-           "none"),
+    Column("attention_failed", "integer", "Number of failed attention checks", low=0),
+    Column("failed_checks", "text", "Checks of the lab that the session failed: practice, "
+           "attention; empty: none"),
     Column("age", "integer", "Age", unit="years", low=0, high=130),
     Column("gender", "text", "Gender, in the words of the questionnaire"),
     Column("education", "text", "Highest education, in the words of the questionnaire"),

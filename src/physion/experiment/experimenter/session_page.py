@@ -13,6 +13,7 @@ from physion.experiment.experimenter.session_list import flags_shown
 from physion.experiment.experimenter.statistics.flagging import Flags
 from physion.experiment.experimenter.statistics.summaries import SessionSummary
 from physion.experiment.store.tables import ANSWERS, EVENTS, SESSIONS, STUDIES
+from physion.experiment.study.courses.attention import instructed_response
 from physion.experiment.study.courses.blocks import stimuli_by_session
 from physion.experiment.study.study import Study
 
@@ -131,6 +132,11 @@ def _answers(
 ) -> tuple[AnswerLine, ...]:
     """Read the answers of a session in order."""
     labels = {key: each.label for key, each in stimuli_by_session(study).items()}
+
+    def label_of(stimulus: str) -> bool | None:
+        asked = instructed_response(stimulus)
+        return labels.get((scenario, stimulus)) if asked is None else asked == "yes"
+
     table = ANSWERS.c
     rows = connection.execute(
         select(*(column for column in table if column.name != "details"))
@@ -139,7 +145,7 @@ def _answers(
     )
     return tuple(
         AnswerLine(
-            row.phase, row.trial, row.stimulus, row.response, labels.get((scenario, row.stimulus)),
+            row.phase, row.trial, row.stimulus, row.response, label_of(row.stimulus),
             row.rt_ms, row.input, row.frames_shown, row.frames_expected, row.frames_dropped,
             row.visibility_changes, row.resumed, row.showings, row.void, row.answered_at,
         )

@@ -6,16 +6,21 @@ from collections.abc import Mapping
 from textwrap import fill
 from typing import Any, Literal
 
-from physion.analysis.people.response_schema import PHASES, Column
+from physion.analysis.people.response_schema import Column
 from physion.experiment.export.conventions.bids import TEXT_RULE
 from physion.experiment.export.spreadsheet import RULE
-from physion.experiment.study.stimuli import LOOKS
+from physion.experiment.study.stimuli import LOOKS, STIMULUS_PHASES
 from physion.experiment.study.study import Study
 
 STIMULI_COLUMNS: tuple[Column, ...] = (
     Column("stimulus", "text", "Name, as in the trials"),
     Column("scenario", "text", "Scenario, as in the trials"),
-    Column("phase", "choice", "Phase in which it is shown", choices=PHASES),
+    Column(
+        "phase",
+        "choice",
+        "Phase in which it is shown; attention: a check among the test trials",
+        choices=STIMULUS_PHASES,
+    ),
     Column("place", "integer", "Position in familiarization, from 0; no order in the test", low=0),
     Column("label", "flag", "Whether the agent touches the patient"),
     Column("frames", "integer", "Number of frames of the observed movie", low=1),
@@ -56,6 +61,7 @@ _FILES = """\
   if it asks some.
 - `practice_repeats.csv`, `practice_repeats.parquet`: answers to practice trials that were repeated
   afterwards, if there are some; `trials` has the last repeat.
+- `attention_checks.csv`, `attention_checks.parquet`: answers to attention checks, if there are any.
 - `events.csv`, `events.parquet`: other events in the browser.
 - `trial_details.parquet`: times of frames and cues within each trial.
 - `stimuli.csv`: the stimuli and their outcomes. `expected.csv`: the test stimuli by scenario.

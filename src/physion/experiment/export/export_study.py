@@ -8,6 +8,7 @@
       sessions.csv, .parquet one row per session: physion compare --sessions
       questions.csv, .parquet    answers to the lab's own questions, if there are any
       practice_repeats.csv, .parquet  answers to practice trials that were repeated, if any
+      attention_checks.csv, .parquet  answers to attention checks, if there are any
       events.csv, .parquet   other events in the browser
       trial_details.parquet  times of frames and cues within each trial
       stimuli.csv, expected.csv   the stimuli; the test stimuli of each scenario or session
@@ -56,7 +57,8 @@ from physion.version import __version__
 Layout = Literal["both", "psych-ds", "bids"]
 GONE = "its stimulus is no longer in the study folder"
 NO_FILE = "no answer yet, so no file in bids/"
-_PSYCH_DS_TABLES = ("trials", "sessions", "events", "questions", "practice_repeats")
+_PSYCH_DS_TABLES = ("trials", "sessions", "events", "questions", "practice_repeats",
+                    "attention_checks")  # fmt: skip
 _SECRET_SETTINGS = ("recruitment", *EARLY_ENDS, "folder", "stimuli")
 
 

@@ -120,7 +120,8 @@ def read_trials(
 def _fetch(connection: Connection, names: Sequence[str], details: bool) -> list[tuple[Any, ...]]:
     """Fetch rows of session, stimulus, details (if requested) and `_NUMBERS`."""
     texts = [ANSWERS.c.session, ANSWERS.c.stimulus, *([ANSWERS.c.details] if details else [])]
-    query = select(*texts, *_NUMBERS.values()).where(ANSWERS.c.session.in_(names))
+    chosen = ANSWERS.c.session.in_(names), ANSWERS.c.phase.in_(PHASES)
+    query = select(*texts, *_NUMBERS.values()).where(*chosen)
     text = query.compile(dialect=connection.dialect, compile_kwargs={"literal_binds": True})
     # Plain rows of the driver: SQLAlchemy's row objects would double the time.
     binary = {"binary": True} if connection.dialect.name == "postgresql" else {}

@@ -14,7 +14,6 @@ import pyarrow.compute as pc
 from sqlalchemy import Connection
 
 from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, Column
-from physion.experiment.export import practice_table
 from physion.experiment.export.conventions.bids import BidsWriter
 from physion.experiment.export.descriptions import STIMULI_COLUMNS
 from physion.experiment.export.event_tables import (
@@ -23,7 +22,12 @@ from physion.experiment.export.event_tables import (
     detail_table,
     read_events,
 )
-from physion.experiment.export.practice_table import read_practice_repeats
+from physion.experiment.export.further_answers import (
+    ATTENTION_COLUMNS,
+    REPEAT_COLUMNS,
+    read_attention,
+    read_practice_repeats,
+)
 from physion.experiment.export.question_table import (
     KEYS,
     question_columns,
@@ -123,12 +127,16 @@ def write_tables(
     described = dict(TABLES)
     if own is not None:
         rows["questions"], described["questions"] = own[0].num_rows, own[1]
-    repeats = read_practice_repeats(connection, study, sessions.table)
-    if repeats.num_rows:
-        with TableWriter(folder, "practice_repeats", practice_table.COLUMNS) as file:
-            file.write(repeats)
-        rows["practice_repeats"] = repeats.num_rows
-        described["practice_repeats"] = practice_table.COLUMNS
+    further = {
+        "practice_repeats": (read_practice_repeats, REPEAT_COLUMNS),
+        "attention_checks": (read_attention, ATTENTION_COLUMNS),
+    }
+    for name, (read, columns) in further.items():
+        table = read(connection, study, sessions.table)
+        if table.num_rows:
+            with TableWriter(folder, name, columns) as file:
+                file.write(table)
+            rows[name], described[name] = table.num_rows, columns
     return WrittenTables(rows, gone, max(latest) or None, own, described)
 
 

@@ -214,6 +214,8 @@ class TrialMedia(Message):
     width: int
     height: int
     fixation_ms: int
+    instructed: Literal["yes", "no"] | None = None
+    """Which button an attention check says to press after the movie; None for other trials."""
 
 
 class TrialList(Message):

@@ -28,7 +28,7 @@ from physion.experiment.study.identity import Secrets
 from physion.experiment.study.media_links import read_media_path
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.recruitment import make_pass
-from physion.experiment.study.stimuli import PHASES, Stimulus
+from physion.experiment.study.stimuli import ATTENTION, PHASES, STIMULUS_PHASES, Stimulus
 from physion.experiment.study.study import ALL_SCENARIOS, Study
 
 DEVICE = wire.Device(
@@ -210,7 +210,7 @@ class Participation:
     ) -> wire.SessionState:
         """Fetch the media of a trial and answer it."""
         await self._fetch(media.movie, media.map)
-        stimulus = self._find_stimulus(phase, media.movie)
+        stimulus = self._find_stimulus(phase, media)
         body = build_answer(cue_ms, media, phase, self._person, stimulus)
         showing = wire.Showing(key=uuid.uuid4().hex, phase=phase, trial=media.trial)
         try:
@@ -234,15 +234,19 @@ class Participation:
         """Let ``ms`` milliseconds of a person's time pass, at the speed that the study allows."""
         await asyncio.sleep(ms / 1000 / self._study.plausibility.simulated_speed)
 
-    def _find_stimulus(self, phase: Phase, movie: str) -> Stimulus:
-        """Return the stimulus of a movie path, which only the server's keys can decode."""
-        path = read_media_path(self._study, self._secrets, movie)
+    def _find_stimulus(self, phase: Phase, media: wire.TrialMedia) -> Stimulus:
+        """Return the stimulus of a trial by its movie, whose path the server's keys decode."""
+        path = read_media_path(self._study, self._secrets, media.movie)
+        # Instructed attention checks show movies of the practice.
+        phases = STIMULUS_PHASES if media.instructed else (phase, ATTENTION)
         for stimulus in self._study.stimuli:
             several = self._visit.scenario in (ALL_SCENARIOS, stimulus.scenario)
-            if several and stimulus.phase == phase and self._study.folder / stimulus.movie == path:
+            fits = several and stimulus.phase in phases
+            if fits and self._study.folder / stimulus.movie == path:
                 return stimulus
         raise PhysionError(
-            f"{movie} is not a movie of {self._study.folder}; does the server serve another study?"
+            f"{media.movie} is not a movie of {self._study.folder}; does the server serve another "
+            "study?"
         )
 
     async def _fetch(self, *paths: str) -> None:
@@ -279,13 +283,16 @@ def build_answer(
     The answer, with a new key.
     """
     prediction = person.predict(stimulus)
+    response = media.instructed or prediction.response
+    if stimulus.phase == ATTENTION:
+        response = "yes" if stimulus.label else "no"
     frame_ms = 1000 / media.rate
     frame_times = [round(frame * frame_ms, 1) for frame in range(media.frames)]
     return wire.Answer(
         key=str(uuid.uuid4()),
         phase=phase,
         trial=media.trial,
-        response=prediction.response,
+        response=response,
         rt_ms=prediction.rt_ms,
         input="keyboard" if person.number % 2 else "mouse",
         fixation_ms=media.fixation_ms,

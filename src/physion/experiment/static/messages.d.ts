@@ -74,6 +74,7 @@ export interface TrialMedia {
   width: number;
   height: number;
   fixation_ms: number;
+  instructed: "yes" | "no" | null;
 }
 
 export interface TrialList {

@@ -38,6 +38,8 @@ const info = {
     keys: { type: ParameterType.KEYS, array: true, default: ["f", "j"] },
     /** Texts by name: prompt, yes, no, trouble, retry. */
     words: { type: ParameterType.OBJECT, default: undefined },
+    /** What the prompt says after the movie of an attention check; empty for other trials. */
+    instruction: { type: ParameterType.STRING, default: "" },
     /** How often the trial was shown before and left without an answer. */
     before: { type: ParameterType.INT, default: 0 },
     /** Whether an interrupted trial is shown again. */
@@ -162,6 +164,7 @@ async function run(screen, cross, buttons, trial, signal, visibility) {
   const cue = await screen.flash({ ms: trial.cue_ms, hz: trial.flash_hz });
   const movie = await screen.play({ hide: true });
   trial.seen.end();
+  if (trial.instruction) instruct(trial.instruction);
   const answer = await answered(buttons, trial, signal);
   const frames = screen.record();
   const since = (moment) => round(moment - start);
@@ -191,6 +194,13 @@ async function run(screen, cross, buttons, trial, signal, visibility) {
       shown_height: Math.round(screen.element.clientHeight),
     },
   };
+}
+
+/** Put the instruction of an attention check in the place of the prompt. @param {string} text */
+function instruct(text) {
+  const prompt = document.getElementById("prompt");
+  prompt.textContent = text;
+  prompt.classList.add("instruction");
 }
 
 /** Wait for the first animation frame at or after a time. */

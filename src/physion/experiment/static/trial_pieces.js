@@ -161,6 +161,7 @@ function predictionOf(context, phase, media, session) {
     flash_hz: study.flash_hz,
     choices: state.buttons.split("-"),
     words: words(texts, "trial", TRIAL_WORDS),
+    instruction: media.instructed ? texts.t(`attention.press_${media.instructed}`) : "",
     repeat: study.interrupted === "repeat",
     fits: () => windowFits(study),
     enlarge: (display, signal) => enlarged(context, display, signal),

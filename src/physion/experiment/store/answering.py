@@ -20,13 +20,21 @@ from physion.experiment.store.plausibility import (
     speed,
 )
 from physion.experiment.store.practice import judge_practice, repeated_response
-from physion.experiment.store.sessions import Session, answered, insert_or_skip, stage_of, state_of
+from physion.experiment.store.sessions import (
+    Session,
+    answered,
+    change_session,
+    insert_or_skip,
+    stage_of,
+    state_of,
+    with_check,
+)
 from physion.experiment.store.showings import read_presentation
 from physion.experiment.store.tables import ANSWERS, SESSIONS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.media_links import session_tag, sign_media
 from physion.experiment.study.orders import trial_order
-from physion.experiment.study.stimuli import PHASES, Stimulus
+from physion.experiment.study.stimuli import ATTENTION, PHASES, Stimulus
 from physion.experiment.study.study import Study
 
 MAX_DETAILS = 16 * 1024
@@ -105,24 +113,26 @@ def store_answer(
         or cannot have been shown until now.
     """
     known = answered(session, answer.phase)
+    # Stimuli cannot change while there are sessions, so an answered trial has its stimulus still.
+    order = trial_order(study, session.scenario, session.order_seed)[answer.phase]
     repeated = repeated_response(connection, session, answer)
     if repeated is not None:
         response, duplicate = repeated, True
     elif answer.trial < known:
-        response = _read_stored(connection, course, session, answer)
+        response = _read_stored(connection, course, session, answer, order[answer.trial])
         duplicate = True
     else:
         _check_next(course, session, answer, known)
         response = answer.response
         duplicate = False
-    # Stimuli cannot change while there are sessions, so an answered trial has this stimulus too.
-    stimulus = trial_order(study, session.scenario, session.order_seed)[answer.phase][answer.trial]
+    stimulus = order[answer.trial]
     if not duplicate:
         if answer.phase == PHASES[0] and session.practice_repeats > 0:
             fetched_at = None  # the browser may still have the media of the first practice
         shown = read_presentation(connection, study, course, session, answer, fetched_at)
         changes = _judge(study, session, answer, shown, now)
         values = {
+            "phase": stimulus.phase,
             "stimulus": stimulus.stimulus,
             "frames_expected": stimulus.frames,
             "showings": shown.showings or None,
@@ -131,17 +141,32 @@ def store_answer(
         _insert_answer(connection, course, session, answer, values, changes, now)
         if answer.phase == PHASES[0]:
             judge_practice(connection, study, course, session, now)
+        if stimulus.phase == ATTENTION:
+            _judge_attention(connection, study, session, answer, stimulus)
     feedback = None
     if answer.phase == PHASES[0] and study.familiarization_feedback:
         feedback = _build_feedback(study, secrets, session, stimulus, answer.trial, response)
     return AnswerStored(duplicate=duplicate, feedback=feedback, state=state_of(session, course))
 
 
-def _read_stored(connection: Connection, course: Course, session: Session, answer: Answer) -> str:
+def _judge_attention(
+    connection: Connection, study: Study, session: Session, answer: Answer, check: Stimulus
+) -> None:
+    """Count a failed attention check, unless its movie was interrupted."""
+    if (answer.response == "yes") == check.label or answer.void is not None:
+        return
+    failed = session.attention_failed + 1
+    flag = with_check(session, ATTENTION) if failed > study.attention.max_failed else {}
+    change_session(connection, session, attention_failed=failed, **flag)
+
+
+def _read_stored(
+    connection: Connection, course: Course, session: Session, answer: Answer, stimulus: Stimulus
+) -> str:
     """Return the stored response of a trial if it has the same key; else raise `Refused`."""
     row = connection.execute(
         _STORED,
-        {"of_session": session.session, "of_phase": answer.phase, "of_trial": answer.trial},
+        {"of_session": session.session, "of_phase": stimulus.phase, "of_trial": answer.trial},
     ).one()
     if row.key != answer.key:
         raise Refused(

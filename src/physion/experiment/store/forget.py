@@ -44,8 +44,8 @@ _EMPTIED = dict.fromkeys((
     "loaded_at_phase", "loaded_at_trial", "block_at", "browser", "progressed_at", "next_from",
     "implausible", "age", "gender", "education", "difficulty", "technical_problems", "feedback",
 )) | {"answered_familiarization": 0, "answered_test": 0, "block": 0, "comprehension_attempts": 0,
-      "practice_repeats": 0, "fast_answers": 0, "unfetched": 0, "replayed": 0, "loads": 0,
-      "device": {}}  # fmt: skip
+      "practice_repeats": 0, "attention_failed": 0, "fast_answers": 0, "unfetched": 0,
+      "replayed": 0, "loads": 0, "device": {}}  # fmt: skip
 """Column values that replace the data of a forgotten session."""
 
 

@@ -43,6 +43,7 @@ class Session:
     comprehended_at: float | None
     comprehension_attempts: int
     practice_repeats: int
+    attention_failed: int
     failed_checks: str | None
     ready_at: float | None
     demographics_at: float | None

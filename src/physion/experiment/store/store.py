@@ -7,7 +7,7 @@ import contextlib
 import json
 import time
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from sqlalchemy import Connection, Engine, func, insert, select, text
 from sqlalchemy.exc import OperationalError
@@ -61,11 +61,13 @@ from physion.experiment.store.showings import store_showing
 from physion.experiment.store.study_record import register
 from physion.experiment.store.tables import EVENTS, RAW_IDS, SESSIONS
 from physion.experiment.store.writer import Writer
+from physion.experiment.study.courses.attention import instructed_response
 from physion.experiment.study.courses.variants import under
 from physion.experiment.study.identity import Secrets, hash_token
 from physion.experiment.study.media_links import MediaKind, session_tag, sign_media
 from physion.experiment.study.orders import fixations, trial_order
 from physion.experiment.study.recruitment import completion, ending_completion
+from physion.experiment.study.stimuli import ATTENTION, Stimulus
 from physion.experiment.study.study import Study
 
 __all__ = ["Refused", "Store"]
@@ -308,6 +310,7 @@ class Store:
                 width=stimulus.width,
                 height=stimulus.height,
                 fixation_ms=crosses[trial],
+                instructed=_instructed(stimulus),
             )
             for trial, stimulus in enumerate(trial_order(study, scenario, seed)[phase])
         ]
@@ -324,6 +327,8 @@ class Store:
         if correct is None:  # a preview of other stimuli, whose labels are no longer known
             raise Refused("unknown_token", "The stimuli have changed since; open your link again.")
         others = list(scores.values())
+        order = trial_order(self.study, session.scenario, session.order_seed)
+        trials = sum(each.phase == "test" for each in order["test"])
         enough = len(others) >= self.study.percentile_from
         row = connection.execute(
             select(SESSIONS).where(SESSIONS.c.session == session.session)
@@ -333,13 +338,19 @@ class Store:
         ).first()
         return Result(
             correct=correct,
-            trials=course.trials["test"],
-            accuracy=correct / course.trials["test"],
+            trials=trials,
+            accuracy=correct / trials,
             percentile=percentile(correct, others) if enough else None,
             completion=Completion(code=None, url=None, withheld=True)
             if session.implausible
             else completion(self.study, self.secrets, row, raw),
         )
+
+
+def _instructed(stimulus: Stimulus) -> Literal["yes", "no"] | None:
+    """Return which button an attention check says to press; None for other trials."""
+    asked = instructed_response(stimulus.stimulus) if stimulus.phase == ATTENTION else None
+    return None if asked is None else "yes" if asked == "yes" else "no"
 
 
 def _check_event_data(data: dict[str, Any], index: int) -> dict[str, Any]:

@@ -101,6 +101,7 @@ SESSIONS = Table(
     Column("next_from", Float),
     Column("practice_repeats", Integer, nullable=False, server_default="0"),
     Column("failed_checks", String(100)),
+    Column("attention_failed", Integer, nullable=False, server_default="0"),
     Column("answered_familiarization", Integer, nullable=False, default=0),
     Column("answered_test", Integer, nullable=False, default=0),
     Column("block", Integer, nullable=False, server_default="0"),
@@ -140,8 +141,9 @@ again: its data were deleted, or it was a preview of other stimuli. ``voided_at`
 decided that the session does not count.
 ``screened_out_at``: when the session ended since the participant failed the check
 ``screened_out_by``; ``comprehension_attempts``: how often the comprehension check was answered.
-``practice_repeats``: how often the practice of the current block was repeated; ``failed_checks``:
-names of the lab's checks that flag the session, separated by commas; NULL without any.
+``attention_failed``: number of failed attention checks. ``practice_repeats``: how often the
+practice of the current block was repeated; ``failed_checks``: names of the lab's checks that flag
+the session, separated by commas; NULL without any.
 ``browser``: keyed hash of the key of the browser that began the session, empty if it sent none,
 NULL in sessions of older versions. ``progressed_at``: time of the last page or answer.
 ``next_from``: earliest time at which the next trial can have begun. ``fast_answers``,
@@ -204,8 +206,9 @@ ANSWERS = Table(
     UniqueConstraint("session", "phase", "stimulus"),
     CheckConstraint("response IN ('yes', 'no')", name="response"),
 )
-"""Answers, one row per session and trial; ``details`` is JSON text. ``showings``: how often the
-movie was shown, counted over all loads of the page; ``void``: what interrupted the movie."""
+"""Answers, one row per session and trial; ``details`` is JSON text. Attention checks are trials of
+the test whose phase here is ``attention``. ``showings``: how often the movie was shown, counted
+over all loads of the page; ``void``: what interrupted the movie."""
 
 PRACTICE_REPEATS = Table(
     "practice_repeats",

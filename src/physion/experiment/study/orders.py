@@ -13,6 +13,7 @@ from functools import lru_cache
 from typing import Literal
 
 from physion.experiment.protocol.stages import Block, SessionTrials
+from physion.experiment.study.courses.attention import count_checks, with_checks
 from physion.experiment.study.courses.blocks import block_scenarios, draw_test, seed_with_order
 from physion.experiment.study.courses.variants import StudyKey
 from physion.experiment.study.identity import Secrets, sign
@@ -49,6 +50,8 @@ def prepared_order_seed(study: Study, secrets: Secrets, scenario: str, number: i
 def trial_order(study: Study, scenario: str, order_seed: int) -> Order:
     """Return the stimuli of both phases in order: familiarization by place, test by seed.
 
+    Attention checks are among the test trials, as stimuli of the phase ``attention``.
+
     If the session has several scenarios, each phase has the trials of all blocks, block by block.
     """
     return dict(_order(StudyKey(study), scenario, order_seed))
@@ -71,6 +74,7 @@ def _trials(key: StudyKey, scenario: str, blocks: tuple[str, ...]) -> SessionTri
         if not found or study.blocks.familiarization == "each":
             practice += len(study.phase(name, "familiarization"))
         test += (several and study.blocks.trials) or len(study.phase(name, "test"))
+        test += count_checks(study, name)
         found.append(Block(name, range(before[0], practice), range(before[1], test)))
     return SessionTrials(tuple(found))
 
@@ -81,13 +85,15 @@ def _order(key: StudyKey, scenario: str, order_seed: int) -> Order:
     study = key.study
     practice: list[Stimulus] = []
     test: list[Stimulus] = []
-    for block in session_trials(study, scenario, order_seed).blocks:
+    for position, block in enumerate(session_trials(study, scenario, order_seed).blocks):
         if block.familiarization:
             practice += study.phase(block.scenario, "familiarization")
         drawn: Sequence[Stimulus] = study.phase(block.scenario, "test")
         if scenario == ALL_SCENARIOS:
             drawn = draw_test(study, drawn, order_seed)
-        test += sorted(drawn, key=lambda each: stable_hash("trial", order_seed, each.stimulus))
+        ranked = sorted(drawn, key=lambda each: stable_hash("trial", order_seed, each.stimulus))
+        instructed = position * study.attention.instructed
+        test += with_checks(study, block.scenario, ranked, order_seed, instructed)
     return {"familiarization": tuple(practice), "test": tuple(test)}
 
 

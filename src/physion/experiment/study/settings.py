@@ -81,6 +81,22 @@ class Practice:
 
 
 @dataclass(frozen=True)
+class Attention:
+    """Attention checks among the test trials, besides the stimuli of the phase ``attention``.
+
+    Attributes
+    ----------
+    instructed
+        Number of checks (in each block) after whose movie the page says which button to press.
+    max_failed
+        Number of failed checks of either kind up to which a session is not flagged.
+    """
+
+    instructed: int = 0
+    max_failed: int = 0
+
+
+@dataclass(frozen=True)
 class Screen:
     """Smallest browser window in which participants may take part, in CSS pixels.
 

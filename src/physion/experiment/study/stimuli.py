@@ -23,6 +23,9 @@ from physion.stimulus_names import canonical_name
 STIMULI_FILE = "stimuli.csv"
 MEDIA_FOLDER = "media"
 PHASES = ("familiarization", "test")
+ATTENTION = "attention"
+"""Phase of stimuli with an obvious outcome, which are attention checks among the test trials."""
+STIMULUS_PHASES = (*PHASES, ATTENTION)
 LOOKS = ("free", "redyellow")
 NAME = r"[A-Za-z0-9][A-Za-z0-9._+-]{0,199}"
 """Pattern of stimulus and scenario names: letters, digits and ._+- only, so that they have no
@@ -41,7 +44,8 @@ class Stimulus:
     stimulus, scenario
         Names; together they identify the stimulus.
     phase
-        ``familiarization`` or ``test``.
+        ``familiarization``, ``test``, or ``attention``: an obvious outcome, shown in the test as a
+        check and never analysed.
     place
         Position in familiarization, from 0. In the test it has no effect on the order.
     label
@@ -217,8 +221,8 @@ def _faults(s: Stimulus) -> Iterable[tuple[str, str]]:
         yield "stimulus", letters
     if not is_name(s.scenario):
         yield "scenario", letters
-    if s.phase not in PHASES:
-        yield "phase", " or ".join(PHASES)
+    if s.phase not in STIMULUS_PHASES:
+        yield "phase", " or ".join(STIMULUS_PHASES)
     if s.look not in LOOKS:
         yield "look", " or ".join(LOOKS)
     if not _MOVIE.fullmatch(s.movie):

@@ -31,6 +31,7 @@ from physion.experiment.study.questions import Question, parse_questions
 from physion.experiment.study.settings import (
     ALL_SCENARIOS,
     EARLY_ENDS,
+    Attention,
     Blocks,
     Bonus,
     Comprehension,
@@ -58,6 +59,7 @@ from physion.stimulus_names import canonical_name
 __all__ = [
     "ALL_SCENARIOS",
     "EARLY_ENDS",
+    "Attention",
     "Blocks",
     "Bonus",
     "Comprehension",
@@ -114,7 +116,7 @@ class Study:
         Whether age, gender and education are asked.
     embed_from
         Sites that may show the pages in a frame (MTurk); none by default.
-    timing, blocks, comprehension, practice, screen, plausibility, recruitment, limits
+    timing, blocks, comprehension, practice, attention, screen, plausibility, recruitment, limits
         The tables of ``study.toml``.
     declined, stopped, screened_out, device_refused, full
         Codes and URLs of participants who gave no consent, who stopped, who failed the
@@ -141,7 +143,8 @@ class Study:
     digest
         SHA-256 of study.toml, texts, consent forms and stimuli.csv.
     stimuli_digest
-        SHA-256 of stimuli.csv; with blocks, also of the settings that choose trials from it.
+        SHA-256 of stimuli.csv; with blocks or instructed checks, also of the settings that choose
+        trials from it.
     """
 
     folder: Path
@@ -165,6 +168,7 @@ class Study:
     blocks: Blocks = field(default=Blocks())
     comprehension: Comprehension = field(default=Comprehension())
     practice: Practice = field(default=Practice())
+    attention: Attention = field(default=Attention())
     screen: Screen = field(default=Screen())
     plausibility: Plausibility = field(default=Plausibility())
     recruitment: Recruitment = field(default=Recruitment())
@@ -202,6 +206,7 @@ _PARTS: dict[str, type[Any]] = {
     "blocks": Blocks,
     "comprehension": Comprehension,
     "practice": Practice,
+    "attention": Attention,
     "screen": Screen,
     "plausibility": Plausibility,
     "recruitment": Recruitment,
@@ -259,7 +264,7 @@ def load_study(folder: Path | str) -> Study:
         texts=texts,
         consent_files=files,
         digest=_digest(content, *written, rows),
-        stimuli_digest=_digest(rows, *_block_settings(study)),
+        stimuli_digest=_digest(rows, *_block_settings(study), *_check_settings(study)),
     )
 
 
@@ -367,6 +372,12 @@ def _block_settings(study: Study) -> tuple[bytes, ...]:
     own = [[each.name, each.scenarios] for each in study.conditions if each.scenarios]
     chosen = [study.scenarios, vars(study.blocks), *([own] if own else [])]
     return (json.dumps(chosen).encode(),)
+
+
+def _check_settings(study: Study) -> tuple[bytes, ...]:
+    """Return the number of instructed checks, which are trials too, as JSON; nothing without."""
+    number = study.attention.instructed
+    return (json.dumps({"instructed": number}).encode(),) if number else ()
 
 
 def _digest(*parts: bytes) -> str:

@@ -20,6 +20,7 @@ from physion.experiment.store.sessions import (
 )
 from physion.experiment.store.tables import ANSWERS, SESSIONS
 from physion.experiment.study.courses.blocks import stimuli_by_session
+from physion.experiment.study.stimuli import ATTENTION
 from physion.experiment.study.study import Study
 
 STATES = {
@@ -48,8 +49,8 @@ class AnswerCounts:
 
     Attributes
     ----------
-    familiarization, test
-        Number of answers in each phase.
+    familiarization, test, attention
+        Number of answers in each phase, without the attention checks, and to these.
     familiarization_correct, correct
         Number of right answers in familiarization and in the test.
     rt_ms
@@ -65,6 +66,7 @@ class AnswerCounts:
 
     familiarization: int = 0
     test: int = 0
+    attention: int = 0
     familiarization_correct: int = 0
     correct: int = 0
     rt_ms: list[float] = field(default_factory=list)
@@ -77,8 +79,8 @@ class AnswerCounts:
 
     @property
     def trials(self) -> int:
-        """Number of answers in both phases."""
-        return self.familiarization + self.test
+        """Number of answers in both phases, with attention checks."""
+        return self.familiarization + self.test + self.attention
 
     @property
     def accuracy(self) -> float | None:
@@ -102,6 +104,8 @@ class AnswerCounts:
             self.test += 1
             self.correct += correct
             self.rt_ms.append(answer.rt_ms)
+        elif answer.phase == ATTENTION:
+            self.attention += 1
         else:
             self.familiarization += 1
             self.familiarization_correct += correct
@@ -185,7 +189,7 @@ class SummaryCache:
 
     def _counts(self, session: str) -> tuple[int, int]:
         known = self._answered.get(session, _NOTHING)
-        return known.familiarization, known.test
+        return known.familiarization, known.test + known.attention
 
     def _stage(self, facts: Mapping[str, Any]) -> str:
         """Return the stage of a session, or the stage at which it was withdrawn."""

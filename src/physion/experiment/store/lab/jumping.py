@@ -11,7 +11,7 @@ from physion.experiment.protocol.refused import Refused
 from physion.experiment.protocol.stages import PAGES, Course
 from physion.experiment.store.sessions import Session, change_session, state_of
 from physion.experiment.store.tables import ANSWERS, PRACTICE_REPEATS
-from physion.experiment.study.stimuli import PHASES
+from physion.experiment.study.stimuli import ATTENTION, PHASES
 
 _ENDS = ("withdrawn_at", "closed_at", "screened_out_at", "screened_out_by")
 """Columns of sessions that ended early."""
@@ -47,7 +47,8 @@ def jump(
     block = _block_of(course, to)
     done = course.stages[: course.stages.index(to.stage)]
     values: dict[str, Any] = dict.fromkeys(_ENDS)
-    values |= {"comprehension_attempts": 0, "practice_repeats": 0, "failed_checks": None}
+    values |= {"comprehension_attempts": 0, "practice_repeats": 0, "failed_checks": None,
+               "attention_failed": 0}  # fmt: skip
     repeated = PRACTICE_REPEATS.c.session == session.session
     connection.execute(delete(PRACTICE_REPEATS).where(repeated))
     for stage, page in PAGES.items():
@@ -57,7 +58,8 @@ def jump(
         here = to.trial if phase == to.stage else own.start
         values[f"answered_{phase}"] = own.stop if phase in done else here
         open_from = values[f"answered_{phase}"]
-        of_phase = (ANSWERS.c.session == session.session) & (ANSWERS.c.phase == phase)
+        phases = (phase, ATTENTION) if phase == "test" else (phase,)
+        of_phase = (ANSWERS.c.session == session.session) & ANSWERS.c.phase.in_(phases)
         connection.execute(delete(ANSWERS).where(of_phase, ANSWERS.c.trial >= open_from))
     change_session(connection, session, block=block, **values)
     return state_of(session, course)
