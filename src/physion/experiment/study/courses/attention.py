@@ -1,4 +1,4 @@
-"""Attention checks: trials mixed into the test whose right answer is obvious or told.
+"""Attention checks: trials mixed into the test whose right answer is obvious or stated.
 
 Obvious ones are the stimuli of ``stimuli.csv`` with the phase ``attention``. Instructed ones show
 the observed part of a practice movie, after which the pages say which button to press. The seed of
