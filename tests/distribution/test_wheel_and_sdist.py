@@ -163,6 +163,8 @@ def test_an_installed_wheel_runs_in_another_folder(built: Path, tmp_path: Path) 
     run(physion_, "run", "--sampled", "--limit", "1", *small)
     assert (folder / "runs" / "sampled" / "report" / "report.html").is_file()
     tiny = ["--width", "64", "--height", "64", "--jitters", "0"]
-    run(physion_, "generate", "trials", "--scenario", "drop", "--count", "2", *tiny)
-    run(physion_, "experiment", "init", "study", "--trials", "trials", "--practice", "0")
+    for split in ("testing", "familiarization"):
+        command = ["generate", "trials", "--scenario", "drop", "--split", split, "--count", "2"]
+        run(physion_, *command, *tiny)
+    run(physion_, "experiment", "init", "study", "--trials", "trials", "--practice", "2")
     assert (folder / "study" / "study.toml").is_file()
