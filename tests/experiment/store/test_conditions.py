@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from sqlalchemy import update
 
+from physion.cli.main import main
 from physion.errors import BadInputError
 from physion.experiment.protocol.messages import Enter
 from physion.experiment.store.lab.managing import set_voided
@@ -116,7 +117,9 @@ def link_to(store: Store, condition: str, kind: str = "study", **more: Any) -> E
     return request(more.pop("person", "ada"), condition=condition, **{"pass": key}, **more)
 
 
-def test_a_signed_link_fixes_the_condition(groups_store: Store) -> None:
+def test_a_signed_link_fixes_the_condition(
+    groups_store: Store, capsys: pytest.CaptureFixture[str]
+) -> None:
     store = groups_store
     for index in range(3):
         run(store.enter(link_to(store, "brief", person=f"person {index}")))
@@ -135,6 +138,9 @@ def test_a_signed_link_fixes_the_condition(groups_store: Store) -> None:
     fixed = [link for link in found if link.condition == "other"]
     assert {link.scenario for link in fixed} == {"drop"}
     assert all("condition=other&pass=" in link.address for link in fixed)
+    folder = str(store.study.folder)
+    assert main(["experiment", "links", folder, "--base-url", "https://lab.example.org"]) == 0
+    assert "  prolific, condition other: " in capsys.readouterr().out
 
 
 def test_a_session_has_the_settings_of_its_condition(groups_store: Store) -> None:

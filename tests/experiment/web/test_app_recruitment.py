@@ -103,7 +103,7 @@ class TestLinks:
         assert main([*words, "--json"]) == 0
         found = json.loads(capsys.readouterr().out)["links"]
         assert len(found) == 12
-        assert set(found[0]) == {"name", "scenario", "address", "goes_to", "lacks"}
+        assert set(found[0]) == {"name", "scenario", "address", "goes_to", "lacks", "condition"}
         assert main([*words[:4], "nothing"]) == 2
         assert capsys.readouterr().err.startswith("physion: --base-url 'nothing'")
 

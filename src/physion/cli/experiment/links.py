@@ -53,7 +53,8 @@ def main(options: Options) -> int:
         print(scenario)
         for link in all_links:
             if link.scenario == scenario:
-                print(f"  {link.name}: {link.goes_to}\n    {link.address}")
+                fixed = f", condition {link.condition}" if link.condition else ""
+                print(f"  {link.name}{fixed}: {link.goes_to}\n    {link.address}")
                 if link.lacks:
                     print(f"    study.toml lacks {link.lacks}")
     return 0
