@@ -7,7 +7,7 @@
 TRAINED is the output folder of the trainings. Particle models were trained on the states of
 ``python benchmarks/particles.py data FOLDER``:
 
-    physion train dpi FOLDER/all --out TRAINED --steps 16000
+    physion train dpi FOLDER/all --out TRAINED --steps 12000
     physion train gns FOLDER/all --out TRAINED --steps 7000
 
 GNS-RANSAC has the weights of GNS and thresholds that are fitted on its own rollouts, for which it
