@@ -137,7 +137,8 @@ def _means_of_sessions(accuracies: Sequence[pd.Series], draws: Bootstrap) -> Arr
     table = pd.concat(accuracies, axis=1).sort_index()
     values = table.to_numpy(dtype=np.float64)
     weights = draws.weights("people of all scenarios", len(values))
-    return np.mean(mean_over_people(values, weights), axis=1)
+    means: Array = np.mean(mean_over_people(values, weights), axis=1)
+    return means
 
 
 def accuracy_by_condition(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataFrame:

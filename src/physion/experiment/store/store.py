@@ -40,7 +40,7 @@ from physion.experiment.store.database import (
     sqlite_url,
     upgrade,
 )
-from physion.experiment.store.entering import enter_session
+from physion.experiment.store.entry.entering import enter_session
 from physion.experiment.store.entry.visitor import identify_visitor
 from physion.experiment.store.fetched_media import FetchedMedia
 from physion.experiment.store.lab.jumping import jump

@@ -1,1 +1,1 @@
-"""Entering a study: who the visitor is, and what a new session is assigned."""
+"""Entering a study: who the visitor is, what a new session is assigned, and how one continues."""
