@@ -109,7 +109,8 @@ def start_probabilities(
     weights = np.where(weights < _LEAST, 0.0, np.minimum(weights, _LARGEST))
     if not weights.any():
         return uniform
-    return (1 - abrupt) * uniform + abrupt * weights / weights.sum()
+    mixed: NDArray[np.float64] = (1 - abrupt) * uniform + abrupt * weights / weights.sum()
+    return mixed
 
 
 def rotated(window: Window) -> Window:
