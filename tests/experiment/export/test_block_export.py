@@ -14,6 +14,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 from physion.analysis.people.check_responses import check_responses
 from physion.analysis.people.completeness import read_expected
 from physion.analysis.people.exclusions import flag_sessions
+from physion.analysis.people.results import read_any_responses
 from physion.experiment.experimenter.overview import compute_overview
 from physion.experiment.experimenter.statistics.flagging import Flags, find_flags
 from physion.experiment.experimenter.statistics.summaries import SummaryCache
@@ -22,8 +23,9 @@ from physion.experiment.store.store import Store
 from physion.experiment.store.tables import SESSIONS
 from physion.experiment.study.courses.blocks import block_scenarios
 from physion.experiment.study.identity import Secrets
+from physion.experiment.study.settings import Attention
 from physion.experiment.study.study import ALL_SCENARIOS, Blocks
-from support.experiment.store_walk import enter, rows, walk
+from support.experiment.store_walk import enter, rows, run, walk
 from support.experiment.tiny_study import make_tiny_study
 
 
@@ -106,3 +108,19 @@ def test_the_overview_counts_sessions_and_the_stages_of_each_block(
     )
     (performance,) = page.performance
     assert performance.people == 4 and performance.accuracy == 0.5
+
+
+def test_attention_checks_are_not_expected(tmp_path: Path) -> None:
+    study = make_tiny_study(
+        tmp_path / "study", test=2, familiarization=1, scenarios=("collide", "drop"), size=32,
+        blocks=Blocks(all_scenarios=True), attention=Attention(instructed=1),
+    )  # fmt: skip
+    store = Store.open(study, Secrets.load(study.folder))
+    token = walk(store, enter(store, "ada"), "done")
+    assert run(store.state(token)).trials["test"] > 4
+    export_study(store.engine, study, tmp_path / "out")
+    store.close()
+    expected = read_expected(tmp_path / "out" / "expected.csv")
+    assert [len(names) for names in expected.values()] == [4]
+    responses = read_any_responses([tmp_path / "out/trials.csv"], tmp_path / "out/sessions.csv")
+    assert not flag_sessions(responses, expected=expected)["incomplete"].any()

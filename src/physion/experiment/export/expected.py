@@ -30,7 +30,7 @@ def expected_stimuli(
     for session in sessions.table.column("session").to_pylist():
         seed, condition = seeds[session]
         order = trial_order(under(study, condition), ALL_SCENARIOS, seed)["test"]
-        found += [(each.stimulus, each.scenario, session) for each in order]
+        found += [(s.stimulus, s.scenario, session) for s in order if s.phase == "test"]
     return found
 
 
@@ -45,7 +45,8 @@ def expected_names(connection: Connection, study: Study) -> dict[str, frozenset[
 
 
 def _names(stimuli: Sequence[Stimulus]) -> frozenset[str]:
-    return frozenset(canonical_name(each.stimulus) for each in stimuli)
+    """Return the names of test stimuli, without the attention checks among them."""
+    return frozenset(canonical_name(s.stimulus) for s in stimuli if s.phase == "test")
 
 
 def _seeds(connection: Connection) -> dict[str, tuple[int, str | None]]:
