@@ -85,8 +85,7 @@ def test_the_python_of_the_readme_runs(tmp_path: Path) -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```python\n(.*?)```", text, re.S)
     assert len(blocks) == 2 and all(f"physion.{name}(" in text for name in ("simulate", "evaluate"))
-    # Worker processes start the script again, so that it needs a main part, and a file.
-    lines = "".join(f"    {line}\n" for line in "\n".join(blocks).splitlines())
-    script = tmp_path / "readme.py"
-    script.write_text(f'if __name__ == "__main__":\n{lines}', encoding="utf-8")
-    run([sys.executable, str(script)], tmp_path)
+    for number, block in enumerate(blocks):
+        script = tmp_path / f"readme_{number}.py"
+        script.write_text(block, encoding="utf-8")
+        run([sys.executable, str(script)], tmp_path)

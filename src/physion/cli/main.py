@@ -21,7 +21,8 @@ def _usage() -> str:
     return (
         "usage: physion VERB [options]     (physion VERB --help lists them)\n\n"
         f"{verbs}\n\n"
-        "exit codes: 0 done, 1 done with failures, 2 bad input, 130 interrupted"
+        "exit codes: 0 done, 1 done with failures, 2 bad input, 130 interrupted,\n"
+        "            141 the program that reads the output closed it"
     )
 
 

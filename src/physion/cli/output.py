@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -44,10 +45,19 @@ def _columns() -> tuple[ProgressColumn, ...]:
     )
 
 
+_LINE_EVERY = 30.0
+"""Seconds between lines of progress where there is no terminal."""
+
+
 class Stages:
-    """Progress bars, one a stage, of work that reports to a `compute.progress.Progress`."""
+    """Progress bars, one a stage, of work that reports to a `compute.progress.Progress`.
+
+    Where standard error is no terminal, work that takes long is told in lines instead.
+    """
 
     def __enter__(self) -> Stages:
+        self._begun: dict[str, tuple[float, int]] = {}
+        self._told = time.monotonic()
         self._progress = Progress(*_columns(), console=Console(file=sys.stderr), transient=True)
         self._tasks: dict[str, TaskID] = {}
         return self
@@ -62,11 +72,25 @@ class Stages:
 
     def __call__(self, what: str, done: int, total: int) -> None:
         """Show that ``done`` of ``total`` items of a stage are finished."""
+        if not self._progress.console.is_terminal:
+            self._tell(what, done, total)
+            return
         # Not started earlier: bars without a stage would still print an empty line when they stop.
         self._progress.start()
         if what not in self._tasks:
             self._tasks[what] = self._progress.add_task(what, total=total)
         self._progress.update(self._tasks[what], completed=done, total=total)
+
+    def _tell(self, what: str, done: int, total: int) -> None:
+        """Print how far a stage is, and how long the rest takes at the speed so far."""
+        now = time.monotonic()
+        since, first = self._begun.setdefault(what, (now, done))
+        if now - self._told < _LINE_EVERY:
+            return
+        self._told = now
+        made = done - first
+        left = f", {(now - since) * (total - done) / made:.0f} s left" if made > 0 else ""
+        self.note(f"{what}: {done} of {total}{left}")
 
 
 def print_warnings(warnings: Iterable[str]) -> None:

@@ -144,8 +144,8 @@ def _trials(checkout: Path) -> tuple[list[ImportedTrial], tuple[str, ...]]:
         first = kept.setdefault(trial.scene.name, trial)
         if trial_line(first) != trial_line(trial):
             raise BadInputError(
-                f"configuration {trial.scene.parameters.get('configuration')!r} is given twice: "
-                f"trial {trial.scene.name!r} differs between two logs; keep one of them"
+                f"trial {trial.scene.name!r} is given twice: the logs of its configuration are in "
+                "two folders, with other content or under other names; keep one of them"
             )
     notes = tuple(f"left out: {failure}" for failure in logs.failures)
     ordered = sorted(kept.values(), key=lambda trial: (trial.scene.scenario, trial.scene.name))

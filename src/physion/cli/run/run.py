@@ -36,10 +36,8 @@ def main(options: Options) -> int:
     else:
         for failure in answer["failures"]:
             console.print(f"failed: {failure}", markup=False, soft_wrap=True)
-        models = len({row["model"] for row in answer["scores"] if row["kind"] == "model"})
-        console.print(
-            f"report of {models} models: {answer['report']}", markup=False, soft_wrap=True
-        )
+        rows = len({row["agent"] for row in answer["scores"]})
+        console.print(f"report, {rows} rows: {answer['report']}", markup=False, soft_wrap=True)
     return 1 if answer["failures"] else 0
 
 
@@ -73,8 +71,9 @@ def _complete(options: Options) -> Options:
 
     if options.sampled and options.humans is not None:
         raise BadInputError("--sampled scenes were seen by nobody: leave out --humans")
-    if options.limit is not None and options.limit < (1 if options.sampled else 0):
-        raise BadInputError(f"--limit must be at least 1, not {options.limit}")
+    least = 1 if options.sampled else 0
+    if options.limit is not None and options.limit < least:
+        raise BadInputError(f"--limit must be at least {least}, not {options.limit}")
     out = options.out or Path("runs") / ("sampled" if options.sampled else "official")
     humans = options.humans
     if not options.sampled and humans is None and official_data(options.scenes) is not None:

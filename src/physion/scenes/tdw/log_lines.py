@@ -52,7 +52,10 @@ class CommandLog:
 def find_logs(root: Path) -> list[Path]:
     """Return all command logs in the folder ``root``, sorted by path."""
     if not root.exists():
-        raise BadInputError(f"{root} does not exist; give a folder with official command logs")
+        raise BadInputError(
+            f"{root} does not exist; give official (the packaged scenes), a folder that "
+            "physion import-official made, or one with official command logs"
+        )
     if not root.is_dir():
         raise BadInputError(f"{root} is a file; give the folder that holds the command logs")
     found = [*root.rglob("tdw_commands.json"), *root.rglob("tdw_commands.json.gz")]
