@@ -76,12 +76,8 @@ def test_anchors_stand_below_the_models_lighter_and_hollow(make_comparison: Make
     hollow = [line.get_markerfacecolor() == theme.LIGHT.paper for line in marks]
     assert hollow == [False, True, True, True, True]
     assert [text.get_text() for text in figure.legends[0].get_texts()].count("anchor") == 1
-    # One person with another has no r: the row would be empty.
-    assert list(figure_tables.r_table(comparison)["agent"].unique()) == [
-        model,
-        given,
-        *COMPUTED[:2],
-    ]
+    # One person has an r too, with the average of the others.
+    assert list(figure_tables.r_table(comparison)["agent"].unique()) == [model, given, *COMPUTED]
     thirds = figure_tables.thirds_table(comparison)
     assert next(iter(thirds["agent"].unique())) == model
 

@@ -47,6 +47,8 @@ def _columns() -> tuple[ProgressColumn, ...]:
 
 _LINE_EVERY = 30.0
 """Seconds between lines of progress where there is no terminal."""
+_KNOWN_AFTER = 5
+"""Items after which such a line says how long the rest takes."""
 
 
 class Stages:
@@ -89,7 +91,9 @@ class Stages:
             return
         self._told = now
         made = done - first
-        left = f", {(now - since) * (total - done) / made:.0f} s left" if made > 0 else ""
+        # The first items take longer: code is compiled, workers start.
+        known = made >= _KNOWN_AFTER
+        left = f", {(now - since) * (total - done) / made:.0f} s left" if known else ""
         self.note(f"{what}: {done} of {total}{left}")
 
 

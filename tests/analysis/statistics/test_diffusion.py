@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import subprocess
+import sys
 
 import numpy as np
 import pandas as pd
@@ -117,3 +119,15 @@ def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch)
     right, times = decide(1.0, 1.6, 0.3, 60)
     with pytest.raises(MissingExtraError, match="diffusion"):
         fit_diffusion(right, times)
+
+
+@fitted
+def test_the_library_renames_no_level_of_other_logs() -> None:
+    program = (
+        "import logging\n"
+        "from physion.analysis.statistics.diffusion import _library\n"
+        "_library()\n"
+        "print(logging.getLevelName(logging.ERROR), logging.getLevelName(logging.CRITICAL))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout.split() == ["ERROR", "CRITICAL"], done.stderr

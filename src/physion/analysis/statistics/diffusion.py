@@ -16,6 +16,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import io
+import logging
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -36,6 +37,8 @@ LONGEST_S = 10.0
 
 STEP_S = 0.01
 """Step of time in which the likelihood is computed, in seconds."""
+
+_LEVELS = (logging.DEBUG, logging.INFO, logging.WARNING, logging.ERROR, logging.CRITICAL)
 
 BOUNDS: Mapping[str, tuple[float, float]] = {
     "drift": (-8.0, 8.0),
@@ -101,13 +104,23 @@ def fit_diffusion(correct: npt.ArrayLike, rt_s: npt.ArrayLike) -> DiffusionFit:
     )
 
 
-def _search(right: Array, times: Array) -> tuple[dict[str, float], float]:
-    """Return the estimates by name and the log-likelihood."""
+def _library() -> tuple[Any, Any]:
+    """Return the module and its loss; it renames the levels of all logs, which is undone."""
     if importlib.util.find_spec("pyddm") is None:
         raise MissingExtraError("the drift diffusion model", "diffusion")
-    import pyddm
-    from pyddm.models import LossRobustLikelihood
+    levels = {value: logging.getLevelName(value) for value in _LEVELS}
+    try:
+        import pyddm
+        from pyddm.models import LossRobustLikelihood
+    finally:
+        for value, name in levels.items():
+            logging.addLevelName(value, name)
+    return pyddm, LossRobustLikelihood
 
+
+def _search(right: Array, times: Array) -> tuple[dict[str, float], float]:
+    """Return the estimates by name and the log-likelihood."""
+    pyddm, loss = _library()
     start = _closed_form(right, times)
     parameters = {
         name: pyddm.Fittable(minval=low, maxval=high, default=start[name])
@@ -124,7 +137,7 @@ def _search(right: Array, times: Array) -> tuple[dict[str, float], float]:
     )
     # The library prints its progress even if asked not to.
     with contextlib.redirect_stdout(io.StringIO()):
-        model.fit(sample, LossRobustLikelihood, fitting_method="simplex", verbose=False)
+        model.fit(sample, loss, fitting_method="simplex", verbose=False)
     # The library renames parameters of constant drift, bound and nondecision time.
     values = model.parameters()
     found = {
