@@ -33,7 +33,7 @@ EXTRAS = {
     "docs": ("mkdocs-material",),
 }
 CORE = (
-    *("numpy", "scipy", "mujoco", "numba", "h5py", "hdf5plugin", "av", "pillow"),
+    *("numpy", "scipy", "mujoco-core", "numba", "h5py", "hdf5plugin", "av", "pillow"),
     *(
         "pandas",
         "pyarrow",
