@@ -14,35 +14,16 @@ import pytest
 
 from physion.compute.executor import Executor, executors
 from physion.compute.local import LocalExecutor, SerialExecutor
-from physion.errors import BadInputError, PhysionError
+from physion.errors import PhysionError
+from support.tasks import die_on_two, die_once, fail_on_three
 
 
 def square(number: int) -> int:
     return number * number
 
 
-def fail_on_three(number: int) -> int:
-    if number == 3:
-        raise BadInputError("three is\nnot liked")
-    return number
-
-
 def disk_full(number: int) -> int:
     raise OSError(28, "No space left on device")
-
-
-def die_on_two(number: int) -> int:
-    if number == 2:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return number
-
-
-def die_once(marker: str) -> str:
-    path = Path(marker)
-    if not path.exists():
-        path.write_text("was here")
-        os.kill(os.getpid(), signal.SIGKILL)
-    return "second try"
 
 
 def leave(number: int) -> int:
