@@ -7,33 +7,25 @@ import pytest
 from physion.cli import output
 
 
-def test_long_work_is_told_in_lines_without_a_terminal(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("done", "seconds", "told"),
+    [
+        ((0, 5, 10, 15, 20), 20, ["trials: 10 of 50, 160 s left", "trials: 20 of 50, 120 s left"]),
+        ((0, 1), 60, ["trials: 1 of 50"]),  # the first item says nothing of the rest
+        ((0, 50), 5, []),
+    ],
+)
+def test_long_work_is_told_in_lines(
+    done: tuple[int, ...],
+    seconds: float,
+    told: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     now = 100.0
     monkeypatch.setattr(output.time, "monotonic", lambda: now)
     with output.Stages() as stages:
-        for done in range(0, 25, 5):
-            stages("trials", done, 50)
-            now += 20.0
-    told = [line for line in capsys.readouterr().err.splitlines() if line]
-    assert told == ["trials: 10 of 50, 160 s left", "trials: 20 of 50, 120 s left"]
-
-
-def test_a_single_item_tells_nothing_of_the_rest(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    now = 100.0
-    monkeypatch.setattr(output.time, "monotonic", lambda: now)
-    with output.Stages() as stages:
-        for done in range(2):
-            stages("trials", done, 50)
-            now += 60.0
-    assert capsys.readouterr().err == "trials: 1 of 50\n"
-
-
-def test_short_work_prints_nothing_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    with output.Stages() as stages:
-        stages("trials", 1, 2)
-        stages("trials", 2, 2)
-    assert capsys.readouterr().err == ""
+        for count in done:
+            stages("trials", count, 50)
+            now += seconds
+    assert capsys.readouterr().err.splitlines() == told

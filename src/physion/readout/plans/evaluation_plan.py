@@ -14,9 +14,9 @@ from typing import Any, TypeGuard
 from physion.compute.executor import Executor
 from physion.compute.progress import Progress
 from physion.digests import is_whole
-from physion.errors import BadInputError
 from physion.readout.folds import plan_folds, select_scenario
-from physion.readout.plans.failures import describe_failure, read_outcome, stop_if_fatal
+from physion.readout.plans.cells import find_task, run_cells
+from physion.readout.plans.failures import describe_failure, stop_if_fatal
 from physion.readout.plans.keys import code_key, dataset_key, key_of
 from physion.readout.plans.model_facts import KnownModels, ModelFacts
 from physion.readout.plans.records import Records
@@ -164,29 +164,19 @@ class EvaluationPlan:
         on_task: OnTask | None,
     ) -> None:
         """Do the pending tasks as tasks of an executor; add their results and failures."""
-        left = {task.key: task for task in self.pending}
+        pending = self.pending
         cells = {
-            key: EvaluationCell(
+            task.key: EvaluationCell(
                 self.dataset.folder.absolute(), self.dataset.verify, self._folder.absolute(),
-                self._selection, self.settings, self.rollout_errors, key,
+                self._selection, self.settings, self.rollout_errors, task.key,
             )
-            for key in left
+            for task in pending
         }  # fmt: skip
-        total = len(left)
-        if progress is not None:
-            progress("plan", 0, total)
-        for outcome in executor.map(evaluate_cell, cells):
-            task = left.pop(outcome.key)
-            values = read_outcome(outcome, self._folder, len(results), len(self.tasks))
-            if values is None:
-                failed[task.key] = str(outcome.error)
-            else:
-                stored = self._stored(values)
-                results[task.key] = dataclasses.replace(stored, problems=values["problems"])
-            if progress is not None:
-                progress("plan", total - len(left), total)
-            if on_task is not None:
-                on_task(task, failed.get(task.key, ""), list(left.values()))
+        for key, values in run_cells(
+            executor, evaluate_cell, cells, pending, failed, self._folder, len(self.tasks),
+            progress, on_task,
+        ):  # fmt: skip
+            results[key] = dataclasses.replace(self._stored(values), problems=values["problems"])
 
     def do(self, key: str) -> dict[str, Any]:
         """Do one task of the plan, or find it done; return its files and problems.
@@ -198,16 +188,10 @@ class EvaluationPlan:
         """
         if key in self.done:
             return {"files": list(self.done[key]["files"]), "problems": {}}
-        for task in self.tasks:
-            if task.key == key:
-                made = self._evaluate(task, None, None)
-                paths = [path for path in (made.path, made.rollout_errors) if path is not None]
-                files = [path.relative_to(self._folder).as_posix() for path in paths]
-                return {"files": files, "problems": dict(made.problems)}
-        raise BadInputError(
-            "this machine has other data, another model or another version of the package than the "
-            "one that planned the evaluation"
-        )
+        made = self._evaluate(find_task(self.tasks, key, "evaluation"), None, None)
+        paths = [path for path in (made.path, made.rollout_errors) if path is not None]
+        files = [path.relative_to(self._folder).as_posix() for path in paths]
+        return {"files": files, "problems": dict(made.problems)}
 
     def expected_seconds(self, task: EvaluationTask) -> float | None:
         """Return the mean time of finished evaluations of the same model; None without any."""

@@ -5,13 +5,8 @@ from __future__ import annotations
 import errno
 import traceback
 from pathlib import Path
-from typing import TypeVar
 
-from physion.compute.executor import TaskOutcome
-from physion.compute.run_tasks import FATAL_ERRNOS
 from physion.errors import PhysionError
-
-R = TypeVar("R")
 
 _NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 
@@ -35,23 +30,3 @@ def stop_if_fatal(error: BaseException, folder: Path, done: int, total: int) -> 
                 "the same command continues from there"
             ) from error
         cause = cause.__cause__
-
-
-def read_outcome(outcome: TaskOutcome[R], folder: Path, done: int, total: int) -> R | None:
-    """Return the result of a task that an executor ran, or None if it failed.
-
-    Raises
-    ------
-    PhysionError
-        If nothing more can be written, or the plan has no other task.
-    """
-    if outcome.error is None:
-        return outcome.value
-    if outcome.errno in FATAL_ERRNOS:
-        raise PhysionError(
-            f"cannot write into {folder}: {outcome.error}; {done} of {total} are done, and the "
-            "same command continues from there"
-        )
-    if total == 1:
-        raise PhysionError(outcome.error)
-    return None

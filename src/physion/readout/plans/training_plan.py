@@ -13,7 +13,8 @@ from physion.compute.executor import Executor
 from physion.compute.progress import Progress
 from physion.errors import BadInputError
 from physion.models.settings import TrainingSettings
-from physion.readout.plans.failures import describe_failure, read_outcome, stop_if_fatal
+from physion.readout.plans.cells import find_task, run_cells
+from physion.readout.plans.failures import describe_failure, stop_if_fatal
 from physion.readout.plans.keys import code_key, dataset_key, key_of
 from physion.readout.plans.model_facts import KnownModels
 from physion.readout.plans.records import Records
@@ -168,30 +169,21 @@ class TrainingPlan:
         on_task: OnTask | None,
     ) -> None:
         """Do the pending tasks as tasks of an executor; add what they gave, and failures."""
-        left = {task.key: task for task in self.pending}
+        pending = self.pending
         folder = self._folder.absolute()
         cells = {
-            key: TrainingCell(
+            task.key: TrainingCell(
                 self.dataset.folder.absolute(), self.dataset.verify, folder, self._selection,
-                self.overrides, self.shared, key,
+                self.overrides, self.shared, task.key,
             )
-            for key in left
+            for task in pending
         }  # fmt: skip
-        total = len(left)
-        if progress is not None:
-            progress("plan", 0, total)
-        for outcome in executor.map(train_cell, cells):
-            task = left.pop(outcome.key)
-            values = read_outcome(outcome, self._folder, len(trained), len(self.tasks))
-            if values is None:
-                failed[task.key] = str(outcome.error)
-            else:
-                place = Path(values["folder"]).relative_to(folder)
-                trained[task.key] = {**values, "folder": str(self._folder / place)}
-            if progress is not None:
-                progress("plan", total - len(left), total)
-            if on_task is not None:
-                on_task(task, failed.get(task.key, ""), list(left.values()))
+        for key, values in run_cells(
+            executor, train_cell, cells, pending, failed, self._folder, len(self.tasks),
+            progress, on_task,
+        ):  # fmt: skip
+            place = Path(values["folder"]).relative_to(folder)
+            trained[key] = {**values, "folder": str(self._folder / place)}
 
     def do(self, key: str) -> dict[str, Any]:
         """Do one task of the plan, or find it done; return the fields of its `TrainedModel`.
@@ -204,13 +196,8 @@ class TrainingPlan:
         if key in self.done:
             values = self.done[key]["trained"]
             return {**values, "folder": str(self._folder / values["folder"])}
-        for task in self.tasks:
-            if task.key == key:
-                return self._train(task, Meter(self.shared.encoder_batch, None))
-        raise BadInputError(
-            "this machine has other data, another model or another version of the package than the "
-            "one that planned the training"
-        )
+        task = find_task(self.tasks, key, "training")
+        return self._train(task, Meter(self.shared.encoder_batch, None))
 
     def steps(self, task: TrainingTask) -> int:
         """Return the number of steps of a task."""
