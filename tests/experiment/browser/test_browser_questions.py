@@ -10,16 +10,27 @@ import pytest
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.experiment.study.identity import Secrets
+from physion.experiment.study.questions import Question
 from physion.experiment.study.recruitment import make_pass
 from support.experiment.browser import Visit, chromium, rows_of, served
 from support.experiment.own_questions import OWN_ANSWERS, OWN_QUESTIONS, OWN_TEXTS
 
 __all__ = ["chromium"]
 pytestmark = pytest.mark.slow
+FUN = """
+[question.fun]
+text = "Was it fun?"
+low = "No"
+high = "Yes"
+"""
 
 
 def test_own_questions_are_asked_and_stored(chromium: Any, tmp_path: Path) -> None:
-    asked = {"questions": OWN_QUESTIONS, "more_texts": OWN_TEXTS, "demographics": False}
+    asked = {
+        "questions": (*OWN_QUESTIONS, Question("fun", "scale", steps=5)),
+        "more_texts": OWN_TEXTS + FUN,
+        "demographics": False,
+    }
     with (
         served(tmp_path, test=1, familiarization=1, **asked) as (study, server),
         Visit(chromium, server.url, "questions") as visit,
@@ -40,7 +51,11 @@ def test_own_questions_are_asked_and_stored(chromium: Any, tmp_path: Path) -> No
         for device in ("Telephone", "Computer"):
             page.get_by_label(device).check()
         page.get_by_role("radiogroup", name="How sure were you?").get_by_label("4").check()
+        # An answer to an optional scale can be taken back.
+        optional = page.get_by_role("radiogroup", name="Was it fun?")
+        optional.get_by_label("2").check()
         visit.picture("answered")
+        optional.get_by_label("I prefer not to say").check()
         visit.main_button().click()
         page.check("#difficulty-4")
         page.check("#technical-no")
@@ -48,7 +63,10 @@ def test_own_questions_are_asked_and_stored(chromium: Any, tmp_path: Path) -> No
         page.locator("#code").wait_for()
         assert visit.unexpected() == []
         session, _, _ = rows_of(study, "Ada")
-        assert session.own_answers == OWN_ANSWERS | {"devices": ["phone", "computer"]}
+        assert session.own_answers == OWN_ANSWERS | {
+            "devices": ["phone", "computer"],
+            "fun": None,
+        }
         # The page is in the list of a preview, which the server gives.
         visit.go(f"?pass={make_pass(Secrets.load(study.folder), 'preview')}")
         places = page.locator("#jump-stage option")

@@ -122,6 +122,12 @@ def test_the_overview_refreshes_without_scripts(chromium: Any, site: tuple[Study
     context.close()
 
 
+def press_enter_on(page: Any, button: str) -> None:
+    """Press Enter on a button without waiting for a new page: a download does not open one."""
+    page.get_by_role("button", name=button).focus()
+    page.keyboard.press("Enter")
+
+
 def test_from_login_to_logout_by_keyboard(chromium: Any, site: tuple[Study, str]) -> None:
     _, url = site
     context = chromium.new_context()
@@ -138,9 +144,9 @@ def test_from_login_to_logout_by_keyboard(chromium: Any, site: tuple[Study, str]
     assert page.evaluate("document.cookie") == ""
     page.goto(f"{url}/export")
     with page.expect_download(timeout=60_000) as download:
-        page.get_by_role("button", name="Download").press("Enter")
+        press_enter_on(page, "Download")
     assert download.value.suggested_filename.endswith(".zip")
-    page.get_by_role("button", name="Log out").press("Enter")
+    press_enter_on(page, "Log out")
     page.wait_for_selector("#password")
     page.goto(f"{url}/sessions")
     assert page.url == f"{url}/login"

@@ -29,6 +29,7 @@ from physion.experiment.export.answer_tables import read_tables
 from physion.experiment.export.export_study import export_study
 from physion.experiment.simulated.server_process import ServerProcess
 from physion.experiment.store.tables import ANSWERS, EVENTS, RAW_IDS, SESSIONS
+from physion.experiment.study.conditions import Condition
 from support.experiment.experimenter_client import BASE, TWO, Lab, Visitor, lab
 from support.experiment.experimenter_rows import insert_sessions
 from support.experiment.tiny_study import PASSWORD, make_tiny_study
@@ -179,6 +180,22 @@ def test_sessions_are_chosen_and_sorted(busy: tuple[Lab, Visitor]) -> None:
     for column in ("reference", "scenario", "source", "state", "started", "minutes", "rt",
                    "flags", "frames", "nonsense", "__class__"):  # fmt: skip
         assert len(references(visitor.see(f"/sessions?sort={column}&page=2").text)) == 50
+
+
+def test_conditions_are_counted_and_their_sessions_chosen(tmp_path: Path) -> None:
+    conditions = (Condition("plain"), Condition("brief", cue_ms=100))
+    with lab(tmp_path / "study", conditions=conditions) as found:
+        for seed, (name, count) in enumerate((("plain", 5), ("brief", 8))):
+            insert_sessions(found.store.engine, found.study, found.secrets, count, seed=seed,
+                            ends=("finished",), condition=name)  # fmt: skip
+        visitor = found.experimenter()
+        table = table_after(visitor.see().text, "Conditions")
+        assert [row[:3] for row in table[1:]] == [["plain", "5", "5"], ["brief", "8", "8"]]
+        brief = [row.reference for row in rows_of(found) if row.condition == "brief"]
+        text = visitor.see("/sessions?condition=brief&sort=reference&down=0").text
+        assert references(text) == sorted(brief)
+        assert "condition=brief&amp;sort=state" in text
+        assert len(references(visitor.see("/sessions?condition=none").text)) == 13
 
 
 def test_a_session_shows_its_answers_in_order_and_no_id(busy: tuple[Lab, Visitor]) -> None:

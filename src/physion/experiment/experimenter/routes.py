@@ -173,7 +173,7 @@ class _Pages:
 
     async def sessions(self, request: Request) -> Response:
         """Show the table of sessions."""
-        choice = SessionFilter.from_query(request.query_params, self._context.study.offered)
+        choice = SessionFilter.from_query(request.query_params, self._context.study)
         result = await self._context.query_statistics(request, "sessions", choice=choice)
         if isinstance(result, Response):
             return result

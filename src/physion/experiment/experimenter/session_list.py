@@ -10,6 +10,7 @@ from urllib.parse import urlencode
 from physion.experiment.experimenter.statistics.flagging import Flags
 from physion.experiment.experimenter.statistics.summaries import STATES, SessionSummary
 from physion.experiment.protocol.stages import label
+from physion.experiment.study.study import Study
 
 PAGE = 50
 """Sessions per page."""
@@ -29,6 +30,7 @@ class SessionFilter:
 
     kind: str = "person"
     scenario: str = ""
+    condition: str = ""
     state: str = ""
     flag: str = ""
     sort: str = "started"
@@ -36,8 +38,9 @@ class SessionFilter:
     page: int = 1
 
     @classmethod
-    def from_query(cls, query: Mapping[str, str], scenarios: Sequence[str]) -> SessionFilter:
+    def from_query(cls, query: Mapping[str, str], study: Study) -> SessionFilter:
         """Parse a query such as ``?kind=person&state=left``; invalid values give the defaults."""
+        conditions = [condition.name for condition in study.conditions]
 
         def one_of(name: str, known: Sequence[str], default: str) -> str:
             given = query.get(name, default)
@@ -45,7 +48,8 @@ class SessionFilter:
 
         return cls(
             kind=one_of("kind", list(KINDS), "person"),
-            scenario=one_of("scenario", scenarios, ""),
+            scenario=one_of("scenario", study.offered, ""),
+            condition=one_of("condition", conditions, ""),
             state=one_of("state", list(STATES), ""),
             flag=query.get("flag", "")[:40],
             sort=one_of("sort", SORTS, "started"),
@@ -135,6 +139,7 @@ def _is_chosen(summary: SessionSummary, flags: Flags, choice: SessionFilter) -> 
     return (
         facts["kind"] == choice.kind
         and choice.scenario in ("", facts["scenario"])
+        and choice.condition in ("", facts["condition"])
         and choice.state in ("", summary.state)
         and (not choice.flag or choice.flag in rules or (choice.flag == ANY and bool(rules)))
     )

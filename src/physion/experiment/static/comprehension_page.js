@@ -4,7 +4,7 @@
  */
 
 import { el, paragraphs } from "./dom.js";
-import { choiceField, complete, form, submit } from "./form_fields.js";
+import { choiceField, questionForm } from "./form_fields.js";
 import { bound } from "./texts.js";
 
 /**
@@ -16,25 +16,17 @@ export function comprehensionPage({ texts, study }) {
   const { t } = bound(texts);
   const required = t("common.required");
   return (page, done) => {
+    /** @type {Array<[string, import("./form_fields.js").Field]>} */
     const fields = study.comprehension_questions.map(({ name, options }) => {
       const own = (key) => t(`comprehension_question.${name}.${key}`);
       /** @type {Array<[string, string]>} */
       const choices = options.map((option) => [option, own(`options.${option}`)]);
-      return choiceField(`c-${name}`, own("text"), choices, { required, style: "radios-list" });
+      return [name, choiceField(`c-${name}`, own("text"), choices, { required, style: "radios-list" })];
     });
-    const send = () => {
-      if (!complete(fields)) return;
-      const named = study.comprehension_questions.map(({ name }, index) => [name, fields[index].value()]);
-      done(Object.fromEntries(named));
-    };
     page.append(
       el("h1", {}, t("comprehension.title")),
       ...paragraphs(t("comprehension.text")),
-      form(
-        send,
-        ...fields.map((each) => each.element),
-        el("div", { class: "buttons" }, submit(t("comprehension.send"))),
-      ),
+      questionForm(fields, t("comprehension.send"), done),
     );
   };
 }

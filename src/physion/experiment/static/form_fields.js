@@ -20,6 +20,21 @@ export function form(send, ...children) {
   return element;
 }
 
+/**
+ * Create a form of questions with their names; its values are sent once all may be.
+ * @param {Array<[string, Field]>} named
+ * @param {string} label Label of the button.
+ * @param {(values: Record<string, any>) => void} send
+ */
+export function questionForm(named, label, send) {
+  const fields = named.map(([, each]) => each);
+  const sent = () => {
+    if (complete(fields)) send(Object.fromEntries(named.map(([name, each]) => [name, each.value()])));
+  };
+  const button = el("div", { class: "buttons" }, submit(label));
+  return form(sent, ...fields.map((each) => each.element), button);
+}
+
 /** Create the button that submits a form. @param {string} label */
 export function submit(label) {
   return el("button", { type: "submit", class: "button" }, label);

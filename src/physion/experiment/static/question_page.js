@@ -4,7 +4,7 @@
  */
 
 import { el, paragraphs } from "./dom.js";
-import { choiceField, complete, form, submit, textField } from "./form_fields.js";
+import { choiceField, questionForm, textField } from "./form_fields.js";
 import { bound } from "./texts.js";
 
 const MAX_LENGTH = 2000;
@@ -20,20 +20,12 @@ const MAX_LENGTH = 2000;
 export function questionPage({ texts, study }) {
   const { t } = bound(texts);
   return (page, done) => {
-    const fields = study.questions.map((question) => fieldOf(question, t));
-    const send = () => {
-      if (!complete(fields)) return;
-      const named = study.questions.map(({ name }, index) => [name, fields[index].value()]);
-      done(Object.fromEntries(named));
-    };
+    /** @type {Array<[string, Field]>} */
+    const fields = study.questions.map((question) => [question.name, fieldOf(question, t)]);
     page.append(
       el("h1", {}, t("questions.title")),
       ...paragraphs(t("questions.text")),
-      form(
-        send,
-        ...fields.map((each) => each.element),
-        el("div", { class: "buttons" }, submit(t("questions.send"))),
-      ),
+      questionForm(fields, t("questions.send"), done),
     );
   };
 }
@@ -50,19 +42,25 @@ function fieldOf({ name, kind, required, options, steps }, t) {
   const needed = required ? t("common.required") : null;
   const id = `q-${name}`;
   if (kind === "text") return textField(id, words, { most: MAX_LENGTH, required: needed });
-  if (kind === "scale") return scaleField(id, words, { needed, steps, ends: [own("low"), own("high")] });
+  // A radio button cannot be cleared again.
+  const none = required ? null : t("demographics.no_answer");
+  if (kind === "scale") return scaleField(id, words, { needed, steps, none, ends: [own("low"), own("high")] });
   /** @type {Array<[string, string]>} */
   const choices = options.map((option) => [option, own(`options.${option}`)]);
   const several = kind === "choices";
-  // A radio button cannot be cleared again.
-  if (!several && !required) choices.push(["", t("demographics.no_answer")]);
+  if (!several && none) choices.push(["", none]);
   return choiceField(id, words, choices, { required: needed, several, style: "radios-list" });
 }
 
-/** Create a scale: numbered steps with a label at either end. @returns {Field} */
-function scaleField(id, words, { needed, steps, ends }) {
+/**
+ * Create a scale: numbered steps with a label at either end, and below them the choice of no answer
+ * where `none` is its label.
+ * @returns {Field}
+ */
+function scaleField(id, words, { needed, steps, none, ends }) {
   /** @type {Array<[string, string]>} */
   const choices = Array.from({ length: steps }, (_, index) => [String(index + 1), String(index + 1)]);
+  if (none) choices.push(["", none]);
   const scale = choiceField(id, words, choices, { required: needed, style: "scale" });
   const [low, high] = ends;
   const labels = el(
@@ -72,6 +70,7 @@ function scaleField(id, words, { needed, steps, ends }) {
     el("span", {}, high),
   );
   scale.element.querySelector(".scale").after(labels);
+  if (none) labels.after(scale.element.querySelector(".radio:last-child"));
   scale.element.setAttribute("aria-describedby", `${id}-ends ${id}-wrong`);
   const chosen = () => scale.value();
   return { ...scale, value: () => (chosen() === null ? null : Number(chosen())) };
