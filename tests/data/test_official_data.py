@@ -105,12 +105,14 @@ def test_the_package_is_what_the_official_files_give(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not OFFICIAL.is_dir(), reason="the official data is not here")
-def test_a_configuration_given_twice_with_other_content_is_refused(tmp_path: Path) -> None:
+def test_a_configuration_given_twice_is_named_and_refused_with_other_content(tmp_path: Path) -> None:
     name = "pilot_it2_collision_simple_box"
     for part in ("a", "b"):
         shutil.copytree(OFFICIAL / "scenes" / "collide" / name, tmp_path / part / name)
     shutil.copytree(OFFICIAL / "humans", tmp_path / "humans")
-    assert make_official(tmp_path, tmp_path / "out" / "first").trials > 0
+    first = make_official(tmp_path, tmp_path / "out" / "first")
+    (note,) = (note for note in first.notes if "twice with the same content" in note)
+    assert note.startswith(f"{first.trials} trials ")
     shutil.rmtree(tmp_path / "out")
     path = tmp_path / "b" / name / "tdw_commands.json.gz"
     text = gzip.decompress(path.read_bytes()).decode()

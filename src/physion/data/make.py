@@ -140,14 +140,22 @@ def _trials(checkout: Path) -> tuple[list[ImportedTrial], tuple[str, ...]]:
     logs = read_scenes(checkout)
     logs.require_trials()
     kept: dict[str, ImportedTrial] = {}
+    twice: list[str] = []
     for trial in logs.trials:
         first = kept.setdefault(trial.scene.name, trial)
+        if first is not trial:
+            twice.append(trial.scene.name)
         if trial_line(first) != trial_line(trial):
             raise BadInputError(
                 f"trial {trial.scene.name!r} is given twice: the logs of its configuration are in "
                 "two folders, with other content or under other names; keep one of them"
             )
     notes = tuple(f"left out: {failure}" for failure in logs.failures)
+    if twice:
+        notes += (
+            f"{len(twice)} trials are there twice with the same content, such as {twice[0]}; each "
+            "was taken once",
+        )
     ordered = sorted(kept.values(), key=lambda trial: (trial.scene.scenario, trial.scene.name))
     return ordered, notes
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from pathlib import Path
 
 import pandas as pd
@@ -81,8 +82,10 @@ def test_command_logs_against_people(
     official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = ["run", "--scenes", str(official / "scenes"), "--humans", str(official / "humans")]
-    command += [*SMALL, "--limit", "1", "--models", "chance", "--out", str(tmp_path), "--json"]
+    command += [*SMALL, "--limit", "1", "--models", "chance", "--out", str(tmp_path)]
     assert main(command) == 0
+    assert re.match(r"report, \d+ rows, made in \d+ min \d+ s: ", capsys.readouterr().out)
+    assert main([*command, "--json"]) == 0
     scores = pd.DataFrame(json.loads(capsys.readouterr().out)["scores"])
     assert scores["human_accuracy"].notna().any()
 

@@ -8,6 +8,7 @@ second run resumes, and a larger --limit only adds.
 from __future__ import annotations
 
 import json as json_module
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,18 +27,22 @@ if TYPE_CHECKING:
 
 def main(options: Options) -> int:
     """Run the whole pipeline, or what is missing of it; return 1 if some trials failed."""
+    started = time.monotonic()
     options = _complete(options)
     assert options.out is not None
-    answer = finished(options, options.out)
+    answer, took = finished(options, options.out), ""
     if answer is None:
         answer = _run(options, options.out)
+        minutes, seconds = divmod(round(time.monotonic() - started), 60)
+        took = f", made in {minutes} min {seconds} s"
     if options.json:
         print(json_module.dumps(answer, indent=1))
     else:
         for failure in answer["failures"]:
             console.print(f"failed: {failure}", markup=False, soft_wrap=True)
         rows = len({row["agent"] for row in answer["scores"]})
-        console.print(f"report, {rows} rows: {answer['report']}", markup=False, soft_wrap=True)
+        line = f"report, {rows} rows{took}: {answer['report']}"
+        console.print(line, markup=False, soft_wrap=True)
     return 1 if answer["failures"] else 0
 
 
