@@ -105,7 +105,7 @@ def test_the_package_is_what_the_official_files_give(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not OFFICIAL.is_dir(), reason="the official data is not here")
-def test_a_configuration_given_twice_is_named_and_refused_with_other_content(tmp_path: Path) -> None:
+def test_a_configuration_given_twice_is_named_or_refused(tmp_path: Path) -> None:
     name = "pilot_it2_collision_simple_box"
     for part in ("a", "b"):
         shutil.copytree(OFFICIAL / "scenes" / "collide" / name, tmp_path / part / name)
