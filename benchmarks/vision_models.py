@@ -10,7 +10,8 @@ imagined, on random pictures with moving boxes; times are processor time on a CP
 
 ``learn`` needs the trials of ``physion generate FOLDER --width 64 --height 64`` with the splits
 training and testing. It trains the small models with three seeds and prints, for one clip of every
-testing trial, after and before the training and for the trivial predictor:
+testing trial, after and before the training and for the trivial predictor, and the ratio of the
+trained to the trivial one:
 
 - C-SWM: the mean reciprocal rank of the true next state among all states of 20 clips; the trivial
   predictor copies the present state.
@@ -162,7 +163,7 @@ def learn(folder: Path, names: list[str], steps: int, seeds: int) -> Rows:
             )
             seconds = time.process_time() - start
             after, trivial = metric(name, model, clips)
-            values = [f"{value:.3f}" for value in (after, before, trivial)]
+            values = [f"{value:.3f}" for value in (after, before, trivial, after / trivial)]
             yield [model.name, str(seed), *values, f"{seconds:.0f}"]
 
 
@@ -295,7 +296,7 @@ def main() -> None:
     elif options.folder is None:
         parser.error(f"{options.part} needs the folder of the trials")
     elif options.part == "learn":
-        head = ["model", "seed", "trained", "untrained", "trivial", "training, s"]
+        head = ["model", "seed", "trained", "untrained", "trivial", "ratio", "training, s"]
         title = "What was learned of new clips"
         rows = learn(options.folder, options.models, options.steps, options.seeds)
     elif options.part == "shipped":

@@ -2,8 +2,8 @@
 if these are those of another trial.
 
 The printed accuracies (`pytest -s`) are those of the trained model, of the same network with its
-initial weights, and of the centroids of the red and yellow blobs. Left out are RPIN, whose boxes
-come from the motion of a trial, which is not exchanged, and OP3, whose features take longer.
+initial weights, and of the centroids of the red and yellow blobs. Left out is RPIN, whose boxes
+come from the motion of a trial, which is not exchanged.
 """
 
 from __future__ import annotations
@@ -22,7 +22,12 @@ from support.moving_dots import make_dots
 
 pytestmark = pytest.mark.slow
 
-STEPS = {"cswm": 40, "svg": 30}
+TRAINING: dict[str, dict[str, Any]] = {
+    "cswm": {"steps": 40}, "svg": {"steps": 30}, "op3": {"steps": 20, "learning_rate": 3e-3},
+}  # fmt: skip
+"""Settings of the training by model."""
+OPTIONS: dict[str, dict[str, Any]] = {"op3": {"slots": 3}}
+"""Options by model; with fewer slots OP3 is quicker."""
 COUNTS = {"training": 16, "readout": 24, "testing": 40}
 CHANCE = 0.24
 """Three standard errors of the accuracy of guessing 40 trials."""
@@ -38,26 +43,32 @@ def exchanged(dots: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Datase
     return with_exchanged_futures(dots, tmp_path_factory.mktemp("exchanged") / "data")
 
 
-def accuracy_of_full(dataset: Dataset, name: str, folder: Path, weights: str, steps: int) -> float:
-    """Return the accuracy of a model, which is trained if it has ``steps``."""
+@pytest.fixture(scope="module")
+def centroids(dots: Dataset, tmp_path_factory: pytest.TempPathFactory) -> float:
+    return accuracy_of_full(dots, "blob-centroids", tmp_path_factory.mktemp("centroids"))
+
+
+def accuracy_of_full(
+    dataset: Dataset, name: str, folder: Path, *, weights: str = "", **training: Any
+) -> float:
+    """Return the accuracy of a model, which is trained if it has settings of a ``training``."""
     config = EvaluationConfig(
         readouts=("full",), accelerator="cpu", readout=ReadoutConfig(grid=(1e-2, 1.0)),
-        steps=steps or None, batch=8, warmup=0, untrained=not steps,
+        batch=8, warmup=0, untrained=not training, **training,
     )  # fmt: skip
-    options: dict[str, Any] = {"weights": weights} if weights else {}
+    options = {**OPTIONS.get(name, {}), **({"weights": weights} if weights else {})}
     table = evaluate(dataset, name, folder, options=options, config=config).predictions
     return float((table["Predicted Outcome"] == table["Actual Outcome"]).mean())
 
 
-@pytest.mark.parametrize("name", list(STEPS))
+@pytest.mark.parametrize("name", list(TRAINING))
 def test_full_falls_to_chance_with_exchanged_futures(
-    name: str, dots: Dataset, exchanged: Dataset, tmp_path: Path
+    name: str, dots: Dataset, exchanged: Dataset, centroids: float, tmp_path: Path
 ) -> None:
-    trained = accuracy_of_full(dots, name, tmp_path / "trained", "", STEPS[name])
+    trained = accuracy_of_full(dots, name, tmp_path / "trained", **TRAINING[name])
     (weights,) = (tmp_path / "trained" / "training").iterdir()
-    fallen = accuracy_of_full(exchanged, name, tmp_path / "exchanged", str(weights), 0)
-    untrained = accuracy_of_full(dots, name, tmp_path / "untrained", "", 0)
-    centroids = accuracy_of_full(dots, "blob-centroids", tmp_path / "centroids", "", 0)
+    fallen = accuracy_of_full(exchanged, name, tmp_path / "exchanged", weights=str(weights))
+    untrained = accuracy_of_full(dots, name, tmp_path / "untrained")
     print(
         f"{name}: {trained:.3f}, with exchanged futures {fallen:.3f}; untrained {untrained:.3f}, "
         f"centroids {centroids:.3f}"
