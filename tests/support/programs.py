@@ -41,3 +41,8 @@ def find_chromium() -> str:
 def find_firefox() -> str:
     """The second browser of the browser tests."""
     return find_program("firefox-esr", "firefox", variable="PHYSION_FIREFOX", what="Firefox")
+
+
+def find_webkit() -> str:
+    """The driver of the third browser of the browser tests."""
+    return find_program("WebKitWebDriver", variable="PHYSION_WEBKIT", what="WebKitWebDriver")

@@ -28,6 +28,8 @@ export class FrameCount {
   /** @param {number} rate Frames per second of the movie. */
   constructor(rate) {
     this.rate = rate;
+    /** `mediaTime` of the first frame in seconds. */
+    this.origin = 0;
     this.shown = 0;
     /** Time (ms), frame, counter of presented frames. @type {Array<[number, number, number]>} */
     this.seen = [];
@@ -39,7 +41,7 @@ export class FrameCount {
    * @param {{mediaTime: number, presentedFrames: number}} metadata
    */
   add(now, metadata) {
-    const frame = Math.round(metadata.mediaTime * this.rate);
+    const frame = Math.round((metadata.mediaTime - this.origin) * this.rate);
     const last = this.seen.at(-1);
     if (!last) this.shown = 1;
     else this.shown += Math.max(0, Math.min(metadata.presentedFrames - last[2], frame - last[1]));
@@ -106,6 +108,8 @@ export class Screen {
     const frames = this.#frames;
     const record = (now, metadata) => {
       if (this.#frames !== frames) return;
+      // WebKitGTK's times include the offset in the edit list of the movie.
+      if (this.video.paused && this.video.currentTime === 0) frames.origin = metadata.mediaTime;
       frames.add(now, metadata);
       onFrame();
       this.video.requestVideoFrameCallback(record);
