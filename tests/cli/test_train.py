@@ -23,6 +23,11 @@ MODEL = f"{trained_models.__file__}:NextBrightness"
 SLOW = f"{trained_models.__file__}:SlowBrightness"
 TESTS = Path(__file__).parents[1]
 CPU = ["--accelerator", "cpu"]
+SLOW_MODULES = {
+    "torch", "numba", "scipy", "av", "h5py", "physion.readout.features.feature_store",
+    "physion.training.sources.open_source",
+}  # fmt: skip
+"""Libraries of models, movies and numerics, and what reads the trials."""
 
 
 @pytest.fixture(scope="module")
@@ -51,12 +56,12 @@ def environment() -> dict[str, str]:
 
 
 def run_apart(*commands: list[str]) -> tuple[str, set[str]]:
-    """Run commands in one new process; return what they print, and slow libraries they import."""
+    """Run commands in one new process; return what they print, and the slow modules they import."""
     code = (
         "import sys\n"
         "from physion.cli.main import main\n"
         f"assert not any([main(arguments) for arguments in {list(commands)!r}])\n"
-        "print(*{'torch', 'numba', 'scipy', 'av', 'h5py'} & set(sys.modules), sep=', ')"
+        f"print(*{SLOW_MODULES} & set(sys.modules), sep=', ')"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment(), capture_output=True, text=True, check=True
@@ -240,7 +245,7 @@ def test_evaluate_takes_the_same_plan(
     again, loaded = run_apart(trainings, arguments)
     assert "6 of 6 trainings were done before" in again
     assert "6 of 6 evaluations were done before" in again
-    assert not loaded, "what is done needs no library of models, movies or numerics"
+    assert not loaded, "what is done reads no trial and needs no library of models or movies"
     assert main([*arguments, "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["results"] == str(table) and len(result["evaluations"]) == 4

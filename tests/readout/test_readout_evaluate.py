@@ -209,4 +209,5 @@ def test_an_encoder_without_dynamics_has_two_readouts(
 
 def test_tables_survive_their_file(done: Evaluation, tmp_path: Path) -> None:
     write_table(done.predictions, tmp_path / "t.csv")
-    pd.testing.assert_frame_equal(read_table(tmp_path / "t.csv"), done.predictions)
+    read = read_table(tmp_path / "t.csv")
+    pd.testing.assert_frame_equal(read, done.predictions, check_exact=True)

@@ -13,6 +13,7 @@ from physion.training.protocols import Training, TrainingSet, set_name, training
 
 TRAINING, READOUT, TESTING = "training", "readout", "testing"
 """Names of the splits in the index."""
+_COLUMNS = ["trial", "scenario", "split", "contact", "digest"]
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,7 @@ def plan_folds(index: pd.DataFrame, protocol: Training, folds: int, seed: int) -
     BadInputError
         If there is no testing trial, or fewer than 2 folds for a cross-validation.
     """
+    index = index[_COLUMNS]  # since rows are selected several times, and an index is wide
     tested = index[index["split"] == TESTING]
     if len(tested) == 0:
         raise BadInputError(f"the dataset has no trial in the split {TESTING!r} to predict")

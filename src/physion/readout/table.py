@@ -81,6 +81,21 @@ OWN_COLUMNS = (
 """
 
 
+_NUMBERS = (
+    "Train Accuracy", "Test Accuracy", "Predicted Prob_false", "Predicted Prob_true",
+    "Readout C", "CV Accuracy", "Noise Scale", "Gap Threshold", "Validation Loss",
+    "Copy-last Loss",
+)  # fmt: skip
+"""Columns of numbers, of which some may be empty."""
+_DTYPES = {
+    **dict.fromkeys((*OFFICIAL_COLUMNS, *OWN_COLUMNS), "str"),
+    **dict.fromkeys(_NUMBERS, "float64"),
+    **dict.fromkeys(("Predicted Outcome", "Actual Outcome", "Observed Contact"), "bool"),
+    **dict.fromkeys(("Fit Trials", "Fold"), "int64"),
+}
+"""Types by column, of which `read_table` reads each column at once."""
+
+
 @dataclass(frozen=True)
 class Evaluation:
     """Table of predictions, its file, and the reasons of trials that have none.
@@ -207,16 +222,10 @@ def file_name(model: str) -> str:
 
 def read_table(path: Path) -> pd.DataFrame:
     """Read a table that `write_table` wrote; texts stay texts, and empty ones stay empty."""
-    numbers = {
-        "Train Accuracy", "Test Accuracy", "Predicted Prob_false", "Predicted Prob_true",
-        "Readout C", "CV Accuracy", "Noise Scale", "Gap Threshold", "Validation Loss",
-        "Copy-last Loss",
-    }  # fmt: skip
-    table = pd.read_csv(path, dtype=str, keep_default_na=False)
-    for name in numbers:
-        table[name] = pd.to_numeric(table[name].replace("", np.nan))
-    for name in ("Predicted Outcome", "Actual Outcome", "Observed Contact"):
-        table[name] = table[name] == "True"
-    for name in ("Fit Trials", "Fold"):
-        table[name] = table[name].astype(int)
-    return table
+    return pd.read_csv(
+        path,
+        dtype=_DTYPES,  # type: ignore[arg-type]
+        keep_default_na=False,
+        na_values={name: [""] for name in _NUMBERS},
+        float_precision="round_trip",
+    )

@@ -16,11 +16,9 @@ from physion.compute.progress import Progress
 from physion.errors import BadInputError, MissingExtraError
 from physion.models.build import build_model
 from physion.models.interface import Model
-from physion.readout.features.feature_store import FeatureStore
 from physion.readout.folds import READOUT, TESTING, TRAINING, plan_folds, select_scenario
 from physion.training.overrides import TrainingOverrides
 from physion.training.protocols import Training, training_sets
-from physion.training.sources.open_source import whole_source
 from physion.trials.dataset import Dataset
 
 if TYPE_CHECKING:
@@ -110,6 +108,10 @@ class Trainer:
         shared: SharedTrainConfig,
         open_devices: Callable[[str], Fabric] | None = None,
     ) -> None:
+        # Imported late: a plan that is done trains nothing and reads no trial.
+        from physion.readout.features.feature_store import FeatureStore
+        from physion.training.sources.open_source import whole_source
+
         try:
             from physion.training.train import check_trainable
         except ModuleNotFoundError as error:

@@ -90,6 +90,7 @@ def test_boxes_are_nearer_than_at_constant_velocity(
     before = loss_of(model, held_out)
     train(model, clips["rpin", "training"], steps=150, batch=8, rate=1e-3, seed=seed)
     with torch.no_grad():
-        errors, constant = model.center_errors(held_out)
+        errors, constant = (float(value.nanmean()) for value in model.center_errors(held_out))
         assert loss_of(model, held_out) < min(before, float(model.baseline(held_out)))
-    assert errors.nanmean() < constant.nanmean()
+    print(f"rpin, seed {seed}: {errors / constant:.3f} of the error at constant velocity")
+    assert errors < 0.6 * constant

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from importlib.metadata import EntryPoints, entry_points
 from pathlib import Path
 
 import pytest
 
+from physion.readout.plans import keys as plan_keys
 from physion.readout.plans.keys import choice_key, key_of
 from physion.readout.plans.records import Records
 from physion.readout.plans.selection import ModelChoice
@@ -52,3 +54,17 @@ def test_keys_tell_options_and_files_apart(tmp_path: Path) -> None:
     weights.write_text("bc")
     assert choice_key(choices[3]) != keys[3] and choice_key(choices[2]) == keys[2]
     assert choice_key(ModelChoice("dpi", {"weights": "x" * 5000})) not in keys
+
+
+def test_installed_packages_are_searched_for_models_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each search opens a file of every installed package."""
+    searches = []
+
+    def search(**asked: str) -> EntryPoints:
+        searches.append(asked)
+        return entry_points(**asked)
+
+    monkeypatch.setattr(plan_keys, "entry_points", search)
+    plan_keys._plugins.cache_clear()
+    keys = [choice_key(ModelChoice(name)) for name in ("dpi", "gns", "cswm")]
+    assert len(set(keys)) == 3 and len(searches) == 1

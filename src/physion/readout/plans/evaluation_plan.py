@@ -243,17 +243,21 @@ class EvaluationPlan:
         needs_dynamics = not readouts or Readout.OBSERVED_SIMULATED.value in readouts
         return facts.diet != "features" or needs_dynamics
 
-    def _task(
-        self, choice: ModelChoice, protocol: Training, name: str, scenario: str, seed: int
-    ) -> EvaluationTask:
+    @cached_property
+    def _inputs(self) -> str:
+        """Key of what all tasks depend on: code, data and settings."""
         inputs = {
             name: value
             for name, value in dataclasses.asdict(self.settings).items()
             if name not in _RUN_ON
         }
-        common = [code_key(), self._data, inputs, self.rollout_errors]
+        return key_of(code_key(), self._data, inputs, self.rollout_errors)
+
+    def _task(
+        self, choice: ModelChoice, protocol: Training, name: str, scenario: str, seed: int
+    ) -> EvaluationTask:
         what = [self.models.choice_key(choice), protocol.value, name, scenario, seed]
-        key = key_of("evaluation", common, what)
+        key = key_of("evaluation", self._inputs, what)
         return EvaluationTask(choice, protocol, name, scenario, seed, key)
 
     def _model(self, task: EvaluationTask) -> Any:

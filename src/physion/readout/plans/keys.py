@@ -12,7 +12,7 @@ import importlib.util
 import json
 from collections.abc import Iterable
 from functools import cache
-from importlib.metadata import PackageNotFoundError, entry_points, version
+from importlib.metadata import EntryPoints, PackageNotFoundError, entry_points, version
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +61,7 @@ def choice_key(choice: ModelChoice) -> str:
     if is_file_name(choice.name):
         sources = Path(choice.name.partition(":")[0]).resolve().parent.glob("*.py")
     else:
-        for point in entry_points(group="physion.models", name=choice.name):
+        for point in _plugins().select(name=choice.name):
             sources = _package_files(point.module.partition(".")[0])
     return key_of(
         choice.name,
@@ -69,6 +69,12 @@ def choice_key(choice: ModelChoice) -> str:
         _files(sources),
         [_stamp(p) for p in named if _is_file(p)],
     )
+
+
+@cache
+def _plugins() -> EntryPoints:
+    """Return the models of other packages; all installed packages are asked once."""
+    return entry_points(group="physion.models")
 
 
 def _files(paths: Iterable[Path]) -> list[tuple[str, str]]:

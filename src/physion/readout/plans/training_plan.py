@@ -218,11 +218,11 @@ class TrainingPlan:
         """Return the tasks, seed after seed, so that a whole table is there early."""
         chosen, shared = self._selection, dataclasses.asdict(self.shared)
         inputs = {name: value for name, value in shared.items() if name not in _RUN_ON}
-        common = [code_key(), self._data, dataclasses.asdict(self.overrides), inputs]
+        common = key_of(code_key(), self._data, dataclasses.asdict(self.overrides), inputs)
         tasks = []
         for seed in chosen.seeds:
             sets = [
-                (protocol, planned)
+                (protocol, planned, key_of(dataclasses.asdict(planned)))
                 for protocol in chosen.protocols
                 for planned in plan_trainings(
                     self.dataset.index,
@@ -239,9 +239,9 @@ class TrainingPlan:
                 tasks += [
                     TrainingTask(
                         choice, protocol, planned, seed,
-                        key_of("training", common, model, seed, dataclasses.asdict(planned)),
+                        key_of("training", common, model, seed, what),
                     )
-                    for protocol, planned in sets
+                    for protocol, planned, what in sets
                 ]  # fmt: skip
         return tasks
 
