@@ -22,11 +22,10 @@ from physion.cli.text_table import text_table
 from physion.compute.settings import ExecutorSettings
 from physion.readout.plans.evaluation_plan import EvaluationPlan, EvaluationResults
 from physion.readout.plans.keys import key_of
-from physion.readout.plans.results import summarise_accuracy
+from physion.readout.plans.results import StoredEvaluation, summarise_accuracy
 from physion.readout.plans.selection import Selection, count_seeds, parse_protocols
 from physion.readout.plans.tasks import EvaluationTask
 from physion.readout.settings import EvaluationSettings
-from physion.readout.table import Evaluation
 from physion.trials.dataset import Dataset
 
 
@@ -123,7 +122,7 @@ def _print(plan: EvaluationPlan, results: EvaluationResults, options: Options) -
     for where, reason in results.problems.items():
         _line(f"no prediction: {where if several else where.partition(': ')[2]}: {reason}")
     for _, evaluation in results.tables:
-        _line(f"{len(evaluation.predictions)} predictions: {evaluation.path}")
+        _line(f"{evaluation.count} predictions: {evaluation.path}")
         if evaluation.rollout_errors is not None:
             _line(f"errors of imagined motion: {evaluation.rollout_errors}")
     if several:
@@ -136,7 +135,7 @@ def _print(plan: EvaluationPlan, results: EvaluationResults, options: Options) -
         _line(f"failed: {task.label}: {reason}")
 
 
-def _values(task: EvaluationTask, evaluation: Evaluation) -> dict[str, Any]:
+def _values(task: EvaluationTask, evaluation: StoredEvaluation) -> dict[str, Any]:
     values = {
         **_identity(task),
         "predictions": str(evaluation.path),

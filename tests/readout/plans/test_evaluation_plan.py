@@ -14,7 +14,7 @@ import pytest
 from physion.analysis.tables.predictions import read_predictions
 from physion.readout.evaluate import evaluate
 from physion.readout.plans.evaluation_plan import EvaluationPlan
-from physion.readout.plans.results import MEAN, summarise_accuracy
+from physion.readout.plans.results import MEAN, StoredEvaluation, summarise_accuracy
 from physion.readout.plans.selection import Selection
 from physion.readout.plans.tasks import EvaluationTask
 from physion.readout.plans.training_plan import TrainingPlan
@@ -63,12 +63,21 @@ def test_a_plan_predicts_all_readouts_and_a_second_run_only_reads(
     def build(*_: Any, **__: Any) -> None:
         raise AssertionError("a plan that is done builds no model")
 
+    def read_tables(*_: Any) -> None:
+        raise AssertionError("a plan that is done reads its records, not its tables")
+
     monkeypatch.setattr("physion.readout.plans.model_facts.build_model", build)
     again = make_evaluation_plan(dots, tmp_path, [UNTRAINED, IMAGINING])
     assert not again.pending
-    pd.testing.assert_frame_equal(
-        summarise_accuracy(again.run().evaluated), summarise_accuracy(results.evaluated)
-    )
+    with monkeypatch.context() as patched:
+        patched.setattr("physion.readout.plans.results.read_table", read_tables)
+        stored = again.run()
+        pd.testing.assert_frame_equal(
+            summarise_accuracy(stored.evaluated), summarise_accuracy(results.evaluated)
+        )
+    for (_, one), (_, other) in zip(stored.tables, results.tables, strict=True):
+        assert (one.path, one.count, one.scores) == (other.path, other.count, other.scores)
+        assert one.count == len(one.predictions) > 0
 
 
 def test_a_table_that_was_changed_in_place_is_made_again(dots: Dataset, tmp_path: Path) -> None:
@@ -146,7 +155,7 @@ def test_a_scenario_and_readouts_can_be_chosen(dots: Dataset, tmp_path: Path) ->
     assert all(set(e.predictions["Protocol"]) == {"observed"} for _, e in results.tables)
 
 
-def evaluation_of(hits: dict[str, list[bool]], init: str = "random") -> Evaluation:
+def evaluation_of(hits: dict[str, list[bool]], init: str = "random") -> StoredEvaluation:
     """Return an evaluation whose predictions of a scenario are right or not as ``hits`` says."""
     rows = [
         {
@@ -156,7 +165,7 @@ def evaluation_of(hits: dict[str, list[bool]], init: str = "random") -> Evaluati
         for scenario, values in hits.items()
         for k, hit in enumerate(values)
     ]  # fmt: skip
-    return Evaluation(pd.DataFrame(rows), Path("t.csv"), {})
+    return StoredEvaluation.of(Evaluation(pd.DataFrame(rows), Path("t.csv"), {}))
 
 
 def test_results_are_means_and_deviations_over_seeds() -> None:

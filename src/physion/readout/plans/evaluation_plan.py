@@ -20,11 +20,11 @@ from physion.readout.plans.failures import describe_failure, stop_if_fatal
 from physion.readout.plans.keys import code_key, dataset_key, key_of
 from physion.readout.plans.model_facts import KnownModels, ModelFacts
 from physion.readout.plans.records import Records
+from physion.readout.plans.results import StoredEvaluation
 from physion.readout.plans.selection import ModelChoice, Selection
 from physion.readout.plans.tasks import EvaluationTask
 from physion.readout.protocols import Readout
 from physion.readout.settings import EvaluationConfig, EvaluationSettings
-from physion.readout.table import Evaluation, read_table
 from physion.training.protocols import Training
 from physion.trials.dataset import Dataset
 
@@ -43,8 +43,8 @@ class EvaluationResults:
     - ``failed``: task and reason.
     """
 
-    evaluated: Sequence[tuple[EvaluationTask, Evaluation]]
-    tables: Sequence[tuple[EvaluationTask, Evaluation]]
+    evaluated: Sequence[tuple[EvaluationTask, StoredEvaluation]]
+    tables: Sequence[tuple[EvaluationTask, StoredEvaluation]]
     failed: Sequence[tuple[EvaluationTask, str]]
 
     @property
@@ -133,7 +133,7 @@ class EvaluationPlan:
     def _run_here(
         self,
         executor: Executor | None,
-        results: dict[str, Evaluation],
+        results: dict[str, StoredEvaluation],
         failed: dict[str, str],
         progress: Progress | None,
         on_task: OnTask | None,
@@ -158,7 +158,7 @@ class EvaluationPlan:
     def _run_cells(
         self,
         executor: Executor,
-        results: dict[str, Evaluation],
+        results: dict[str, StoredEvaluation],
         failed: dict[str, str],
         progress: Progress | None,
         on_task: OnTask | None,
@@ -179,7 +179,7 @@ class EvaluationPlan:
             results[key] = dataclasses.replace(self._stored(values), problems=values["problems"])
 
     def do(self, key: str) -> dict[str, Any]:
-        """Do one task of the plan, or find it done; return its files and problems.
+        """Do one task of the plan, or find it done; return the values of its record, and problems.
 
         Raises
         ------
@@ -187,11 +187,9 @@ class EvaluationPlan:
             If the plan has no such task: data, model or code are not those of the plan's maker.
         """
         if key in self.done:
-            return {"files": list(self.done[key]["files"]), "problems": {}}
+            return {**self.done[key], "problems": {}}
         made = self._evaluate(find_task(self.tasks, key, "evaluation"), None, None)
-        paths = [path for path in (made.path, made.rollout_errors) if path is not None]
-        files = [path.relative_to(self._folder).as_posix() for path in paths]
-        return {"files": files, "problems": dict(made.problems)}
+        return {**self._values(made), "problems": dict(made.problems)}
 
     def expected_seconds(self, task: EvaluationTask) -> float | None:
         """Return the mean time of finished evaluations of the same model; None without any."""
@@ -270,7 +268,7 @@ class EvaluationPlan:
 
     def _evaluate(
         self, task: EvaluationTask, executor: Executor | None, progress: Progress | None
-    ) -> Evaluation:
+    ) -> StoredEvaluation:
         start = time.perf_counter()
         evaluation = self._ask(task, task.scenario, executor, progress)
         if not evaluation.problems and self.models.record(task.choice):
@@ -278,18 +276,20 @@ class EvaluationPlan:
         return evaluation
 
     def _record(
-        self, key: str, task: EvaluationTask, evaluation: Evaluation, seconds: float
+        self, key: str, task: EvaluationTask, evaluation: StoredEvaluation, seconds: float
     ) -> None:
-        paths = [evaluation.path]
-        if evaluation.rollout_errors is not None:
-            paths.append(evaluation.rollout_errors)
-        values = {
-            "label": task.label,
-            "model": self.models.choice_key(task.choice),
-            "seconds": seconds,
+        known = {"label": task.label, "model": self.models.choice_key(task.choice)}
+        values = {**known, "seconds": seconds, **self._values(evaluation)}
+        self._records.write(key, values, [self._folder / name for name in values["files"]])
+
+    def _values(self, evaluation: StoredEvaluation) -> dict[str, Any]:
+        """Return the JSON values from which `_stored` makes an evaluation without problems."""
+        paths = [path for path in (evaluation.path, evaluation.rollout_errors) if path is not None]
+        return {
             "files": [path.relative_to(self._folder).as_posix() for path in paths],
+            "count": evaluation.count,
+            "scores": list(evaluation.scores),
         }
-        self._records.write(key, values, paths)
 
     def _ask(
         self,
@@ -297,7 +297,7 @@ class EvaluationPlan:
         scenario: str,
         executor: Executor | None = None,
         progress: Progress | None = None,
-    ) -> Evaluation:
+    ) -> StoredEvaluation:
         config = EvaluationConfig(
             **{f.name: getattr(self.settings, f.name) for f in dataclasses.fields(self.settings)},
             training=task.protocol.value,
@@ -307,7 +307,7 @@ class EvaluationPlan:
         # Imported late: a plan that is done needs none of the libraries of models and movies.
         from physion.readout.evaluate import evaluate_model
 
-        return evaluate_model(
+        evaluation = evaluate_model(
             self.dataset,
             self._model(task),
             self._folder,
@@ -316,18 +316,20 @@ class EvaluationPlan:
             executor=executor,
             progress=progress,
         )
+        return StoredEvaluation.of(evaluation)
 
     def _is_valid(self, values: Mapping[str, Any] | None) -> TypeGuard[Mapping[str, Any]]:
         """Return whether there is a record, and its tables have their SHA-256."""
         return values is not None and all(is_whole(self._folder / n) for n in values["files"])
 
-    def _stored(self, values: Mapping[str, Any]) -> Evaluation:
+    def _stored(self, values: Mapping[str, Any]) -> StoredEvaluation:
         path, *errors = (self._folder / name for name in values["files"])
-        return Evaluation(read_table(path), path, {}, errors[0] if errors else None)
+        of_motion = errors[0] if errors else None
+        return StoredEvaluation(path, {}, of_motion, values["count"], values["scores"])
 
     def _whole_tables(
-        self, results: Mapping[str, Evaluation]
-    ) -> list[tuple[EvaluationTask, Evaluation]]:
+        self, results: Mapping[str, StoredEvaluation]
+    ) -> list[tuple[EvaluationTask, StoredEvaluation]]:
         """Join the tables of single scenarios, where all of a protocol are there and complete."""
         groups: dict[tuple[str, str, int], list[EvaluationTask]] = defaultdict(list)
         for task in self.tasks:
@@ -341,7 +343,7 @@ class EvaluationPlan:
                 tables += [(task, results[task.key]) for task in tasks if task.key in results]
         return tables
 
-    def _joined(self, tasks: Sequence[EvaluationTask]) -> Evaluation:
+    def _joined(self, tasks: Sequence[EvaluationTask]) -> StoredEvaluation:
         key = key_of("joined", [task.key for task in tasks])
         values = self._records.read(key)
         if self._is_valid(values):

@@ -1,21 +1,73 @@
-"""Table of the results of a plan: accuracy by model, protocol, readout and scenario."""
+"""Results of a plan: evaluations as they are recorded, and the table of their accuracies."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
 from physion.readout.plans.tasks import EvaluationTask
-from physion.readout.table import Evaluation
+from physion.readout.table import Evaluation, read_table
 
 MEAN = "mean"
 """Name of the rows with the mean of the scenarios."""
 _MODEL = ["model", "init", "protocol", "readout"]
 _GROUP = [*_MODEL, "scenario"]
+_COLUMNS = {
+    "model": "Model",
+    "init": "Init",
+    "readout": "Protocol",
+    "scenario": "Readout Test Data",
+}
+"""Columns of a table of predictions that name a score, by their names there."""
 
 
-def summarise_accuracy(evaluated: Iterable[tuple[EvaluationTask, Evaluation]]) -> pd.DataFrame:
+@dataclass(frozen=True)
+class StoredEvaluation:
+    """Evaluation of a plan, of which the table is read only if it is asked for.
+
+    - ``path``, ``problems``, ``rollout_errors``: as in `physion.readout.table.Evaluation`.
+    - ``count``: number of predictions.
+    - ``scores``: rows of JSON values: ``model``, ``init``, ``readout``, ``scenario``, ``hits`` and
+      ``trials`` (numbers of right predictions, and of all).
+    """
+
+    path: Path
+    problems: Mapping[str, str]
+    rollout_errors: Path | None
+    count: int
+    scores: Sequence[Mapping[str, Any]]
+
+    @classmethod
+    def of(cls, evaluation: Evaluation) -> StoredEvaluation:
+        """Return an evaluation with the scores of its table."""
+        table = evaluation.predictions
+        hits = table["Predicted Outcome"] == table["Actual Outcome"]
+        scores = [
+            {
+                **dict(zip(_COLUMNS, key, strict=True)),
+                "hits": int(of_cell.sum()),
+                "trials": len(of_cell),
+            }
+            for key, of_cell in hits.groupby([table[name] for name in _COLUMNS.values()])
+        ]
+        return cls(
+            evaluation.path, evaluation.problems, evaluation.rollout_errors, len(table), scores
+        )
+
+    @cached_property
+    def predictions(self) -> pd.DataFrame:
+        """Table of predictions."""
+        return read_table(self.path)
+
+
+def summarise_accuracy(
+    evaluated: Iterable[tuple[EvaluationTask, StoredEvaluation]],
+) -> pd.DataFrame:
     """Return the accuracy of evaluations, as mean and spread over seeds.
 
     Parameters
@@ -32,27 +84,15 @@ def summarise_accuracy(evaluated: Iterable[tuple[EvaluationTask, Evaluation]]) -
         seed). Rows with the scenario `MEAN` are of the mean of the scenarios of each seed, where
         there are several.
     """
-    rows = []
-    for task, evaluation in evaluated:
-        table = evaluation.predictions
-        hits = table["Predicted Outcome"] == table["Actual Outcome"]
-        named = pd.DataFrame(
-            {
-                "model": table["Model"],
-                "init": table["Init"],
-                "protocol": task.protocol.value if task.set_name else "",
-                "readout": table["Protocol"],
-                "scenario": table["Readout Test Data"],
-                "seed": task.seed,
-                "hit": hits.astype(float),
-            }
-        )
-        rows.append(named)
+    rows = [
+        {"protocol": task.protocol.value if task.set_name else "", "seed": task.seed, **score}
+        for task, evaluation in evaluated
+        for score in evaluation.scores
+    ]
     if not rows:
         return pd.DataFrame(columns=[*_GROUP, "seeds", "trials", "accuracy", "spread"])
-    trials = pd.concat(rows, ignore_index=True)
-    by_seed = trials.groupby([*_GROUP, "seed"])["hit"].agg(accuracy="mean", trials="size")
-    by_seed = by_seed.reset_index()
+    by_seed = pd.DataFrame(rows).groupby([*_GROUP, "seed"])[["hits", "trials"]].sum().reset_index()
+    by_seed["accuracy"] = by_seed.pop("hits") / by_seed["trials"]
     whole = by_seed.groupby([*_MODEL, "seed"]).agg(
         accuracy=("accuracy", "mean"), trials=("trials", "sum"), scenarios=("scenario", "size")
     )
