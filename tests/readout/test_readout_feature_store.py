@@ -475,6 +475,28 @@ def test_memory_used_up_names_the_setting_to_lower(model: Any) -> None:
         FeatureStore(None, batch=1).encoded(model, Movies(), TRIALS, "context")
 
 
+def test_memory_used_up_by_reading_names_the_setting_to_lower() -> None:
+    class Large(Movies):
+        def context(self, trials: Sequence[str]) -> Batch:
+            raise MemoryError
+
+    for batch, setting in ((3, "the encoder batch, now 3"), (1, "the image size of the model")):
+        expected = f"reading {batch} clips at a time ran out of memory; lower {setting}"
+        with pytest.raises(OutOfMemoryError, match=expected):
+            FeatureStore(None, batch=batch).encoded(Network(), Large(), TRIALS, "context")
+
+
+def test_memory_used_up_by_imagining_names_the_setting_to_lower() -> None:
+    class Vivid(Dreamer):
+        def imagine(self, context: Batch, samples: int, seed: int) -> Any:
+            return np.ones(2**50)
+
+    for batch, setting in ((3, "the encoder batch, now 3"), (1, "the image size of the model")):
+        store = FeatureStore(None, batch=batch)
+        with pytest.raises(OutOfMemoryError, match=f"imagine ran out of memory .* lower {setting}"):
+            store.imagined(Vivid(), Movies(), None, TRIALS, samples=2, seed=0, knobs={})
+
+
 def test_what_a_model_raises_names_model_method_and_line() -> None:
     def divide(pixels: Any) -> Any:
         return 1 // 0

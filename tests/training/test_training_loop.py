@@ -322,6 +322,8 @@ def test_memory_that_is_used_up_names_the_setting_to_lower(error: Exception) -> 
 
     with pytest.raises(OutOfMemoryError, match="batch 4 and accumulate 2"):
         run(Large(), settings=replace(QUICK, held_out=0.0))
+    with pytest.raises(OutOfMemoryError, match=r"at batch 1; use .*bf16-mixed"):
+        run(Large(), settings=replace(QUICK, held_out=0.0, batch=1))
 
 
 @pytest.mark.parametrize(

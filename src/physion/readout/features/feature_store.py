@@ -247,8 +247,10 @@ def _read(read: Callable[[tuple[str, ...]], Batch], group: tuple[str, ...]) -> B
     try:
         return read(group)
     except MemoryError as error:
+        many = len(group) > 1
+        lower = f"the encoder batch, now {len(group)}" if many else "the image size of the model"
         raise OutOfMemoryError(
-            f"reading {len(group)} clips at a time ran out of memory; lower the encoder batch"
+            f"reading {len(group)} clips at a time ran out of memory; lower {lower}"
         ) from error
 
 
