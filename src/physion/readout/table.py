@@ -227,5 +227,4 @@ def read_table(path: Path) -> pd.DataFrame:
         dtype=_DTYPES,  # type: ignore[arg-type]
         keep_default_na=False,
         na_values={name: [""] for name in _NUMBERS},
-        float_precision="round_trip",
     )
