@@ -100,6 +100,19 @@ def test_every_vision_model_is_shown(
     assert browser.ask("document.images.length") == 0
 
 
+def check_masks(drawn: np.ndarray, masks: np.ndarray) -> None:
+    """Check that each of five slots has a cell, the more coloured the larger its mask is.
+
+    The cells lie in rows of three, with gaps of 4 pixels; ``masks`` (5, h, w) are in 0..1.
+    """
+    width, height = (drawn.shape[1] - 8) // 3, (drawn.shape[0] - 4) // 2
+    colored = []
+    for slot in range(len(masks)):
+        top, left = slot // 3 * (height + 4), slot % 3 * (width + 4)
+        colored.append(np.ptp(drawn[top : top + height, left : left + width, :3], axis=2).mean())
+    assert np.corrcoef(colored, masks.mean(axis=(1, 2)))[0, 1] > 0.9
+
+
 def check_kind(browser: Browser, name: str, one: ImaginedTrial, first: int, second: int) -> None:
     """Check what sets a model apart; the time line is just after its frame ``second``."""
     if "imagined" in TILES[name]:
@@ -118,8 +131,10 @@ def check_kind(browser: Browser, name: str, one: ImaginedTrial, first: int, seco
         painted(browser, "masks")
         assert f"imagined at frame {first}" in text(browser, "masks")
         drawn = canvas(browser, "masks")
+        check_masks(drawn, one.shown["masks"][0])
         seek(browser, int(one.seen_frames[1]))
         assert f"seen at frame {one.seen_frames[1]}" in text(browser, "masks")
+        check_masks(canvas(browser, "masks"), one.seen["masks"][1])
         assert not np.array_equal(drawn, canvas(browser, "masks"))
     if name == "rpin":
         left, top, right, bottom = 256 * one.shown["boxes"][1, 0]

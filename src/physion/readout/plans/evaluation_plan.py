@@ -367,7 +367,7 @@ class EvaluationCell:
 
 
 def evaluate_cell(cell: EvaluationCell) -> dict[str, Any]:
-    """Do one evaluation of a plan; return its files, relative to its folder, and its problems."""
+    """Do one evaluation of a plan; return what `EvaluationPlan.do` returns."""
     dataset = Dataset(cell.dataset, verify=cell.verify)
     errors = cell.rollout_errors
     plan = EvaluationPlan(
