@@ -11,9 +11,9 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.experiment.simulated.server_process import ServerProcess
 from physion.experiment.study.courses.blocks import block_scenarios
-from physion.experiment.study.study import Blocks, Plausibility, Recruitment
+from physion.experiment.study.study import Blocks, Recruitment
 from physion.experiment.study.texts import TEXTS_FOLDER
-from support.experiment.browser import SHORT, Visit, chromium, rows_of
+from support.experiment.browser import FAST, SHORT, Visit, chromium, rows_of
 from support.experiment.tiny_study import make_tiny_study
 
 __all__ = ["chromium"]
@@ -25,7 +25,7 @@ def test_a_session_of_two_blocks(chromium: Any, tmp_path: Path) -> None:
     study = make_tiny_study(
         tmp_path, test=4, familiarization=1, scenarios=("collide", "drop"), languages=("en",),
         blocks=Blocks(all_scenarios=True, trials=2), timing=SHORT,
-        plausibility=Plausibility(reading_s=0.0), recruitment=Recruitment(link_code="TINY-CODE"),
+        plausibility=FAST, recruitment=Recruitment(link_code="TINY-CODE"),
     )  # fmt: skip
     with (tmp_path / TEXTS_FOLDER / "en.toml").open("a") as texts:
         texts.write(PROMPT)

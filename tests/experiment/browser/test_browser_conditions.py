@@ -14,9 +14,9 @@ from physion.experiment.simulated.server_process import ServerProcess
 from physion.experiment.study.conditions import Condition
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import make_pass
-from physion.experiment.study.study import Plausibility, write_settings
+from physion.experiment.study.study import write_settings
 from physion.experiment.study.texts import TEXTS_FOLDER
-from support.experiment.browser import SHORT, Visit, chromium, rows_of
+from support.experiment.browser import FAST, SHORT, Visit, chromium, rows_of
 from support.experiment.tiny_study import make_tiny_study
 
 __all__ = ["chromium"]
@@ -38,7 +38,7 @@ prompt = "Do they meet?"
 def test_a_condition_has_its_own_settings_and_texts(chromium: Any, tmp_path: Path) -> None:
     study = make_tiny_study(
         tmp_path, test=2, familiarization=1, languages=("en",), timing=SHORT,
-        plausibility=Plausibility(reading_s=0.0),
+        plausibility=FAST,
     )  # fmt: skip
     with (tmp_path / TEXTS_FOLDER / "en.toml").open("a") as texts:
         texts.write(TEXTS)

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from physion.experiment.study.study import Plausibility
-from support.experiment.browser import SIZE, Visit, chromium, rows_of, served
+from support.experiment.browser import FAST, SIZE, Visit, chromium, rows_of, served
 
 __all__ = ["chromium"]
-RULES = Plausibility(reading_s=0.0)
 SMALL = {"width": 700, "height": 400}
 
 
@@ -26,7 +25,7 @@ def test_interrupted_trials_are_shown_again_and_showings_are_counted(
     chromium: Any, tmp_path: Path
 ) -> None:
     with (
-        served(tmp_path / "s", familiarization=1, plausibility=RULES) as (study, server),
+        served(tmp_path / "s", familiarization=1, plausibility=FAST) as (study, server),
         Visit(chromium, server.url, "interrupted") as visit,
     ):
         to_the_test(visit, "?participant=Ada&language=en")
@@ -56,7 +55,7 @@ def test_interrupted_trials_are_shown_again_and_showings_are_counted(
 @pytest.mark.slow
 def test_interrupted_trials_go_on_and_are_void(chromium: Any, tmp_path: Path) -> None:
     """The movie plays once, and its answer says what interrupted it; later trials count again."""
-    rules = Plausibility(reading_s=0.0, interrupted="void")
+    rules = replace(FAST, interrupted="void")
     with (
         served(tmp_path / "s", familiarization=1, test=3, plausibility=rules) as (study, server),
         Visit(chromium, server.url, "void") as visit,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 
 import pytest
@@ -23,7 +22,6 @@ def answer(webkit: WebKit, response: str, by: str = "mouse") -> None:
     """Answer the trial as soon as the buttons are enabled."""
     button = f".answer[data-response={response}]:enabled"
     webkit.find(button)
-    time.sleep(0.2)  # answers within 0.1 s are not those of a person
     if by == "keyboard":
         left = webkit.run("return document.querySelector('.answer').dataset.response")
         webkit.press("f" if left == response else "j")

@@ -30,6 +30,8 @@ from support.experiment.tiny_study import make_tiny_study
 from support.programs import absent, find_chromium, find_firefox
 
 SIZE = {"width": 1280, "height": 800}
+FAST = Plausibility(reading_s=0.0, fast_ms=0)
+"""Rules of plausible sessions under which a test may read and answer faster than people do."""
 SHORT = Timing(fixation_ms=(60, 120), cue_ms=500, flash_hz=2.0)
 OFFLINE = re.compile(r"ERR_(INTERNET_DISCONNECTED|CONNECTION_REFUSED)|status of (409|503)")
 """Console messages of browsers about requests that a test lets fail."""
@@ -75,7 +77,7 @@ def served(folder: Path, **settings: Any) -> Iterator[tuple[Study, ServerProcess
         "test": 3,
         "familiarization": 2,
         "timing": SHORT,
-        "plausibility": Plausibility(reading_s=0.0),
+        "plausibility": FAST,
         "recruitment": Recruitment(link_code="TINY-CODE", link_address="https://lab.example/done"),
     }
     study = make_tiny_study(folder, **{**given, **settings})
