@@ -33,7 +33,7 @@ OF_PICTURES = ("svg", "op3")
 ENCODERS = {"pVGG": "test_resnet", "pDeIT": "test_vit", "pEffNetLite0": "test_efficientnet"}
 """Small encoders in place of those of the families with a frozen encoder."""
 OVERFITTED = {
-    "cswm": 60, "rpin": 60, "svg": 40, "op3": 20,
+    "cswm": 60, "rpin": 40, "svg": 40, "op3": 12,
     **{f"{family}-{dynamics}": 150 for family in ENCODERS for dynamics in ("mlp", "lstm")},
 }  # fmt: skip
 """Steps on one batch by model."""
