@@ -73,7 +73,7 @@ def test_a_whole_session_in_webkit(webkit: WebKit, tmp_path: Path) -> None:
     assert [row.response for row in answers] == ["yes", "yes", "yes", "no", "yes"]
     assert [row.input for row in answers] == ["mouse", "mouse", "mouse", "keyboard", "mouse"]
     for row in answers:
-        assert row.cue_ms > 400 and row.rt_ms > 100 and row.showings == 1
+        assert row.cue_ms > 400 and row.rt_ms > 0 and row.showings == 1
         # WebKit tells which frames it presented; a busy machine drops some.
         assert 0 < row.frames_shown <= row.frames_expected == 45
         frames = [frame for _, frame, _ in json.loads(row.details)["frames"]]

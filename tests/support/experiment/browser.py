@@ -33,7 +33,9 @@ SIZE = {"width": 1280, "height": 800}
 FAST = Plausibility(reading_s=0.0, fast_ms=0)
 """Rules of plausible sessions under which a test may read and answer faster than people do."""
 SHORT = Timing(fixation_ms=(60, 120), cue_ms=500, flash_hz=2.0)
-OFFLINE = re.compile(r"ERR_(INTERNET_DISCONNECTED|CONNECTION_REFUSED)|status of (409|503)")
+OFFLINE = re.compile(
+    r"ERR_(INTERNET_DISCONNECTED|CONNECTION_(REFUSED|RESET)|EMPTY_RESPONSE)|status of (409|503)"
+)
 """Console messages of browsers about requests that a test lets fail."""
 
 
