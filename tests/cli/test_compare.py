@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import physion
 from physion.cli.compare.compare import SUBVERBS
 from physion.cli.main import main
 from physion.trials.index import COLUMNS
@@ -353,6 +354,25 @@ def test_leaderboard_prints_and_writes(
     assert rows[0]["rmsd"] < rows[1]["rmsd"]
     assert main([*command, "--sort", "accuracy", "--ascending", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["rows"][0]["model"] == "weak"
+
+
+def test_leaderboard_of_chosen_rows_says_licence_and_date(
+    official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [
+        predictions(official, tmp_path / f"{name}.csv", name, skill)
+        for name, skill in (("weak", 0.55), ("good", 0.85))
+    ]
+    command = ["compare", "leaderboard", *map(str, files), "--json"]
+    said = ["--license", "CC BY 4.0", "--date", "2026-11-01"]
+    assert main([*command, "--model", "OO", *said]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [row["model"] for row in found["rows"]] == ["good"]
+    settings = found["settings"]
+    assert (settings["Licence"], settings["Date"]) == ("CC BY 4.0", "2026-11-01")
+    assert settings["Made with"] == f"physion {physion.__version__}"
+    assert main([*command, "--readout", "full"]) == 2
+    assert "no model passes the filters" in capsys.readouterr().err
 
 
 def test_leaderboard_of_later_contacts_needs_their_column(

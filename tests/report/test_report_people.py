@@ -146,6 +146,21 @@ def test_tests_and_mixed_models_are_told(report: Path) -> None:
     assert {"flagged", "sd of participant", "sd of stimulus"} <= fitted
 
 
+def test_items_and_paired_measures_have_tables_that_the_page_names(report: Path) -> None:
+    text, tables = text_of(report), report.parent / "tables"
+    items = pd.read_csv(tables / "people_items.csv")
+    assert set(items["stimulus"]) == {
+        f"{s}_{i:04d}" for s in STEMS.values() for i in range(STIMULI)
+    }
+    pairs = pd.read_csv(tables / "paired_measures.csv")
+    # Three rows of models make three pairs, in each scenario and over all.
+    counts = pairs.groupby(["scenario", "measure"]).size()
+    assert set(SCENARIOS) < set(pairs["scenario"]) and (counts == 3).all()
+    assert set(pairs["measure"]) >= {"kappa_from_averages", "rmsd"}
+    for name in ("people_items", "paired_measures"):
+        assert f"tables/{name}.csv" in text
+
+
 def test_hypotheses_without_their_attribute_give_a_reason(report: Path) -> None:
     values = json.loads((report.parent / "report.json").read_text())
     first = next(row for row in values["people_hypotheses"] if row["hypothesis"] == "H1")

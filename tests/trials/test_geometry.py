@@ -139,11 +139,16 @@ def test_verify_finds_geometry_of_another_scene(tmp_path: Path) -> None:
     paths = TrialPaths(tmp_path, "testing", "drop", "tiny")
     paths.trial_file.parent.mkdir(parents=True)
     paths.trial_file.write_bytes(parts._replace(metadata=meta).pack())
-    assert not [fault for fault in _check_trial(paths) if "not that of the scene" in fault]
+    assert not faults_of_geometry(paths)
     # Of another size: the camera's focal length in pixels differs.
     paths.trial_file.write_bytes(with_width(parts._replace(metadata=meta).pack(), 64))
-    (fault,) = [fault for fault in _check_trial(paths) if "not that of the scene" in fault]
+    (fault,) = faults_of_geometry(paths)
     assert "'camera/intrinsics'" in fault
+
+
+def faults_of_geometry(paths: TrialPaths) -> list[str]:
+    faults = _check_trial(paths, Trial.open(paths.trial_file))
+    return [fault for fault in faults if "not that of the scene" in fault]
 
 
 def with_width(data: bytes, width: int) -> bytes:

@@ -21,6 +21,7 @@ from physion.trials.layout import INDEX, SAFE_NAME, TrialPaths, find_trials
 
 if TYPE_CHECKING:
     from physion.scenes.scene import Scene
+    from physion.trials.trial_file import Trial
 
 COLUMNS = {name: column.dtype for name, column in INDEX_COLUMNS.items()}
 """Pandas types by column, in the stored order."""
@@ -37,13 +38,16 @@ _KINDS: dict[str, tuple[str, tuple[Callable[[Any], bool], ...]]] = {
 _KINDS |= {"Int64": _KINDS["int64"], "Float64": _KINDS["float64"], "boolean": _KINDS["bool"]}
 
 
-def index_row(paths: TrialPaths) -> dict[str, Any]:
-    """Return the index row of one trial; `BadInputError` if a file is missing or damaged."""
+def index_row(paths: TrialPaths, opened: Trial | None = None) -> dict[str, Any]:
+    """Return the index row of one trial; `BadInputError` if a file is missing or damaged.
+
+    ``opened``: the trial, if its file was read already.
+    """
     # Imported late: an index is read without what reads trial files.
     from physion.trials.trial_file import Trial
 
     row: dict[str, Any] = dict.fromkeys(COLUMNS)
-    trial = Trial.open(paths.trial_file)
+    trial = opened or Trial.open(paths.trial_file)
     meta, labels, scene = trial.metadata, trial.labels, trial.scene
     if (meta.trial, meta.scenario, meta.split) != (paths.trial, paths.scenario, paths.split):
         raise BadInputError(

@@ -57,20 +57,23 @@ def test_feedback_shows_the_map_and_is_kept_over_a_reload(chromium: Any, tmp_pat
 
 
 def test_title_and_question_differ_by_scenario(chromium: Any, tmp_path: Path) -> None:
-    own = '[study]\ntitle = "Was geschieht?"\n[scenario.drop.trial]\nprompt = "Trifft es?"\n'
+    own = (
+        '[study]\ntitle = "Was geschieht?"\n[scenario.drop.study]\ntitle = "Was fällt?"\n'
+        '[scenario.drop.trial]\nprompt = "Trifft es?"\n'
+    )
     study = make_tiny_study(
         tmp_path, test=1, familiarization=1, scenarios=("collide", "drop"), timing=SHORT
     )
     path = study.folder / TEXTS_FOLDER / "de.toml"
     path.write_text(path.read_text() + own)
     with ServerProcess(study.folder) as server, Visit(chromium, server.url) as visit:
-        for scenario, prompt in (
-            ("drop", "Trifft es?"),
-            ("collide", "Wird der rote Gegenstand den gelben berühren?"),
+        for scenario, title, prompt in (
+            ("drop", "Was fällt?", "Trifft es?"),
+            ("collide", "Was geschieht?", "Wird der rote Gegenstand den gelben berühren?"),
         ):
             visit.go(f"?participant={scenario}&scenario={scenario}&language=de")
             visit.heading("Teilnahme an dieser Studie")
-            assert visit.page.inner_text("#title") == visit.page.title() == "Was geschieht?"
+            assert visit.page.inner_text("#title") == visit.page.title() == title
             visit.main_button().click()
             visit.heading("Was Sie tun")
             visit.page.get_by_text(prompt).wait_for()

@@ -268,6 +268,23 @@ def test_one_id_and_two(tmp_path: Path) -> None:
     assert "the 2 stored ids should be deleted. They are removed" in said[1]
 
 
+def test_implausible_sessions_stand_out_on_every_page(tmp_path: Path) -> None:
+    reason = "fast answers, no media"
+    with lab(tmp_path) as found:
+        for seed, facts in ((1, {}), (2, {"implausible": reason})):
+            (session,) = insert_sessions(
+                found.store.engine, found.study, found.secrets, 1, ends=("finished",), seed=seed,
+                **facts,
+            )  # fmt: skip
+        visitor = found.experimenter()
+        assert "and 1 implausible" in words_of(visitor.see().text)
+        implausible = [row.reference for row in rows_of(found) if row.implausible]
+        assert references(visitor.see("/sessions?flag=implausible").text) == implausible
+        assert reason in words_of(visitor.see(f"/sessions/{session}").text)
+        payments = words_of(visitor.open_payments().text)
+        assert payments.count(f"withheld: {reason}") == 1
+
+
 def test_pages_of_one_hostile_session(tmp_path: Path, database_url: str) -> None:
     """Script and SQL in every text that a browser or recruiter can give."""
     device = {"user_agent": HOSTILE, "refresh_hz": None, HOSTILE: HOSTILE, "touch": True}

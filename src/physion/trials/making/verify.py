@@ -23,7 +23,6 @@ from physion.trials.columns import FILES
 from physion.trials.geometry import geometry_arrays
 from physion.trials.index import (
     COLUMNS,
-    as_table,
     describe_mixed_versions,
     index_bytes,
     index_row,
@@ -104,16 +103,17 @@ def verify_dataset(
     result.notes += [f"{folder}: {mixed}"] if mixed else []
     settings = _settings(folder)
     remade = _choose_trials(table, again)
-    rows = [row for _, row in table.iterrows()]
+    rows = table.to_dict("records")
     for row in tracked(rows, "verifying", len(rows), progress):
         paths = TrialPaths(folder, row["split"], row["scenario"], row["trial"])
         try:
-            result.faults += _compare(row, paths)
-            result.faults += _check_trial(paths)
-            _check_movies(paths, result)
+            trial = Trial.open(paths.trial_file)
+            result.faults += _compare(row, paths, trial)
+            result.faults += _check_trial(paths, trial)
+            _check_movies(paths, trial, result)
             result.faults += _check_split(row, settings)
             if row["trial"] in remade:
-                _make_again(paths, settings, result)
+                _make_again(paths, trial, settings, result)
         except BadInputError as error:
             result.faults.append(str(error))
     return result
@@ -160,7 +160,7 @@ def _writer(content: bytes) -> str:
         return ""
 
 
-def _check_split(row: pd.Series[Any], settings: Mapping[str, Any]) -> list[str]:
+def _check_split(row: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
     """Return the conditions of its split that a sampled trial violates."""
     if pd.isna(row["seed"]) or not settings:
         return []
@@ -194,9 +194,9 @@ def _duplicates(table: pd.DataFrame) -> list[str]:
     ]
 
 
-def _compare(stored: pd.Series[Any], paths: TrialPaths) -> list[str]:
+def _compare(stored: Mapping[str, Any], paths: TrialPaths, trial: Trial) -> list[str]:
     """Return the cells of an index row that differ from the files."""
-    found = as_table([index_row(paths)]).iloc[0]
+    found = index_row(paths, trial)
     return [
         f"{paths.trial}: {name} is {found[name]!s}, the index says {stored[name]!s}"
         for name in COLUMNS
@@ -210,9 +210,8 @@ def _same(one: Any, other: Any) -> bool:
     return bool(one == other)
 
 
-def _check_trial(paths: TrialPaths) -> list[str]:
+def _check_trial(paths: TrialPaths, trial: Trial) -> list[str]:
     """Return contradictions between the parts of a trial."""
-    trial = Trial.open(paths.trial_file)
     meta, faults = trial.metadata, []
     lengths = {"movie": meta.frames, "observed_movie": meta.observed_frames}
     lengths |= {f"free_{name}": frames for name, frames in lengths.items()}
@@ -242,22 +241,22 @@ def _check_trial(paths: TrialPaths) -> list[str]:
     return faults
 
 
-def _check_movies(paths: TrialPaths, result: Verification) -> None:
+def _check_movies(paths: TrialPaths, trial: Trial, result: Verification) -> None:
     """Add movies that do not show the state of their trial; those of other renderers may not."""
     from physion.trials.making.make import RENDERER
     from physion.trials.making.movie_check import foreign_movies
 
-    trial = Trial.open(paths.trial_file)
     if trial.metadata.renderer != "imported":
         result.add(foreign_movies(paths, trial), trial.metadata.renderer, RENDERER)
 
 
-def _make_again(paths: TrialPaths, settings: Mapping[str, Any], result: Verification) -> None:
+def _make_again(
+    paths: TrialPaths, trial: Trial, settings: Mapping[str, Any], result: Verification
+) -> None:
     """Sample, simulate and render a trial again; add the differences to ``result``."""
     from physion.physics.engine import engine_of
     from physion.trials.making.make import RENDERER
 
-    trial = Trial.open(paths.trial_file)
     meta = trial.metadata
     if meta.imported:
         return
