@@ -5,8 +5,9 @@
 
 Studies are simulated again and again, and intervals of scores, of people and of their agreement are
 computed by the package's own functions. Not simulated are those of paired differences of RMSD and
-kappa, mixed models, hypotheses, effects of flags, ranks, and the published tables. An interval is about the expected value of the number with other people,
-other stimuli, or both, of the same number; that value is the mean over all repeats. Coverage is the
+kappa, mixed models, hypotheses, effects of flags, ranks, and the published tables. An interval is
+about the expected value of the number with other people, other stimuli, or both, of the same
+number; that value is the mean over all repeats. Coverage is the
 fraction of repeats whose interval contains it. Its standard error is 1.3 % with 300 repeats, 0.8 %
 with 800; for means over eight scenarios, which are groups of repeats drawn at random, it is larger.
 
