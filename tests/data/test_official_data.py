@@ -87,6 +87,7 @@ def test_other_versions_and_folders_are_refused(copy: Path, tmp_path: Path) -> N
         make_official(tmp_path / "nowhere", tmp_path / "out")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not OFFICIAL.is_dir(), reason="the official data is not here")
 def test_the_package_is_what_the_official_files_give(tmp_path: Path) -> None:
     made = make_official(OFFICIAL, tmp_path / "made")

@@ -269,6 +269,7 @@ def test_the_digest_of_a_class_without_a_file_covers_its_code() -> None:
     assert digest(1) == digest(1) != digest(2)
 
 
+@pytest.mark.slow
 def test_a_simulator_in_a_file_runs_in_worker_processes(
     dots: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -94,6 +94,7 @@ def accuracy_of_full(dataset: Dataset, folder: Path) -> float:
     return float((table["Predicted Outcome"] == table["Actual Outcome"]).mean())
 
 
+@pytest.mark.slow
 def test_full_falls_to_chance_with_exchanged_futures_and_permuted_labels(
     dots: Dataset, tmp_path: Path
 ) -> None:

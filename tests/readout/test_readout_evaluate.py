@@ -44,6 +44,7 @@ def accuracy(table: pd.DataFrame, protocol: str) -> float:
     return float((rows["Predicted Outcome"] == rows["Actual Outcome"]).mean())
 
 
+@pytest.mark.slow
 def test_full_is_far_above_chance_and_observed_is_not(done: Evaluation) -> None:
     """The dot changes direction after the observed part, which therefore does not predict it."""
     table = done.predictions

@@ -389,6 +389,7 @@ def test_marks_stand_out_from_the_paper(look: theme.Theme) -> None:
     assert min(contrast(colour, look.paper) for colour in look.palette) > 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_people", [True, False])
 def test_figures_are_sound_files(make_comparison: Maker, with_people: bool) -> None:
     for plot in make_plots(ReportInputs(make_comparison(with_people=with_people))):
@@ -401,6 +402,7 @@ def test_figures_are_sound_files(make_comparison: Maker, with_people: bool) -> N
         assert image.width > 1000 and np.asarray(image.convert("L")).std() > 10
 
 
+@pytest.mark.slow
 def test_bytes_repeat(make_comparison: Maker) -> None:
     def draw(kind: str) -> list[bytes]:
         found = make_plots(ReportInputs(make_comparison()))

@@ -95,6 +95,7 @@ def test_page_needs_nothing_from_elsewhere(make_comparison: Maker, movie: Path) 
     assert "default-src 'none'" in raw and "prefers-color-scheme: dark" in raw
 
 
+@pytest.mark.slow
 def test_bytes_repeat_in_any_folder(make_comparison: Maker, tmp_path: Path, movie: Path) -> None:
     def build(name: str) -> dict[str, bytes]:
         comparison = make_comparison()
@@ -124,6 +125,7 @@ def test_foreign_text_stays_text(make_comparison: Maker) -> None:
     assert page.text.count(evil) >= 5  # title, heading, methods and tables, as written
 
 
+@pytest.mark.slow
 def test_page_says_the_numbers_of_the_tables(make_comparison: Maker, tmp_path: Path) -> None:
     comparison = make_comparison()
     path = build_report(ReportInputs(comparison), tmp_path / "out")
@@ -168,6 +170,7 @@ def test_contents_lead_to_every_section(make_comparison: Maker) -> None:
     assert page.links() == places and len(places) > 6
 
 
+@pytest.mark.slow
 def test_numbers_for_machines_are_those_of_the_tables(
     make_comparison: Maker, tmp_path: Path
 ) -> None:
@@ -237,6 +240,7 @@ def predictions_file(path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_files_in_report_out(tmp_path: Path) -> None:
     humans = people_folder(tmp_path)
     predicted = predictions_file(tmp_path / "p.csv")
@@ -265,6 +269,7 @@ def test_files_in_report_out(tmp_path: Path) -> None:
     assert people.loc["collide", "zone_high"] == 0.9
 
 
+@pytest.mark.slow
 def test_the_official_people_make_a_page(official: Path, tmp_path: Path) -> None:
     names = pd.read_csv(official / "stimuli" / "stimulus_names_and_labels.csv")
     p = np.random.default_rng(0).random(len(names))

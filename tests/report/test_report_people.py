@@ -22,6 +22,7 @@ from physion.report import compare_files
 
 SCENARIOS = ("collide", "drop")
 STEMS = {"collide": "pilot_it2_collision_simple_box", "drop": "pilot_it2_drop_simple_box"}
+pytestmark = pytest.mark.slow
 PEOPLE, STIMULI = 8, 16
 
 

@@ -27,6 +27,7 @@ def built(results: PublishedResults, tmp_path_factory: pytest.TempPathFactory) -
     return build_published_report(results, tmp_path_factory.mktemp("pub"))
 
 
+@pytest.mark.slow
 def test_page_shows_published_and_expected_means(built: Path) -> None:
     whole = re.sub(r"<(style|figure)>.*?</\1>", " ", built.read_text(encoding="utf-8"), flags=re.S)
     text = " ".join(unescape(re.sub(r"<[^>]+>", " ", whole)).split())
@@ -53,6 +54,7 @@ def test_four_panels_with_their_tables(built: Path) -> None:
     assert panel["value"].notna().all() and len(panel) == 99
 
 
+@pytest.mark.slow
 def test_bytes_repeat(results: PublishedResults, built: Path, tmp_path: Path) -> None:
     assert [plot.name for plot in published_plots(results)] == FIGURES
     again = build_published_report(results, tmp_path / "again")

@@ -273,6 +273,7 @@ def test_one_sentence_says_which_weights_each_model_started_from(
 # --- a page for each stimulus ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_trial_pages_are_linked_both_ways(
     make_comparison: Maker, tmp_path: Path, movie: Path
 ) -> None:

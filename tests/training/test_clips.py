@@ -96,6 +96,7 @@ def test_wrong_passes_and_looks_are_refused_at_once(made: Dataset) -> None:
         made.clips(look="blue")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_workers_of_a_loader_give_the_same_clips(method: str, made: Dataset) -> None:
     clips = made.clips(**SHORT, passes=("rgb", "depth"))

@@ -423,6 +423,7 @@ def test_mcnemar_is_that_of_statsmodels(pair: Array) -> None:
         assert found.p == 1
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=40)
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=30))
 def test_corrections_are_those_of_statsmodels(p: list[float]) -> None:

@@ -218,6 +218,7 @@ POSTS = st.lists(
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(POSTS)
 def test_any_sequence_of_requests_stores_the_first_trials_once(

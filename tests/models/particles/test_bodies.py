@@ -39,6 +39,7 @@ def test_points_lie_on_the_box_with_its_corners_and_normals() -> None:
     assert np.allclose(np.linalg.norm(normals, axis=1), 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [n for n in sorted(shapes.names()) if ":" not in n])
 def test_points_cover_every_shape(name: str) -> None:
     """No point of the surface is farther than the spacing from a particle."""

@@ -26,6 +26,7 @@ def motions() -> list[Motion]:
     return [Motion(scene, simulate(scene)) for scene in scenes]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_weights_predict_motion(name: str, motions: list[Motion]) -> None:
     """The error after 0.6 s is at most half of that of constant velocity; random weights fail."""

@@ -137,6 +137,7 @@ def steps(model: Any, batch: Batch, count: int, rate: float = 2e-3) -> list[floa
     return losses
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "count"), OVERFITTED.items())
 def test_a_model_overfits_one_batch(name: str, count: int) -> None:
     """Dynamics of frozen encoders repeat the last feature at first, so that their first loss is

@@ -238,6 +238,7 @@ def test_scenery_stands_on_both_sides_of_the_ledge() -> None:
     assert all(math.hypot(*thing.position[:2]) < 6 for thing in scenery)
 
 
+@pytest.mark.slow
 def test_probes_of_collisions_are_tumbled_and_start_above_the_floor() -> None:
     params = roll.RollParameters(template=("collision",))
     raised = 0
