@@ -6,7 +6,8 @@ The order lets the renderer draw and shade the first two once for all frames.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,21 +119,22 @@ def assemble(scene: Scene, room: Room) -> Assembly:
     moving = [i for i in range(len(scene.bodies)) if i not in set(static)]
     for i in static + moving:
         body = scene.bodies[i]
-        form = shape(body.shape)
-        mesh = form.mesh
-        part = solid(
-            np.asarray(mesh.vertices, np.float64),
-            np.asarray(mesh.faces, np.int32),
-            np.asarray(body.scale),
-            mesh.smooth,
-            table.add(body.look),
-        )
+        bare = _bare_mesh(body.shape, tuple(body.scale))
+        part = replace(bare, materials=np.full(len(bare.faces), table.add(body.look), np.int32))
         if body.name not in (scene.roles.agent, scene.roles.patient):
-            part = painted(part, form, table.add)
+            part = painted(part, shape(body.shape), table.add)
         parts.append((part, i))
     for i, cloth in enumerate(scene.cloths):
         parts.append((sheet(cloth.resolution, table.add(cloth.look)), len(scene.bodies) + i))
     return _concatenate(parts, 1 + len(static), table)
+
+
+@lru_cache(maxsize=64)
+def _bare_mesh(name: str, scale: tuple[float, ...]) -> MeshPart:
+    """Return the mesh of a shape, of the first material; scenes share it, so it is not changed."""
+    mesh = shape(name).mesh
+    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
+    return solid(vertices, faces, np.asarray(scale), mesh.smooth, 0)
 
 
 def _concatenate(

@@ -182,7 +182,11 @@ class FieldReader(GuardedHdf5):
     def array(self, path: str) -> NDArray[Any]:
         """Return the whole array of the declared field at ``path``."""
         dataset = self._dataset(path, _ARRAYS[path])
-        return np.asarray(self.guard(path, lambda: dataset[()]))
+        values = np.empty(dataset.shape, _ARRAYS[path].dtype)
+        if values.size:
+            # The lower layer of h5py, as in `GuardedHdf5.find`.
+            self.guard(path, lambda: dataset.id.read(h5py.h5s.ALL, h5py.h5s.ALL, values))
+        return values
 
     def image(self, name: str, frame: int) -> NDArray[Any]:
         """Return one frame of the image pass ``name``."""

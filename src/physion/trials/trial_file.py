@@ -186,7 +186,7 @@ class Trial:
         check_seal(data, where)
         self._where = where
         self._renderers: dict[tuple[int, int, str], Renderer] = {}
-        self._reader = FieldReader(open_hdf5(io.BytesIO(data), where), where)
+        self._reader = FieldReader(open_hdf5(data, where), where)
         for path in (*FIELDS, *(GEOMETRY if self._reader.has_geometry() else ())):
             self._reader.check(path)
         for name in self.pass_names:
