@@ -154,7 +154,7 @@ def make_data(folder: Path) -> None:
         ("all", tuple(scenarios.names()), counts),
     ):
         report = make_trials(folder / name, plan_dataset("physion", chosen, sizes), settings)
-        print(name, report)
+        print(f"{name}: {len(report.made)} made, {len(report.failed)} failed", flush=True)
 
 
 def run_collide(folder: Path) -> str:
