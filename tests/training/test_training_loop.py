@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from lightning_fabric import Fabric
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from physion.atomic import folder_lock
@@ -324,6 +325,15 @@ def test_memory_that_is_used_up_names_the_setting_to_lower(error: Exception) -> 
         run(Large(), settings=replace(QUICK, held_out=0.0))
     with pytest.raises(OutOfMemoryError, match=r"at batch 1; use .*bf16-mixed"):
         run(Large(), settings=replace(QUICK, held_out=0.0, batch=1))
+
+
+def test_features_that_do_not_fit_into_memory_are_not_blamed_on_the_batch() -> None:
+    class Full(MovingValues):
+        def features(self, trials: Sequence[str]) -> NDArray[np.float32]:
+            raise MemoryError
+
+    with pytest.raises(OutOfMemoryError, match=r"features of 20 training trials .* fewer trials"):
+        run(NextBrightness("features"), source=Full())
 
 
 @pytest.mark.parametrize(

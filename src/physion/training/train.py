@@ -233,7 +233,13 @@ def _windows(
     if features is None:
         raise BadInputError(f"model {model.provenance().model!r} is trained on features")
     with fabric.rank_zero_first():  # which stores them for the others
-        values = features(trials)
+        try:
+            values = features(trials)
+        except MemoryError as error:
+            raise OutOfMemoryError(
+                f"the features of {len(trials)} training trials do not fit into memory; train on "
+                "fewer trials, or use pooled features or a smaller image_size of the model"
+            ) from error
     frames = [source.length(trial) for trial in trials]
     first, second = (
         FeatureWindows(model.spec, trials, values, frames, part, model.window)
