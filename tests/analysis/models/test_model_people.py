@@ -38,7 +38,7 @@ from physion.analysis.statistics.calibration import (
     decompose,
     reliability_curve,
 )
-from physion.analysis.statistics.jackknife import Variance
+from physion.analysis.statistics.jackknife import Variance, degrees_of_freedom
 from physion.analysis.statistics.kappa import correctness
 from physion.analysis.statistics.paired import (
     benjamini_hochberg,
@@ -160,7 +160,10 @@ def test_intervals_are_those_of_leaving_out_people_or_stimuli(
                 assert np.isnan(found).all() and "do not enter" in row["reason"]
                 continue
             values = np.array([value[measure] for value in without])
-            variance = Variance(np.asarray((n - 1) * np.var(values)), np.asarray(n - 1.0))
+            df = np.asarray(n - 1.0)
+            if measure != "accuracy":
+                df = degrees_of_freedom(values - values.mean(), np.asarray(float(n)))
+            variance = Variance(np.asarray((n - 1) * np.var(values)), df)
             expected = variance.interval(whole[measure], 0.95, metrics.get(measure).scale)
             if what == "stimuli":
                 assert found == pytest.approx(expected, abs=1e-9), (what, measure)
@@ -174,7 +177,7 @@ def test_a_perfect_model_lies_in_its_interval_as_often_as_it_should(drawn: Resam
     """The noise of people's averages counts once: in the value, not again in the interval."""
     rng = np.random.default_rng(5)
     chosen = {name: metrics.get(name) for name in ("rmsd", "r")}
-    rows: dict[str, list[tuple[float, float, float]]] = {name: [] for name in chosen}
+    rows: dict[str, list[tuple[float, ...]]] = {name: [] for name in chosen}
     true = rng.beta(0.8, 0.8, 60)
     for _ in range(120):
         if drawn == "both":
@@ -189,12 +192,12 @@ def test_a_perfect_model_lies_in_its_interval_as_often_as_it_should(drawn: Resam
                  for name, metric in chosen.items()}  # fmt: skip
         for name, variance in sampling_variances(models, answers, chosen, drawn).items():
             low, high = variance.of(0).interval(value[name], 0.95, metrics.get(name).scale)
-            rows[name].append((value[name], low, high))
+            rows[name].append((value[name], low, high, float(np.sqrt(variance.value[0]))))
     for name, found in rows.items():
-        values, low, high = np.array(found).T
+        values, low, high, sd = np.array(found).T
         inside = (low < values.mean()) & (values.mean() < high)
         assert 0.88 <= inside.mean() <= 0.995, name
-        assert np.mean(high - low) == pytest.approx(3.92 * np.std(values), rel=0.25), name
+        assert np.mean(sd) == pytest.approx(np.std(values), rel=0.25), name
         assert ((low < values) & (values < high)).all(), name
 
 

@@ -57,6 +57,11 @@ class Metric:
     two_people: Compute | None
     position: int
 
+    @property
+    def counts(self) -> bool:
+        """Whether the metric is a function of counts of the model's answers (`jackknife`)."""
+        return self.needs == "outcome"
+
     def __call__(self, sample: Sample) -> Array:
         """Return the values (b, m); division by zero gives NaN without a warning."""
         with np.errstate(divide="ignore", invalid="ignore"):

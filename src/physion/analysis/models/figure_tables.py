@@ -339,7 +339,7 @@ def _effect(
         for _, part in subset.groupby("scenario"):
             mean = part.groupby("stimulus")["right"].mean().sort_index().to_numpy(np.float64)
             values.append(mean.mean())
-            variances.append(variance_of_mean(mean))
+            variances.append(variance_of_mean(mean, counts=True))
         value = float(np.mean(values))
         low, high = mean_of(variances).interval(value, level, "fraction")
         records.append((panel, model, group, value, low, high, np.nan,

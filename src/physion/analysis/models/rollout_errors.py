@@ -76,7 +76,8 @@ def rollout_error_table(errors: pd.DataFrame, level: float = 0.95) -> pd.DataFra
     errors
         From `read_rollout_errors`.
     level
-        Level of the intervals, which are symmetric in the logarithm of the mean error.
+        Level of the intervals, which are symmetric in the logarithm of the mean error. Errors are
+        skewed, which `jackknife.degrees_of_freedom` takes into account.
     """
     agents = list(dict.fromkeys(errors["agent"]))
     scenarios = in_order(set(errors["scenario"]))

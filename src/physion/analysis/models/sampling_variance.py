@@ -19,6 +19,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import numpy.typing as npt
 
+from physion.analysis.metrics import metrics
 from physion.analysis.models.model_people import Models, sample_of_models
 from physion.analysis.people.answers import ScenarioAnswers
 from physion.analysis.sample import Resampled, Sample
@@ -27,7 +28,7 @@ from physion.seeds import generator
 
 Array = npt.NDArray[np.float64]
 Computes = Mapping[str, Callable[[Sample], Array]]
-"""By name, functions from a `Sample` to values (b, m)."""
+"""By name of the metric, functions from a `Sample` to values (b, m)."""
 
 PAIRS = 2000
 """Most pairs of people for the correction of second order."""
@@ -69,7 +70,8 @@ def _over_stimuli(
         values = compute(sample)
         # One person with another has one column, for which every stimulus counts.
         used = predicted if values.shape == predicted.shape else None
-        variances[name] = jackknife(values, used=used)
+        counts = name in metrics and metrics.get(name).counts
+        variances[name] = jackknife(values, used=used, counts=counts)
     return variances
 
 

@@ -152,10 +152,11 @@ def _record(
         "changed": int((rows["label"] != rows["simulated"]).sum()),
     }
     for key, values in values_of.items():
-        variance = jackknife(values[1:], strata)
-        low, high = variance.interval(float(values[0]), level, metrics.get(key).scale)
+        metric = metrics.get(key)
+        variance = jackknife(values[1:], strata, counts=metric.counts)
+        low, high = variance.interval(float(values[0]), level, metric.scale)
         if np.isfinite(values[0]) and np.isnan(low) and len(rows) > 1:
-            name = metrics.get(key).label or key
+            name = metric.label or key
             reasons.append(f"{name}: no interval, too few stimuli or undefined without one of them")
         record |= {key: float(values[0]), f"{key}_low": low, f"{key}_high": high}
     if len(rows) > 1 and record["accuracy_low"] == record["accuracy_high"]:

@@ -4,10 +4,14 @@ A statistic is computed again without each of the units (stimuli or people). Unl
 which draws the observed people again and so adds their sampling noise to that which the observed
 averages have already, this leaves the expected value of the statistic nearly where it is. The
 variance of what is nonlinear in the units is estimated too large, which `second_order` corrects.
+A few units that weigh much make the estimated variance uncertain, and mostly too small; intervals
+are then wider by the degrees of freedom of `degrees_of_freedom`.
 
 References
 ----------
 B. Efron and C. Stein, *The jackknife estimate of variance*, Annals of Statistics 9, 1981, 586-596.
+F. E. Satterthwaite, *An approximate distribution of estimates of variance components*, Biometrics
+Bulletin 2, 1946, 110-114.
 """
 
 from __future__ import annotations
@@ -99,7 +103,11 @@ def delete_one(sizes: Sequence[int]) -> tuple[list[Array], Integers]:
 
 
 def jackknife(
-    values: Array, strata: Integers | None = None, used: npt.NDArray[np.bool_] | None = None
+    values: Array,
+    strata: Integers | None = None,
+    used: npt.NDArray[np.bool_] | None = None,
+    *,
+    counts: bool = False,
 ) -> Variance:
     """Return the jackknife estimate of the variance of statistics.
 
@@ -111,6 +119,9 @@ def jackknife(
         (n,): stratum of each unit, drawn independently of the others; None: one stratum.
     used
         Of the shape of ``values``: whether the unit enters the statistic at all; None: all do.
+    counts
+        Whether the statistic is a function of counts, such as an accuracy. Its variance then
+        follows from its value, and the degrees of freedom are n - 1.
 
     Returns
     -------
@@ -124,7 +135,7 @@ def jackknife(
         V = (n - 1) / n * sum (v_i - mean(v))^2
 
     Strata add up, with the degrees of freedom of Welch and Satterthwaite,
-    (sum V)^2 / sum (V^2 / (n - 1)).
+    (sum V)^2 / sum (V^2 / df) with the df of `degrees_of_freedom`.
     """
     groups = np.zeros(len(values), dtype=np.int_) if strata is None else strata
     counted = np.ones(values.shape, dtype=bool) if used is None else used
@@ -134,24 +145,67 @@ def jackknife(
         n = own.sum(axis=0).astype(np.float64)
         with np.errstate(divide="ignore", invalid="ignore"):
             mean = np.sum(np.where(own, rows, 0.0), axis=0) / n
-            squares = np.sum(np.where(own, (rows - mean) ** 2, 0.0), axis=0)
+            apart = np.where(own, rows - mean, 0.0)
+            squares = np.sum(apart**2, axis=0)
             parts.append(np.where(n > 1, (n - 1) / n * squares, np.where(n > 0, np.nan, 0.0)))
-        dfs.append(np.maximum(n - 1, 1))
+        dfs.append(np.maximum(n - 1, 1) if counts else degrees_of_freedom(apart, n))
     if not parts:
         return Variance(np.full(values.shape[1:], np.nan), np.full(values.shape[1:], np.nan))
     return add([Variance(part, df) for part, df in zip(parts, dfs, strict=True)])
 
 
-def variance_of_mean(values: Array) -> Variance:
+def variance_of_mean(values: Array, *, counts: bool = False) -> Variance:
     """Return the variance of the mean of values (n, ...), which is that of the jackknife.
 
-    NaN are left out; the result is NaN for fewer than two values.
+    NaN are left out; the result is NaN for fewer than two values. ``counts``: the values are 0 or
+    1, as in `jackknife`.
     """
-    n = np.sum(np.isfinite(values), axis=0).astype(np.float64)
+    known = np.isfinite(values)
+    n = np.sum(known, axis=0).astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
-        mean = np.nansum(values, axis=0) / n
-        squares = np.nansum((values - mean) ** 2, axis=0)
-        return Variance(np.where(n > 1, squares / (n - 1) / n, np.nan), np.maximum(n - 1, 1))
+        mean = np.sum(np.where(known, values, 0.0), axis=0) / n
+        apart = np.where(known, values - mean, 0.0)
+        variance = np.where(n > 1, np.sum(apart**2, axis=0) / (n - 1) / n, np.nan)
+    return Variance(variance, np.maximum(n - 1, 1) if counts else degrees_of_freedom(apart, n))
+
+
+def degrees_of_freedom(apart: Array, n: Array) -> Array:
+    """Return the degrees of freedom of the variance of n values, from their kurtosis.
+
+    Parameters
+    ----------
+    apart
+        (units, ...): the values less their mean, 0 for units that do not count.
+    n
+        (...): how many count.
+
+    Returns
+    -------
+    df
+        At least 1 and at most n - 1, which it is for fewer than four values.
+
+    Notes
+    -----
+    With the excess kurtosis k, the variance of an estimated variance s^2 is::
+
+        s^4 (k / n + 2 / (n - 1))
+
+    (A. M. Mood, F. A. Graybill and D. C. Boes, *Introduction to the Theory of Statistics*, 1974,
+    page 229). A multiple of chi-square with the same mean and variance has::
+
+        df = 2 / (k / n + 2 / (n - 1))
+
+    degrees of freedom (Satterthwaite), which is n - 1 for normal values. k is the usual unbiased
+    estimate for normal values. Means of log-normal values, of which most samples lack the
+    largest, then have intervals whose coverage is right within 2 % from 60 values on
+    (``benchmarks/interval_coverage.py``).
+    """
+    most = np.maximum(n - 1, 1.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        second, fourth = np.sum(apart**2, axis=0) / n, np.sum(apart**4, axis=0) / n
+        excess = (n - 1) / ((n - 2) * (n - 3)) * ((n + 1) * (fourth / second**2 - 3) + 6)
+        df = 2 / (excess / n + 2 / (n - 1))
+    return np.where((n > 3) & (df > 0), np.clip(df, 1.0, most), most)
 
 
 def add(variances: Sequence[Variance]) -> Variance:
