@@ -333,8 +333,9 @@ def _people(
 def _describe_scores(scenario: str, single: bool) -> dict[str, str]:
     descriptions = {
         "Ranks": "by the column sorted by; equal scores have the same rank, and models that lack "
-        "stimuli rank after those that lack none. In brackets the 95 % interval of the rank over "
-        "draws of stimuli and, where their single answers are known, of people",
+        "stimuli rank after those that lack none. Beside it the 95 % interval of the rank, for "
+        "other stimuli and, where their single answers are known, other people: 1 + the models "
+        "that are significantly better, to those that may be better",
         "Normalised scores": "r of its ceiling: r divided by the expected r of a model that knows "
         "the true fractions of yes; kappa of people's: kappa from averages divided by that of one "
         "person with another",
