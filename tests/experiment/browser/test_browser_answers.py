@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,7 +17,7 @@ import sqlalchemy as sa
 from physion.experiment.store.database import open_database, sqlite_url
 from physion.experiment.store.tables import TOKENS
 from physion.experiment.study.study import Study
-from support.experiment.browser import Visit, chromium, rows_of, served, signed_query
+from support.experiment.browser import SHORT, Visit, chromium, rows_of, served, signed_query
 
 __all__ = ["chromium"]
 pytestmark = pytest.mark.slow
@@ -148,3 +151,112 @@ def test_a_refused_answer_is_stored_as_event_before_removal(
     assert event.data == {
         "code": "already_answered", "phase": "test", "trial": 0, "response": "no",
     }  # fmt: skip
+
+
+class Early:
+    """Makes a visit's answers too early: the server learns of each showing only with its answer.
+
+    The first announcement of a showing is held back, and the one before the answer says that the
+    showing begins now. ``responses``: those to answers, by the key of the answer.
+    """
+
+    def __init__(self, visit: Visit) -> None:
+        self.responses: dict[str, list[Any]] = {}
+        self._first: dict[str, Any] = {}
+        self._held: list[Any] | None = None
+        visit.context.route("**/api/showings", self._announce)
+        visit.context.route("**/api/answers", self._answer)
+        visit.context.on("response", self._note)
+
+    def hold(self) -> None:
+        """Hold back answers that are sent again."""
+        self._held = []
+
+    def release(self) -> None:
+        """Send what was held back."""
+        held, self._held = self._held or [], None
+        for route in held:
+            route.continue_()
+
+    def _announce(self, route: Any) -> None:
+        showing = route.request.post_data_json
+        if showing["key"] not in self._first:
+            self._first[showing["key"]] = route
+            return
+        route.continue_(post_data=json.dumps({**showing, "ago_ms": 0}))
+        first, self._first[showing["key"]] = self._first[showing["key"]], None
+        if first is not None:
+            first.fulfill(json={"showings": 1})
+
+    def _answer(self, route: Any) -> None:
+        again = route.request.post_data_json["key"] in self.responses
+        if again and self._held is not None:
+            self._held.append(route)
+        else:
+            route.continue_()
+
+    def _note(self, response: Any) -> None:
+        if response.url.endswith("/api/answers"):
+            key = response.request.post_data_json["key"]
+            self.responses.setdefault(key, []).append(response)
+
+
+WATCH_TROUBLE = """() => {
+  window.troubles = [];
+  const status = document.getElementById("status");
+  new MutationObserver(() => window.troubles.push(status.textContent))
+    .observe(status, {childList: true, characterData: true, subtree: true});
+}"""
+"""Function that keeps what the page says about the connection from now on."""
+
+
+def test_answers_that_are_too_early_are_sent_again(chromium: Any, tmp_path: Path) -> None:
+    """After the time that the server says; the participant notices nothing and goes on."""
+    timing = replace(SHORT, cue_ms=2000)
+    with (
+        served(tmp_path, test=2, familiarization=1, timing=timing) as (study, server),
+        Visit(chromium, server.url, "early") as visit,
+    ):
+        early = Early(visit)
+        visit.begin("?participant=Early&language=en")
+        visit.page.evaluate(WATCH_TROUBLE)
+        visit.answer("yes")
+        visit.see_feedback()  # comes when the answer is stored
+        visit.begin_test()
+        early.hold()
+        visit.answer("no")
+        visit.page.get_by_text("Trial 2 of 2").wait_for()
+        assert visit.page.evaluate(KEPT) == [0]
+        early.release()
+        visit.wait_for_answer()
+        while visit.page.evaluate(KEPT):
+            visit.page.wait_for_timeout(50)
+        assert visit.page.evaluate("window.troubles") == []
+        # A reload does not lose an answer that waits.
+        early.hold()
+        with visit.page.expect_response("**/api/answers"):
+            visit.page.click(".answer[data-response=yes]")
+        assert visit.page.evaluate(KEPT) == [1]
+        early.release()
+        visit.page.reload()
+        visit.heading("About you")
+        assert visit.page.evaluate(KEPT) == []
+        assert visit.page.locator("#status").inner_text() == ""
+        statuses = [[one.status for one in sent] for sent in early.responses.values()]
+        for sent in list(early.responses.values())[:2]:
+            refused, accepted = (one.request for one in sent)
+            wait_ms = 1000 * int(sent[0].headers["retry-after"])
+            began = refused.timing["startTime"]
+            assert wait_ms >= 1000 and accepted.timing["startTime"] - began >= wait_ms
+            assert accepted.post_data_json == refused.post_data_json
+        assert [line for line in visit.unexpected() if "status of 425" not in line] == []
+        visit.finish()
+    assert statuses[:2] == [[425, 200]] * 2
+    # The new load of the page sends it at once, which is too early again.
+    assert set(statuses[2][:-1]) == {425} and statuses[2][-1] == 200
+    session, answers, events = rows_of(study, "Early")
+    stored = [(row.phase, row.trial, row.response) for row in answers]
+    assert stored == [("familiarization", 0, "yes"), ("test", 0, "no"), ("test", 1, "yes")]
+    assert [row.key for row in answers] == list(early.responses)
+    assert session.implausible is None
+    assert "answer_refused" not in {event.kind for event in events}

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from support.experiment.browser import FAST, SIZE, Visit, chromium, rows_of, served
+from support.experiment.browser import FAST, HIDE, SIZE, Visit, chromium, rows_of, served
 
 __all__ = ["chromium"]
 SMALL = {"width": 700, "height": 400}
+HIDE_MOVIES = f"""
+const hide = {HIDE};
+document.addEventListener("playing", () => {{
+  if (!window.hideMovies) return;
+  hide(true);
+  setTimeout(hide, 50, false);
+}}, true);"""
+"""Script that hides the page for a moment whenever a movie starts, if `hideMovies` is set."""
 
 
 def to_the_test(visit: Visit, query: str) -> None:
@@ -81,3 +90,38 @@ def test_interrupted_trials_go_on_and_are_void(chromium: Any, tmp_path: Path) ->
     assert [row.frames_shown > 0 for row in test] == [True] * 3
     assert (session.replayed, session.implausible) == (0, None)
     assert not [row for row in events if row.kind == "trial_interrupted"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("interrupted", "showings"), [("void", 1), ("repeat", 6)])
+def test_a_trial_whose_movie_is_hidden_each_time_is_void(
+    chromium: Any, tmp_path: Path, interrupted: str, showings: int
+) -> None:
+    """At once, or after five repetitions; later trials count again."""
+    rules = replace(FAST, interrupted=interrupted)
+    with (
+        served(tmp_path / "s", familiarization=1, test=2, plausibility=rules) as (study, server),
+        Visit(chromium, server.url, f"hidden-{interrupted}") as visit,
+    ):
+        visit.context.add_init_script(HIDE_MOVIES)
+        to_the_test(visit, "?participant=Cy&language=en")
+        visit.page.evaluate("window.hideMovies = true")
+        visit.wait_for_answer()
+        visit.page.evaluate("window.hideMovies = false")
+        visit.answer("yes")
+        visit.answer("no")
+        visit.finish()
+        assert visit.unexpected() == []
+    session, answers, events = rows_of(study, "Cy")
+    test = [row for row in answers if row.phase == "test"]
+    assert [row.void for row in test] == ["hidden", None]
+    assert [row.showings for row in test] == [showings, 1]
+    details = [json.loads(row.details) for row in test]
+    assert [(one["attempts"], one["hidden"]) for one in details] == [(showings, showings), (1, 0)]
+    assert test[0].visibility_changes >= 2 * showings and test[1].visibility_changes == 0
+    assert [row.frames_shown > 0 for row in test] == [True, True]
+    # More showings than `max_showings` flag the session.
+    assert (session.replayed, session.implausible) == (int(showings > 2), None)
+    told = [row.data for row in events if row.kind == "trial_interrupted"]
+    again = [{"trial": 0, "attempt": i + 1, "reason": "hidden"} for i in range(showings - 1)]
+    assert told == again

@@ -55,6 +55,10 @@ def test_own_questions_are_asked_and_stored(chromium: Any, tmp_path: Path) -> No
         optional = page.get_by_role("radiogroup", name="Was it fun?")
         optional.get_by_label("2").check()
         visit.picture("answered")
+        # The choice of no answer is no part of the scale.
+        ends = optional.locator(".scale-ends").bounding_box()
+        none = optional.locator(".scale-ends + .radio").bounding_box()
+        assert none["y"] - (ends["y"] + ends["height"]) >= 10
         optional.get_by_label("I prefer not to say").check()
         visit.main_button().click()
         page.check("#difficulty-4")

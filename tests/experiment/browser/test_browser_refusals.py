@@ -17,7 +17,7 @@ from physion.experiment.store.tables import RAW_IDS, SESSIONS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Recruitment, Study
-from support.experiment.browser import Visit, chromium, rows_of, served
+from support.experiment.browser import HIDE, Visit, chromium, rows_of, served
 
 __all__ = ["chromium"]
 pytestmark = pytest.mark.slow
@@ -179,15 +179,6 @@ def test_movies_that_fail_are_shown_again(chromium: Any, site: tuple[Study, str]
     assert "movie_failed" in {event.kind for event in events}
 
 
-HIDE = (
-    "hidden => {"
-    "const set = (name, value) =>"
-    " Object.defineProperty(document, name, {value, configurable: true});"
-    "set('hidden', hidden); set('visibilityState', hidden ? 'hidden' : 'visible');"
-    "document.dispatchEvent(new Event('visibilitychange')); }"
-)
-
-
 def test_hiding_the_page_is_recorded(chromium: Any, site: tuple[Study, str]) -> None:
     study, url = site
     with Visit(chromium, url) as visit:
@@ -238,6 +229,7 @@ def test_a_trial_that_was_hidden_is_shown_again(chromium: Any, site: tuple[Study
     details = [json.loads(row.details) for row in answers]
     assert [(one["attempts"], one["hidden"]) for one in details] == [(3, 2), (6, 6)]
     assert [row.visibility_changes for row in answers] == [6, 12]
+    assert [row.void for row in answers] == [None, "hidden"]
     for row, one in zip(answers, details, strict=True):
         assert abs(row.cue_ms - 500) < 60
         assert [on for _, on in one["flashes"]] == [True, False]

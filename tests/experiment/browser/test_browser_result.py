@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs
 
@@ -11,7 +13,7 @@ import pytest
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.experiment.study.study import Recruitment, Study
-from support.experiment.browser import Visit, chromium, rows_of, served
+from support.experiment.browser import FAST, Visit, chromium, rows_of, served, signed_query
 
 __all__ = ["chromium"]
 pytestmark = pytest.mark.slow
@@ -127,3 +129,45 @@ def test_forms_go_to_no_other_host(chromium: Any, site: tuple[Study, str], addre
         visit.page.locator("#code").wait_for()
         assert visit.page.locator("form").count() == 0
         visit.page.get_by_text("You can close this window now.").wait_for()
+
+
+def test_an_implausible_session_gets_neither_code_nor_link(chromium: Any, tmp_path: Path) -> None:
+    """The page says whom to ask instead, also when the participant comes back to it."""
+    slow_readers = replace(FAST, reading_s=3600.0)
+    with (
+        served(tmp_path, test=2, familiarization=1, plausibility=slow_readers) as (study, server),
+        Visit(chromium, server.url, "withheld") as visit,
+    ):
+        visit.begin("?participant=Ada&language=en")
+        visit.practise(1)
+        visit.begin_test()
+        visit.answer("yes")
+        visit.answer("yes")
+        visit.heading("About you")
+        visit.send_forms()
+
+        secrets = (study.recruitment.link_code, study.recruitment.link_address)
+
+        def check_page() -> None:
+            told = visit.page.locator("#withheld").inner_text()
+            assert "before your participation is credited" in told and study.contact in told
+            said = visit.page.inner_text("main")
+            assert "You were right in 1 of 2 movies" in said
+            assert rows_of(study, "Ada")[0].reference in said
+            assert visit.page.locator("#code, #go, main form, main a").count() == 0
+            assert not [secret for secret in secrets if secret in visit.page.content()]
+
+        check_page()
+        visit.picture("result")
+        visit.page.reload()
+        check_page()
+        visit.go("?participant=Ada&language=en")
+        check_page()
+        assert visit.unexpected() == []
+        with Visit(chromium, server.url) as elsewhere:
+            elsewhere.go(f"{signed_query(study, 'Ada')}&language=en")
+            elsewhere.page.get_by_text("You have already taken part").wait_for()
+            assert elsewhere.page.locator("#code, #go, main form, main a").count() == 0
+            assert not [secret for secret in secrets if secret in elsewhere.page.content()]
+    assert all(secrets)
+    assert rows_of(study, "Ada")[0].implausible == "short"

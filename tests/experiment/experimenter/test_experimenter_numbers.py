@@ -79,17 +79,41 @@ def test_histograms_hold_everybody() -> None:
     assert accuracy_histogram([]).bars == () and "none yet" in rt_histogram([]).label
 
 
+MACOS = "Mozilla/5.0 (Macintosh; Intel Mac OS X 10_15_7) "
+IPHONE = "Mozilla/5.0 (iPhone; CPU iPhone OS 18_5 like Mac OS X) "
+LINUX = "Mozilla/5.0 (X11; Linux x86_64) "
+WEBKIT = "AppleWebKit/605.1.15 (KHTML, like Gecko) "
+BLINK = "AppleWebKit/537.36 (KHTML, like Gecko) "
+
+
 @pytest.mark.parametrize(
     ("agent", "name"),
     [
         *zip(BROWSERS, ("Chrome 150", "Firefox 140", "Safari 18"), strict=True),
-        (BROWSERS[0] + " Edg/150.0", "Edge 150"),
-        (BROWSERS[0] + " OPR/120.0", "Opera 120"),
+        (f"{LINUX}{BLINK}HeadlessChrome/150.0.0.0 Safari/537.36", "Chrome 150"),
+        (f"{IPHONE}{WEBKIT}CriOS/150.0.7151.79 Mobile/15E148 Safari/604.1", "Chrome 150"),
+        (BROWSERS[0] + " Edg/150.0.0.0", "Edge 150"),
+        (f"{IPHONE}{WEBKIT}Version/18.0 EdgiOS/149.0 Mobile/15E148 Safari/605.1.15", "Edge 149"),
+        (BROWSERS[0] + " OPR/120.0.0.0", "Opera 120"),
+        (f"{LINUX.replace(')', '; rv:128.0)')}Gecko/20100101 Firefox/128.0", "Firefox 128"),
+        (f"{IPHONE}{WEBKIT}FxiOS/140.0 Mobile/15E148 Safari/605.1.15", "Firefox 140"),
+        (f"{MACOS}{WEBKIT}Version/17.6 Safari/605.1.15", "Safari 17"),
+        (f"{IPHONE}{WEBKIT}Version/18.5 Mobile/15E148 Safari/604.1", "Safari 18"),
+        (f"{LINUX}{WEBKIT}Version/60.5 Safari/605.1.15", "WebKitGTK"),
+        (f"{LINUX}{WEBKIT}Version/18.0 Safari/605.1.15 Epiphany/605.1.15", "WebKitGTK"),
+        (f"Mozilla/5.0 (X11; Ubuntu; Linux x86_64) {WEBKIT}Version/60.5 Safari/605.1.15",
+         "WebKitGTK"),
+        (f"Mozilla/5.0 (Linux; Android 10; K) {BLINK}SamsungBrowser/28.0 Chrome/130.0.0.0 "
+         "Mobile Safari/537.36", "Samsung Internet 28"),
+        (f"Mozilla/5.0 (Linux; Android 14; Pixel; wv) {BLINK}Version/4.0 Chrome/150.0.0.0 "
+         "Mobile Safari/537.36", "Chrome 150"),
         ("", "browser not known"),
         ("curl/8", "other"),
+        ("Mozilla/5.0 (compatible; Konqueror/4.5; Linux) KHTML/4.5.4 (like Gecko)", "other"),
         ("Version/" * 100_000, "other"),
+        ("(X11; " * 100_000, "other"),
     ],
-)
+)  # fmt: skip
 def test_browsers_by_their_own_words(agent: str, name: str) -> None:
     assert browser_label(agent) == name
 

@@ -37,6 +37,14 @@ OFFLINE = re.compile(
     r"ERR_(INTERNET_DISCONNECTED|CONNECTION_(REFUSED|RESET)|EMPTY_RESPONSE)|status of (409|503)"
 )
 """Console messages of browsers about requests that a test lets fail."""
+HIDE = """
+hidden => {
+  const set = (name, value) => Object.defineProperty(document, name, {value, configurable: true});
+  set("hidden", hidden);
+  set("visibilityState", hidden ? "hidden" : "visible");
+  document.dispatchEvent(new Event("visibilitychange"));
+}"""
+"""Function of the page that hides it, or shows it again, as far as its scripts can tell."""
 
 
 # One per module: while it runs, its event loop blocks this thread for other event loops.
@@ -204,7 +212,12 @@ class Visit:
         self.main_button().click()
 
     def finish(self) -> None:
-        """Fill in demographics and feedback and wait for the result page."""
+        """Fill in demographics and feedback and wait for the completion code."""
+        self.send_forms()
+        self.page.locator("#code").wait_for()
+
+    def send_forms(self) -> None:
+        """Fill in demographics and feedback."""
         self.page.fill("#age", "33")
         self.page.select_option("#gender", "female")
         self.page.select_option("#education", "master")
@@ -213,7 +226,6 @@ class Visit:
         self.page.check("#technical-no")
         self.page.fill("#text", "<img src=x onerror=alert(1)> 'ok'")
         self.main_button().click()
-        self.page.locator("#code").wait_for()
 
 
 def rows_of(study: Study, raw_id: str) -> tuple[Any, list[Any], list[Any]]:

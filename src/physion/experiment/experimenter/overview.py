@@ -354,16 +354,21 @@ _BROWSERS = (
     ("Samsung Internet", r"SamsungBrowser/(\d+)"),
     ("Firefox", r"(?:Firefox|FxiOS)/(\d+)"),
     ("Chrome", r"(?:Headless)?(?:Chrome|CriOS)/(\d+)"),
+    # It calls itself Safari, of a version that is neither Safari's nor its own.
+    ("WebKitGTK", r"\(X11; [^)]*\) .* Version/\S+ Safari/"),
     ("Safari", r"Version/(\d+)\S* (?:Mobile/\S+ )?Safari/"),
 )
 
 
 def browser_label(user_agent: str) -> str:
-    """Return name and major version of a browser, such as ``Firefox 140``, or ``other``."""
+    """Return name and major version of a browser, such as ``Firefox 140``, or ``other``.
+
+    WebKitGTK does not tell its version.
+    """
     for name, pattern in _BROWSERS:
         match = re.search(pattern, user_agent[:1000])
         if match:
-            return f"{name} {match[1]}"
+            return " ".join((name, *match.groups()))
     return "other" if user_agent else "browser not known"
 
 
