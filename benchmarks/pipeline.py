@@ -3,7 +3,7 @@
     python benchmarks/pipeline.py [--parts workers ray thousand verify safe] [--write]
 
 - ``workers``: trials with movies by one and by two processes, in turn; ratio of wall times.
-- ``ray``: 200 trials without movies on Ray and on the local pool, in turn; ratio of wall times.
+- ``ray``: 200 trials of the readout with movies on Ray and on the local pool; ratio of wall times.
   Needs the extra 'ray'.
 - ``thousand``: 1,000 trials without movies: the finished command repeated, and ``verify`` beside a
   process that only reads all files and computes their SHA-256.
@@ -109,7 +109,8 @@ def workers() -> dict[str, float]:
 
 def ray() -> dict[str, float]:
     """Ray on this machine and the local pool."""
-    return in_turn(3, 200, WITHOUT_MOVIES, {"ray": ("--executor", "ray"), "local": ()})
+    what = (*WITH_MOVIES, "--split", "readout")
+    return in_turn(1, 200, what, {"ray": ("--executor", "ray"), "local": ()})
 
 
 def thousand() -> dict[str, float]:
