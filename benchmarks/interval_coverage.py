@@ -10,8 +10,8 @@ simulated are those of the published tables. An interval is about the expected v
 with other people, other stimuli, or both, of the same number; that value is the mean over all
 repeats (of ranks: the rank of the mean score). Coverage is the fraction of repeats whose interval
 contains it. Its standard error is 0.6 % with 1200 repeats; for means over eight scenarios, which
-are groups of repeats drawn at random, up to 1.8 %. Ranks, mixed models and pooled scenarios, which
-take long, have fewer repeats.
+are groups of repeats drawn at random, up to 1.8 %. What takes long has fewer repeats (column
+``repeats``): numbers about people, flags, hypotheses, ranks, mixed models and pooled scenarios.
 """
 
 from __future__ import annotations
@@ -38,12 +38,13 @@ BOUNDS = (93, 97)
 def markdown(table: pd.DataFrame, seconds: float, command: str) -> str:
     """The table as text: a summary by number, then every interval outside 93 to 97 %."""
     outside = table[~table["inside"].between(*BOUNDS)]
-    each = table[~table["what"].str.startswith("mean of 8")]
+    is_mean = table["what"].str.startswith("mean of 8")
+    groups = (("of single numbers", ~is_mean), ("of means of 8", is_mean))
+    counted = "; ".join(_counted(table[chosen], what) for what, chosen in groups if chosen.any())
     lines = [
         f"## {datetime.date.today()}, {platform.machine()}, `{command}`",
         "",
-        f"{len(table)} intervals, {seconds:.0f} s of processor. "
-        f"{_counted(each, 'of one scenario')}; {_counted(table.drop(each.index), 'of means')}.",
+        f"{len(table)} intervals, {seconds:.0f} s of processor. {counted}.",
         "",
         "| number | intervals | lowest % | mean % | highest % | outside 93 to 97 % |",
         "|---|---|---|---|---|---|",
@@ -98,7 +99,7 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help="write results/interval_coverage.md")
     options = parser.parse_args()
     coverage, began = Coverage(options.only, options.population), time.process_time()
-    repeats, few = options.repeats, max(2, options.repeats // 8)
+    repeats = options.repeats
 
     def done(what: str) -> None:
         print(f"{what}: {time.process_time() - began:.0f} s", flush=True)
@@ -107,14 +108,17 @@ def main() -> None:
         for drawn in RESAMPLED:
             measures(coverage, drawn, size, repeats)
             done(f"measures, {drawn} drawn, {size}")
-        for part in (of_stimuli, of_people, flags, hypotheses):
-            part(coverage, size, repeats)
+        of_stimuli(coverage, size, repeats)
+        done(f"differences, {size}")
+        for part in (of_people, flags):
+            part(coverage, size, repeats // 2)
             done(f"{part.__name__}, {size}")
-        rollout_errors(coverage, size, repeats // 2)
-        ranks(coverage, size, repeats // 2)
-        mixed_models(coverage, size, few)
-        done(f"rollout errors, ranks, mixed models, {size}")
-    pooled(coverage, SIZES[0], 2 * few)
+        for slow in (rollout_errors, hypotheses, ranks):
+            slow(coverage, size, repeats // 4)
+            done(f"{slow.__name__}, {size}")
+        mixed_models(coverage, size, repeats // 8)
+        done(f"mixed models, {size}")
+    pooled(coverage, SIZES[0], repeats // 4)
     command = f"python benchmarks/interval_coverage.py --repeats {repeats}"
     command += f" --size {' '.join(options.size)} --population {options.population}"
     command += f" --only {' '.join(map(repr, options.only))}" if options.only else ""

@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
 from physion.analysis.people.exclusions import (
     BY_CONSTRUCTION,
@@ -293,6 +294,10 @@ def test_the_effect_of_a_flag_is_found_and_its_interval_allows_for_people() -> N
     for column in ("low_accuracy", "flagged"):
         assert flag_effect(responses, poor, column)["reason"].tolist() == [BY_CONSTRUCTION]
     assert flag_effect(responses, poor.assign(slow=worse), "slow")["reason"].tolist() == [""]
+    one = flags["session"] == flags["session"].iloc[0]
+    single = flag_effect(responses, flags.assign(slow=one), "slow")
+    assert np.isfinite(single["b"].iloc[0]) and np.isnan(single["low"].iloc[0])
+    assert single["reason"].tolist() == ["one participant alone determines it"]
     other = flag_effect(responses, flags.assign(low_accuracy=False, flagged=worse), "flagged")
     assert other["reason"].tolist() == [""]
     with pytest.raises(BadInputError, match="no rule"):
@@ -316,6 +321,45 @@ def test_clustered_errors_are_wider_where_people_differ_and_cover_the_truth() ->
         found = clustered_logit(rows, "right", ["group"]).set_index("term").loc["group"]
         held += bool(found["low"] <= 0 <= found["high"])
     assert 88 <= held <= 100
+
+
+def test_clustered_errors_of_two_groups_are_those_of_the_means_of_people() -> None:
+    """Two groups of people with equally many answers each: Welch's test of their means."""
+    generator = np.random.default_rng(3)
+    sizes, answers = (5, 12), 30
+    person = np.repeat(np.arange(sum(sizes)), answers)
+    group = (person < sizes[0]).astype(float)
+    ability = generator.normal(0, 0.7, sum(sizes))[person]
+    right = generator.random(len(person)) < 1 / (1 + np.exp(-ability - 0.5))
+    rows = pd.DataFrame({"participant": person, "group": group, "right": right})
+    found = clustered_logit(rows, "right", ["group"]).set_index("term").loc["group"]
+    squared, parts, of_df = 0.0, 0.0, 0.0
+    for flag, n in ((1.0, sizes[0]), (0.0, sizes[1])):
+        means = rows[rows["group"] == flag].groupby("participant")["right"].mean()
+        slope = 1 / (means.mean() * (1 - means.mean()))
+        squared += slope**2 * means.var(ddof=1) / n
+        parts += slope / n
+        of_df += (slope / n) ** 2 / (n - 1)
+    assert found["se"] == pytest.approx(np.sqrt(squared))
+    assert found["df"] == pytest.approx(parts**2 / of_df)
+    assert (found["high"] - found["low"]) / 2 / found["se"] == pytest.approx(
+        stats.t.ppf(0.975, found["df"])
+    )
+
+
+@pytest.mark.slow
+def test_few_participants_with_a_property_have_wide_intervals() -> None:
+    """6 of 40 differ in nothing: the normal distribution would hold 0 in 88 % of the studies."""
+    held = 0
+    for seed in range(300):
+        generator = np.random.default_rng(seed)
+        person = np.repeat(np.arange(40), 30)
+        ability = generator.normal(0, 0.6, 40)[person]
+        right = generator.random(1200) < 1 / (1 + np.exp(-ability - 1))
+        rows = pd.DataFrame({"participant": person, "few": (person < 6) * 1.0, "right": right})
+        found = clustered_logit(rows, "right", ["few"]).set_index("term").loc["few"]
+        held += bool(found["low"] <= 0 <= found["high"])
+    assert 0.93 <= held / 300 <= 0.985
 
 
 @pytest.mark.parametrize(

@@ -138,9 +138,10 @@ def learning(test: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
 
     Logistic regression of correctness on the position in the order, in units of 100 trials, with
     standard errors clustered by participant (`clustered_logit`); for all scenarios together with an
-    intercept for each. Columns: ``scenario``, ``b`` (log odds per 100 trials), ``se``, ``z``,
-    ``p``, ``low``, ``high``, ``rows``, ``clusters``, ``reason``, ``first_half`` and ``second_half``
-    (accuracy in either half of the trials). Orders are random, so stimuli need no adjustment.
+    intercept for each. Columns: ``scenario``, ``b`` (log odds per 100 trials), ``se``, ``t``,
+    ``df``, ``p``, ``low``, ``high``, ``rows``, ``clusters``, ``reason``, ``first_half`` and
+    ``second_half`` (accuracy in either half of the trials). Orders are random, so stimuli need no
+    adjustment.
     """
     table = test.assign(hundred=test["trial"].to_numpy(dtype=np.float64) / 100)
     parts = [(name, table[table["scenario"] == name]) for name in in_order(table["scenario"])]

@@ -208,7 +208,7 @@ def _biases(tables: Mapping[str, pd.DataFrame]) -> str:
         PageColumn("first half", "first_half", digits=3),
         PageColumn("second half", "second_half", digits=3),
         PageColumn("log odds per 100 trials", "b", "interval", 3, "low", "high"),
-        PageColumn("z", "z"),
+        PageColumn("t", "t"),
         PageColumn("p", "p", "p"),
     ]
     questions = [

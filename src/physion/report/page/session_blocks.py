@@ -40,7 +40,7 @@ def sessions_alone(people: PeopleResults, models: str = "") -> str:
         columns = [
             PageColumn("rule", "term", "text"),
             PageColumn("log odds of being right", "b", "interval", 3, "low", "high"),
-            PageColumn("z", "z"),
+            PageColumn("t", "t"),
             PageColumn("p", "p", "p"),
             PageColumn("answers", "rows", "count"),
             PageColumn("participants", "clusters", "count"),
