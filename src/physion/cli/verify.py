@@ -1,4 +1,7 @@
-"""Check all files, labels and motions of a dataset, and name the files and fields with faults."""
+"""Check all files, labels and motions of a dataset, and name the files and fields with faults.
+
+With another dataset also name the trials that differ between both.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from typing import Annotated
 import tyro
 
 from physion.cli.output import Stages, console
+from physion.trials.making.compare_sets import Comparison, compare_datasets
 from physion.trials.making.verify import SAMPLE, verify_dataset
 
 
@@ -21,17 +25,26 @@ class Options:
     """Folder of a dataset."""
     again: int = SAMPLE
     """Number of trials to simulate and render again for a bitwise comparison; -1: all."""
+    against: Path | None = None
+    """Folder of another dataset, for example of another machine or version: trials that only one of
+    both has, or that differ in scene, motion, label or bytes of files, are named."""
     json: bool = False
-    """Print one JSON object: faults, differences from trials of another version, and notes."""
+    """Print one JSON object: faults, differences from trials of another version, and notes; with
+    --against also what differs from the other dataset."""
 
 
 def main(options: Options) -> int:
-    """Print faults and notes; return 1 if there is a fault."""
+    """Print faults, notes and differences; return 1 if there is a fault or a difference."""
+    other = None
     with Stages() as stages:
         result = verify_dataset(options.folder, again=options.again, progress=stages)
+        if options.against is not None:
+            other = compare_datasets(options.folder, options.against, progress=stages)
+    failed = bool(result.faults) or (other is not None and not other.equal)
     if options.json:
-        print(json_module.dumps(asdict(result), indent=1))
-        return 1 if result.faults else 0
+        compared = {} if other is None else {"against": asdict(other)}
+        print(json_module.dumps({**asdict(result), **compared}, indent=1))
+        return 1 if failed else 0
     for line in (*result.notes, *result.other_versions, *result.faults):
         console.print(line, markup=False, soft_wrap=True)
     others = result.other_versions
@@ -39,4 +52,21 @@ def main(options: Options) -> int:
     noted = f", {len(result.notes)} notes" if result.notes else ""
     line = f"{options.folder}: {len(result.faults)} faults{differ}{noted}"
     console.print(line, markup=False, soft_wrap=True)
-    return 1 if result.faults else 0
+    if other is not None and options.against is not None:
+        _print_comparison(other, options.folder, options.against)
+    return 1 if failed else 0
+
+
+def _print_comparison(compared: Comparison, folder: Path, against: Path) -> None:
+    """Print what differs between two datasets, and a line that counts it."""
+    lines = [f"made by other versions: {line}" for line in compared.versions]
+    for place, names in ((folder, compared.only_first), (against, compared.only_second)):
+        lines += [f"{name}: only in {place}" for name in names]
+    lines += compared.differences
+    alone = len(compared.only_first) + len(compared.only_second)
+    lines.append(
+        f"{folder} against {against}: {compared.same} trials are the same, "
+        f"{len(compared.differences)} differ, {alone} are in one of them alone"
+    )
+    for line in lines:
+        console.print(line, markup=False, soft_wrap=True)

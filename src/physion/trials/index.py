@@ -148,6 +148,13 @@ def describe_mixed_versions(table: pd.DataFrame) -> str:
     return f"the trials were made by several versions: {listed}; a new folder has those of one"
 
 
+def same_value(one: Any, other: Any) -> bool:
+    """Return whether two cells of an index are equal, or both missing."""
+    if pd.isna(one) or pd.isna(other):
+        return bool(pd.isna(one) and pd.isna(other))
+    return bool(one == other)
+
+
 def as_table(rows: list[dict[str, Any]]) -> pd.DataFrame:
     """Return rows as a table with the columns and types of `COLUMNS`, sorted by split and trial."""
     table = pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS)

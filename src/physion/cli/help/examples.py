@@ -61,7 +61,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "import": ("physion import official-files trials --split testing",),
     "import-official": ("physion import-official CHECKOUT study",),
-    "verify": ("physion verify trials --again 20",),
+    "verify": (
+        "physion verify trials --again 20",
+        "physion verify trials --against trials-of-another-machine",
+    ),
     "ls": ("physion ls models", "physion ls presets"),
     "doctor": ("physion doctor --reproduce",),
     "bench": ("physion bench", "physion bench --scenario drop --count 10 --json"),

@@ -27,6 +27,7 @@ from physion.trials.index import (
     index_bytes,
     index_row,
     read_index,
+    same_value,
 )
 from physion.trials.layout import CHOICES, INDEX, SETTINGS, TrialPaths, find_trials
 from physion.trials.making.choose import BALANCED, robustness, split_of, wanted_contact
@@ -200,14 +201,8 @@ def _compare(stored: Mapping[str, Any], paths: TrialPaths, trial: Trial) -> list
     return [
         f"{paths.trial}: {name} is {found[name]!s}, the index says {stored[name]!s}"
         for name in COLUMNS
-        if not _same(found[name], stored[name])
+        if not same_value(found[name], stored[name])
     ]
-
-
-def _same(one: Any, other: Any) -> bool:
-    if pd.isna(one) or pd.isna(other):
-        return bool(pd.isna(one) and pd.isna(other))
-    return bool(one == other)
 
 
 def _check_trial(paths: TrialPaths, trial: Trial) -> list[str]:
