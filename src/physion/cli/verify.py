@@ -13,7 +13,7 @@ from typing import Annotated
 import tyro
 
 from physion.cli.output import Stages, console
-from physion.trials.making.compare_sets import Comparison, compare_datasets
+from physion.trials.making.compare_sets import DatasetComparison, compare_datasets
 from physion.trials.making.verify import SAMPLE, verify_dataset
 
 
@@ -57,7 +57,7 @@ def main(options: Options) -> int:
     return 1 if failed else 0
 
 
-def _print_comparison(compared: Comparison, folder: Path, against: Path) -> None:
+def _print_comparison(compared: DatasetComparison, folder: Path, against: Path) -> None:
     """Print what differs between two datasets, and a line that counts it."""
     lines = [f"made by other versions: {line}" for line in compared.versions]
     for place, names in ((folder, compared.only_first), (against, compared.only_second)):

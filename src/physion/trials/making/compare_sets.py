@@ -1,4 +1,4 @@
-"""Comparison of two datasets that should be equal, such as those of two machines or versions."""
+"""DatasetComparison of two datasets that should be equal, such as those of two machines or versions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PICTURES = tuple(name for name in FILES if name != "trial_file")
 
 
 @dataclass
-class Comparison:
+class DatasetComparison:
     """What differs between two datasets, one line per finding.
 
     - ``same``: number of trials of both sets that have the same scene, motion, labels and files.
@@ -44,7 +44,9 @@ class Comparison:
         return not (self.only_first or self.only_second or self.differences)
 
 
-def compare_datasets(first: Path, second: Path, *, progress: Progress | None = None) -> Comparison:
+def compare_datasets(
+    first: Path, second: Path, *, progress: Progress | None = None
+) -> DatasetComparison:
     """Compare the trials of two datasets by name.
 
     Scenes, motions, labels and files are compared by the digests in both indices; `verify_dataset`
@@ -59,7 +61,7 @@ def compare_datasets(first: Path, second: Path, *, progress: Progress | None = N
     """
     tables = [read_index(folder).set_index("trial", drop=False) for folder in (first, second)]
     names = [set(table.index) for table in tables]
-    result = Comparison(
+    result = DatasetComparison(
         only_first=sorted(names[0] - names[1]), only_second=sorted(names[1] - names[0])
     )
     for column in _VERSIONS:
