@@ -1,4 +1,4 @@
-"""DatasetComparison of two datasets that should be equal, such as those of two machines or versions."""
+"""Comparison of two datasets that should be equal, such as those of two machines or versions."""
 
 from __future__ import annotations
 
