@@ -22,8 +22,9 @@ SCALE = 2
 tells trials apart as well."""
 LARGEST_DIFFERENCE = 40.0
 """Largest difference of a cell's mean colour between movie and rendered state, of 255. Compression
-changes cells by up to 20 (64 trials of all scenarios, 128 and 256 pixels); the movie of another
-trial of the same scenario and length differs by 60 or more somewhere (488 pairs)."""
+and the smaller pictures change cells by up to 22 (72 trials of all scenarios, 64, 128 and 256
+pixels); the movie of another trial of the same scenario differs by 57 or more somewhere (144
+pairs)."""
 
 
 def foreign_movies(paths: TrialPaths, trial: Trial) -> list[str]:
