@@ -7,7 +7,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
 from physion.numerics.kernel import kernel
 from physion.numerics.linear_algebra import dot, multiply, norm
@@ -55,6 +54,9 @@ def fill_shape(name: str, scale: Vec3, spacing: float) -> tuple[Points, Filled]:
 @lru_cache(maxsize=1024)
 def _planes(name: str, number: int) -> Points:
     """Return the faces (K, 4) of a convex piece of a shape: unit normal out, and offset."""
+    # Imported late: what only reads scenes and trials starts faster.
+    from scipy.spatial import ConvexHull
+
     return np.ascontiguousarray(ConvexHull(shape(name).pieces[number].vertices).equations)
 
 

@@ -11,7 +11,6 @@ from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
 from physion.numerics.elementary import arctan2
 from physion.numerics.kernel import kernel
@@ -106,6 +105,9 @@ def hull_faces(corners: F64) -> list[I64]:
 
     ``corners`` (K, 3) are points in metres, on the hull or within its faces.
     """
+    # Imported late: what only reads scenes and trials starts faster.
+    from scipy.spatial import ConvexHull
+
     hull = ConvexHull(corners)
     size = float(np.ptp(corners, axis=0).max())
     normals, offsets = hull.equations[:, :3], hull.equations[:, 3]

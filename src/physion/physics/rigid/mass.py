@@ -12,7 +12,6 @@ from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import ConvexHull
 
 from physion.numerics.linear_algebra import (
     apply,
@@ -137,6 +136,9 @@ def _from_moments(volume: float, first: F64, second: F64, mass: float) -> MassPr
 
 def hull_moments(corners: F64) -> tuple[float, F64, F64]:
     """Return the integrals of 1, x (3,) and x x^T (3, 3) over a convex hull of corners (K, 3)."""
+    # Imported late: what only reads scenes and trials starts faster.
+    from scipy.spatial import ConvexHull
+
     corners = np.asarray(corners, np.float64)
     inside = ordered_mean(corners, axis=0)
     triangles = corners[ConvexHull(corners).simplices] - inside

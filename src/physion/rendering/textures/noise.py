@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from physion.numerics.elementary import exp
 from physion.numerics.fourier import inverse_real_transform
@@ -81,6 +80,9 @@ def cells(rng: np.random.Generator, count: int) -> tuple[F32, F32, NDArray[np.in
         (SIZE, SIZE) each: distances to the nearest and to the second nearest point, in units of
         the texture's side, and the index of the nearest.
     """
+    # Imported late: what only reads scenes and trials starts faster.
+    from scipy.spatial import KDTree
+
     u, v = grid()
     points = rng.random((count, 2))
     texels = np.stack([u.ravel(), v.ravel()], 1).astype(np.float64)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import ConvexHull
 
 from physion.numerics.elementary import cos, sin
 from physion.numerics.linear_algebra import apply, dot, ordered_sum, outer
@@ -47,6 +46,9 @@ class Mesh:
 
 def hull(points: ArrayLike, smooth: float = 0.0) -> Mesh:
     """Return the convex hull of ``points`` (K, 3), with faces oriented outwards."""
+    # Imported late: what only reads scenes and trials starts faster.
+    from scipy.spatial import ConvexHull
+
     cloud = np.asarray(points, np.float64)
     convex = ConvexHull(cloud)
     faces = convex.simplices.astype(np.int32)
