@@ -21,7 +21,6 @@ def test_every_quantity_of_a_scenario_is_measured(capsys: pytest.CaptureFixture[
     assert row.keys() == COLUMNS.keys() and row.pop("scenario") == "drop"
     assert row.pop("agreement") in (0.0, 1.0)
     assert all(math.isfinite(value) and value > 0 for value in row.values())
-    assert row["passes_ms"] > row["color_ms"]
 
 
 @pytest.mark.parametrize(
