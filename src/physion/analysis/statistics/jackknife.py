@@ -196,8 +196,8 @@ def degrees_of_freedom(apart: Array, n: Array) -> Array:
         df = 2 / (k / n + 2 / (n - 1))
 
     degrees of freedom (Satterthwaite), which is n - 1 for normal values. k is the usual unbiased
-    estimate for normal values. Means of log-normal values, of which most samples lack the
-    largest, then have intervals whose coverage is right within 2 % from 60 values on
+    estimate for normal values. Means of few log-normal values still have intervals that are
+    somewhat too short, since most samples lack the largest values
     (``benchmarks/interval_coverage.py``).
     """
     most = np.maximum(n - 1, 1.0)

@@ -18,8 +18,8 @@ from physion.trials.video import read_chosen
 CELL = 8
 """Side in pixels of the cells whose mean colours are compared."""
 SCALE = 2
-"""The state is rendered with so many times fewer pixels a side, which takes a third of the time and
-tells trials apart as well."""
+"""The state is rendered with so many times fewer pixels a side, which takes less time and tells
+trials apart as well."""
 LARGEST_DIFFERENCE = 40.0
 """Largest difference of a cell's mean colour between movie and rendered state, of 255. Compression
 and the smaller pictures change cells by up to 22 (72 trials of all scenarios, 64, 128 and 256
