@@ -92,6 +92,8 @@ def in_turn(
     """
     seconds: dict[str, list[float]] = {name: [] for name in settings}
     with folders() as folder:
+        for options in settings.values():  # modules are compiled before anything is timed
+            cli("generate", folder(), "--count", 1, *what, *options)
         for _ in range(rounds):
             for name, options in settings.items():
                 wall, _ = cli("generate", folder(), "--count", count, *what, *options)

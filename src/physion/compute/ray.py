@@ -22,6 +22,11 @@ R = TypeVar("R")
 
 _WAITING_PER_CORE = 2
 """Tasks given to Ray for each core of the cluster; the others wait in this process."""
+_started_here: int | None = None
+"""Cores of the Ray that this process started; None if it started none.
+
+Ray and its workers stay, since a verb calls `map` several times and each start takes seconds.
+"""
 _THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
@@ -34,7 +39,8 @@ class RayExecutor:
     Parameters
     ----------
     address
-        Of a cluster, or ``auto``; empty: Ray is started on this machine and stopped afterwards.
+        Of a cluster, or ``auto``; empty: Ray is started on this machine by the first call of
+        `map`. It stops when this process ends, or when a call of `map` is ended early.
     workers
         Cores of a Ray that is started here; by default all.
     cpus, gpus, memory_gb
@@ -78,9 +84,7 @@ class RayExecutor:
         if not tasks:
             return
         ray = self._ray
-        started = not ray.is_initialized()
-        if started:
-            self._start()
+        self._connect()
         running: dict[Any, _Started] = {}
         try:
             remote = ray.remote(max_retries=0, **self._shares)(run_task)
@@ -104,8 +108,9 @@ class RayExecutor:
         finally:
             for ref in running:
                 ray.cancel(ref, force=True)
-            if started:
-                ray.shutdown()
+            if running and _started_here is not None:
+                # When this call returns, no task of it writes any more.
+                self._stop()
 
     def _window(self) -> int:
         """Return how many tasks Ray is given at a time."""
@@ -115,8 +120,22 @@ class RayExecutor:
         # No more than can run, so that the time of a task does not count its waiting.
         return max(1, int(cores / max(self._shares["num_cpus"], 1)))
 
+    def _connect(self) -> None:
+        """Connect to the cluster or start Ray on this machine, unless that was done before."""
+        if not self.address and _started_here not in (None, self.workers):
+            self._stop()
+        if not self._ray.is_initialized():
+            self._start()
+
+    def _stop(self) -> None:
+        """Stop the Ray that this process started."""
+        global _started_here
+        self._ray.shutdown()
+        _started_here = None
+
     def _start(self) -> None:
         """Connect to the cluster, or start Ray on this machine."""
+        global _started_here
         options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
         options["runtime_env"] = {"env_vars": _THREADS}
         if self.address:
@@ -128,6 +147,7 @@ class RayExecutor:
         except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
             text = " ".join(str(error).split())
             raise PhysionError(f"Ray cannot be reached at {self.address!r}: {text}") from error
+        _started_here = None if self.address else self.workers
 
     def _collect(self, ref: Any, done: _Started) -> TaskOutcome[Any] | None:
         """Return the outcome of a finished call; None if its task is to be started again."""
