@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,6 +31,35 @@ def cluster() -> Iterator[None]:
         ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, runtime_env=environment)
         yield
         ray.shutdown()
+
+
+STAYS = """
+import time
+import ray
+from physion.compute.ray import RayExecutor
+from support.tasks import process_of
+
+def node():
+    return ray.get_runtime_context().get_node_id()
+
+executor = RayExecutor(workers=1)
+first, second = ({o.value for o in executor.map(process_of, {"a": 1, "b": 2})} for _ in range(2))
+assert len(first) == 1 and first == second, (first, second)
+before = node()
+outcomes = RayExecutor(workers=2).map(time.sleep, {"short": 0, "long": 600})
+next(outcomes)
+assert node() != before
+outcomes.close()
+assert not ray.is_initialized()
+"""
+
+
+def test_ray_started_here_stays_for_the_next_call_until_one_is_ended_early(
+    cluster: None,
+) -> None:
+    # In a process of its own, since Ray of this one was started by the fixture.
+    run = subprocess.run([sys.executable, "-c", STAYS], capture_output=True, text=True, timeout=300)
+    assert run.returncode == 0, run.stderr
 
 
 def numbers(*values: int) -> dict[str, int]:
