@@ -1,4 +1,4 @@
-"""The schedule of `benchmarks/study_plan.py`, compared with closed forms."""
+"""The schedule of `benchmarks/trials/study_plan.py`, compared with closed forms."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-FILE = Path(__file__).parents[1] / "benchmarks" / "study_schedule.py"
+FILE = Path(__file__).parents[1] / "benchmarks" / "trials" / "study_schedule.py"
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,6 @@
 """The data sets and formulas that our mixed models and R's are compared on.
 
-``benchmarks/mixed_fixtures.py`` writes these data for R and keeps R's numbers in
+``benchmarks/analysis/mixed_fixtures.py`` writes these data for R and keeps R's numbers in
 ``fixtures/mixed_r.csv``; the tests make the same data again and check that they are the same.
 """
 

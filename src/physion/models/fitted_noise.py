@@ -1,8 +1,9 @@
 """Levels of noise that were fitted to recorded outcomes or to people's answers.
 
-`benchmarks/noise.py` divided the official configurations into two halves and fitted the levels on
-each. A scene gets the levels that were fitted on the half without its configuration, so that no
-prediction of an official scene rests on its own outcome, or on answers to it.
+`benchmarks/models/noise.py` divided the official configurations into two halves and fitted
+the levels on each. A scene gets the levels that were fitted on the half without its
+configuration, so that no prediction of an official scene rests on its own outcome, or on
+answers to it.
 """
 
 from __future__ import annotations

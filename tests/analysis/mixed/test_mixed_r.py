@@ -1,7 +1,8 @@
 """Our mixed models beside R's: lme4 with lmerTest, and glmmTMB, on the same data.
 
-The stored numbers come from ``benchmarks/mixed_fixtures.py``. Coefficients are compared in units of
-their standard errors. glmer stops a little early where a variance is zero, hence its 1 %.
+The stored numbers come from ``benchmarks/analysis/mixed_fixtures.py``. Coefficients are compared
+in units of their standard errors. glmer stops a little early where a variance is zero,
+hence its 1 %.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def stored(name: str, fitter: str) -> pd.DataFrame:
     """R's numbers of one case and fitter by (quantity, term)."""
     table = pd.read_csv(STORED, dtype=str, keep_default_na=False)
     rows = table[(table["case"] == name) & (table["fitter"] == fitter)]
-    assert len(rows), f"run benchmarks/mixed_fixtures.py --case {name!r}"
+    assert len(rows), f"run benchmarks/analysis/mixed_fixtures.py --case {name!r}"
     return rows.set_index(["quantity", "term"])["value"]
 
 

@@ -1,6 +1,6 @@
 """What DPI-Net (small) learns in a minute: contacts and motion of Collide.
 
-Three seeds and more steps: `benchmarks/particles.py`.
+Three seeds and more steps: `benchmarks/models/particles.py`.
 """
 
 from __future__ import annotations

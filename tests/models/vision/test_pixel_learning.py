@@ -1,6 +1,6 @@
 """What SVG and OP3 learn in seconds: squares that move, in small pictures.
 
-Rendered trials, and the sizes that users train: `benchmarks/vision_models.py learn`.
+Rendered trials, and the sizes that users train: `benchmarks/models/vision_models.py learn`.
 """
 
 from __future__ import annotations

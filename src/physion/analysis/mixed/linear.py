@@ -3,7 +3,7 @@
 As lme4::lmer with lmerTest: variances maximise the restricted likelihood, profiled over the
 residual variance; t tests have Satterthwaite's degrees of freedom. Not statsmodels' MixedLM: it has
 no degrees of freedom, and for crossed groups of this size does not finish in 300 s (``python
-benchmarks/mixed.py --others``).
+benchmarks/analysis/mixed.py --others``).
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 """Logistic regression with crossed random effects (maximum likelihood, Laplace approximation).
 
 Of the maintained fitters none is both fast and correct at the size of the study (800 participants,
-120 000 answers). ``python benchmarks/mixed.py --r --others`` compares them; its last results are in
-benchmarks/results/mixed.json. mixedlm and interlace-lme agree with this module and take one minute
-and three; GPBoost is fast, but stops early and gives standard errors of the fixed effects up to 65
-% too small; lme-python's coefficients differ by 0.2 of a standard error, as those of lme4 with nAGQ
-= 0 would; statsmodels has Bayesian approximations only, which do not finish in 300 s; bambi
-samples; pymer4 needs R.
+120 000 answers). ``python benchmarks/analysis/mixed.py --r --others`` compares them; its last
+results are in benchmarks/results/mixed.json. mixedlm and interlace-lme agree with this module and
+take one minute and three; GPBoost is fast, but stops early and gives standard errors of the fixed
+effects up to 65 % too small; lme-python's coefficients differ by 0.2 of a standard error, as those
+of lme4 with nAGQ = 0 would; statsmodels has Bayesian approximations only, which do not finish in
+300 s; bambi samples; pymer4 needs R.
 
 The marginal likelihood of the fixed effects and standard deviations is, as in glmmTMB and
 lme4::glmer(nAGQ = 1), that of the normal distribution around the mode of the random effects. Its

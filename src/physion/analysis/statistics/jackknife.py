@@ -198,7 +198,7 @@ def degrees_of_freedom(apart: Array, n: Array) -> Array:
     degrees of freedom (Satterthwaite), which is n - 1 for normal values. k is the usual unbiased
     estimate for normal values. Means of few log-normal values still have intervals that are
     somewhat too short, since most samples lack the largest values
-    (``benchmarks/interval_coverage.py``).
+    (``benchmarks/analysis/interval_coverage.py``).
     """
     most = np.maximum(n - 1, 1.0)
     with np.errstate(divide="ignore", invalid="ignore"):

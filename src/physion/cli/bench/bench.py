@@ -9,13 +9,13 @@ from __future__ import annotations
 import dataclasses
 import json as json_module
 import os
-import platform
 from dataclasses import dataclass
 
 import pandas as pd
 
 from physion.cli.output import Stages, console
 from physion.cli.text_table import text_table
+from physion.compute.machine import processor
 from physion.errors import BadInputError
 from physion.scenes.sampling.registry import scenarios
 from physion.version import MADE_WITH
@@ -63,7 +63,7 @@ def main(options: Options) -> int:
         for done, name in enumerate(names, start=1):
             rows.append(measure(name, options.count))
             stages("measuring", done, len(names))
-    machine = platform.processor() or platform.machine()
+    machine = processor()
     if options.json:
         values = {"package": MADE_WITH, "machine": machine, "cores": os.cpu_count()}
         found = [dataclasses.asdict(row) for row in rows]

@@ -1,0 +1,237 @@
+"""Intervals of models and of their agreement with people, for `interval_coverage.py`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pandas as pd
+from coverage_studies import F64, MODELS, SCENARIOS, Coverage, Size, Study, logistic
+
+from physion.analysis.leaderboard.ranks import rank_intervals
+from physion.analysis.metrics import all_metrics, metrics
+from physion.analysis.models.model_people import Models, sample_of_models
+from physion.analysis.models.model_tests import PooledStimuli, pool_scenarios
+from physion.analysis.models.paired_measures import paired_measures
+from physion.analysis.models.rollout_errors import CONSTANT_VELOCITY, rollout_error_table
+from physion.analysis.models.sampling_variance import sampling_variances
+from physion.analysis.models.score_tables import score_table
+from physion.analysis.sample import Resampled, Sample
+from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.statistics.calibration import reliability_curve
+from physion.analysis.statistics.correlation import correlate_resampled
+from physion.analysis.statistics.jackknife import Variance, jackknife
+from physion.analysis.statistics.paired import compare_models
+from physion.analysis.tables.stimuli import MEAN, POOLED
+from physion.seeds import generator
+
+LEFT_OUT = ("accuracy_simulated", "r_same", "euclid_over_n")
+"""Metrics that equal others where the simulated outcome is the official one, or up to a factor."""
+RANKED = (0.9, 0.8, 0.7, 0.6, 0.5)
+"""Slopes of the models that are ranked: logit slope s m + e with e standard normal."""
+
+
+def measures(coverage: Coverage, drawn: Resampled, size: Size, repeats: int) -> None:
+    """Every metric of every model, of one scenario and of the mean over eight."""
+    computes: dict[str, Callable[[Sample], F64]] = {}
+    for metric in all_metrics():
+        if drawn not in metric.resampled or metric.name in LEFT_OUT:
+            continue
+        if coverage.wants(*(f"mean of 8: {model}: {metric.name}" for model in MODELS)):
+            computes[metric.name] = metric
+        pair = f"two people: {metric.name}"
+        if metric.two_people is not None and coverage.wants(f"mean of 8: {pair}"):
+            computes[pair] = metric.of_two_people
+    if not computes:
+        return
+    values: dict[str, list[F64]] = {}
+    variances: dict[str, list[Variance]] = {}
+    for study in coverage.studies(drawn, size, repeats):
+        models, answers = study.models(), study.answers()
+        sample = sample_of_models(models, answers)
+        for name, variance in sampling_variances(models, answers, computes, drawn).items():
+            values.setdefault(name, []).append(computes[name](sample)[0])
+            variances.setdefault(name, []).append(variance)
+    rng = generator("groups of scenarios", repeats)
+    groups = [rng.choice(repeats, SCENARIOS, replace=False) for _ in range(repeats)]
+    for name in values:
+        value = np.array(values[name])
+        spread = Variance(
+            np.array([one.value for one in variances[name]]),
+            np.array([one.df for one in variances[name]]),
+        )
+        scale = metrics.get(name.removeprefix("two people: ")).scale
+        for k in range(value.shape[1]):
+            what = name if name.startswith("two people") else f"{MODELS[k]}: {name}"
+            for r in range(repeats):
+                variance = Variance(spread.value[r, k], spread.df[r, k])
+                one = float(value[r, k])
+                coverage.add(what, drawn, size, one, *variance.interval(one, 0.95, scale))
+            # Of independent scenarios; their population is the same, so is the expected value.
+            mean = np.array([value[group, k].mean() for group in groups])
+            total = np.array([spread.value[group, k].sum() for group in groups])
+            parts = np.array([(spread.value[g, k] ** 2 / spread.df[g, k]).sum() for g in groups])
+            with np.errstate(invalid="ignore"):
+                df = np.where(total > 0, total**2 / parts, 1.0)
+            for r in range(repeats):
+                variance = Variance(total[r] / SCENARIOS**2, df[r])
+                one = float(mean[r])
+                coverage.add(f"mean of 8: {what}", drawn, size, one,
+                             *variance.interval(one, 0.95, scale))  # fmt: skip
+
+
+def of_stimuli(coverage: Coverage, size: Size, repeats: int) -> None:
+    """Differences between models, r in a third of the stimuli, and calibration."""
+    pairs = [f"{a} less {b}: {measure}" for a in MODELS for b in MODELS
+             for measure in ("r", "rmsd", "kappa_from_averages")]  # fmt: skip
+    easy = [f"{name}: r, easy stimuli" for name in MODELS]
+    bin_name = "good: calibration, P 0.8 to 0.9"
+    wanted = [coverage.wants(*names) for names in (pairs, easy, [bin_name])]
+    if not any(wanted):
+        return
+    for study in coverage.studies("stimuli", size, repeats):
+        if wanted[0]:
+            _differences(coverage, size, study)
+        if wanted[1]:
+            _easy(coverage, size, study)
+        bin_ = reliability_curve(study.p_contact[1], study.label).iloc[8]
+        coverage.add(bin_name, "stimuli", size, bin_["share"], bin_["low"], bin_["high"])
+
+
+def _differences(coverage: Coverage, size: Size, study: Study) -> None:
+    pooled = pool_scenarios([(study.models(), study.answers())])
+    tests = compare_models(
+        list(MODELS), pooled.correct, pooled.p_contact, pooled.p_yes, permutations=1
+    )
+    for row in tests.to_dict("records"):
+        coverage.add(
+            f"{row['first']} less {row['second']}: r", "stimuli", size,
+            row["r_difference"], row["r_difference_low"], row["r_difference_high"],
+        )  # fmt: skip
+    _paired(coverage, "", size, pooled)
+
+
+def _paired(coverage: Coverage, prefix: str, size: Size | str, pooled: PooledStimuli) -> None:
+    """Add differences of RMSD and kappa; those of r are the ones of `compare_models`."""
+    table = paired_measures(pooled, permutations=1)
+    last = table["scenario"].iloc[-1]
+    table = table[(table["scenario"] == last) & (table["measure"] != "r")]
+    for row in table.to_dict("records"):
+        what = f"{prefix}{row['first']} less {row['second']}: {row['measure']}"
+        coverage.add(what, "stimuli", size, row["difference"], row["low"], row["high"])
+
+
+def _easy(coverage: Coverage, size: Size, study: Study) -> None:
+    easy = study.right >= 2 / 3
+    p_yes, without = study.p_yes[easy], 1 - np.eye(int(easy.sum()))
+    y, ones = np.broadcast_to(p_yes, without.shape), np.ones((1, len(p_yes)))
+    for k, name in enumerate(MODELS):
+        x = study.p_contact[k : k + 1, easy]
+        r = float(correlate_resampled(x, p_yes[None], ones)[0, 0])
+        variance = jackknife(correlate_resampled(x, y, without)).of(0)
+        coverage.add(f"{name}: r, easy stimuli", "stimuli", size, r,
+                     *variance.interval(r, 0.95, "correlation"))  # fmt: skip
+
+
+def rollout_errors(coverage: Coverage, size: Size, repeats: int) -> None:
+    """Mean errors of rollouts: log-normal ones of a model, exponential ones of the baseline."""
+    shapes = {"model": "log-normal", CONSTANT_VELOCITY: "exponential"}
+    if not coverage.wants(*(f"mean of 8: rollout error, {name}" for name in shapes.values())):
+        return
+    rng, stimuli = generator("rollout errors", *size), size[1]
+    scenario = np.repeat([f"s{k}" for k in range(SCENARIOS)], stimuli)
+    names = np.arange(len(scenario)).astype(str)
+    for _ in range(repeats):
+        errors = pd.DataFrame(
+            {"agent": "model", "scenario": scenario, "stimulus": names, "seconds": 0.03,
+             "error": rng.lognormal(0, 1, len(names)),
+             "baseline": rng.exponential(1, len(names))}
+        )  # fmt: skip
+        table = rollout_error_table(errors).set_index(["panel", "agent"])
+        for agent, shape in shapes.items():
+            for panel, row in table.xs(agent, level="agent").iterrows():
+                prefix = "mean of 8: " if panel == MEAN else ""
+                coverage.add(f"{prefix}rollout error, {shape}", "stimuli", size, row["value"],
+                             row["low"], row["high"])  # fmt: skip
+
+
+def pooled(coverage: Coverage, size: Size, repeats: int) -> None:
+    """The rows of all stimuli pooled and of the mean of the table of scores, and differences."""
+    named = f"8 x {size[0]} x {size[1]}"
+    shown = ("accuracy", "r", "kappa_from_averages", "rmsd", "r_beyond_outcome")
+    scores = [f"good, {where}: {name}" for where in (MEAN, POOLED) for name in shown]
+    pairs = [f"pooled: {a} less {b}: {measure}" for a in MODELS for b in MODELS
+             for measure in ("rmsd", "kappa_from_averages")]  # fmt: skip
+    if not coverage.wants(*scores, *pairs):
+        return
+    drawn = coverage.studies("stimuli", size, SCENARIOS * repeats)
+    for _ in range(repeats):
+        parts = {f"s{k}": next(drawn) for k in range(SCENARIOS)}
+        rows = [_good(name, study, size[0]) for name, study in parts.items()]
+        table = score_table(pd.concat(rows, ignore_index=True)).set_index("scenario")
+        for where in (MEAN, POOLED):
+            for name in shown:
+                row = table.loc[where]
+                coverage.add(f"good, {where}: {name}", "stimuli", named, row[name],
+                             row[f"{name}_low"], row[f"{name}_high"])  # fmt: skip
+        if coverage.wants(*pairs):
+            both = [(study.models(), study.answers(name)) for name, study in parts.items()]
+            _paired(coverage, "pooled: ", named, pool_scenarios(both))
+
+
+def _good(scenario: str, study: Study, people: int) -> pd.DataFrame:
+    """Return the rows of the model *good* as a table of a comparison has them."""
+    p_contact, label = study.p_contact[1], study.label.astype(bool)
+    return pd.DataFrame(
+        {
+            "agent": "good", "model": "good", "readout": "", "scenario": scenario,
+            "stimulus": [f"{scenario} {k:03d}" for k in range(len(label))],
+            "p_contact": p_contact, "predicted": p_contact > 0.5, "label": label,
+            "simulated": label, "count": people, "p_yes": study.p_yes,
+            "human_accuracy": study.right,
+        }
+    )  # fmt: skip
+
+
+def ranks(coverage: Coverage, size: Size, repeats: int) -> None:
+    """Ranks of five models that differ little, by r and by RMSD.
+
+    The true rank is that of the expected values.
+    """
+    names = [f"slope {slope}" for slope in RANKED]
+    shown = [name for name in ("r", "rmsd")
+             if coverage.wants(*(f"{model}: rank by {name}" for model in names))]  # fmt: skip
+    if not shown:
+        return
+    rng = generator("ranked models", *size)
+    values: dict[str, list[F64]] = {name: [] for name in shown}
+    found: dict[str, list[F64]] = {name: [] for name in shown}
+    for study in coverage.studies("both", size, repeats):
+        own = np.array(RANKED)[:, None] * (2 * study.label - 1) * study.easiness
+        p_contact = logistic(own + rng.normal(size=own.shape))
+        answers, models = study.answers(), len(names)
+        rows = pd.DataFrame(
+            {
+                "file": "f", "agent": np.repeat(names, size[1]), "scenario": "drop",
+                "stimulus": np.tile(answers.stimuli, models), "p_contact": p_contact.ravel(),
+                "predicted": (p_contact > 0.5).ravel(), "label": np.tile(study.label, models),
+                "p_yes": np.tile(study.p_yes, models), "count": size[0],
+                "human_accuracy": np.tile(study.right, models),
+            }
+        )  # fmt: skip
+        given = Models(tuple(names), p_contact, (p_contact > 0.5).astype(np.float64))
+        sample = sample_of_models(given, answers)
+        for name in shown:
+            metric = metrics.get(name)
+            values[name].append(metric(sample)[0])
+            table = rank_intervals(rows, {"drop": answers}, metric, "drop", Bootstrap())
+            found[name].append(table[["rank_low", "rank_high"]].to_numpy(dtype=np.float64))
+    for name in shown:
+        sign = -1 if metrics.get(name).better == "higher" else 1
+        expected = sign * np.mean(values[name], axis=0)
+        truth = 1 + np.argsort(np.argsort(expected))
+        for own_values, bounds in zip(values[name], found[name], strict=True):
+            own_rank = 1 + np.argsort(np.argsort(sign * own_values))
+            for k, model in enumerate(names):
+                coverage.add(f"{model}: rank by {name}", "both", size, float(own_rank[k]),
+                             *bounds[k], truth=float(truth[k]))  # fmt: skip

@@ -1,0 +1,327 @@
+"""What the particle models have learned: contacts, and errors of their rollouts.
+
+    python benchmarks/models/particles.py data FOLDER  # trials without images
+    python benchmarks/models/particles.py collide FOLDER --write  # three minutes, three seeds
+    python benchmarks/models/particles.py transfer FOLDER --write  # trained without Collide
+    python benchmarks/models/particles.py shipped FOLDER --write  # weights of the package
+    python benchmarks/models/particles.py official FOLDER --write  # the same on official scenes
+    python benchmarks/models/particles.py batched FOLDER --write  # rollouts together, one by one
+
+``collide`` trains DPI-Net (small) on 300 trials of Collide, with swept and with plain edges, and
+tests on 300 balanced trials without observed contact; the state classifier is fitted on the same
+300. Answers are those of one future, and P(contact) of 8 futures with noise on the velocities from
+which they start. Times are processor time; use OMP_NUM_THREADS=1. With --write a section of
+``results/particles.md`` is replaced.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import datetime
+import os
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sklearn.metrics import roc_auc_score
+
+from physion import Dataset, build_model, simulate
+from physion.compute.machine import processor
+from physion.data import official
+from physion.models.batch import Motion
+from physion.models.interface import Fits
+from physion.models.observed import cut_to_observed
+from physion.models.particles.simulator import ParticleSimulator
+from physion.physics.labels import label_contact
+from physion.readout.rollout_error import motion_error
+from physion.scenes.sampling.registry import scenarios
+from physion.training.sources.open_source import observed_source, whole_source
+from physion.training.train import train_model
+from physion.trials.making.generate import make_trials
+from physion.trials.making.plan import GenerateSettings, plan_dataset
+
+RESULTS = Path(__file__).parents[1] / "results" / "particles.md"
+HORIZONS = (15, 30, 60, 90)
+"""Frames after the last observed one at which errors are measured."""
+GROUP = 64
+"""Scenes of one rollout."""
+FUTURES, SPREAD = 8, 0.1
+"""Futures for P(contact), and standard deviation of the noise on their initial velocities, m/s."""
+COLLIDE_STEPS = 2600
+TRANSFER_STEPS = 5000
+RIGID = ("dominoes", "support", "collide", "contain", "drop", "link", "roll")
+
+Rows = list[list[str]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Tested:
+    """Smallest gaps and outcomes of n trials, and errors (n, H) at the horizons, metres.
+
+    ``observed`` (n,): contact within the observed part. ``constant``: errors of constant velocity.
+    """
+
+    gaps: NDArray[np.float64]
+    contacts: NDArray[np.bool_]
+    observed: NDArray[np.bool_]
+    errors: NDArray[np.float64]
+    constant: NDArray[np.float64]
+    seconds: float
+
+    def only(self, rows: NDArray[np.bool_]) -> Tested:
+        """Return some of the trials."""
+        names = [f.name for f in dataclasses.fields(self) if f.name != "seconds"]
+        return dataclasses.replace(self, **{name: getattr(self, name)[rows] for name in names})
+
+    def cells(self) -> list[str]:
+        """Return number, accuracy, AUC, and errors after 30 and 60 frames."""
+        right = np.mean((self.gaps <= 0) == self.contacts)
+        both = len(set(self.contacts.tolist())) == 2
+        auc = roc_auc_score(self.contacts, -self.gaps) if both else float("nan")
+        pairs = [
+            f"{np.nanmean(self.errors[:, h]):.3f} / {np.nanmean(self.constant[:, h]):.3f}"
+            for h in (1, 2)
+        ]
+        return [str(len(self.gaps)), f"{right:.3f}", f"{auc:.3f}", *pairs]
+
+
+def test(model: ParticleSimulator, motions: Sequence[Motion], contacts: Iterable[bool]) -> Tested:
+    """Imagine the rest of every motion and compare."""
+    start, gaps, errors, constant, observed = time.process_time(), [], [], [], []
+    for first in range(0, len(motions), GROUP):
+        group = motions[first : first + GROUP]
+        cut = [Motion(m.scene, cut_to_observed(m.scene, m.trajectory)) for m in group]
+        futures = model.futures(cut, 1, 0)
+        gaps += model.gaps(cut, futures)[:, 0].tolist()
+        for motion, ((particles, poses),) in zip(group, futures, strict=True):
+            rows = motion_error(motion, particles, poses, model.spec.stride, max(HORIZONS))
+            rows = rows.set_index("Frames").reindex(HORIZONS)
+            errors.append(rows["Error"].tolist())
+            constant.append(rows["Constant Velocity Error"].tolist())
+            observed.append(label_contact(motion.scene, motion.trajectory).observed)
+    return Tested(
+        np.array(gaps), np.array(list(contacts)), np.array(observed),
+        np.array(errors), np.array(constant), time.process_time() - start,
+    )  # fmt: skip
+
+
+def fractions(model: ParticleSimulator, motions: Sequence[Motion]) -> NDArray[np.float64]:
+    """Return the fraction of `FUTURES` with a contact, for every motion."""
+    model.options = dataclasses.replace(model.options, spread=SPREAD)
+    cut = [Motion(m.scene, cut_to_observed(m.scene, m.trajectory)) for m in motions]
+    step = GROUP // FUTURES
+    groups = [cut[first : first + step] for first in range(0, len(cut), step)]
+    gaps = [model.gaps(group, model.futures(group, FUTURES, 0)) for group in groups]
+    return np.asarray((np.concatenate(gaps) <= 0).mean(axis=1))
+
+
+def motions_of(dataset: Dataset, trials: Sequence[str]) -> tuple[list[Motion], list[bool]]:
+    """Return motions and outcomes of trials."""
+    files = [dataset.trial(trial) for trial in trials]
+    motions = [Motion(file.scene, file.trajectory) for file in files]
+    return motions, [label_contact(m.scene, m.trajectory).contact for m in motions]
+
+
+def trained(
+    dataset: Dataset, trials: Sequence[str], steps: int, **options: Any
+) -> tuple[ParticleSimulator, float]:
+    """Return a DPI-Net trained on some trials, and the processor time that it took."""
+    model = build_model("dpi", **options)
+    assert isinstance(model, ParticleSimulator)
+    start = time.process_time()
+    train_model(
+        model, whole_source(dataset, model.spec), trials, name="benchmark", folder=None,
+        settings=dataclasses.replace(model.settings, steps=steps), seed=model.options.seed,
+        accelerator="cpu",
+    )  # fmt: skip
+    return model, time.process_time() - start
+
+
+def classified(
+    dataset: Dataset, fitted_on: Sequence[str], tested: Dataset, trials: Sequence[str]
+) -> tuple[float, float]:
+    """Return accuracy and AUC of the state classifier, fitted on some trials, on others."""
+    model = build_model("state-classifier")
+    assert isinstance(model, Fits)
+    (fit, labels), (test, contacts) = (
+        (observed_source(source, model.spec).context(names), motions_of(source, names)[1])
+        for source, names in ((dataset, fitted_on), (tested, trials))
+    )
+    predicted = model.fit(fit, np.array(labels), 0).predict(test)
+    right = (predicted > 0.5) == np.array(contacts)
+    return float(right.mean()), float(roc_auc_score(contacts, predicted))
+
+
+def make_data(folder: Path) -> None:
+    """Make trials without images: of Collide, and of all scenarios."""
+    settings = GenerateSettings(movies=False, jitters=0, min_visible=0.0)
+    collide = {"training": 300, "testing": 300}
+    counts = {"training": 220, "readout": 60, "testing": 60}
+    for name, chosen, sizes in (
+        ("collide", ("collide",), collide),
+        ("all", tuple(scenarios.names()), counts),
+    ):
+        report = make_trials(folder / name, plan_dataset("physion", chosen, sizes), settings)
+        print(f"{name}: {len(report.made)} made, {len(report.failed)} failed", flush=True)
+
+
+def run_collide(folder: Path) -> str:
+    """Return the table of three seeds with swept and with plain edges."""
+    dataset = Dataset(folder / "collide")
+    motions, contacts = motions_of(dataset, dataset.trials("testing"))
+    rows = []
+    for seed in range(3):
+        for swept in (True, False):
+            model, seconds = trained(
+                dataset, dataset.trials("training"), COLLIDE_STEPS, seed=seed, swept=swept
+            )
+            tested, share = test(model, motions, contacts), fractions(model, motions)
+            ratio = np.nanmean(tested.errors[:, 2]) / np.nanmean(tested.constant[:, 2])
+            rows.append(
+                [str(seed), "swept" if swept else "plain", f"{seconds:.0f}", *tested.cells(),
+                 f"{ratio:.2f}", f"{np.mean((share > 0.5) == tested.contacts):.3f}",
+                 f"{roc_auc_score(tested.contacts, share):.3f}"]
+            )  # fmt: skip
+            print(rows[-1], flush=True)
+    of_several = [f"{name}, {FUTURES} futures" for name in ("accuracy", "AUC")]
+    head = ["seed", "edges", "training, s", *HEAD, "of constant", *of_several]
+    scores = classified(dataset, dataset.trials("training"), dataset, dataset.trials("testing"))
+    return table(head, rows) + of_classifier("the same 300 trials", scores)
+
+
+def run_transfer(folder: Path) -> str:
+    """Return the table of a model and a classifier that never saw Collide."""
+    dataset = Dataset(folder / "all")
+    others = [t for t in dataset.trials("training") if not t.startswith("collide")]
+    model, seconds = trained(dataset, others, TRANSFER_STEPS)
+    collide = Dataset(folder / "collide")
+    motions, contacts = motions_of(collide, collide.trials("testing"))
+    tested = test(model, motions, contacts)
+    both, n = tested.contacts.mean(), len(tested.contacts)
+    error = np.sqrt((n + 1) / (12 * n * n * both * (1 - both)))
+    scores = classified(dataset, others, collide, collide.trials("testing"))
+    return (
+        table(["model", "training, s", *HEAD], [["dpi-small", f"{seconds:.0f}", *tested.cells()]])
+        + f"\nAn AUC of chance has a standard error of {error:.3f} (Mann and Whitney 1947).\n"
+        + of_classifier("the same trials of the other scenarios", scores)
+    )
+
+
+def of_classifier(fitted_on: str, scores: tuple[float, float]) -> str:
+    """Return a sentence on the scores of the state classifier."""
+    accuracy, auc = scores
+    return (
+        f"\nThe state classifier, fitted on {fitted_on}: accuracy {accuracy:.3f}, AUC {auc:.3f}.\n"
+    )
+
+
+def run_shipped(folder: Path) -> str:
+    """Return the table of the shipped weights on own testing trials."""
+    dataset = Dataset(folder / "all")
+    return "**Own testing trials, without observed contact**\n\n" + scores_of_shipped(
+        *motions_of(dataset, dataset.trials("testing"))
+    )
+
+
+def run_official(_: Path) -> str:
+    """Return the table of the shipped weights on official scenes, with the recorded outcomes.
+
+    The true motion, from which errors are measured, is that of our simulation.
+    """
+    known = [trial for trial in official().trials if "familiarization" not in trial.scene.name]
+    motions = [Motion(trial.scene, simulate(trial.scene)) for trial in known]
+    return "**Official scenes, recorded outcomes**\n\n" + scores_of_shipped(
+        motions, [trial.outcome.contact for trial in known]
+    )
+
+
+def scores_of_shipped(motions: Sequence[Motion], contacts: Sequence[bool]) -> str:
+    """Return the table of the shipped weights by scenario."""
+    rows: Rows = []
+    names = np.array([motion.scene.scenario for motion in motions])
+    for name in ("dpi", "gns", "gns-ransac"):
+        model = build_model(name, weights="shipped")
+        assert isinstance(model, ParticleSimulator)
+        tested = test(model, motions, contacts)
+        for scenario in sorted(set(names)):
+            rows.append([model.name, scenario, *tested.only(names == scenario).cells()])
+        rigid = np.isin(names, RIGID)
+        rows.append([model.name, "seven rigid", *tested.only(rigid).cells()])
+        if tested.observed.any():
+            unseen = tested.only(rigid & ~tested.observed)
+            rows.append([model.name, "of these without observed contact", *unseen.cells()])
+        print(rows[-1], f"{tested.seconds:.0f} s", flush=True)
+    return table(["model", "scenario", *HEAD], rows)
+
+
+def run_batched(folder: Path) -> str:
+    """Return the times of rollouts of 64 scenes together and one by one, side by side."""
+    dataset = Dataset(folder / "collide")
+    motions, _ = motions_of(dataset, dataset.trials("testing")[:GROUP])
+    cut = [Motion(m.scene, cut_to_observed(m.scene, m.trajectory)) for m in motions]
+    model = build_model("dpi", weights="shipped")
+    assert isinstance(model, ParticleSimulator)
+    model.futures(cut[:2], 1, 0)
+    rows = []
+    for _ in range(3):
+        start = time.process_time()
+        model.futures(cut, 1, 0)
+        together = time.process_time() - start
+        start = time.process_time()
+        for motion in cut:
+            model.futures([motion], 1, 0)
+        apart = time.process_time() - start
+        rows.append([f"{together:.2f}", f"{apart:.2f}", f"{apart / together:.1f}"])
+    return table(["together, s", "one by one, s", "ratio"], rows)
+
+
+HEAD = ["trials", "accuracy", "AUC", "error 30, m / constant", "error 60, m / constant"]
+
+
+def table(head: list[str], rows: Rows) -> str:
+    """Return a Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def write(section: str, text: str) -> None:
+    """Replace a section of the file of results."""
+    head = "# Particle models\nMade by `benchmarks/models/particles.py`.\n"
+    old = RESULTS.read_text() if RESULTS.is_file() else head
+    parts = old.split("\n## ")
+    kept = [part for part in parts[1:] if not part.startswith(section + "\n")]
+    made = f"{datetime.date.today()}, {processor()}, "
+    made += f"{os.cpu_count()} cores, torch {torch.__version__}: "
+    made += f"`OMP_NUM_THREADS=1 python benchmarks/models/particles.py {section} FOLDER --write`"
+    new = f"{section}\n{made}\n\n{text.strip()}\n"
+    RESULTS.write_text("\n## ".join([parts[0], *sorted([*kept, new])]))
+
+
+def main() -> None:
+    """Run one of the benchmarks."""
+    runs = {
+        "collide": run_collide, "transfer": run_transfer,
+        "shipped": run_shipped, "official": run_official, "batched": run_batched,
+    }  # fmt: skip
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=["data", *runs])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--write", action="store_true")
+    chosen = parser.parse_args()
+    torch.set_num_threads(1)
+    if chosen.what == "data":
+        make_data(chosen.folder)
+        return
+    text = runs[chosen.what](chosen.folder)
+    print(text)
+    if chosen.write:
+        write(chosen.what, text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,317 @@
+"""Speed of the vision models, and what they have learned of movies that they were not trained on.
+
+    OMP_NUM_THREADS=1 python benchmarks/models/vision_models.py speed --write  # seconds a clip
+    python benchmarks/models/vision_models.py learn FOLDER --write  # after trainings
+    python benchmarks/models/vision_models.py shipped FOLDER --write  # shipped weights
+    OMP_NUM_THREADS=1 python benchmarks/models/vision_models.py boxes FOLDER --write  # steps/s
+
+``speed`` times a training step (forward and backward) and the features of a clip, with what is
+imagined, on random pictures with moving boxes; times are processor time on a CPU.
+
+``learn`` needs the trials of ``physion generate FOLDER --width 64 --height 64`` with the splits
+training and testing. It trains the small models with three seeds and prints, for one clip of every
+testing trial, after and before the training and for the trivial predictor, and the ratio of the
+trained to the trivial one:
+
+- C-SWM: the mean reciprocal rank of the true next state among all states of 20 clips; the trivial
+  predictor copies the present state.
+- RPIN: the mean distance of predicted from true centres of boxes, as part of the picture's side,
+  times 1000; the trivial predictor keeps the last velocity.
+- SVG and OP3: the squared error of moving pixels of the imagined frames, times 1000
+  (`physion.models.vision.moving`); the trivial predictor repeats the last observed picture.
+
+``shipped`` prints the same for the weights that come with the package, without training.
+
+``boxes`` trains RPIN (small) on the same trials and prints the steps a second of processor time,
+reading and rendering included: with boxes that are rendered for every window, with those of earlier
+windows kept, and with all of them kept from the start.
+
+With --write a section of ``results/vision_models.md`` is replaced.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import datetime
+import os
+import re
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from physion import Dataset, build_model
+from physion.compute.machine import processor
+from physion.models.batch import Batch, Spec
+from physion.models.cswm.contrast import ranking
+from physion.seeds import generator, stable_hash
+from physion.training.sources.batches import ObservedBatches, TrialReaders, WholeBatches
+from physion.training.sources.kept_boxes import MOST_BYTES
+from physion.training.sources.movies import MovieReader, movie_files
+from physion.training.sources.open_source import whole_source
+from physion.training.sources.rendered import MotionRenderer
+from physion.training.sources.states import TrialMotions
+from physion.training.train import train_model
+
+RESULTS = Path(__file__).parents[1] / "results" / "vision_models.md"
+METRICS = {
+    "cswm": "mean reciprocal rank of the next state",
+    "rpin": "distance of centres",
+    "svg": "error of moving pixels",
+    "op3": "error of moving pixels",
+}
+"""What is measured of each model."""
+NAMES = tuple(METRICS)
+MODELS: tuple[tuple[str, dict[str, Any], int], ...] = (
+    ("cswm", {}, 8),
+    ("cswm", {"size": "paper"}, 1),
+    ("rpin", {}, 4),
+    ("rpin", {"size": "paper"}, 1),
+    ("svg", {}, 8),
+    ("svg", {"backbone": "vgg"}, 2),
+    ("svg", {"size": "paper"}, 1),
+    ("svg", {"size": "paper", "backbone": "dcgan"}, 1),
+    ("op3", {}, 4),
+    ("op3", {"size": "paper"}, 1),
+)
+"""Models whose speed is measured: name, options, clips of a batch."""
+TESTED_CLIPS = 20
+"""Clips of a batch of testing trials, whose states are ranked together."""
+LATEST_START = 40
+"""Last frame at which a tested clip starts; later most objects rest."""
+BOX_STEPS = 100
+"""Steps of the trainings with and without kept boxes."""
+
+Rows = Iterator[list[str]]
+
+
+def random_clips(clips: int, frames: int, spec: Spec) -> Batch:
+    """Return clips of random pictures in which the boxes of all objects move, as tensors."""
+    rng = generator("clips of random pictures")
+    shape = (clips, frames, spec.image_size, spec.image_size, 3)
+    ends = rng.uniform(0.2, 0.8, (2, clips, 1, spec.objects, 2))
+    part = np.linspace(0, 1, frames)[None, :, None, None]
+    centers = ends[0] + part * (ends[1] - ends[0])
+    boxes = np.concatenate([centers - 0.1, centers + 0.1], -1).astype(np.float32)
+    return Batch(
+        tuple(f"clip_{row}" for row in range(clips)),
+        np.tile(np.arange(frames), (clips, 1)),
+        np.ones((clips, frames), np.bool_),
+        rgb=rng.integers(0, 256, shape, np.uint8),
+        boxes=boxes if "boxes" in spec.inputs else None,
+    ).to("cpu")
+
+
+def speed(names: list[str], repeats: int) -> Rows:
+    """Yield name, weights, pictures, frames and the least processor times of each model."""
+    for name, options, clips in MODELS:
+        if name not in names:
+            continue
+        model: Any = build_model(name, **options)
+        spec = model.spec
+        window = random_clips(clips, model.window, spec)
+        context = random_clips(clips, spec.context, spec)
+
+        def train(model: Any = model, window: Batch = window) -> None:
+            model.train().loss(window)["loss"].backward()
+
+        def extract(model: Any = model, context: Batch = context) -> None:
+            with torch.no_grad():
+                model.eval().encode(context)
+                model.imagine(context, 1, 0)
+
+        weights = sum(value.numel() for value in model.parameters())
+        times = [best_time(function, repeats) / clips for function in (train, extract)]
+        cells = [model.name, f"{weights / 1e6:.2f} M", f"{spec.image_size} px", str(model.window)]
+        yield [*cells, *(f"{seconds:.4f}" for seconds in times)]
+
+
+def best_time(function: Callable[[], None], repeats: int) -> float:
+    """Return the least processor time of several calls, seconds."""
+    function()
+    times = []
+    for _ in range(repeats):
+        start = time.process_time()
+        function()
+        times.append(time.process_time() - start)
+    return min(times)
+
+
+def learn(folder: Path, names: list[str], steps: int, seeds: int) -> Rows:
+    """Yield the metrics of testing trials by model and seed."""
+    dataset = Dataset(folder)
+    for name in names:
+        for seed in range(seeds):
+            model: Any = build_model(name, seed=seed)
+            source = whole_source(dataset, model.spec)
+            clips = tested_clips(model, source, dataset.trials("testing"))
+            before, _ = metric(name, model, clips)
+            start = time.process_time()
+            train_model(
+                model,
+                source,
+                dataset.trials("training"),
+                settings=dataclasses.replace(model.settings, steps=steps or model.settings.steps),
+                seed=seed,
+                name="all",
+                folder=None,
+                accelerator="cpu",
+            )
+            seconds = time.process_time() - start
+            after, trivial = metric(name, model, clips)
+            values = [f"{value:.3f}" for value in (after, before, trivial, after / trivial)]
+            yield [model.name, str(seed), *values, f"{seconds:.0f}"]
+
+
+def shipped(folder: Path, names: list[str]) -> Rows:
+    """Yield the metrics of testing trials with shipped weights."""
+    dataset = Dataset(folder)
+    for name in names:
+        model: Any = build_model(name, weights="shipped")
+        source = whole_source(dataset, model.spec)
+        clips = tested_clips(model, source, dataset.trials("testing"))
+        after, trivial = metric(name, model, clips)
+        before, _ = metric(name, build_model(name), clips)
+        yield [model.name, METRICS[name], *(f"{value:.3f}" for value in (after, before, trivial))]
+
+
+def tested_clips(model: Any, source: Any, trials: list[str]) -> list[Batch]:
+    """Return one training clip of every trial, from an early frame, in batches."""
+    rng = generator("tested clips")
+    starts = rng.integers(LATEST_START + 1, size=len(trials)).tolist()
+    groups = range(0, len(trials) - TESTED_CLIPS + 1, TESTED_CLIPS)
+    if not groups:
+        raise SystemExit(f"learn needs {TESTED_CLIPS} testing trials or more")
+    chosen = [slice(start, start + TESTED_CLIPS) for start in groups]
+    return [source.window(trials[part], starts[part], model.window).to("cpu") for part in chosen]
+
+
+@torch.no_grad()
+def metric(name: str, model: Any, clips: list[Batch]) -> tuple[float, float]:
+    """Return the metric of a model and of the trivial predictor, means over the batches."""
+    metrics = {"cswm": reciprocal_ranks, "rpin": center_distances}
+    model.eval()
+    pairs = []
+    with torch.random.fork_rng(devices=[]):
+        for number, batch in enumerate(clips):
+            torch.manual_seed(stable_hash("tested clips", number) % 2**63)
+            pairs.append(metrics.get(name, moving_errors)(model, batch))
+    own, trivial = np.mean(pairs, axis=0)
+    return float(own), float(trivial)
+
+
+def reciprocal_ranks(model: Any, batch: Batch) -> tuple[float, float]:
+    """Return the mean reciprocal ranks of true next states: of the model, of a copy."""
+    ranks, copied = model.next_state_ranks(batch)
+    return ranking(ranks).reciprocal, ranking(copied).reciprocal
+
+
+def center_distances(model: Any, batch: Batch) -> tuple[float, float]:
+    """Return 1000 times the distances of centres: of the model, at constant velocity."""
+    own, constant = (1000 * float(value.nanmean()) for value in model.center_errors(batch))
+    return own, constant
+
+
+def moving_errors(model: Any, batch: Batch) -> tuple[float, float]:
+    """Return 1000 times the errors of moving pixels: of the model, of a copy."""
+    return 1000 * float(model.loss(batch)["loss"]), 1000 * float(model.baseline(batch))
+
+
+def boxes(folder: Path, steps: int) -> Rows:
+    """Yield which boxes are kept, steps a second, and their ratio to those without kept boxes."""
+    dataset = Dataset(folder, verify=False)
+    trials = dataset.trials("training")
+    motions = TrialMotions(dataset.files("trial_file"), observed=False)
+    lengths = {trial: len(motions[trial].trajectory) for trial in trials}
+    first = 0.0
+    for kept, most_bytes in (("none", 0), ("of earlier windows", MOST_BYTES), ("all", MOST_BYTES)):
+        model: Any = build_model("rpin")
+        renderer = MotionRenderer(
+            motions,
+            ["boxes"],
+            model.spec.image_size,
+            model.spec.objects,
+            dict.fromkeys(trials, "redyellow"),
+            most_bytes,
+        )
+        for trial, length in lengths.items():
+            # One frame compiles and reads what every line needs.
+            renderer.read(trial, np.arange(length if kept == "all" else 1))
+        movies = movie_files(dataset, observed=False)
+        pictures = MovieReader(movies, model.spec.image_size)
+        readers = TrialReaders(lengths, [pictures, renderer])
+        source = WholeBatches(ObservedBatches(model.spec, readers), readers)
+        start = time.process_time()
+        train_model(
+            model,
+            source,
+            trials,
+            settings=dataclasses.replace(model.settings, steps=steps, held_out=0.0),
+            seed=0,
+            name="all",
+            folder=None,
+            accelerator="cpu",
+        )
+        rate = steps / (time.process_time() - start)
+        first = first or rate
+        yield [kept, str(steps), f"{rate:.2f}", f"{rate / first:.2f}"]
+
+
+def table(head: list[str], rows: Rows) -> str:
+    """Return a Markdown table; print its rows as they come."""
+    lines = [head, ["---"] * len(head)]
+    for row in rows:
+        print(*row, flush=True)
+        lines.append(row)
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def write_section(title: str, text: str) -> None:
+    """Replace a section of the results, or append it."""
+    known = RESULTS.read_text() if RESULTS.is_file() else "# Vision models\n"
+    known = re.sub(rf"\n## {re.escape(title)}\n.*?(?=\n## |\Z)", "", known, flags=re.DOTALL)
+    where = f"{datetime.date.today()}, {processor()}, torch {torch.__version__}"
+    threads = f"{torch.get_num_threads()} thread(s), load {os.getloadavg()[0]:.1f}"
+    RESULTS.write_text(f"{known.rstrip()}\n\n## {title}\n{text}\n\n{where}, {threads}.\n")
+
+
+def main() -> None:
+    """Run one part."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("part", choices=("speed", "learn", "shipped", "boxes"))
+    parser.add_argument("folder", nargs="?", type=Path)
+    parser.add_argument("--models", nargs="+", default=list(NAMES), choices=NAMES)
+    parser.add_argument("--steps", type=int, default=0, help="0: those of the model")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
+    if options.part == "speed":
+        head = ["model", "weights", "pictures", "frames", "training step, s", "features, s"]
+        title, rows = "Processor time of a clip", speed(options.models, options.repeats)
+    elif options.folder is None:
+        parser.error(f"{options.part} needs the folder of the trials")
+    elif options.part == "learn":
+        head = ["model", "seed", "trained", "untrained", "trivial", "ratio", "training, s"]
+        title = "What was learned of new clips"
+        rows = learn(options.folder, options.models, options.steps, options.seeds)
+    elif options.part == "shipped":
+        head = ["model", "metric", "trained", "untrained", "trivial"]
+        title = "Shipped weights on new clips"
+        rows = shipped(options.folder, options.models)
+    else:
+        head = ["boxes kept", "steps", "steps a second", "ratio"]
+        title = "Training steps of RPIN a second"
+        rows = boxes(options.folder, options.steps or BOX_STEPS)
+    text = table(head, rows)
+    print(text)
+    if options.write:
+        write_section(title, text)
+
+
+if __name__ == "__main__":
+    main()
