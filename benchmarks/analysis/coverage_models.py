@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
-from coverage_studies import F64, MODELS, SCENARIOS, Coverage, Size, Study, logistic
 
+from coverage_studies import F64, MODELS, SCENARIOS, Coverage, Size, Study, logistic
 from physion.analysis.leaderboard.ranks import rank_intervals
 from physion.analysis.metrics import all_metrics, metrics
 from physion.analysis.models.model_people import Models, sample_of_models

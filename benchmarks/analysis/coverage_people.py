@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
-from coverage_studies import Coverage, Size, Study, logistic
 
+from coverage_studies import Coverage, Size, Study, logistic
 from physion.analysis.mixed.linear import fit_linear
 from physion.analysis.mixed.logistic import fit_logistic
 from physion.analysis.people.biases import learning, side_bias, yes_bias

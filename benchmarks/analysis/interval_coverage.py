@@ -22,10 +22,10 @@ import time
 from pathlib import Path
 
 import pandas as pd
+
 from coverage_models import measures, of_stimuli, pooled, ranks, rollout_errors
 from coverage_people import flags, hypotheses, mixed_models, of_people
 from coverage_studies import MODELS, POPULATIONS, Coverage
-
 from physion.analysis.sample import RESAMPLED
 from physion.compute.machine import processor
 

@@ -24,17 +24,16 @@ import time
 import venv
 from pathlib import Path
 
-from physion.compute.machine import processor
-
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"))
 
 import numpy as np
 import pandas as pd
-from mixed_fixtures import CASES, as_csv, ask_r
 
+from mixed_fixtures import CASES, as_csv, ask_r
 from physion.analysis.mixed.linear import fit_linear
 from physion.analysis.mixed.logistic import fit_logistic
 from physion.analysis.mixed.result import MixedFit
+from physion.compute.machine import processor_and_cores
 from support.simulated_answers import AnswerDesign, simulate_answers
 
 RESULTS = Path(__file__).parents[1] / "results"
@@ -243,7 +242,7 @@ def main() -> None:
     result = {
         "date": datetime.date.today().isoformat(),
         "command": " ".join(["python benchmarks/analysis/mixed.py", *sys.argv[1:]]),
-        "processor": processor(),
+        "processor": processor_and_cores(),
         "threads": 1,
         "goal_seconds": GOAL,
         "reached": found["big"][0] < GOAL,

@@ -1,9 +1,9 @@
-"""R's answers to the mixed models that the tests fit: writes tests/analysis/fixtures/mixed_r.csv.
+"""R's answers to the mixed models that the tests fit: writes support/fixtures/mixed_r.csv.
 
     python benchmarks/analysis/mixed_fixtures.py [--install] [--case NAME ...]
 
 ``--install`` first installs R and its packages from Debian (as root): r-base-core, r-cran-lme4,
-r-cran-lmertest, r-cran-glmmtmb. The data are made from a fixed seed (tests/analysis/mixed_cases.py)
+r-cran-lmertest, r-cran-glmmtmb. The data are made from a fixed seed (tests/support/mixed_cases.py)
 and their digest is stored beside the numbers. ``--case`` redoes some and keeps the others. lme4
 needs many minutes for the case "big".
 """
@@ -19,7 +19,7 @@ from pathlib import Path
 import pandas as pd
 
 ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "analysis")]
+sys.path.insert(0, str(ROOT / "tests"))
 
 from support.mixed_cases import CASES, STORED, Case, as_csv, digest, published  # noqa: E402
 from support.official import official_folder  # noqa: E402
@@ -41,7 +41,7 @@ def ask_r(name: str, case: Case, fitters: str = "lme4,glmmTMB") -> pd.DataFrame:
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "data.csv", Path(folder) / "numbers.csv"
         source.write_bytes(as_csv(data))
-        script = ROOT / "benchmarks" / "mixed_fixtures.R"
+        script = Path(__file__).with_suffix(".R")
         asked = [name, case.kind, case.formula, str(source), str(target), fitters]
         subprocess.run(["Rscript", str(script), *asked], check=True)
         numbers = pd.read_csv(target, names=COLUMNS, keep_default_na=False)

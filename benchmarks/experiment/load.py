@@ -43,8 +43,8 @@ from typing import Any
 import numpy as np
 import sqlalchemy as sa
 import uvloop
-from light_http import Connection, request
 
+from light_http import Connection, request
 from physion.compute.machine import processor
 from physion.experiment.simulated.server_process import HOST, ServerProcess
 from physion.experiment.store.database import open_database, sqlite_url
@@ -55,7 +55,7 @@ from physion.experiment.study.study import Study
 
 ROOT = Path(__file__).parents[2]
 RESULTS = Path(__file__).parents[1] / "results"
-sys.path.insert(0, str(ROOT / "tests" / "experiment"))
+sys.path.insert(0, str(ROOT / "tests"))
 LOADS = ("paced", "media", "full")
 TEST_TRIALS = 150
 AIM_P99_MS, AIM_ANSWERS_PER_S = 250, 400

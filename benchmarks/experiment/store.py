@@ -1,13 +1,12 @@
 """How fast the store alone keeps answers.
 
     python benchmarks/experiment/store.py
-
-    [--postgres URL] [--people 200] [--seconds 10] [--profile FILE]
+        [--postgres URL] [--people 200] [--seconds 10] [--profile FILE]
 
 No HTTP: so many participants as coroutines of one process, each storing its next answer as soon as
 the last one is on the disk. Commits are durable as when a study is served. Prints one JSON object:
 answers a second of wall time and of processor time, and the times to the acknowledgement. The HTTP
-server on top of it is measured by experiment_load.py.
+server on top of it is measured by benchmarks/experiment/load.py.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Study, Timing
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "experiment"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 TEST_TRIALS = 150
 
 

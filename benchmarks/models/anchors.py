@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.compute.machine import processor
+from physion.compute.machine import processor_and_cores
 from physion.models import build_model
 from physion.models.batch import LAST_OBSERVED, Batch, Motion
 from physion.physics.engine import DEFAULT_ENGINE, make_engine
@@ -181,8 +181,8 @@ def lines(
     yield "# Anchors on the official scenes"
     yield (
         f"`python benchmarks/models/anchors.py OFFICIAL/scenes --write`, {datetime.date.today()}, "
-        f"{processor()}. Accuracy for the recorded outcome of {len(trials)} scenes without "
-        f"duplicates, with whole configurations held out / in {FOLDS} random folds; the standard "
+        f"{processor_and_cores()}. Accuracy for the recorded outcome of {len(trials)} scenes "
+        f"without duplicates, with whole configurations held out / in {FOLDS} random folds; the standard "
         f"error of a scenario is about {math.sqrt(0.2 * len(present) / len(trials)):.2f}. Engine: "
         f"{make_engine(DEFAULT_ENGINE).name}."
     )

@@ -36,9 +36,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from noise_simulations import F64, Simulations
 from numpy.typing import NDArray
 
+from noise_simulations import F64, Simulations
 from physion.analysis.statistics.correlation import correlation_within_groups
 from physion.compute.machine import processor
 from physion.models.state_noise import NoiseLevels

@@ -1,8 +1,7 @@
 """Official scenes that people saw, and simulations of them with levels of noise.
 
 Part of `benchmarks/models/noise.py`. A scene whose contact is in the observed part is not
-simulated: its
-fraction is 1, as in the model.
+simulated: its fraction is 1, as in the model.
 """
 
 from __future__ import annotations

@@ -38,8 +38,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from calibration_quantities import QUANTITIES, Quantity
 
+from calibration_quantities import QUANTITIES, Quantity
 from physion.compute.machine import processor
 from physion.physics.jitter import jitter_scene
 from physion.physics.labels import label_contact

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import calibration_shapes as made
-
 from physion.physics.rigid import hulls
 from physion.physics.rigid.mass import MassProperties
 from physion.scenes.scene import Scene, SurfaceMaterial

@@ -15,7 +15,7 @@ import statistics
 import time
 from pathlib import Path
 
-from physion.compute.machine import processor
+from physion.compute.machine import processor_and_cores
 from physion.physics.jitter import jitter_scene
 from physion.physics.rigid.engine import RigidEngine
 from physion.scenes.tdw.read_logs import read_scenes
@@ -51,7 +51,7 @@ def main() -> None:
         assert digests[0] == digests[1], f"{trial.scene.name}: bytes depend on the threads"
     result = {
         "date": str(datetime.date.today()),
-        "hardware": processor(),
+        "hardware": processor_and_cores(),
         "command": "python benchmarks/physics/jittered_runs.py FOLDER "
         f"--scenario {options.scenario} "
         f"--limit {options.limit} --write",

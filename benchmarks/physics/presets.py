@@ -20,10 +20,8 @@ import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from replay import RESULTS, cell
-
 from physion.compute.local import LocalExecutor
-from physion.compute.machine import processor
+from physion.compute.machine import processor_and_cores
 from physion.errors import BadSceneError
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
@@ -31,6 +29,7 @@ from physion.scenes.sampling.preset import Preset, get_preset, load_presets
 from physion.scenes.sampling.registry import scenarios
 from physion.scenes.sampling.sample import sample_scene
 from physion.seeds import trial_seed
+from replay import RESULTS, cell
 
 GOAL = 0.85
 """Share of presets whose contact rate is to be within two standard errors."""
@@ -140,7 +139,7 @@ def table(rows: list[Row], command: str) -> str:
     """The rows in Markdown, with the shares that count."""
     lines = [
         "# Presets beside the official configurations",
-        f"{datetime.date.today()}, {processor()}, `{command}`",
+        f"{datetime.date.today()}, {processor_and_cores()}, `{command}`",
         "",
         "| scenario | preset | trials | contact | official, test | standard error | within two | "
         "official, test and readout | within two | frames: mean, median | official | "

@@ -18,7 +18,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from physion.compute.machine import processor
+from physion.compute.machine import processor_and_cores
 
 RESULTS = Path(__file__).parents[1] / "results"
 TARGETS = {
@@ -92,7 +92,7 @@ def main() -> None:
     out.write_text(json.dumps({**result, "scenarios": rows}, indent=2) + "\n")
     lines = [
         "# Official scenes, simulated again",
-        f"{datetime.date.today()}, {processor()}, "
+        f"{datetime.date.today()}, {processor_and_cores()}, "
         "`python benchmarks/physics/replay.py FOLDER --repeats "
         f"{options.repeats} --engines {options.engines}`. docs/physics.md describes the columns.",
         "Jittered runs: the first engine only.",

@@ -19,7 +19,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from physion.compute.machine import processor
+from physion.compute.machine import processor_and_cores
 
 RESULTS = Path(__file__).parents[1] / "results"
 HERE = Path(__file__).parents[2] / "src"
@@ -94,8 +94,8 @@ def main() -> None:
         title = [
             f"# Processor time of this version over that of commit {commit}",
             f"`python benchmarks/physics/side_by_side.py OTHER/src --seeds {options.seeds} "
-            f"--rounds {options.rounds} --write`, {datetime.date.today()}, {processor()}. Median "
-            "over rounds in turns; below 1 is faster. Physics: 150 frames; rendering: every pass "
+            f"--rounds {options.rounds} --write`, {datetime.date.today()}, "
+            f"{processor_and_cores()}. Median over rounds in turns; below 1 is faster. Physics: 150 frames; rendering: every pass "
             "of 10 frames at 256 x 256 pixels, the first frame left out.",
             "",
         ]

@@ -36,8 +36,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from study_schedule import Task, schedule
-from study_times import MODELS, ModelTimes, make_trials, measure_model, measure_readout
 
 import physion
 from physion.compute.machine import processor
@@ -45,6 +43,8 @@ from physion.training.protocols import Training, TrainingSet, training_sets
 from physion.training.sources.kept_boxes import MOST_BYTES
 from physion.training.windows import VALIDATION_CLIPS
 from physion.trials.making.plan import FULL_COUNTS
+from study_schedule import Task, schedule
+from study_times import MODELS, ModelTimes, make_trials, measure_model, measure_readout
 
 RESULTS = Path(__file__).parents[1] / "results"
 FASTER = (20, 50, 100, 200)
@@ -268,7 +268,7 @@ def report(kept: dict[str, Any], options: argparse.Namespace) -> str:
     prices = options.core_price, options.gpu_price
     generation = json.loads((RESULTS / "generation.json").read_text())
     parts = [
-        "# The whole study on paper",
+        "# What the whole study takes",
         f"25,200 trials, {len(MODELS)} models of the size `paper`, 17 trainings each, one seed, on "
         f"{options.cores} cores and {options.gpus} GPUs. Nothing of it was run: times of single "
         "steps and trials were measured and multiplied. Prices are assumptions: "

@@ -42,21 +42,36 @@ from support.tasks import process_of
 def node():
     return ray.get_runtime_context().get_node_id()
 
+from physion.errors import PhysionError
+
 executor = RayExecutor(workers=1)
 first, second = ({o.value for o in executor.map(process_of, {"a": 1, "b": 2})} for _ in range(2))
 assert len(first) == 1 and first == second, (first, second)
 before = node()
+assert ray.cluster_resources()["CPU"] == 1
 outcomes = RayExecutor(workers=2).map(time.sleep, {"short": 0, "long": 600})
 next(outcomes)
-assert node() != before
+assert node() != before and ray.cluster_resources()["CPU"] == 2
+try:
+    next(executor.map(process_of, {"a": 1}))
+except PhysionError as error:
+    assert "in use" in str(error)
+else:
+    raise AssertionError("tasks must not run on the Ray of another executor")
 outcomes.close()
 assert not ray.is_initialized()
+# The address of a cluster is not answered by the Ray that was started here.
+assert next(executor.map(process_of, {"a": 1})).error is None
+try:
+    list(RayExecutor("127.0.0.1:1").map(process_of, {"a": 1}))
+except PhysionError as error:
+    assert "cannot be reached" in str(error)
+else:
+    raise AssertionError("there is no cluster at this address")
 """
 
 
-def test_ray_started_here_stays_for_the_next_call_until_one_is_ended_early(
-    cluster: None,
-) -> None:
+def test_ray_started_here_stays_for_the_next_call_until_one_is_ended_early() -> None:
     # In a process of its own, since Ray of this one was started by the fixture.
     run = subprocess.run([sys.executable, "-c", STAYS], capture_output=True, text=True, timeout=300)
     assert run.returncode == 0, run.stderr

@@ -22,12 +22,23 @@ R = TypeVar("R")
 
 _WAITING_PER_CORE = 2
 """Tasks given to Ray for each core of the cluster; the others wait in this process."""
-_started_here: int | None = None
-"""Cores of the Ray that this process started; None if it started none.
-
-Ray and its workers stay, since a verb calls `map` several times and each start takes seconds.
-"""
 _THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+@dataclass
+class _Connection:
+    """Connection of this process to Ray.
+
+    It stays between calls of `RayExecutor.map`, since a verb has several and each start takes
+    seconds. ``of``: address and workers of the executor that connected; None if none did.
+    ``calls``: calls of `map` that are not over.
+    """
+
+    of: tuple[str, int] | None = None
+    calls: int = 0
+
+
+_connection = _Connection()
 
 
 class RayExecutor:
@@ -40,7 +51,8 @@ class RayExecutor:
     ----------
     address
         Of a cluster, or ``auto``; empty: Ray is started on this machine by the first call of
-        `map`. It stops when this process ends, or when a call of `map` is ended early.
+        `map`. It stops when this process ends, when a call of `map` is ended early, or when
+        another executor wants another address or number of workers.
     workers
         Cores of a Ray that is started here; by default all.
     cpus, gpus, memory_gb
@@ -86,6 +98,7 @@ class RayExecutor:
         ray = self._ray
         self._connect()
         running: dict[Any, _Started] = {}
+        _connection.calls += 1
         try:
             remote = ray.remote(max_retries=0, **self._shares)(run_task)
             stored = ray.put(function)
@@ -108,9 +121,10 @@ class RayExecutor:
         finally:
             for ref in running:
                 ray.cancel(ref, force=True)
-            if running and _started_here is not None:
+            _connection.calls -= 1
+            if running and _connection.of is not None:
                 # When this call returns, no task of it writes any more.
-                self._stop()
+                self._disconnect()
 
     def _window(self) -> int:
         """Return how many tasks Ray is given at a time."""
@@ -121,33 +135,41 @@ class RayExecutor:
         return max(1, int(cores / max(self._shares["num_cpus"], 1)))
 
     def _connect(self) -> None:
-        """Connect to the cluster or start Ray on this machine, unless that was done before."""
-        if not self.address and _started_here not in (None, self.workers):
-            self._stop()
+        """Connect to the cluster or start Ray on this machine, unless that was done before.
+
+        A Ray to which the caller of this package has connected is used as it is.
+        """
+        wanted = (self.address, 0 if self.address else self.workers)
+        if _connection.of not in (None, wanted):
+            if _connection.calls:
+                raise PhysionError(
+                    "Ray is in use with another address or number of workers; let that call end "
+                    "first"
+                )
+            self._disconnect()
         if not self._ray.is_initialized():
             self._start()
+            _connection.of = wanted
 
-    def _stop(self) -> None:
-        """Stop the Ray that this process started."""
-        global _started_here
+    def _disconnect(self) -> None:
+        """Leave the cluster, or stop the Ray that was started here."""
         self._ray.shutdown()
-        _started_here = None
+        _connection.of = None
 
     def _start(self) -> None:
         """Connect to the cluster, or start Ray on this machine."""
-        global _started_here
         options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
         options["runtime_env"] = {"env_vars": _THREADS}
         if self.address:
             options["address"] = self.address
         else:
-            options |= {"num_cpus": self.workers, "include_dashboard": False}
+            # Without "local" a cluster that runs on this machine would be taken.
+            options |= {"address": "local", "num_cpus": self.workers, "include_dashboard": False}
         try:
             self._ray.init(**options)
         except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
             text = " ".join(str(error).split())
             raise PhysionError(f"Ray cannot be reached at {self.address!r}: {text}") from error
-        _started_here = None if self.address else self.workers
 
     def _collect(self, ref: Any, done: _Started) -> TaskOutcome[Any] | None:
         """Return the outcome of a finished call; None if its task is to be started again."""

@@ -19,7 +19,7 @@ class ExecutorSettings:
     executor: Literal["local", "slurm", "ray"] = "local"
     """Where tasks run: in processes of this machine, as jobs of Slurm, or on Ray."""
     workers: int = os.cpu_count() or 1
-    """Number of processes of the executor local."""
+    """Processes of the executor local, or cores of a Ray that is started on this machine."""
     tries: int = TRIES
     """How often a task is started, if its process or job ends without a result."""
     task_minutes: float | None = None
