@@ -5,13 +5,17 @@
     python benchmarks/models/particles.py transfer FOLDER --write  # trained without Collide
     python benchmarks/models/particles.py shipped FOLDER --write  # weights of the package
     python benchmarks/models/particles.py official FOLDER --write  # the same on official scenes
+    python benchmarks/models/particles.py futures FOLDER --write  # one and several, beside people
     python benchmarks/models/particles.py batched FOLDER --write  # rollouts together, one by one
 
 ``collide`` trains DPI-Net (small) on 300 trials of Collide, with swept and with plain edges, and
 tests on 300 balanced trials without observed contact; the state classifier is fitted on the same
 300. Answers are those of one future, and P(contact) of 8 futures with noise on the velocities from
-which they start. Times are processor time; use OMP_NUM_THREADS=1. With --write a section of
-``results/particles.md`` is replaced.
+which they start. ``futures`` compares such answers of the shipped DPI-Net with those of the people
+who saw the official scenes, Drape left out; outcomes are the recorded ones.
+
+Times are processor time; use OMP_NUM_THREADS=1. With --write a section of ``results/particles.md``
+is replaced.
 """
 
 from __future__ import annotations
@@ -31,6 +35,7 @@ from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score
 
 from physion import Dataset, build_model, simulate
+from physion.analysis.tables.responses import read_humans
 from physion.compute.machine import processor
 from physion.data import official
 from physion.models.batch import Motion
@@ -40,6 +45,7 @@ from physion.models.particles.simulator import ParticleSimulator
 from physion.physics.labels import label_contact
 from physion.readout.rollout_error import motion_error
 from physion.scenes.sampling.registry import scenarios
+from physion.stimulus_names import canonical_name
 from physion.training.sources.open_source import observed_source, whole_source
 from physion.training.train import train_model
 from physion.trials.making.generate import make_trials
@@ -54,6 +60,7 @@ FUTURES, SPREAD = 8, 0.1
 """Futures for P(contact), and standard deviation of the noise on their initial velocities, m/s."""
 COLLIDE_STEPS = 2600
 TRANSFER_STEPS = 5000
+NAMES = ("dpi", "gns", "gns-ransac")
 RIGID = ("dominoes", "support", "collide", "contain", "drop", "link", "roll")
 
 Rows = list[list[str]]
@@ -110,13 +117,18 @@ def test(model: ParticleSimulator, motions: Sequence[Motion], contacts: Iterable
     )  # fmt: skip
 
 
-def fractions(model: ParticleSimulator, motions: Sequence[Motion]) -> NDArray[np.float64]:
-    """Return the fraction of `FUTURES` with a contact, for every motion."""
-    model.options = dataclasses.replace(model.options, spread=SPREAD)
+def fractions(
+    model: ParticleSimulator,
+    motions: Sequence[Motion],
+    samples: int = FUTURES,
+    spread: float = SPREAD,
+) -> NDArray[np.float64]:
+    """Return the fraction of futures with a contact, for every motion."""
+    model.options = dataclasses.replace(model.options, spread=spread)
     cut = [Motion(m.scene, cut_to_observed(m.scene, m.trajectory)) for m in motions]
-    step = GROUP // FUTURES
+    step = GROUP // samples
     groups = [cut[first : first + step] for first in range(0, len(cut), step)]
-    gaps = [model.gaps(group, model.futures(group, FUTURES, 0)) for group in groups]
+    gaps = [model.gaps(group, model.futures(group, samples, 0)) for group in groups]
     return np.asarray((np.concatenate(gaps) <= 0).mean(axis=1))
 
 
@@ -220,42 +232,77 @@ def of_classifier(fitted_on: str, scores: tuple[float, float]) -> str:
     )
 
 
-def run_shipped(folder: Path) -> str:
-    """Return the table of the shipped weights on own testing trials."""
+def run_shipped(folder: Path, name: str) -> str:
+    """Return the table of a model with shipped weights on own testing trials."""
     dataset = Dataset(folder / "all")
     return "**Own testing trials, without observed contact**\n\n" + scores_of_shipped(
-        *motions_of(dataset, dataset.trials("testing"))
+        name, *motions_of(dataset, dataset.trials("testing"))
     )
 
 
-def run_official(_: Path) -> str:
-    """Return the table of the shipped weights on official scenes, with the recorded outcomes.
+def run_official(_: Path, name: str) -> str:
+    """Return the table of a model with shipped weights on official scenes, recorded outcomes.
 
     The true motion, from which errors are measured, is that of our simulation.
     """
     known = [trial for trial in official().trials if "familiarization" not in trial.scene.name]
     motions = [Motion(trial.scene, simulate(trial.scene)) for trial in known]
     return "**Official scenes, recorded outcomes**\n\n" + scores_of_shipped(
-        motions, [trial.outcome.contact for trial in known]
+        name, motions, [trial.outcome.contact for trial in known]
     )
 
 
-def scores_of_shipped(motions: Sequence[Motion], contacts: Sequence[bool]) -> str:
-    """Return the table of the shipped weights by scenario."""
-    rows: Rows = []
-    names = np.array([motion.scene.scenario for motion in motions])
-    for name in ("dpi", "gns", "gns-ransac"):
-        model = build_model(name, weights="shipped")
-        assert isinstance(model, ParticleSimulator)
-        tested = test(model, motions, contacts)
-        for scenario in sorted(set(names)):
-            rows.append([model.name, scenario, *tested.only(names == scenario).cells()])
-        rigid = np.isin(names, RIGID)
-        rows.append([model.name, "seven rigid", *tested.only(rigid).cells()])
-        if tested.observed.any():
-            unseen = tested.only(rigid & ~tested.observed)
-            rows.append([model.name, "of these without observed contact", *unseen.cells()])
-        print(rows[-1], f"{tested.seconds:.0f} s", flush=True)
+def run_futures(_: Path) -> str:
+    """Return accuracy, and r with people, of one future and of several."""
+    people = read_humans(official().humans).set_index("stimulus")["accuracy"]
+    trials = [
+        trial
+        for trial in official().trials
+        if canonical_name(trial.scene.name) in people.index and trial.scene.scenario in RIGID
+    ]
+    contacts = np.array([trial.outcome.contact for trial in trials])
+    right = people.loc[[canonical_name(trial.scene.name) for trial in trials]].to_numpy(float)
+    said_yes = np.where(contacts, right, 1 - right)
+    names = np.array([trial.scene.scenario for trial in trials])
+    motions = [Motion(trial.scene, simulate(trial.scene)) for trial in trials]
+    model = build_model("dpi", weights="shipped")
+    assert isinstance(model, ParticleSimulator)
+    rows = []
+    for samples, spread in ((1, 0.0), (8, 0.05), (8, 0.1)):
+        share = fractions(model, motions, samples, spread)
+        hits = (share > 0.5) == contacts
+        each = [(hits[names == name].mean(), correlation(share, said_yes, names == name))
+                for name in RIGID]  # fmt: skip
+        accuracy, r = np.mean(each, axis=0)
+        rows.append(
+            [str(samples), f"{spread:g}" if samples > 1 else "-", f"{accuracy:.3f}", f"{r:.3f}",
+             f"{correlation(share, said_yes, np.ones_like(contacts)):.3f}"]
+        )  # fmt: skip
+        print(rows[-1], flush=True)
+    head = ["futures", "noise, m/s", "accuracy, mean of scenarios", "r, mean of scenarios", "r"]
+    return f"{model.name}, {len(trials)} scenes\n\n" + table(head, rows)
+
+
+def correlation(
+    share: NDArray[np.float64], people: NDArray[np.float64], rows: NDArray[np.bool_]
+) -> float:
+    """Return the correlation of P(contact) with the fraction of people who said yes."""
+    return float(np.corrcoef(share[rows], people[rows])[0, 1])
+
+
+def scores_of_shipped(name: str, motions: Sequence[Motion], contacts: Sequence[bool]) -> str:
+    """Return the table of a model with shipped weights by scenario."""
+    model = build_model(name, weights="shipped")
+    assert isinstance(model, ParticleSimulator)
+    tested = test(model, motions, contacts)
+    scenario_of = np.array([motion.scene.scenario for motion in motions])
+    rigid = np.isin(scenario_of, RIGID)
+    parts = {scenario: scenario_of == scenario for scenario in sorted(set(scenario_of))}
+    parts["seven rigid"] = rigid
+    if tested.observed.any():
+        parts["of these without observed contact"] = rigid & ~tested.observed
+    rows = [[model.name, part, *tested.only(chosen).cells()] for part, chosen in parts.items()]
+    print(rows[-1], f"{tested.seconds:.0f} s", flush=True)
     return table(["model", "scenario", *HEAD], rows)
 
 
@@ -289,15 +336,18 @@ def table(head: list[str], rows: Rows) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
-def write(section: str, text: str) -> None:
-    """Replace a section of the file of results."""
+def report(section: str, command: str, text: str, write: bool) -> None:
+    """Print a result, and replace its section of the file of results if asked to."""
+    print(text)
+    if not write:
+        return
     head = "# Particle models\nMade by `benchmarks/models/particles.py`.\n"
     old = RESULTS.read_text() if RESULTS.is_file() else head
     parts = old.split("\n## ")
     kept = [part for part in parts[1:] if not part.startswith(section + "\n")]
     made = f"{datetime.date.today()}, {processor()}, "
     made += f"{os.cpu_count()} cores, torch {torch.__version__}: "
-    made += f"`OMP_NUM_THREADS=1 python benchmarks/models/particles.py {section} FOLDER --write`"
+    made += f"`OMP_NUM_THREADS=1 python benchmarks/models/particles.py {command} --write`"
     new = f"{section}\n{made}\n\n{text.strip()}\n"
     RESULTS.write_text("\n## ".join([parts[0], *sorted([*kept, new])]))
 
@@ -305,22 +355,31 @@ def write(section: str, text: str) -> None:
 def main() -> None:
     """Run one of the benchmarks."""
     runs = {
-        "collide": run_collide, "transfer": run_transfer,
-        "shipped": run_shipped, "official": run_official, "batched": run_batched,
+        "collide": run_collide, "transfer": run_transfer, "futures": run_futures,
+        "batched": run_batched,
     }  # fmt: skip
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=["data", *runs])
+    by_model = {"shipped": run_shipped, "official": run_official}
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", choices=["data", *runs, *by_model])
     parser.add_argument("folder", type=Path)
+    parser.add_argument(
+        "--models", nargs="+", choices=NAMES, default=NAMES, help="of shipped and official"
+    )
     parser.add_argument("--write", action="store_true")
     chosen = parser.parse_args()
     torch.set_num_threads(1)
-    if chosen.what == "data":
+    what = chosen.what
+    if what == "data":
         make_data(chosen.folder)
         return
-    text = runs[chosen.what](chosen.folder)
-    print(text)
-    if chosen.write:
-        write(chosen.what, text)
+    if what in runs:
+        report(what, f"{what} FOLDER", runs[what](chosen.folder), chosen.write)
+        return
+    for name in chosen.models:
+        text = by_model[what](chosen.folder, name)
+        report(f"{what}, {name}", f"{what} FOLDER --models {name}", text, chosen.write)
 
 
 if __name__ == "__main__":

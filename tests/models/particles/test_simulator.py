@@ -19,6 +19,7 @@ from physion.models.particles.bodies import KINEMATIC, RIGID, poses_of, scene_pa
 from physion.models.particles.gap import smallest_distance
 from physion.models.particles.graph import drift_of, make_graph
 from physion.models.particles.layout import ObjectState, join_poses, join_scenes, rotate_scenes
+from physion.models.particles.networks import JoinedInputs
 from physion.models.particles.rigid_motion import rotation_from_vector
 from physion.models.particles.simulator import ParticleSimulator
 from physion.models.particles.windows import Window, read_window
@@ -152,6 +153,92 @@ def test_the_graph_leaves_out_what_nothing_reaches(collide: Motion) -> None:
     reached = torch.zeros_like(free)
     reached[graph.rows[graph.receivers]] = True
     assert torch.equal(kept[~free], reached[~free])
+
+
+def test_the_graph_of_dpi_has_particles_near_something_alone(collide: Motion) -> None:
+    model = model_of("dpi")
+    layout, _, now = last_states(model, collide)
+    free = (layout.kinds != KINEMATIC)[layout.owners]
+    up = torch.zeros_like(now.centers)
+    up[layout.kinds == RIGID, 2] = 1.0
+    heights = now.positions(layout)[:, 2] - layout.floor[layout.owners]
+    lowest = heights[free].min()
+
+    def at(height: float) -> ObjectState:
+        return ObjectState(now.centers + up * (height - lowest), now.rotations, now.loose)
+
+    def without_edge(before: ObjectState, now: ObjectState) -> torch.Tensor:
+        graph = model._graph(layout, drift_of(layout, before, now))
+        alone = torch.zeros_like(free)
+        alone[graph.rows] = True
+        alone[graph.rows[graph.receivers]] = False
+        reached = torch.zeros_like(free)
+        reached[graph.rows[graph.receivers]] = True
+        # All that is not in the graph is far from the floor and from other objects.
+        assert torch.equal(alone, expected(before, now) & ~reached)
+        return alone
+
+    def expected(before: ObjectState, now: ObjectState) -> torch.Tensor:
+        drift = drift_of(layout, before, now)
+        ends = torch.stack([drift.positions, drift.positions + drift.moves])[..., 2]
+        return free & (ends.min(0).values - layout.floor[layout.owners] < model.config.radius)
+
+    assert without_edge(now, now).any()
+    assert not without_edge(at(0.3), at(0.3)).any()
+    # What falls into the reach of the floor within the step counts.
+    assert without_edge(at(0.6), at(0.3)).any()
+    # Nothing needs a particle in the graph: bodies in free fall far from each other have none.
+    spread = torch.zeros_like(up)
+    spread[:, 0] = 50.0 * torch.arange(len(up))
+    far = ObjectState(at(5.0).centers + spread, now.rotations, now.loose)
+    assert not len(model._graph(layout, drift_of(layout, far, far)).nodes)
+    after = model.step(layout, far, far)
+    assert after.centers.isfinite().all() and after.rotations.isfinite().all()
+
+
+def test_all_particles_of_a_cloth_are_in_the_graph() -> None:
+    model = model_of("dpi")
+    layout, before, now = last_states(model, motion("drape", 3))
+    graph = model._graph(layout, drift_of(layout, before, now))
+    assert len(layout.loose) > 200 and set(layout.loose.tolist()) <= set(graph.rows.tolist())
+
+
+def test_the_graph_of_gns_has_all_particles_that_can_move(collide: Motion) -> None:
+    model = model_of("gns")
+    layout, before, now = last_states(model, collide)
+    graph = model._graph(layout, drift_of(layout, before, now))
+    free = (layout.kinds != KINEMATIC)[layout.owners].nonzero()[:, 0]
+    assert set(free.tolist()) <= set(graph.rows.tolist()) and not len(graph.moments)
+
+
+def test_joined_inputs_are_those_of_one_matrix() -> None:
+    torch.manual_seed(0)
+    layers, rows = JoinedInputs(3 + 5 + 4, 8), torch.tensor([0, 2, 1, 1, 2, 0])
+    first, second, shared = torch.randn(6, 3), torch.randn(6, 5), torch.randn(3, 4)
+    expected = torch.cat([first, second, shared[rows]], -1)
+    for layer in layers:
+        expected = layer(expected)
+    found = layers(first, second, shared=shared, rows=rows)
+    assert torch.allclose(found, expected, atol=1e-5) and found.std() > 0.1
+
+
+def test_the_moments_of_an_object_turn_with_it(collide: Motion) -> None:
+    model = model_of("dpi")
+    layout, _, now = last_states(model, collide)
+
+    def moments(state: ObjectState) -> torch.Tensor:
+        xx, yy, zz, xy, xz, yz = model._graph(layout, drift_of(layout, state, state)).moments.T
+        rows = [xx, xy, xz, xy, yy, yz, xz, yz, zz]
+        return torch.stack(rows, -1).reshape(-1, 3, 3).double()
+
+    still = moments(now)
+    assert torch.allclose(still.diagonal(dim1=1, dim2=2).sum(-1), torch.ones(len(still)).double())
+    turn = rotation_from_vector(torch.tensor([0.3, -0.5, 0.9], dtype=torch.float64))
+    bodies = layout.kinds == RIGID
+    expected = (turn @ still @ turn.T)[bodies]
+    turned = moments(ObjectState(now.centers, turn @ now.rotations, now.loose))[bodies]
+    assert torch.allclose(turned, expected, atol=1e-6)
+    assert not torch.allclose(still[bodies], expected, atol=1e-3)
 
 
 def test_a_body_that_hardly_moves_rests(collide: Motion) -> None:

@@ -33,8 +33,8 @@ from physion.models.particles.rigid_motion import (
     vector_from_rotation,
 )
 
-NODE, EDGE, OBJECT = 14, 17, 11
-"""Sizes of the inputs of nodes, edges and objects."""
+NODE, EDGE, OBJECT, MOMENTS = 14, 17, 11, 6
+"""Sizes of the inputs of nodes, edges and objects, and of the moments of an object."""
 _SPIN = 0.1
 """Unit of spins, radians a step."""
 
@@ -59,11 +59,16 @@ class Graph:
     """Inputs of a network, float32: N nodes, E edges, K objects.
 
     Nodes are the particles of all objects that can move, and those of kinematic bodies that have
-    an edge: the others would change nothing.
+    an edge: the others would change nothing. For DPI-Net, whose bodies move as wholes, they are
+    the particles of cloths, and of bodies those alone that have an edge or, if the body can move,
+    come nearer to the floor than the radius in the step.
 
     - ``particles``: P. ``rows`` (N,): particle of each node. ``owners`` (N,): its object.
     - ``receivers``, ``senders`` (E,): nodes.
     - ``nodes`` (N, `NODE`), ``edges`` (E, `EDGE`), ``things`` (K, `OBJECT`).
+    - ``moments`` (K, `MOMENTS`): second moments of the particles of an object about their centre
+      along the axes of the world, xx, yy, zz, xy, xz, yz, divided by their trace. They tell how an
+      object lies and where it is long. Empty but for DPI-Net.
     """
 
     particles: int
@@ -75,6 +80,7 @@ class Graph:
     nodes: Tensor
     edges: Tensor
     things: Tensor
+    moments: Tensor
 
 
 def drift_of(layout: SceneLayout, before: ObjectState, now: ObjectState) -> Drift:
@@ -114,7 +120,13 @@ def move_loose(
 
 
 def make_graph(
-    layout: SceneLayout, drift: Drift, radius: float, unit: float, *, swept: bool
+    layout: SceneLayout,
+    drift: Drift,
+    radius: float,
+    unit: float,
+    *,
+    swept: bool,
+    near_only: bool = False,
 ) -> Graph:
     """Return the graph of a state.
 
@@ -128,6 +140,8 @@ def make_graph(
         Unit of displacements, metres a step.
     swept : bool
         Whether particles that come within the radius during the step are neighbours too.
+    near_only : bool
+        Whether the graph is that of DPI-Net, which leaves out particles far from everything.
     """
     moves = drift.moves if swept else torch.zeros_like(drift.moves)
     on_cpu = moves.device.type == "cpu"
@@ -136,6 +150,11 @@ def make_graph(
     )
     pairs = torch.cat([outer, layout.links], dim=1)
     used = (layout.kinds != KINEMATIC)[layout.owners]
+    if near_only:
+        # Fast bodies reach the floor within the step, with plain edges too.
+        lowest = drift.positions[:, 2] + drift.moves[:, 2].clamp_max(0)
+        used &= lowest - layout.floor[layout.owners] < radius
+        used[layout.loose] = True
     used[pairs[0]] = True
     rows = used.nonzero()[:, 0]
     node_of = used.long().cumsum(0) - 1
@@ -145,9 +164,10 @@ def make_graph(
         receivers=node_of[pairs[0]],
         senders=node_of[pairs[1]],
         owners=layout.owners[rows],
-        nodes=_node_inputs(layout, drift, radius, unit)[rows],
+        nodes=_node_inputs(layout, drift, radius, unit, rows),
         edges=_edge_inputs(drift, pairs, outer.shape[1], radius, unit),
         things=_object_inputs(layout, drift, radius, unit),
+        moments=_moments(layout, drift) if near_only else drift.positions.new_zeros(0),
     )
 
 
@@ -174,16 +194,19 @@ def outer_edges_on_device(
     return pairs[:, (first != second) & (free[first] | free[second])]
 
 
-def _node_inputs(layout: SceneLayout, drift: Drift, radius: float, unit: float) -> Tensor:
+def _node_inputs(
+    layout: SceneLayout, drift: Drift, radius: float, unit: float, rows: Tensor
+) -> Tensor:
     """Return displacement, offset from the centre, normal, heights now and after, and kind."""
     centers = mean_by(drift.positions, layout.owners, layout.objects)
-    offsets = (drift.positions - centers[layout.owners]) / radius
+    owners, moves, positions = layout.owners[rows], drift.moves[rows], drift.positions[rows]
+    offsets = (positions - centers[owners]) / radius
     # Nothing depends on where the middle of a kinematic body is, which may be metres away.
-    offsets = offsets.masked_fill((layout.kinds == KINEMATIC)[layout.owners][:, None], 0.0)
-    height = drift.positions[:, 2] - layout.floor[layout.owners]
-    heights = torch.stack([height, height + drift.moves[:, 2]], -1) / radius
-    kinds = torch.nn.functional.one_hot(layout.kinds, 3)[layout.owners]
-    parts = [drift.moves / unit, offsets, drift.normals, heights.clamp(-2, 1), kinds.double()]
+    offsets = offsets.masked_fill((layout.kinds == KINEMATIC)[owners][:, None], 0.0)
+    height = positions[:, 2] - layout.floor[owners]
+    heights = torch.stack([height, height + moves[:, 2]], -1) / radius
+    kinds = torch.nn.functional.one_hot(layout.kinds, 3)[owners]
+    parts = [moves / unit, offsets, drift.normals[rows], heights.clamp(-2, 1), kinds.double()]
     return torch.cat(parts, dim=-1).float()
 
 
@@ -219,3 +242,12 @@ def _object_inputs(layout: SceneLayout, drift: Drift, radius: float, unit: float
     rim = drift.spin.norm(dim=-1, keepdim=True) * layout.size[:, None] / unit
     parts = [drift.velocity / unit, spin, layout.size[:, None] / radius, rim, kinds]
     return torch.cat(parts, dim=-1).float()
+
+
+def _moments(layout: SceneLayout, drift: Drift) -> Tensor:
+    """Return the second moments (K, `MOMENTS`) of the particles of each object; see `Graph`."""
+    centers = mean_by(drift.positions, layout.owners, layout.objects)
+    offsets = drift.positions - centers[layout.owners]
+    products = offsets[:, [0, 1, 2, 0, 0, 1]] * offsets[:, [0, 1, 2, 1, 2, 2]]
+    means = mean_by(products, layout.owners, layout.objects)
+    return (means / means[:, :3].sum(-1, keepdim=True).clamp_min(1e-12)).float()

@@ -5,8 +5,9 @@ residual updates with layer normalisation (Sanchez-Gonzalez et al. 2020).
 
     m_ij  = f(h_i, h_j, e_ij),     h_i <- h_i + g(h_i, sum_j m_ij)
 
-`ObjectNetwork` (DPI-Net): in addition every object has a node, which receives from its particles
-and gives to them in every round (Li et al. 2019).
+`ObjectNetwork` (DPI-Net): in addition every object has a node, which receives from those of its
+particles that are in the graph (0 if none is) and gives to them in every round (Li et al. 2019).
+How the particles of an object are spread is one of its inputs.
 
     H_o <- H_o + G(H_o, mean_i q_i, max_i q_i),  q_i = q(h_i, sum_j m_ij)
     h_i <- h_i + g(h_i, sum_j m_ij, H_o)
@@ -23,10 +24,12 @@ fluids, ICLR 2019.
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch
 from torch import Tensor, nn
 
-from physion.models.particles.graph import EDGE, NODE, OBJECT, Graph
+from physion.models.particles.graph import EDGE, MOMENTS, NODE, OBJECT, Graph
 from physion.models.particles.rigid_motion import mean_by
 
 
@@ -34,6 +37,33 @@ def mlp(inputs: int, width: int, outputs: int, *, normalized: bool = True) -> nn
     """Return two linear layers with a ReLU between them, and layer normalisation at the end."""
     layers = [nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, outputs)]
     return nn.Sequential(*layers, *([nn.LayerNorm(outputs)] if normalized else []))
+
+
+class JoinedInputs(nn.Sequential):
+    """`mlp` of several inputs side by side.
+
+    The first layer is the sum of a product for each input. So nothing is copied into one matrix,
+    and what many rows share is multiplied once.
+    """
+
+    def __init__(self, inputs: int, width: int) -> None:
+        super().__init__(*mlp(inputs, width, width))
+
+    def forward(  # type: ignore[override]
+        self, *inputs: Tensor, shared: Tensor | None = None, rows: Tensor | None = None
+    ) -> Tensor:
+        """Return outputs (n, width) for inputs (n, ...), the last of which is ``shared[rows]``."""
+        first = cast(nn.Linear, self[0])
+        parts = inputs if shared is None else (*inputs, shared)
+        weights = torch.split(first.weight, [part.shape[1] for part in parts], dim=1)
+        hidden = nn.functional.linear(inputs[0], weights[0], first.bias)
+        for part, weight in zip(inputs[1:], weights[1:], strict=False):
+            hidden = hidden + nn.functional.linear(part, weight)
+        if shared is not None:
+            hidden = hidden + nn.functional.linear(shared, weights[-1])[rows]
+        for layer in list(self)[1:]:
+            hidden = layer(hidden)
+        return hidden
 
 
 class EdgeMessages(nn.Module):
@@ -65,19 +95,19 @@ class MessageNetwork(nn.Module):
 
     def __init__(self, width: int, rounds: int) -> None:
         super().__init__()
-        self.node = mlp(NODE + OBJECT, width, width)
+        self.node = JoinedInputs(NODE + OBJECT, width)
         self.edge = mlp(EDGE, width, width)
         self.messages = nn.ModuleList(EdgeMessages(width) for _ in range(rounds))
-        self.updates = nn.ModuleList(mlp(2 * width, width, width) for _ in range(rounds))
+        self.updates = nn.ModuleList(JoinedInputs(2 * width, width) for _ in range(rounds))
         self.head = mlp(width, width, 3, normalized=False)
 
     def forward(self, graph: Graph) -> Tensor:
         """Return changes of displacements (N, 3) of the nodes."""
-        nodes = self.node(torch.cat([graph.nodes, graph.things[graph.owners]], -1))
+        nodes = self.node(graph.nodes, shared=graph.things, rows=graph.owners)
         edges = self.edge(graph.edges)
         for message, update in zip(self.messages, self.updates, strict=True):
             received = message(nodes, edges, graph)
-            nodes = nodes + update(torch.cat([nodes, received], -1))
+            nodes = nodes + update(nodes, received)
         out: Tensor = self.head(nodes)
         return out
 
@@ -94,11 +124,11 @@ class ObjectNetwork(nn.Module):
         super().__init__()
         self.node = mlp(NODE, width, width)
         self.edge = mlp(EDGE, width, width)
-        self.object = mlp(OBJECT, width, width)
+        self.object = mlp(OBJECT + MOMENTS, width, width)
         self.messages = nn.ModuleList(EdgeMessages(width) for _ in range(rounds))
-        self.gather = nn.ModuleList(mlp(2 * width, width, width) for _ in range(rounds))
-        self.objects = nn.ModuleList(mlp(3 * width, width, width) for _ in range(rounds))
-        self.updates = nn.ModuleList(mlp(3 * width, width, width) for _ in range(rounds))
+        self.gather = nn.ModuleList(JoinedInputs(2 * width, width) for _ in range(rounds))
+        self.objects = nn.ModuleList(JoinedInputs(3 * width, width) for _ in range(rounds))
+        self.updates = nn.ModuleList(JoinedInputs(3 * width, width) for _ in range(rounds))
         self.rigid_head = mlp(width, width, 6, normalized=False)
         self.loose_head = mlp(width, width, 3, normalized=False)
 
@@ -107,18 +137,18 @@ class ObjectNetwork(nn.Module):
         nodes, edges, things = (
             self.node(graph.nodes),
             self.edge(graph.edges),
-            self.object(graph.things),
+            self.object(torch.cat([graph.things, graph.moments], -1)),
         )
         owners, count = graph.owners, len(things)
         layers = zip(self.messages, self.gather, self.objects, self.updates, strict=True)
         for message, gather, join, update in layers:
             received = message(nodes, edges, graph)
-            own = gather(torch.cat([nodes, received], -1))
+            own = gather(nodes, received)
             rows = owners[:, None].expand_as(own)
             largest = own.new_zeros(count, own.shape[1]).scatter_reduce(
                 0, rows, own, "amax", include_self=False
             )
-            things = things + join(torch.cat([things, mean_by(own, owners, count), largest], -1))
-            nodes = nodes + update(torch.cat([nodes, received, things[owners]], -1))
+            things = things + join(things, mean_by(own, owners, count), largest)
+            nodes = nodes + update(nodes, received, shared=things, rows=owners)
         velocity, rim = self.rigid_head(things).split(3, dim=-1)
         return velocity, rim, self.loose_head(nodes)

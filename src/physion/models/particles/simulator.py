@@ -69,8 +69,8 @@ from physion.models.torch_model import TorchModel, digest_of, initial_weights
 from physion.scenes.scene import FRAME_TIME
 from physion.seeds import generator
 
-VERSION = 3
-"""To be raised with every change of what equal weights predict, or of the training."""
+VERSIONS = {"messages": 3, "objects": 4}
+"""By network; to be raised with every change of what equal weights predict, or of the training."""
 UNIT, CHANGE = 0.06, 0.02
 """Metres a step: units of displacements, and of their changes. A body that falls for 0.03 s changes
 its displacement by 0.009 m, one that moves at 1 m/s moves 0.03 m."""
@@ -153,7 +153,8 @@ class ParticleSimulator(TorchModel):
         """Return the SHA-256 of settings and weights; the number of futures is no part."""
         config = asdict(self.config)
         config.pop("training")
-        parts = [VERSION, config, self.options.stride, self.options.spread, torch.__version__]
+        version = VERSIONS[self.config.network]
+        parts = [version, config, self.options.stride, self.options.spread, torch.__version__]
         return digest_of(parts, self.state_dict().items())
 
     def built_as(self) -> dict[str, Any]:
@@ -161,7 +162,7 @@ class ParticleSimulator(TorchModel):
         options = self.options
         return {
             "model": self.name,
-            "version": VERSION,
+            "version": VERSIONS[self.config.network],
             "stride": options.stride,
             "swept": options.swept,
         }
@@ -336,7 +337,10 @@ class ParticleSimulator(TorchModel):
 
     def _graph(self, layout: SceneLayout, drift: Drift) -> Graph:
         config = self.config
-        return make_graph(layout, drift, config.radius, UNIT, swept=config.swept)
+        near_only = config.network == "objects"
+        return make_graph(
+            layout, drift, config.radius, UNIT, swept=config.swept, near_only=near_only
+        )
 
     def _changes(self, graph: Graph) -> Tensor:
         """Return the changes of displacements (P, 3) that GNS predicts, metres."""
