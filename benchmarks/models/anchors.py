@@ -183,7 +183,8 @@ def lines(
         f"`python benchmarks/models/anchors.py OFFICIAL/scenes --write`, {datetime.date.today()}, "
         f"{processor_and_cores()}. Accuracy for the recorded outcome of {len(trials)} scenes "
         f"without duplicates, with whole configurations held out / in {FOLDS} random folds; the "
-        f"standard error of a scenario is about {math.sqrt(0.2 * len(present) / len(trials)):.2f}. Engine: "
+        "standard error of a scenario is about "
+        f"{math.sqrt(0.2 * len(present) / len(trials)):.2f}. Engine: "
         f"{make_engine(DEFAULT_ENGINE).name}."
     )
     yield ""

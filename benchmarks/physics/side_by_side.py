@@ -96,7 +96,8 @@ def main() -> None:
             f"`python benchmarks/physics/side_by_side.py OTHER/src --seeds {options.seeds} "
             f"--rounds {options.rounds} --write`, {datetime.date.today()}, "
             f"{processor_and_cores()}. Median over rounds in turns; below 1 is faster. Physics: "
-            "150 frames; rendering: every pass of 10 frames at 256 x 256 pixels, the first frame left out.",
+            "150 frames; rendering: every pass of 10 frames at 256 x 256 pixels, the first frame "
+            "left out.",
             "",
         ]
         (RESULTS / "side_by_side.md").write_text("\n".join([*title, *lines]) + "\n")
