@@ -62,12 +62,17 @@ outcomes.close()
 assert not ray.is_initialized()
 # The address of a cluster is not answered by the Ray that was started here.
 assert next(executor.map(process_of, {"a": 1})).error is None
+class Elsewhere(RayExecutor):
+    def _start(self):
+        assert not ray.is_initialized()
+        raise PhysionError("it looks for the cluster")
+
 try:
-    list(RayExecutor("127.0.0.1:1").map(process_of, {"a": 1}))
+    list(Elsewhere("127.0.0.1:1").map(process_of, {"a": 1}))
 except PhysionError as error:
-    assert "cannot be reached" in str(error)
+    assert "looks for the cluster" in str(error)
 else:
-    raise AssertionError("there is no cluster at this address")
+    raise AssertionError("tasks must not run on the Ray that was started here")
 """
 
 
