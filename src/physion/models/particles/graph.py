@@ -158,16 +158,19 @@ def make_graph(
     used[pairs[0]] = True
     rows = used.nonzero()[:, 0]
     node_of = used.long().cumsum(0) - 1
+    offsets = (
+        drift.positions - mean_by(drift.positions, layout.owners, layout.objects)[layout.owners]
+    )
     return Graph(
         particles=len(layout.owners),
         rows=rows,
         receivers=node_of[pairs[0]],
         senders=node_of[pairs[1]],
         owners=layout.owners[rows],
-        nodes=_node_inputs(layout, drift, radius, unit, rows),
+        nodes=_node_inputs(layout, drift, offsets, radius, unit, rows),
         edges=_edge_inputs(drift, pairs, outer.shape[1], radius, unit),
         things=_object_inputs(layout, drift, radius, unit),
-        moments=_moments(layout, drift) if near_only else drift.positions.new_zeros(0),
+        moments=_moments(layout, offsets) if near_only else drift.positions.new_zeros(0),
     )
 
 
@@ -195,15 +198,17 @@ def outer_edges_on_device(
 
 
 def _node_inputs(
-    layout: SceneLayout, drift: Drift, radius: float, unit: float, rows: Tensor
+    layout: SceneLayout, drift: Drift, offsets: Tensor, radius: float, unit: float, rows: Tensor
 ) -> Tensor:
-    """Return displacement, offset from the centre, normal, heights now and after, and kind."""
-    centers = mean_by(drift.positions, layout.owners, layout.objects)
-    owners, moves, positions = layout.owners[rows], drift.moves[rows], drift.positions[rows]
-    offsets = (positions - centers[owners]) / radius
+    """Return displacement, offset from the centre, normal, heights now and after, and kind.
+
+    ``offsets`` (P, 3): of all particles from the centres of their objects, metres.
+    """
+    owners, moves = layout.owners[rows], drift.moves[rows]
     # Nothing depends on where the middle of a kinematic body is, which may be metres away.
-    offsets = offsets.masked_fill((layout.kinds == KINEMATIC)[owners][:, None], 0.0)
-    height = positions[:, 2] - layout.floor[owners]
+    kinematic = (layout.kinds == KINEMATIC)[owners][:, None]
+    offsets = (offsets[rows] / radius).masked_fill(kinematic, 0.0)
+    height = drift.positions[rows, 2] - layout.floor[owners]
     heights = torch.stack([height, height + moves[:, 2]], -1) / radius
     kinds = torch.nn.functional.one_hot(layout.kinds, 3)[owners]
     parts = [moves / unit, offsets, drift.normals[rows], heights.clamp(-2, 1), kinds.double()]
@@ -244,10 +249,8 @@ def _object_inputs(layout: SceneLayout, drift: Drift, radius: float, unit: float
     return torch.cat(parts, dim=-1).float()
 
 
-def _moments(layout: SceneLayout, drift: Drift) -> Tensor:
+def _moments(layout: SceneLayout, offsets: Tensor) -> Tensor:
     """Return the second moments (K, `MOMENTS`) of the particles of each object; see `Graph`."""
-    centers = mean_by(drift.positions, layout.owners, layout.objects)
-    offsets = drift.positions - centers[layout.owners]
     products = offsets[:, [0, 1, 2, 0, 0, 1]] * offsets[:, [0, 1, 2, 1, 2, 2]]
     means = mean_by(products, layout.owners, layout.objects)
     return (means / means[:, :3].sum(-1, keepdim=True).clamp_min(1e-12)).float()
