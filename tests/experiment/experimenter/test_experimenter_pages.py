@@ -277,7 +277,7 @@ def test_implausible_sessions_stand_out_on_every_page(tmp_path: Path) -> None:
                 **facts,
             )  # fmt: skip
         visitor = found.experimenter()
-        assert "and 1 implausible" in words_of(visitor.see().text)
+        assert "and 1 implausible" in words_of(with_flags(visitor))
         implausible = [row.reference for row in rows_of(found) if row.implausible]
         assert references(visitor.see("/sessions?flag=implausible").text) == implausible
         assert reason in words_of(visitor.see(f"/sessions/{session}").text)
