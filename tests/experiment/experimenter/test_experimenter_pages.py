@@ -348,6 +348,10 @@ def test_flags_are_those_of_the_analysis(busy: tuple[Lab, Visitor]) -> None:
     flagged = set(table.loc[table["flagged"], "session"])
     shown = references(visitor.see("/sessions?state=finished&flag=any").text)
     assert set(shown) == {finished[name].reference for name in flagged}
+    none = visitor.see("/sessions?state=going&flag=any").text
+    assert "No matching session." in none
+    unknown = visitor.see("/sessions?kind=preview&flag=any").text
+    assert "Flags are not known" in unknown and "previews are never analysed" in unknown
     one = visitor.see(f"/sessions/{flagged.pop()}").text
     assert '<span class="flag">' in one
 
