@@ -5,8 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from support.official import official_folder
+
+# A test must not fail because the machine is slow.
+settings.register_profile("physion", deadline=None)
+settings.load_profile("physion")
 
 
 @pytest.fixture(scope="session")

@@ -114,6 +114,7 @@ def test_a_poison_task_is_put_aside_and_a_lost_one_runs_again(tmp_path: Path) ->
 
 
 def test_a_task_without_end_is_stopped() -> None:
+    list(RayExecutor().map(square, numbers(1, 2)))  # starts the workers, which may take long
     outcomes = {
         o.key: o
         for o in RayExecutor(tries=1, timeout=20.0).map(time.sleep, {"long": 600, "short": 0})

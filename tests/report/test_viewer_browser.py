@@ -53,6 +53,7 @@ def seek(browser: Browser, frame: int) -> None:
     """Move the time line, and wait until the movie stands there."""
     choose(browser, "frame-slider", str(frame))
     browser.until(f"document.getElementById('now').textContent.startsWith('frame {frame} of')")
+    browser.until("![...document.querySelectorAll('video')].some(video => video.seeking)")
     browser.ask("new Promise(done => setTimeout(done, 300))")
 
 

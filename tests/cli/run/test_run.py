@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import re
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
+from physion.cli import output
 from physion.cli.main import main
 from physion.cli.run.plan import balanced_trials
 from physion.data import official
@@ -44,7 +46,7 @@ def test_sampled_scenes_to_report(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 @pytest.mark.slow
 def test_the_first_command_compares_models_with_people(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     few = ["--models", "noisy-simulation,state-classifier,chance"]
     command = ["run", "--out", str(tmp_path), *SMALL, *few, "--trial-pages", "--json"]
@@ -68,6 +70,7 @@ def test_the_first_command_compares_models_with_people(
     tested = index[index["split"] == "testing"]
     assert (tested.groupby("scenario")["recorded_contact"].sum() == 1).all(), "balanced"
     first = digests(tmp_path)
+    monkeypatch.setattr(output, "_LINE_EVERY", math.inf)  # progress, on a slow machine
     assert main(command) == 0
     again = capsys.readouterr()
     assert json.loads(again.out) == answer and again.err == ""

@@ -57,8 +57,8 @@ def test_breaks_are_offered_and_stored(chromium: Any, tmp_path: Path) -> None:
     _, answers, events = rows_of(study, "Rest")
     rests = [row.break_ms for row in answers if row.phase == "test"]
     assert rests[:2] == [None, None] and rests[3] is None
-    assert 700 <= rests[2] < 5000
-    assert answers[3].rt_ms < 5000
+    assert 700 <= rests[2] < 60_000
+    assert answers[3].rt_ms < 60_000
     assert [event.data for event in events if event.kind == "break"] == [{"trial": 2}] * 3
 
 

@@ -55,7 +55,7 @@ def test_all_boxes_are_ticked_before_one_agrees(chromium: Any, tmp_path: Path) -
         visit.main_button().click()
         visit.heading("What you will do")
         assert visit.unexpected() == []
-        sent = httpx2.get(f"{server.url}/consent/en.pdf")
+        sent = httpx2.get(f"{server.url}/consent/en.pdf", timeout=60)
         assert (sent.content, sent.headers["content-type"]) == (FORM, "application/pdf")
         for name in ("de.pdf", "en.toml", "..%2fen.toml"):
-            assert httpx2.get(f"{server.url}/consent/{name}").status_code == 404
+            assert httpx2.get(f"{server.url}/consent/{name}", timeout=60).status_code == 404

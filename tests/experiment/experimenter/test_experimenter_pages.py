@@ -419,11 +419,13 @@ def is_alive(pid: int) -> bool:
 def test_no_process_is_left_by_a_killed_server(tmp_path: Path) -> None:
     study = make_tiny_study(tmp_path, size=64, languages=("en",))
     with ServerProcess(study.folder) as server:
-        with httpx2.Client(base_url=server.url, trust_env=False, follow_redirects=True) as client:
+        with httpx2.Client(
+            base_url=server.url, trust_env=False, follow_redirects=True, timeout=60
+        ) as client:
             form = re.search(r'name="form_token" value="(\w+)"', client.get(f"{BASE}/login").text)
             assert form is not None
             fields = {"form_token": form[1], "password": PASSWORD}
-            assert "Log out" in client.post(f"{BASE}/login", data=fields, timeout=60).text
+            assert "Log out" in client.post(f"{BASE}/login", data=fields).text
         children = Path(f"/proc/{server.pid}/task/{server.pid}/children")
         tasks = [path.read_text().split() for path in children.parents[1].glob("*/children")]
         left = {int(pid) for pids in tasks for pid in pids}

@@ -48,7 +48,7 @@ def test_simulated_participants_pass_all_checks(tmp_path: Path) -> None:
 
 def read_page(url: str, session: str) -> str:
     """Return the experimenter's page of a session."""
-    with httpx2.Client(base_url=url, follow_redirects=True) as client:
+    with httpx2.Client(base_url=url, follow_redirects=True, timeout=60) as client:
         form = client.get(f"{BASE}/login").text
         fields = {
             "form_token": form.split('name="form_token" value="')[1].split('"')[0],

@@ -63,7 +63,7 @@ class Load:
             # Retry often, but leave processor time for the server.
             plan = SimulationPlan(
                 self._url, self._people, seed=1000 * number + wave, dropouts=0.0, pace=0.01,
-                waits_s=(0.05, 0.4), patience_s=90.0, media=False,
+                waits_s=(0.05, 0.4), patience_s=300.0, media=False,
             )  # fmt: skip
             self.waves.append(await simulate(self._study, self._secrets, plan))
             wave += 1
@@ -76,7 +76,7 @@ class Load:
         self._stopping.set()
         if kind is not None:  # the server may have ended
             return
-        self._thread.join(120)
+        self._thread.join(300)
         assert not self._thread.is_alive(), "the participants did not get to the end"
         if self.error is not None:
             raise self.error

@@ -165,7 +165,7 @@ class TestBodies:
             begin = time.monotonic()
             answer = exchange(port, head("/echo", "Content-Length: 50"), b"half")
             assert_refused(answer, 408, "bad_request")
-            assert time.monotonic() - begin < 5
+            assert time.monotonic() - begin < 15
 
     def test_the_connection_stays_open_after_a_good_request(self, port: int) -> None:
         one = head("/echo", "Content-Length: 3") + b"abc"
@@ -196,18 +196,18 @@ class TestHeads:
         assert trickle.sent < 9_000_000
 
     def test_silent_connections_are_closed(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(connections, "HEAD_SECONDS", 0.3)
+        monkeypatch.setattr(connections, "HEAD_SECONDS", 1.0)
         with running(make_app()) as port:
             for start in (b"", b"GET /echo HT"):
-                with socket.create_connection((HOST, port), timeout=5) as connection:
+                with socket.create_connection((HOST, port), timeout=30) as connection:
                     connection.sendall(start)
                     assert connection.recv(10) == b""
             # This does not end a running request or one that was answered.
-            with socket.create_connection((HOST, port), timeout=5) as connection:
-                for _ in range(3):
+            with socket.create_connection((HOST, port), timeout=30) as connection:
+                for _ in range(2):
                     connection.sendall(head("/echo", method="GET"))
                     assert connection.recv(65536).startswith(b"HTTP/1.1 200")
-                    time.sleep(0.5)
+                    time.sleep(1.5)
 
     def test_websockets_are_refused(self, port: int) -> None:
         lines = ["Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13",
@@ -314,12 +314,14 @@ class TestRates:
         assert limits.wait_time("GET", "/api/session", "good", "1.2.3.4", 0.0) == 0
 
     def test_new_sessions_are_counted_by_address(self) -> None:
-        client = TestClient(make_app(limits=Limits(sessions_at_once=3)), client=("9.9.9.9", 1))
+        limits = Limits(sessions_per_minute=1, sessions_at_once=3)
+        client = TestClient(make_app(limits=limits), client=("9.9.9.9", 1))
         assert [client.post("/api/enter").status_code for _ in range(4)] == [200] * 3 + [429]
         assert client.get("/echo").status_code == 200
 
     def test_a_refused_body_is_read_so_that_the_connection_stays_open(self) -> None:
-        with running(make_app(limits=Limits(sessions_at_once=1))) as port:
+        limits = Limits(sessions_per_minute=1, sessions_at_once=1)
+        with running(make_app(limits=limits)) as port:
             one = head("/api/enter", "Content-Length: 60000") + b"x" * 60000
             answer = exchange(port, one, one, head("/echo", method="GET"))
             assert re.findall(rb"HTTP/1.1 (\d+)", answer) == [b"200", b"429", b"200"]

@@ -85,7 +85,7 @@ def started(folder: Path, *words: str) -> Iterator[Process]:
 
 
 def ask(port: int, method: str, path: str, body: Any = None, token: str = "") -> Any:
-    connection = http.client.HTTPConnection(HOST, port, timeout=10)
+    connection = http.client.HTTPConnection(HOST, port, timeout=30)
     headers = {"content-type": "application/json", "authorization": f"Bearer {token}"}
     connection.request(method, path, None if body is None else json.dumps(body), headers)
     return json.loads(connection.getresponse().read())
@@ -104,8 +104,8 @@ def test_stopping_finishes_requests_and_keeps_every_answer(study: Study) -> None
         lines += ["Content-Type: application/json", f"Content-Length: {len(body)}", "", ""]
         head = "\r\n".join(lines)
         with (
-            socket.create_connection((HOST, server.port), timeout=10) as idle,
-            socket.create_connection((HOST, server.port), timeout=10) as connection,
+            socket.create_connection((HOST, server.port), timeout=30) as idle,
+            socket.create_connection((HOST, server.port), timeout=30) as connection,
         ):
             idle.sendall(b"GET /api/health HTTP/1.1\r\nHost: x\r\n\r\n")
             heard = b""
@@ -135,7 +135,7 @@ def test_https_and_printed_url(study: Study, certificate: tuple[Path, Path]) -> 
         assert server.said["address"] == f"https://127.0.0.1:{server.port}"
         assert server.said["experimenter"] == f"{server.said['address']}/experimenter"
         context = ssl.create_default_context(cafile=certificate[0])
-        connection = http.client.HTTPSConnection(HOST, server.port, timeout=10, context=context)
+        connection = http.client.HTTPSConnection(HOST, server.port, timeout=30, context=context)
         connection.request("GET", "/?PROLIFIC_PID=5f0c")
         answer = connection.getresponse()
         assert answer.status == 200 and b"<!doctype html>" in answer.read()
@@ -158,7 +158,7 @@ def test_only_named_proxies_are_trusted(tmp_path: Path, trusted: bool) -> None:
     ):
         statuses, secure = [], []
         for address in ("1.1.1.1", "2.2.2.2", "2.2.2.2"):
-            connection = http.client.HTTPConnection(HOST, port, timeout=10)
+            connection = http.client.HTTPConnection(HOST, port, timeout=30)
             headers = {"content-type": "application/json", "x-forwarded-for": address,
                        "x-forwarded-proto": "https"}  # fmt: skip
             connection.request("POST", "/api/enter", "{}", headers)

@@ -43,8 +43,8 @@ def test_serving_imports_nothing_slow() -> None:
 def test_requests_are_logged_without_personal_data(tmp_path: Path) -> None:
     folder = make_tiny_study(tmp_path / "study", test=2, familiarization=1).folder
     with ServerProcess(folder, options=["--log-requests"]) as server:
-        asked = httpx2.get(f"{server.url}/?PROLIFIC_PID=SECRET", trust_env=False)
-        httpx2.get(f"{server.url}/no%0Asuch", trust_env=False)
+        asked = httpx2.get(f"{server.url}/?PROLIFIC_PID=SECRET", trust_env=False, timeout=60)
+        httpx2.get(f"{server.url}/no%0Asuch", trust_env=False, timeout=60)
         lines = server.last_output().splitlines()
     assert asked.status_code == 200
     for request in ("GET / 200", "GET /no%0Asuch 404"):

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from physion.errors import BadInputError, PhysionError
@@ -233,7 +234,12 @@ def test_the_estimate_says_what_it_comes_from_and_writes_nothing(
         overrides=TrainingOverrides(steps=6000),
     )  # fmt: skip
     slow, quick = estimate_plan(longer)[0].seconds, estimates[2].seconds
-    assert slow is not None and quick is not None and slow > 100 * (quick - 1)
+    records = [
+        json.loads(path.read_bytes()) for path in (tmp_path / "plan" / "trainings").iterdir()
+    ]
+    step = np.median([record["values"]["speed"]["step"] for record in records])
+    assert slow is not None and quick is not None
+    assert slow - quick == pytest.approx((6000 - 6) * step)
     assert time_left(later, later.pending).startswith(", about ")
 
 

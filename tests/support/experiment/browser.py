@@ -56,7 +56,9 @@ def chromium() -> Iterator[Any]:
     driver = importlib.import_module("playwright.sync_api")
     path = find_chromium()
     with driver.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        browser = playwright.chromium.launch(
+            executable_path=path, args=["--no-sandbox"], timeout=120_000
+        )
         yield browser
         browser.close()
 
@@ -109,7 +111,7 @@ class Visit:
         self.complaints: list[str] = []
         self.requests: list[str] = []
         self.context = chromium.new_context(**{"viewport": SIZE, "locale": "en-US", **context})
-        self.context.set_default_timeout(20_000)
+        self.context.set_default_timeout(60_000)
         self.page = self.open_tab()
         self._pictures = 0
 

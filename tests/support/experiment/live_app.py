@@ -43,7 +43,7 @@ def exchange(port: int, *parts: bytes, patience: float = 10.0) -> bytes:
         return read_all(connection)
 
 
-def read_all(connection: socket.socket, silence: float = 0.4) -> bytes:
+def read_all(connection: socket.socket, silence: float = 2.0) -> bytes:
     """Read until the other side closes or sends nothing for ``silence`` seconds."""
     received = b""
     while True:

@@ -255,6 +255,7 @@ def test_the_system_refusing_to_write_more_is_an_error_and_not_a_crash(
 
 KILLED = """
 import sys
+import time
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from support.paths import TESTS
@@ -262,9 +263,13 @@ from support.hand_made import make_by_hand, make_scene
 from physion.compute.local import LocalExecutor
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import plan_scenes
+told = []
 def progress(what, done, total):
     if done:
         print(done, flush=True)
+        told.append(done)
+    if len(told) == int(sys.argv[4]):
+        time.sleep(600)  # until the kill, however late it is; the worker goes on with one trial
 if __name__ == "__main__":
     names = [f"t{n:02d}" for n in range(int(sys.argv[3]))]
     tasks = plan_scenes("tests", [make_scene(name) for name in names])
@@ -283,6 +288,7 @@ def run_and_kill(folder: Path, trials: int, after: int, delay: float) -> int:
         str(folder),
         str(TESTS),
         str(trials),
+        str(after),
     ]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
     assert process.stdout is not None
