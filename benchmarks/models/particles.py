@@ -7,12 +7,19 @@
     python benchmarks/models/particles.py official FOLDER --write  # the same on official scenes
     python benchmarks/models/particles.py futures FOLDER --write  # one and several, beside people
     python benchmarks/models/particles.py batched FOLDER --write  # rollouts together, one by one
+    python benchmarks/models/particles.py symmetry FOLDER --write  # scenes that are rotated
+    python benchmarks/models/particles.py memory FOLDER --write  # of one scene of Drape
 
 ``collide`` trains DPI-Net (small) on 300 trials of Collide, with swept and with plain edges, and
 tests on 300 balanced trials without observed contact; the state classifier is fitted on the same
 300. Answers are those of one future, and P(contact) of 8 futures with noise on the velocities from
-which they start. ``futures`` compares such answers of the shipped DPI-Net with those of the people
-who saw the official scenes, Drape left out; outcomes are the recorded ones.
+which they start.
+
+``futures`` compares such answers of the shipped DPI-Net with those of the people who saw the
+official scenes, Drape left out; outcomes are the recorded ones. ``symmetry`` compares the step
+after the last observed frame with that of the same scene rotated by 1 rad about the vertical, for
+shipped weights and untrained ones: the models have no such symmetry built in. ``memory`` does one
+training step of one scene of Drape in a process of its own.
 
 Times are processor time; use OMP_NUM_THREADS=1. With --write a section of ``results/particles.md``
 is replaced.
@@ -24,8 +31,11 @@ import argparse
 import dataclasses
 import datetime
 import os
+import resource
 import time
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +44,17 @@ import torch
 from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score
 
-from physion import Dataset, build_model, simulate
+from physion import Dataset, build_model, sample_scene, simulate
 from physion.analysis.tables.responses import read_humans
 from physion.compute.machine import processor
 from physion.data import official
-from physion.models.batch import Motion
+from physion.models.batch import Batch, Motion
 from physion.models.interface import Fits
 from physion.models.observed import cut_to_observed
+from physion.models.particles.bodies import poses_of, scene_particles
+from physion.models.particles.graph import drift_of, make_graph
+from physion.models.particles.layout import join_poses, join_scenes, rotate_scenes
+from physion.models.particles.rigid_motion import rotation_from_vector
 from physion.models.particles.simulator import ParticleSimulator
 from physion.physics.labels import label_contact
 from physion.readout.rollout_error import motion_error
@@ -330,6 +344,75 @@ def run_batched(folder: Path) -> str:
 HEAD = ["trials", "accuracy", "AUC", "error 30, m / constant", "error 60, m / constant"]
 
 
+def run_symmetry(folder: Path) -> str:
+    """Return the table of differences between rotated predictions and those of rotated scenes."""
+    dataset = Dataset(folder / "all")
+    motions, _ = motions_of(dataset, dataset.trials("testing", "collide"))
+    rotation = rotation_from_vector(torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64))
+    rows = []
+    for name in NAMES:
+        for weights in ("shipped", "random"):
+            model: Any = build_model(name, weights=weights)
+            changes, differences = [], []
+            for motion in motions:
+                particles = scene_particles(motion.scene, model.config.particles)
+                poses = [poses_of(particles, motion, [41, 44])]
+                layout = join_scenes([particles], model.device)
+                before, now = (join_poses(poses, row, model.device) for row in (0, 1))
+                with torch.no_grad():
+                    after = model.step(layout, before, now)
+                    other = model.step(
+                        layout,
+                        rotate_scenes(before, layout, rotation),
+                        rotate_scenes(now, layout, rotation),
+                    )
+                drift = drift_of(layout, before, now)
+                change = after.positions(layout) - drift.positions - drift.moves
+                rotated = rotate_scenes(after, layout, rotation).positions(layout)
+                changes.append(float(change.norm(dim=-1).mean()))
+                differences.append(float((rotated - other.positions(layout)).norm(dim=-1).mean()))
+            mean, difference = 1000 * np.mean(changes), 1000 * np.mean(differences)
+            cells = [f"{mean:.3f}", f"{difference:.3f}", f"{difference / mean:.2f}"]
+            rows.append([model.name, weights, str(len(motions)), *cells])
+            print(rows[-1], flush=True)
+    head = ["model", "weights", "trials", "change of a particle, mm", "difference, mm", "ratio"]
+    return table(head, rows) + (
+        "\nChange: by the network, of the motion in a step of 0.03 s; mean over particles, "
+        "then trials."
+    )
+
+
+def run_memory(_: Path) -> str:
+    """Return the table of particles, edges and memory of a training step of one scene of Drape."""
+    rows = []
+    for name in ("dpi", "gns"):
+        for size in ("small", "paper"):
+            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+                rows.append([f"{name}-{size}", *pool.submit(step_of_drape, name, size).result()])
+                print(rows[-1], flush=True)
+    return table(["model", "particles", "edges", "before, MB", "at most, MB"], rows)
+
+
+def step_of_drape(name: str, size: str) -> list[str]:
+    """Return particles, edges, and the memory of this process before and at most."""
+    scene = sample_scene("drape", 1)
+    motion = Motion(scene, simulate(scene))
+    model: Any = build_model(name, size=size)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    frames = np.arange(30, 30 + 3 * model.window, 3)[None]
+    batch = Batch((scene.name,), frames, np.ones_like(frames, np.bool_), state=(motion,))
+    model.train().loss(batch)["loss"].backward()
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    particles = scene_particles(scene, model.config.particles)
+    poses = [poses_of(particles, motion, [41, 44])]
+    layout = join_scenes([particles], model.device)
+    drift = drift_of(layout, *(join_poses(poses, row, model.device) for row in (0, 1)))
+    near_only = model.config.network == "objects"
+    graph = make_graph(layout, drift, model.config.radius, 1.0, swept=True, near_only=near_only)
+    counts = [len(particles.owners), len(graph.senders), before // 1024, most // 1024]
+    return [f"{count:,}" for count in counts]
+
+
 def table(head: list[str], rows: Rows) -> str:
     """Return a Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
@@ -356,7 +439,8 @@ def main() -> None:
     """Run one of the benchmarks."""
     runs = {
         "collide": run_collide, "transfer": run_transfer, "futures": run_futures,
-        "batched": run_batched,
+        "batched": run_batched, "symmetry": run_symmetry,
+        "memory": run_memory,
     }  # fmt: skip
     by_model = {"shipped": run_shipped, "official": run_official}
     parser = argparse.ArgumentParser(

@@ -7,7 +7,7 @@
 TRAINED is the output folder of the trainings. Particle models were trained on the states of
 ``python benchmarks/models/particles.py data FOLDER``:
 
-    physion train dpi FOLDER/all --out TRAINED --steps 12000
+    physion train dpi FOLDER/all --out TRAINED --steps 16000
     physion train gns FOLDER/all --out TRAINED --steps 7000
 
 GNS-RANSAC has the weights of GNS and thresholds that are fitted on its own rollouts, for which it
@@ -18,7 +18,7 @@ needs ``--particles FOLDER``. Vision models were trained on movies of 64 px:
     physion train svg,op3,cswm,rpin MOVIES --out TRAINED
 
 The weights of SVG are stored as float16. With --scores only the cards are written again, with the
-tables of ``results/particles.md`` and ``results/vision_models.md``.
+digests of the weights and the tables of ``results/particles.md`` and ``results/vision_models.md``.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -83,15 +84,19 @@ def ship(trained: Path, name: str, particles: Path | None) -> None:
         if particles is None:
             raise SystemExit(f"{name} needs --particles FOLDER")
         fit_distances(model, Dataset(particles / "all"), metadata["config"])
-        card = card.replace("gns-small", name).replace("| rigid | fit |", "| rigid | robust |") + (
-            "\nThe weights are those of gns-small; the distances that count as contact are fitted "
-            "on the rollouts of this model.\n"
-        )
+        card = card.replace("gns-small", name).replace("| rigid | fit |", "| rigid | robust |")
+    # Settings of the size; those of this training have a table of their own.
+    card = "".join(line for line in card.splitlines(True) if not line.startswith("| training | {"))
     card = card.split("## Use")[0] + "## Use\n`physion evaluate TRIALS "
     card += f"{name.removesuffix('-small')} --weights shipped`\n"
     if isinstance(model, ParticleSimulator):
         touch = ", ".join(f"{value:.3f}" for value in model.touch.tolist())
         card += f"\n## Contact\nDistance that counts as contact, bodies and cloth, m: {touch}\n"
+    if name != SOURCES[name]:
+        card += (
+            f"The weights are those of {SOURCES[name]}; the distances are fitted on the rollouts "
+            "of this model.\n"
+        )
     card += f"\n## Hardware\n{processor()}, one thread\n"
     card += f"\n## Trials\nMade by {TRIALS[model.diet]}.\n"
     stored = tensors_of(model)
@@ -112,19 +117,22 @@ def fit_distances(model: Any, dataset: Dataset, training: Any) -> None:
 
 
 def write_scores() -> None:
-    """Append the tables of every shipped model to its card, in place of earlier ones."""
+    """Append the digest and the tables of every shipped model to its card, in place of earlier."""
+    digests = json.loads((SHIPPED / DIGESTS).read_text())
     tables = [
         *tables_of((RESULTS / "particles.md").read_text(), "| model | scenario |"),
         *tables_of((RESULTS / "vision_models.md").read_text(), "| model | metric |"),
     ]
     for name in sorted(path.stem for path in SHIPPED.glob("*.safetensors")):
-        text = ["## Scores"]
+        text = ["## Weights", f"SHA-256 of {name}.safetensors: {digests[name]}", "", "## Scores"]
         for title, head, rows in tables:
             own = [row for row in rows if row.startswith(f"| {name} |")]
             if own:
                 text += ["", title, "", head, "|---" * (head.count("|") - 1) + "|", *own]
         path = SHIPPED / f"{name}.md"
-        card = path.read_text().split("## Scores")[0].rstrip()
+        card = re.split(r"^## (?:Weights|Scores)$", path.read_text(), flags=re.MULTILINE)[
+            0
+        ].rstrip()
         path.write_text(card + "\n\n" + "\n".join(text) + "\n")
 
 

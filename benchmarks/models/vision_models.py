@@ -6,7 +6,9 @@
     OMP_NUM_THREADS=1 python benchmarks/models/vision_models.py boxes FOLDER --write  # steps/s
 
 ``speed`` times a training step (forward and backward) and the features of a clip, with what is
-imagined, on random pictures with moving boxes; times are processor time on a CPU.
+imagined, on random pictures with moving boxes; times are processor time on a CPU, and elapsed time
+on a GPU (``--accelerator cuda``, also with ``--precision bf16-mixed``), where batches are 16 times
+as large.
 
 ``learn`` needs the trials of ``physion generate FOLDER --width 64 --height 64`` with the splits
 training and testing. It trains the small models with three seeds and prints, for one clip of every
@@ -106,39 +108,52 @@ def random_clips(clips: int, frames: int, spec: Spec) -> Batch:
     ).to("cpu")
 
 
-def speed(names: list[str], repeats: int) -> Rows:
-    """Yield name, weights, pictures, frames and the least processor times of each model."""
-    for name, options, clips in MODELS:
+def speed(names: list[str], repeats: int, device: str, precision: str) -> Rows:
+    """Yield name, weights, pictures, frames, the least times and clips/s of each model."""
+    for name, options, few in MODELS:
         if name not in names:
             continue
-        model: Any = build_model(name, **options)
+        clips = few if device == "cpu" else 16 * few
+        model: Any = build_model(name, **options).to(device)  # type: ignore[attr-defined]
         spec = model.spec
-        window = random_clips(clips, model.window, spec)
-        context = random_clips(clips, spec.context, spec)
+        window = random_clips(clips, model.window, spec).to(device)
+        context = random_clips(clips, spec.context, spec).to(device)
+        half = torch.autocast(device, torch.bfloat16, enabled=precision != "32-true")
 
-        def train(model: Any = model, window: Batch = window) -> None:
-            model.train().loss(window)["loss"].backward()
+        def train(model: Any = model, window: Batch = window, half: Any = half) -> None:
+            with half:
+                loss = model.train().loss(window)["loss"]
+            loss.backward()
 
-        def extract(model: Any = model, context: Batch = context) -> None:
-            with torch.no_grad():
+        def extract(model: Any = model, context: Batch = context, half: Any = half) -> None:
+            with torch.no_grad(), half:
                 model.eval().encode(context)
                 model.imagine(context, 1, 0)
 
         weights = sum(value.numel() for value in model.parameters())
-        times = [best_time(function, repeats) / clips for function in (train, extract)]
+        times = [best_time(function, repeats, device) / clips for function in (train, extract)]
         cells = [model.name, f"{weights / 1e6:.2f} M", f"{spec.image_size} px", str(model.window)]
-        yield [*cells, *(f"{seconds:.4f}" for seconds in times)]
+        yield [*cells, *(f"{seconds:.4f}" for seconds in times), *(f"{1 / s:.1f}" for s in times)]
 
 
-def best_time(function: Callable[[], None], repeats: int) -> float:
-    """Return the least processor time of several calls, seconds."""
+def best_time(function: Callable[[], None], repeats: int, device: str) -> float:
+    """Return the least time of several calls, seconds: of the processor, or elapsed on a GPU."""
+    clock = time.process_time if device == "cpu" else time.perf_counter
     function()
     times = []
     for _ in range(repeats):
-        start = time.process_time()
+        wait_for(device)
+        start = clock()
         function()
-        times.append(time.process_time() - start)
+        wait_for(device)
+        times.append(clock() - start)
     return min(times)
+
+
+def wait_for(device: str) -> None:
+    """Wait until the GPU has done what it was given."""
+    if device != "cpu":
+        torch.cuda.synchronize()
 
 
 def learn(folder: Path, names: list[str], steps: int, seeds: int) -> Rows:
@@ -288,11 +303,20 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=0, help="0: those of the model")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--accelerator", default="cpu", choices=("cpu", "cuda"), help="of speed")
+    parser.add_argument(
+        "--precision", default="32-true", choices=("32-true", "bf16-mixed"), help="of speed"
+    )
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     if options.part == "speed":
+        device, precision = options.accelerator, options.precision
         head = ["model", "weights", "pictures", "frames", "training step, s", "features, s"]
-        title, rows = "Processor time of a clip", speed(options.models, options.repeats)
+        head += ["trained clips/s", "clips/s of features"]
+        title = "Processor time of a clip"
+        if device != "cpu":
+            title = f"Time of a clip on {torch.cuda.get_device_name()}, {precision}"
+        rows = speed(options.models, options.repeats, device, precision)
     elif options.folder is None:
         parser.error(f"{options.part} needs the folder of the trials")
     elif options.part == "learn":

@@ -26,8 +26,12 @@ def test_weights_have_a_card_and_load(key: str) -> None:
     size = len(folder.joinpath(f"{key}.safetensors").read_bytes())
     assert size < (3_000_000 if name in PARTICLES else 4_000_000)
     card = folder.joinpath(f"{key}.md").read_text()
-    for heading in ("Data", "Training", "Losses", "Hardware", "Trials", "Scores"):
+    for heading in ("Data", "Training", "Losses", "Hardware", "Trials", "Weights", "Scores"):
         assert f"\n## {heading}\n" in card
+    assert f"SHA-256 of {key}.safetensors: {shipped_digests()[key]}\n" in card
+    assert card.count("| seed | ") == 1 and card.count(f"| {key} | ") >= 1
+    if name in PARTICLES:
+        assert "**Official scenes, recorded outcomes**" in card
     model: Any = build_model(name, weights="shipped")
     assert model.init == f"shipped:{shipped_digests()[key][:12]}"
     assert model.trained and model.digest() != build_model(name).digest()

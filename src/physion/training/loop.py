@@ -99,6 +99,7 @@ class TrainingLoop:
         self._kept = folder is not None
         self.state = TrainingState()
         self._unread: list[Tensor] = []
+        self._unread_trials: list[tuple[str, ...]] = []
         self._names: tuple[str, ...] = ()
         self._parts = settings.accumulate * fabric.world_size
         trained = [parameter for parameter in model.parameters() if parameter.requires_grad]
@@ -124,7 +125,8 @@ class TrainingLoop:
         Raises
         ------
         TrainingStoppedError
-            If a loss or weight is not finite; the message names the steps.
+            If a loss or weight is not finite; the message names the steps, and the trials of that
+            loss.
         BadInputError
             If the model gives no usable loss.
         """
@@ -171,9 +173,11 @@ class TrainingLoop:
         for group in self._optimizer.param_groups:
             group["lr"] = rate
         self._optimizer.zero_grad(set_to_none=True)
-        values = []
+        values: list[Tensor] = []
+        trials: list[str] = []
         for index in range(settings.accumulate):
             batch = next(batches).to(fabric.device)
+            trials += batch.trials
             last = index + 1 == settings.accumulate
             part = index * fabric.world_size + fabric.global_rank
             # Seeded by the step, so that no state of a generator has to be stored.
@@ -191,6 +195,7 @@ class TrainingLoop:
             )
         self._wrapped.step()
         self._unread.append(torch.stack(values).mean(0))
+        self._unread_trials.append(tuple(dict.fromkeys(trials)))
 
     def _after_step(self, log: MetricsLog | None) -> None:
         """Read losses, validate and write a checkpoint where it is time."""
@@ -224,12 +229,13 @@ class TrainingLoop:
             return
         reduced = self._fabric.all_reduce(torch.stack(self._unread), reduce_op="mean")
         assert isinstance(reduced, Tensor)
-        rows = reduced.double().cpu().tolist()
-        self._unread.clear()
+        rows, trials = reduced.double().cpu().tolist(), self._unread_trials
+        self._unread, self._unread_trials = [], []
         first = self.state.step - len(rows) + 1
         for index, row in enumerate(rows):
             if not math.isfinite(row[0]):
-                raise self._stopped(f"the loss of step {first + index} is {row[0]}", first)
+                found = f"the loss of step {first + index} is {row[0]}"
+                raise self._stopped(f"{found} (trials {', '.join(trials[index])})", first)
         self.state.recent += [dict(zip(self._names, row, strict=True)) for row in rows]
 
     def _check_weights(self) -> None:

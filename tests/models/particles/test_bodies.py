@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from physion.errors import BadInputError
 from physion.models.batch import Motion
+from physion.models.particles import bodies, surface
 from physion.models.particles.bodies import (
     CLOTH,
     KINEMATIC,
@@ -22,7 +23,8 @@ from physion.models.particles.bodies import (
 from physion.models.particles.surface import surface_points
 from physion.physics.particles import particles_over_time
 from physion.scenes.scene import Cloth, Roles
-from physion.scenes.shapes.primitives import shapes
+from physion.scenes.shapes.meshes import Mesh
+from physion.scenes.shapes.primitives import Shape, shapes
 from support.rendered_scenes import body, scene_of, tumbling
 
 
@@ -64,6 +66,32 @@ def test_bad_spacings_and_limits_are_named(spacing: float, limit: int) -> None:
         surface_points("cube", (1.0, 1.0, 1.0), spacing, limit)
     with pytest.raises(BadInputError, match="particles: the spacing"):
         ParticleSettings(spacing=spacing, limit=limit)
+
+
+def test_a_shape_without_faces_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = Mesh(np.eye(3), np.zeros((0, 3), np.int32))
+    monkeypatch.setattr(surface, "shape", lambda name: Shape(name, mesh, ()))
+    with pytest.raises(BadInputError, match="shape 'test:bare' has no faces"):
+        surface_points("test:bare", (1.0, 1.0, 1.0), 0.1, 10)
+
+
+@pytest.mark.parametrize("fill", ["surface", "volume"])
+def test_a_kinematic_body_has_a_limit_of_its_own(fill: str) -> None:
+    scene = scene_of(body("a"), body("b", kinematic=True), body("c", kinematic=True, scenery=True))
+    settings = ParticleSettings(0.1, 20, 70, fill)  # type: ignore[arg-type]
+    own = scene_particles(scene, settings)
+    assert own.kinds.tolist() == [RIGID, KINEMATIC] and np.bincount(own.owners).tolist() == [20, 70]
+    swapped = scene_particles(scene, dataclasses.replace(settings, limit=70, still_limit=20))
+    assert np.bincount(swapped.owners).tolist() == [70, 20]
+
+
+def test_a_scene_with_too_many_particles_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All objects of a scene count, up to the number itself."""
+    monkeypatch.setattr(bodies, "MAX_PARTICLES", 10)
+    scene = scene_of(body("a"), body("b", kinematic=True))
+    assert len(scene_particles(scene, ParticleSettings(limit=4, still_limit=6)).owners) == 10
+    with pytest.raises(BadInputError, match="'test' has 11 particles, at most 10: use a larger"):
+        scene_particles(scene, ParticleSettings(limit=5, still_limit=6))
 
 
 def test_kinds_scenery_and_absent_bodies() -> None:

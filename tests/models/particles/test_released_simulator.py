@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from torch import Tensor, nn
 from physion import sample_scene
 from physion.errors import BadInputError
 from physion.models.anchors.smallest_gap import FAR
-from physion.models.batch import LAST_OBSERVED, Batch, Motion
+from physion.models.batch import Batch, Motion
 from physion.models.build import build_model
 from physion.models.observed import cut_to_observed
 from physion.models.particles.bodies import (
@@ -255,16 +256,28 @@ def test_scenes_beyond_the_limit_go_in_parts(
     assert np.allclose(model.imagine(observed(collide, drape), 1, 0).gap, whole, atol=1e-3)
 
 
+@pytest.mark.parametrize("scenario", ["collide", "drape"])
 @pytest.mark.parametrize("name", NAMES)
-def test_what_follows_the_observed_part_is_not_seen(name: str, collide: Motion) -> None:
+def test_what_follows_the_observed_part_is_not_seen(
+    name: str,
+    scenario: str,
+    poisoned: Callable[[Motion], Motion],
+    request: pytest.FixtureRequest,
+) -> None:
     model = tiny(name)
-    later = collide.trajectory.positions.copy()
-    later[LAST_OBSERVED + 1 :] += 1.0
-    changed = Motion(collide.scene, dataclasses.replace(collide.trajectory, positions=later))
-    first = model.imagine(observed(collide), 2, 5).gap
-    assert first.tobytes() == model.imagine(observed(changed), 2, 5).gap.tobytes()
-    uncut = batch_of(range(2, 45, 3), changed)
-    assert first.tobytes() == model.imagine(uncut, 2, 5).gap.tobytes()
+    clean: Motion = request.getfixturevalue(scenario)
+    changed = poisoned(clean)
+
+    def imagined(batch: Batch) -> bytes:
+        rollout = model.imagine(batch, 2, 5, show=1.0)
+        shown = rollout.shown["particles"]
+        assert shown.shape[2] > 0 and np.isfinite(shown).all(), "something is imagined"
+        return rollout.gap.tobytes() + shown.tobytes()
+
+    found = imagined(observed(clean))
+    assert found == imagined(observed(changed)) == imagined(batch_of(range(2, 45, 3), changed))
+    model.network = ConstantVelocity()
+    assert found != imagined(observed(clean)), "the network moves something"
 
 
 def test_contact_is_decided_by_particles_at_the_steps(collide: Motion) -> None:

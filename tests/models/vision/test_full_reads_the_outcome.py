@@ -1,5 +1,5 @@
 """Under *full* a trained model's features tell the outcome that the later frames show, and nothing
-if these are those of another trial.
+if these are those of another trial, or if the labels are.
 
 The printed accuracies (`pytest -s`) are those of the trained model, of the same network with its
 initial weights, and of the centroids of the red and yellow blobs. Left out is RPIN, whose boxes
@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from physion.readout.evaluate import evaluate
-from physion.readout.leak_checks import with_exchanged_futures
+from physion.readout.leak_checks import with_exchanged_futures, with_permuted_labels
 from physion.readout.logistic import ReadoutConfig
 from physion.readout.settings import EvaluationConfig
 from physion.trials.dataset import Dataset
@@ -28,9 +28,9 @@ TRAINING: dict[str, dict[str, Any]] = {
 """Settings of the training by model."""
 OPTIONS: dict[str, dict[str, Any]] = {"op3": {"slots": 3}}
 """Options by model; with fewer slots OP3 is quicker."""
-COUNTS = {"training": 16, "readout": 24, "testing": 40}
-CHANCE = 0.24
-"""Three standard errors of the accuracy of guessing 40 trials."""
+COUNTS = {"training": 16, "readout": 24, "testing": 100}
+CHANCE = 0.15
+"""Three standard errors of the accuracy of guessing 100 trials."""
 
 
 @pytest.fixture(scope="module")
@@ -68,10 +68,12 @@ def test_full_falls_to_chance_with_exchanged_futures(
     trained = accuracy_of_full(dots, name, tmp_path / "trained", **TRAINING[name])
     (weights,) = (tmp_path / "trained" / "training").iterdir()
     fallen = accuracy_of_full(exchanged, name, tmp_path / "exchanged", weights=str(weights))
+    permuted = with_permuted_labels(dots)
+    guessed = accuracy_of_full(permuted, name, tmp_path / "permuted", weights=str(weights))
     untrained = accuracy_of_full(dots, name, tmp_path / "untrained")
     print(
-        f"{name}: {trained:.3f}, with exchanged futures {fallen:.3f}; untrained {untrained:.3f}, "
-        f"centroids {centroids:.3f}"
+        f"{name}: {trained:.3f}, with exchanged futures {fallen:.3f}, with permuted labels "
+        f"{guessed:.3f}; untrained {untrained:.3f}, centroids {centroids:.3f}"
     )
     assert trained > 0.5 + CHANCE and centroids > 0.5 + CHANCE
-    assert abs(fallen - 0.5) < CHANCE
+    assert abs(fallen - 0.5) < CHANCE and abs(guessed - 0.5) < CHANCE

@@ -1,4 +1,4 @@
-"""C-SWM and RPIN (small) on movies that they were not trained on, after half a minute of training,
+"""C-SWM and RPIN (small) on movies that they were not trained on, after up to a minute of training,
 compared with no training and with trivial predictors."""
 
 from __future__ import annotations
@@ -71,12 +71,14 @@ def test_slots_tell_the_next_state_from_the_present_and_from_others(
     before = loss_of(model, held_out)
     with torch.no_grad():
         untrained, _ = model.next_state_ranks(held_out)
-    train(model, clips["cswm", "training"], steps=400, batch=16, rate=2e-3, seed=seed)
+    train(model, clips["cswm", "training"], steps=1000, batch=16, rate=2e-3, seed=seed)
     with torch.no_grad():
         ranks, copied = model.next_state_ranks(held_out)
     assert loss_of(model, held_out) < before
     best = max(ranking(copied).reciprocal, ranking(untrained).reciprocal)
-    assert len(ranks) == 60 and ranking(ranks).reciprocal > best
+    own = ranking(ranks).reciprocal
+    print(f"cswm, seed {seed}: reciprocal rank {own:.3f}, untrained or copied at best {best:.3f}")
+    assert len(ranks) == 60 and own > best + 0.02
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -88,9 +90,14 @@ def test_boxes_are_nearer_than_at_constant_velocity(
     held_out = early_windows(model, clips["rpin", "testing"])
     model.eval()
     before = loss_of(model, held_out)
+    with torch.no_grad():
+        untrained, _ = (float(value.nanmean()) for value in model.center_errors(held_out))
     train(model, clips["rpin", "training"], steps=150, batch=8, rate=1e-3, seed=seed)
     with torch.no_grad():
         errors, constant = (float(value.nanmean()) for value in model.center_errors(held_out))
         assert loss_of(model, held_out) < min(before, float(model.baseline(held_out)))
-    print(f"rpin, seed {seed}: {errors / constant:.3f} of the error at constant velocity")
-    assert errors < 0.6 * constant
+    print(
+        f"rpin, seed {seed}: {errors / constant:.3f} of the error at constant velocity, "
+        f"{errors / untrained:.3f} of that without training"
+    )
+    assert errors < 0.6 * constant and errors < 0.95 * untrained

@@ -132,4 +132,11 @@ def own_config(network: Literal["messages", "objects"], options: ParticleOptions
             gap_limit=1000,
             training=_PAPER,
         )
-    return replace(config, swept=options.swept)
+    # A step of fewer frames is shorter, and so is what is counted in metres a step.
+    part = options.stride / 3
+    return replace(
+        config,
+        swept=options.swept,
+        velocity_noise=config.velocity_noise * part,
+        rest=config.rest * part,
+    )

@@ -54,6 +54,7 @@ from physion.models.particles.rigid_motion import (
     fit_rigid,
     fit_robust,
     mean_by,
+    rotation_from_vector,
     vector_from_rotation,
 )
 from physion.models.particles.rollout import Start, disturbed_start, roll_out
@@ -72,8 +73,9 @@ from physion.seeds import generator
 VERSIONS = {"messages": 3, "objects": 4}
 """By network; to be raised with every change of what equal weights predict, or of the training."""
 UNIT, CHANGE = 0.06, 0.02
-"""Metres a step: units of displacements, and of their changes. A body that falls for 0.03 s changes
-its displacement by 0.009 m, one that moves at 1 m/s moves 0.03 m."""
+"""Metres a step of 3 frames: units of displacements, and of their changes. A body that falls for
+0.03 s changes its displacement by 0.009 m, one that moves at 1 m/s moves 0.03 m. In steps of s
+frames the units are those times s / 3 and (s / 3)²."""
 _AT_ONCE = 32
 """Scenes of one graph when the distances are fitted."""
 _TOGETHER = 4
@@ -108,6 +110,7 @@ class ParticleSimulator(TorchModel):
         self.samples, self.seed = options.samples, options.seed
         self.knobs: Mapping[str, tuple[float, ...]] = {}
         stride = options.stride
+        self._unit, self._change = UNIT * (stride / 3), CHANGE * (stride / 3) ** 2
         self.spec = Spec(
             inputs=("state",),
             stride=stride,
@@ -149,12 +152,19 @@ class ParticleSimulator(TorchModel):
             versions=f"torch {torch.__version__}",
         )
 
+    @property
+    def _weights_version(self) -> int:
+        # Before, steps of one frame had the units of steps of three.
+        return VERSIONS[self.config.network] + (self.options.stride == 1)
+
     def digest(self) -> str:
         """Return the SHA-256 of settings and weights; the number of futures is no part."""
         config = asdict(self.config)
         config.pop("training")
-        version = VERSIONS[self.config.network]
-        parts = [version, config, self.options.stride, self.options.spread, torch.__version__]
+        options = self.options
+        parts = [
+            self._weights_version, config, options.stride, options.spread, torch.__version__
+        ]  # fmt: skip
         return digest_of(parts, self.state_dict().items())
 
     def built_as(self) -> dict[str, Any]:
@@ -162,7 +172,7 @@ class ParticleSimulator(TorchModel):
         options = self.options
         return {
             "model": self.name,
-            "version": VERSIONS[self.config.network],
+            "version": self._weights_version,
             "stride": options.stride,
             "swept": options.swept,
         }
@@ -285,6 +295,10 @@ class ParticleSimulator(TorchModel):
         goal = drift.positions + drift.moves + changes
         with torch.no_grad():
             rotations, centers = self._fit(layout, goal, robust=robust)
+            # Fewer than three particles determine no rotation: such a body goes on as it turned.
+            few = (_counts(layout) < 3)[:, None, None]
+            spun = rotation_from_vector(drift.spin) @ now.rotations
+            rotations = torch.where(few, spun, rotations)
             rigid = layout.kinds == RIGID
             state = ObjectState(
                 torch.where(rigid[:, None], centers, now.centers),
@@ -339,7 +353,7 @@ class ParticleSimulator(TorchModel):
         config = self.config
         near_only = config.network == "objects"
         return make_graph(
-            layout, drift, config.radius, UNIT, swept=config.swept, near_only=near_only
+            layout, drift, config.radius, self._unit, swept=config.swept, near_only=near_only
         )
 
     def _changes(self, graph: Graph) -> Tensor:
@@ -348,7 +362,7 @@ class ParticleSimulator(TorchModel):
 
     def _of_particles(self, graph: Graph, values: Tensor) -> Tensor:
         """Return values of nodes (N, 3), in units of changes, as metres of particles (P, 3)."""
-        metres = values.double() * CHANGE
+        metres = values.double() * self._change
         return metres.new_zeros(graph.particles, 3).index_copy(0, graph.rows, metres)
 
     def _move_objects(
@@ -356,8 +370,10 @@ class ParticleSimulator(TorchModel):
     ) -> ObjectState:
         """Return the next state as DPI-Net predicts it."""
         velocity, rim, changes = self.network(graph)
-        linear, angular = (value.double() * CHANGE for value in (velocity, rim))
-        state = move(layout, now, drift, linear, angular / layout.size[:, None])
+        linear, angular = (value.double() * self._change for value in (velocity, rim))
+        # A single particle has no rim, by which rotations are measured.
+        spin = torch.where((_counts(layout) > 1)[:, None], angular / layout.size[:, None], 0.0)
+        state = move(layout, now, drift, linear, spin)
         loose = self._of_particles(graph, changes)[layout.loose]
         return move_loose(layout, state, drift, loose)
 
@@ -373,10 +389,15 @@ class ParticleSimulator(TorchModel):
         return rotations, centers
 
     def _error(self, layout: SceneLayout, target: ObjectState, predicted: Tensor) -> Tensor:
-        squares = ((predicted - target.positions(layout)) / CHANGE).pow(2).sum(-1)
+        squares = ((predicted - target.positions(layout)) / self._change).pow(2).sum(-1)
         errors = _softened(mean_by(squares, layout.owners, layout.objects), self.config.knee)
         free = (layout.kinds != KINEMATIC).double()
         return ((errors * free).sum() / free.sum().clamp_min(1)).float()
+
+
+def _counts(layout: SceneLayout) -> Tensor:
+    """Return the number of particles of every object (K,)."""
+    return torch.bincount(layout.owners, minlength=layout.objects)
 
 
 def _made_again(
