@@ -34,9 +34,10 @@ FAST = Plausibility(reading_s=0.0, fast_ms=0)
 """Rules of plausible sessions under which a test may read and answer faster than people do."""
 SHORT = Timing(fixation_ms=(60, 120), cue_ms=500, flash_hz=2.0)
 OFFLINE = re.compile(
-    r"ERR_(INTERNET_DISCONNECTED|CONNECTION_(REFUSED|RESET)|EMPTY_RESPONSE)|status of (409|503)"
+    r"ERR_(INTERNET_DISCONNECTED|CONNECTION_(REFUSED|RESET)|EMPTY_RESPONSE)|status of (409|425|503)"
 )
-"""Console messages of browsers about requests that a test lets fail."""
+"""Console messages of browsers about requests that a test lets fail, or that are sent again: on a
+slow machine the server may learn so late of a movie that its answer seems too early."""
 HIDE = """
 hidden => {
   const set = (name, value) => Object.defineProperty(document, name, {value, configurable: true});
@@ -140,7 +141,7 @@ class Visit:
         return {urlsplit(url).netloc for url in self.requests if not url.startswith("blob:")}
 
     def unexpected(self) -> list[str]:
-        """Return the console errors that are not due to a connection cut by the test."""
+        """Return the console errors but those of `OFFLINE`."""
         return [line for line in self.complaints if not OFFLINE.search(line)]
 
     def picture(self, what: str) -> None:
