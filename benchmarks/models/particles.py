@@ -48,12 +48,18 @@ from physion import Dataset, build_model, sample_scene, simulate
 from physion.analysis.tables.responses import read_humans
 from physion.compute.machine import processor
 from physion.data import official
-from physion.models.batch import Batch, Motion
+from physion.models.batch import LAST_OBSERVED, Batch, Motion
 from physion.models.interface import Fits
 from physion.models.observed import cut_to_observed
 from physion.models.particles.bodies import poses_of, scene_particles
 from physion.models.particles.graph import drift_of, make_graph
-from physion.models.particles.layout import join_poses, join_scenes, rotate_scenes
+from physion.models.particles.layout import (
+    ObjectState,
+    SceneLayout,
+    join_poses,
+    join_scenes,
+    rotate_scenes,
+)
 from physion.models.particles.rigid_motion import rotation_from_vector
 from physion.models.particles.simulator import ParticleSimulator
 from physion.physics.labels import label_contact
@@ -355,10 +361,7 @@ def run_symmetry(folder: Path) -> str:
             model: Any = build_model(name, weights=weights)
             changes, differences = [], []
             for motion in motions:
-                particles = scene_particles(motion.scene, model.config.particles)
-                poses = [poses_of(particles, motion, [41, 44])]
-                layout = join_scenes([particles], model.device)
-                before, now = (join_poses(poses, row, model.device) for row in (0, 1))
+                layout, before, now = last_states(model, motion)
                 with torch.no_grad():
                     after = model.step(layout, before, now)
                     other = model.step(
@@ -382,6 +385,16 @@ def run_symmetry(folder: Path) -> str:
     )
 
 
+def last_states(
+    model: ParticleSimulator, motion: Motion
+) -> tuple[SceneLayout, ObjectState, ObjectState]:
+    """Return the layout of a scene and its last two observed states."""
+    particles = scene_particles(motion.scene, model.config.particles)
+    poses = [poses_of(particles, motion, [LAST_OBSERVED - 3, LAST_OBSERVED])]
+    before, now = (join_poses(poses, row, model.device) for row in (0, 1))
+    return join_scenes([particles], model.device), before, now
+
+
 def run_memory(_: Path) -> str:
     """Return the table of particles, edges and memory of a training step of one scene of Drape."""
     rows = []
@@ -403,13 +416,11 @@ def step_of_drape(name: str, size: str) -> list[str]:
     batch = Batch((scene.name,), frames, np.ones_like(frames, np.bool_), state=(motion,))
     model.train().loss(batch)["loss"].backward()
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    particles = scene_particles(scene, model.config.particles)
-    poses = [poses_of(particles, motion, [41, 44])]
-    layout = join_scenes([particles], model.device)
-    drift = drift_of(layout, *(join_poses(poses, row, model.device) for row in (0, 1)))
+    layout, *states = last_states(model, motion)
+    drift = drift_of(layout, *states)
     near_only = model.config.network == "objects"
     graph = make_graph(layout, drift, model.config.radius, 1.0, swept=True, near_only=near_only)
-    counts = [len(particles.owners), len(graph.senders), before // 1024, most // 1024]
+    counts = [len(layout.owners), len(graph.senders), before // 1024, most // 1024]
     return [f"{count:,}" for count in counts]
 
 
@@ -439,8 +450,7 @@ def main() -> None:
     """Run one of the benchmarks."""
     runs = {
         "collide": run_collide, "transfer": run_transfer, "futures": run_futures,
-        "batched": run_batched, "symmetry": run_symmetry,
-        "memory": run_memory,
+        "batched": run_batched, "symmetry": run_symmetry, "memory": run_memory,
     }  # fmt: skip
     by_model = {"shipped": run_shipped, "official": run_official}
     parser = argparse.ArgumentParser(

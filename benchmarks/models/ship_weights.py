@@ -130,10 +130,8 @@ def write_scores() -> None:
             if own:
                 text += ["", title, "", head, "|---" * (head.count("|") - 1) + "|", *own]
         path = SHIPPED / f"{name}.md"
-        card = re.split(r"^## (?:Weights|Scores)$", path.read_text(), flags=re.MULTILINE)[
-            0
-        ].rstrip()
-        path.write_text(card + "\n\n" + "\n".join(text) + "\n")
+        card, *_ = re.split(r"^## (?:Weights|Scores)$", path.read_text(), flags=re.MULTILINE)
+        path.write_text(card.rstrip() + "\n\n" + "\n".join(text) + "\n")
 
 
 def tables_of(text: str, head: str) -> list[tuple[str, str, list[str]]]:

@@ -12,15 +12,17 @@ as large.
 
 ``learn`` needs the trials of ``physion generate FOLDER --width 64 --height 64`` with the splits
 training and testing. It trains the small models with three seeds and prints, for one clip of every
-testing trial, after and before the training and for the trivial predictor, and the ratio of the
-trained to the trivial one:
+testing trial, after and before the training and for trivial predictors, and the ratio of the
+trained to the best trivial one:
 
 - C-SWM: the mean reciprocal rank of the true next state among all states of 20 clips; the trivial
   predictor copies the present state.
 - RPIN: the mean distance of predicted from true centres of boxes, as part of the picture's side,
   times 1000; the trivial predictor keeps the last velocity.
 - SVG and OP3: the squared error of moving pixels of the imagined frames, times 1000
-  (`physion.models.vision.moving`); the trivial predictor repeats the last observed picture.
+  (`physion.models.vision.moving`); one trivial predictor repeats the last observed picture, another
+  shows an empty scene, the median of the observed pictures. Without them as a measure of motion, a
+  model that lets objects vanish would seem to have learned it.
 
 ``shipped`` prints the same for the weights that come with the package, without training.
 
@@ -45,11 +47,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from physion import Dataset, build_model
 from physion.compute.machine import processor
 from physion.models.batch import Batch, Spec
 from physion.models.cswm.contrast import ranking
+from physion.models.vision.moving import future_error
 from physion.seeds import generator, stable_hash
 from physion.training.sources.batches import ObservedBatches, TrialReaders, WholeBatches
 from physion.training.sources.kept_boxes import MOST_BYTES
@@ -164,9 +168,9 @@ def learn(folder: Path, names: list[str], steps: int, seeds: int) -> Rows:
             model: Any = build_model(name, seed=seed)
             source = whole_source(dataset, model.spec)
             clips = tested_clips(model, source, dataset.trials("testing"))
-            before, _ = metric(name, model, clips)
+            before, *_ = metric(name, model, clips)
             start = time.process_time()
-            train_model(
+            trained = train_model(
                 model,
                 source,
                 dataset.trials("training"),
@@ -177,9 +181,10 @@ def learn(folder: Path, names: list[str], steps: int, seeds: int) -> Rows:
                 accelerator="cpu",
             )
             seconds = time.process_time() - start
-            after, trivial = metric(name, model, clips)
-            values = [f"{value:.3f}" for value in (after, before, trivial, after / trivial)]
-            yield [model.name, str(seed), *values, f"{seconds:.0f}"]
+            after, *trivial = metric(name, model, clips)
+            best = (max if name == "cswm" else min)(trivial)
+            values = [*in_words(after, before, *trivial), f"{after / best:.3f}"]
+            yield [model.name, str(seed), str(trained.steps), *values, f"{seconds:.0f}"]
 
 
 def shipped(folder: Path, names: list[str]) -> Rows:
@@ -189,9 +194,14 @@ def shipped(folder: Path, names: list[str]) -> Rows:
         model: Any = build_model(name, weights="shipped")
         source = whole_source(dataset, model.spec)
         clips = tested_clips(model, source, dataset.trials("testing"))
-        after, trivial = metric(name, model, clips)
-        before, _ = metric(name, build_model(name), clips)
-        yield [model.name, METRICS[name], *(f"{value:.3f}" for value in (after, before, trivial))]
+        after, *trivial = metric(name, model, clips)
+        before, *_ = metric(name, build_model(name), clips)
+        yield [model.name, METRICS[name], *in_words(after, before, *trivial)]
+
+
+def in_words(after: float, before: float, trivial: float, empty: float | None = None) -> list[str]:
+    """Return the cells of a metric; "-" where it is not defined of an empty scene."""
+    return [*(f"{v:.3f}" for v in (after, before, trivial)), f"{empty:.3f}" if empty else "-"]
 
 
 def tested_clips(model: Any, source: Any, trials: list[str]) -> list[Batch]:
@@ -206,17 +216,16 @@ def tested_clips(model: Any, source: Any, trials: list[str]) -> list[Batch]:
 
 
 @torch.no_grad()
-def metric(name: str, model: Any, clips: list[Batch]) -> tuple[float, float]:
-    """Return the metric of a model and of the trivial predictor, means over the batches."""
+def metric(name: str, model: Any, clips: list[Batch]) -> list[float]:
+    """Return the metric of a model and of the trivial predictors, means over the batches."""
     metrics = {"cswm": reciprocal_ranks, "rpin": center_distances}
     model.eval()
-    pairs = []
+    values = []
     with torch.random.fork_rng(devices=[]):
         for number, batch in enumerate(clips):
             torch.manual_seed(stable_hash("tested clips", number) % 2**63)
-            pairs.append(metrics.get(name, moving_errors)(model, batch))
-    own, trivial = np.mean(pairs, axis=0)
-    return float(own), float(trivial)
+            values.append(metrics.get(name, moving_errors)(model, batch))
+    return [float(value) for value in np.mean(values, axis=0)]
 
 
 def reciprocal_ranks(model: Any, batch: Batch) -> tuple[float, float]:
@@ -231,9 +240,20 @@ def center_distances(model: Any, batch: Batch) -> tuple[float, float]:
     return own, constant
 
 
-def moving_errors(model: Any, batch: Batch) -> tuple[float, float]:
-    """Return 1000 times the errors of moving pixels: of the model, of a copy."""
-    return 1000 * float(model.loss(batch)["loss"]), 1000 * float(model.baseline(batch))
+def moving_errors(model: Any, batch: Batch) -> tuple[float, float, float]:
+    """Return 1000 times the errors of moving pixels: of the model, a copy, and an empty scene."""
+    own, copied = model.loss(batch)["loss"], model.baseline(batch)
+    return 1000 * float(own), 1000 * float(copied), 1000 * float(empty_scene(model, batch))
+
+
+def empty_scene(model: Any, batch: Batch) -> Tensor:
+    """Return the error of moving pixels of the median of the observed pictures."""
+    assert batch.rgb is not None, "the clips have pictures"
+    pictures = torch.as_tensor(batch.rgb).permute(0, 1, 4, 2, 3).float() / 255
+    future = model.config.imagined
+    median = pictures[:, :-future].median(1, keepdim=True).values
+    still = median.expand(-1, future, -1, -1, -1)
+    return future_error(still, pictures, torch.as_tensor(batch.valid)).moving
 
 
 def boxes(folder: Path, steps: int) -> Rows:
@@ -320,11 +340,12 @@ def main() -> None:
     elif options.folder is None:
         parser.error(f"{options.part} needs the folder of the trials")
     elif options.part == "learn":
-        head = ["model", "seed", "trained", "untrained", "trivial", "ratio", "training, s"]
+        head = ["model", "seed", "steps", "trained", "untrained", "trivial", "empty scene"]
+        head += ["ratio", "training, s"]
         title = "What was learned of new clips"
         rows = learn(options.folder, options.models, options.steps, options.seeds)
     elif options.part == "shipped":
-        head = ["model", "metric", "trained", "untrained", "trivial"]
+        head = ["model", "metric", "trained", "untrained", "trivial", "empty scene"]
         title = "Shipped weights on new clips"
         rows = shipped(options.folder, options.models)
     else:

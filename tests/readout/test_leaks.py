@@ -23,6 +23,7 @@ from physion.readout.settings import EvaluationConfig
 from physion.trials.dataset import Dataset
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, plan_dataset
+from support.late_turns import make_late_turns
 from support.moving_dots import make_dots
 from support.tiny_models import OPTIONS, TINY
 
@@ -80,6 +81,28 @@ def test_the_copy_is_poisoned_where_it_should_be(made: Dataset, poisoned: Datase
         assert made.paths(trial).movie.read_bytes() == poisoned.paths(trial).movie.read_bytes()
     with pytest.raises(BadInputError, match="exists"):
         with_poisoned_futures(made, poisoned.folder)
+
+
+def test_motions_continue_like_those_of_another_trial(tmp_path: Path) -> None:
+    made = make_late_turns(tmp_path / "data", {"testing": 4})
+    exchanged = with_exchanged_futures(made, tmp_path / "exchanged", motions=True)
+    motions = [made.trial(trial).trajectory for trial in made.trials()]
+    for trial, own in zip(made.trials(), motions, strict=True):
+        changed = exchanged.trial(trial).trajectory
+        assert np.array_equal(own.positions[:45], changed.positions[:45])
+        (partner,) = [
+            m for m in motions if np.array_equal(m.positions[45:], changed.positions[45:])
+        ]
+        assert partner is not own
+        assert np.array_equal(changed.contacts.frame, partner.contacts.frame), "all are late"
+        assert np.array_equal(changed.velocities[45:], partner.velocities[45:])
+        assert exchanged.trial(trial).labels == made.trial(trial).labels
+
+
+def test_a_trial_without_a_partner_is_named(tmp_path: Path) -> None:
+    alone = make_dots(tmp_path / "data", {"testing": 1}, ("drop",))
+    with pytest.raises(BadInputError, match=r"drop_testing_0000.*only one"):
+        with_exchanged_futures(alone, tmp_path / "exchanged")
 
 
 @pytest.fixture(scope="module")

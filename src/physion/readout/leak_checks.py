@@ -2,8 +2,8 @@
 
 - With poisoned futures, everything after the observed part is noise. Predictions under *observed*
   and *observed+simulated* must stay the same to the byte.
-- With exchanged futures, every movie ends like that of another trial. Predictions under *full* must
-  fall to chance.
+- With exchanged futures, every movie ends like that of another trial, and so do the motions if this
+  is wanted. Predictions under *full* must fall to what the observed part tells.
 - With permuted labels, nothing that is fitted can be better than chance.
 
 A copy must be evaluated in a folder of its own: stored features and rollouts of the observed part
@@ -32,6 +32,8 @@ from physion.trials.trial_file import Trial, write_trial
 from physion.trials.video import encode_movie, read_frames
 
 Pictures = NDArray[np.uint8]
+_MOTION = ("positions", "rotations", "velocities", "angular_velocities", "cloth_vertices")
+_GAP = "cloth_distance"
 
 
 def with_poisoned_futures(
@@ -71,18 +73,46 @@ def with_poisoned_futures(
 
 
 def with_exchanged_futures(
-    dataset: Dataset, folder: Path, splits: Sequence[str] = ("testing",), seed: int = 0
+    dataset: Dataset,
+    folder: Path,
+    splits: Sequence[str] = ("testing",),
+    seed: int = 0,
+    *,
+    motions: bool = False,
 ) -> Dataset:
     """Return a copy in which every movie continues like that of another trial of its scenario.
 
-    A scenario needs two trials or more. Motions are not exchanged, as those of another scene do not
-    fit. Parameters and errors are as for `with_poisoned_futures`.
+    Parameters
+    ----------
+    dataset, folder, splits, seed
+        As for `with_poisoned_futures`.
+    motions
+        Exchange the motions too, and with them the boxes of objects. The other trial is then one
+        with as many bodies, whose motion the bodies continue in the order of the scene; shapes,
+        camera and label stay. Trials with cloth have no such partner.
+
+    Raises
+    ------
+    BadInputError
+        If the folder exists, or a trial has no partner.
     """
     copy = _copy(dataset, folder)
+    groups: dict[tuple[str, str], list[str]] = {}
     for scenario in sorted(set(copy.index["scenario"])):
-        trials = [t for split in splits for t in copy.trials(split, scenario)]
-        order = [trials[i] for i in generator("exchange", seed, scenario).permutation(len(trials))]
+        for trial in [t for split in splits for t in copy.trials(split, scenario)]:
+            kind = _bodies(dataset, trial) if motions else ""
+            groups.setdefault((scenario, kind), []).append(trial)
+    for (scenario, kind), trials in groups.items():
+        if len(trials) < 2:
+            raise BadInputError(
+                f"trial {trials[0]!r} is the only one of {scenario}{kind and f' with {kind}'}: "
+                "no other one has a future for it"
+            )
+        rng = generator("exchange", seed, scenario, *([kind] if kind else []))
+        order = [trials[i] for i in rng.permutation(len(trials))]
         for trial, other in zip(order, order[1:] + order[:1], strict=True):
+            if motions:
+                _exchange_motion(copy, trial, dataset.trial(other).trajectory)
             ending = dataset.frames(other)[OBSERVED_FRAMES:]
             _change_movie(
                 copy,
@@ -139,13 +169,36 @@ def _written(dataset: Dataset) -> Dataset:
     return Dataset(dataset.folder)
 
 
+def _bodies(dataset: Dataset, name: str) -> str:
+    """Return the number of bodies as text, which trials with exchanged motions share."""
+    scene = dataset.trial(name).scene
+    if scene.cloths:
+        raise BadInputError(f"trial {name!r} has cloth, whose motion fits no other trial")
+    return f"{len(scene.bodies)} bodies"
+
+
+def _exchange_motion(dataset: Dataset, name: str, other: Trajectory) -> None:
+    """Let the motion of a trial continue like another one, with its contacts."""
+    own = Trial.open(dataset.paths(name).trial_file).trajectory
+
+    def joined(first: Any, second: Any, field: str, kept: Any, taken: Any) -> Any:
+        return np.concatenate([getattr(first, field)[kept], getattr(second, field)[taken]])
+
+    seen, later = slice(OBSERVED_FRAMES), slice(OBSERVED_FRAMES, None)
+    arrays = {field: joined(own, other, field, seen, later) for field in (*_MOTION, _GAP)}
+    touching = [motion.contacts.frame < OBSERVED_FRAMES for motion in (own, other)]
+    contacts = {
+        field.name: joined(own.contacts, other.contacts, field.name, touching[0], ~touching[1])
+        for field in dataclasses.fields(Contacts)
+    }
+    _change_motion(dataset, name, arrays, Contacts(**contacts), other.completed)
+
+
 def _poison_motion(dataset: Dataset, name: str, rng: np.random.Generator) -> None:
     """Replace the motion after the observed part by noise, and remove its contacts."""
-    path = dataset.paths(name).trial_file
-    trial = Trial.open(path)
-    trajectory = trial.trajectory
+    trajectory = Trial.open(dataset.paths(name).trial_file).trajectory
     changed: dict[str, Any] = {}
-    for what in ("positions", "rotations", "velocities", "angular_velocities", "cloth_vertices"):
+    for what in _MOTION:
         array = getattr(trajectory, what).copy()
         array[OBSERVED_FRAMES:] = rng.normal(size=array[OBSERVED_FRAMES:].shape)
         changed[what] = array
@@ -154,8 +207,18 @@ def _poison_motion(dataset: Dataset, name: str, rng: np.random.Generator) -> Non
         field.name: getattr(trajectory.contacts, field.name)[observed]
         for field in dataclasses.fields(Contacts)
     }
-    poisoned: Trajectory = dataclasses.replace(
-        trajectory, **changed, contacts=Contacts(**contacts), completed=not trajectory.completed
+    _change_motion(dataset, name, changed, Contacts(**contacts), not trajectory.completed)
+
+
+def _change_motion(
+    dataset: Dataset, name: str, arrays: dict[str, Any], contacts: Contacts, completed: bool
+) -> None:
+    """Write a trial file anew with arrays and contacts of a changed motion."""
+    path = dataset.paths(name).trial_file
+    trial = Trial.open(path)
+    changed: Trajectory = dataclasses.replace(
+        trial.trajectory, **arrays, contacts=contacts, completed=completed
     )
-    write_trial(path, trial.metadata, trial.scene, poisoned, trial.labels, trial.ids)
+    metadata = dataclasses.replace(trial.metadata, frames=len(changed))
+    write_trial(path, metadata, trial.scene, changed, trial.labels, trial.ids)
     _index_again(dataset, name, "trial_file", path.read_bytes())

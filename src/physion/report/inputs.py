@@ -63,8 +63,10 @@ class ReportInputs(ComparisonResults):
         """Every table by the name of its file."""
         comparison = self.comparison
         found: dict[str, pd.DataFrame | None] = {
-            "comparison": comparison.all_scores,
-            "comparison_later": comparison.later if len(comparison.later) else None,
+            "comparison": self._with_init(comparison.all_scores),
+            "comparison_later": self._with_init(comparison.later)
+            if len(comparison.later)
+            else None,
             "people": comparison.people,
             "stimuli": comparison.stimuli,
             "changed_outcomes": comparison.changed,
@@ -74,7 +76,7 @@ class ReportInputs(ComparisonResults):
             "calibration_scores": self.calibration,
             "comparison_with_flagged": None
             if self.comparison_all is None
-            else self.comparison_all.all_scores,
+            else self._with_init(self.comparison_all.all_scores),
         }
         if self.beside is not None:
             found |= {
@@ -88,3 +90,10 @@ class ReportInputs(ComparisonResults):
         if self.people is not None:
             found |= {f"people_{name}": table for name, table in self.people.tables.items()}
         return {name: t for name, t in found.items() if t is not None and len(t.columns)}
+
+    def _with_init(self, scores: pd.DataFrame) -> pd.DataFrame:
+        """Return scores with the column ``init``, the weights of each model, after the readout."""
+        init = [self.model_weights.get(str(model), "") for model in scores["model"]]
+        table = scores.copy()
+        table.insert(list(table.columns).index("readout") + 1, "init", init)
+        return table

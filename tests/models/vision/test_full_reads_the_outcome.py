@@ -2,12 +2,13 @@
 if these are those of another trial, or if the labels are.
 
 The printed accuracies (`pytest -s`) are those of the trained model, of the same network with its
-initial weights, and of the centroids of the red and yellow blobs. Left out is RPIN, whose boxes
-come from the motion of a trial, which is not exchanged.
+initial weights, and of the centroids of the red and yellow blobs. For RPIN, whose boxes come from
+the motions of trials, these are exchanged too.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,14 @@ from physion.readout.leak_checks import with_exchanged_futures, with_permuted_la
 from physion.readout.logistic import ReadoutConfig
 from physion.readout.settings import EvaluationConfig
 from physion.trials.dataset import Dataset
+from support.late_turns import make_late_turns
 from support.moving_dots import make_dots
 
 pytestmark = pytest.mark.slow
 
 TRAINING: dict[str, dict[str, Any]] = {
     "cswm": {"steps": 40}, "svg": {"steps": 30}, "op3": {"steps": 20, "learning_rate": 3e-3},
+    "rpin": {"steps": 20},
 }  # fmt: skip
 """Settings of the training by model."""
 OPTIONS: dict[str, dict[str, Any]] = {"op3": {"slots": 3}}
@@ -33,19 +36,31 @@ CHANCE = 0.15
 """Three standard errors of the accuracy of guessing 100 trials."""
 
 
-@pytest.fixture(scope="module")
-def dots(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return make_dots(tmp_path_factory.mktemp("dots") / "data", COUNTS, ("drop",))
+@dataclass(frozen=True)
+class Cases:
+    """A dataset, its copy with exchanged futures, and the accuracy of the blobs' centroids."""
+
+    dataset: Dataset
+    exchanged: Dataset
+    centroids: float
+
+
+def cases_of(dataset: Dataset, folder: Path, *, motions: bool) -> Cases:
+    exchanged = with_exchanged_futures(dataset, folder / "exchanged", motions=motions)
+    centroids = accuracy_of_full(dataset, "blob-centroids", folder / "centroids")
+    return Cases(dataset, exchanged, centroids)
 
 
 @pytest.fixture(scope="module")
-def exchanged(dots: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return with_exchanged_futures(dots, tmp_path_factory.mktemp("exchanged") / "data")
+def dots(tmp_path_factory: pytest.TempPathFactory) -> Cases:
+    folder = tmp_path_factory.mktemp("dots")
+    return cases_of(make_dots(folder / "data", COUNTS, ("drop",)), folder, motions=False)
 
 
 @pytest.fixture(scope="module")
-def centroids(dots: Dataset, tmp_path_factory: pytest.TempPathFactory) -> float:
-    return accuracy_of_full(dots, "blob-centroids", tmp_path_factory.mktemp("centroids"))
+def late_turns(tmp_path_factory: pytest.TempPathFactory) -> Cases:
+    folder = tmp_path_factory.mktemp("late turns")
+    return cases_of(make_late_turns(folder / "data", COUNTS), folder, motions=True)
 
 
 def accuracy_of_full(
@@ -63,17 +78,18 @@ def accuracy_of_full(
 
 @pytest.mark.parametrize("name", list(TRAINING))
 def test_full_falls_to_chance_with_exchanged_futures(
-    name: str, dots: Dataset, exchanged: Dataset, centroids: float, tmp_path: Path
+    name: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    trained = accuracy_of_full(dots, name, tmp_path / "trained", **TRAINING[name])
+    made: Cases = request.getfixturevalue("late_turns" if name == "rpin" else "dots")
+    trained = accuracy_of_full(made.dataset, name, tmp_path / "trained", **TRAINING[name])
     (weights,) = (tmp_path / "trained" / "training").iterdir()
-    fallen = accuracy_of_full(exchanged, name, tmp_path / "exchanged", weights=str(weights))
-    permuted = with_permuted_labels(dots)
+    fallen = accuracy_of_full(made.exchanged, name, tmp_path / "exchanged", weights=str(weights))
+    permuted = with_permuted_labels(made.dataset)
     guessed = accuracy_of_full(permuted, name, tmp_path / "permuted", weights=str(weights))
-    untrained = accuracy_of_full(dots, name, tmp_path / "untrained")
+    untrained = accuracy_of_full(made.dataset, name, tmp_path / "untrained")
     print(
         f"{name}: {trained:.3f}, with exchanged futures {fallen:.3f}, with permuted labels "
-        f"{guessed:.3f}; untrained {untrained:.3f}, centroids {centroids:.3f}"
+        f"{guessed:.3f}; untrained {untrained:.3f}, centroids {made.centroids:.3f}"
     )
-    assert trained > 0.5 + CHANCE and centroids > 0.5 + CHANCE
+    assert trained > 0.5 + CHANCE and made.centroids > 0.5 + CHANCE
     assert abs(fallen - 0.5) < CHANCE and abs(guessed - 0.5) < CHANCE

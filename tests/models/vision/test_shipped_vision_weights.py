@@ -9,6 +9,7 @@ import torch
 
 from physion.models.build import build_model
 from physion.models.cswm.contrast import ranking
+from physion.models.vision.moving import future_error
 from physion.stimulus_names import SCENARIOS
 from physion.trials.dataset import Dataset
 from support.small_movies import early_windows, make_movies, read_whole
@@ -27,19 +28,20 @@ def movies(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_predictions_of_new_movies_beat_those_without_training(name: str, movies: Dataset) -> None:
-    """Better than the same network with random weights, and than the trivial predictor."""
-    trained, trivial = scores(name, movies, "shipped")
-    untrained, _ = scores(name, movies, "random")
-    assert trained < min(untrained, trivial)
+    """Better than the same network with random weights, and than every trivial predictor."""
+    trained, *trivial = scores(name, movies, "shipped")
+    untrained, *_ = scores(name, movies, "random")
+    print(f"{name}: {trained:.4f}, untrained {untrained:.4f}, trivial {trivial}")
+    assert trained < 0.95 * min(untrained, *trivial)
 
 
 @torch.no_grad()
-def scores(name: str, movies: Dataset, weights: str) -> tuple[float, float]:
-    """Return what is to be small, of the model and of the trivial predictor.
+def scores(name: str, movies: Dataset, weights: str) -> list[float]:
+    """Return what is to be small, of the model and of the trivial predictors.
 
     C-SWM: 1 less the mean reciprocal rank of the next state; of a copy of the present one. RPIN:
     the distance of centres; at constant velocity. SVG and OP3: the error of moving pixels; of the
-    last observed picture.
+    last observed picture, and of the median of the observed ones, which shows an empty scene.
     """
     model: Any = build_model(name, weights=weights)
     batch = early_windows(model, read_whole(movies, "testing", model.spec))
@@ -47,8 +49,12 @@ def scores(name: str, movies: Dataset, weights: str) -> tuple[float, float]:
     torch.manual_seed(0)
     if name == "cswm":
         ranks, copied = model.next_state_ranks(batch)
-        return 1 - ranking(ranks).reciprocal, 1 - ranking(copied).reciprocal
+        return [1 - ranking(ranks).reciprocal, 1 - ranking(copied).reciprocal]
     if name == "rpin":
         own, constant = model.center_errors(batch)
-        return float(own.nanmean()), float(constant.nanmean())
-    return float(model.loss(batch)["loss"]), float(model.baseline(batch))
+        return [float(own.nanmean()), float(constant.nanmean())]
+    future = model.config.imagined
+    pictures = batch.rgb.permute(0, 1, 4, 2, 3).float() / 255
+    median = pictures[:, :-future].median(1, keepdim=True).values.expand(-1, future, -1, -1, -1)
+    empty = future_error(median, pictures, batch.valid).moving
+    return [float(model.loss(batch)["loss"]), float(model.baseline(batch)), float(empty)]
