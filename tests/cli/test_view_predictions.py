@@ -5,13 +5,17 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from physion.cli.imagined_trials import imagine_with
 from physion.cli.main import main
 from physion.errors import BadInputError, UnknownNameError
+from physion.models.build import build_model
+from physion.training.sources.open_source import whole_source
 from physion.trials.dataset import Dataset
 from support.viewer_dataset import Plan, make_dataset
 
@@ -112,6 +116,34 @@ def test_pictures_come_with_what_was_seen_and_what_is_true(folder: Path) -> None
         assert true[:3] == pytest.approx(40 + 3 * one.frames[:3], abs=3)
         assert copied == pytest.approx(np.full(len(one.frames), seen[-1]))
         assert np.isnan(one.gap) and np.isnan(one.probability)
+
+
+SHOWN = {
+    "svg": ({"rgb"}, {"rgb"}, {"rgb"}),
+    "op3": ({"rgb", "masks"}, {"rgb"}, {"rgb", "masks"}),
+    "rpin": ({"rgb", "boxes"}, {"rgb"}, {"boxes"}),
+    "cswm": ({"rgb", "masks", "slots"}, {"rgb", "slots"}, {"slots"}),
+}
+"""What is shown of frames that were seen, of true ones after them, and of imagined ones."""
+
+
+@pytest.mark.parametrize("name", list(SHOWN))
+def test_vision_models_show_what_they_saw_and_imagined(folder: Path, name: str) -> None:
+    model: Any = build_model(name, weights="shipped")
+    dataset = Dataset(folder)
+    (one,) = imagine_with(dataset, [name], {"weights": "shipped"})(["drop_0"])["drop_0"]
+    assert one.weights == f"weights {model.init}"
+    spec, parts = model.spec, (one.seen, one.true, one.shown)
+    assert tuple(map(set, parts)) == SHOWN[name]
+    assert one.seen_frames.tolist() == [spec.stride * i for i in range(spec.context)]
+    last = one.seen_frames[-1]
+    assert one.frames.tolist() == [last + spec.stride * (i + 1) for i in range(spec.future)]
+    # Exactly what the model imagines of the same frames.
+    context = whole_source(dataset, spec).context(("drop_0",)).to("cpu")
+    with torch.no_grad():
+        imagined = model.eval().imagine(context, 1, 0, show=1.0).shown
+    for key, values in one.shown.items():
+        np.testing.assert_array_equal(values, np.asarray(imagined[key])[0, 0])
 
 
 def test_trials_without_movies_are_rendered(tmp_path: Path) -> None:

@@ -268,6 +268,9 @@ def test_one_sentence_says_which_weights_each_model_started_from(
     sentence = "Weights that each network started from: encoder: imagenet."
     assert weights_sentence(inputs) == sentence and sentence in render_page(inputs, [])
     assert weights_sentence(ReportInputs(make_comparison())) == ""
+    table = inputs.tables()["comparison"].set_index("model")["init"]
+    assert set(table["encoder"]) == {"imagenet"} and set(table["simulation"]) == {"none"}
+    assert set(table.drop(["encoder", "simulation"])) == {""}, "anchors that were computed"
 
 
 # --- a page for each stimulus ---------------------------------------------------------------------
