@@ -79,7 +79,8 @@ frames the units are those times s / 3 and (s / 3)²."""
 _AT_ONCE = 32
 """Scenes of one graph when the distances are fitted."""
 _TOGETHER = 4
-"""Scenes of one graph on a CPU; chosen before the graph of DPI-Net became smaller."""
+"""Scenes of one graph on a CPU. Another number is another rounding, and with it other rollouts of a
+few scenes, so that published scores would have to be computed again."""
 _HYPOTHESES = 16
 """Random choices of particles in a robust fit."""
 _INLIER = 0.1
