@@ -13,16 +13,17 @@ as large.
 ``learn`` needs the trials of ``physion generate FOLDER --width 64 --height 64`` with the splits
 training and testing. It trains the small models with three seeds and prints, for one clip of every
 testing trial, after and before the training and for trivial predictors, and the ratio of the
-trained to the best trivial one:
+trained to the best trivial one, which is to be above 1 for C-SWM and below 1 for the others:
 
 - C-SWM: the mean reciprocal rank of the true next state among all states of 20 clips; the trivial
   predictor copies the present state.
 - RPIN: the mean distance of predicted from true centres of boxes, as part of the picture's side,
-  times 1000; the trivial predictor keeps the last velocity.
+  times 1000; the trivial predictor keeps the last velocity. Untrained, RPIN predicts that boxes
+  stay.
 - SVG and OP3: the squared error of moving pixels of the imagined frames, times 1000
   (`physion.models.vision.moving`); one trivial predictor repeats the last observed picture, another
-  shows an empty scene, the median of the observed pictures. Without them as a measure of motion, a
-  model that lets objects vanish would seem to have learned it.
+  shows an empty scene, the median of the observed pictures. A model that only lets moving objects
+  vanish is better than the first one; it must be better than both.
 
 ``shipped`` prints the same for the weights that come with the package, without training.
 
@@ -30,7 +31,8 @@ trained to the best trivial one:
 reading and rendering included: with boxes that are rendered for every window, with those of earlier
 windows kept, and with all of them kept from the start.
 
-With --write a section of ``results/vision_models.md`` is replaced.
+With --write a section of ``results/vision_models.md`` is replaced; ``learn`` has one for every
+choice of models.
 """
 
 from __future__ import annotations
@@ -47,13 +49,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from physion import Dataset, build_model
 from physion.compute.machine import processor
 from physion.models.batch import Batch, Spec
 from physion.models.cswm.contrast import ranking
-from physion.models.vision.moving import future_error
+from physion.models.vision.moving import empty_scene_error
 from physion.seeds import generator, stable_hash
 from physion.training.sources.batches import ObservedBatches, TrialReaders, WholeBatches
 from physion.training.sources.kept_boxes import MOST_BYTES
@@ -183,7 +184,7 @@ def learn(folder: Path, names: list[str], steps: int, seeds: int) -> Rows:
             seconds = time.process_time() - start
             after, *trivial = metric(name, model, clips)
             best = (max if name == "cswm" else min)(trivial)
-            values = [*in_words(after, before, *trivial), f"{after / best:.3f}"]
+            values = [*metric_cells(after, before, *trivial), f"{after / best:.3f}"]
             yield [model.name, str(seed), str(trained.steps), *values, f"{seconds:.0f}"]
 
 
@@ -196,12 +197,17 @@ def shipped(folder: Path, names: list[str]) -> Rows:
         clips = tested_clips(model, source, dataset.trials("testing"))
         after, *trivial = metric(name, model, clips)
         before, *_ = metric(name, build_model(name), clips)
-        yield [model.name, METRICS[name], *in_words(after, before, *trivial)]
+        yield [model.name, METRICS[name], *metric_cells(after, before, *trivial)]
 
 
-def in_words(after: float, before: float, trivial: float, empty: float | None = None) -> list[str]:
+def metric_cells(
+    after: float, before: float, trivial: float, empty: float | None = None
+) -> list[str]:
     """Return the cells of a metric; "-" where it is not defined of an empty scene."""
-    return [*(f"{v:.3f}" for v in (after, before, trivial)), f"{empty:.3f}" if empty else "-"]
+    return [
+        *(f"{v:.3f}" for v in (after, before, trivial)),
+        "-" if empty is None else f"{empty:.3f}",
+    ]
 
 
 def tested_clips(model: Any, source: Any, trials: list[str]) -> list[Batch]:
@@ -242,18 +248,12 @@ def center_distances(model: Any, batch: Batch) -> tuple[float, float]:
 
 def moving_errors(model: Any, batch: Batch) -> tuple[float, float, float]:
     """Return 1000 times the errors of moving pixels: of the model, a copy, and an empty scene."""
-    own, copied = model.loss(batch)["loss"], model.baseline(batch)
-    return 1000 * float(own), 1000 * float(copied), 1000 * float(empty_scene(model, batch))
-
-
-def empty_scene(model: Any, batch: Batch) -> Tensor:
-    """Return the error of moving pixels of the median of the observed pictures."""
     assert batch.rgb is not None, "the clips have pictures"
     pictures = torch.as_tensor(batch.rgb).permute(0, 1, 4, 2, 3).float() / 255
-    future = model.config.imagined
-    median = pictures[:, :-future].median(1, keepdim=True).values
-    still = median.expand(-1, future, -1, -1, -1)
-    return future_error(still, pictures, torch.as_tensor(batch.valid)).moving
+    valid = torch.as_tensor(batch.valid)
+    empty = empty_scene_error(pictures, model.config.imagined, valid).moving
+    own, copied = model.loss(batch)["loss"], model.baseline(batch)
+    return 1000 * float(own), 1000 * float(copied), 1000 * float(empty)
 
 
 def boxes(folder: Path, steps: int) -> Rows:
@@ -342,7 +342,7 @@ def main() -> None:
     elif options.part == "learn":
         head = ["model", "seed", "steps", "trained", "untrained", "trivial", "empty scene"]
         head += ["ratio", "training, s"]
-        title = "What was learned of new clips"
+        title = f"What {', '.join(options.models)} learned of new clips"
         rows = learn(options.folder, options.models, options.steps, options.seeds)
     elif options.part == "shipped":
         head = ["model", "metric", "trained", "untrained", "trivial", "empty scene"]

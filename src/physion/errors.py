@@ -5,6 +5,9 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+MEMORY_SETTINGS = "lower --encoder-batch, --batch, --workers or the size of the pictures"
+"""What to do when memory is used up where no model is at work."""
+
 
 class PhysionError(Exception):
     """Base class of all errors of this package.

@@ -118,9 +118,9 @@ def test_memory_that_is_used_up_names_what_to_lower(
         train[1] = f"{file}:{name}"
         assert message in refused(capsys, *train, "--batch", "4")
     evaluate = ["evaluate", str(made.folder), f"{file}:HugeFeatures", "--out", str(tmp_path)]
-    assert "lower the encoder batch, now 4" in refused(capsys, *evaluate, *ENCODE)
+    assert "lower --encoder-batch, now 4" in refused(capsys, *evaluate, *ENCODE)
     one = [*ENCODE, "--encoder-batch", "1"]
-    assert "lower the image size of the model" in refused(capsys, *evaluate, *one)
+    assert "use a smaller image_size or size of the model" in refused(capsys, *evaluate, *one)
 
 
 def test_memory_that_numpy_lacks_is_one_line(

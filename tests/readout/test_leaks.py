@@ -12,6 +12,7 @@ import pytest
 from physion.compute.local import SerialExecutor
 from physion.errors import BadInputError
 from physion.models import build_model, models
+from physion.models.batch import Spec
 from physion.readout.evaluate import evaluate, evaluate_model
 from physion.readout.leak_checks import (
     with_exchanged_futures,
@@ -20,12 +21,14 @@ from physion.readout.leak_checks import (
 )
 from physion.readout.logistic import ReadoutConfig
 from physion.readout.settings import EvaluationConfig
+from physion.training.sources.open_source import whole_source
 from physion.trials.dataset import Dataset
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, plan_dataset
-from support.late_turns import make_late_turns
+from support.late_motions import make_late_motions
 from support.moving_dots import make_dots
 from support.tiny_models import OPTIONS, TINY
+from support.viewer_dataset import make_dataset
 
 QUICK = EvaluationConfig(steps=3, accelerator="cpu", readout=ReadoutConfig(grid=(1e-2, 1.0)))
 PREDICTING = ("observed", "observed+simulated")
@@ -86,25 +89,45 @@ def test_the_copy_is_poisoned_where_it_should_be(made: Dataset, poisoned: Datase
 
 
 def test_motions_continue_like_those_of_another_trial(tmp_path: Path) -> None:
-    made = make_late_turns(tmp_path / "data", {"testing": 4})
+    """The trials have different lengths; clips of the copy can be read, and their boxes."""
+    made = make_late_motions(tmp_path / "data", {"testing": 4}, more=3)
     exchanged = with_exchanged_futures(made, tmp_path / "exchanged", motions=True)
-    motions = [made.trial(trial).trajectory for trial in made.trials()]
-    for trial, own in zip(made.trials(), motions, strict=True):
-        changed = exchanged.trial(trial).trajectory
+    trials = made.trials()
+    motions = [made.trial(trial).trajectory for trial in trials]
+    for trial, own in zip(trials, motions, strict=True):
+        opened = exchanged.trial(trial)
+        changed = opened.trajectory
         assert np.array_equal(own.positions[:45], changed.positions[:45])
         (partner,) = [
             m for m in motions if np.array_equal(m.positions[45:], changed.positions[45:])
         ]
-        assert partner is not own
-        assert np.array_equal(changed.contacts.frame, partner.contacts.frame), "all are late"
+        assert partner is not own and len(changed) == len(partner) != len(own)
         assert np.array_equal(changed.velocities[45:], partner.velocities[45:])
-        assert exchanged.trial(trial).labels == made.trial(trial).labels
+        frames = [f for f in own.contacts.frame if f < 45]
+        frames += [f for f in partner.contacts.frame if f >= 45]
+        assert changed.contacts.frame.tolist() == frames and 10 in frames
+        assert opened.labels == made.trial(trial).labels
+        row = exchanged.index.set_index("trial").loc[trial]
+        assert row["digest"] == opened.metadata.digest == changed.digest()
+        assert row["frames"] == opened.metadata.frames == len(exchanged.frames(trial))
+        assert row["playback_seconds"] == pytest.approx(len(partner) / 30)
+    spec = Spec(inputs=("rgb", "boxes"), image_size=32, stride=9, context=5, future=12)
+    batches = [whole_source(dataset, spec).whole(trials) for dataset in (made, exchanged)]
+    for values in (batch.boxes for batch in batches):
+        assert values is not None
+    before, after = (np.nan_to_num(np.asarray(batch.boxes)) for batch in batches)
+    assert np.array_equal(before[:, :5], after[:, :5]) and not np.array_equal(before, after)
 
 
 def test_a_trial_without_a_partner_is_named(tmp_path: Path) -> None:
     alone = make_dots(tmp_path / "data", {"testing": 1}, ("drop",))
     with pytest.raises(BadInputError, match=r"drop_testing_0000.*only one"):
         with_exchanged_futures(alone, tmp_path / "exchanged")
+    cloth = Dataset(make_dataset(tmp_path / "cloth"))
+    with pytest.raises(BadInputError, match=r"has cloth, whose motion fits no other trial"):
+        with_exchanged_futures(
+            cloth, tmp_path / "more", cloth.index["split"].unique(), motions=True
+        )
 
 
 @pytest.fixture(scope="module")
@@ -113,21 +136,27 @@ def dots(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return make_dots(tmp_path_factory.mktemp("dots") / "data", counts, ("drop",))
 
 
-def accuracy_of_full(dataset: Dataset, folder: Path) -> float:
-    config: Any = EvaluationConfig(readouts=("full",), accelerator="cpu", readout=QUICK.readout)
-    table = evaluate(dataset, "frozen-encoder", folder, options=TINY, config=config).predictions
+def accuracy_of_full(dataset: Dataset, folder: Path, **options: Any) -> float:
+    config: Any = EvaluationConfig(
+        readouts=("full",), accelerator="cpu", readout=QUICK.readout, steps=20, batch=4, warmup=0
+    )
+    options = {**TINY, **options}
+    table = evaluate(dataset, "frozen-encoder", folder, options=options, config=config).predictions
     return float((table["Predicted Outcome"] == table["Actual Outcome"]).mean())
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("fine_tuned", [False, True], ids=["frozen", "fine-tuned"])
 def test_full_falls_to_chance_with_exchanged_futures_and_permuted_labels(
-    dots: Dataset, tmp_path: Path
+    fine_tuned: bool, dots: Dataset, tmp_path: Path
 ) -> None:
     """Of 40 trials, 3 standard errors of chance are .24."""
     exchanged = with_exchanged_futures(dots, tmp_path / "exchanged")
-    assert accuracy_of_full(dots, tmp_path / "a") > 0.74
-    assert abs(accuracy_of_full(exchanged, tmp_path / "b") - 0.5) < 0.24
+    assert accuracy_of_full(dots, tmp_path / "a", fine_tuned=fine_tuned) > 0.74
+    fallen = accuracy_of_full(exchanged, tmp_path / "b", fine_tuned=fine_tuned)
+    assert abs(fallen - 0.5) < 0.24
     permuted = with_permuted_labels(dots)
     assert not permuted.index["contact"].equals(dots.index["contact"])
     assert permuted.index["contact"].sum() == dots.index["contact"].sum()
-    assert abs(accuracy_of_full(permuted, tmp_path / "c") - 0.5) < 0.24
+    guessed = accuracy_of_full(permuted, tmp_path / "c", fine_tuned=fine_tuned)
+    assert abs(guessed - 0.5) < 0.24

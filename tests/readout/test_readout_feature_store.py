@@ -469,9 +469,11 @@ class FullDevice(Network):
 
 @pytest.mark.parametrize("model", [Numpy(fill_memory), HugeNetwork(), FullDevice()])
 def test_memory_used_up_names_the_setting_to_lower(model: Any) -> None:
-    with pytest.raises(OutOfMemoryError, match=r"3 clips of 3 frames .* encoder batch, now 3"):
+    with pytest.raises(OutOfMemoryError, match=r"3 clips of 3 frames .* --encoder-batch, now 3"):
         FeatureStore(None, batch=3).encoded(model, Movies(), TRIALS, "context")
-    with pytest.raises(OutOfMemoryError, match="lower the image size of the model"):
+    with pytest.raises(
+        OutOfMemoryError, match="use a smaller image_size or size of the model, or fewer"
+    ):
         FeatureStore(None, batch=1).encoded(model, Movies(), TRIALS, "context")
 
 
@@ -480,8 +482,8 @@ def test_memory_used_up_by_reading_names_the_setting_to_lower() -> None:
         def context(self, trials: Sequence[str]) -> Batch:
             raise MemoryError
 
-    for batch, setting in ((3, "the encoder batch, now 3"), (1, "the image size of the model")):
-        expected = f"reading {batch} clips at a time ran out of memory; lower {setting}"
+    for batch, advice in ((3, "lower --encoder-batch, now 3"), (1, "use a smaller image_size")):
+        expected = f"reading {batch} clips at a time ran out of memory; {advice}"
         with pytest.raises(OutOfMemoryError, match=expected):
             FeatureStore(None, batch=batch).encoded(Network(), Large(), TRIALS, "context")
 
@@ -491,9 +493,9 @@ def test_memory_used_up_by_imagining_names_the_setting_to_lower() -> None:
         def imagine(self, context: Batch, samples: int, seed: int) -> Any:
             return np.ones(2**50)
 
-    for batch, setting in ((3, "the encoder batch, now 3"), (1, "the image size of the model")):
+    for batch, advice in ((3, "lower --encoder-batch, now 3"), (1, "size of the model, or fewer")):
         store = FeatureStore(None, batch=batch)
-        with pytest.raises(OutOfMemoryError, match=f"imagine ran out of memory .* lower {setting}"):
+        with pytest.raises(OutOfMemoryError, match=f"imagine ran out of memory .* {advice}"):
             store.imagined(Vivid(), Movies(), None, TRIALS, samples=2, seed=0, knobs={})
 
 

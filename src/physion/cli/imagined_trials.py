@@ -14,6 +14,7 @@ from physion.errors import BadInputError
 from physion.models.batch import Batch, Rollout
 from physion.models.build import build_model
 from physion.models.interface import Encodes, HasReader, Imagines, Learns, Model, Trained
+from physion.models.raised import OutOfMemoryError
 from physion.readout.model_calls import call_model, check_identity, is_network, model_name, to_array
 from physion.readout.readers.reader import fraction_of_futures
 from physion.readout.rollouts import Outcomes
@@ -98,15 +99,20 @@ def _imagine_trials(
 ) -> dict[str, ImaginedTrial]:
     """Return what one model imagines of the trials."""
     if is_network(model):
-        from physion.training.devices import Devices, make_fabric
+        from physion.training.devices import Devices, make_fabric, move_to_device
 
-        network: Any = model
-        make_fabric(Devices(), "32-true").to_device(network)
+        move_to_device(make_fabric(Devices(), "32-true"), model)
     source = whole_source(dataset, model.spec, rendered=_without_movies(dataset, trials))
     groups = [trials[row : row + _TRIALS] for row in range(0, len(trials), _TRIALS)]
     imagined: dict[str, ImaginedTrial] = {}
     for group in tracked(groups, f"predictions of {model_name(model)}", len(groups), progress):
-        imagined |= zip(group, _imagine_group(model, source, group), strict=True)
+        try:
+            imagined |= zip(group, _imagine_group(model, source, group), strict=True)
+        except OutOfMemoryError:
+            if len(group) == 1:
+                raise
+            for trial in group:
+                imagined[trial] = _imagine_group(model, source, [trial])[0]
     return imagined
 
 

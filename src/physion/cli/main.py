@@ -28,7 +28,7 @@ def _usage() -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Run one verb and return the exit code."""
-    from physion.errors import PhysionError
+    from physion.errors import MEMORY_SETTINGS, PhysionError
 
     try:
         try:
@@ -42,8 +42,8 @@ def main(argv: list[str] | None = None) -> int:
         print(f"physion: {message}", file=sys.stderr)
         return error.exit_code
     except MemoryError:
-        advice = "lower --encoder-batch, --batch, --workers or the size of the pictures"
-        print(f"physion: memory is used up; {advice}, where the verb has them", file=sys.stderr)
+        text = f"memory is used up; {MEMORY_SETTINGS}, where the verb has them"
+        print(f"physion: {text}", file=sys.stderr)
         return 2
     except BrokenPipeError:
         _discard_output()

@@ -2,8 +2,8 @@
 
 - With poisoned futures, everything after the observed part is noise. Predictions under *observed*
   and *observed+simulated* must stay the same to the byte.
-- With exchanged futures, every movie ends like that of another trial, and so do the motions if this
-  is wanted. Predictions under *full* must fall to what the observed part tells.
+- With exchanged futures, every movie ends like that of another trial; with ``motions=True`` the
+  motions do, too. Predictions under *full* must fall to what the observed part tells.
 - With permuted labels, nothing that is fitted can be better than chance.
 
 A copy must be evaluated in a folder of its own: stored features and rollouts of the observed part
@@ -33,7 +33,6 @@ from physion.trials.video import encode_movie, read_frames
 
 Pictures = NDArray[np.uint8]
 _MOTION = ("positions", "rotations", "velocities", "angular_velocities", "cloth_vertices")
-_GAP = "cloth_distance"
 
 
 def with_poisoned_futures(
@@ -89,12 +88,13 @@ def with_exchanged_futures(
     motions
         Exchange the motions too, and with them the boxes of objects. The other trial is then one
         with as many bodies, whose motion the bodies continue in the order of the scene; shapes,
-        camera and label stay. Trials with cloth have no such partner.
+        camera and label stay. A trial with cloth is an error, so that no set with Drape works.
 
     Raises
     ------
     BadInputError
-        If the folder exists, or a trial has no partner.
+        If the folder exists, no other trial of the scenario has as many bodies, or a trial has
+        cloth whose motion is to be exchanged.
     """
     copy = _copy(dataset, folder)
     groups: dict[tuple[str, str], list[str]] = {}
@@ -148,13 +148,16 @@ def _trials(dataset: Dataset, splits: Sequence[str]) -> list[str]:
 def _change_movie(
     dataset: Dataset, trial: str, change: Callable[[str, Pictures], Pictures]
 ) -> None:
-    """Write a trial's movie anew and put its new size and checksum into the index."""
+    """Write a trial's movie anew and put its new size, checksum and length into the index."""
     path = dataset.paths(trial).movie
-    frames = change(trial, read_frames(path))
+    before = read_frames(path)
+    frames = change(trial, before)
     content = encode_movie(frames)
     path.write_bytes(content)
     _index_again(dataset, trial, "movie", content)
-    dataset.index.loc[dataset.index["trial"] == trial, "frames"] = len(frames)
+    row = dataset.index["trial"] == trial
+    dataset.index.loc[row, "frames"] = len(frames)
+    dataset.index.loc[row, "playback_seconds"] *= len(frames) / len(before)
 
 
 def _index_again(dataset: Dataset, trial: str, column: str, content: bytes) -> None:
@@ -185,7 +188,9 @@ def _exchange_motion(dataset: Dataset, name: str, other: Trajectory) -> None:
         return np.concatenate([getattr(first, field)[kept], getattr(second, field)[taken]])
 
     seen, later = slice(OBSERVED_FRAMES), slice(OBSERVED_FRAMES, None)
-    arrays = {field: joined(own, other, field, seen, later) for field in (*_MOTION, _GAP)}
+    arrays = {
+        field: joined(own, other, field, seen, later) for field in (*_MOTION, "cloth_distance")
+    }
     touching = [motion.contacts.frame < OBSERVED_FRAMES for motion in (own, other)]
     contacts = {
         field.name: joined(own.contacts, other.contacts, field.name, touching[0], ~touching[1])
@@ -219,6 +224,11 @@ def _change_motion(
     changed: Trajectory = dataclasses.replace(
         trial.trajectory, **arrays, contacts=contacts, completed=completed
     )
-    metadata = dataclasses.replace(trial.metadata, frames=len(changed))
+    metadata = dataclasses.replace(
+        trial.metadata, frames=len(changed), completed=completed, digest=changed.digest()
+    )
     write_trial(path, metadata, trial.scene, changed, trial.labels, trial.ids)
     _index_again(dataset, name, "trial_file", path.read_bytes())
+    for column in ("completed", "digest", "physics_seconds"):
+        row = dataset.index["trial"] == name
+        dataset.index.loc[row, column] = getattr(metadata, column)

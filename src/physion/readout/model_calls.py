@@ -161,15 +161,19 @@ def _device(network: Any) -> Any:
     return "cpu"
 
 
+MEMORY_ADVICE = "use a smaller image_size or size of the model, or fewer samples"
+"""What to do if memory is used up by a single clip."""
+
+
 def _explain(error: Exception, model: Model, method: str, batch: Batch) -> PhysionError:
     """Return the error that says in one line what a model raised."""
     name = model_name(model)
     clips, steps = batch.frames.shape[:2]
     if is_out_of_memory(error):
-        lower = f"the encoder batch, now {clips}" if clips > 1 else "the image size of the model"
+        advice = MEMORY_ADVICE if clips == 1 else f"lower --encoder-batch, now {clips}"
         return OutOfMemoryError(
             f"model {name!r}: {method} ran out of memory with {clips} clips of {steps} frames at a "
-            f"time; lower {lower}"
+            f"time; {advice}"
         )
     return describe_raised(error, name, method)
 

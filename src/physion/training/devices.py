@@ -104,9 +104,11 @@ def memory_advice(settings: TrainingSettings) -> Iterator[None]:
         if not is_out_of_memory(error):
             raise
         clips, parts = settings.batch, settings.accumulate
+        # The smallest divisor above 1: the same clips make a step.
+        least = next((part for part in range(2, clips + 1) if clips % part == 0), 1)
         advice = (
-            f"lower the batch and accumulate more, such as batch {clips // 2} and accumulate "
-            f"{2 * parts}"
+            f"lower the batch and accumulate more, such as batch {clips // least} and accumulate "
+            f"{least * parts}"
             if clips > 1
             else "use a smaller image_size or size of the model, or precision bf16-mixed"
         )

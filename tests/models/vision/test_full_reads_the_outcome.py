@@ -19,7 +19,7 @@ from physion.readout.leak_checks import with_exchanged_futures, with_permuted_la
 from physion.readout.logistic import ReadoutConfig
 from physion.readout.settings import EvaluationConfig
 from physion.trials.dataset import Dataset
-from support.late_turns import make_late_turns
+from support.late_motions import make_late_motions
 from support.moving_dots import make_dots
 
 pytestmark = pytest.mark.slow
@@ -58,9 +58,9 @@ def dots(tmp_path_factory: pytest.TempPathFactory) -> Cases:
 
 
 @pytest.fixture(scope="module")
-def late_turns(tmp_path_factory: pytest.TempPathFactory) -> Cases:
-    folder = tmp_path_factory.mktemp("late turns")
-    return cases_of(make_late_turns(folder / "data", COUNTS), folder, motions=True)
+def late_motions(tmp_path_factory: pytest.TempPathFactory) -> Cases:
+    folder = tmp_path_factory.mktemp("late motions")
+    return cases_of(make_late_motions(folder / "data", COUNTS), folder, motions=True)
 
 
 def accuracy_of_full(
@@ -80,7 +80,7 @@ def accuracy_of_full(
 def test_full_falls_to_chance_with_exchanged_futures(
     name: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    made: Cases = request.getfixturevalue("late_turns" if name == "rpin" else "dots")
+    made: Cases = request.getfixturevalue("late_motions" if name == "rpin" else "dots")
     trained = accuracy_of_full(made.dataset, name, tmp_path / "trained", **TRAINING[name])
     (weights,) = (tmp_path / "trained" / "training").iterdir()
     fallen = accuracy_of_full(made.exchanged, name, tmp_path / "exchanged", weights=str(weights))

@@ -7,7 +7,13 @@ import torch
 from torch.distributions import Independent, Normal, kl_divergence
 
 from physion.models.vision.gaussians import gaussian_divergence, gaussian_values
-from physion.models.vision.moving import CHANGE, copy_error, future_error, moving_pixels
+from physion.models.vision.moving import (
+    CHANGE,
+    copy_error,
+    empty_scene_error,
+    future_error,
+    moving_pixels,
+)
 
 
 def column_clip() -> torch.Tensor:
@@ -41,6 +47,14 @@ def test_a_copy_is_wrong_where_the_column_is_and_where_it_was_seen_last() -> Non
     error = copy_error(pictures, 2, valid)
     assert error.moving == pytest.approx(3 / 4)
     assert error.pixels == pytest.approx(4 * 4 / 32)
+
+
+def test_an_empty_scene_is_wrong_where_the_column_is() -> None:
+    """The median of two frames has no column; half of the pixels that move show one."""
+    pictures, valid = column_clip(), torch.ones(1, 4, dtype=torch.bool)
+    error = empty_scene_error(pictures, 2, valid)
+    assert error.moving == pytest.approx(1 / 2)
+    assert error.pixels == pytest.approx(2 * 4 / 32)
 
 
 def test_errors_are_means_of_squares_over_what_counts() -> None:

@@ -9,7 +9,7 @@ import torch
 
 from physion.models.build import build_model
 from physion.models.cswm.contrast import ranking
-from physion.models.vision.moving import future_error
+from physion.models.vision.moving import empty_scene_error
 from physion.stimulus_names import SCENARIOS
 from physion.trials.dataset import Dataset
 from support.small_movies import early_windows, make_movies, read_whole
@@ -53,8 +53,6 @@ def scores(name: str, movies: Dataset, weights: str) -> list[float]:
     if name == "rpin":
         own, constant = model.center_errors(batch)
         return [float(own.nanmean()), float(constant.nanmean())]
-    future = model.config.imagined
     pictures = batch.rgb.permute(0, 1, 4, 2, 3).float() / 255
-    median = pictures[:, :-future].median(1, keepdim=True).values.expand(-1, future, -1, -1, -1)
-    empty = future_error(median, pictures, batch.valid).moving
+    empty = empty_scene_error(pictures, model.config.imagined, batch.valid).moving
     return [float(model.loss(batch)["loss"]), float(model.baseline(batch)), float(empty)]

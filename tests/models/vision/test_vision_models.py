@@ -229,6 +229,12 @@ def test_weights_of_another_architecture_are_refused_by_name(name: str, tmp_path
     write_checkpoint(path, tensors_of(model), {"built_as": built})
     with pytest.raises(BadInputError, match=f"model was {name}-paper and is {name}-small"):
         model_of(name, weights=str(path))
+    other = model_of("cswm" if name != "cswm" else "svg")
+    write_checkpoint(path, tensors_of(other), {"built_as": other.built_as()})
+    first = next(iter(model.state_dict()))
+    with pytest.raises(BadInputError, match=rf"{first} is missing.*weights of this one$") as caught:
+        model_of(name, weights=str(path))
+    assert "delete" not in str(caught.value), "the file is good"
     tensors = tensors_of(model)
     missing, *_, wider = (key for key, value in tensors.items() if value.ndim > 1)
     tensors["model/foreign"] = tensors.pop(missing)

@@ -156,9 +156,13 @@ def load_weights(path: Path, model: nn.Module) -> None:
 
 
 def check_same(
-    path: Path, what: str, stored: Mapping[str, Any], current: Mapping[str, Any]
+    path: Path,
+    what: str,
+    stored: Mapping[str, Any],
+    current: Mapping[str, Any],
+    advice: str = "delete it to start again",
 ) -> None:
-    """Raise `BadInputError` that names the values of ``what`` that differ."""
+    """Raise `BadInputError` that names the values of ``what`` that differ, and what to do."""
     old, new = _flat(stored), _flat(current)
     differences = [
         f"{key} was {_shown(old, key)} and is {_shown(new, key)}"
@@ -167,9 +171,13 @@ def check_same(
     ]
     if differences:
         raise BadInputError(
-            f"checkpoint {path} belongs to another {what}: {_listed(differences)}; delete it to "
-            "start again"
+            f"checkpoint {path} belongs to another {what}: {_listed(differences)}; {advice}"
         )
+
+
+def describe_tensors(tensors: Mapping[str, Tensor], model: nn.Module) -> str:
+    """Return in words which weights of a checkpoint differ from those of a model; "" if none."""
+    return _listed(_compare_tensors(_with_prefix(tensors, _MODEL), model.state_dict()))
 
 
 def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> str:

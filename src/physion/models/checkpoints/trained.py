@@ -16,6 +16,7 @@ from physion.models.checkpoints.checkpoint import (
     WEIGHTS,
     DamagedFileError,
     check_same,
+    describe_tensors,
     is_checkpoint,
     load_tensors,
     read_checkpoint,
@@ -124,5 +125,8 @@ def _load(path: Path, model: nn.Module) -> None:
     tensors = {name: v.float() if name in halves else v for name, v in stored.items()}
     built_as = getattr(model, "built_as", None)
     if built_as is not None:
-        check_same(path, "model", metadata.get(BUILT_AS, {}), built_as())
+        differences = describe_tensors(tensors, model)
+        advice = f"{differences}; " * bool(differences)
+        advice += "build the model that the weights belong to, or give weights of this one"
+        check_same(path, "model", metadata.get(BUILT_AS, {}), built_as(), advice)
     load_tensors(path, tensors, model)

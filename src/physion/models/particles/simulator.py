@@ -79,8 +79,8 @@ frames the units are those times s / 3 and (s / 3)²."""
 _AT_ONCE = 32
 """Scenes of one graph when the distances are fitted."""
 _TOGETHER = 4
-"""Scenes of one graph on a CPU. Another number is another rounding, and with it other rollouts of a
-few scenes, so that published scores would have to be computed again."""
+"""Scenes of one graph on a CPU. The published scores were computed with 4; another number changes
+rounding, and with it the rollouts of a few scenes."""
 _HYPOTHESES = 16
 """Random choices of particles in a robust fit."""
 _INLIER = 0.1

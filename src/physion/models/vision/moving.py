@@ -1,4 +1,4 @@
-"""Error of predicted pictures where something moves, and that of repeating the last seen picture.
+"""Error of predicted pictures where something moves, and those of trivial predictions.
 
 Most pixels of a movie never change, so that a copy of the last seen picture has a small error over
 all of them. It predicts no motion, which shows where pixels change:
@@ -65,6 +65,15 @@ def copy_error(pictures: Tensor, future: int, valid: Tensor) -> FutureError:
     """Return the errors of repeating the picture before the last ``future`` ones."""
     last = pictures[:, -future - 1 : -future]
     return future_error(last.expand(-1, future, -1, -1, -1), pictures, valid)
+
+
+def empty_scene_error(pictures: Tensor, future: int, valid: Tensor) -> FutureError:
+    """Return the errors of showing the median of the pictures before the last ``future`` ones.
+
+    Objects that move are absent there: a model that only lets them vanish is as good.
+    """
+    median = pictures[:, :-future].median(1, keepdim=True).values
+    return future_error(median.expand(-1, future, -1, -1, -1), pictures, valid)
 
 
 def _mean(values: Tensor, counted: Tensor) -> Tensor:

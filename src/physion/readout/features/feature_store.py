@@ -31,7 +31,7 @@ from physion.readout.features.feature_file import (
 )
 from physion.readout.features.model_outputs import CONTACT, GAP, Arrays, encode_clips, imagine_clips
 from physion.readout.features.stored_features import FEATURES, StoredFeatures
-from physion.readout.model_calls import model_name
+from physion.readout.model_calls import MEMORY_ADVICE, model_name
 from physion.readout.rollouts import Outcomes
 from physion.training.sources.source import ObservedSource, Part
 
@@ -247,10 +247,10 @@ def _read(read: Callable[[tuple[str, ...]], Batch], group: tuple[str, ...]) -> B
     try:
         return read(group)
     except MemoryError as error:
-        many = len(group) > 1
-        lower = f"the encoder batch, now {len(group)}" if many else "the image size of the model"
+        count = len(group)
+        advice = MEMORY_ADVICE if count == 1 else f"lower --encoder-batch, now {count}"
         raise OutOfMemoryError(
-            f"reading {len(group)} clips at a time ran out of memory; lower {lower}"
+            f"reading {count} clips at a time ran out of memory; {advice}"
         ) from error
 
 

@@ -6,16 +6,22 @@ import errno
 import traceback
 from pathlib import Path
 
-from physion.errors import PhysionError
+from physion.errors import MEMORY_SETTINGS, PhysionError
+from physion.models.raised import is_out_of_memory
 
 _NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 
 
 def describe_failure(error: Exception) -> str:
-    """Return one line about an error, with the line of code if it is no `PhysionError`."""
+    """Return one line about an error, with the line of code if it is no `PhysionError`.
+
+    If memory is used up it names the settings to lower.
+    """
     text = " ".join(str(error).split())
     if isinstance(error, PhysionError):
         return text
+    if is_out_of_memory(error):
+        text += f"; {MEMORY_SETTINGS}"
     last = traceback.extract_tb(error.__traceback__)[-1]
     return f"{type(error).__name__}: {text} ({Path(last.filename).name}, line {last.lineno})"
 
