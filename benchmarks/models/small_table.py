@@ -5,14 +5,16 @@
 Makes 200 training, 200 readout and 60 tested trials a scenario in FOLDER, with movies of 64 px, and
 evaluates on them under the protocol *all*
 
-- models whose weights come with the package;
+- vision models whose weights come with the package;
+- particle models whose weights come with the package, on the same tested trials without movies:
+  they have no readout;
 - EfficientNet-Lite0 of ImageNet, whose dynamics are trained here, and fine-tuned for 200 steps;
 - the same networks with random weights, untrained;
 - anchors.
 
 The same command continues a run that was interrupted, and does nothing again. The processor time of
-every part is kept in FOLDER and printed with the table. With --write it is written to
-``results/small.txt``.
+every part, also that of interrupted runs, is kept in FOLDER and printed with the table. With
+--write it is written to ``results/small.txt``.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from pathlib import Path
 import pandas as pd
 import torch
 
+from physion.atomic import write_atomic
 from physion.cli.text_table import text_table
 from physion.compute.machine import processor
 
@@ -39,28 +42,33 @@ FROZEN = "pEffNetLite0-mlp,pEffNetLite0-lstm"
 ANCHORS = (
     "state-classifier,constant-motion,already-touched,blob-centroids,copy-last-frame,outcome,chance"
 )
+MOVIES, STATES = "movies", "states"
+"""Folders of the trials."""
+UNTRAINED = "untrained"
 PARTS: dict[str, tuple[str, ...]] = {
-    "shipped weights": (f"{VISION},dpi,gns,gns-ransac", "--weights", "shipped"),
-    "anchors": (ANCHORS,),
-    "frozen encoders": (FROZEN,),
-    "untrained": (f"{VISION},{FROZEN}", "--weights", "random", "--untrained"),
-    "fine-tuned encoders": (FROZEN, "--option", "fine_tuned=true", "--steps", "200"),
+    "vision models": (MOVIES, VISION, "--weights", "shipped"),
+    "particle models": (STATES, "dpi,gns,gns-ransac", "--weights", "shipped"),
+    "anchors": (MOVIES, ANCHORS),
+    "frozen encoders": (MOVIES, FROZEN),
+    UNTRAINED: (MOVIES, f"{VISION},{FROZEN}", "--weights", "random", "--untrained"),
+    "fine-tuned encoders": (MOVIES, FROZEN, "--option", "fine_tuned=true", "--steps", "200"),
 }
-"""Models and options of `physion evaluate` by part of the table."""
+"""Trials, models and options of `physion evaluate` by part of the table."""
 
 
-def run(folder: Path, part: str, *words: str) -> str:
-    """Run a verb and return what it printed; add its processor time to those of the part."""
+def run(folder: Path, part: str, *arguments: str) -> str:
+    """Run a verb in a folder and return what it printed; add up the processor time of the part."""
     path = folder / "seconds.json"
     seconds = json.loads(path.read_text()) if path.is_file() else {}
     before = processor_seconds()
-    done = subprocess.run(
-        [sys.executable, "-m", "physion.cli.main", *words], stdout=subprocess.PIPE, text=True
-    )
-    seconds[part] = seconds.get(part, 0.0) + processor_seconds() - before
-    path.write_text(json.dumps(seconds))
+    command = [sys.executable, "-m", "physion.cli.main", *arguments]
+    try:
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, cwd=folder)
+    finally:
+        seconds[part] = seconds.get(part, 0.0) + processor_seconds() - before
+        write_atomic(path, json.dumps(seconds).encode())
     if done.returncode:
-        raise SystemExit(f"physion {' '.join(words)} ended with code {done.returncode}")
+        raise SystemExit(f"physion {' '.join(arguments)} ended with code {done.returncode}")
     return done.stdout
 
 
@@ -73,17 +81,29 @@ def processor_seconds() -> float:
 def make_table(folder: Path) -> pd.DataFrame:
     """Make trials, evaluate all parts, and return their accuracies."""
     folder.mkdir(parents=True, exist_ok=True)
-    movies = str(folder / "movies")
-    for split, count in COUNTS.items():
-        chosen = ["--split", split, "--count", str(count)]
-        run(folder, "trials", "generate", movies, "--name", "small", *chosen, *SIZE)
+    for arguments in generations():
+        run(folder, "trials", *arguments)
     tables = []
-    for part, (models, *options) in PARTS.items():
-        out = ["--out", str(folder / "models"), "--json"]
-        printed = run(folder, part, "evaluate", movies, models, *options, *out)
-        tables.append(pd.read_csv(json.loads(printed)["results"]))
-    # pandas reads the name "none" of no weights as text, and an empty protocol as NaN.
-    return pd.concat(tables, ignore_index=True).fillna({"init": "none", "protocol": ""})
+    for part, options in PARTS.items():
+        printed = run(folder, part, "evaluate", *options, "--out", "models", "--json")
+        table = pd.read_csv(folder / json.loads(printed)["results"])
+        if part == UNTRAINED:
+            table["init"] += f" ({UNTRAINED})"
+        tables.append(table)
+    # A model without training has an empty protocol, which pandas reads as NaN.
+    return pd.concat(tables, ignore_index=True).fillna({"protocol": ""})
+
+
+def generations() -> list[list[str]]:
+    """Return the arguments of `physion generate` for all trials."""
+    chosen = [
+        [folder, "--split", split, "--count", str(COUNTS[split]), *more]
+        for folder, split, *more in (
+            *((MOVIES, split) for split in COUNTS),
+            (STATES, "testing", "--no-movies"),
+        )
+    ]
+    return [["generate", *options, "--name", "small", *SIZE] for options in chosen]
 
 
 def main() -> None:
@@ -98,7 +118,9 @@ def main() -> None:
     text = [
         "Accuracies of small models on own trials, 200 of the readout and 60 tested a scenario:",
         "  OMP_NUM_THREADS=1 python benchmarks/models/small_table.py FOLDER --write",
-        f"{datetime.date.today()}, {processor()}, torch {torch.__version__}.",
+        f"{datetime.date.today()}, {processor()}, torch {torch.__version__}. It runs:",
+        *(f"  physion {' '.join(arguments)}" for arguments in generations()),
+        *(f"  physion evaluate {' '.join(options)}" for options in PARTS.values()),
         f"Processor time without the training of shipped weights: {total:.0f} minutes, of which",
         *(f"  {part}: {value / 60:.1f}" for part, value in seconds.items()),
         "",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from physion.trials.dataset import Dataset
 from physion.trials.index import write_index
 from physion.trials.video import encode_movie
 from support import trained_models
-from support.moving_dots import OBSERVED, SIZE, make_dots
+from support.moving_dots import FRAMES, OBSERVED, SIZE, make_dots
 
 MODEL = f"{trained_models.__file__}:NextBrightness"
 HUGE = """
@@ -64,40 +63,49 @@ def refused(capsys: pytest.CaptureFixture[str], *command: str) -> str:
     return error
 
 
-def cut(content: bytes) -> bytes:
-    return content[: len(content) // 2]
+CHANGES: dict[str, tuple[int, int, int]] = {
+    "short": (-5, SIZE, 30), "rate": (0, SIZE, 25), "size": (0, 32, 30),
+}  # fmt: skip
+"""What a movie has: frames more than it should have, pixels of a side, frames a second."""
+MOVIES = {
+    "observed": ("evaluate", "testing", OBSERVED),
+    "whole": ("evaluate", "testing", FRAMES),
+    "trained": ("train", "training", FRAMES),
+}
+"""Verb that reads a movie, split of its trial, and frames that it should have."""
 
 
-def movie(frames: int, size: int, rate: int) -> Callable[[bytes], bytes]:
-    return lambda _: encode_movie(np.full((frames, size, size, 3), 90, np.uint8), rate=rate)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (cut, "cannot be read|is damaged|is cut short"),
-        (movie(OBSERVED - 5, SIZE, 30), "has 40 frames of 64 x 64 pixels at 30 a second, not 45"),
-        (movie(OBSERVED, SIZE, 25), "has 45 frames of 64 x 64 pixels at 25 a second, not 45"),
-        (movie(OBSERVED, 32, 30), "has 45 frames of 32 x 32 pixels at 30 a second, not 45"),
-    ],
-    ids=["cut", "short", "rate", "size"],
-)
+@pytest.mark.parametrize("change", ["cut", *CHANGES])
+@pytest.mark.parametrize("read", list(MOVIES))
 @pytest.mark.parametrize("known", [True, False], ids=["indexed", "changed"])
 def test_a_movie_that_does_not_fit_is_named(
-    change: Callable[[bytes], bytes], message: str, known: bool, dots: Dataset,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    change: str, read: str, known: bool, dots: Dataset, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Whether or not the index holds the SHA-256 of the movie as it is."""
-    trial = dots.trials("testing")[0]
-    path = dots.paths(trial).observed_movie
-    path.write_bytes(change(path.read_bytes()))
+    verb, split, frames = MOVIES[read]
+    trial = dots.trials(split)[0]
+    column = "observed_movie" if read == "observed" else "movie"
+    path = getattr(dots.paths(trial), column)
+    message = "cannot be read|is damaged|is cut short"
+    if change == "cut":
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    else:
+        more, size, rate = CHANGES[change]
+        pictures = np.full((frames + more, size, size, 3), 90, np.uint8)
+        path.write_bytes(encode_movie(pictures, rate=rate))
+        message = (
+            f"has {frames + more} frames of {size} x {size} pixels at {rate} a second, not {frames}"
+        )
     if known:
         row = dots.index["trial"] == trial
         sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-        dots.index.loc[row, "observed_movie_sha256"] = sha256
+        dots.index.loc[row, f"{column}_sha256"] = sha256
         write_index(dots.folder, dots.index)
-    out = ["--out", str(dots.folder.parent / "out")]
-    error = refused(capsys, "evaluate", str(dots.folder), MODEL, *out, *ENCODE)
+    out = ["--out", str(dots.folder.parent / "out"), "--accelerator", "cpu"]
+    if verb == "evaluate":
+        error = refused(capsys, verb, str(dots.folder), MODEL, *out, "--untrained")
+    else:
+        error = refused(capsys, verb, MODEL, str(dots.folder), *out)
     assert str(path) in error
     expected = message if known else "was changed since it was made"
     assert any(part in error for part in expected.split("|"))
