@@ -15,7 +15,8 @@ needs ``--particles FOLDER``. Vision models were trained on movies of 64 px:
 
     physion generate MOVIES --split training --count 200 --name small --width 64 --height 64 \
         --jitters 0
-    physion train svg,op3,cswm,rpin MOVIES --out TRAINED
+    physion train svg,cswm,rpin MOVIES --out TRAINED
+    physion train op3 MOVIES --out TRAINED --steps 1500
 
 The weights of SVG are stored as float16. With --scores only the cards are written again, with the
 digests of the weights and the tables of ``results/particles.md`` and ``results/vision_models.md``.

@@ -47,7 +47,7 @@ class CswmConfig:
 
 _SMALL = CswmConfig(
     training=TrainingSettings(
-        steps=1500,
+        steps=6000,
         batch=32,
         learning_rate=1e-3,
         schedule="cosine",

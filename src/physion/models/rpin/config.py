@@ -46,7 +46,7 @@ class RpinConfig:
 
 _SMALL = RpinConfig(
     training=TrainingSettings(
-        steps=600,
+        steps=1800,
         batch=16,
         learning_rate=1e-3,
         schedule="cosine",
