@@ -176,7 +176,7 @@ def check_same(
 
 
 def describe_tensors(tensors: Mapping[str, Tensor], model: nn.Module) -> str:
-    """Return in words which weights of a checkpoint differ from those of a model; "" if none."""
+    """Return which weights of a checkpoint differ from those of a model, as text; "" if none."""
     return _listed(_compare_tensors(_with_prefix(tensors, _MODEL), model.state_dict()))
 
 
