@@ -6,8 +6,9 @@
     OMP_NUM_THREADS=1 python benchmarks/models/vision_models.py boxes FOLDER --write  # steps/s
 
 ``speed`` times a training step (forward and backward) and the features of a clip, with what is
-imagined, on random pictures with moving boxes; times are processor time on a CPU, and elapsed time
-on a GPU (``--accelerator cuda``, also with ``--precision bf16-mixed``), where batches are 16 times
+imagined, on random pictures with moving boxes; of frozen encoders, which have random weights here,
+it times a training step of the dynamics on stored features. Times are processor time on a CPU, and
+elapsed time on a GPU (``--accelerator cuda``, also with ``--precision bf16-mixed``), where batches are 16 times
 as large.
 
 ``learn`` needs the trials of ``physion generate FOLDER --width 64 --height 64`` with the splits
@@ -73,6 +74,9 @@ METRICS = {
 }
 """What is measured of each model."""
 NAMES = tuple(METRICS)
+ENCODERS = ("pVGG-mlp", "pDeIT-mlp", "pEffNetLite0-mlp")
+"""Models with a frozen encoder. A training step is one of their dynamics, on stored features."""
+SIZES = ("small", "paper")
 MODELS: tuple[tuple[str, dict[str, Any], int], ...] = (
     ("cswm", {}, 8),
     ("cswm", {"size": "paper"}, 1),
@@ -84,6 +88,7 @@ MODELS: tuple[tuple[str, dict[str, Any], int], ...] = (
     ("svg", {"size": "paper", "backbone": "dcgan"}, 1),
     ("op3", {}, 4),
     ("op3", {"size": "paper"}, 1),
+    *((name, {"size": size, "weights": "random"}, 1) for name in ENCODERS for size in SIZES),
 )
 """Models whose speed is measured: name, options, clips of a batch."""
 TESTED_CLIPS = 20
@@ -124,20 +129,27 @@ def speed(names: list[str], repeats: int, device: str, precision: str) -> Rows:
         window = random_clips(clips, model.window, spec).to(device)
         context = random_clips(clips, spec.context, spec).to(device)
         half = torch.autocast(device, torch.bfloat16, enabled=precision != "32-true")
+        weights = sum(value.numel() for value in model.parameters())
+        if name in ENCODERS:
+            weights += sum(value.numel() for value in model.network().parameters())
+            window = dataclasses.replace(window, features=model.encode(window))
 
         def train(model: Any = model, window: Batch = window, half: Any = half) -> None:
             with half:
                 loss = model.train().loss(window)["loss"]
             loss.backward()
 
-        def extract(model: Any = model, context: Batch = context, half: Any = half) -> None:
+        def extract(
+            model: Any = model, context: Batch = context, half: Any = half, name: str = name
+        ) -> None:
             with torch.no_grad(), half:
-                model.eval().encode(context)
-                model.imagine(context, 1, 0)
+                features = model.eval().encode(context)
+                given = {"features": features} if name in ENCODERS else {}
+                model.imagine(dataclasses.replace(context, **given), 1, 0)
 
-        weights = sum(value.numel() for value in model.parameters())
         times = [best_time(function, repeats, device) / clips for function in (train, extract)]
-        cells = [model.name, f"{weights / 1e6:.2f} M", f"{spec.image_size} px", str(model.window)]
+        label = model.provenance().model
+        cells = [label, f"{weights / 1e6:.2f} M", f"{spec.image_size} px", str(model.window)]
         yield [*cells, *(f"{seconds:.4f}" for seconds in times), *(f"{1 / s:.1f}" for s in times)]
 
 
@@ -319,7 +331,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("part", choices=("speed", "learn", "shipped", "boxes"))
     parser.add_argument("folder", nargs="?", type=Path)
-    parser.add_argument("--models", nargs="+", default=list(NAMES), choices=NAMES)
+    parser.add_argument("--models", nargs="+", default=(), choices=NAMES + ENCODERS)
     parser.add_argument("--steps", type=int, default=0, help="0: those of the model")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--repeats", type=int, default=3)
@@ -329,6 +341,7 @@ def main() -> None:
     )
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
+    models = list(options.models or NAMES + ENCODERS * (options.part == "speed"))
     if options.part == "speed":
         device, precision = options.accelerator, options.precision
         head = ["model", "weights", "pictures", "frames", "training step, s", "features, s"]
@@ -336,18 +349,18 @@ def main() -> None:
         title = "Processor time of a clip"
         if device != "cpu":
             title = f"Time of a clip on {torch.cuda.get_device_name()}, {precision}"
-        rows = speed(options.models, options.repeats, device, precision)
+        rows = speed(models, options.repeats, device, precision)
     elif options.folder is None:
         parser.error(f"{options.part} needs the folder of the trials")
     elif options.part == "learn":
         head = ["model", "seed", "steps", "trained", "untrained", "trivial", "empty scene"]
         head += ["ratio", "training, s"]
-        title = f"What {', '.join(options.models)} learned of new clips"
-        rows = learn(options.folder, options.models, options.steps, options.seeds)
+        title = f"What {', '.join(models)} learned of new clips"
+        rows = learn(options.folder, models, options.steps, options.seeds)
     elif options.part == "shipped":
         head = ["model", "metric", "trained", "untrained", "trivial", "empty scene"]
         title = "Shipped weights on new clips"
-        rows = shipped(options.folder, options.models)
+        rows = shipped(options.folder, models)
     else:
         head = ["boxes kept", "steps", "steps a second", "ratio"]
         title = "Training steps of RPIN a second"
