@@ -8,8 +8,8 @@
 ``speed`` times a training step (forward and backward) and the features of a clip, with what is
 imagined, on random pictures with moving boxes; of frozen encoders, which have random weights here,
 it times a training step of the dynamics on stored features. Times are processor time on a CPU, and
-elapsed time on a GPU (``--accelerator cuda``, also with ``--precision bf16-mixed``), where batches are 16 times
-as large.
+elapsed time on a GPU (``--accelerator cuda``, also with ``--precision bf16-mixed``), where batches
+are 16 times as large.
 
 ``learn`` needs the trials of ``physion generate FOLDER --width 64 --height 64`` with the splits
 training and testing. It trains the small models with three seeds and prints, for one clip of every
