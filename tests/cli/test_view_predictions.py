@@ -54,6 +54,13 @@ class Rough(Standstill):
     dtype = np.float64
 
 
+class Greedy(Standstill):
+    def imagine(self, context, samples, seed, **knobs):
+        if len(context) > 1:
+            raise MemoryError
+        return super().imagine(context, samples, seed, **knobs)
+
+
 class Silent(Standstill):
     def imagine(self, context, samples, seed, **knobs):
         return Rollout(gap=np.zeros((len(context), samples)))
@@ -116,6 +123,19 @@ def test_pictures_come_with_what_was_seen_and_what_is_true(folder: Path) -> None
         assert true[:3] == pytest.approx(40 + 3 * one.frames[:3], abs=3)
         assert copied == pytest.approx(np.full(len(one.frames), seen[-1]))
         assert np.isnan(one.gap) and np.isnan(one.probability)
+
+
+def test_trials_that_memory_cannot_hold_together_are_imagined_one_by_one(
+    folder: Path, file: Path
+) -> None:
+    trials = ["drop_0", "drape_0"]
+    alone = imagine_with(Dataset(folder), [f"{file}:Greedy"], {})(trials)
+    together = imagine_with(Dataset(folder), [f"{file}:Standstill"], {})(trials)
+    for trial in trials:
+        (one,), (other,) = alone[trial], together[trial]
+        np.testing.assert_array_equal(
+            one.shown["particles"], other.shown["particles"][:, : one.shown["particles"].shape[1]]
+        )
 
 
 SHOWN = {
