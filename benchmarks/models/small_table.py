@@ -50,8 +50,8 @@ PARTS: dict[str, tuple[str, ...]] = {
     "particle models": (STATES, "dpi,gns,gns-ransac", "--weights", "shipped"),
     "anchors": (MOVIES, ANCHORS),
     "frozen encoders": (MOVIES, FROZEN),
-    UNTRAINED: (MOVIES, f"{VISION},{FROZEN}", "--weights", "random", "--untrained"),
     "fine-tuned encoders": (MOVIES, FROZEN, "--option", "fine_tuned=true", "--steps", "200"),
+    UNTRAINED: (MOVIES, f"{VISION},{FROZEN}", "--weights", "random", "--untrained"),
 }
 """Trials, models and options of `physion evaluate` by part of the table."""
 
