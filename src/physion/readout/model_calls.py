@@ -20,6 +20,9 @@ from physion.models.batch import Batch, Provenance
 from physion.models.interface import Model
 from physion.models.raised import OutOfMemoryError, describe_raised, is_out_of_memory
 
+MEMORY_ADVICE = "use a smaller image_size or size of the model, or fewer samples"
+"""What to do if memory is used up by a single clip."""
+
 
 def call_model(model: Model, method: str, batch: Batch, /, *arguments: Any, **options: Any) -> Any:
     """Return what ``model.method(batch, ...)`` returns.
@@ -159,10 +162,6 @@ def _device(network: Any) -> Any:
         for tensor in tensors:
             return tensor.device
     return "cpu"
-
-
-MEMORY_ADVICE = "use a smaller image_size or size of the model, or fewer samples"
-"""What to do if memory is used up by a single clip."""
 
 
 def _explain(error: Exception, model: Model, method: str, batch: Batch) -> PhysionError:
