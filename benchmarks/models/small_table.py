@@ -9,7 +9,6 @@ evaluates on them under the protocol *all*
 - particle models whose weights come with the package, on the same tested trials without movies:
   they have no readout;
 - EfficientNet-Lite0 of ImageNet, whose dynamics are trained here, and fine-tuned for 200 steps;
-- the same networks with random weights, untrained;
 - anchors.
 
 The same command continues a run that was interrupted, and does nothing again. The processor time of
@@ -44,14 +43,12 @@ ANCHORS = (
 )
 MOVIES, STATES = "movies", "states"
 """Folders of the trials."""
-UNTRAINED = "untrained"
 PARTS: dict[str, tuple[str, ...]] = {
     "vision models": (MOVIES, VISION, "--weights", "shipped"),
     "particle models": (STATES, "dpi,gns,gns-ransac", "--weights", "shipped"),
     "anchors": (MOVIES, ANCHORS),
     "frozen encoders": (MOVIES, FROZEN),
     "fine-tuned encoders": (MOVIES, FROZEN, "--option", "fine_tuned=true", "--steps", "200"),
-    UNTRAINED: (MOVIES, f"{VISION},{FROZEN}", "--weights", "random", "--untrained"),
 }
 """Trials, models and options of `physion evaluate` by part of the table."""
 
@@ -86,10 +83,7 @@ def make_table(folder: Path) -> pd.DataFrame:
     tables = []
     for part, options in PARTS.items():
         printed = run(folder, part, "evaluate", *options, "--out", "models", "--json")
-        table = pd.read_csv(folder / json.loads(printed)["results"])
-        if part == UNTRAINED:
-            table["init"] += f" ({UNTRAINED})"
-        tables.append(table)
+        tables.append(pd.read_csv(folder / json.loads(printed)["results"]))
     # A model without training has an empty protocol, which pandas reads as NaN.
     return pd.concat(tables, ignore_index=True).fillna({"protocol": ""})
 
