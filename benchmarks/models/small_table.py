@@ -75,13 +75,13 @@ def processor_seconds() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def make_table(folder: Path) -> pd.DataFrame:
-    """Make trials, evaluate all parts, and return their accuracies."""
+def make_table(folder: Path, parts: dict[str, tuple[str, ...]]) -> pd.DataFrame:
+    """Make trials, evaluate the parts, and return their accuracies."""
     folder.mkdir(parents=True, exist_ok=True)
     for arguments in generations():
         run(folder, "trials", *arguments)
     tables = []
-    for part, options in PARTS.items():
+    for part, options in parts.items():
         printed = run(folder, part, "evaluate", *options, "--out", "models", "--json")
         tables.append(pd.read_csv(folder / json.loads(printed)["results"]))
     # A model without training has an empty protocol, which pandas reads as NaN.
@@ -104,17 +104,20 @@ def main() -> None:
     """Print the table, and write it on request."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
+    parser.add_argument("--without", nargs="+", default=(), choices=PARTS, help="parts left out")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    table = text_table(make_table(options.folder))
-    seconds = json.loads((options.folder / "seconds.json").read_text())
+    parts = {part: evaluated for part, evaluated in PARTS.items() if part not in options.without}
+    table = text_table(make_table(options.folder, parts))
+    used = json.loads((options.folder / "seconds.json").read_text())
+    seconds = {part: used[part] for part in ("trials", *parts)}
     total = sum(seconds.values()) / 60
     text = [
         "Accuracies of small models on own trials, 200 of the readout and 60 tested a scenario:",
         "  OMP_NUM_THREADS=1 python benchmarks/models/small_table.py FOLDER --write",
         f"{datetime.date.today()}, {processor()}, torch {torch.__version__}. It runs:",
         *(f"  physion {' '.join(arguments)}" for arguments in generations()),
-        *(f"  physion evaluate {' '.join(options)}" for options in PARTS.values()),
+        *(f"  physion evaluate {' '.join(evaluated)}" for evaluated in parts.values()),
         f"Processor time without the training of shipped weights: {total:.0f} minutes, of which",
         *(f"  {part}: {value / 60:.1f}" for part, value in seconds.items()),
         "",
