@@ -22,6 +22,7 @@ import argparse
 import datetime
 import json
 import resource
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -112,9 +113,10 @@ def main() -> None:
     used = json.loads((options.folder / "seconds.json").read_text())
     seconds = {part: used[part] for part in ("trials", *parts)}
     total = sum(seconds.values()) / 60
+    left_out = f" --without {shlex.join(options.without)}" if options.without else ""
     text = [
         "Accuracies of small models on own trials, 200 of the readout and 60 tested a scenario:",
-        "  OMP_NUM_THREADS=1 python benchmarks/models/small_table.py FOLDER --write",
+        f"  OMP_NUM_THREADS=1 python benchmarks/models/small_table.py FOLDER --write{left_out}",
         f"{datetime.date.today()}, {processor()}, torch {torch.__version__}. It runs:",
         *(f"  physion {' '.join(arguments)}" for arguments in generations()),
         *(f"  physion evaluate {' '.join(evaluated)}" for evaluated in parts.values()),
