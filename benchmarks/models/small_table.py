@@ -84,7 +84,8 @@ def make_table(folder: Path, parts: dict[str, tuple[str, ...]]) -> pd.DataFrame:
     tables = []
     for part, options in parts.items():
         printed = run(folder, part, "evaluate", *options, "--out", "models", "--json")
-        tables.append(pd.read_csv(folder / json.loads(printed)["results"]))
+        results = folder / json.loads(printed)["results"]
+        tables.append(pd.read_csv(results, dtype={"protocol": str}))
     # A model without training has an empty protocol, which pandas reads as NaN.
     return pd.concat(tables, ignore_index=True).fillna({"protocol": ""})
 
