@@ -104,9 +104,9 @@ def with_exchanged_futures(
             groups.setdefault((scenario, kind), []).append(trial)
     for (scenario, kind), trials in groups.items():
         if len(trials) < 2:
+            among = f"{scenario} with {kind}" if kind else scenario
             raise BadInputError(
-                f"trial {trials[0]!r} is the only one of {scenario}{kind and f' with {kind}'}: "
-                "no other one has a future for it"
+                f"trial {trials[0]!r} is the only one of {among}: no other one has a future for it"
             )
         rng = generator("exchange", seed, scenario, *([kind] if kind else []))
         order = [trials[i] for i in rng.permutation(len(trials))]

@@ -125,8 +125,8 @@ def _load(path: Path, model: nn.Module) -> None:
     tensors = {name: v.float() if name in halves else v for name, v in stored.items()}
     built_as = getattr(model, "built_as", None)
     if built_as is not None:
-        differences = describe_tensors(tensors, model)
-        advice = f"{differences}; " * bool(differences)
-        advice += "build the model that the weights belong to, or give weights of this one"
+        advice = "build the model that the weights belong to, or give weights of this one"
+        if differences := describe_tensors(tensors, model):
+            advice = f"{differences}; {advice}"
         check_same(path, "model", metadata.get(BUILT_AS, {}), built_as(), advice)
     load_tensors(path, tensors, model)
