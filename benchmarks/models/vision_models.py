@@ -25,6 +25,8 @@ trained to the best trivial one, which is to be above 1 for C-SWM and below 1 fo
   (`physion.models.vision.moving`); one trivial predictor repeats the last observed picture, another
   shows an empty scene, the median of the observed pictures. A model that only lets moving objects
   vanish is better than the first one; it must be better than both.
+- Dynamics of the frozen EfficientNet-Lite0: the squared error of the next feature, times 1000; the
+  trivial predictor repeats the last one, and so do untrained dynamics.
 
 ``shipped`` prints the same for the weights that come with the package, without training.
 
@@ -41,8 +43,10 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import datetime
+import itertools
 import os
 import re
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -56,6 +60,7 @@ from physion.compute.machine import processor
 from physion.models.batch import Batch, Spec
 from physion.models.cswm.contrast import ranking
 from physion.models.vision.moving import empty_scene_error
+from physion.readout.features.feature_store import FeatureStore
 from physion.seeds import generator, stable_hash
 from physion.training.sources.batches import ObservedBatches, TrialReaders, WholeBatches
 from physion.training.sources.kept_boxes import MOST_BYTES
@@ -71,11 +76,16 @@ METRICS = {
     "rpin": "distance of centres",
     "svg": "error of moving pixels",
     "op3": "error of moving pixels",
+    "pEffNetLite0-mlp": "error of the next feature",
+    "pEffNetLite0-lstm": "error of the next feature",
 }
 """What is measured of each model."""
-NAMES = tuple(METRICS)
+SHIPPED = ("cswm", "rpin", "svg", "op3")
+"""Models whose weights come with the package."""
+DYNAMICS = tuple(name for name in METRICS if name not in SHIPPED)
+"""Models of which the dynamics are trained alone."""
 ENCODERS = ("pVGG-mlp", "pDeIT-mlp", "pEffNetLite0-mlp")
-"""Models with a frozen encoder. A training step is one of their dynamics, on stored features."""
+"""Frozen encoders whose speed is measured, with a training step of the dynamics."""
 SIZES = ("small", "paper")
 MODELS: tuple[tuple[str, dict[str, Any], int], ...] = (
     ("cswm", {}, 8),
@@ -176,28 +186,35 @@ def wait_for(device: str) -> None:
 def learn(folder: Path, names: list[str], steps: int, seeds: int) -> Rows:
     """Yield the metrics of testing trials by model and seed."""
     dataset = Dataset(folder)
-    for name in names:
-        for seed in range(seeds):
+    trials = dataset.trials("training")
+    with tempfile.TemporaryDirectory() as kept:
+        store = FeatureStore(Path(kept))
+        for name, seed in itertools.product(names, range(seeds)):
             model: Any = build_model(name, seed=seed)
             source = whole_source(dataset, model.spec)
             clips = tested_clips(model, source, dataset.trials("testing"))
+            features = None
+            if name in DYNAMICS:
+                features = store.encoded(model, source, trials, "whole").array()
             before, *_ = metric(name, model, clips)
             start = time.process_time()
             trained = train_model(
                 model,
                 source,
-                dataset.trials("training"),
+                trials,
                 settings=dataclasses.replace(model.settings, steps=steps or model.settings.steps),
                 seed=seed,
                 name="all",
                 folder=None,
+                features=None if features is None else lambda _, known=features: known,
                 accelerator="cpu",
             )
             seconds = time.process_time() - start
             after, *trivial = metric(name, model, clips)
             best = (max if name == "cswm" else min)(trivial)
             values = [*metric_cells(after, before, *trivial), f"{after / best:.3f}"]
-            yield [model.name, str(seed), str(trained.steps), *values, f"{seconds:.0f}"]
+            label = model.provenance().model
+            yield [label, str(seed), str(trained.steps), *values, f"{seconds:.0f}"]
 
 
 def shipped(folder: Path, names: list[str]) -> Rows:
@@ -230,13 +247,20 @@ def tested_clips(model: Any, source: Any, trials: list[str]) -> list[Batch]:
     if not groups:
         raise SystemExit(f"learn needs {TESTED_CLIPS} testing trials or more")
     chosen = [slice(start, start + TESTED_CLIPS) for start in groups]
-    return [source.window(trials[part], starts[part], model.window).to("cpu") for part in chosen]
+    clips = [source.window(trials[part], starts[part], model.window).to("cpu") for part in chosen]
+    if model.diet != "features":
+        return clips
+    return [dataclasses.replace(batch, features=model.encode(batch)) for batch in clips]
 
 
 @torch.no_grad()
 def metric(name: str, model: Any, clips: list[Batch]) -> list[float]:
     """Return the metric of a model and of the trivial predictors, means over the batches."""
-    metrics = {"cswm": reciprocal_ranks, "rpin": center_distances}
+    metrics = {
+        "cswm": reciprocal_ranks,
+        "rpin": center_distances,
+        **dict.fromkeys(DYNAMICS, feature_errors),
+    }
     model.eval()
     values = []
     with torch.random.fork_rng(devices=[]):
@@ -256,6 +280,12 @@ def center_distances(model: Any, batch: Batch) -> tuple[float, float]:
     """Return 1000 times the distances of centres: of the model, at constant velocity."""
     own, constant = (1000 * float(value.nanmean()) for value in model.center_errors(batch))
     return own, constant
+
+
+def feature_errors(model: Any, batch: Batch) -> tuple[float, float]:
+    """Return 1000 times the errors of the next feature: of the model, and of the last feature."""
+    unit = 1000 * float(model.scale) ** 2
+    return unit * float(model.loss(batch)["loss"]), unit * float(model.baseline(batch))
 
 
 def moving_errors(model: Any, batch: Batch) -> tuple[float, float, float]:
@@ -331,7 +361,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("part", choices=("speed", "learn", "shipped", "boxes"))
     parser.add_argument("folder", nargs="?", type=Path)
-    parser.add_argument("--models", nargs="+", default=(), choices=NAMES + ENCODERS)
+    parser.add_argument("--models", nargs="+", default=(), choices=sorted({*METRICS, *ENCODERS}))
     parser.add_argument("--steps", type=int, default=0, help="0: those of the model")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--repeats", type=int, default=3)
@@ -341,7 +371,10 @@ def main() -> None:
     )
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    models = list(options.models or NAMES + ENCODERS * (options.part == "speed"))
+    known = {"speed": (*SHIPPED, *ENCODERS), "learn": tuple(METRICS), "shipped": SHIPPED}
+    models = list(options.models or known.get(options.part, ()))
+    if unknown := set(models).difference(known.get(options.part, ())):
+        parser.error(f"{options.part} has no model {', '.join(sorted(unknown))}")
     if options.part == "speed":
         device, precision = options.accelerator, options.precision
         head = ["model", "weights", "pictures", "frames", "training step, s", "features, s"]

@@ -14,7 +14,7 @@ from physion.models.encoders.dynamics import Kind
 from physion.models.encoders.encoder_model import EncoderModel, Label
 from physion.models.encoders.fine_tuned import FineTunedEncoder
 from physion.models.encoders.frozen import FrozenEncoder
-from physion.models.encoders.settings import FAMILIES, FINE_TUNING, SMALL, EncoderConfig
+from physion.models.encoders.settings import DYNAMICS, FAMILIES, FINE_TUNING, SMALL, EncoderConfig
 from physion.models.encoders.trained import before_training
 from physion.models.settings import TrainingSettings
 from physion.models.weights import RANDOM, EncoderWeights
@@ -103,13 +103,13 @@ def _build(
     config: EncoderConfig,
     label: Label,
     trained: Path | None,
-    training: TrainingSettings | None = None,
+    training: TrainingSettings = DYNAMICS,
 ) -> EncoderModel:
     """Build a model, with the weights of the file ``trained`` if there is one."""
     model = (
         FineTunedEncoder(config, label, FINE_TUNING)
         if config.fine_tuned
-        else FrozenEncoder(config, label, training or TrainingSettings())
+        else FrozenEncoder(config, label, training)
     )
     if trained is not None:
         load_named(model, str(trained))
