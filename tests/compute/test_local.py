@@ -36,6 +36,22 @@ def hang(number: int) -> int:
     return number
 
 
+def process_of(number: int) -> int:
+    """Return the number of the process, after a moment in which the others get a task."""
+    time.sleep(0.5)
+    return os.getpid()
+
+
+class Unloadable:
+    """Function that can be sent to another process but not be read there."""
+
+    def __call__(self, number: int) -> int:
+        return number
+
+    def __reduce__(self) -> tuple[object, tuple[int]]:
+        return leave, (3,)
+
+
 def unsendable(number: int) -> object:
     return lambda: number
 
@@ -84,6 +100,35 @@ def test_a_poison_task_is_put_aside_after_three_deaths() -> None:
 def test_a_task_whose_worker_was_killed_runs_again(tmp_path: Path) -> None:
     (outcome,) = LocalExecutor(1).map(die_once, {"a": str(tmp_path / "marker")})
     assert outcome.value == "second try" and outcome.tries == 2
+
+
+def test_processes_are_kept_in_a_block_and_end_with_it() -> None:
+    with LocalExecutor(2) as executor:
+        first = {o.value for o in executor.map(process_of, numbers(1, 2))}
+        with executor:
+            assert {o.value for o in executor.map(process_of, numbers(1, 2))} == first
+        squares = {o.key: o.value for o in executor.map(square, numbers(3, 4, 5))}
+        assert squares == {"task 3": 9, "task 4": 16, "task 5": 25}
+        assert {o.value for o in executor.map(process_of, numbers(1, 2))} == first
+        assert {child.pid for child in multiprocessing.active_children()} >= first
+    assert not {child.pid for child in multiprocessing.active_children()} & first
+    (outcome,) = executor.map(process_of, numbers(1))
+    assert outcome.value not in first
+
+
+def test_a_kept_process_that_dies_is_replaced() -> None:
+    with LocalExecutor(1) as executor:
+        (first,) = executor.map(process_of, numbers(1))
+        os.kill(first.value, signal.SIGKILL)
+        (second,) = executor.map(process_of, numbers(1))
+        assert second.error is None and second.value != first.value
+
+
+def test_a_function_that_kept_processes_cannot_load_is_reported() -> None:
+    with LocalExecutor(1) as executor:
+        list(executor.map(square, numbers(1)))
+        with pytest.raises(PhysionError, match="before they start working"):
+            list(executor.map(Unloadable(), numbers(1)))
 
 
 def test_exit_code_of_a_worker_is_told() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -118,6 +119,13 @@ def _run_step(folder: Path, number: int, killed_after: int | None = None) -> str
     )
     assert done.returncode == (0 if killed_after is None else 9), done.stderr
     return done.stdout.strip()
+
+
+def test_code_of_equal_sources_is_read_in_another_folder(tmp_path: Path) -> None:
+    (tmp_path / "first").mkdir()
+    assert _run_step(tmp_path / "first", 1) == "2 0"
+    shutil.copytree(tmp_path / "first", tmp_path / "second", copy_function=shutil.copyfile)
+    assert _run_step(tmp_path / "second", 1) == "2 1"
 
 
 def _cache_files(folder: Path) -> set[str]:

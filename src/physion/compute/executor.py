@@ -8,6 +8,7 @@ ends in exactly one outcome.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar, cast
 
@@ -64,6 +65,14 @@ class Executor(Protocol):
         of times. Closing the iterator stops all running tasks.
         """
         ...
+
+
+def workers_kept(executor: Executor) -> AbstractContextManager[object]:
+    """Return a context in which an executor keeps its processes from one `map` to the next.
+
+    That of an executor that has none, such as one that runs tasks as jobs of a cluster, is empty.
+    """
+    return executor if isinstance(executor, AbstractContextManager) else nullcontext()
 
 
 executors: Registry[type] = Registry(

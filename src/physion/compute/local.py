@@ -15,7 +15,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 from physion.compute.executor import TaskOutcome
 from physion.compute.task import run_task
@@ -48,6 +48,9 @@ class LocalExecutor:
     A worker process that dies (killed, out of memory, crash in C) is replaced, and its task is
     started again; other tasks are not affected.
 
+    A process takes seconds to start, most of them to load kernels. In a ``with`` block of the
+    executor, processes are kept for the next call of `map`, and end with the block.
+
     Parameters
     ----------
     workers
@@ -72,13 +75,30 @@ class LocalExecutor:
         if self.workers < 1 or tries < 1:
             raise PhysionError(f"{workers} workers and {tries} tries: both must be at least 1")
         self.tries, self.timeout, self.logs = tries, timeout, logs
+        self._blocks = 0
+        self._kept: list[_Worker] = []
+
+    def __enter__(self) -> Self:
+        self._blocks += 1
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._blocks -= 1
+        if self._blocks:
+            return  # the processes end with the outer block
+        workers, self._kept = self._kept, []
+        for worker in workers:
+            worker.pipe.close()  # all end at the same time
+        for worker in workers:
+            worker.stop()
 
     def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[TaskOutcome[R]]:
         """Yield outcomes as they come; see `physion.compute.executor.Executor`."""
         waiting = deque(_QueuedTask(key, task) for key, task in tasks.items())
-        workers = [_Worker(function, self.logs) for _ in range(min(self.workers, len(tasks)))]
+        workers = self._start_workers(function, min(self.workers, len(tasks)))
         failed_starts = 0
         try:
+            workers = self._assign(workers, waiting)
             while workers:
                 done: list[TaskOutcome[R]] = []
                 for worker in self._wait(workers):
@@ -94,11 +114,32 @@ class LocalExecutor:
                         if waiting:
                             workers.append(_Worker(function, self.logs))
                 # Before yielding, so that workers are busy while the caller handles the outcomes.
-                workers = _assign(workers, waiting)
+                workers = self._assign(workers, waiting)
                 yield from done
         finally:
             for worker in workers:
                 worker.stop()
+
+    def _start_workers(self, function: Callable[..., Any], count: int) -> list[_Worker]:
+        """Return ``count`` processes for ``function``: kept ones, and new ones for the rest."""
+        workers = [self._kept.pop() for _ in range(min(count, len(self._kept)))]
+        for worker in workers:
+            worker.take(function)
+        return workers + [_Worker(function, self.logs) for _ in range(count - len(workers))]
+
+    def _assign(self, workers: list[_Worker], waiting: deque[_QueuedTask]) -> list[_Worker]:
+        """Give a task to each idle worker, keep or stop those that have none; return the others."""
+        busy = []
+        for worker in workers:
+            if worker.job is None and worker.ready and waiting:
+                worker.start(waiting.popleft())
+            if worker.job is not None or waiting:
+                busy.append(worker)
+            elif self._blocks and worker.ready:
+                self._kept.append(worker)
+            else:
+                worker.stop()
+        return busy
 
     def _wait(self, workers: list[_Worker]) -> list[_Worker]:
         """Wait until workers send a message, die or exceed the timeout; return these workers."""
@@ -139,6 +180,13 @@ class _QueuedTask:
     tries: int = 1
 
 
+@dataclass(frozen=True)
+class _NextFunction:
+    """Message to a worker process: the function of the tasks that follow."""
+
+    function: Callable[..., Any]
+
+
 class _Worker:
     """Parent's handle of one worker process, which has at most one task at a time."""
 
@@ -156,12 +204,19 @@ class _Worker:
         self.ready, self.lost, self.since = False, False, time.monotonic()
         self._late = False
 
+    def take(self, function: Callable[..., Any]) -> None:
+        """Send the function of the next tasks to a process that was kept."""
+        self._send(_NextFunction(function))
+
     def start(self, job: _QueuedTask) -> None:
         """Send a task to the process."""
         self.job, self.since = job, time.monotonic()
+        self._send((job.key, job.task))
+
+    def _send(self, message: object) -> None:
         # A worker that has just died is noticed at the next wait, and its task is queued again.
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-            self.pipe.send((job.key, job.task))
+            self.pipe.send(message)
 
     def overdue(self, timeout: float | None) -> bool:
         """Return whether the task has run longer than ``timeout`` seconds."""
@@ -210,19 +265,6 @@ class _Worker:
             self.process.join()
 
 
-def _assign(workers: list[_Worker], waiting: deque[_QueuedTask]) -> list[_Worker]:
-    """Give a task to every idle worker, stop those that have none, and return the others."""
-    kept = []
-    for worker in workers:
-        if worker.job is None and worker.ready and waiting:
-            worker.start(waiting.popleft())
-        if worker.job is not None or waiting:
-            kept.append(worker)
-        else:
-            worker.stop()
-    return kept
-
-
 def _startup_error(worker: _Worker) -> PhysionError:
     return PhysionError(
         f"worker processes end before they start working ({worker.reason()}); a script that "
@@ -239,7 +281,11 @@ def _serve(pipe: Connection, function: Callable[..., Any], logs: Path | None) ->
     try:
         pipe.send(_READY)
         while True:
-            key, task = pipe.recv()
+            message = pipe.recv()
+            if isinstance(message, _NextFunction):
+                function = message.function
+                continue
+            key, task = message
             outcome = run_task(key, function, task, logs)
             try:
                 pipe.send(outcome)

@@ -22,7 +22,7 @@ from numba.core.dispatcher import Dispatcher
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
-"""The wrapper for calls from C, which no kernel needs, would take a tenth of the compilation."""
+"""No kernel needs the wrapper for calls from C, which takes long to compile."""
 IN_PLACE_OPTIONS: dict[str, Any] = {**OPTIONS, "_nrt": False}
 
 
@@ -62,14 +62,12 @@ class _KernelCache(FunctionCache):
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
-        # Numba asks only the kernel's own file whether cached code is outdated. The files of the
-        # kernels that it calls, and of the constants and records that it imports, are added.
-        files = set(_files_called(function)) | _files_imported(function.__code__.co_filename)
-        sources = (
-            numba.__version__,
-            self._impl.locator.get_source_stamp(),
-            *(_digest(file) for file in sorted(files)),
-        )
+        # Numba looks only at time and size of the kernel's own file. Here it is the content that
+        # counts, also that of the kernels that it calls, and of the constants and records that it
+        # imports.
+        own = function.__code__.co_filename
+        files = {own, *_files_called(function)} | _files_imported(own)
+        sources = (numba.__version__, *sorted(_digest(file) for file in files))
         self._cache_file = _StampedFiles(self._cache_path, self._impl.filename_base, sources)
 
 

@@ -29,7 +29,7 @@ from physion.trials.making.plan import GenerateSettings, plan_dataset
 
 pytestmark = pytest.mark.slow
 
-STEPS = 2000
+STEPS = 1000
 HORIZON = 60
 """Frames after the last observed one."""
 
@@ -57,7 +57,7 @@ def motions_and_contacts(dataset: Dataset) -> list[tuple[Motion, bool]]:
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     folder = tmp_path_factory.mktemp("learning") / "data"
-    tasks = plan_dataset("physion", ("collide",), {"training": 300, "testing": 300})
+    tasks = plan_dataset("physion", ("collide",), {"training": 200, "testing": 200})
     settings = GenerateSettings(movies=False, jitters=0, min_visible=0.0)
     assert not make_trials(folder, tasks, settings, executor=LocalExecutor(workers=2)).failed
     return Dataset(folder)
@@ -96,7 +96,7 @@ def contacts(dataset: Dataset) -> NDArray[np.bool_]:
 
 
 def test_contacts_are_told_from_misses(result: Result, contacts: NDArray[np.bool_]) -> None:
-    """The standard error of an AUC of .9 from 300 trials is .02; that of chance is .5."""
+    """The standard error of an AUC of .9 from 200 trials is .02; that of chance is .5."""
     assert roc_auc_score(contacts, -result.gaps) >= 0.85
 
 

@@ -6,7 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -116,6 +116,13 @@ ENVIRONMENTS = {
     "two threads": _threads(2),
 }
 
+TOGETHER = (
+    ("blas of prescott", "numpy without AVX2", "C library without FMA", "two threads"),
+    ("blas of haswell", "numpy without AVX-512", "one thread", "hash seed, time zone and locale"),
+    ("blas of skylake", "generic processor for numba"),
+)
+"""Environments whose settings are made together: bytes that none of them changes are equal."""
+
 
 def run_in(settings: dict[str, str], *command: str) -> str:
     """Run Python in an environment without other choices of code paths; return what it prints."""
@@ -137,21 +144,27 @@ def default_code_paths() -> dict[str, Any]:
     return dict(json.loads(run_in({}, "-c", PROBE)))
 
 
-def require_effect(name: str) -> Environment:
-    """Return an environment after checking that its settings take effect.
-
-    The test is skipped where the processor lacks what the settings choose or switch off; elsewhere
-    settings without effect are a failure.
-    """
-    environment = ENVIRONMENTS[name]
-    lacking = [feature for feature in environment.needs if not FEATURES.get(feature)]
-    if lacking:
-        pytest.skip(f"{name}: this processor has no {', '.join(lacking)}")
+def lacking(name: str) -> str:
+    """Return what this machine lacks for an environment; empty if nothing."""
     if name.startswith("two") and (os.cpu_count() or 1) < 2:
-        pytest.skip(f"{name}: this machine has one core")
-    seen = json.loads(run_in(environment.settings, "-c", PROBE))
-    assert environment.effective(seen, default_code_paths()), seen
-    return environment
+        return "a second core"
+    return ", ".join(need for need in ENVIRONMENTS[name].needs if not FEATURES.get(need))
+
+
+def effective_settings(names: Sequence[str]) -> dict[str, str]:
+    """Return the settings of environments after checking that each of them takes effect.
+
+    Left out are those for which the processor lacks what they choose or switch off. If it lacks
+    something for all of them, the test is skipped. Elsewhere, settings without effect are a
+    failure.
+    """
+    possible = [ENVIRONMENTS[name] for name in names if not lacking(name)]
+    if not possible:
+        pytest.skip(f"this machine lacks {'; '.join(lacking(name) for name in names)}")
+    settings = {key: value for each in possible for key, value in each.settings.items()}
+    seen = json.loads(run_in(settings, "-c", PROBE))
+    assert all(each.effective(seen, default_code_paths()) for each in possible), seen
+    return settings
 
 
 @pytest.mark.parametrize("scenario", sorted(scenarios.names()))
@@ -160,12 +173,15 @@ def test_trials_are_those_of_this_version(scenario: str) -> None:
     assert trial_digests(scenario) == golden_digests()[scenario]
 
 
+def test_every_environment_is_tested() -> None:
+    assert sorted(name for names in TOGETHER for name in names) == sorted(ENVIRONMENTS)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ENVIRONMENTS)
-def test_other_processors_give_the_same_bytes(name: str) -> None:
+@pytest.mark.parametrize("names", TOGETHER, ids=" + ".join)
+def test_other_processors_give_the_same_bytes(names: tuple[str, ...]) -> None:
     """The effect of the settings is checked first: ignored ones would prove nothing."""
-    settings = require_effect(name).settings
-    printed = run_in(settings, "-m", "physion.trials.making.reproduce")
+    printed = run_in(effective_settings(names), "-m", "physion.trials.making.reproduce")
     assert json.loads(printed) == golden_digests()
 
 

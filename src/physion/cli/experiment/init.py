@@ -140,9 +140,8 @@ def _choose_official(options: Options) -> StimulusSelection:
     assert options.scenes is not None
     data, logs = official_data(options.scenes), read_trials(options.scenes)
     logs.require_trials()
-    executor = LocalExecutor(workers=options.workers)
     folder = options.rendered or options.folder.with_name(f"{options.folder.name}-trials")
-    with Stages() as stages:
+    with LocalExecutor(workers=options.workers) as executor, Stages() as stages:
         chosen = choose_official(
             logs.trials,
             None if data is None else set(read_humans(data.humans)["stimulus"]),

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from physion.atomic import folder_for_writing, remove_leftovers, write_atomic
-from physion.compute.executor import Executor, TaskOutcome
+from physion.compute.executor import Executor, TaskOutcome, workers_kept
 from physion.compute.progress import Progress
 from physion.compute.run_tasks import FATAL_ERRNOS, RunReport, run_tasks
 from physion.digests import has_digest
@@ -89,7 +89,7 @@ def make_trials(
     if len(datasets) != 1:
         raise BadInputError(f"one folder takes one dataset, not {sorted(datasets) or 'none'}")
     jobs = {task.trial: GenerateJob(task, folder, settings) for task in tasks}
-    with folder_for_writing(folder):
+    with folder_for_writing(folder), workers_kept(executor):
         _fix_settings(folder, datasets.pop(), settings, tasks)
         remove_leftovers(folder)
         listed = _listed_files(folder)
