@@ -135,7 +135,7 @@ class LocalExecutor:
                 worker.start(waiting.popleft())
             if worker.job is not None or waiting:
                 busy.append(worker)
-            elif self._blocks and worker.ready:
+            elif self._blocks:
                 self._kept.append(worker)
             else:
                 worker.stop()
