@@ -65,7 +65,7 @@ class Process:
     def end(self, number: signal.Signals) -> tuple[int, str]:
         """Send a signal and return the exit code and standard error."""
         self.process.send_signal(number)
-        _, errors = self.process.communicate(timeout=30)
+        _, errors = self.process.communicate(timeout=120)
         return self.process.returncode, errors
 
 
@@ -77,11 +77,11 @@ def started(folder: Path, *words: str) -> Iterator[Process]:
     try:
         assert process.stdout is not None
         line = process.stdout.readline()
-        assert line, process.communicate(timeout=30)[1]
+        assert line, process.communicate(timeout=120)[1]
         yield Process(process, json.loads(line))
     finally:
         process.kill()
-        process.communicate(timeout=30)
+        process.communicate(timeout=120)
 
 
 def ask(port: int, method: str, path: str, body: Any = None, token: str = "") -> Any:

@@ -78,7 +78,7 @@ def test_no_more_is_read_ahead_than_asked_for() -> None:
 
 
 def test_threads_read_at_the_same_time() -> None:
-    barrier = threading.Barrier(3, timeout=60)
+    barrier = threading.Barrier(3, timeout=300)
 
     def read(number: int) -> int:
         barrier.wait()  # breaks unless three reads run at once

@@ -305,7 +305,7 @@ def run_and_kill(folder: Path, trials: int, after: int, delay: float) -> int:
 
 
 @pytest.mark.parametrize(
-    ("kills", "trials"), [(1, 8), pytest.param(20, 60, marks=pytest.mark.slow)]
+    ("kills", "trials"), [(1, 8), pytest.param(10, 30, marks=pytest.mark.slow)]
 )
 def test_killed_runs_resume_to_the_same_tree(kills: int, trials: int, tmp_path: Path) -> None:
     chance = random.Random(kills)
