@@ -20,19 +20,27 @@ export class MovieFailed extends Error {
 }
 
 /**
- * Counter of presented frames, from the reports of requestVideoFrameCallback. Callbacks can be
- * missed, so the browser's counter `presentedFrames` is used; a frame that is presented twice (as
- * the first one is when the movie starts) counts once.
+ * Counter of the different frames that were presented, from the reports of
+ * requestVideoFrameCallback. Callbacks can be missed: if the browser's counter `presentedFrames`
+ * grew by more than one, that many of the frames between two reports count as presented too. A frame
+ * that is presented twice counts once, also when a busy browser reports frames out of order.
  */
 export class FrameCount {
+  /** Frames that were presented. @type {Set<number>} */
+  #presented = new Set();
+
   /** @param {number} rate Frames per second of the movie. */
   constructor(rate) {
     this.rate = rate;
     /** `mediaTime` of the first frame in seconds. */
     this.origin = 0;
-    this.shown = 0;
     /** Time (ms), frame, counter of presented frames. @type {Array<[number, number, number]>} */
     this.seen = [];
+  }
+
+  /** Number of different frames that were presented. */
+  get shown() {
+    return this.#presented.size;
   }
 
   /**
@@ -40,12 +48,14 @@ export class FrameCount {
    * @param {number} now Time in ms.
    * @param {{mediaTime: number, presentedFrames: number}} metadata
    */
-  add(now, metadata) {
-    const frame = Math.round((metadata.mediaTime - this.origin) * this.rate);
-    const last = this.seen.at(-1);
-    if (!last) this.shown = 1;
-    else this.shown += Math.max(0, Math.min(metadata.presentedFrames - last[2], frame - last[1]));
-    this.seen.push([now, frame, metadata.presentedFrames]);
+  add(now, { mediaTime, presentedFrames }) {
+    const frame = Math.round((mediaTime - this.origin) * this.rate);
+    const [, before, counted] = this.seen.at(-1) ?? [now, frame, presentedFrames];
+    const missed = presentedFrames - counted - 1;
+    // Which of the frames between were presented is unknown, only how many.
+    for (let k = 0; k <= missed && frame - k > before; k += 1) this.#presented.add(frame - k);
+    this.#presented.add(frame);
+    this.seen.push([now, frame, presentedFrames]);
   }
 }
 
