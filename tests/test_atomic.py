@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from physion import atomic
-from physion.atomic import write_atomic
 from physion.cli import main as main_module
+from physion.core import files as atomic
+from physion.core.files import write_atomic
 
 
 @pytest.mark.parametrize("call", ["open", "write", "fsync", "replace"])

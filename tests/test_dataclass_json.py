@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from physion.dataclass_json import MAX_DEPTH, parse_json, read_dataclass, shown
-from physion.errors import BadInputError, BadSceneError
+from physion.core.errors import BadInputError, BadSceneError
+from physion.core.settings import MAX_DEPTH, parse_json, read_dataclass, shown
 from physion.scenes.scene import Body, Camera, Roles, Scene
 
 

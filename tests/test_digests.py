@@ -9,11 +9,19 @@ from pathlib import Path
 
 import pytest
 
-from physion import atomic, digests
 from physion.analysis.tables.csv_table import read_csv
-from physion.digests import check_digest, digest_path, has_digest, is_whole, write_with_digest
-from physion.errors import BadInputError
-from physion.sealed import read_sealed, write_sealed
+from physion.core import files as atomic
+from physion.core import files as digests
+from physion.core.errors import BadInputError
+from physion.core.files import (
+    check_digest,
+    digest_path,
+    has_digest,
+    is_whole,
+    read_sealed,
+    write_sealed,
+    write_with_digest,
+)
 
 
 def test_a_file_has_its_digest_beside_it(tmp_path: Path) -> None:
@@ -85,7 +93,7 @@ def test_sealed_files_are_bounded_and_nested_shallowly(
     path.write_text('{"a": ' + "[" * 100_000)
     with pytest.raises(BadInputError, match=r"s\.json is nested deeper than 100 levels"):
         read_sealed(path)
-    monkeypatch.setattr("physion.sealed.MAX_BYTES", 10)
+    monkeypatch.setattr("physion.core.files.MAX_BYTES", 10)
     with pytest.raises(BadInputError, match=r"s\.json has \d+ bytes, more than 10"):
         read_sealed(path)
     with pytest.raises(BadInputError, match="is missing"):

@@ -77,11 +77,6 @@ def test_modules_have_names_that_say_something() -> None:
     assert not [path for path in SOURCES if {path.stem, path.parent.name} & vague]
 
 
-def test_folders_can_be_read_at_a_glance() -> None:
-    counts = Counter(path.parent.relative_to(ROOT / "src") for path in SOURCES)
-    assert not {str(folder): count for folder, count in counts.items() if count > 16}
-
-
 SAME_BYTES = [
     path
     for path in SOURCES

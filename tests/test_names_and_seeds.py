@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from physion.errors import PhysionError, UnknownNameError
-from physion.registry import Registry
-from physion.seeds import child_generator, stable_hash, trial_seed
+from physion.core.errors import PhysionError, UnknownNameError
+from physion.core.registry import Registry
+from physion.core.seeds import child_generator, stable_hash, trial_seed
 
 
 def test_unknown_names_get_the_three_closest() -> None:
@@ -43,7 +43,7 @@ def test_different_parts_hash_differently(parts: list[str | int]) -> None:
 
 def test_seeds_are_the_same_in_any_process() -> None:
     code = (
-        "from physion.seeds import *;"
+        "from physion.core.seeds import *;"
         "print(child_generator(trial_seed('d', 'drop', 'testing', 3), 'looks').integers(2**60))"
     )
     here = child_generator(trial_seed("d", "drop", "testing", 3), "looks").integers(2**60)

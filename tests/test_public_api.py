@@ -24,7 +24,7 @@ NAMES = {
     "build_model": "physion.models.build",
     "compare": "physion.analysis.results",
     "evaluate": "physion.readout.evaluate",
-    "generate": "physion.trials.generate",
+    "generate": "physion.trials.making.generate",
     "label_contact": "physion.physics.labels",
     "sample_scene": "physion.scenes.sampling.sample",
     "simulate": "physion.physics.engine",

@@ -10,12 +10,12 @@ import pandas as pd
 import pytest
 
 from physion.cli.main import main
-from physion.models.batch import Provenance
+from physion.clips.batch import Provenance
+from physion.core.version import MADE_WITH, __version__
 from physion.readout.protocols import Readout
-from physion.readout.table import ScenarioPredictions, make_table
+from physion.readout.tables import ScenarioPredictions, make_table
 from physion.report.page.document import render_document
 from physion.report.viewer.text import render_viewer
-from physion.version import MADE_WITH, __version__
 
 GENERATOR = f'<meta name="generator" content="physion {__version__}">'
 

@@ -32,8 +32,8 @@ from physion.analysis.models.people_comparison import compare_everywhere
 from physion.analysis.people.answers import ScenarioAnswers
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.kappa import pair_values, pairwise_kappa, resampled_mean_kappa
-from physion.compute.machine import processor
-from physion.stimulus_names import SCENARIOS
+from physion.compute.tasks import processor
+from physion.core.names import SCENARIOS
 
 RESULTS = Path(__file__).parents[1] / "results" / "agreement.json"
 PEOPLE, STIMULI, MODELS, RESAMPLES = 100, 150, 20, 1000

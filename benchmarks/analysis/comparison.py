@@ -27,8 +27,8 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis import results
+from physion.core.names import SCENARIOS
 from physion.report import build, settings_text
-from physion.stimulus_names import SCENARIOS
 
 RESULTS = Path(__file__).parents[1] / "results"
 PEOPLE, STIMULI, PRACTICE = 100, 150, 10

@@ -23,7 +23,7 @@ from physion.analysis.statistics.correlation import correlate_resampled
 from physion.analysis.statistics.jackknife import Variance, jackknife
 from physion.analysis.statistics.paired import compare_models
 from physion.analysis.tables.stimuli import MEAN, POOLED
-from physion.seeds import generator
+from physion.core.seeds import generator
 
 LEFT_OUT = ("accuracy_simulated", "r_same", "euclid_over_n")
 """Metrics that equal others where the simulated outcome is the official one, or up to a factor."""

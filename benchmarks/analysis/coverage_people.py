@@ -14,7 +14,7 @@ from physion.analysis.people.hypotheses import HYPOTHESES, regress_hypotheses
 from physion.analysis.people.participants import Responses
 from physion.analysis.people.people import accuracy_by_scenario, agreement_by_scenario
 from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.seeds import generator
+from physion.core.seeds import generator
 
 
 def of_people(coverage: Coverage, size: Size, repeats: int) -> None:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from physion.analysis.models.model_people import Models
 from physion.analysis.people.answers import ScenarioAnswers
 from physion.analysis.sample import Resampled
-from physion.seeds import generator
+from physion.core.seeds import generator
 
 F64 = NDArray[np.float64]
 Size = tuple[int, int]

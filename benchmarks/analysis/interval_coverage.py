@@ -27,7 +27,7 @@ from coverage_models import measures, of_stimuli, pooled, ranks, rollout_errors
 from coverage_people import flags, hypotheses, mixed_models, of_people
 from coverage_studies import MODELS, POPULATIONS, Coverage
 from physion.analysis.sample import RESAMPLED
-from physion.compute.machine import processor
+from physion.compute.tasks import processor
 
 RESULTS = Path(__file__).parents[1] / "results" / "interval_coverage.md"
 SIZES = ((40, 60), (100, 150))

@@ -33,7 +33,7 @@ from mixed_fixtures import CASES, as_csv, ask_r
 from physion.analysis.mixed.linear import fit_linear
 from physion.analysis.mixed.logistic import fit_logistic
 from physion.analysis.mixed.result import MixedFit
-from physion.compute.machine import processor_and_cores
+from physion.compute.tasks import processor_and_cores
 from support.simulated_answers import AnswerDesign, simulate_answers
 
 RESULTS = Path(__file__).parents[1] / "results"

@@ -28,13 +28,13 @@ from typing import Any
 import numpy as np
 from sqlalchemy import insert
 
-from physion.compute.machine import processor
+from physion.compute.tasks import processor
+from physion.core.names import SCENARIOS
 from physion.experiment.export.export_study import export_study
 from physion.experiment.store.database import open_database, upgrade
 from physion.experiment.store.tables import ANSWERS, EVENTS, PARTICIPANTS, SESSIONS, STUDIES
 from physion.experiment.study.stimuli import Stimulus
 from physion.experiment.study.study import Study
-from physion.stimulus_names import SCENARIOS
 
 RESULTS = Path(__file__).parents[1] / "results"
 PRACTICE, TEST = 10, 150

@@ -45,7 +45,7 @@ import sqlalchemy as sa
 import uvloop
 
 from light_http import Connection, request
-from physion.compute.machine import processor
+from physion.compute.tasks import processor
 from physion.experiment.simulated.server_process import HOST, ServerProcess
 from physion.experiment.store.database import open_database, sqlite_url
 from physion.experiment.store.tables import ANSWERS, SESSIONS

@@ -24,17 +24,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.compute.machine import processor_and_cores
+from physion.clips.batch import LAST_OBSERVED, Batch, Motion
+from physion.clips.rendered import RenderedSource
+from physion.compute.tasks import processor_and_cores
+from physion.core.names import SCENARIOS
 from physion.models import build_model
-from physion.models.batch import LAST_OBSERVED, Batch, Motion
 from physion.physics.engine import DEFAULT_ENGINE, make_engine
-from physion.readout.readers.gap import GapReader
-from physion.readout.readers.logistic_reader import LogisticReader
-from physion.readout.rollouts import Outcomes
+from physion.readout.decisions import GapReader, LogisticReader
+from physion.readout.features import Outcomes
 from physion.scenes.scene import OBSERVED_FRAMES
 from physion.scenes.tdw.read_logs import ImportedTrial, read_scenes
-from physion.stimulus_names import SCENARIOS
-from physion.training.sources.rendered import RenderedSource
 
 FOLDS, SEED = 5, 0
 RESULTS = Path(__file__).parents[1] / "results"

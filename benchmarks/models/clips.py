@@ -23,14 +23,14 @@ from typing import Any
 
 import numpy as np
 
+from physion.clips.batch import Spec
+from physion.clips.clips import whole_source
 from physion.compute.local import SerialExecutor
-from physion.compute.machine import processor
-from physion.models.batch import Spec
-from physion.training.sources.open_source import whole_source
+from physion.compute.tasks import processor
 from physion.trials.dataset import Dataset
-from physion.trials.decoder import open_movie
-from physion.trials.generate import generate
+from physion.trials.making.generate import generate
 from physion.trials.making.plan import GenerateSettings
+from physion.trials.video import open_movie
 
 RESULTS = Path(__file__).parents[1] / "results"
 SCENARIOS, TRIALS, SIZE = ("collide", "drop"), 6, 128

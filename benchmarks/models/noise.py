@@ -40,9 +40,9 @@ from numpy.typing import NDArray
 
 from noise_simulations import F64, Simulations
 from physion.analysis.statistics.correlation import correlation_within_groups
-from physion.compute.machine import processor
+from physion.compute.tasks import processor
+from physion.core.seeds import generator
 from physion.models.state_noise import NoiseLevels
-from physion.seeds import generator
 
 RESULTS = Path(__file__).parents[1] / "results" / "noise.md"
 GRID = {

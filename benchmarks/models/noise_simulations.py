@@ -17,16 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.analysis.tables.responses import read_humans
+from physion.core.names import canonical_name
+from physion.core.seeds import stable_hash
 from physion.data import official
-from physion.models.fitted_noise import configuration_half
-from physion.models.noisy_simulation import cut_trial
+from physion.models.noisy_simulation import configuration_half, cut_trial
 from physion.models.state_noise import NoiseLevels, ObservedTrial, simulate_contacts
 from physion.physics.engine import make_engine, simulate
-from physion.physics.rigid.hulls import collision_hulls
-from physion.physics.rigid.mass import hull_moments
+from physion.physics.rigid.bodies import collision_hulls, hull_moments
 from physion.scenes.scene import OBSERVED_FRAMES, Body, Scene
-from physion.seeds import stable_hash
-from physion.stimulus_names import canonical_name
 
 F64 = NDArray[np.float64]
 

@@ -35,9 +35,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from physion import seeds
-from physion.models.particles.cell_list import radius_edges_on_device
-from physion.models.particles.neighbours import radius_edges
+from physion.core import seeds
+from physion.models.particles.neighbours import radius_edges, radius_edges_on_device
 from physion.models.particles.released import ReleasedGraph, dpi, gns, released_graph
 from physion.models.particles.released.layers import StageLayers
 from physion.models.particles.released.propagation import EdgeBlock

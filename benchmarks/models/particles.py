@@ -46,27 +46,27 @@ from sklearn.metrics import roc_auc_score
 
 from physion import Dataset, build_model, sample_scene, simulate
 from physion.analysis.tables.responses import read_humans
-from physion.compute.machine import processor
+from physion.clips.batch import LAST_OBSERVED, Batch, Motion, cut_to_observed
+from physion.clips.clips import observed_source, whole_source
+from physion.compute.tasks import processor
+from physion.core.names import canonical_name
 from physion.data import official
-from physion.models.batch import LAST_OBSERVED, Batch, Motion
 from physion.models.interface import Fits
-from physion.models.observed import cut_to_observed
 from physion.models.particles.bodies import poses_of, scene_particles
-from physion.models.particles.graph import drift_of, make_graph
-from physion.models.particles.layout import (
+from physion.models.particles.graph import (
     ObjectState,
     SceneLayout,
+    drift_of,
     join_poses,
     join_scenes,
+    make_graph,
     rotate_scenes,
 )
 from physion.models.particles.rigid_motion import rotation_from_vector
 from physion.models.particles.simulator import ParticleSimulator
 from physion.physics.labels import label_contact
 from physion.readout.rollout_error import motion_error
-from physion.scenes.sampling.registry import scenarios
-from physion.stimulus_names import canonical_name
-from physion.training.sources.open_source import observed_source, whole_source
+from physion.scenes.sampling.build import scenarios
 from physion.training.train import train_model
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, plan_dataset

@@ -38,10 +38,16 @@ from typing import Any
 
 import numpy as np
 
-from physion.readout.features.feature_file import open_features, write_features
-from physion.readout.features.stored_features import StoredFeatures
-from physion.readout.gram import Fit, JoinedFeatures, grams
-from physion.readout.logistic import C_GRID, FOLDS, fit_readout, solve_path
+from physion.readout.features import StoredFeatures, open_features, write_features
+from physion.readout.logistic import (
+    C_GRID,
+    FOLDS,
+    Fit,
+    JoinedFeatures,
+    fit_readout,
+    grams,
+    solve_path,
+)
 
 RESULTS = Path(__file__).parents[1] / "results"
 FIT, TEST, FRAMES, SIZE, FACTORS = 1000, 100, 25, 8000, 60

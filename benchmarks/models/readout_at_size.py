@@ -31,10 +31,9 @@ from typing import Any
 
 import numpy as np
 
-from physion.readout.features.feature_file import open_features, write_features
-from physion.readout.features.stored_features import StoredFeatures
+from physion.core.seeds import generator
+from physion.readout.features import StoredFeatures, open_features, write_features
 from physion.readout.logistic import fit_readout
-from physion.seeds import generator
 
 RESULTS = Path(__file__).parents[1] / "results"
 FIT, TEST, FRAMES, SIZE, FACTORS = 1000, 100, 21, 100_000, 20

@@ -34,16 +34,18 @@ from typing import Any
 import torch
 
 from physion import Dataset, build_model
-from physion.compute.machine import processor
-from physion.models.checkpoints.checkpoint import (
+from physion.clips.clips import whole_source
+from physion.compute.tasks import processor
+from physion.models.checkpoint import (
+    BUILT_AS,
+    DIGESTS,
+    FOLDER,
     load_tensors,
     read_checkpoint,
     tensors_of,
     write_checkpoint,
 )
-from physion.models.checkpoints.trained import BUILT_AS, DIGESTS, FOLDER
 from physion.models.particles.simulator import ParticleSimulator
-from physion.training.sources.open_source import whole_source
 from physion.training.train import calibrate
 
 SHIPPED = Path(__file__).parents[2] / "src/physion/models/checkpoints" / FOLDER

@@ -30,9 +30,9 @@ from pathlib import Path
 import pandas as pd
 import torch
 
-from physion.atomic import write_atomic
 from physion.cli.text_table import text_table
-from physion.compute.machine import processor
+from physion.compute.tasks import processor
+from physion.core.files import write_atomic
 
 RESULTS = Path(__file__).parents[1] / "results" / "small.txt"
 COUNTS = {"training": 200, "readout": 200, "testing": 60}

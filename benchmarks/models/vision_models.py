@@ -22,7 +22,7 @@ trained to the best trivial one, which is to be above 1 for C-SWM and below 1 fo
   times 1000; the trivial predictor keeps the last velocity. Untrained, RPIN predicts that boxes
   stay.
 - SVG and OP3: the squared error of moving pixels of the imagined frames, times 1000
-  (`physion.models.vision.moving`); one trivial predictor repeats the last observed picture, another
+  (`physion.models.vision`); one trivial predictor repeats the last observed picture, another
   shows an empty scene, the median of the observed pictures. A model that only lets moving objects
   vanish is better than the first one; it must be better than both.
 - Dynamics of the frozen EfficientNet-Lite0: the squared error of the next feature, times 1000; the
@@ -56,18 +56,17 @@ import numpy as np
 import torch
 
 from physion import Dataset, build_model
-from physion.compute.machine import processor
-from physion.models.batch import Batch, Spec
-from physion.models.cswm.contrast import ranking
-from physion.models.vision.moving import empty_scene_error
-from physion.readout.features.feature_store import FeatureStore
-from physion.seeds import generator, stable_hash
-from physion.training.sources.batches import ObservedBatches, TrialReaders, WholeBatches
-from physion.training.sources.kept_boxes import MOST_BYTES
-from physion.training.sources.movies import MovieReader, movie_files
-from physion.training.sources.open_source import whole_source
-from physion.training.sources.rendered import MotionRenderer
-from physion.training.sources.states import TrialMotions
+from physion.clips.batch import Batch, Spec
+from physion.clips.clips import whole_source
+from physion.clips.movies import MovieReader, movie_files
+from physion.clips.rendered import MOST_BYTES, MotionRenderer
+from physion.clips.source import ObservedBatches, TrialReaders, WholeBatches
+from physion.clips.states import TrialMotions
+from physion.compute.tasks import processor
+from physion.core.seeds import generator, stable_hash
+from physion.models.cswm import ranking
+from physion.models.vision import empty_scene_error
+from physion.readout.features import FeatureStore
 from physion.training.train import train_model
 
 RESULTS = Path(__file__).parents[1] / "results" / "vision_models.md"

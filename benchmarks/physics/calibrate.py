@@ -40,18 +40,18 @@ from typing import Any
 import numpy as np
 
 from calibration_quantities import QUANTITIES, Quantity
-from physion.compute.machine import processor
-from physion.physics.jitter import jitter_scene
-from physion.physics.labels import label_contact
-from physion.physics.rigid import hulls, mass
+from physion.compute.tasks import processor
+from physion.core.seeds import child_generator, trial_seed
+from physion.physics.labels import jitter_scene, label_contact
+from physion.physics.rigid import bodies as hulls
+from physion.physics.rigid import bodies as mass
+from physion.physics.rigid.bodies import RigidSettings
 from physion.physics.rigid.engine import RigidEngine
-from physion.physics.rigid.settings import RigidSettings
 from physion.physics.trajectory import Trajectory
 from physion.scenes.scene import Scene, SurfaceMaterial, Vec3
 from physion.scenes.shapes import primitives
 from physion.scenes.shapes.primitives import Shape
 from physion.scenes.tdw.read_logs import ImportedTrial, read_scenes
-from physion.seeds import child_generator, trial_seed
 
 RESULTS = Path(__file__).parents[1] / "results" / "calibration.md"
 JITTER = 0.001

@@ -30,8 +30,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.physics.cloth.contact_gap import CLOTH_CONTACT_GAP
 from physion.physics.cloth.simulate import ClothSettings, settle_solids, simulate_cloth
+from physion.physics.cloth.solver import CLOTH_CONTACT_GAP
 from physion.physics.replay import area_under_curve
 from physion.scenes.scene import Scene
 from physion.scenes.tdw.read_logs import ImportedTrial, read_scenes

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import calibration_shapes as made
-from physion.physics.rigid import hulls
-from physion.physics.rigid.mass import MassProperties
+from physion.physics.rigid import bodies as hulls
+from physion.physics.rigid.bodies import MassProperties
 from physion.scenes.scene import Scene, SurfaceMaterial
 from physion.scenes.shapes import primitives
 from physion.scenes.shapes.primitives import Shape

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from physion.numerics.elementary import cos, sin
-from physion.physics.rigid.mass import MassProperties
+from physion.physics.rigid.bodies import MassProperties
 from physion.scenes.scene import Body, Scene
 from physion.scenes.shapes import primitives
 from physion.scenes.shapes.meshes import box, hull, revolve

@@ -2,7 +2,7 @@
 
     python benchmarks/physics/geometry.py
 
-For the official scenes of the package: kilobytes (1024 bytes) that `physion.trials.geometry` adds
+For the official scenes of the package: kilobytes (1024 bytes) that `physion.trials.trial_file` adds
 to a trial file, mean and largest by scenario.
 """
 
@@ -16,8 +16,7 @@ import numpy as np
 
 from physion.data import official
 from physion.scenes.scene import Scene
-from physion.trials.geometry import geometry_arrays
-from physion.trials.schema import GEOMETRY, storage
+from physion.trials.trial_file import GEOMETRY, geometry_arrays, storage
 
 
 def file_size(scene: Scene, *, filled: bool) -> int:

@@ -15,11 +15,11 @@ import statistics
 import time
 from pathlib import Path
 
-from physion.compute.machine import processor_and_cores
-from physion.physics.jitter import jitter_scene
+from physion.compute.tasks import processor_and_cores
+from physion.core.seeds import child_generator, trial_seed
+from physion.physics.labels import jitter_scene
 from physion.physics.rigid.engine import RigidEngine
 from physion.scenes.tdw.read_logs import read_scenes
-from physion.seeds import child_generator, trial_seed
 
 RESULTS = Path(__file__).parents[1] / "results"
 RUNS, JITTER, TARGET = 8, 0.001, 0.8

@@ -21,14 +21,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from physion.compute.local import LocalExecutor
-from physion.compute.machine import processor_and_cores
-from physion.errors import BadSceneError
+from physion.compute.tasks import processor_and_cores
+from physion.core.errors import BadSceneError
+from physion.core.seeds import trial_seed
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
-from physion.scenes.sampling.preset import Preset, get_preset, load_presets
-from physion.scenes.sampling.registry import scenarios
-from physion.scenes.sampling.sample import sample_scene
-from physion.seeds import trial_seed
+from physion.scenes.sampling.build import scenarios
+from physion.scenes.sampling.sample import Preset, get_preset, load_presets, sample_scene
 from replay import RESULTS, cell
 
 GOAL = 0.85

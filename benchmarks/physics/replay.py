@@ -18,7 +18,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from physion.compute.machine import processor_and_cores
+from physion.compute.tasks import processor_and_cores
 
 RESULTS = Path(__file__).parents[1] / "results"
 TARGETS = {

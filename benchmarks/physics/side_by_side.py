@@ -19,16 +19,16 @@ import subprocess
 import sys
 from pathlib import Path
 
-from physion.compute.machine import processor_and_cores
+from physion.compute.tasks import processor_and_cores
 
 RESULTS = Path(__file__).parents[1] / "results"
 HERE = Path(__file__).parents[2] / "src"
 WORK = """
 import json, sys, time
-from physion.scenes.sampling.registry import scenarios
+from physion.scenes.sampling.build import scenarios
 from physion.physics.engine import simulate
 from physion.rendering.renderer import Renderer
-from physion.seeds import trial_seed
+from physion.core.seeds import trial_seed
 times = {}
 for scenario in sorted(scenarios.names()):
     chosen = scenarios.get(scenario)

@@ -30,7 +30,7 @@ ROUNDS = 3
 def measure(folder: Path, images: bool) -> dict[str, float]:
     """Return frames and trials per second of processor time, and MB per trial."""
     from physion.trials.dataset import Dataset
-    from physion.trials.official.writing.hdf5 import official_file
+    from physion.trials.official.write_file import official_file
 
     if not images and "images" not in inspect.signature(official_file).parameters:
         return {}

@@ -25,8 +25,8 @@ from pathlib import Path
 import numpy as np
 
 import physion
-from physion.compute.machine import processor
-from physion.scenes.sampling.registry import scenarios
+from physion.compute.tasks import processor
+from physion.scenes.sampling.build import scenarios
 from physion.trials.making.choose import Slot, choose
 from physion.trials.making.make import make_trial
 from physion.trials.making.plan import FULL_COUNTS, GenerateJob, GenerateSettings, plan_dataset

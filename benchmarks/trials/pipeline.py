@@ -35,7 +35,7 @@ from pathlib import Path
 from unittest import mock
 
 import physion
-from physion.compute.machine import processor
+from physion.compute.tasks import processor
 from physion.trials.making.choose import Slot, choose
 from physion.trials.making.make import make_trial
 from physion.trials.making.plan import GenerateJob, GenerateSettings, plan_dataset

@@ -38,9 +38,9 @@ from typing import Any
 import torch
 
 import physion
-from physion.compute.machine import processor
+from physion.clips.rendered import MOST_BYTES
+from physion.compute.tasks import processor
 from physion.training.protocols import Training, TrainingSet, training_sets
-from physion.training.sources.kept_boxes import MOST_BYTES
 from physion.training.windows import VALIDATION_CLIPS
 from physion.trials.making.plan import FULL_COUNTS
 from study_schedule import Task, schedule

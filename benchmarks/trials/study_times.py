@@ -31,22 +31,20 @@ import numpy as np
 import torch
 
 from physion import Dataset, build_model
+from physion.clips.batch import LAST_OBSERVED, Batch, Motion, cut_to_observed
+from physion.clips.clips import observed_source, whole_source
 from physion.compute.local import SerialExecutor
-from physion.models.batch import LAST_OBSERVED, Batch, Motion
+from physion.core.seeds import generator
 from physion.models.interface import ChoosesWindows, Encodes
-from physion.models.observed import cut_to_observed
-from physion.models.particles.futures import join_futures, observed_start
 from physion.models.particles.rollout import roll_out
-from physion.readout.features.model_outputs import encode_clips, imagine_clips
+from physion.models.particles.simulator import join_futures, observed_start
+from physion.readout.features import encode_clips, imagine_clips
 from physion.readout.logistic import fit_readout
 from physion.scenes.scene import FRAME_TIME
-from physion.seeds import generator
 from physion.training.devices import Devices, make_fabric, move_to_device
-from physion.training.loop import TrainingData, TrainingLoop
-from physion.training.losses import evaluating, losses_of
-from physion.training.sources.open_source import observed_source, whole_source
+from physion.training.loop import TrainingData, TrainingLoop, evaluating, losses_of
 from physion.training.windows import ClipWindows, FeatureWindows, Request, Windows
-from physion.trials.generate import generate
+from physion.trials.making.generate import generate
 from physion.trials.making.plan import FULL_COUNTS, GenerateSettings
 
 MODELS = (

@@ -5,7 +5,7 @@ from my_encoder import MyEncoder
 from torch import Tensor, nn
 
 from physion.models import Batch, Rollout
-from physion.models.settings import TrainingSettings
+from physion.models.interface import TrainingSettings
 
 
 class MyDynamics(MyEncoder):

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from physion.version import __version__
+from physion.core.version import __version__
 
 if TYPE_CHECKING:
     from physion.analysis.results import compare
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from physion.rendering.renderer import Renderer
     from physion.scenes.sampling.sample import sample_scene
     from physion.trials.dataset import Dataset
-    from physion.trials.generate import generate
+    from physion.trials.making.generate import generate
 
 __all__ = [
     "Dataset",
@@ -47,7 +47,7 @@ _MODULES = {
     "build_model": "physion.models.build",
     "compare": "physion.analysis.results",
     "evaluate": "physion.readout.evaluate",
-    "generate": "physion.trials.generate",
+    "generate": "physion.trials.making.generate",
     "label_contact": "physion.physics.labels",
     "sample_scene": "physion.scenes.sampling.sample",
     "simulate": "physion.physics.engine",

@@ -15,8 +15,7 @@ import pytest
 import physion
 from physion.cli.compare.compare import SUBVERBS
 from physion.cli.main import main
-from physion.trials.index import COLUMNS
-from physion.trials.layout import TrialPaths
+from physion.trials.index import COLUMNS, TrialPaths
 
 
 def predictions(official: Path, path: Path, model: str = "m", skill: float = 0.8) -> Path:

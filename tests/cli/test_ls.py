@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-import physion.registry
+import physion.core.registry
 from physion.cli.ls import DESCRIBED
 from physion.cli.main import main
-from physion.registry import Registry
+from physion.core.registry import Registry
 
 
 @pytest.mark.parametrize("kind", DESCRIBED)
@@ -42,7 +42,7 @@ def test_plug_ins_are_described_without_being_imported(
         }
         return [EntryPoint(name, target, group) for name, target in targets.items()]
 
-    monkeypatch.setattr(physion.registry, "entry_points", points)
+    monkeypatch.setattr(physion.core.registry, "entry_points", points)
     fresh: Registry[object] = Registry("model")
     assert {name: fresh.describe(name) for name in fresh} == {
         "mine": "What it is.", "bare": "", "absent": "",

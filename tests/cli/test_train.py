@@ -24,8 +24,8 @@ SLOW = f"{trained_models.__file__}:SlowBrightness"
 TESTS = Path(__file__).parents[1]
 CPU = ["--accelerator", "cpu"]
 SLOW_MODULES = {
-    "torch", "numba", "scipy", "av", "h5py", "physion.readout.features.feature_store",
-    "physion.training.sources.open_source",
+    "torch", "numba", "scipy", "av", "h5py", "physion.readout.features",
+    "physion.clips.clips",
 }  # fmt: skip
 """Libraries of models, movies and numerics, and what reads the trials."""
 

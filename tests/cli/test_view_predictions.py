@@ -13,9 +13,9 @@ import torch
 
 from physion.cli.imagined_trials import imagine_with
 from physion.cli.main import main
-from physion.errors import BadInputError, UnknownNameError
+from physion.clips.clips import whole_source
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.models.build import build_model
-from physion.training.sources.open_source import whole_source
 from physion.trials.dataset import Dataset
 from support.viewer_dataset import Plan, make_dataset
 

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from physion.compute.executor import Executor, executors
 from physion.compute.local import LocalExecutor, SerialExecutor
-from physion.errors import PhysionError
+from physion.compute.tasks import Executor, executors
+from physion.core.errors import PhysionError
 from support.tasks import die_on_two, die_once, fail_on_three
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from physion.compute.ray import RayExecutor
-from physion.compute.task import log_path
+from physion.compute.tasks import log_path
 from support.paths import FIND_TESTS, ROOT
 from support.tasks import die_on_two, die_once, fail_on_three, square
 
@@ -42,7 +42,7 @@ from support.tasks import process_of
 def node():
     return ray.get_runtime_context().get_node_id()
 
-from physion.errors import PhysionError
+from physion.core.errors import PhysionError
 
 executor = RayExecutor(workers=1)
 first, second = ({o.value for o in executor.map(process_of, {"a": 1, "b": 2})} for _ in range(2))

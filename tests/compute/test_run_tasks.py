@@ -7,11 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from physion.compute.executor import TaskOutcome
 from physion.compute.local import SerialExecutor
-from physion.compute.progress import tracked
 from physion.compute.run_tasks import RunReport, run_tasks
-from physion.errors import PhysionError
+from physion.compute.tasks import TaskOutcome, tracked
+from physion.core.errors import PhysionError
 
 
 def half(number: int) -> float:

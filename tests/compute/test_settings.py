@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from physion.compute.local import LocalExecutor
-from physion.compute.settings import ExecutorSettings
-from physion.compute.task import log_path
-from physion.errors import BadInputError
+from physion.compute.run_tasks import ExecutorSettings
+from physion.compute.tasks import log_path
+from physion.core.errors import BadInputError
 from support import slurm
 from support.tasks import fail_on_three, square
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from physion.compute.slurm import SlurmExecutor, SlurmJobSettings
-from physion.compute.task import log_path
-from physion.errors import BadInputError, PhysionError
+from physion.compute.tasks import log_path
+from physion.core.errors import BadInputError, PhysionError
 from support import slurm
 from support.tasks import die_on_two, die_once, fail_on_three, square
 

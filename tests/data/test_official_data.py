@@ -11,12 +11,12 @@ import pytest
 
 from physion.analysis.published.summary import published_results
 from physion.analysis.tables.responses import read_humans
+from physion.core.errors import BadInputError
+from physion.core.names import SCENARIOS, canonical_name
 from physion.data import OfficialData, official
 from physion.data.make import make_official
 from physion.data.official import SCENES, trial_line
-from physion.errors import BadInputError
 from physion.scenes.tdw.read_logs import read_scenes
-from physion.stimulus_names import SCENARIOS, canonical_name
 from support.official import official_folder
 
 OFFICIAL = official_folder() or Path("absent")

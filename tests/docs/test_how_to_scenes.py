@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from physion.scenes.sampling.preset import parse_presets
+from physion.scenes.sampling.sample import parse_presets
 from support.paths import ROOT
 
 

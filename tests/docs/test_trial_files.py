@@ -14,10 +14,8 @@ import pytest
 
 from physion.physics.labels import Labels
 from physion.trials import state
-from physion.trials.columns import INDEX_COLUMNS
-from physion.trials.metadata import Metadata
-from physion.trials.schema import FIELDS, GEOMETRY, PASSES, SCHEMA, Field
-from physion.trials.trial_file import Trial
+from physion.trials.index import INDEX_COLUMNS, Metadata
+from physion.trials.trial_file import FIELDS, GEOMETRY, PASSES, SCHEMA, Field, Trial
 from support.paths import ROOT
 
 PAGE = (ROOT / "docs" / "trial-files.md").read_text(encoding="utf-8")

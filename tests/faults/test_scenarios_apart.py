@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from physion.scenes.sampling.registry import scenarios
+from physion.core.seeds import trial_seed
+from physion.scenes.sampling.build import scenarios
 from physion.scenes.sampling.sample import sample_scene
-from physion.seeds import trial_seed
 
 
 @pytest.mark.parametrize("changed", ["drop", "roll"])

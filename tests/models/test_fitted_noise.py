@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.data import official
-from physion.errors import BadInputError, UnknownNameError
 from physion.models import Batch, Motion, build_model
-from physion.models.fitted_noise import FITTED, configuration_half, fitted_levels
+from physion.models.noisy_simulation import FITTED, configuration_half, fitted_levels
 from physion.models.state_noise import NoiseLevels
 from physion.physics.engine import simulate
 from physion.scenes.scene import Scene

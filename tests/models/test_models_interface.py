@@ -13,14 +13,14 @@ import pytest
 import torch
 from torch import nn
 
-import physion.registry
-from physion.errors import BadInputError, MissingExtraError, UnknownNameError
+import physion.core.registry
+from physion.clips.batch import clip_frames, join_batches
+from physion.core.errors import BadInputError, MissingExtraError, UnknownNameError
+from physion.core.registry import Registry
 from physion.models import Batch, Provenance, Spec, build_model, models
-from physion.models.batch import clip_frames, join_batches
 from physion.models.build import ModelFactory
 from physion.models.interface import Encodes, Fits, Imagines, Learns, Model, Predicts
-from physion.readout.capabilities import ways
-from physion.registry import Registry
+from physion.readout.predictor import ways
 from support.tiny_models import FROZEN, TINY, tiny
 
 
@@ -203,7 +203,7 @@ def test_another_package_adds_a_model_by_an_entry_point(monkeypatch: pytest.Monk
     def points(group: str) -> list[EntryPoint]:
         return [EntryPoint("foreign", f"{__name__}:_Foreign", group)]
 
-    monkeypatch.setattr(physion.registry, "entry_points", points)
+    monkeypatch.setattr(physion.core.registry, "entry_points", points)
     fresh: Registry[ModelFactory] = Registry("model")
     assert fresh.names() == ["foreign"]
     assert fresh.get("foreign")().provenance().model == "foreign"
@@ -218,7 +218,7 @@ class Absent:
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 sys.meta_path.insert(0, Absent())
 import physion.readout
-from physion.errors import MissingExtraError
+from physion.core.errors import MissingExtraError
 from physion.models import build_model
 build_model("noisy-simulation")
 try:

@@ -10,16 +10,15 @@ import numpy as np
 import pytest
 
 from physion.compute.local import LocalExecutor
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
+from physion.core.seeds import child_generator, trial_seed
 from physion.models import Batch, Motion, build_model
 from physion.models.noisy_simulation import NoisySimulation, NoisySimulationConfig, cut_trial
 from physion.models.state_noise import add_noise, simulate_contacts
-from physion.numerics.elementary import exp_of
-from physion.numerics.random_normals import standard_normal
+from physion.numerics.elementary import exp_of, standard_normal
 from physion.physics.engine import make_engine, simulate
 from physion.physics.trajectory import Contacts, State, Trajectory
 from physion.scenes.scene import Body, Camera, Cloth, Joint, Push, Roles, Scene
-from physion.seeds import child_generator, trial_seed
 
 FRAMES = 120
 

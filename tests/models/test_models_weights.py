@@ -17,9 +17,9 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 import physion
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.models import build_model
-from physion.models.weights import EncoderWeights, create_encoder, read_state_dict
+from physion.models.encoders.weights import EncoderWeights, create_encoder, read_state_dict
 
 NAME, SIZE = "test_resnet", 64
 

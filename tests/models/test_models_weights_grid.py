@@ -6,9 +6,13 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from physion.errors import BadInputError
-from physion.models.weights import EncoderWeights, create_encoder, feature_size
-from physion.models.weights.grid import GridFeatures
+from physion.core.errors import BadInputError
+from physion.models.encoders.weights import (
+    EncoderWeights,
+    GridFeatures,
+    create_encoder,
+    feature_size,
+)
 
 RANDOM = EncoderWeights("random")
 

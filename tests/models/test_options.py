@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from physion.cli.model_options import parse_options
-from physion.errors import BadInputError, PhysionError
-from physion.models.anchors.blob_centroids import BlobCentroidsConfig
+from physion.core.errors import BadInputError, PhysionError
+from physion.models.baselines.pixels import BlobCentroidsConfig
 from physion.models.build import build_model, make_config
-from physion.models.encoders.settings import EncoderConfig
+from physion.models.encoders.encoder import EncoderConfig
 from physion.models.encoders.video import VideoConfig
 from physion.models.noisy_simulation import NoisySimulationConfig
 from physion.models.particles.config import ParticleOptions
-from physion.models.vision.model import VisionOptions
+from physion.models.vision import VisionOptions
 
 CONFIGS: list[Any] = [
     BlobCentroidsConfig, EncoderConfig, NoisySimulationConfig, ParticleOptions, VideoConfig,

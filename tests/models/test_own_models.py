@@ -13,12 +13,12 @@ import pytest
 import physion
 from physion.cli.main import main
 from physion.compute.local import LocalExecutor, SerialExecutor
-from physion.errors import BadInputError, PhysionError
+from physion.core.errors import BadInputError, PhysionError
 from physion.models import Batch
 from physion.readout.logistic import ReadoutConfig
 from physion.readout.settings import EvaluationConfig
 from physion.readout.trainings import TrainConfig
-from physion.training.overrides import TrainingOverrides
+from physion.training.loop import TrainingOverrides
 from physion.trials.dataset import Dataset
 from physion.trials.making.plan import GenerateSettings
 from support.moving_dots import make_dots

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from physion.models.build import build_model
-from physion.models.checkpoints.trained import shipped_digests
+from physion.models.checkpoint import shipped_digests
 
 NAMES = tuple(sorted(shipped_digests()))
 PARTICLES, VISION = {"dpi", "gns", "gns-ransac"}, {"svg", "op3", "cswm", "rpin"}
@@ -22,7 +22,7 @@ def test_all_models_that_must_have_weights_do() -> None:
 @pytest.mark.parametrize("key", NAMES)
 def test_weights_have_a_card_and_load(key: str) -> None:
     name = key.removesuffix("-small")
-    folder = files("physion.models.checkpoints").joinpath("shipped")
+    folder = files("physion.data.weights")
     size = len(folder.joinpath(f"{key}.safetensors").read_bytes())
     assert size < (3_000_000 if name in PARTICLES else 4_000_000)
     card = folder.joinpath(f"{key}.md").read_text()

@@ -10,8 +10,8 @@ from hypothesis.extra.numpy import arrays
 
 from physion.numerics import linear_algebra as algebra
 from physion.numerics import rotations
-from physion.numerics.fourier import inverse_real_transform
-from physion.numerics.random_normals import standard_normal
+from physion.numerics.elementary import standard_normal
+from physion.numerics.linear_algebra import inverse_real_transform
 
 RNG = np.random.default_rng(3)
 MATRICES = RNG.normal(size=(7, 3, 3))

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError, BadSceneError, UnknownNameError
+from physion.core.errors import BadInputError, BadSceneError, UnknownNameError
 from physion.physics.engine import (
     DEFAULT_ENGINE,
     can_simulate,
@@ -20,8 +20,7 @@ from physion.physics.engine import (
     simulate_many,
 )
 from physion.physics.labels import label_contact
-from physion.physics.mujoco.engine import MujocoEngine
-from physion.physics.mujoco.settings import MujocoSettings
+from physion.physics.mujoco.engine import MujocoEngine, MujocoSettings
 from physion.physics.trajectory import ENVIRONMENT, State, Trajectory
 from physion.scenes.scene import (
     Body,

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.metrics import roc_auc_score
 
-from physion.physics.jitter import jitter_scene, pair_agreement
+from physion.physics.labels import jitter_scene, pair_agreement
 from physion.physics.replay import (
     Replay,
     ReplayTask,

@@ -9,10 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from physion.clips.batch import Spec
+from physion.clips.clips import whole_source
 from physion.compute.local import SerialExecutor
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.models import build_model, models
-from physion.models.batch import Spec
 from physion.readout.evaluate import evaluate, evaluate_model
 from physion.readout.leak_checks import (
     with_exchanged_futures,
@@ -21,7 +22,6 @@ from physion.readout.leak_checks import (
 )
 from physion.readout.logistic import ReadoutConfig
 from physion.readout.settings import EvaluationConfig
-from physion.training.sources.open_source import whole_source
 from physion.trials.dataset import Dataset
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, plan_dataset

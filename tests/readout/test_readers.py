@@ -5,12 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
+from physion.readout.decisions import (
+    GapReader,
+    NoiseReader,
+    best_threshold,
+    fit_knobs,
+    log_likelihood,
+    readers,
+)
+from physion.readout.features import Knobs, Outcomes, all_knobs
 from physion.readout.logistic import ReadoutConfig
-from physion.readout.readers import readers
-from physion.readout.readers.gap import GapReader, best_threshold
-from physion.readout.readers.noise import NoiseReader, fit_knobs, log_likelihood
-from physion.readout.rollouts import Knobs, Outcomes, all_knobs
 
 NO_KNOBS: Knobs = ()
 

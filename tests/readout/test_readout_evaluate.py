@@ -10,12 +10,18 @@ import pandas as pd
 import pytest
 
 from physion.analysis.tables.predictions import check_predictions
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.models import build_model, models
 from physion.readout.evaluate import evaluate, evaluate_model
 from physion.readout.logistic import ReadoutConfig
 from physion.readout.settings import EvaluationConfig
-from physion.readout.table import OFFICIAL_COLUMNS, OWN_COLUMNS, Evaluation, read_table, write_table
+from physion.readout.tables import (
+    OFFICIAL_COLUMNS,
+    OWN_COLUMNS,
+    Evaluation,
+    read_table,
+    write_table,
+)
 from physion.trials.dataset import Dataset
 from support.moving_dots import make_dots
 from support.tiny_models import TINY

@@ -19,9 +19,9 @@ import torch
 from safetensors import safe_open
 from torch import nn
 
-from physion.errors import BadInputError
-from physion.models.batch import Batch, Provenance, Rollout, Spec
-from physion.readout.features.feature_store import FeatureStore
+from physion.clips.batch import Batch, Provenance, Rollout, Spec
+from physion.core.errors import BadInputError
+from physion.readout.features import FeatureStore
 from physion.readout.model_calls import OutOfMemoryError
 
 SPEC = Spec(image_size=2, context=3, future=4)
@@ -240,7 +240,7 @@ def test_every_damaged_bit_is_noticed_and_the_file_written_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Hundreds of files are written, none of which must survive a power failure.
-    monkeypatch.setattr("physion.atomic.os.fsync", lambda descriptor: None)
+    monkeypatch.setattr("physion.core.files.os.fsync", lambda descriptor: None)
     model, movies, store = Numpy(), Movies(), FeatureStore(tmp_path)
     expected = store.encoded(model, movies, TRIALS[:1], "context").array()
     (path,) = files(tmp_path)
@@ -321,7 +321,7 @@ def test_files_are_safetensors_with_aligned_float32(tmp_path: Path) -> None:
 def test_what_was_written_before_a_failure_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("physion.readout.features.feature_store._WRITE_TRIALS", 2)
+    monkeypatch.setattr("physion.readout.features._WRITE_TRIALS", 2)
     model, movies, store = Numpy(), Movies(), FeatureStore(tmp_path, batch=1)
     good = model.give
 
@@ -563,7 +563,7 @@ def test_no_trial_has_no_feature(tmp_path: Path) -> None:
 def test_models_without_torch_do_not_import_it() -> None:
     code = (
         "import sys\n"
-        "import physion.readout.features.feature_store, physion.readout.logistic\n"
+        "import physion.readout.features, physion.readout.logistic\n"
         "print(json.dumps(sorted({'torch', 'lightning_fabric', 'timm'} & set(sys.modules))))"
     )
     done = subprocess.run(

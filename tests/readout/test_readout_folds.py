@@ -5,7 +5,7 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.readout.folds import assign_folds, plan_folds
 from physion.training.protocols import Training
 

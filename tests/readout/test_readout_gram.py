@@ -11,11 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError
-from physion.readout.features.feature_file import ArraysInMemory, open_features, write_features
-from physion.readout.features.stored_features import StoredFeatures
-from physion.readout.gram import Fit, JoinedFeatures, gram, grams
-from physion.readout.logistic import ReadoutConfig, fit_readout
+from physion.core.errors import BadInputError
+from physion.readout.features import ArraysInMemory, StoredFeatures, open_features, write_features
+from physion.readout.logistic import Fit, JoinedFeatures, ReadoutConfig, fit_readout, gram, grams
 
 
 def features_of(n: int, steps: int, size: int, seed: int = 0) -> np.ndarray:
@@ -64,8 +62,8 @@ def test_stored_features_are_read_in_any_piece(tmp_path: Path) -> None:
 def test_a_gram_matrix_is_that_of_standardised_features(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block: int
 ) -> None:
-    monkeypatch.setattr("physion.readout.gram._COLUMNS", block)
-    monkeypatch.setattr("physion.readout.gram._READ_BYTES", 1000)
+    monkeypatch.setattr("physion.readout.logistic._COLUMNS", block)
+    monkeypatch.setattr("physion.readout.logistic._READ_BYTES", 1000)
     first, second = features_of(12, 3, 9), features_of(12, 2, 9, seed=1)
     flat = np.concatenate([first, second], axis=1).reshape(12, -1)
     fitted = np.array([7, 0, 3, 4, 9, 11, 2])
@@ -91,7 +89,7 @@ def test_fits_are_standardised_apart_and_rows_count_through_tables(
         assert within == pytest.approx(expected[fit.fitted], rel=1e-10, abs=1e-9)
         assert across == pytest.approx(expected[fit.others], rel=1e-10, abs=1e-9)
     # With little memory the features are read once for every fit.
-    monkeypatch.setattr("physion.readout.gram._GRAM_BYTES", 1)
+    monkeypatch.setattr("physion.readout.logistic._GRAM_BYTES", 1)
     for one, other in zip(together, grams(tables, fits), strict=True):
         assert (one[0] == other[0]).all() and (one[1] == other[1]).all()
 
@@ -134,9 +132,9 @@ PEAK = """
 import json, resource, sys
 from pathlib import Path
 import numpy as np
-from physion.readout.features.feature_file import open_features, write_features
+from physion.readout.features import open_features, write_features
 from physion.readout.logistic import fit_readout
-from physion.readout.features.stored_features import StoredFeatures
+from physion.readout.features import StoredFeatures
 
 folder, trials, steps, size = Path(sys.argv[1]), 300, 25, 8000
 rng = np.random.default_rng(0)

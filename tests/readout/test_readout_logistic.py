@@ -12,17 +12,17 @@ from sklearn.model_selection import GridSearchCV, StratifiedKFold
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from physion.errors import BadInputError, UnknownNameError
-from physion.readout.gram import gram
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.readout.decisions import released_reader
 from physion.readout.logistic import (
     C_GRID,
     ReadoutConfig,
     fit_readout,
+    gram,
     solve_path,
     undersample,
 )
 from physion.readout.protocols import Readout, flatten_time
-from physion.readout.readers.logistic_reader import released_reader
 
 
 def problem(n: int, d: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -11,15 +11,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import physion.training.sources.states
-from physion.errors import BadInputError
+import physion.clips.states
+from physion.core.errors import BadInputError
 from physion.models import Batch, Provenance, Spec
 from physion.models.noisy_simulation import NoisySimulation, NoisySimulationConfig
 from physion.physics.trajectory import Contacts, State, Trajectory
-from physion.readout.capabilities import choose_readouts
 from physion.readout.evaluate import evaluate, evaluate_model
 from physion.readout.folds import plan_folds
-from physion.readout.predictor import Predictor
+from physion.readout.predictor import Predictor, choose_readouts
 from physion.readout.settings import EvaluationConfig
 from physion.scenes.scene import Body, Camera, Roles, Scene
 from physion.training.protocols import Training
@@ -119,7 +118,7 @@ def shelves_in_place_of_files(monkeypatch: pytest.MonkeyPatch) -> None:
     def opened(content: bytes, where: str) -> Any:
         return SHELVED[content] if content in SHELVED else Trial(content, where)
 
-    monkeypatch.setattr(physion.training.sources.states, "Trial", opened)
+    monkeypatch.setattr(physion.clips.states, "Trial", opened)
 
 
 def fitted_scale(shelf: Any, model: Any, folder: Path) -> tuple[float, np.ndarray]:

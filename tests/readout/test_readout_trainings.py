@@ -8,11 +8,11 @@ import typing
 import pandas as pd
 import pytest
 
-from physion.errors import BadInputError, UnknownNameError
-from physion.models.settings import TrainingSettings
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.models.interface import TrainingSettings
 from physion.readout.folds import plan_folds
 from physion.readout.trainings import TrainConfig, plan_trainings
-from physion.training.overrides import TrainingOverrides
+from physion.training.loop import TrainingOverrides
 from physion.training.protocols import Training
 
 

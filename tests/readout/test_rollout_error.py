@@ -12,8 +12,8 @@ import pandas as pd
 import pytest
 
 from physion.cli.main import main
-from physion.errors import BadInputError
-from physion.models.batch import Motion, Provenance, Spec
+from physion.clips.batch import Motion, Provenance, Spec
+from physion.core.errors import BadInputError
 from physion.models.particles.bodies import (
     ParticleSettings,
     Poses,

@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 
 from physion import sample_scene
+from physion.clips.batch import Batch, Motion, Rollout, Spec, cut_to_observed
 from physion.compute.local import LocalExecutor, SerialExecutor
-from physion.errors import BadInputError
-from physion.models.batch import Batch, Motion, Rollout, Spec
+from physion.core.errors import BadInputError
 from physion.models.build import build_model
-from physion.models.observed import cut_to_observed
 from physion.physics.engine import simulate
-from physion.readout.rollouts import RolloutStore
+from physion.readout.features import RolloutStore
 from physion.scenes.scene import Ending
 
 

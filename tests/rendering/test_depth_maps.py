@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from physion.rendering.depth_maps import (
+from physion.rendering.rasterizer import (
     BLOCK,
     OCCLUSION_REACH,
     DepthMap,

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.rendering.camera import View, axes, intrinsics, projection_matrix, view_matrix
 from physion.scenes.scene import Camera
 

@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.rendering.camera import View
 from physion.rendering.renderer import (
     PASSES,

@@ -12,13 +12,12 @@ from physion.rendering.renderer import Renderer
 from physion.rendering.rooms import rooms
 from physion.rendering.textures import atlas as textures
 from physion.rendering.textures.atlas import FINISHES, LEVELS, PAINTERS, SIZE, build_atlas, finish
-from physion.rendering.textures.noise import F32, Painter
+from physion.rendering.textures.materials import F32, Painter
 from physion.rendering.triangles import assemble
 from physion.scenes.looks import MATERIALS, RED, TEXTURES
 from physion.scenes.scene import Camera, Look, Scene
-from physion.scenes.shapes.primitives import shape
-from physion.scenes.shapes.prop_names import PREFIX, PROPS
-from physion.scenes.shapes.prop_parts import PropShape
+from physion.scenes.shapes.primitives import PREFIX, PROPS, shape
+from physion.scenes.shapes.prop_shapes import PropShape
 from support.rendered_scenes import body, resting, scene_of
 
 NEAR = Camera((1.3, 1.0, 0.9), (0.0, 0.0, 0.35))

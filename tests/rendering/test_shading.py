@@ -9,45 +9,42 @@ import pytest
 from numpy.typing import NDArray
 
 from physion.rendering.camera import View, intrinsics
-from physion.rendering.depth_maps import BLOCK, DepthMap
 from physion.rendering.light import pack_light
 from physion.rendering.rasterizer import (
+    BLOCK,
+    CAMERA,
+    LIGHT,
+    MATERIAL,
     NOTHING,
+    POINT,
     SAMPLES,
+    SURFACE,
+    DepthMap,
     DepthRange,
+    LightMaps,
+    ShadingInputs,
     Triangles,
     VisibilityBuffer,
     barycentric,
     rasterize,
 )
-from physion.rendering.records import (
-    CAMERA,
-    LIGHT,
-    MATERIAL,
-    POINT,
-    SURFACE,
-    LightMaps,
-    ShadingInputs,
-)
-from physion.rendering.reflection import (
+from physion.rendering.rooms import rooms
+from physion.rendering.shading import (
     CORNER_OCCLUSION,
     CORNER_RANGE,
+    FOOTPRINT,
+    TONES,
+    WHITEST,
     corner_occlusion,
     fresnel,
     highlight,
     lambert,
-    window_fraction,
-)
-from physion.rendering.rooms import rooms
-from physion.rendering.shading import (
-    FOOTPRINT,
-    TONES,
-    WHITEST,
     shade,
     shade_static_points,
     texture_footprint,
+    window_fraction,
 )
-from physion.rendering.textures.lookup import Atlas
+from physion.rendering.textures.atlas import Atlas
 from physion.scenes.scene import Camera
 
 SIZE = 33

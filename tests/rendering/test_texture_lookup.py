@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from physion.rendering.textures.lookup import (
+from physion.rendering.textures.atlas import (
     SLOPE_SCALE,
     SLOPE_ZERO,
     Atlas,

@@ -25,6 +25,7 @@ from physion.analysis.models.anchors import COMPUTED
 from physion.analysis.models.mixed_fits import fits_of_models
 from physion.analysis.people.difficulty import below_chance_level
 from physion.analysis.tables.stimuli import MEAN
+from physion.core.names import SCENARIOS
 from physion.report.figures import theme
 from physion.report.figures.by_stimulus.difficulty import difficulty_figure
 from physion.report.figures.by_stimulus.scatter import SQUARE, scatter_figure
@@ -36,7 +37,6 @@ from physion.report.page import blocks, scores
 from physion.report.page.document import Picture
 from physion.report.page.page import render_page
 from physion.report.words import number, protocol_names
-from physion.stimulus_names import SCENARIOS
 from support.paths import ROOT
 
 Maker = Callable[..., Comparison]

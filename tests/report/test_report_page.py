@@ -14,7 +14,7 @@ import pytest
 
 from physion.analysis import Bootstrap, Comparison
 from physion.analysis.tables.stimuli import MEAN
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.report import ReportInputs, build_report, compare_files
 from physion.report.inputs import EXPECTED_METHODS
 from physion.report.page.document import Picture

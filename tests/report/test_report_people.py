@@ -17,7 +17,7 @@ from physion.analysis.people.participants import PERSON, REHEARSAL
 from physion.analysis.statistics.kappa import cross_kappa
 from physion.analysis.tables.attributes import attributes_from_table
 from physion.cli.main import main
-from physion.errors import BadInputError, ExclusionError, UnknownNameError
+from physion.core.errors import BadInputError, ExclusionError, UnknownNameError
 from physion.report import compare_files
 
 SCENARIOS = ("collide", "drop")

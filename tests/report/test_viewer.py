@@ -17,7 +17,7 @@ import pytest
 
 from physion.cli import view
 from physion.cli.main import main as cli
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.report.viewer import facts as viewer_facts
 from physion.report.viewer import write_viewer as viewer
 from physion.report.viewer.motion import STEPS, pack_grid, pack_motion, pack_shapes

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.report.viewer.imagined.pack import pack_imagined
 from physion.report.viewer.imagined.particles import REACH
 from physion.report.viewer.imagined.trial import ImaginedTrial, caption

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.report.viewer.imagined.pack import pack_imagined
 from physion.report.viewer.imagined.pictures import ROWS, SIDE, SLOTS
 from physion.report.viewer.imagined.trial import ImaginedTrial

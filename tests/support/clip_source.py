@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from physion.models.batch import Batch, Spec
+from physion.clips.batch import Batch, Spec
 
 
 class ClipSource:

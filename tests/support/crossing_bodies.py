@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from physion.models.batch import Batch, Motion
+from physion.clips.batch import Batch, Motion
 from physion.physics.trajectory import Contacts, Trajectory
 from physion.scenes.scene import Body, Camera, Roles, Scene, Vec3
 

@@ -12,13 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.physics.labels import Labels, label_contact
 from physion.physics.trajectory import Contacts, Trajectory
 from physion.scenes.scene import Body, Camera, Cloth, Roles, Scene
-from physion.trials.files import encode_png, write_files
+from physion.trials.index import Metadata, encode_png, write_files
 from physion.trials.making.plan import GenerateJob
-from physion.trials.metadata import Metadata
 from physion.trials.trial_file import TrialWriter
 from physion.trials.video import encode_movie
 

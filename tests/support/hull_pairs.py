@@ -11,6 +11,7 @@ from scipy.optimize import nnls
 from scipy.spatial import ConvexHull
 
 from physion.numerics.rotations import rotation_matrices
+from physion.physics.rigid.bodies import face_planes, hull_faces
 from physion.physics.rigid.collision.closest_points import (
     CLOSE,
     OVERLAPPING,
@@ -18,9 +19,8 @@ from physion.physics.rigid.collision.closest_points import (
     closest_points,
     new_simplex,
 )
-from physion.physics.rigid.collision.hull_records import Hulls
+from physion.physics.rigid.collision.faces import Hulls
 from physion.physics.rigid.collision.penetration import new_polytope, penetration
-from physion.physics.rigid.hulls import face_planes, hull_faces
 
 F64 = NDArray[np.float64]
 UPRIGHT = np.eye(3)

@@ -13,16 +13,20 @@ from typing import Any
 
 import numpy as np
 
-from physion.models.batch import Motion
+from physion.clips.batch import Motion
 from physion.physics.labels import label_contact
 from physion.physics.trajectory import ENVIRONMENT
 from physion.rendering.renderer import Renderer, role_map
 from physion.scenes.looks import in_look
 from physion.trials.dataset import Dataset
-from physion.trials.files import encode_png, write_files
-from physion.trials.index import build_index, write_index
-from physion.trials.layout import TrialPaths
-from physion.trials.metadata import Metadata
+from physion.trials.index import (
+    Metadata,
+    TrialPaths,
+    build_index,
+    encode_png,
+    write_files,
+    write_index,
+)
 from physion.trials.trial_file import TrialWriter
 from physion.trials.video import encode_movie
 from support.crossing_bodies import crossing

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from physion.models.batch import Batch, Spec
+from physion.clips.batch import Batch, Spec
 
 COLORS = ((220, 40, 30), (230, 220, 40), (40, 60, 200), (40, 180, 60))
 BACKGROUND = 110

@@ -12,10 +12,7 @@ from physion.physics.trajectory import ENVIRONMENT, Contacts, Trajectory
 from physion.rendering.renderer import Renderer, role_map
 from physion.scenes.looks import in_look
 from physion.scenes.scene import Body, Camera, Cloth, Look, Push, Roles, Scene, SurfaceMaterial
-from physion.trials.files import write_files
-from physion.trials.index import build_index, write_index
-from physion.trials.layout import TrialPaths
-from physion.trials.metadata import Metadata
+from physion.trials.index import Metadata, TrialPaths, build_index, write_files, write_index
 from physion.trials.trial_file import TrialWriter
 from physion.trials.video import encode_movie
 from support.hand_made import encode_png
@@ -99,7 +96,7 @@ def make_trajectory(scene: Scene) -> Trajectory:
 def _cloth(scene: Scene, rng: np.random.Generator) -> np.ndarray:
     if not scene.cloths:
         return np.zeros((FRAMES, 0, 3), np.float32)
-    from physion.physics.cloth.sheet import sheet_vertices
+    from physion.physics.cloth.springs import sheet_vertices
 
     flat = sheet_vertices(scene.cloths[0])
     wave = rng.normal(size=flat.shape) * 0.05

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from physion.physics.rigid.bodies import RigidSettings
 from physion.physics.rigid.engine import RigidEngine
-from physion.physics.rigid.settings import RigidSettings
 from physion.physics.trajectory import Trajectory
 from physion.scenes.scene import (
     Body,

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis.tables.attributes import COLUMNS
-from physion.stimulus_names import canonical_name
+from physion.core.names import canonical_name
 
 
 def attributes_from_metadata(folder: Path) -> pd.DataFrame:

@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.errors import BadInputError
-from physion.seeds import child_generator, named_seed
-from physion.stimulus_names import SCENARIOS
+from physion.core.errors import BadInputError
+from physion.core.names import SCENARIOS
+from physion.core.seeds import child_generator, named_seed
 
 Array = npt.NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from physion.clips.batch import Batch, Spec
+from physion.clips.clips import whole_source
 from physion.compute.local import LocalExecutor
-from physion.models.batch import Batch, Spec
-from physion.training.sources.open_source import whole_source
 from physion.trials.dataset import Dataset
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, plan_dataset

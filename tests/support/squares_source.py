@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from physion.models.batch import Batch, Spec, clip_frames
-from physion.training.sources.source import Part
+from physion.clips.batch import Batch, Spec, clip_frames
+from physion.clips.source import Part
 from support.clip_source import ClipSource
 from support.moving_squares import squares
 

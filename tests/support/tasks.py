@@ -6,7 +6,7 @@ import os
 import signal
 from pathlib import Path
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 
 def square(number: int) -> int:

@@ -13,12 +13,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from physion.errors import UnknownNameError
-from physion.models.batch import Batch, Motion, Spec, clip_frames
-from physion.models.interface import Diet
-from physion.models.settings import TrainingSettings
+from physion.clips.batch import Batch, Motion, Spec, clip_frames
+from physion.clips.source import Part
+from physion.core.errors import UnknownNameError
+from physion.models.interface import Diet, TrainingSettings
 from physion.models.torch_model import TorchModel
-from physion.training.sources.source import Part
 from support.clip_source import ClipSource
 from support.hand_made import make_scene, make_trajectory
 

@@ -15,7 +15,7 @@ import torch
 from torch.utils.data import DataLoader
 
 import physion
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.trials.dataset import Dataset
 from support.official_hand_made import make_dataset
 

@@ -14,16 +14,21 @@ from lightning_fabric import Fabric
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from physion.atomic import folder_lock
-from physion.errors import BadInputError, PhysionError
-from physion.models.batch import Batch
-from physion.models.checkpoints.checkpoint import WEIGHTS, read_checkpoint
-from physion.models.raised import OutOfMemoryError
-from physion.models.settings import TrainingSettings
+from physion.clips.batch import Batch
+from physion.core.errors import BadInputError, PhysionError
+from physion.core.files import folder_lock
+from physion.models.build import OutOfMemoryError
+from physion.models.checkpoint import WEIGHTS, read_checkpoint
+from physion.models.interface import TrainingSettings
 from physion.training.devices import Devices, make_fabric
-from physion.training.folder import CARD, CHECKPOINT, PREVIOUS
-from physion.training.loop import TrainingStoppedError
-from physion.training.metrics_log import METRICS, read_metrics
+from physion.training.loop import (
+    CARD,
+    CHECKPOINT,
+    METRICS,
+    PREVIOUS,
+    TrainingStoppedError,
+    read_metrics,
+)
 from physion.training.train import TrainedModel, train_model
 from support.trained_models import QUICK, MovingValues, NextBrightness, equal_weights
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from physion.training.metrics_log import EVENTS, METRICS, MetricsLog, read_metrics
+from physion.training.loop import EVENTS, METRICS, MetricsLog, read_metrics
 
 
 def write(folder: Path, start: int, steps: list[int]) -> None:

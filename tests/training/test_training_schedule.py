@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch.optim.lr_scheduler import ReduceLROnPlateau
 
-from physion.models.settings import TrainingSettings
-from physion.training.schedule import Plateau, learning_rate
+from physion.models.interface import TrainingSettings
+from physion.training.loop import Plateau, learning_rate
 
 
 def test_the_rate_rises_linearly_and_is_constant_afterwards() -> None:

@@ -12,9 +12,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from physion.errors import BadInputError
-from physion.trials.decoder import MovieDecoder, MovieProperties
-from physion.trials.video import GROUP, encode_movie, read_chosen, read_frames
+from physion.core.errors import BadInputError
+from physion.trials.video import (
+    GROUP,
+    MovieDecoder,
+    MovieProperties,
+    encode_movie,
+    read_chosen,
+    read_frames,
+)
 
 FRAMES, HEIGHT, WIDTH = 100, 48, 64
 SIZES: tuple[tuple[int, int] | None, ...] = (None, (24, 32), (17, 40), (96, 96))

@@ -9,8 +9,8 @@ import pytest
 
 import physion
 from physion.compute.run_tasks import RunReport
-from physion.errors import BadInputError, PhysionError, UnknownNameError
-from physion.trials import generate as module
+from physion.core.errors import BadInputError, PhysionError, UnknownNameError
+from physion.trials.making import generate as module
 from physion.trials.making.plan import GenerateSettings, plan_dataset
 
 

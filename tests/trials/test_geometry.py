@@ -13,12 +13,11 @@ import pytest
 from numpy.typing import NDArray
 
 import physion
-from physion.errors import BadInputError
-from physion.trials.layout import TrialPaths
+from physion.core.errors import BadInputError
+from physion.trials.index import TrialPaths
 from physion.trials.making.verify import _check_trial
-from physion.trials.schema import GEOMETRY, SEAL_BYTES, seal
 from physion.trials.state import world_vertices
-from physion.trials.trial_file import Trial, TrialWriter
+from physion.trials.trial_file import GEOMETRY, SEAL_BYTES, Trial, TrialWriter, seal
 from support.hand_made import make_parts
 
 PIXELS = 128

@@ -11,8 +11,8 @@ import pytest
 
 from physion.cli.main import main as cli
 from physion.compute.local import SerialExecutor
-from physion.digests import digest_path
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
+from physion.core.files import digest_path
 from physion.trials.dataset import Dataset
 from physion.trials.index import COLUMNS, index_bytes, read_index, write_index
 from physion.trials.making.generate import make_trials

@@ -11,17 +11,17 @@ from typing import Any
 import pytest
 
 from physion.cli.main import main as cli
+from physion.clips.batch import Spec
+from physion.clips.clips import observed_source, whole_source
 from physion.compute.local import SerialExecutor
-from physion.errors import BadInputError
-from physion.models.batch import Spec
+from physion.core.errors import BadInputError
 from physion.report.page.movies import movies_of
 from physion.report.viewer.write_viewer import ViewerOptions, build_viewer
-from physion.training.sources.open_source import observed_source, whole_source
 from physion.trials.dataset import Dataset
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, plan_scenes
-from physion.trials.official.writing.export_folder import export_official
-from physion.trials.publishing.card import write_card
+from physion.trials.official.export_folder import export_official
+from physion.trials.share.card import write_card
 from support.hand_made import make_by_hand, make_scene
 
 RGB = Spec(image_size=16, future=1)

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
-from physion.errors import BadInputError, BadSceneError
+from physion.core.errors import BadInputError, BadSceneError
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
 from physion.rendering.renderer import Renderer

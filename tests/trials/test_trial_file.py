@@ -15,10 +15,9 @@ import h5py
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.physics.trajectory import Trajectory
-from physion.trials.schema import FIELDS, SEAL_BYTES, seal
-from physion.trials.trial_file import Trial, TrialWriter, write_trial
+from physion.trials.trial_file import FIELDS, SEAL_BYTES, Trial, TrialWriter, seal, write_trial
 from support.hand_made import FRAMES, Parts, images, make_parts
 from support.paths import FIND_TESTS
 
@@ -341,8 +340,8 @@ def test_evil_files_with_a_right_seal_are_refused_with_their_field(name: str, pa
 FUZZ = """
 import sys
 import numpy as np
-from physion.errors import BadInputError
-from physion.trials.schema import seal, SEAL_BYTES
+from physion.core.errors import BadInputError
+from physion.trials.trial_file import seal, SEAL_BYTES
 from tests.trials.test_trial_file import read_all
 data = open(sys.argv[1], "rb").read()
 rng = np.random.default_rng(int(sys.argv[2]))

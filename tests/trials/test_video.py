@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.trials.video import MovieEncoder, count_frames, encode_movie, read_frames
 
 NAMED = {"red": (255, 0, 0), "yellow": (255, 255, 0), "carpet": (30, 60, 160), "grey": (128,) * 3}

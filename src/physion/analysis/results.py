@@ -22,7 +22,7 @@ from physion.analysis.people.people import accuracy_by_stimulus
 from physion.analysis.people.results import PeopleResults
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.tables.stimuli import check_excluded_names
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 
 @dataclass(frozen=True)

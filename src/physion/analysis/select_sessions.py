@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import pandas as pd
 
 from physion.analysis.people.participants import Responses
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
 
 COLUMNS = ("condition", "language", "recruited_by", "gender", "education", "buttons", "study")
 """Columns by which sessions can be chosen, in the table of sessions or in the trials."""

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from physion.cli.output import console
-from physion.version import __version__
+from physion.core.version import __version__
 
 EXTRAS = {
     "models": ("torch", "torchvision", "timm", "lightning-fabric", "safetensors"),
@@ -161,7 +161,7 @@ def codec() -> Check:
 
 def reproduction() -> list[Check]:
     """Check whether trials generated here have the digests of this version."""
-    from physion.golden import golden_digests
+    from physion.core.version import golden_digests
     from physion.trials.making.reproduce import differences
 
     checks = []

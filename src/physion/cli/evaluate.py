@@ -19,7 +19,7 @@ from physion.cli.output import Stages, console, write_text
 from physion.cli.plans.choose_models import choose_models
 from physion.cli.plans.tables import evaluations_table, print_estimates
 from physion.cli.text_table import text_table
-from physion.compute.settings import ExecutorSettings
+from physion.compute.run_tasks import ExecutorSettings
 from physion.readout.plans.evaluation_plan import EvaluationPlan, EvaluationResults
 from physion.readout.plans.keys import key_of
 from physion.readout.plans.results import StoredEvaluation, summarise_accuracy

@@ -14,7 +14,7 @@ import tyro
 from physion.cli.official.report import print_report
 from physion.cli.output import Stages, console
 from physion.compute.local import LocalExecutor
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def main(options: Options) -> int:
 
 
 def _card(options: Options) -> int:
-    from physion.trials.publishing.card import write_card
+    from physion.trials.share.card import write_card
 
     if options.split or options.scenario:
         raise BadInputError("a card describes a whole dataset: leave out --split and --scenario")
@@ -106,7 +106,7 @@ def _card(options: Options) -> int:
 
 
 def _result_tables(options: Options, out: Path) -> int:
-    from physion.trials.publishing.result_tables import export_result_tables
+    from physion.trials.share.tables import export_result_tables
 
     if options.split or options.scenario:
         raise BadInputError(
@@ -125,7 +125,7 @@ def _print_paths(paths: Sequence[Path], as_json: bool) -> int:
 
 
 def _webdataset(options: Options, out: Path) -> int:
-    from physion.trials.publishing.shards import PARTS, SEEN_PARTS, export_shards
+    from physion.trials.share.shards import PARTS, SEEN_PARTS, export_shards
 
     with Stages() as stages:
         report = export_shards(
@@ -148,7 +148,7 @@ def _webdataset(options: Options, out: Path) -> int:
 
 
 def _official(options: Options, out: Path) -> int:
-    from physion.trials.official.writing.export_folder import export_official
+    from physion.trials.official.export_folder import export_official
 
     with Stages() as stages:
         report = export_official(

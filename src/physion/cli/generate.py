@@ -10,10 +10,9 @@ from typing import Annotated, Literal
 import tyro
 
 from physion.cli.output import Stages, console
-from physion.compute.run_tasks import RunReport
-from physion.compute.settings import ExecutorSettings
-from physion.errors import BadInputError
-from physion.scenes.sampling.registry import scenarios
+from physion.compute.run_tasks import ExecutorSettings, RunReport
+from physion.core.errors import BadInputError
+from physion.scenes.sampling.build import scenarios
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import FULL_COUNTS, SPLITS, GenerateSettings, plan_dataset
 

@@ -9,19 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.compute.progress import Progress, tracked
-from physion.errors import BadInputError
-from physion.models.batch import Batch, Rollout
-from physion.models.build import build_model
+from physion.clips.batch import Batch, Rollout
+from physion.clips.clips import whole_source
+from physion.clips.source import WholeSource
+from physion.compute.tasks import Progress, tracked
+from physion.core.errors import BadInputError
+from physion.models.build import OutOfMemoryError, build_model
 from physion.models.interface import Encodes, HasReader, Imagines, Learns, Model, Trained
-from physion.models.raised import OutOfMemoryError
+from physion.readout.decisions import fraction_of_futures
+from physion.readout.features import Outcomes
 from physion.readout.model_calls import call_model, check_identity, is_network, model_name, to_array
-from physion.readout.readers.reader import fraction_of_futures
-from physion.readout.rollouts import Outcomes
 from physion.report.viewer.imagined.pack import SHOWABLE
 from physion.report.viewer.imagined.trial import Imagine, ImaginedTrial
-from physion.training.sources.open_source import whole_source
-from physion.training.sources.source import WholeSource
 from physion.trials.dataset import Dataset
 
 Arrays = NDArray[Any]

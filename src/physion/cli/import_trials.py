@@ -12,7 +12,7 @@ import tyro
 from physion.cli.official.report import print_report
 from physion.cli.output import Stages
 from physion.compute.local import LocalExecutor
-from physion.trials.official.reading.import_folder import import_official
+from physion.trials.official.import_folder import import_official
 
 
 @dataclass(frozen=True)

@@ -10,15 +10,15 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from physion.cli.output import console
-from physion.compute.executor import executors
-from physion.errors import BadInputError
+from physion.compute.tasks import executors
+from physion.core.errors import BadInputError
+from physion.core.registry import Registry
 from physion.models import models
 from physion.physics.engine import engines
-from physion.registry import Registry
 from physion.scenes.looks import MATERIALS
+from physion.scenes.sampling.build import as_record, scenarios
 from physion.scenes.sampling.parameters import describe_limits
-from physion.scenes.sampling.preset import Preset, get_preset, load_presets
-from physion.scenes.sampling.registry import as_record, scenarios
+from physion.scenes.sampling.sample import Preset, get_preset, load_presets
 from physion.scenes.shapes.primitives import shapes
 from physion.scenes.shapes.props import NATURAL_SIZES
 
@@ -47,7 +47,7 @@ DESCRIBED: Mapping[str, Callable[[], Registry[Any]]] = {
 
 def _readers() -> Registry[Any]:
     # Imported late: it takes time.
-    from physion.readout.readers.reader import readers
+    from physion.readout.decisions import readers
 
     return readers
 

@@ -28,7 +28,7 @@ def _usage() -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Run one verb and return the exit code."""
-    from physion.errors import MEMORY_SETTINGS, PhysionError
+    from physion.core.errors import MEMORY_SETTINGS, PhysionError
 
     try:
         try:
@@ -64,12 +64,12 @@ def _run_verb(args: list[str]) -> int:
         print(_usage())
         return 0 if args else 2
     if args[0] == "--version":
-        from physion.version import __version__
+        from physion.core.version import __version__
 
         print(f"physion {__version__}")
         return 0
     if args[0] not in VERBS:
-        from physion.errors import UnknownNameError
+        from physion.core.errors import UnknownNameError
 
         raise UnknownNameError("verb", args[0], VERBS)
     import tyro

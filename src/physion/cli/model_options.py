@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 
 def parse_options(pairs: tuple[str, ...], given: Mapping[str, str] | None = None) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from physion.atomic import write_atomic
+from physion.core.files import write_atomic
 
 
 class OutputConsole(Console):

@@ -21,15 +21,14 @@ import tyro
 from physion.cli.official.read import read_trials
 from physion.cli.output import Stages, console, write_text
 from physion.cli.text_table import text_table
-from physion.compute.executor import Executor
-from physion.compute.progress import tracked
-from physion.compute.settings import ExecutorSettings
+from physion.compute.run_tasks import ExecutorSettings
+from physion.compute.tasks import Executor, tracked
+from physion.core.errors import BadInputError
+from physion.core.version import MADE_WITH
 from physion.data import PACKAGED
-from physion.errors import BadInputError
 from physion.physics.engine import DEFAULT_ENGINE, can_simulate, engines
 from physion.physics.replay import Replay, ReplayRow, ReplayTask, replay_trial, summarise
 from physion.scenes.tdw.read_logs import TrialSet
-from physion.version import MADE_WITH
 
 SHOWN_FAILURES = 5
 COLUMNS = {

@@ -19,13 +19,13 @@ import tyro
 from physion.cli.output import Stages, console
 from physion.cli.plans.choose_models import choose_models
 from physion.cli.plans.tables import estimates_table, print_estimates
-from physion.compute.settings import ExecutorSettings
+from physion.compute.run_tasks import ExecutorSettings
 from physion.readout.plans.estimates import estimate_plan, time_left
 from physion.readout.plans.selection import Selection, count_seeds, parse_protocols
 from physion.readout.plans.tasks import TrainingTask
 from physion.readout.plans.training_plan import TrainingPlan, TrainingResults
 from physion.readout.trainings import SharedTrainConfig
-from physion.training.overrides import TrainingOverrides
+from physion.training.loop import TrainingOverrides
 from physion.trials.dataset import Dataset
 
 

@@ -13,8 +13,7 @@ from typing import Annotated
 import tyro
 
 from physion.cli.output import Stages, console
-from physion.trials.making.compare_sets import DatasetComparison, compare_datasets
-from physion.trials.making.verify import SAMPLE, verify_dataset
+from physion.trials.making.verify import SAMPLE, DatasetComparison, compare_datasets, verify_dataset
 
 
 @dataclass(frozen=True)

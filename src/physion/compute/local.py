@@ -17,9 +17,8 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from physion.compute.executor import TaskOutcome
-from physion.compute.task import run_task
-from physion.errors import PhysionError
+from physion.compute.tasks import TaskOutcome, run_task
+from physion.core.errors import PhysionError
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -36,7 +35,7 @@ class SerialExecutor:
     """Executor that runs the tasks one after the other in the calling process."""
 
     def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[TaskOutcome[R]]:
-        """Yield outcomes in the order of the tasks; see `physion.compute.executor.Executor`."""
+        """Yield outcomes in the order of the tasks; see `physion.compute.tasks.Executor`."""
         for key, task in tasks.items():
             yield run_task(key, function, task)
 
@@ -93,7 +92,7 @@ class LocalExecutor:
             worker.stop()
 
     def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[TaskOutcome[R]]:
-        """Yield outcomes as they come; see `physion.compute.executor.Executor`."""
+        """Yield outcomes as they come; see `physion.compute.tasks.Executor`."""
         waiting = deque(_QueuedTask(key, task) for key, task in tasks.items())
         workers = self._start_workers(function, min(self.workers, len(tasks)))
         failed_starts = 0

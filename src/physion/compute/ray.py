@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from physion.compute.executor import TaskOutcome
 from physion.compute.local import TRIES, available_cores
-from physion.compute.task import run_task
-from physion.errors import BadInputError, MissingExtraError, PhysionError
+from physion.compute.tasks import TaskOutcome, run_task
+from physion.core.errors import BadInputError, MissingExtraError, PhysionError
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -92,7 +91,7 @@ class RayExecutor:
         self._ray: Any = ray
 
     def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[TaskOutcome[R]]:
-        """Yield outcomes as they come; see `physion.compute.executor.Executor`."""
+        """Yield outcomes as they come; see `physion.compute.tasks.Executor`."""
         if not tasks:
             return
         ray = self._ray

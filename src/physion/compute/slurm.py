@@ -15,10 +15,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from physion.compute.executor import TaskOutcome
 from physion.compute.local import TRIES
-from physion.compute.task import log_path, run_task
-from physion.errors import BadInputError, MissingExtraError, PhysionError
+from physion.compute.tasks import TaskOutcome, log_path, run_task
+from physion.core.errors import BadInputError, MissingExtraError, PhysionError
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -120,7 +119,7 @@ class SlurmExecutor:
         self._submitit: Any = submitit
 
     def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[TaskOutcome[R]]:
-        """Yield outcomes as they come; see `physion.compute.executor.Executor`."""
+        """Yield outcomes as they come; see `physion.compute.tasks.Executor`."""
         size = self.settings.tasks_per_job
         keys = list(tasks)
         groups = [_Group(tuple(keys[i : i + size])) for i in range(0, len(keys), size)]

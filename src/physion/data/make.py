@@ -16,7 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from physion.atomic import write_atomic
+from physion.core.errors import BadInputError
+from physion.core.files import write_atomic
+from physion.core.names import canonical_name
+from physion.core.settings import parse_json
 from physion.data.official import (
     HUMANS,
     LABELS,
@@ -28,10 +31,7 @@ from physion.data.official import (
     official,
     trial_line,
 )
-from physion.dataclass_json import parse_json
-from physion.errors import BadInputError
 from physion.scenes.tdw.read_logs import ImportedTrial, read_scenes
-from physion.stimulus_names import canonical_name
 
 RESULT_FILES = (
     "human_accuracy_by_scenario.csv",

@@ -25,11 +25,11 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from physion.dataclass_json import parse_json, read_dataclass
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
+from physion.core.names import canonical_name
+from physion.core.settings import parse_json, read_dataclass
 from physion.scenes.scene import Scene
 from physion.scenes.tdw.read_logs import ImportedTrial, RecordedOutcome, TrialSet
-from physion.stimulus_names import canonical_name
 
 PACKAGED = "official"
 """What the command line takes in place of a folder for the data of the package."""

@@ -14,7 +14,7 @@ from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import Response
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.experiment.experimenter.routes import build_router
 from physion.experiment.protocol.refused import Refused
 from physion.experiment.study.media_links import read_media

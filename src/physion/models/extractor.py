@@ -24,8 +24,8 @@ import torch
 from PIL import Image
 from torch import Tensor, nn
 
-from physion.errors import BadInputError
-from physion.models.batch import LAST_OBSERVED, Batch, Provenance, Spec
+from physion.clips.batch import LAST_OBSERVED, Batch, Provenance, Spec
+from physion.core.errors import BadInputError
 from physion.models.torch_model import TorchModel, digest_of, source_of
 
 _VERSION = 1

@@ -12,16 +12,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.errors import BadInputError
-from physion.numerics.elementary import cos, exp, sin
+from physion.core.errors import BadInputError
+from physion.core.seeds import child_generator, trial_seed
+from physion.numerics.elementary import cos, exp, sin, standard_normal
 from physion.numerics.linear_algebra import norm
-from physion.numerics.random_normals import standard_normal
 from physion.numerics.rotations import multiply_quaternions
 from physion.physics.engine import Engine, simulate_many
 from physion.physics.labels import label_contact
 from physion.physics.trajectory import State, Trajectory
 from physion.scenes.scene import Scene, SurfaceMaterial
-from physion.seeds import child_generator, trial_seed
 
 F64 = NDArray[np.float64]
 

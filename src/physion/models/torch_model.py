@@ -16,9 +16,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from physion.models.batch import Provenance, Spec
-from physion.models.from_file import FileLoader
-from physion.seeds import stable_hash
+from physion.clips.batch import Provenance, Spec
+from physion.core.seeds import stable_hash
+from physion.models.build import FileLoader
 
 _KNOWN_PACKAGES = {"abc", "builtins", "physion", "torch", "typing"}
 """Packages whose versions, not sources, belong to the digest of a model."""

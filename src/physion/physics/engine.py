@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
+from dataclasses import asdict
+from typing import Any, Protocol, runtime_checkable
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
+from physion.core.registry import Registry
 from physion.physics.trajectory import State, Trajectory
-from physion.registry import Registry
 from physion.scenes.scene import Scene
 
 
@@ -187,3 +190,12 @@ def simulate_many(
         )
         for index, scene in enumerate(scenes)
     ]
+
+
+# Tag that distinguishes the settings of engines in the names of their results.
+
+
+def settings_tag(settings: Any) -> str:
+    """Return eight hexadecimal digits that change whenever a field of a dataclass does."""
+    text = json.dumps(asdict(settings), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:8]

@@ -15,14 +15,14 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
+from physion.core.seeds import child_generator, named_seed
 from physion.numerics.linear_algebra import norm
 from physion.numerics.rotations import rotate_vectors
 from physion.physics.trajectory import Trajectory
 from physion.scenes.scene import Scene, Vec3
 from physion.scenes.shapes.meshes import Mesh
 from physion.scenes.shapes.primitives import shape
-from physion.seeds import child_generator, named_seed
 
 SPACING, CLOTH_SPACING = 0.05, 0.035
 """Metres between particles, and those of scenes with cloth (docs/official-system.md, section 6)."""

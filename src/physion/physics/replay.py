@@ -11,15 +11,14 @@ from statistics import fmean
 import numpy as np
 from scipy.stats import rankdata
 
+from physion.core.seeds import child_generator, trial_seed
 from physion.numerics.elementary import log_of
 from physion.numerics.linear_algebra import norm
 from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine, simulate_many
-from physion.physics.jitter import jitter_scene, pair_agreement
-from physion.physics.labels import label_contact
+from physion.physics.labels import jitter_scene, label_contact, pair_agreement
 from physion.physics.trajectory import Trajectory
 from physion.scenes.scene import FRAME_TIME
 from physion.scenes.tdw.read_logs import ImportedTrial
-from physion.seeds import child_generator, trial_seed
 
 SMOOTHING = 0.5
 """Added to the runs of either outcome before the logarithm: P = (k + .5) / (n + 1) for k of n runs,

@@ -11,21 +11,20 @@ from typing import Any
 
 import pandas as pd
 
-from physion.compute.executor import Executor
-from physion.compute.progress import Progress, tracked
-from physion.digests import is_whole
-from physion.errors import BadInputError
-from physion.models.batch import Provenance
+from physion.clips.batch import Provenance
+from physion.compute.tasks import Executor, Progress, tracked
+from physion.core.errors import BadInputError
+from physion.core.files import is_whole
+from physion.core.version import __version__
 from physion.models.build import build_model
 from physion.models.interface import Learns, Model
-from physion.readout.capabilities import choose_readouts
 from physion.readout.folds import Fold, plan_folds, select_scenario
 from physion.readout.model_calls import check_identity
-from physion.readout.predictor import Predictor
+from physion.readout.predictor import Predictor, choose_readouts
 from physion.readout.protocols import Readout
 from physion.readout.rollout_error import check_moves_objects, rollout_error
 from physion.readout.settings import EvaluationConfig
-from physion.readout.table import (
+from physion.readout.tables import (
     ORDER,
     Evaluation,
     ScenarioPredictions,
@@ -36,7 +35,6 @@ from physion.readout.table import (
 )
 from physion.training.protocols import Training
 from physion.trials.dataset import Dataset
-from physion.version import __version__
 
 PARTS = "parts"
 """Folder of the tables of single scenarios."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from physion.errors import BadInputError, UnknownNameError
-from physion.seeds import stable_hash
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.seeds import stable_hash
 from physion.training.protocols import Training, TrainingSet, set_name, training_sets
 
 TRAINING, READOUT, TESTING = "training", "readout", "testing"

@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
+from physion.core.seeds import generator
 from physion.physics.trajectory import Contacts, Trajectory
 from physion.scenes.scene import OBSERVED_FRAMES
-from physion.seeds import generator
 from physion.trials.dataset import Dataset
 from physion.trials.index import write_index
 from physion.trials.trial_file import Trial, write_trial

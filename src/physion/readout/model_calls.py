@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.errors import BadInputError, PhysionError
-from physion.models.batch import Batch, Provenance
+from physion.clips.batch import Batch, Provenance
+from physion.core.errors import BadInputError, PhysionError
+from physion.models.build import OutOfMemoryError, describe_raised, is_out_of_memory
 from physion.models.interface import Model
-from physion.models.raised import OutOfMemoryError, describe_raised, is_out_of_memory
 
 MEMORY_ADVICE = "use a smaller image_size or size of the model, or fewer samples"
 """What to do if memory is used up by a single clip."""

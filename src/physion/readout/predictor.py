@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,33 +13,121 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.compute.executor import Executor
+from physion.clips.batch import Batch
+from physion.clips.clips import observed_source, whole_source
+from physion.clips.source import ObservedSource, WholeSource
 from physion.compute.local import SerialExecutor
-from physion.compute.progress import Progress
-from physion.errors import BadInputError
-from physion.models.batch import Batch
+from physion.compute.tasks import Executor, Progress
+from physion.core.errors import BadInputError
 from physion.models.interface import (
+    Encodes,
     Fits,
     HasReader,
+    Imagines,
     ImaginesInProcesses,
     Learns,
     Model,
+    Predicts,
     SeesOutcomes,
     Trained,
 )
-from physion.readout.capabilities import Way, build_reader, reader_name
-from physion.readout.features.feature_store import FeatureStore
-from physion.readout.features.stored_features import StoredFeatures
+from physion.readout.decisions import FeatureReader, Reading, RolloutReader, readers
+from physion.readout.features import (
+    FeatureStore,
+    Knobs,
+    Outcomes,
+    RolloutStore,
+    StoredFeatures,
+    all_knobs,
+    stack_outcomes,
+)
 from physion.readout.folds import Fold, ScenarioSplit
+from physion.readout.logistic import ReadoutConfig
 from physion.readout.model_calls import call_model, check_finite, is_network, to_array
 from physion.readout.protocols import Readout
-from physion.readout.readers.reader import Reading
-from physion.readout.rollouts import Knobs, Outcomes, RolloutStore, all_knobs, stack_outcomes
 from physion.readout.settings import EvaluationConfig
-from physion.readout.table import ScenarioPredictions, describe_labels
-from physion.training.sources.open_source import observed_source, whole_source
-from physion.training.sources.source import ObservedSource, WholeSource
+from physion.readout.tables import ScenarioPredictions, describe_labels
 from physion.trials.dataset import Dataset
+
+# Which readout protocols a model supports, and how its predictions are made under each.
+
+
+class Way(Enum):
+    """How predictions are made."""
+
+    ANSWERS = "the model answers"
+    FEATURES = "a reader of features"
+    ROLLOUTS = "a reader of rollouts"
+
+
+def reader_name(model: Model, wanted: str = "") -> str:
+    """Return the name of the reader: ``wanted``, the model's own, or the one that fits it."""
+    if wanted:
+        return wanted
+    if isinstance(model, HasReader):
+        return model.reader
+    return "logistic" if isinstance(model, Encodes) else "gap"
+
+
+def build_reader(model: Model, wanted: str, config: ReadoutConfig) -> FeatureReader | RolloutReader:
+    """Return the reader of a model; raise `BadInputError` if it does not fit the model."""
+    name = reader_name(model, wanted)
+    reader = readers.get(name)(config)
+    if reader.input == "features" and not isinstance(model, Encodes):
+        raise BadInputError(
+            f"reader {name!r} reads features, but model {model.provenance().model} has no "
+            "method encode; use the reader gap or noise"
+        )
+    if reader.input == "rollouts" and not isinstance(model, Imagines):
+        raise BadInputError(
+            f"reader {name!r} reads rollouts, but model {model.provenance().model} has no "
+            "method imagine; use the reader logistic"
+        )
+    return reader
+
+
+def ways(model: Model, reader: str = "") -> dict[Readout, Way]:
+    """Return the readout protocols that a model supports, and the way of each.
+
+    Raises `BadInputError` for a model without any.
+    """
+    found: dict[Readout, Way] = {}
+    if isinstance(model, Encodes):
+        found[Readout.OBSERVED] = Way.FEATURES
+        if model.spec.future:
+            found[Readout.FULL] = Way.FEATURES
+    if isinstance(model, Imagines):
+        by_features = readers.get(reader_name(model, reader))(ReadoutConfig()).input == "features"
+        found[Readout.OBSERVED_SIMULATED] = Way.FEATURES if by_features else Way.ROLLOUTS
+    if isinstance(model, Predicts | Fits):
+        found[Readout.named(model.answers)] = Way.ANSWERS
+    if not found:
+        raise BadInputError(
+            f"{_name(model)} has none of the methods encode, imagine, predict and fit, so that it "
+            "cannot be evaluated"
+        )
+    return {readout: found[readout] for readout in Readout if readout in found}
+
+
+def choose_readouts(model: Model, names: tuple[str, ...], reader: str = "") -> dict[Readout, Way]:
+    """Return the requested protocols, by default all that the model supports.
+
+    Raises `BadInputError` for a protocol that the model does not support.
+    """
+    possible = ways(model, reader)
+    requested = [Readout.named(name) for name in names]
+    impossible = [readout.value for readout in requested if readout not in possible]
+    if impossible:
+        raise BadInputError(
+            f"{_name(model)} does not support the readout protocol {', '.join(impossible)}; "
+            f"supported: {', '.join(readout.value for readout in possible)}"
+        )
+    return {r: way for r, way in possible.items() if not requested or r in requested}
+
+
+def _name(model: Any) -> str:
+    return str(model.provenance().model)
+
 
 _UNKNOWN = float("nan")
 _ANSWER_TRIALS = 16

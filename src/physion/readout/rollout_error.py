@@ -15,14 +15,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from physion.compute.progress import Progress
-from physion.errors import BadInputError
-from physion.models.batch import LAST_OBSERVED, Motion, Spec
+from physion.clips.batch import LAST_OBSERVED, Motion, Spec
+from physion.clips.clips import observed_source, whole_source
+from physion.compute.tasks import Progress
+from physion.core.errors import BadInputError
 from physion.models.interface import HasReader, Model
 from physion.models.particles.bodies import Poses, SceneParticles, poses_of
 from physion.readout.model_calls import model_name
 from physion.scenes.scene import Scene
-from physion.training.sources.open_source import observed_source, whole_source
 from physion.trials.dataset import Dataset
 
 HORIZON = 105

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.readout.logistic import ReadoutConfig
-from physion.training.overrides import TrainingOverrides
+from physion.training.loop import TrainingOverrides
 
 
 @dataclass(frozen=True, kw_only=True)

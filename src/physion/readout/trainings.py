@@ -12,12 +12,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from physion.compute.progress import Progress
-from physion.errors import BadInputError, MissingExtraError
+from physion.compute.tasks import Progress
+from physion.core.errors import BadInputError, MissingExtraError
 from physion.models.build import build_model
 from physion.models.interface import Model
 from physion.readout.folds import READOUT, TESTING, TRAINING, plan_folds, select_scenario
-from physion.training.overrides import TrainingOverrides
+from physion.training.loop import TrainingOverrides
 from physion.training.protocols import Training, training_sets
 from physion.trials.dataset import Dataset
 
@@ -109,8 +109,8 @@ class Trainer:
         open_devices: Callable[[str], Fabric] | None = None,
     ) -> None:
         # Imported late: a plan that is done trains nothing and reads no trial.
-        from physion.readout.features.feature_store import FeatureStore
-        from physion.training.sources.open_source import whole_source
+        from physion.clips.clips import whole_source
+        from physion.readout.features import FeatureStore
 
         try:
             from physion.training.train import check_trainable

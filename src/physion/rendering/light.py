@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from physion.numerics.elementary import exp, power
 from physion.numerics.linear_algebra import apply, norm, unit
-from physion.rendering.depth_maps import BLOCK, DepthMap
-from physion.rendering.records import LIGHT, Records
+from physion.rendering.rasterizer import BLOCK, LIGHT, DepthMap, Records
 from physion.rendering.rooms import Room
 from physion.rendering.shading import TONES, WHITEST
 from physion.scenes.scene import Scene
@@ -61,7 +60,7 @@ def empty_maps(scene: Scene, room: Room) -> tuple[StaticDepthMap, StaticDepthMap
 
 
 def pack_light(room: Room) -> Records:
-    """Return the light of a room as one record of `physion.rendering.records.LIGHT`, (1,)."""
+    """Return the light of a room as one record of `physion.rendering.rasterizer.LIGHT`, (1,)."""
     light = np.zeros(1, LIGHT)
     light["direction"] = unit(room.light_direction)
     light["color"] = room.light_color

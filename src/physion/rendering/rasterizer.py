@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.numerics.kernel import kernel
+from physion.rendering.textures.atlas import Atlas
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -365,3 +366,230 @@ def shows_back(edges: F64, t: int) -> bool:
     a2, b2, c2 = edges[t, 2, 0], edges[t, 2, 1], edges[t, 2, 2]
     determinant = a0 * (b1 * c2 - b2 * c1) - b0 * (a1 * c2 - a2 * c1) + c0 * (a1 * b2 - a2 * b1)
     return bool(determinant > 0.0)
+
+
+# Depth maps of what lies between a surface and the light, or above the ground.
+#
+# The shadow map looks along the directional light; it tells how much of that light reaches a
+# point. The occlusion map looks straight up from below; it tells how much of the sky over a point
+# is hidden by things that stand on the ground near it or hang low above it.
+#
+# References
+# ----------
+# Reeves, W., Salesin, D. and Cook, R. (1987). Rendering antialiased shadows with depth maps.
+#     SIGGRAPH.
+# Bunnell, M. (2005). Dynamic ambient occlusion and indirect lighting. GPU Gems 2.
+
+BLOCK = 8
+"""Texels along the side of a block of `DepthMap.occupied`."""
+SHADOW_RADIUS = 2
+"""Texels of the shadow map on each side of the nearest one that a lookup averages."""
+SHADOW_AREA = float((2 * SHADOW_RADIUS + 1) * (2 * SHADOW_RADIUS + 1))
+OCCLUSION_RADIUS = 3
+"""Texels of the occlusion map on each side of the nearest one that a lookup averages."""
+OCCLUSION_AREA = float((2 * OCCLUSION_RADIUS + 1) * (2 * OCCLUSION_RADIUS + 1))
+OCCLUSION_REACH = 0.25
+"""Metres above a point beyond which a thing does not darken it."""
+OCCLUSION_TOLERANCE = 0.004
+"""Metres by which a thing may lie lower than the point that it darkens."""
+
+
+class DepthMap(NamedTuple):
+    """Smallest depth of anything in each texel, by parallel projection.
+
+    - ``matrix`` (3, 4) float64: from world (x, y, z, 1) to texel x, texel y, depth in metres.
+    - ``depth`` (H, W) float32: metres; infinity where there is nothing.
+    - ``occupied`` (H / BLOCK, W / BLOCK) bool: blocks of texels in which, or in a neighbour of
+      which, there is anything. Elsewhere a lookup is skipped.
+    """
+
+    matrix: F64
+    depth: F32
+    occupied: NDArray[np.bool_]
+
+
+@kernel
+def lit_fraction(shadow: DepthMap, px: float, py: float, pz: float) -> float:
+    """Return the fraction, 0..1, of the directional light that reaches a world point.
+
+    Percentage-closer filtering (Reeves, Salesin and Cook 1987): the depth z of the point is
+    compared with each texel near it, and the results are averaged,
+
+        lit = sum of w_i [depth_i >= z] / sum of w_i.
+
+    The window is 5 x 5 texels wide and centred on the point, not on a texel: of 6 x 6 texels the
+    outer ones are weighted by the fraction that the window covers, so that shadows move smoothly.
+    Outside the map everything is lit.
+    """
+    m, depth, occupied = shadow.matrix, shadow.depth, shadow.occupied
+    x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3] - 0.5
+    y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3] - 0.5
+    low, high = -SHADOW_RADIUS, SHADOW_RADIUS + 1
+    height, width = depth.shape
+    if x < SHADOW_RADIUS or y < SHADOW_RADIUS or x >= width - high or y >= height - high:
+        return 1.0
+    j, i = int(x), int(y)
+    if not occupied[i // BLOCK, j // BLOCK]:
+        return 1.0
+    z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
+    ax, ay = x - j, y - i
+    total = 0.0
+    for row in range(low, high + 1):
+        line = 0.0
+        for column in range(low + 1, high):
+            if depth[i + row, j + column] >= z:
+                line += 1.0
+        if depth[i + row, j + low] >= z:
+            line += 1.0 - ax
+        if depth[i + row, j + high] >= z:
+            line += ax
+        total += line * (1.0 - ay if row == low else (ay if row == high else 1.0))
+    return float(total / SHADOW_AREA)
+
+
+@kernel
+def occluded_fraction(occlusion: DepthMap, px: float, py: float, pz: float) -> float:
+    """Return how much of the surroundings of a world point is hidden by things above it, 0..1.
+
+    Each texel near the point whose lowest thing is ``gap`` metres above it counts
+    1 - gap / `OCCLUSION_REACH`, nothing beyond that reach; the result is the mean over a window of
+    7 x 7 texels, centred on the point as in `lit_fraction`. It stands for the integral of hidden
+    directions over the hemisphere (Bunnell 2005), of which nearer things hide more.
+    """
+    m, depth, occupied = occlusion.matrix, occlusion.depth, occlusion.occupied
+    x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3] - 0.5
+    y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3] - 0.5
+    low, high = -OCCLUSION_RADIUS, OCCLUSION_RADIUS + 1
+    height, width = depth.shape
+    if x < OCCLUSION_RADIUS or y < OCCLUSION_RADIUS or x >= width - high or y >= height - high:
+        return 0.0
+    j, i = int(x), int(y)
+    if not occupied[i // BLOCK, j // BLOCK]:
+        return 0.0
+    ax, ay = x - j, y - i
+    total = 0.0
+    for row in range(low, high + 1):
+        line = 0.0
+        for column in range(low, high + 1):
+            gap = depth[i + row, j + column] - pz
+            if -OCCLUSION_TOLERANCE < gap < OCCLUSION_REACH:
+                weight = 1.0 - gap / OCCLUSION_REACH
+                line += weight * (1.0 - ax if column == low else (ax if column == high else 1.0))
+        total += line * (1.0 - ay if row == low else (ay if row == high else 1.0))
+    return float(total / OCCLUSION_AREA)
+
+
+# Records that the colour pass reads and writes: camera, surfaces, materials, light, points.
+#
+# Fields of one kind stand side by side in one array of records. With one array for each field, in
+# nested NamedTuples, the colour pass took 1.5 times as long: numba passes each array to each
+# kernel by value and counts references to it.
+
+U8 = NDArray[np.uint8]
+Records = NDArray[np.void]
+
+CAMERA = np.dtype([("position", "f8", 3), ("rays", "f8", (3, 3))], align=True)
+"""The camera: its position in metres; the matrix from a pixel (x, y, 1) to the world vector from
+the camera to depth 1 m."""
+SURFACE = np.dtype(
+    [
+        ("normals", "f4", (3, 3)),
+        ("uv", "f4", (3, 2)),
+        ("tangents", "f4", (2, 3)),
+        ("material", "i4"),
+    ],
+    align=True,
+)
+"""A triangle.
+
+- ``normals``: normal of each corner in the world. ``uv``: texture coordinates of each corner.
+- ``tangents``: world directions of growing u and v.
+- ``material``: index of its `MATERIAL`.
+"""
+MATERIAL = np.dtype(
+    [
+        *(("color", "f8", 3), ("texture", "i8"), ("specular", "f8"), ("exponent", "f8")),
+        *(("reflectance", "f8"), ("metalness", "f8"), ("normal_scale", "f8")),
+        *(("emission", "f8"), ("occluded", "?")),
+    ],
+    align=True,
+)
+"""A surface material.
+
+- ``color``: linear colour; the albedo is its product with the texture. ``texture``: index into the
+  atlas.
+- ``specular``, ``exponent``: strength and exponent of the highlight.
+- ``reflectance``: fraction of the environment that is reflected seen straight on.
+- ``metalness``: 0 dielectric .. 1 metal, whose reflections have the colour of its albedo.
+- ``normal_scale``: factor of the texture's slopes in the normal map; 0 is without.
+- ``emission``: light of its own, as a multiple of the albedo.
+- ``occluded``: whether the room's walls darken it near the edges between them.
+"""
+LIGHT = np.dtype(
+    [
+        *(("direction", "f8", 3), ("color", "f8", 3)),
+        *(("ambient", "f8", 3), ("ambient_slopes", "f8", (3, 3)), ("environment", "f8", (3, 3))),
+        *(("window_low", "f8", 3), ("window_high", "f8", 3), ("window_color", "f8", 3)),
+        *(("room_low", "f8", 3), ("room_high", "f8", 3), ("background", "f8", 3)),
+        *(("shadow_strength", "f8"), ("occlusion_strength", "f8")),
+    ],
+    align=True,
+)
+"""Light of a room; colours are linear.
+
+- ``direction``: unit vector towards the directional light. ``color``: its colour.
+- ``ambient``, ``ambient_slopes``: the ambient light of a normal n is
+  ``ambient + n @ ambient_slopes``, so that walls differ.
+- ``environment``: what reflections show at the sides, below and above (rows).
+- ``window_low``, ``window_high``, ``window_color``: corners of a bright rectangle in a plane of one
+  y, which reflections show too, and its colour.
+- ``room_low``, ``room_high``: corners of the room, for ambient occlusion near its edges.
+- ``background``: colour where nothing is seen.
+- ``shadow_strength``: fraction of the directional light that a full shadow takes.
+- ``occlusion_strength``: fraction of all light that full occlusion under objects takes.
+"""
+POINT = np.dtype(
+    [
+        *(("position", "f4", 3), ("normal", "f4", 3)),
+        *(("ambient", "f4", 3), ("direct", "f4", 3), ("levelness", "f4")),
+    ],
+    align=True,
+)
+"""A surface point with its light before shadows.
+
+- ``position``: metres in the world. ``normal``: unit, before normal mapping.
+- ``ambient``: ambient light, environment and emission that the point sends.
+- ``direct``: the directional light that it sends if lit.
+- ``levelness``: 1 for a horizontal surface that faces up, 0 from 60 degrees on; the weight of the
+  occlusion under objects.
+"""
+
+
+class ShadingInputs(NamedTuple):
+    """Everything about a scene that is the same for all its pixels.
+
+    - ``camera`` (1,) of `CAMERA`; ``lights`` (1,) of `LIGHT`; ``materials`` (M,) of `MATERIAL`.
+    - ``edges`` (T, 3, 3): edge functions of the triangles, written by
+      `physion.rendering.rasterizer.rasterize`.
+    - ``surfaces`` (T,) of `SURFACE`; ``groups`` (T,): triangles of one number make one smooth
+      surface and are shaded as one.
+    - ``atlas``: the textures.
+    - ``tones`` (TONES,) uint8: the sRGB bytes of linear light, see
+      `physion.rendering.light.tone_table`.
+    """
+
+    camera: Records
+    edges: F64
+    surfaces: Records
+    groups: I32
+    materials: Records
+    atlas: Atlas
+    lights: Records
+    tones: U8
+
+
+class LightMaps(NamedTuple):
+    """Depth maps of one frame: of the directional light, and of what hangs low over the ground."""
+
+    shadow: DepthMap
+    occlusion: DepthMap

@@ -12,31 +12,29 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.numerics.linear_algebra import apply
 from physion.physics.trajectory import Trajectory
 from physion.rendering.camera import View
-from physion.rendering.depth_maps import DepthMap
 from physion.rendering.light import StaticDepthMap, empty_maps, pack_light, tone_table
 from physion.rendering.rasterizer import (
+    CAMERA,
     NOTHING,
+    POINT,
     SAMPLES,
+    SURFACE,
+    DepthMap,
     DepthRange,
     GeometryBuffers,
+    LightMaps,
+    Records,
+    ShadingInputs,
     SurfaceMotion,
     Triangles,
     VisibilityBuffer,
     fill_geometry_buffers,
     rasterize,
     rasterize_depth,
-)
-from physion.rendering.records import (
-    CAMERA,
-    POINT,
-    SURFACE,
-    LightMaps,
-    Records,
-    ShadingInputs,
 )
 from physion.rendering.rooms import Room, rooms
 from physion.rendering.shading import shade, shade_static_points

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from physion.core.registry import Registry
 from physion.numerics.linear_algebra import norm
-from physion.registry import Registry
 from physion.scenes.scene import Vec3
 
 F64 = NDArray[np.float64]
@@ -58,7 +58,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Room:
-    """Panels and light; colours of light are linear, see `physion.rendering.records.LIGHT`.
+    """Panels and light; colours of light are linear, see `physion.rendering.rasterizer.LIGHT`.
 
     - ``panels``: the first one is the floor.
     - ``low``, ``high``: corners of the box that the walls, floor and ceiling make.

@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 from physion.numerics.linear_algebra import apply, dot, norm, unit
 from physion.numerics.rotations import rotation_matrices
 from physion.physics.trajectory import Trajectory
-from physion.rendering.geometry import F32, F64, I32, MeshPart, sheet, solid
+from physion.rendering.camera import F32, F64, I32, MeshPart, sheet, solid
 from physion.rendering.light import to_linear
-from physion.rendering.paint import painted
-from physion.rendering.records import MATERIAL, Records
+from physion.rendering.rasterizer import MATERIAL, Records
 from physion.rendering.rooms import Panel, Room
-from physion.rendering.textures.atlas import Finish, build_atlas, finish
-from physion.rendering.textures.lookup import Atlas
+from physion.rendering.shading import painted
+from physion.rendering.textures.atlas import Atlas, Finish, build_atlas, finish
 from physion.scenes.scene import Look, Scene
 from physion.scenes.shapes.primitives import shape
 
@@ -95,7 +94,7 @@ class _MaterialTable:
         return len(self._colors) - 1
 
     def materials(self) -> Records:
-        """Return all materials (M,) of `physion.rendering.records.MATERIAL`."""
+        """Return all materials (M,) of `physion.rendering.rasterizer.MATERIAL`."""
         table = np.zeros(len(self._colors), MATERIAL)
         table["color"] = to_linear(self._colors)
         table["emission"], table["occluded"] = self._emission, self._occluded

@@ -29,8 +29,9 @@ from physion.analysis.tables.stimuli import (
     in_order,
     read_stimulus_list,
 )
-from physion.atomic import write_atomic
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
+from physion.core.files import write_atomic
+from physion.core.version import MADE_WITH
 from physion.report.figures.registry import make_plots
 from physion.report.inputs import ReportInputs
 from physion.report.page.movies import check_movies
@@ -47,7 +48,6 @@ from physion.report.settings_text import (
     read_by_model,
 )
 from physion.report.write import prepare_folder, write_csv, write_plot
-from physion.version import MADE_WITH
 
 ZONE_FILE = "human_accuracy_by_scenario.csv"
 

@@ -13,7 +13,8 @@ from physion.analysis.models.figure_tables import response_time_table
 from physion.analysis.people.difficulty import below_chance_level
 from physion.analysis.people.results import PeopleResults
 from physion.analysis.tables.stimuli import in_order
-from physion.atomic import write_atomic
+from physion.core.files import write_atomic
+from physion.core.version import MADE_WITH
 from physion.report.figures.by_stimulus.difficulty import CAPTION as DIFFICULTY
 from physion.report.figures.by_stimulus.difficulty import difficulty_figure
 from physion.report.figures.by_stimulus.response_time import CAPTION as RESPONSE_TIME
@@ -23,7 +24,6 @@ from physion.report.page import blocks, people_blocks, session_blocks
 from physion.report.page.document import Picture, Section, figure, render_document
 from physion.report.words import plural
 from physion.report.write import prepare_folder, write_csv, write_plot
-from physion.version import MADE_WITH
 
 TITLE = "People on physical prediction"
 

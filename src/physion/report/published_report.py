@@ -19,7 +19,8 @@ from physion.analysis.models.figure_tables import (
 from physion.analysis.published.cells import grid
 from physion.analysis.published.summary import TITLES, PublishedResults
 from physion.analysis.tables.stimuli import MEAN
-from physion.atomic import write_atomic
+from physion.core.files import write_atomic
+from physion.core.version import MADE_WITH
 from physion.report.figures.by_scenario.model_and_people import model_and_people_figure
 from physion.report.figures.by_stimulus.difficulty import difficulty_figure
 from physion.report.figures.conditions import grouped_figure
@@ -29,7 +30,6 @@ from physion.report.page.blocks import PageColumn, details, p_value, paragraph, 
 from physion.report.page.document import Section, figure, render_document
 from physion.report.words import number
 from physion.report.write import prepare_folder, write_csv, write_plot
-from physion.version import MADE_WITH
 
 TITLE = "The published results of the original study, recomputed from its released tables"
 

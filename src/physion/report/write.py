@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from physion.atomic import write_atomic
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
+from physion.core.files import write_atomic
 from physion.report.figures import theme
 from physion.report.figures.theme import Plot
 from physion.report.page.document import Picture, page_kind

@@ -9,9 +9,9 @@ from types import MappingProxyType
 
 import numpy as np
 
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.seeds import child_generator, named_seed
 from physion.scenes.scene import Body, Cloth, Look, Scene, Vec3
-from physion.seeds import child_generator, named_seed
 
 MATERIALS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {

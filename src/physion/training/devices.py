@@ -13,9 +13,9 @@ from lightning_fabric import Fabric
 from lightning_fabric.strategies.ddp import DDPStrategy
 from lightning_fabric.utilities.rank_zero import rank_zero_only
 
-from physion.errors import BadInputError
-from physion.models.raised import OutOfMemoryError, is_out_of_memory
-from physion.models.settings import TrainingSettings
+from physion.core.errors import BadInputError
+from physion.models.build import OutOfMemoryError, is_out_of_memory
+from physion.models.interface import TrainingSettings
 
 PRECISIONS = ("32-true", "16-mixed", "bf16-mixed")
 """Precisions in which weights and features stay float32."""

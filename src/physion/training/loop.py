@@ -6,39 +6,495 @@ device does not wait for the processor at every step.
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import math
 import os
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
-from dataclasses import dataclass
-from typing import Any
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
 
 import torch
 from lightning_fabric import Fabric
-from torch import Tensor
+from torch import Tensor, nn
 
-from physion.errors import BadInputError, PhysionError
-from physion.models.batch import Batch
-from physion.models.checkpoints.checkpoint import load_tensors, tensors_of
-from physion.models.interface import HasBaseline
-from physion.models.settings import TrainingSettings
-from physion.seeds import stable_hash
-from physion.training.folder import CheckpointContent, TrainingFolder
-from physion.training.losses import (
-    LOSS,
-    Given,
-    Learner,
-    call,
-    evaluating,
-    losses_of,
-    mean_over,
-    ordered,
+from physion.clips.batch import Batch
+from physion.clips.movies import background
+from physion.core.errors import BadInputError, PhysionError
+from physion.core.files import remove_leftovers, write_atomic
+from physion.core.seeds import stable_hash
+from physion.models.build import describe_raised, is_out_of_memory
+from physion.models.checkpoint import (
+    WEIGHTS,
+    DamagedFileError,
+    check_same,
+    load_tensors,
+    read_checkpoint,
+    tensors_of,
+    versions,
+    write_checkpoint,
 )
-from physion.training.metrics_log import MetricsLog
-from physion.training.schedule import learning_rate
-from physion.training.sources.background import background
-from physion.training.state import TrainingState
+from physion.models.interface import HasBaseline, TrainingSettings
 from physion.training.windows import Request, Windows, step_request, validation_requests
+
+# Losses of a model: checked, wrapped for Fabric, and averaged over held-out clips.
+
+LOSS = "loss"
+
+
+class Given:
+    """Batch on its way through Fabric, which would take a frozen dataclass apart."""
+
+    __slots__ = ("batch",)
+
+    def __init__(self, batch: Batch) -> None:
+        self.batch = batch
+
+
+class Learner(nn.Module):
+    """Module whose ``forward`` is the loss of a model, for Fabric to wrap."""
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, given: Given) -> dict[str, Tensor]:
+        """Return the loss and its parts; only the loss has a gradient."""
+        losses = losses_of(self.model, given.batch)
+        return {name: v if name == LOSS else v.detach() for name, v in losses.items()}
+
+
+@contextmanager
+def evaluating(model: nn.Module, fabric: Fabric) -> Iterator[None]:
+    """Set a model to evaluation mode without gradients; random numbers drawn inside are local."""
+    model.eval()
+    try:
+        with torch.no_grad(), fabric.autocast(), torch.random.fork_rng(devices=[]):
+            yield
+    finally:
+        model.train()
+
+
+def call(model: Any, method: str, batch: Batch) -> Any:
+    """Return what a method of a model returns; what it raises names model, method and line."""
+    try:
+        return getattr(model, method)(batch)
+    except PhysionError:
+        raise
+    except Exception as error:
+        if is_out_of_memory(error):
+            raise
+        raise describe_raised(error, model.provenance().model, method) from error
+
+
+def losses_of(model: Any, batch: Batch) -> dict[str, Tensor]:
+    """Return loss and parts of a batch; raise `BadInputError` if they are no scalars."""
+    name = model.provenance().model
+    losses = call(model, "loss", batch)
+    if not isinstance(losses, Mapping) or LOSS not in losses:
+        raise BadInputError(f"model {name!r}: loss must give a mapping with {LOSS!r}")
+    for part, value in losses.items():
+        if not isinstance(value, Tensor) or value.ndim != 0:
+            found = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+            raise BadInputError(f"model {name!r}: loss gave {part} as {found}, expected a scalar")
+    if torch.is_grad_enabled() and not losses[LOSS].requires_grad:
+        raise BadInputError(f"model {name!r}: loss gave a loss that depends on no weight")
+    return dict(losses)
+
+
+def mean_over(
+    function: Callable[[Batch], Mapping[str, Tensor]],
+    windows: Windows,
+    requests: list[Request],
+    fabric: Fabric,
+    seed: int,
+) -> dict[str, float]:
+    """Return the means, weighted by clips, of what ``function`` gives for ``requests``.
+
+    The batches are divided among the processes. Random operations are seeded by ``seed`` and the
+    number of the batch.
+    """
+    rank, processes = fabric.global_rank, fabric.world_size
+    sums: Tensor | None = None
+    names: tuple[str, ...] = ()
+    # A process without a batch of its own computes the first one and gives it no weight.
+    own = list(range(rank, len(requests), processes)) or [0]
+    batches = background([requests[number] for number in own], windows.read)
+    for number, batch in zip(own, batches, strict=True):
+        weight = len(batch) if number % processes == rank else 0
+        torch.manual_seed(stable_hash("validation", seed, number) % 2**63)
+        values = function(batch.to(fabric.device))
+        names = ordered(values)
+        row = torch.stack([values[name].detach().float() for name in names])
+        row = torch.cat([row * weight, row.new_tensor([weight])])
+        sums = row if sums is None else sums + row
+    reduced = fabric.all_reduce(sums, reduce_op="sum") if sums is not None else None
+    assert isinstance(reduced, Tensor), "there is a batch"
+    *totals, count = reduced.double().cpu().tolist()
+    return {name: total / count for name, total in zip(names, totals, strict=True)}
+
+
+def ordered(losses: Mapping[str, Tensor]) -> tuple[str, ...]:
+    """Return the names of the losses: the loss itself first, then its parts by name."""
+    return (LOSS, *sorted(name for name in losses if name != LOSS))
+
+
+# Learning rate of a step: warm-up, then constant, cosine, or lowered when validation stalls.
+
+_THRESHOLD = 1e-4
+"""Relative decrease of the validation loss that counts as an improvement, as in torch."""
+
+
+def learning_rate(settings: TrainingSettings, step: int, factor: float = 1.0) -> float:
+    """Return the learning rate of a step.
+
+    With base rate r, w steps of warm-up and n steps in all, step k (from 0) has
+
+    - k < w: r (k + 1) / w,
+    - k >= w, ``cosine``: r (1 + cos(pi (k - w) / (n - w))) / 2, which would be 0 at step n,
+    - k >= w, otherwise: r.
+
+    It is multiplied by ``factor``, that of `Plateau`.
+    """
+    rate = settings.learning_rate * factor
+    if step < settings.warmup:
+        return rate * (step + 1) / settings.warmup
+    if settings.schedule == "cosine":
+        done = (step - settings.warmup) / max(settings.steps - settings.warmup, 1)
+        return rate * (1 + math.cos(math.pi * done)) / 2
+    return rate
+
+
+@dataclass
+class Plateau:
+    """Factor of the learning rate that falls when the validation loss stops falling.
+
+    The rule is that of torch's ``ReduceLROnPlateau``: after more than ``patience`` validations in
+    a row that are not lower than the best one by a ten-thousandth, the rate is lowered.
+    """
+
+    factor: float = 1.0
+    best: float | None = None
+    waited: int = 0
+
+    def update(self, loss: float, settings: TrainingSettings) -> None:
+        """Take the loss of a validation into account."""
+        if self.best is None or loss < self.best - abs(self.best) * _THRESHOLD:
+            self.best, self.waited = loss, 0
+            return
+        self.waited += 1
+        if self.waited > settings.plateau_patience:
+            self.factor, self.waited = self.factor * settings.plateau_factor, 0
+
+    def state(self) -> dict[str, Any]:
+        """Return the state as JSON values."""
+        return {"factor": self.factor, "best": self.best, "waited": self.waited}
+
+    @classmethod
+    def of(cls, state: Mapping[str, Any]) -> Plateau:
+        """Return the plateau with a stored `state`."""
+        best = state["best"]
+        return cls(
+            float(state["factor"]), None if best is None else float(best), int(state["waited"])
+        )
+
+
+# How far a training is: what a checkpoint holds in addition to weights and optimiser.
+
+
+@dataclass
+class TrainingState:
+    """How far a training is, as stored in its checkpoints.
+
+    - ``step``: finished steps.
+    - ``recent``: values of the steps since the last line of the metrics, by name.
+    - ``loss``: mean loss of the last interval of ``log_every`` steps.
+    - ``validation``, ``baseline``: of the last validation; NaN without one.
+    """
+
+    step: int = 0
+    recent: list[dict[str, float]] = field(default_factory=list)
+    plateau: Plateau = field(default_factory=Plateau)
+    loss: float = math.nan
+    validation: float = math.nan
+    baseline: float = math.nan
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the state as JSON values."""
+        return {
+            "step": self.step,
+            "recent": self.recent,
+            "plateau": self.plateau.state(),
+            "loss": _finite(self.loss),
+            "validation": _finite(self.validation),
+            "baseline": _finite(self.baseline),
+        }
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> TrainingState:
+        """Return the state with the given JSON values."""
+        losses = {
+            name: math.nan if values[name] is None else float(values[name])
+            for name in ("loss", "validation", "baseline")
+        }
+        plateau = Plateau.of(values["plateau"])
+        return cls(int(values["step"]), list(values["recent"]), plateau, **losses)
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+# Metrics of a training: ``metrics.jsonl``, to which lines are appended, and TensorBoard events.
+
+METRICS, EVENTS = "metrics.jsonl", "events"
+
+
+class MetricsLog:
+    """Log of the metrics of a training, one JSON object a line, in the order of steps.
+
+    It is opened at a step: later lines, of a training that was stopped after its checkpoint, are
+    removed, so that a resumed training neither repeats nor loses a line. If the extra
+    ``tensorboard`` is installed, event files in the folder ``events`` hold the same numbers.
+
+    Parameters
+    ----------
+    folder
+        Folder of the training, which exists.
+    step
+        Number of steps of the checkpoint from which training goes on; 0 for a new training.
+    """
+
+    def __init__(self, folder: Path, step: int) -> None:
+        path = folder / METRICS
+        kept = _lines_until(path, step)
+        text = "".join(line + "\n" for line in kept)
+        if not path.is_file() or path.read_bytes() != text.encode():
+            write_atomic(path, text.encode())
+        # Kept open, and appended to: nothing that was written is written again.
+        self._file = path.open("a", encoding="utf-8")
+        self._events = _open_events(folder / EVENTS)
+        for line in kept:
+            self._add_events(json.loads(line))
+
+    def write(self, step: int, values: Mapping[str, float]) -> None:
+        """Append the values after ``step`` steps; one that is not finite becomes null."""
+        line: dict[str, Any] = {"step": step}
+        line |= {name: value if math.isfinite(value) else None for name, value in values.items()}
+        self._file.write(json.dumps(line) + "\n")
+        self._file.flush()
+        self._add_events(line)
+
+    def sync(self) -> None:
+        """Wait until all lines are on the disk."""
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        if self._events is not None:
+            self._events.flush()
+
+    def __enter__(self) -> MetricsLog:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._file.close()
+        if self._events is not None:
+            self._events.close()
+
+    def _add_events(self, line: Mapping[str, Any]) -> None:
+        if self._events is not None:
+            for name, value in line.items():
+                if name != "step" and value is not None:
+                    self._events.add_scalar(name, value, int(line["step"]))
+
+
+def read_metrics(folder: Path) -> list[dict[str, Any]]:
+    """Return the lines of ``metrics.jsonl`` in the folder of a training."""
+    return [json.loads(line) for line in (folder / METRICS).read_text().splitlines()]
+
+
+def _lines_until(path: Path, step: int) -> list[str]:
+    """Return the whole lines of a file up to ``step``; a cut or damaged line ends them."""
+    kept: list[str] = []
+    if not path.is_file():
+        return kept
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            inside = int(json.loads(line)["step"]) <= step
+        except (ValueError, KeyError, TypeError):
+            break
+        if not inside:
+            break
+        kept.append(line)
+    return kept
+
+
+def _open_events(folder: Path) -> Any:
+    """Return a writer of new event files; None without the extra ``tensorboard``."""
+    try:
+        from tensorboardX import SummaryWriter
+    except ModuleNotFoundError:
+        return None
+    # Written again from the metrics, since events of lines that were removed would stay.
+    shutil.rmtree(folder, ignore_errors=True)
+    return SummaryWriter(str(folder))
+
+
+# Settings of a training that a user sets in place of those of the model.
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingOverrides:
+    """Single fields of `TrainingSettings`; None leaves the value of the model."""
+
+    steps: int | None = None
+    """Steps of the optimiser; default: that of the model, as for all settings up to
+    checkpoint-every."""
+    batch: int | None = None
+    """Clips of a step, divided among the devices."""
+    accumulate: int | None = None
+    """Batches whose gradients are averaged for a step; raise it where memory is short."""
+    optimizer: Literal["adam", "adamw"] | None = None
+    """Optimiser."""
+    learning_rate: float | None = None
+    """Learning rate."""
+    betas: tuple[float, float] | None = None
+    """Decay rates of the optimiser's moments."""
+    weight_decay: float | None = None
+    """Weight decay."""
+    schedule: Literal["constant", "cosine", "plateau"] | None = None
+    """Schedule of the learning rate after the warm-up."""
+    warmup: int | None = None
+    """Steps in which the learning rate rises linearly."""
+    plateau_factor: float | None = None
+    """Factor of the learning rate when the validation loss stalls (schedule plateau)."""
+    plateau_patience: int | None = None
+    """Validations without improvement that are waited for (schedule plateau)."""
+    clip: float | None = None
+    """Largest norm of the gradient; 0 does not clip."""
+    precision: Literal["32-true", "16-mixed", "bf16-mixed"] | None = None
+    """Precision of the computation; weights stay float32."""
+    held_out: float | None = None
+    """Fraction of the trials that is held out for validation."""
+    validate_every: int | None = None
+    """Steps between two validations."""
+    log_every: int | None = None
+    """Steps of which one line of metrics holds the means."""
+    checkpoint_every: int | None = None
+    """Steps between two checkpoints."""
+
+    def apply(self, settings: TrainingSettings) -> TrainingSettings:
+        """Return ``settings`` with the fields that are not None."""
+        # Not of a subclass, which has settings of other things too.
+        names = [field.name for field in dataclasses.fields(TrainingOverrides)]
+        values = {name: getattr(self, name) for name in names}
+        return dataclasses.replace(
+            settings, **{name: value for name, value in values.items() if value is not None}
+        )
+
+
+# Folder of one training: checkpoints while it runs, weights and model card when it is done.
+
+CHECKPOINT, PREVIOUS = "checkpoint.safetensors", "previous.safetensors"
+CARD = "model_card.md"
+_DAMAGED = ".damaged"
+"""Suffix of damaged files that were set aside."""
+
+
+@dataclass(frozen=True, eq=False)
+class CheckpointContent:
+    """Content of a checkpoint, or of the file of a trained model."""
+
+    path: Path
+    tensors: Mapping[str, Tensor]
+    metadata: Mapping[str, Any]
+
+
+class TrainingFolder:
+    """Files of one training.
+
+    While it runs there are two checkpoints, so that one remains if the other is damaged. When it
+    is done, the weights alone are written, without the state of the optimiser, and the checkpoints
+    are deleted.
+
+    Parameters
+    ----------
+    path
+        The folder; it need not exist.
+    config
+        JSON values of everything that determines the weights. Files of another config are refused.
+    """
+
+    def __init__(self, path: Path, config: Mapping[str, Any]) -> None:
+        self.path, self._config = path, config
+        self.notes: list[str] = []
+        """What was found damaged, in sentences."""
+        self._damaged: list[Path] = []
+
+    def finished(self) -> CheckpointContent | None:
+        """Return the trained model, if there is one."""
+        return self._read(WEIGHTS)
+
+    def resumable(self) -> CheckpointContent | None:
+        """Return the newest whole checkpoint, if there is one.
+
+        Raises `BadInputError` if it was written by other versions of the libraries, with which the
+        results would be a mixture.
+        """
+        found = self._read(CHECKPOINT) or self._read(PREVIOUS)
+        if found is not None:
+            check_same(found.path, "version", found.metadata["versions"], versions())
+        if self._damaged:
+            start = f"step {found.metadata['step']}" if found is not None else "the beginning"
+            self.notes.append(f"training goes on from {start}")
+        return found
+
+    def clean(self) -> None:
+        """Create the folder, set damaged files aside, delete what an interrupted writer left."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(self.path)
+        for path in self._damaged:
+            path.replace(path.with_name(path.name + _DAMAGED))
+
+    def save(self, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
+        """Write a checkpoint and keep the one before."""
+        path = self.path / CHECKPOINT
+        if path.is_file():
+            path.replace(self.path / PREVIOUS)
+        write_checkpoint(path, tensors, metadata)
+
+    def finish(self, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any], card: str) -> None:
+        """Write the trained model and its card, and delete the checkpoints."""
+        write_atomic(self.path / CARD, card.encode())
+        write_checkpoint(self.path / WEIGHTS, tensors, metadata)
+        self.remove_checkpoints()
+
+    def remove_checkpoints(self) -> None:
+        """Delete the checkpoints of a training that is done."""
+        for name in (CHECKPOINT, PREVIOUS):
+            (self.path / name).unlink(missing_ok=True)
+
+    def _read(self, name: str) -> CheckpointContent | None:
+        path = self.path / name
+        if not path.is_file():
+            return None
+        try:
+            tensors, metadata = read_checkpoint(path)
+        except DamagedFileError as error:
+            self.notes.append(f"{error}; it is set aside as {name}{_DAMAGED}")
+            self._damaged.append(path)
+            return None
+        check_same(path, "config", metadata["config"], self._config)
+        return CheckpointContent(path, tensors, metadata)
+
 
 _AHEAD = 8
 """Largest number of batches that are read ahead."""

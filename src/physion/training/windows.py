@@ -9,11 +9,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.errors import BadInputError
-from physion.models.batch import Batch, Spec, clip_frames
+from physion.clips.batch import Batch, Spec, clip_frames
+from physion.clips.source import WholeSource
+from physion.core.errors import BadInputError
+from physion.core.seeds import generator
 from physion.models.interface import ChoosesWindows
-from physion.seeds import generator
-from physion.training.sources.source import WholeSource
 
 Floats = NDArray[np.float32]
 

@@ -15,10 +15,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from physion.errors import BadInputError, UnknownNameError
-from physion.trials.index import read_index
-from physion.trials.indexed_file import IndexedFile
-from physion.trials.layout import TrialPaths
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.trials.index import IndexedFile, TrialPaths, read_index
 
 if TYPE_CHECKING:
     from physion.trials.trial_file import Trial
@@ -87,7 +85,7 @@ class Dataset:
     def __init__(self, folder: Path | str, *, verify: bool = True) -> None:
         self.folder, self.verify = Path(folder), verify
         self.index: pd.DataFrame = read_index(self.folder)
-        """Index: one row per trial; columns as in `physion.trials.columns.INDEX_COLUMNS`."""
+        """Index: one row per trial; columns as in `physion.trials.index.INDEX_COLUMNS`."""
 
     def __len__(self) -> int:
         return len(self.index)
@@ -184,7 +182,7 @@ class Dataset:
     ) -> Sequence[dict[str, Any]]:
         """Return clips, one for each trial, which torch's ``DataLoader`` takes as they are.
 
-        The words are those of `physion.models.batch.Spec`; its defaults are those of the study.
+        The words are those of `physion.clips.batch.Spec`; its defaults are those of the study.
 
         Parameters
         ----------
@@ -235,7 +233,7 @@ class Dataset:
         >>> loader = torch.utils.data.DataLoader(clips, 32, shuffle=True)  # doctest: +SKIP
         """
         # By name: training imports this module, and what only reads trials does not need it.
-        made: Any = import_module("physion.training.clips").Clips(
+        made: Any = import_module("physion.clips.clips").Clips(
             self,
             split=split,
             scenario=scenario,

@@ -21,16 +21,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.numerics.rotations import rotate_vectors
 from physion.physics.particles import Particles, particles_over_time
-from physion.physics.rigid.hulls import collision_hulls
-from physion.physics.rigid.mass import hull_mass
+from physion.physics.rigid.bodies import collision_hulls, hull_mass
 from physion.physics.trajectory import ENVIRONMENT
 from physion.rendering.camera import intrinsics, view_matrix
 from physion.scenes.scene import FRAME_TIME, Body, Cloth, Scene, SurfaceMaterial, Vec3
-from physion.trials.geometry import mesh_of
-from physion.trials.trial_file import Trial
+from physion.trials.trial_file import Trial, mesh_of
 
 Floats = NDArray[np.float32]
 Matrix = NDArray[np.float64]

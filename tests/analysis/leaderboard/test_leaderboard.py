@@ -19,7 +19,7 @@ from physion.analysis.leaderboard.submissions import Filters, read_sidecar
 from physion.analysis.people.exclusions import ExclusionRules
 from physion.analysis.people.participants import Responses, clean
 from physion.analysis.people.response_schema import TRIAL_COLUMNS, check_table
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.report.leaderboard_page import leaderboard_page
 
 QUICK = Bootstrap(resamples=200)

@@ -10,7 +10,7 @@ from physion.analysis.mixed.design import build_design
 from physion.analysis.mixed.formula import split_formula
 from physion.analysis.mixed.linear import fit_linear
 from physion.analysis.mixed.logistic import fit_logistic
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
 from support.simulated_answers import AnswerDesign, simulate_answers
 
 CROSSED = "(1|participant) + (1|stimulus)"

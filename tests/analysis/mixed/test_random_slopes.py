@@ -17,7 +17,7 @@ from physion.analysis.mixed.linear import fit_linear
 from physion.analysis.mixed.linear_slopes import SlopesModel
 from physion.analysis.mixed.logistic import LogisticModel, fit_logistic
 from physion.analysis.mixed.random_effects import RandomEffects
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 FORMULAS = {
     "correlated": "{y} ~ x + (1 + x|person) + (1|item)",

@@ -27,7 +27,7 @@ from physion.analysis.models.people_comparison import compare_everywhere
 from physion.analysis.sample import sample_of_rows
 from physion.analysis.tables.responses import read_humans, read_labels
 from physion.analysis.tables.stimuli import MEAN, POOLED
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from support.simulated_people import study
 
 Array = npt.NDArray[np.float64]

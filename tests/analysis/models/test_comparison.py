@@ -16,7 +16,7 @@ from physion.analysis.results import compare
 from physion.analysis.tables.predictions import check_predictions, name_models
 from physion.analysis.tables.responses import read_humans, read_labels
 from physion.analysis.tables.stimuli import MEAN, POOLED
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 QUICK = Bootstrap(resamples=200)
 SCENARIOS = {"collide": "pilot_it2_collision_simple_box", "drop": "pilot_it2_drop_simple_box"}

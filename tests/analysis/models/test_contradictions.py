@@ -15,7 +15,7 @@ from physion.analysis.models.contradictions import check_coverage
 from physion.analysis.results import compare
 from physion.analysis.tables.predictions import check_predictions, name_models
 from physion.cli.main import main
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.report import compare_files
 
 QUICK = Bootstrap(resamples=20)

@@ -48,7 +48,7 @@ from physion.analysis.statistics.paired import (
     r_permutation_p,
     swap_coins,
 )
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from support.simulated_people import study
 
 Array = npt.NDArray[np.float64]

@@ -15,7 +15,7 @@ from physion.analysis.models.rollout_errors import (
     read_rollout_errors,
     rollout_error_table,
 )
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 FRAMES = (3, 6, 9)
 

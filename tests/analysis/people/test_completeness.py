@@ -19,7 +19,7 @@ from physion.analysis.people.completeness import (
 from physion.analysis.people.exclusions import RULES, check_excluded, flag_sessions
 from physion.analysis.people.participants import Responses
 from physion.analysis.people.results import analyse_people
-from physion.errors import BadInputError, ExclusionError, UnknownNameError
+from physion.core.errors import BadInputError, ExclusionError, UnknownNameError
 from support.simulated_people import as_responses, simulate_study, study
 
 QUICK = Bootstrap(resamples=20)

@@ -30,7 +30,7 @@ from physion.analysis.people.participants import DROPPED_COLUMNS, Responses, mis
 from physion.analysis.people.people import accuracy_by_scenario
 from physion.analysis.people.session_measures import longest_alternation, longest_streak
 from physion.analysis.statistics.clustered_logit import clustered_logit
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from support.simulated_people import as_responses, simulate_study, study
 
 answers = st.lists(st.booleans(), max_size=60)

@@ -11,14 +11,8 @@ import pytest
 from physion.analysis.statistics import agreement
 from physion.analysis.tables.responses import read_human_zone, read_humans, read_labels, with_labels
 from physion.analysis.tables.stimuli import read_stimulus_list, scenario_name
-from physion.errors import BadInputError, PhysionError, UnknownNameError
-from physion.stimulus_names import (
-    OFFICIAL_SCENARIOS,
-    SCENARIOS,
-    canonical_name,
-    is_ledge,
-    scenario_of,
-)
+from physion.core.errors import BadInputError, PhysionError, UnknownNameError
+from physion.core.names import OFFICIAL_SCENARIOS, SCENARIOS, canonical_name, is_ledge, scenario_of
 
 PLAIN = "human_accuracy-dominoes_pilot-production_1_testing.csv"
 RED = "human_accuracy-dominoes-redyellow_pilot-production_2_testing.csv"

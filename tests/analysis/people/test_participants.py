@@ -29,7 +29,7 @@ from physion.analysis.people.response_schema import (
     check_table,
     data_dictionary,
 )
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from support.simulated_people import as_responses, simulate_study, study
 
 SMALL = {"people": 3, "stimuli": 6, "scenarios": ("collide",)}

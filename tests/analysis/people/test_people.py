@@ -55,7 +55,7 @@ from physion.analysis.tables.attributes import (
     better_attributes,
 )
 from physion.analysis.tables.responses import read_humans, read_labels, with_labels
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from support.scene_metadata import attributes_from_metadata
 from support.simulated_people import study
 

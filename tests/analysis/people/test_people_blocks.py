@@ -14,7 +14,7 @@ from physion.analysis.people.participants import clean, scenario_set, scenarios_
 from physion.analysis.people.people import accuracy_by_scenario
 from physion.analysis.people.response_schema import TRIAL_COLUMNS, check_table
 from physion.analysis.people.results import analyse_people
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 BLOCKS = {"collide": 6, "support": 6}
 

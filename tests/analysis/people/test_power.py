@@ -11,7 +11,7 @@ from scipy import special, stats
 
 from physion.analysis.people.power import COLUMNS, PlannedEffect, power_table
 from physion.cli.main import main
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 
 @pytest.fixture

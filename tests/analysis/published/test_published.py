@@ -27,8 +27,8 @@ from physion.analysis.published.tables import (
     read_published,
 )
 from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.errors import BadInputError
-from physion.stimulus_names import OFFICIAL_SCENARIOS, SCENARIOS
+from physion.core.errors import BadInputError
+from physion.core.names import OFFICIAL_SCENARIOS, SCENARIOS
 
 
 @pytest.fixture(scope="module")

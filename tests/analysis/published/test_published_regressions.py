@@ -17,7 +17,7 @@ from physion.analysis.published.regressions import (
     released_state,
 )
 from physion.analysis.published.tables import PARTICLES, PublishedTables, read_published
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 
 @given(st.integers(1, 60), st.integers(0, 5))

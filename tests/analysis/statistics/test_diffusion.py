@@ -17,7 +17,7 @@ from physion.analysis.statistics.diffusion import (
     fit_diffusion,
 )
 from physion.cli.main import main
-from physion.errors import BadInputError, MissingExtraError
+from physion.core.errors import BadInputError, MissingExtraError
 
 fitted = pytest.mark.skipif(
     importlib.util.find_spec("pyddm") is None, reason="the extra 'diffusion' is not installed"

@@ -15,7 +15,7 @@ from sklearn.metrics import cohen_kappa_score
 
 from physion.analysis.statistics import kappa
 from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import pytest
 
 from physion.analysis.tables.submission import Checked, Reference, read_index, validate
 from physion.analysis.tables.submission_rows import SHOWN
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 STIMULI = [f"pilot_it2_drop_simple_box_{i:04d}" for i in range(6)]
 LABELS = {name: i % 2 == 0 for i, name in enumerate(STIMULI)}

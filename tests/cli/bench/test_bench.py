@@ -9,7 +9,7 @@ import pytest
 
 from physion.cli.bench.bench import COLUMNS
 from physion.cli.main import main
-from physion.version import MADE_WITH
+from physion.core.version import MADE_WITH
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import sqlalchemy as sa
 from pandas.testing import assert_frame_equal
 
 from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, check_table
-from physion.errors import PhysionError, UnknownNameError
+from physion.core.errors import PhysionError, UnknownNameError
 from physion.experiment.experimenter.statistics.summaries import SummaryCache
 from physion.experiment.export import trial_rows
 from physion.experiment.export.answer_tables import read_tables, snapshot

@@ -15,7 +15,7 @@ from physion.analysis.people.biases import accuracy_by_background, background
 from physion.analysis.people.people import accuracy_by_condition
 from physion.analysis.people.results import read_any_responses
 from physion.analysis.select_sessions import keep_where
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.experiment.experimenter.overview import compute_overview
 from physion.experiment.experimenter.statistics.flagging import Flags
 from physion.experiment.experimenter.statistics.summaries import SummaryCache

@@ -18,7 +18,7 @@ from physion.analysis.people.response_schema import check_table
 from physion.analysis.tables.csv_table import read_table
 from physion.cli.experiment import export as experiment_export
 from physion.cli.main import main
-from physion.errors import BadInputError, PhysionError
+from physion.core.errors import BadInputError, PhysionError
 from physion.experiment.export import export_study as export
 from physion.experiment.export import write_tables as export_tables
 from physion.experiment.export.answer_tables import read_tables

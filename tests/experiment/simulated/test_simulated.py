@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.cli.main import main
-from physion.errors import UnknownNameError
+from physion.core.errors import UnknownNameError
 from physion.experiment.simulated.participants import SimulationPlan, Visit, simulate
 from physion.experiment.simulated.person import SimulatedPerson
 from physion.experiment.simulated.server_process import ServerProcess

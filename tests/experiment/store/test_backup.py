@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from physion.cli.main import main
-from physion.errors import BadInputError, PhysionError
+from physion.core.errors import BadInputError, PhysionError
 from physion.experiment.store.lab.backup import back_up
 from physion.experiment.store.store import Store
 from physion.experiment.store.tables import ANSWERS

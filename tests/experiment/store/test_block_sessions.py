@@ -10,7 +10,7 @@ import pytest
 from alembic import command
 from sqlalchemy import text
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.experiment.protocol.messages import Jump, PageDone
 from physion.experiment.store.database import _load_migrations, open_database
 from physion.experiment.store.store import Store

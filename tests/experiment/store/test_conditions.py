@@ -12,7 +12,7 @@ import pytest
 from sqlalchemy import update
 
 from physion.cli.main import main
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.experiment.protocol.messages import Enter
 from physion.experiment.store.lab.managing import set_voided
 from physion.experiment.store.store import Store

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from physion.cli.main import main
-from physion.errors import BadInputError, PhysionError
+from physion.core.errors import BadInputError, PhysionError
 from physion.experiment.protocol.messages import Device, Enter, Event, Events
 from physion.experiment.store.forget import forget, forget_raw_ids, forget_sessions
 from physion.experiment.store.store import Store

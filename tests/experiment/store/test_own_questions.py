@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from sqlalchemy import inspect
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.experiment.export.export_study import export_study
 from physion.experiment.export.spreadsheet import restore_cell
 from physion.experiment.protocol.messages import PageDone

@@ -13,7 +13,7 @@ from alembic.runtime.migration import MigrationContext
 from sqlalchemy import insert, text
 from sqlalchemy.exc import SQLAlchemyError
 
-from physion.errors import BadInputError, PhysionError
+from physion.core.errors import BadInputError, PhysionError
 from physion.experiment.store.database import (
     check_version,
     connect_writer,

@@ -12,7 +12,7 @@ import pytest
 from pydantic import ValidationError
 from sqlalchemy import update
 
-from physion.errors import BadInputError, PhysionError
+from physion.core.errors import BadInputError, PhysionError
 from physion.experiment.protocol.messages import REFUSALS, Device, Enter, Event, Events, PageDone
 from physion.experiment.store.scores import percentile
 from physion.experiment.store.sessions import ACTIVE_WITHIN

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.experiment.study.courses.attention import instructed_response
 from physion.experiment.study.orders import session_trials, trial_order
 from physion.experiment.study.stimuli import ATTENTION, STIMULI_FILE

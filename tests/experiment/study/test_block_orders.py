@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.experiment.study.courses.blocks import (
     block_orders,
     block_scenarios,

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.experiment.study.identity import (
     SECRET_FILE,
     Secrets,

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from physion.cli.main import main
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.experiment.study.media_checks import check_media
 from physion.experiment.study.study import Study, load_study
 from physion.trials.video import encode_movie

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.experiment.study.stimuli import (
     COLUMNS,
     Stimulus,

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.experiment.study.study import (
     Attention,
     Bonus,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.experiment.study.texts import (
     read_consent_file,
     read_texts,

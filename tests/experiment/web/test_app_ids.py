@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.cli.main import main
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.experiment.study.recruitment import links
 from physion.experiment.study.study import Recruitment, load_study
 from support.experiment.app_walk import Person, Served, served

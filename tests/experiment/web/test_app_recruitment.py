@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.cli.main import main
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.experiment.protocol.messages import Enter
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import (

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError, UnknownNameError
+from physion.clips.batch import Batch
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.models import build_model
-from physion.models.batch import Batch
 from physion.models.interface import Encodes, Fits, Imagines, Model, Predicts, SeesOutcomes
 from support.crossing_bodies import batch_of, crossing, replace_future, some_crossings
 

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError
-from physion.models.anchors.constant_motion import constant_motion
-from physion.models.anchors.smallest_gap import FAR, TOLERANCE, minimise
-from physion.models.batch import Motion
-from physion.physics.cloth.contact_gap import CLOTH_CONTACT_GAP
+from physion.clips.batch import Motion
+from physion.core.errors import BadInputError
+from physion.models.baselines.motion import FAR, TOLERANCE, constant_motion, minimise
 from physion.physics.cloth.simulate import ClothSettings
+from physion.physics.cloth.solver import CLOTH_CONTACT_GAP
 from physion.scenes.scene import Body, BodyEvent, Cloth, Roles, Vec3
 from support.crossing_bodies import batch_of, crossing
 

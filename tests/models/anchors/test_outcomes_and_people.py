@@ -8,12 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError
-from physion.models.anchors.already_touched import already_touched
-from physion.models.anchors.majority_of_people import majority_of_people
-from physion.models.anchors.outcome import outcome
-from physion.models.anchors.people_files import read_people
-from physion.stimulus_names import scenario_of
+from physion.core.errors import BadInputError
+from physion.core.names import scenario_of
+from physion.models.baselines.answers import majority_of_people, outcome, read_people
+from physion.models.baselines.motion import already_touched
 from support.crossing_bodies import batch_of, crossing, some_crossings
 
 DOMINOES = "pilot_dominoes_1mid_boxroom"

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError
-from physion.models.anchors.blob_centroids import blob_centroids, color_masks
-from physion.models.anchors.copy_last_frame import copy_last_frame
-from physion.models.batch import Batch
+from physion.clips.batch import Batch
+from physion.core.errors import BadInputError
+from physion.models.baselines.pixels import blob_centroids, color_masks, copy_last_frame
 from physion.rendering.renderer import Renderer
 from physion.scenes.looks import in_look
 from physion.scenes.scene import Body, Camera, Roles, Scene

@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError
-from physion.models.anchors.state_classifier import state_classifier
-from physion.models.anchors.state_features import BLOCK, NAMES, state_features
-from physion.models.batch import Motion
+from physion.clips.batch import Motion
+from physion.core.errors import BadInputError
+from physion.models.baselines.motion import BLOCK, NAMES, state_classifier, state_features
 from physion.scenes.scene import Body, BodyEvent, Cloth, Roles
 from support.crossing_bodies import batch_of, crossing, some_crossings
 

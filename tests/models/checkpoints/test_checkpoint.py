@@ -14,8 +14,8 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from physion.errors import BadInputError
-from physion.models.checkpoints.checkpoint import (
+from physion.core.errors import BadInputError
+from physion.models.checkpoint import (
     WEIGHTS,
     DamagedFileError,
     check_same,
@@ -24,10 +24,10 @@ from physion.models.checkpoints.checkpoint import (
     tensors_of,
     write_checkpoint,
 )
-from physion.models.settings import TrainingSettings
-from physion.training import folder as folder_module
+from physion.models.interface import TrainingSettings
+from physion.training import loop as folder_module
 from physion.training.devices import Devices, make_fabric
-from physion.training.folder import CHECKPOINT, PREVIOUS
+from physion.training.loop import CHECKPOINT, PREVIOUS
 from physion.training.train import TrainedModel, train_model
 from support.trained_models import QUICK, MovingValues, NextBrightness, equal_weights
 
@@ -237,7 +237,7 @@ def test_a_broken_or_foreign_file_is_one_clear_line(kind: str, tmp_path: Path) -
 
 
 def test_a_file_of_a_later_format_is_refused(tmp_path: Path, monkeypatch: Any) -> None:
-    from physion.models.checkpoints import checkpoint
+    from physion.models import checkpoint
 
     path = tmp_path / "file.safetensors"
     monkeypatch.setattr(checkpoint, "_VERSION", 2)

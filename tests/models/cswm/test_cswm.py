@@ -9,19 +9,20 @@ import pytest
 import torch
 from torch import nn
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.models.build import build_model
-from physion.models.cswm.config import cswm_config
-from physion.models.cswm.contrast import (
+from physion.models.cswm import (
+    Cswm,
+    SlotExtractor,
+    SlotTransition,
     all_pairs_loss,
+    cswm_config,
     energy,
     hinge_loss,
     rank_next_states,
     ranking,
 )
-from physion.models.cswm.model import Cswm
-from physion.models.cswm.networks import SlotExtractor, SlotTransition
-from physion.models.vision.model import VisionOptions
+from physion.models.vision import VisionOptions
 from support.moving_squares import squares, with_arrays
 
 

@@ -14,7 +14,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from physion.models.batch import Batch
+from physion.clips.batch import Batch
 from physion.models.build import build_model
 from physion.training.train import train_model
 from support.squares_source import SquaresSource

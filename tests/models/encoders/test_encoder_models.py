@@ -10,12 +10,21 @@ import timm
 import torch
 from safetensors.torch import save_file
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.models import build_model
-from physion.models.encoders.build import frozen_encoder
-from physion.models.encoders.encoder_model import EncoderModel
-from physion.models.encoders.settings import FAMILIES, FINE_TUNING, RELEASED_TRAINING
-from physion.models.weights import IMAGENET, EncoderWeights, create_encoder, input_statistics
+from physion.models.encoders.encoder import (
+    FAMILIES,
+    FINE_TUNING,
+    RELEASED_TRAINING,
+    EncoderModel,
+    frozen_encoder,
+)
+from physion.models.encoders.weights import (
+    IMAGENET,
+    EncoderWeights,
+    create_encoder,
+    input_statistics,
+)
 from support.tiny_models import TINY
 
 ALL = [(family, size) for family, sizes in FAMILIES.items() for size in sizes]

@@ -11,13 +11,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.models import Batch, build_model
-from physion.models.checkpoints.checkpoint import WEIGHTS, load_weights
-from physion.models.encoders.fine_tuned import FineTunedEncoder
-from physion.models.encoders.settings import FINE_TUNING
-from physion.models.interface import features_digest
-from physion.models.settings import TrainingSettings
+from physion.models.checkpoint import WEIGHTS, load_weights
+from physion.models.encoders.encoder import FINE_TUNING, FineTunedEncoder
+from physion.models.interface import TrainingSettings, features_digest
 from physion.readout.evaluate import evaluate
 from physion.readout.logistic import ReadoutConfig
 from physion.readout.settings import EvaluationConfig

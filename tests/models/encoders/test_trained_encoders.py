@@ -10,13 +10,12 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.models import build_model
-from physion.models.checkpoints.checkpoint import WEIGHTS, tensors_of, write_checkpoint
-from physion.models.encoders.encoder_model import EncoderModel
-from physion.models.interface import features_digest
-from physion.models.settings import TrainingSettings
-from physion.models.weights import EncoderWeights, create_encoder
+from physion.models.checkpoint import WEIGHTS, tensors_of, write_checkpoint
+from physion.models.encoders.encoder import EncoderModel
+from physion.models.encoders.weights import EncoderWeights, create_encoder
+from physion.models.interface import TrainingSettings, features_digest
 from physion.readout.evaluate import evaluate
 from physion.readout.logistic import ReadoutConfig
 from physion.readout.settings import EvaluationConfig

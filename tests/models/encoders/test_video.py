@@ -14,7 +14,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.models import Batch, build_model
 from physion.readout.evaluate import evaluate
 from physion.readout.logistic import ReadoutConfig
@@ -28,7 +28,7 @@ try:
 except ModuleNotFoundError:
     absent("transformers is not installed: it comes with the extra video")
 
-from physion.models.encoders import video_networks
+from physion.models.encoders import video as video_networks
 from physion.models.encoders.video import VideoEncoder
 
 NAMES = ["VideoMAE", "V-JEPA2"]
@@ -240,7 +240,7 @@ class Absent:
         if name == "transformers":
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 sys.meta_path.insert(0, Absent())
-from physion.errors import MissingExtraError
+from physion.core.errors import MissingExtraError
 from physion.models import build_model
 try:
     build_model("VideoMAE")

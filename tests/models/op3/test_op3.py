@@ -12,22 +12,30 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Categorical, Independent, MixtureSameFamily, Normal
 
-from physion.errors import BadInputError
-from physion.models.batch import Batch
+from physion.clips.batch import Batch
+from physion.core.errors import BadInputError
 from physion.models.build import build_model
-from physion.models.checkpoints.checkpoint import tensors_of, write_checkpoint
-from physion.models.op3.config import Op3Config, Op3Options, op3_config
-from physion.models.op3.inference import Explained, SlotInference, Slots
-from physion.models.op3.model import Op3, weighted_means
-from physion.models.op3.networks import BroadcastConv, SlotDecoder, SlotDynamics, coordinates
-from physion.models.op3.pixels import (
+from physion.models.checkpoint import tensors_of, write_checkpoint
+from physion.models.op3 import (
+    BroadcastConv,
     Decoded,
+    Explained,
     Likelihood,
+    Op3,
+    Op3Config,
+    Op3Options,
+    SlotDecoder,
+    SlotDynamics,
+    SlotInference,
+    Slots,
+    coordinates,
     log_likelihood,
+    op3_config,
     plain_maps,
     slope_maps,
+    weighted_means,
 )
-from physion.models.vision.pictures import normalized_pictures
+from physion.models.vision import normalized_pictures
 from support.moving_squares import squares, with_arrays
 
 TINY = Op3Config(

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from physion.models.batch import LAST_OBSERVED, Motion
-from physion.models.observed import cut_to_observed
+from physion.clips.batch import LAST_OBSERVED, Motion, cut_to_observed
 
 ARRAYS = (
     "positions", "rotations", "velocities", "angular_velocities", "cloth_vertices",

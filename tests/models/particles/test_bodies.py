@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from physion.errors import BadInputError
-from physion.models.batch import Motion
-from physion.models.particles import bodies, surface
+from physion.clips.batch import Motion
+from physion.core.errors import BadInputError
+from physion.models.particles import bodies
+from physion.models.particles import bodies as surface
 from physion.models.particles.bodies import (
     CLOTH,
     KINEMATIC,
@@ -19,8 +20,8 @@ from physion.models.particles.bodies import (
     particle_positions,
     poses_of,
     scene_particles,
+    surface_points,
 )
-from physion.models.particles.surface import surface_points
 from physion.physics.particles import particles_over_time
 from physion.scenes.scene import Cloth, Roles
 from physion.scenes.shapes.meshes import Mesh

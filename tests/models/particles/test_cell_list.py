@@ -7,11 +7,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from physion import seeds
-from physion.errors import BadInputError
-from physion.models.particles import cell_list
-from physion.models.particles.cell_list import radius_edges_on_device, swept_edges_on_device
-from physion.models.particles.neighbours import radius_edges
+from physion.core import seeds
+from physion.core.errors import BadInputError
+from physion.models.particles import neighbours as cell_list
+from physion.models.particles.neighbours import (
+    radius_edges,
+    radius_edges_on_device,
+    swept_edges_on_device,
+)
 
 RADIUS = 0.08
 

@@ -7,12 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from physion.models.particles.bodies import (
-    ParticleSettings,
-    Poses,
-    SceneParticles,
-    scene_particles,
-)
+from physion.models.particles.bodies import ParticleSettings, Poses, SceneParticles, scene_particles
 from physion.models.particles.gap import FAR, TOLERANCE, smallest_distance
 from physion.scenes.scene import Cloth, Scene
 from support.rendered_scenes import body, scene_of

@@ -6,10 +6,15 @@ import pytest
 import torch
 
 from physion import sample_scene
-from physion.models.batch import Motion
+from physion.clips.batch import Motion
 from physion.models.particles.bodies import ParticleSettings, poses_of, scene_particles
-from physion.models.particles.graph import drift_of, outer_edges, outer_edges_on_device
-from physion.models.particles.layout import join_poses, join_scenes
+from physion.models.particles.graph import (
+    drift_of,
+    join_poses,
+    join_scenes,
+    outer_edges,
+    outer_edges_on_device,
+)
 from physion.physics.engine import simulate
 
 CPU = torch.device("cpu")

@@ -13,15 +13,14 @@ import pytest
 from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score
 
+from physion.clips.batch import Motion, cut_to_observed
+from physion.clips.clips import whole_source
 from physion.compute.local import LocalExecutor
-from physion.models.batch import Motion
+from physion.core.seeds import generator
 from physion.models.build import build_model
-from physion.models.observed import cut_to_observed
 from physion.models.particles.simulator import ParticleSimulator
 from physion.physics.labels import label_contact
 from physion.readout.rollout_error import motion_error
-from physion.seeds import generator
-from physion.training.sources.open_source import whole_source
 from physion.training.train import train_model
 from physion.trials.dataset import Dataset
 from physion.trials.making.generate import make_trials

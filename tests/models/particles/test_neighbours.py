@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from physion.models.particles.neighbours import (
-    gap_over_time,
-    radius_edges,
-    swept_edges,
-)
+from physion.models.particles.neighbours import gap_over_time, radius_edges, swept_edges
 
 F64 = NDArray[np.float64]
 

@@ -12,11 +12,10 @@ from scipy.spatial.distance import cdist, pdist
 from torch import Tensor, nn
 
 from physion import sample_scene
-from physion.errors import BadInputError
-from physion.models.anchors.smallest_gap import FAR
-from physion.models.batch import Batch, Motion
+from physion.clips.batch import Batch, Motion, cut_to_observed
+from physion.core.errors import BadInputError
+from physion.models.baselines.motion import FAR
 from physion.models.build import build_model
-from physion.models.observed import cut_to_observed
 from physion.models.particles.bodies import (
     CLOTH,
     FREE,

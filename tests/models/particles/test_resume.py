@@ -13,13 +13,13 @@ import pytest
 import torch
 
 from physion import sample_scene
-from physion.models.batch import Batch, Motion, Spec, clip_frames
+from physion.clips.batch import Batch, Motion, Spec, clip_frames
+from physion.clips.source import Part
 from physion.models.build import build_model
-from physion.models.checkpoints.checkpoint import WEIGHTS
-from physion.models.settings import TrainingSettings
+from physion.models.checkpoint import WEIGHTS
+from physion.models.interface import TrainingSettings
 from physion.physics.engine import simulate
 from physion.scenes.scene import Ending
-from physion.training.sources.source import Part
 from physion.training.train import train_model
 from support.clip_source import ClipSource
 from support.trained_models import equal_weights

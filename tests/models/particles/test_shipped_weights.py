@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from physion import sample_scene
-from physion.models.batch import Motion
+from physion.clips.batch import Motion, cut_to_observed
 from physion.models.build import build_model
-from physion.models.observed import cut_to_observed
 from physion.models.particles.simulator import ParticleSimulator
 from physion.physics.engine import simulate
 from physion.readout.rollout_error import motion_error

@@ -11,19 +11,24 @@ import pytest
 import torch
 
 from physion import sample_scene
-from physion.errors import BadInputError
-from physion.models.batch import Batch, Motion
+from physion.clips.batch import Batch, Motion, cut_to_observed
+from physion.core.errors import BadInputError
 from physion.models.build import build_model
-from physion.models.checkpoints.checkpoint import DamagedFileError
-from physion.models.observed import cut_to_observed
+from physion.models.checkpoint import DamagedFileError
 from physion.models.particles.bodies import KINEMATIC, RIGID, poses_of, scene_particles
 from physion.models.particles.gap import smallest_distance
-from physion.models.particles.graph import drift_of, make_graph
-from physion.models.particles.layout import ObjectState, join_poses, join_scenes, rotate_scenes
+from physion.models.particles.graph import (
+    ObjectState,
+    drift_of,
+    join_poses,
+    join_scenes,
+    make_graph,
+    rotate_scenes,
+)
 from physion.models.particles.networks import JoinedInputs
 from physion.models.particles.rigid_motion import rotation_from_vector
+from physion.models.particles.rollout import Window, read_window
 from physion.models.particles.simulator import ParticleSimulator
-from physion.models.particles.windows import Window, read_window
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
 from physion.scenes.scene import BodyEvent, Ending
@@ -508,7 +513,7 @@ def test_calibration_finds_the_distance_that_separates(collide: Motion) -> None:
 
 
 def test_weights_of_a_file_are_loaded_and_named(tmp_path: Path) -> None:
-    from physion.models.checkpoints.checkpoint import tensors_of, write_checkpoint
+    from physion.models.checkpoint import tensors_of, write_checkpoint
 
     source = model_of("dpi", seed=3)
     path = tmp_path / "model.safetensors"

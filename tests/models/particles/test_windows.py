@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from physion import sample_scene
-from physion.models.particles.windows import start_probabilities
+from physion.models.particles.rollout import start_probabilities
 from physion.physics.engine import simulate
 from physion.physics.trajectory import Trajectory
 

@@ -8,23 +8,27 @@ from typing import Any
 import pytest
 import torch
 
-from physion.errors import BadInputError
-from physion.models.batch import Batch
+from physion.clips.batch import Batch
+from physion.core.errors import BadInputError
 from physion.models.build import build_model
-from physion.models.rpin.backbone import Backbone
-from physion.models.rpin.boxes import (
+from physion.models.rpin import (
     UNIT,
+    Backbone,
+    Dynamics,
+    Imagined,
+    Interaction,
+    Rpin,
+    Targets,
     constant_velocity,
+    cut_regions,
     is_present,
     known_boxes,
     last_changes,
+    rpin_config,
     to_center,
     to_edges,
 )
-from physion.models.rpin.config import rpin_config
-from physion.models.rpin.model import Imagined, Rpin, Targets
-from physion.models.rpin.networks import Dynamics, Interaction, cut_regions
-from physion.models.vision.model import VisionOptions
+from physion.models.vision import VisionOptions
 from support.moving_squares import squares, with_arrays
 
 NAN = float("nan")

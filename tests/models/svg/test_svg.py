@@ -10,14 +10,21 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from physion.errors import BadInputError
-from physion.models.batch import Batch
+from physion.clips.batch import Batch
+from physion.core.errors import BadInputError
 from physion.models.build import build_model
-from physion.models.checkpoints.checkpoint import tensors_of, write_checkpoint
-from physion.models.svg.config import SvgConfig, SvgOptions, svg_config
-from physion.models.svg.model import Svg
-from physion.models.svg.networks import CodePredictor, Decoder, Encoder, GaussianPredictor
-from physion.models.vision.moving import copy_error, moving_pixels
+from physion.models.checkpoint import tensors_of, write_checkpoint
+from physion.models.svg import (
+    CodePredictor,
+    Decoder,
+    Encoder,
+    GaussianPredictor,
+    Svg,
+    SvgConfig,
+    SvgOptions,
+    svg_config,
+)
+from physion.models.vision import copy_error, moving_pixels
 from support.moving_squares import squares, with_arrays
 
 TINY = SvgConfig(

@@ -6,12 +6,13 @@ import pytest
 import torch
 from torch.distributions import Independent, Normal, kl_divergence
 
-from physion.models.vision.gaussians import gaussian_divergence, gaussian_values
-from physion.models.vision.moving import (
+from physion.models.vision import (
     CHANGE,
     copy_error,
     empty_scene_error,
     future_error,
+    gaussian_divergence,
+    gaussian_values,
     moving_pixels,
 )
 

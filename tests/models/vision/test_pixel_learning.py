@@ -11,12 +11,10 @@ from typing import Any
 import pytest
 import torch
 
-from physion.models.op3.config import Op3Config, Op3Options
-from physion.models.op3.model import Op3
-from physion.models.settings import TrainingSettings
-from physion.models.svg.config import SvgConfig, SvgOptions
-from physion.models.svg.model import Svg
-from physion.models.vision.moving import future_error
+from physion.models.interface import TrainingSettings
+from physion.models.op3 import Op3, Op3Config, Op3Options
+from physion.models.svg import Svg, SvgConfig, SvgOptions
+from physion.models.vision import future_error
 from physion.training.train import train_model
 from physion.training.windows import ClipWindows, validation_requests
 from support.moving_squares import BACKGROUND

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 import torch
 
+from physion.core.names import SCENARIOS
 from physion.models.build import build_model
-from physion.models.cswm.contrast import ranking
-from physion.models.vision.moving import empty_scene_error
-from physion.stimulus_names import SCENARIOS
+from physion.models.cswm import ranking
+from physion.models.vision import empty_scene_error
 from physion.trials.dataset import Dataset
 from support.small_movies import early_windows, make_movies, read_whole
 

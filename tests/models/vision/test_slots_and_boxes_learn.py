@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from physion.models.batch import Batch
+from physion.clips.batch import Batch
 from physion.models.build import build_model
-from physion.models.cswm.contrast import ranking
+from physion.models.cswm import ranking
 from physion.trials.dataset import Dataset
 from support.small_movies import early_windows, make_movies, read_whole, windows
 

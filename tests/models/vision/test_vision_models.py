@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 import torch
 
-from physion.errors import BadInputError
-from physion.models.batch import Batch
+from physion.clips.batch import Batch
+from physion.core.errors import BadInputError
 from physion.models.build import build_model
-from physion.models.checkpoints.checkpoint import (
+from physion.models.checkpoint import (
     WEIGHTS,
     DamagedFileError,
     read_checkpoint,
+    shipped_digests,
     tensors_of,
     write_checkpoint,
 )
-from physion.models.checkpoints.trained import shipped_digests
-from physion.models.settings import TrainingSettings
+from physion.models.interface import TrainingSettings
 from physion.training.train import train_model
 from support.moving_squares import squares, with_arrays
 from support.squares_source import SquaresSource

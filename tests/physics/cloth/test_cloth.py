@@ -12,21 +12,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.numerics.linear_algebra import unit
 from physion.numerics.rotations import rotate_vectors
-from physion.physics.cloth.contact_gap import CLOTH_CONTACT_GAP
-from physion.physics.cloth.contacts import smallest_distance
-from physion.physics.cloth.near_solids import (
+from physion.physics.cloth.contacts import (
     BodyPoses,
     find_neighbours,
     new_neighbours,
+    smallest_distance,
     world_bounds,
 )
-from physion.physics.cloth.sheet import sheet_springs, sheet_triangles, sheet_vertices
 from physion.physics.cloth.simulate import ClothMotion, ClothSettings, settle_solids, simulate_cloth
 from physion.physics.cloth.solids import fill_bodies, fill_shape, particles_of, surface_particles
-from physion.physics.cloth.springs import correct_springs
+from physion.physics.cloth.solver import CLOTH_CONTACT_GAP
+from physion.physics.cloth.springs import (
+    correct_springs,
+    sheet_springs,
+    sheet_triangles,
+    sheet_vertices,
+)
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
 from physion.physics.replay import area_under_curve

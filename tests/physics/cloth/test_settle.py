@@ -11,16 +11,16 @@ import pytest
 from physion.numerics.linear_algebra import norm
 from physion.numerics.rotations import axis_angle_quaternion, rotate_vectors
 from physion.physics.cloth.contacts import ClothOptions
-from physion.physics.cloth.settle import settle, settled_poses
-from physion.physics.cloth.simulate import ClothSettings, settle_solids
-from physion.physics.cloth.solid_motion import (
+from physion.physics.cloth.simulate import ClothSettings, settle, settle_solids, settled_poses
+from physion.physics.cloth.solids import (
     SolidBody,
     SolidState,
+    fill_lattices,
+    fill_shape,
     rotate_by,
     solid_particles,
     spin_between,
 )
-from physion.physics.cloth.solids import fill_lattices, fill_shape
 from physion.scenes.scene import Body, Camera, Cloth, Roles, Scene, Vec3
 
 SPACING = ClothSettings().particle_spacing

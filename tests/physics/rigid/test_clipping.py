@@ -13,15 +13,15 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from physion.numerics.rotations import axis_angle_matrix
-from physion.physics.rigid.collision.clipping import clip_faces
-from physion.physics.rigid.collision.facing_faces import (
+from physion.physics.rigid.bodies import face_planes, hull_faces
+from physion.physics.rigid.collision.faces import (
     MAX_LOOP,
+    clip_faces,
     face_points,
     facing_face,
     new_clip_space,
 )
-from physion.physics.rigid.collision.reduction import FAR, spread_points
-from physion.physics.rigid.hulls import face_planes, hull_faces
+from physion.physics.rigid.collision.manifold import FAR, spread_points
 from support.hull_pairs import NOWHERE, UPRIGHT, box, hulls_of
 
 F64 = NDArray[np.float64]

@@ -10,16 +10,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from physion.errors import BadInputError, BadSceneError
+from physion.core.errors import BadInputError, BadSceneError
+from physion.core.seeds import trial_seed
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
+from physion.physics.rigid.bodies import RigidSettings
 from physion.physics.rigid.engine import RigidEngine
-from physion.physics.rigid.run import RigidRun
-from physion.physics.rigid.settings import RigidSettings
+from physion.physics.rigid.step import RigidRun
 from physion.physics.trajectory import ENVIRONMENT
 from physion.scenes.sampling.sample import sample_scene
 from physion.scenes.scene import Body, Ending, Joint, Push, SurfaceMaterial
-from physion.seeds import trial_seed
 from support.rigid_scenes import DT, ICE, ROUGH, ZONE, G, run, scene_of, way_of_steps
 
 

@@ -8,11 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from physion.numerics.rotations import axis_angle_quaternion, rotation_matrices
-from physion.physics.contact_record import summarise_contacts
-from physion.physics.rigid.hulls import collision_hulls, hull_faces, inner_box
-from physion.physics.rigid.model import build_model
-from physion.physics.rigid.settings import RigidSettings
-from physion.physics.trajectory import ENVIRONMENT
+from physion.physics.rigid.bodies import (
+    RigidSettings,
+    build_model,
+    collision_hulls,
+    hull_faces,
+    inner_box,
+)
+from physion.physics.trajectory import ENVIRONMENT, summarise_contacts
 from physion.scenes.scene import Body, Joint
 from support.hull_pairs import box, hulls_of, random_hull
 from support.rigid_scenes import scene_of

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from physion.physics.rigid.bodies import RigidSettings
 from physion.physics.rigid.engine import RigidEngine
-from physion.physics.rigid.settings import RigidSettings
 from physion.physics.trajectory import Trajectory
 from physion.scenes.scene import Body, Push, Roles, Scene, SurfaceMaterial
 from support.rigid_scenes import DT, ICE, ROUGH, scene_of
@@ -163,7 +163,7 @@ def test_same_bytes_in_threads_and_processes() -> None:
     code = (
         "import sys; from physion.scenes.scene import Scene; "
         "from physion.physics.rigid.engine import RigidEngine; "
-        "from physion.physics.rigid.settings import RigidSettings; "
+        "from physion.physics.rigid.bodies import RigidSettings; "
         "engine = RigidEngine(RigidSettings(continuous=True)); "
         "print(engine.simulate(Scene.from_json(sys.stdin.read()), frames=60).digest())"
     )

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
 
 from physion.numerics.rotations import axis_angle_matrix, axis_angle_quaternion
-from physion.physics.rigid.collision.floor_update import FLOOR_FRACTION, FLOOR_ROTATED, update_floor
-from physion.physics.rigid.collision.hull_records import Hulls
+from physion.physics.rigid.bodies import collision_hulls
+from physion.physics.rigid.collision.faces import Hulls
 from physion.physics.rigid.collision.manifold import (
     MOVED_FRACTIONS,
     ROTATED,
@@ -24,14 +24,17 @@ from physion.physics.rigid.collision.manifold import (
     refresh_points,
     set_direction,
 )
-from physion.physics.rigid.collision.pair_distance import new_pair_space, still_apart
-from physion.physics.rigid.collision.pair_update import (
+from physion.physics.rigid.collision.pairs import (
     BREAK_FRACTION,
+    FLOOR_FRACTION,
+    FLOOR_ROTATED,
     REPLACE_FRACTION,
     keep_pair,
+    new_pair_space,
+    still_apart,
+    update_floor,
     update_pair,
 )
-from physion.physics.rigid.hulls import collision_hulls
 from support.hull_pairs import box, hulls_of, random_hull, search
 
 F64 = NDArray[np.float64]

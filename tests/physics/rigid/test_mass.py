@@ -11,9 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from physion.numerics.rotations import axis_angle_quaternion
-from physion.physics.rigid.actors import center_of_mass
+from physion.physics.rigid.bodies import body_mass, center_of_mass, hull_mass, merge_masses
 from physion.physics.rigid.engine import RigidEngine
-from physion.physics.rigid.mass import body_mass, hull_mass, merge_masses
 from physion.scenes.scene import Body, Camera, Joint, Push, Roles, Scene
 from physion.scenes.shapes.meshes import solid_properties
 from physion.scenes.shapes.primitives import ball_mesh, shape

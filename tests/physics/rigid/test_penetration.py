@@ -8,9 +8,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from physion.numerics.rotations import axis_angle_matrix
+from physion.physics.rigid.bodies import collision_hulls
 from physion.physics.rigid.collision.closest_points import CLOSE, OVERLAPPING, new_simplex
 from physion.physics.rigid.collision.penetration import new_polytope, penetration
-from physion.physics.rigid.hulls import collision_hulls
 from support.hull_pairs import (
     UPRIGHT,
     box,

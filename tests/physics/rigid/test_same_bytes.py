@@ -10,12 +10,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.physics.engine import simulate_many
-from physion.physics.rigid import run as run_module
+from physion.physics.rigid import step as run_module
+from physion.physics.rigid.bodies import RigidSettings
 from physion.physics.rigid.engine import RigidEngine
-from physion.physics.rigid.run import RigidRun
-from physion.physics.rigid.settings import RigidSettings
+from physion.physics.rigid.step import RigidRun
 from physion.physics.trajectory import Trajectory
 from physion.scenes.scene import Body, Push, Roles, Scene
 from support.rigid_scenes import ROUGH, scene_of

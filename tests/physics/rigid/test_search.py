@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from physion.physics.rigid.collision.hull_records import Hulls
+from physion.physics.rigid.collision.faces import Hulls
 from physion.physics.rigid.collision.manifold import Manifolds, new_manifolds
-from physion.physics.rigid.collision.pair_distance import new_pair_space
+from physion.physics.rigid.collision.pairs import new_pair_space
 from physion.physics.rigid.collision.search import (
     FULL,
     SearchScene,

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from physion.physics.rigid.run import RigidRun
-from physion.physics.rigid.settings import RigidSettings
+from physion.physics.rigid.bodies import RigidSettings
 from physion.physics.rigid.sleeping import (
     SleepOptions,
     SleepState,
@@ -15,7 +14,8 @@ from physion.physics.rigid.sleeping import (
     update_sleep,
     wake_touched,
 )
-from physion.physics.rigid.solver_records import Bodies
+from physion.physics.rigid.solver import Bodies
+from physion.physics.rigid.step import RigidRun
 from physion.scenes.scene import Body, Push
 from support.rigid_scenes import ICE, run, scene_of
 

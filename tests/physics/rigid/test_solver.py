@@ -12,23 +12,22 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from physion.numerics.rotations import axis_angle_quaternion, rotation_matrices
+from physion.physics.rigid.bodies import RigidSettings
 from physion.physics.rigid.collision.manifold import Manifolds, new_manifolds
 from physion.physics.rigid.collision.search import ContactList
-from physion.physics.rigid.constraint_rows import first_tangent, set_order
-from physion.physics.rigid.friction_anchors import remember_anchors
 from physion.physics.rigid.motion import fill_rotations, move_freely, move_poses
-from physion.physics.rigid.settings import RigidSettings
 from physion.physics.rigid.solver import (
-    build_constraints,
-    correct_positions,
-    correct_velocities,
-    sweep,
-)
-from physion.physics.rigid.solver_records import (
     Bodies,
     Constraints,
     SolverOptions,
+    build_constraints,
+    correct_positions,
+    correct_velocities,
+    first_tangent,
     new_constraints,
+    remember_anchors,
+    set_order,
+    sweep,
 )
 
 F64 = NDArray[np.float64]

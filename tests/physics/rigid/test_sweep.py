@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
 
 from physion.numerics.rotations import axis_angle_matrix
+from physion.physics.rigid.bodies import collision_hulls, inscribed_radius
 from physion.physics.rigid.collision.closest_points import CLOSE
-from physion.physics.rigid.collision.pair_distance import new_pair_space
+from physion.physics.rigid.collision.pairs import new_pair_space
 from physion.physics.rigid.collision.sweep import GAP_FRACTION, time_of_impact
-from physion.physics.rigid.hulls import collision_hulls, inscribed_radius
 from support.hull_pairs import box, hulls_of, random_hull, random_rotation, search
 
 F64 = NDArray[np.float64]

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from physion.compute.executor import TaskOutcome
 from physion.compute.local import LocalExecutor, SerialExecutor
-from physion.errors import BadInputError, PhysionError
+from physion.compute.tasks import TaskOutcome
+from physion.core.errors import BadInputError, PhysionError
 from physion.training.protocols import Training
 from physion.trials.dataset import Dataset
 from support.plans.make_plans import FAILS, IMAGINING, make_evaluation_plan, make_training_plan

@@ -19,9 +19,9 @@ from physion.readout.plans.selection import Selection
 from physion.readout.plans.tasks import EvaluationTask
 from physion.readout.plans.training_plan import TrainingPlan
 from physion.readout.settings import EvaluationConfig
-from physion.readout.table import Evaluation
+from physion.readout.tables import Evaluation
 from physion.readout.trainings import SharedTrainConfig
-from physion.training.overrides import TrainingOverrides
+from physion.training.loop import TrainingOverrides
 from physion.training.protocols import Training
 from physion.trials.dataset import Dataset
 from support.plans.make_plans import (

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from physion.errors import MEMORY_SETTINGS, BadInputError, PhysionError
+from physion.core.errors import MEMORY_SETTINGS, BadInputError, PhysionError
 from physion.readout.plans.failures import describe_failure, stop_if_fatal
 
 

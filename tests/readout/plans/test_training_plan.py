@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError, PhysionError
-from physion.models.checkpoints.checkpoint import read_checkpoint
+from physion.core.errors import BadInputError, PhysionError
+from physion.models.checkpoint import read_checkpoint
 from physion.readout.plans.estimates import (
     DONE,
     EARLIER,
@@ -28,7 +28,7 @@ from physion.readout.plans.selection import (
     split_names,
 )
 from physion.readout.plans.tasks import TrainingTask
-from physion.training.overrides import TrainingOverrides
+from physion.training.loop import TrainingOverrides
 from physion.training.protocols import Training
 from physion.trials.dataset import Dataset
 from support.plans.make_plans import (
@@ -194,7 +194,7 @@ def test_a_full_disk_stops_the_plan(
     def full(*_: Any, **__: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("physion.training.folder.write_atomic", full)
+    monkeypatch.setattr("physion.training.loop.write_atomic", full)
     plan = make_training_plan(dots, tmp_path)
     with pytest.raises(PhysionError, match="No space left on device; 0 of 10 are done"):
         plan.run()

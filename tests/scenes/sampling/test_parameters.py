@@ -14,8 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.strategies import SearchStrategy
 
-from physion.errors import BadInputError, BadSceneError
+from physion.core.errors import BadInputError, BadSceneError
 from physion.numerics.rotations import rotate_vectors
+from physion.scenes.sampling.build import as_record, scenarios
 from physion.scenes.sampling.parameters import (
     Angle,
     Axes,
@@ -41,8 +42,7 @@ from physion.scenes.sampling.parameters import (
     retry,
     uniform,
 )
-from physion.scenes.sampling.registry import as_record, scenarios
-from physion.scenes.sampling.rules import (
+from physion.scenes.sampling.placement import (
     BodyRule,
     PushRule,
     ZoneRule,

@@ -10,11 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.seeds import trial_seed
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
+from physion.scenes.sampling.build import scenarios
 from physion.scenes.sampling.parameters import check_params
-from physion.scenes.sampling.preset import (
+from physion.scenes.sampling.sample import (
     DEBUG,
     DEFAULT,
     FAMILIARIZATION,
@@ -24,10 +26,8 @@ from physion.scenes.sampling.preset import (
     load_presets,
     parse_presets,
     read_preset_file,
+    sample_scene,
 )
-from physion.scenes.sampling.registry import scenarios
-from physion.scenes.sampling.sample import sample_scene
-from physion.seeds import trial_seed
 from support.sound_scenes import assert_seen, assert_valid, overlapping
 
 SCENARIOS = (

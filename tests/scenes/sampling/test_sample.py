@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 import physion
-from physion.errors import BadInputError, UnknownNameError
-from physion.scenes.sampling.preset import get_preset
-from physion.scenes.sampling.registry import scenarios
-from physion.seeds import named_seed
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.seeds import named_seed
+from physion.scenes.sampling.build import scenarios
+from physion.scenes.sampling.sample import get_preset
 
 
 def test_a_number_gives_the_same_scene_and_another_gives_another() -> None:

@@ -13,19 +13,22 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError, BadSceneError
+from physion.core.errors import BadInputError, BadSceneError
+from physion.core.seeds import trial_seed
 from physion.physics.engine import simulate
-from physion.scenes.sampling.clearance import GAP, is_clear_of, raise_above, required_rise
+from physion.scenes.sampling.build import scenarios
 from physion.scenes.sampling.parameters import LEAST_MASS, Range, yaw
 from physion.scenes.sampling.placement import world_bounds
-from physion.scenes.sampling.preset import get_preset, load_presets, parse_presets
-from physion.scenes.sampling.registry import scenarios
-from physion.scenes.sampling.sample import sample_scene
+from physion.scenes.sampling.sample import get_preset, load_presets, parse_presets, sample_scene
 from physion.scenes.sampling.stacks import (
+    GAP,
     SMALLEST,
     StackRule,
     choose_position,
     height_of_top,
+    is_clear_of,
+    raise_above,
+    required_rise,
     set_mass_by_volume,
 )
 from physion.scenes.scenarios import contain, link, support
@@ -33,7 +36,6 @@ from physion.scenes.scene import Body, Scene
 from physion.scenes.shapes.primitives import TORUS_INNER
 from physion.scenes.shapes.props import NATURAL_SIZES
 from physion.scenes.tdw.read_logs import read_scenes
-from physion.seeds import trial_seed
 from support.sound_scenes import body, hulls, overlap
 
 

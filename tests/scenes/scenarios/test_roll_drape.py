@@ -14,22 +14,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError, BadSceneError
+from physion.core.errors import BadInputError, BadSceneError
+from physion.core.seeds import trial_seed
 from physion.numerics.rotations import rotate_vectors
 from physion.physics.cloth.simulate import settle_solids
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
-from physion.physics.rigid.hulls import collision_hulls
+from physion.physics.rigid.bodies import collision_hulls
 from physion.scenes.sampling.parameters import euler_rotation
-from physion.scenes.sampling.placement import project_to_image, world_bounds, world_corners
-from physion.scenes.sampling.preset import Preset, load_presets, parse_presets
-from physion.scenes.sampling.rules import BodyRule
-from physion.scenes.sampling.sample import sample_scene
+from physion.scenes.sampling.placement import (
+    BodyRule,
+    project_to_image,
+    world_bounds,
+    world_corners,
+)
+from physion.scenes.sampling.sample import Preset, load_presets, parse_presets, sample_scene
 from physion.scenes.scenarios import drape, roll
 from physion.scenes.scene import Body, Scene
 from physion.scenes.shapes.primitives import shape
 from physion.scenes.tdw.read_logs import read_scenes
-from physion.seeds import trial_seed
 
 ROLL = Path("scenes") / "roll"
 DRAPE = Path("scenes") / "drape"

@@ -11,20 +11,18 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError, BadSceneError, UnknownNameError
+from physion.core.errors import BadInputError, BadSceneError, UnknownNameError
+from physion.core.seeds import child_generator, trial_seed
 from physion.numerics.rotations import rotate_vectors
 from physion.scenes.looks import RED, YELLOW, is_mistakable, with_role_colors
+from physion.scenes.sampling.build import Scenario, scenarios
 from physion.scenes.sampling.placement import CameraRule, SceneryRule, place_camera, world_bounds
-from physion.scenes.sampling.preset import get_preset, parse_presets
-from physion.scenes.sampling.registry import Scenario, scenarios
-from physion.scenes.sampling.sample import sample_scene
+from physion.scenes.sampling.sample import get_preset, parse_presets, sample_scene
 from physion.scenes.scenarios.collide import CollideParameters as Collide
 from physion.scenes.scenarios.dominoes import DominoesParameters as Dominoes
 from physion.scenes.scenarios.drop import DropParameters as Drop
 from physion.scenes.scene import Body, Scene
-from physion.scenes.shapes.primitives import shape
-from physion.scenes.shapes.prop_names import expand_props
-from physion.seeds import child_generator, trial_seed
+from physion.scenes.shapes.primitives import expand_props, shape
 from support.sound_scenes import (
     assert_seen,
     assert_valid,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.scenes.looks import (
     MATERIALS,
     RED,
@@ -20,8 +20,7 @@ from physion.scenes.looks import (
     pick_material,
     prop_look,
 )
-from physion.scenes.shapes.primitives import shape, shapes
-from physion.scenes.shapes.prop_names import (
+from physion.scenes.shapes.primitives import (
     _MODELS,
     FALLBACK,
     PREFIX,
@@ -29,9 +28,11 @@ from physion.scenes.shapes.prop_names import (
     expand_props,
     prop_for,
     read_model_bounds,
+    shape,
+    shapes,
 )
-from physion.scenes.shapes.prop_names import PROPS as NAMES
-from physion.scenes.shapes.prop_parts import PropShape
+from physion.scenes.shapes.primitives import PROPS as NAMES
+from physion.scenes.shapes.prop_shapes import PropShape
 from physion.scenes.shapes.props import NATURAL_SIZES
 
 PROPS = [name for name in shapes.names() if name.startswith("prop:")]

@@ -11,8 +11,8 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from physion.errors import UnknownNameError
-from physion.physics.rigid.mass import body_mass
+from physion.core.errors import UnknownNameError
+from physion.physics.rigid.bodies import body_mass
 from physion.scenes.scene import Body
 from physion.scenes.shapes.meshes import Mesh, hull, solid_properties
 from physion.scenes.shapes.primitives import Shape, shape, shapes

@@ -14,12 +14,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.physics.engine import make_engine
 from physion.physics.labels import label_contact
 from physion.scenes.scene import BodyEvent, Scene
-from physion.scenes.tdw.commands import quaternion_from_euler, vector
-from physion.scenes.tdw.log_lines import MAX_LINE_BYTES
+from physion.scenes.tdw.commands import MAX_LINE_BYTES, quaternion_from_euler, vector
 from physion.scenes.tdw.read_logs import read_scenes
 
 Command = dict[str, Any]
@@ -404,7 +403,7 @@ def test_a_packed_log_of_many_lines_is_bounded_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write_log(tmp_path / "bomb", [[two_cubes()]], packed=True)
-    monkeypatch.setattr("physion.scenes.tdw.log_lines.MAX_LOG_BYTES", 2**20)
+    monkeypatch.setattr("physion.scenes.tdw.commands.MAX_LOG_BYTES", 2**20)
     (tmp_path / "bomb" / "metadata.json").write_text("[]")
     path.write_bytes(gzip.compress(b"[] trial 0\n" * 2**10) * 100)
     (failure,) = read_scenes(tmp_path).failures

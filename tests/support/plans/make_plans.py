@@ -12,7 +12,7 @@ from physion.readout.plans.selection import ModelChoice, Selection
 from physion.readout.plans.training_plan import TrainingPlan
 from physion.readout.settings import EvaluationSettings
 from physion.readout.trainings import SharedTrainConfig
-from physion.training.overrides import TrainingOverrides
+from physion.training.loop import TrainingOverrides
 from physion.training.protocols import Training
 from physion.trials.dataset import Dataset
 from support.plans import plan_models

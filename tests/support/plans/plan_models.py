@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from physion.models.batch import Batch, Rollout
-from physion.models.settings import TrainingSettings
+from physion.clips.batch import Batch, Rollout
+from physion.models.interface import TrainingSettings
 from support.trained_models import NextBrightness
 
 SIX = TrainingSettings(
@@ -62,7 +62,7 @@ class NothingToTrain:
     spec = Imagining().spec
 
     def provenance(self) -> Any:
-        from physion.models.batch import Provenance
+        from physion.clips.batch import Provenance
 
         return Provenance("nothing to train", "none")
 

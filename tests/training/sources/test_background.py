@@ -10,12 +10,12 @@ from functools import partial
 import numpy as np
 import pytest
 
-from physion.compute.executor import Executor
+from physion.clips.batch import Spec
+from physion.clips.clips import whole_source
+from physion.clips.movies import background
 from physion.compute.local import LocalExecutor, SerialExecutor
-from physion.errors import BadInputError, PhysionError
-from physion.models.batch import Spec
-from physion.training.sources.background import background
-from physion.training.sources.open_source import whole_source
+from physion.compute.tasks import Executor
+from physion.core.errors import BadInputError, PhysionError
 from physion.trials.dataset import Dataset
 from support.official_hand_made import CLOTH, RIGID
 

@@ -24,7 +24,7 @@ assert not {'av', 'hdf5plugin', 'h5py', 'torch'} & set(sys.modules)
 IMPORTS = """
 import importlib, pkgutil
 import physion.models, physion.training
-files = {'physion.training.sources.movies', 'physion.training.sources.states'}
+files = {'physion.clips.movies', 'physion.clips.states'}
 names = [
     module.name
     for package in (physion.models, physion.training)
@@ -44,9 +44,9 @@ for name in files:
 TRAINING = """
 import numpy as np, torch
 from physion.models import Motion, Provenance, Spec
-from physion.models.settings import TrainingSettings
-from physion.training.sources.background import background
-from physion.training.sources.rendered import RenderedSource
+from physion.models.interface import TrainingSettings
+from physion.clips.movies import background
+from physion.clips.rendered import RenderedSource
 from physion.training.train import train_model
 from support.rendered_scenes import body, scene_of, trajectory_of
 

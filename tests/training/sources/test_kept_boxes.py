@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from physion.models.batch import Motion
+from physion.clips import rendered
+from physion.clips.batch import Motion
+from physion.clips.movies import background
+from physion.clips.rendered import BoxesOfTrial, KeptBoxes, MotionRenderer
 from physion.rendering.renderer import Frame, Renderer
-from physion.training.sources import rendered
-from physion.training.sources.background import background
-from physion.training.sources.kept_boxes import BoxesOfTrial, KeptBoxes
-from physion.training.sources.rendered import MotionRenderer
 from support.official_hand_made import CLOTH, FRAMES, RIGID, make_scene, make_trajectory
 
 OBJECTS, SIZE = 4, 24

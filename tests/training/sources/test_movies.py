@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError, UnknownNameError
-from physion.models.batch import Spec
-from physion.training.sources.open_source import observed_source, whole_source
-from physion.trials import indexed_file
+from physion.clips.batch import Spec
+from physion.clips.clips import observed_source, whole_source
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.trials import index as indexed_file
 from physion.trials.dataset import Dataset
 from physion.trials.video import encode_movie, read_frames
 from support.official_hand_made import CLOTH, FRAMES, RIGID, SIZE

@@ -11,16 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError
-from physion.models.batch import Batch, Motion, Spec
-from physion.models.observed import cut_to_observed
+from physion.clips.batch import Batch, Motion, Spec, cut_to_observed
+from physion.clips.clips import observed_source, whole_source
+from physion.clips.rendered import RenderedSource
+from physion.clips.source import FutureFrameError, ObservedSource, WholeBatches
+from physion.clips.states import cut_motion
+from physion.core.errors import BadInputError
 from physion.physics.trajectory import Contacts, Trajectory
 from physion.scenes.scene import OBSERVED_FRAMES
-from physion.training.sources.batches import WholeBatches
-from physion.training.sources.motions import cut_motion
-from physion.training.sources.open_source import observed_source, whole_source
-from physion.training.sources.rendered import RenderedSource
-from physion.training.sources.source import FutureFrameError, ObservedSource
 from physion.trials.dataset import Dataset
 from physion.trials.trial_file import Trial, write_trial
 from physion.trials.video import encode_movie

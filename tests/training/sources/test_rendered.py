@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError
-from physion.models.batch import Motion, Spec
+from physion.clips.batch import Motion, Spec
+from physion.clips.clips import observed_source, whole_source
+from physion.clips.rendered import RenderedSource, boxes, object_ids
+from physion.clips.source import FutureFrameError
+from physion.core.errors import BadInputError
 from physion.rendering.camera import View
 from physion.rendering.renderer import Renderer
 from physion.scenes.looks import in_look
 from physion.scenes.scene import Roles, Scene
-from physion.training.sources.open_source import observed_source, whole_source
-from physion.training.sources.rendered import RenderedSource, boxes, object_ids
-from physion.training.sources.source import FutureFrameError
 from physion.trials.dataset import Dataset
 from physion.trials.video import encode_movie
 from support.official_hand_made import CLOTH, FRAMES, RIGID, SIZE, make_scene, make_trajectory

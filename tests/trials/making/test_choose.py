@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from physion.compute.local import SerialExecutor
-from physion.errors import BadInputError, BadSceneError, PhysionError
+from physion.core.errors import BadInputError, BadSceneError, PhysionError
+from physion.core.seeds import trial_seed
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
 from physion.scenes.sampling.sample import sample_scene
-from physion.seeds import trial_seed
 from physion.trials.dataset import Dataset
 from physion.trials.making import choose as choosing
 from physion.trials.making.choose import (

@@ -15,9 +15,9 @@ from physion.cli.main import main as cli
 from physion.compute.local import SerialExecutor
 from physion.trials.dataset import Dataset
 from physion.trials.index import build_index, write_index
-from physion.trials.making.compare_sets import compare_datasets
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateJob, plan_scenes
+from physion.trials.making.verify import compare_datasets
 from physion.trials.video import encode_movie
 from support.hand_made import FRAMES, SIZE, Parts, make_by_hand, make_parts, make_scene
 

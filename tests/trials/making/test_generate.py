@@ -17,14 +17,13 @@ from typing import Any
 
 import pytest
 
-from physion.atomic import folder_lock, write_atomic
 from physion.cli.generate import _print
 from physion.compute.local import LocalExecutor, SerialExecutor
 from physion.compute.run_tasks import RunReport
-from physion.errors import BadInputError, PhysionError, UnknownNameError
+from physion.core.errors import BadInputError, PhysionError, UnknownNameError
+from physion.core.files import folder_lock, write_atomic
 from physion.trials.dataset import Dataset
-from physion.trials.index import build_index, index_row
-from physion.trials.layout import TrialPaths, find_trials
+from physion.trials.index import TrialPaths, build_index, find_trials, index_row
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, TrialTask, plan_dataset, plan_scenes
 from physion.trials.making.verify import verify_dataset
@@ -225,7 +224,7 @@ from pathlib import Path
 from support.paths import TESTS
 from support.hand_made import make_by_hand, make_scene
 from physion.compute.local import SerialExecutor
-from physion.errors import PhysionError
+from physion.core.errors import PhysionError
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import plan_scenes
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
@@ -490,7 +489,7 @@ def test_writers_of_one_path_do_not_meet(tmp_path: Path) -> None:
     """Two processes that write the same path at once: one of the two contents, never a mixture."""
     path = tmp_path / "f"
     script = (
-        "import sys; from pathlib import Path; from physion.atomic import write_atomic\n"
+        "import sys; from pathlib import Path; from physion.core.files import write_atomic\n"
         "for _ in range(200): write_atomic(Path(sys.argv[1]), sys.argv[2].encode() * 20000)\n"
     )
     writers = [

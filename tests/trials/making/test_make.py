@@ -14,10 +14,10 @@ import pytest
 from PIL import Image
 
 from physion.compute.local import LocalExecutor, SerialExecutor
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
-from physion.scenes.sampling.registry import scenarios
+from physion.scenes.sampling.build import scenarios
 from physion.scenes.scene import Ending
 from physion.scenes.tdw.read_logs import read_scenes
 from physion.trials.dataset import Dataset

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from physion.compute.local import SerialExecutor
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.files import read_sealed
 from physion.physics.engine import make_engine
-from physion.sealed import read_sealed
 from physion.trials.dataset import Dataset
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, plan_dataset

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from physion.golden import golden_digests
-from physion.scenes.sampling.registry import scenarios
+from physion.core.version import golden_digests
+from physion.scenes.sampling.build import scenarios
 from physion.trials.making.reproduce import trial_digests
 
 PROBE = """

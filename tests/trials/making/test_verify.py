@@ -14,11 +14,16 @@ from PIL import Image
 import physion.trials.making.verify as verify_module
 from physion.cli.main import main as cli
 from physion.compute.local import SerialExecutor
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.trials.dataset import Dataset
-from physion.trials.files import encode_png, same_picture
-from physion.trials.index import build_index, read_index, write_index
-from physion.trials.layout import TrialPaths
+from physion.trials.index import (
+    TrialPaths,
+    build_index,
+    encode_png,
+    read_index,
+    same_picture,
+    write_index,
+)
 from physion.trials.making.generate import make_trials
 from physion.trials.making.make import make_trial
 from physion.trials.making.plan import (

@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.rendering.camera import View
 from physion.scenes.scene import Camera
 from physion.scenes.tdw.commands import quaternion_from_euler, vector
-from physion.trials.official.axes import (
+from physion.trials.official.names import (
     from_official_camera,
     from_official_rotation,
     rotation_matrices,

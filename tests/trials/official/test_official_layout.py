@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
+from physion.core.names import CONTROLLERS, guess_scenario, plain_name
 from physion.rendering.camera import axes
 from physion.scenes.scene import Camera
-from physion.stimulus_names import CONTROLLERS, guess_scenario, plain_name
-from physion.trials.files import encode_png
+from physion.trials.index import encode_png
 from physion.trials.official.names import (
     decode_depth,
     decode_picture,

@@ -18,13 +18,20 @@ import pyarrow.parquet as pq
 import pytest
 
 from physion.cli.main import main as cli
-from physion.errors import BadInputError
-from physion.sealed import write_sealed
-from physion.trials.columns import INDEX_COLUMNS
-from physion.trials.files import encode_png, write_files
-from physion.trials.index import COLUMNS, build_index, read_index, write_index
-from physion.trials.layout import TrialPaths, find_trials
-from physion.trials.publishing.card import write_card
+from physion.core.errors import BadInputError
+from physion.core.files import write_sealed
+from physion.trials.index import (
+    COLUMNS,
+    INDEX_COLUMNS,
+    TrialPaths,
+    build_index,
+    encode_png,
+    find_trials,
+    read_index,
+    write_files,
+    write_index,
+)
+from physion.trials.share.card import write_card
 from support.hand_made import SIZE, make_parts
 from support.programs import find_program
 

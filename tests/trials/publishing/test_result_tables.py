@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 
 from physion.cli.main import main as cli
-from physion.errors import BadInputError
-from physion.trials.publishing.result_tables import export_result_tables
+from physion.core.errors import BadInputError
+from physion.trials.share.tables import export_result_tables
 
 DATASET_COLUMNS = ("Encoder Training Dataset", "Dynamics Training Dataset", "Readout Train Data")
 NOTEBOOK_SCENARIOS = {

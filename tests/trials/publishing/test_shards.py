@@ -13,14 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import physion.trials.publishing.shards as shards_module
+import physion.trials.share.shards as shards_module
 from physion.cli.main import main as cli
 from physion.compute.local import LocalExecutor, SerialExecutor
-from physion.errors import BadInputError, UnknownNameError
-from physion.trials.files import encode_png, write_files
-from physion.trials.index import build_index, write_index
-from physion.trials.layout import TrialPaths
-from physion.trials.publishing.shards import SEEN_PARTS, SHARD_BYTES
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.trials.index import TrialPaths, build_index, encode_png, write_files, write_index
+from physion.trials.share.shards import SEEN_PARTS, SHARD_BYTES
 from physion.trials.trial_file import Trial
 from physion.trials.video import encode_movie
 from support.hand_made import FRAMES, SIZE, images, make_parts, tree_digest

@@ -51,8 +51,8 @@ from physion.analysis.people.participants import REHEARSAL, Responses, check_lab
 from physion.analysis.people.people import all_answers
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.tables.stimuli import MEAN, POOLED, check_excluded_names
-from physion.errors import BadInputError, UnknownNameError
-from physion.stimulus_names import SCENARIOS
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.names import SCENARIOS
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from physion.analysis.leaderboard.rows import DETECTION, PEOPLE
 from physion.analysis.metrics import leaderboard_metrics
 from physion.analysis.models.comparison import NOT_PREDICTED
 from physion.analysis.tables.stimuli import MEAN, POOLED
-from physion.errors import UnknownNameError
+from physion.core.errors import UnknownNameError
 
 FIRST_COLUMNS = (
     "rank",

@@ -21,7 +21,7 @@ from physion.analysis.people.answers import ScenarioAnswers
 from physion.analysis.statistics.jackknife import mean_of
 from physion.analysis.tables.predictions import READOUTS
 from physion.analysis.tables.stimuli import MEAN, POOLED
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 DETECTION = "detection"
 """``kind`` of models that see the whole movie, so that they need not predict."""

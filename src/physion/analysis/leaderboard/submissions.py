@@ -11,8 +11,8 @@ import pandas as pd
 
 from physion.analysis.tables.csv_table import read_csv
 from physion.analysis.tables.predictions import REQUIRED, check_predictions, name_models
-from physion.digests import file_sha256
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
+from physion.core.files import file_sha256
 
 SIDECAR_KEYS = ("versions", "license")
 """What the JSON file next to a table of predictions may state."""

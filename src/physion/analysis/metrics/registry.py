@@ -16,7 +16,7 @@ import numpy as np
 
 from physion.analysis.sample import RESAMPLED, Array, Resampled, Sample
 from physion.analysis.statistics.jackknife import Scale
-from physion.registry import Registry
+from physion.core.registry import Registry
 
 Compute = Callable[[Sample], Array]
 

@@ -13,7 +13,7 @@ from formulaic.errors import FormulaicError  # type: ignore[import-untyped]
 from scipy.linalg import qr
 
 from physion.analysis.mixed.formula import RandomTerm, columns_of, split_formula
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
 

@@ -18,7 +18,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 FUNCTIONS = {
     *("C", "Treatment", "Sum", "Helmert", "Diff", "Poly"),

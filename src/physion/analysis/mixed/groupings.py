@@ -19,7 +19,7 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
 Codes = npt.NDArray[np.int64]

@@ -19,7 +19,7 @@ from physion.analysis.mixed.linear_model import LinearModel
 from physion.analysis.mixed.linear_slopes import SlopesModel
 from physion.analysis.mixed.optimum import Optimum, difference_gradient, find_optimum
 from physion.analysis.mixed.result import MixedFit, collect
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
 

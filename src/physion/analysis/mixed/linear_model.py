@@ -14,7 +14,7 @@ import numpy.typing as npt
 from physion.analysis.mixed.design import Design
 from physion.analysis.mixed.factor import Factor
 from physion.analysis.mixed.random_effects import RandomEffects
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
 

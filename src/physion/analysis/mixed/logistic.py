@@ -30,7 +30,7 @@ from physion.analysis.mixed.optimum import find_optimum
 from physion.analysis.mixed.random_effects import RandomEffects
 from physion.analysis.mixed.result import MixedFit, collect
 from physion.analysis.mixed.separation import refuse_separation
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
 

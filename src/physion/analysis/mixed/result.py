@@ -11,7 +11,7 @@ import pandas as pd
 from scipy import stats
 
 from physion.analysis.mixed.design import INTERCEPT, Design, Group
-from physion.errors import UnknownNameError
+from physion.core.errors import UnknownNameError
 
 Array = npt.NDArray[np.float64]
 DegreesOfFreedom = Callable[[Array], float]

@@ -13,7 +13,7 @@ from scipy.optimize import linprog
 from scipy.special import expit
 
 from physion.analysis.mixed.design import Design
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
 

@@ -21,8 +21,8 @@ from physion.analysis.people.participants import EXCLUDED, LEDGE
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.tables.predictions import check_predictions, name_models
 from physion.analysis.tables.responses import with_labels
-from physion.errors import BadInputError
-from physion.stimulus_names import canonical_name, is_ledge
+from physion.core.errors import BadInputError
+from physion.core.names import canonical_name, is_ledge
 
 NO_LABEL = "no official outcome is known"
 NOT_SEEN = "people did not see it"

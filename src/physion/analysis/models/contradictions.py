@@ -13,8 +13,8 @@ import pandas as pd
 from scipy import stats
 
 from physion.analysis.tables.stimuli import in_order
-from physion.errors import BadInputError
-from physion.stimulus_names import is_ledge, scenario_of
+from physion.core.errors import BadInputError
+from physion.core.names import is_ledge, scenario_of
 
 SURE = 1e-3
 """Probability under chance below which outcomes that mostly differ are called opposite."""

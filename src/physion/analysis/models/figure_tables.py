@@ -27,7 +27,7 @@ from physion.analysis.statistics.correlation import correlate_resampled, correla
 from physion.analysis.statistics.jackknife import jackknife, mean_of, variance_of_mean
 from physion.analysis.tables.predictions import DATASETS, PROTOCOLS, READOUTS
 from physion.analysis.tables.stimuli import MEAN, POOLED, in_order
-from physion.stimulus_names import OFFICIAL_SCENARIOS, SCENARIOS
+from physion.core.names import OFFICIAL_SCENARIOS, SCENARIOS
 
 Array = npt.NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from physion.analysis.models.comparison import Comparison
 from physion.analysis.people.hypotheses import HYPOTHESES, answer_rows, with_attributes
 from physion.analysis.people.results import PeopleResults
 from physion.analysis.tables.stimuli import MEAN, POOLED
-from physion.errors import PhysionError
+from physion.core.errors import PhysionError
 
 CROSSED = "(1|participant) + (1|stimulus)"
 

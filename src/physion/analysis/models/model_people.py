@@ -20,7 +20,7 @@ from physion.analysis.statistics.kappa import (
     correctness,
     cross_kappa,
 )
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
 

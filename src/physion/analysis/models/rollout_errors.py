@@ -16,7 +16,7 @@ import pandas as pd
 from physion.analysis.statistics.jackknife import Variance, mean_of, variance_of_mean
 from physion.analysis.tables.csv_table import as_numbers, read_csv
 from physion.analysis.tables.stimuli import MEAN, in_order
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 CONSTANT_VELOCITY = "constant velocity"
 """Name of the baseline: objects go on as they moved in the last observed step."""

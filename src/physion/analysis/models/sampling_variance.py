@@ -24,7 +24,7 @@ from physion.analysis.models.model_people import Models, sample_of_models
 from physion.analysis.people.answers import ScenarioAnswers
 from physion.analysis.sample import Resampled, Sample
 from physion.analysis.statistics.jackknife import Variance, add, jackknife, second_order
-from physion.seeds import generator
+from physion.core.seeds import generator
 
 Array = npt.NDArray[np.float64]
 Computes = Mapping[str, Callable[[Sample], Array]]

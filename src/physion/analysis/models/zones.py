@@ -14,7 +14,7 @@ from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.correlation import correlate_rows
 from physion.analysis.statistics.kappa import cross_kappa
 from physion.analysis.tables.stimuli import MEAN
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from physion.analysis.people.exclusions import PREREGISTERED, ExclusionRules, fl
 from physion.analysis.people.participants import Responses, check_labels, missing_times
 from physion.analysis.people.results import read_any_responses
 from physion.analysis.tables.submission import Checked, Fault
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 FEWEST_PEOPLE = 2
 """People a stimulus, below which neither kappa of two people nor a noise ceiling is defined."""

@@ -16,8 +16,8 @@ import pandas as pd
 from physion.analysis.people.participants import Responses, scenarios_in
 from physion.analysis.tables.csv_table import read_table
 from physion.analysis.tables.stimuli import in_order
-from physion.errors import BadInputError
-from physion.stimulus_names import OFFICIAL_SCENARIOS, canonical_name
+from physion.core.errors import BadInputError
+from physion.core.names import OFFICIAL_SCENARIOS, canonical_name
 
 Expected = Mapping[str, frozenset[str]]
 """Canonical names of the test stimuli by session or, for all sessions of it, by scenario."""

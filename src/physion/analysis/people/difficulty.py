@@ -11,7 +11,7 @@ from physion.analysis.people.answers import mean_over_people
 from physion.analysis.people.people import split_halves
 from physion.analysis.statistics.correlation import correlate_rows
 from physion.analysis.statistics.paired import benjamini_hochberg
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
 

@@ -22,7 +22,7 @@ from physion.analysis.people.participants import Responses
 from physion.analysis.people.session_measures import session_measures
 from physion.analysis.statistics.clustered_logit import clustered_logit
 from physion.analysis.tables.stimuli import in_order
-from physion.errors import BadInputError, ExclusionError, UnknownNameError
+from physion.core.errors import BadInputError, ExclusionError, UnknownNameError
 
 RULES = (
     "streak",

@@ -16,8 +16,8 @@ import pandas as pd
 from physion.analysis.people.participants import Refuse, Responses, clean
 from physion.analysis.people.response_schema import TRIAL_COLUMNS, check_table
 from physion.analysis.tables.csv_table import read_csv
-from physion.errors import BadInputError
-from physion.stimulus_names import OFFICIAL_SCENARIOS, canonical_name, scenario_of
+from physion.core.errors import BadInputError
+from physion.core.names import OFFICIAL_SCENARIOS, canonical_name, scenario_of
 
 RT_OFFSET_MS = 2500.0
 """What the study takes off ``rt``. The cue of 2000 ms and 1500 ms of movie come before the buttons,

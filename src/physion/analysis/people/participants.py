@@ -19,8 +19,8 @@ import pandas as pd
 from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, check_table
 from physion.analysis.tables.csv_table import read_table, refuse_duplicates
 from physion.analysis.tables.stimuli import in_order
-from physion.errors import BadInputError
-from physion.stimulus_names import OFFICIAL_SCENARIOS, canonical_name, is_ledge
+from physion.core.errors import BadInputError
+from physion.core.names import OFFICIAL_SCENARIOS, canonical_name, is_ledge
 
 Refuse = Literal["refuse", "drop"]
 Kind = Literal["people", "simulated", "all"]

@@ -25,8 +25,8 @@ from physion.analysis.statistics.kappa import (
     resampled_mean_of_pairs,
 )
 from physion.analysis.tables.stimuli import MEAN, in_order
-from physion.errors import BadInputError
-from physion.seeds import generator
+from physion.core.errors import BadInputError
+from physion.core.seeds import generator
 
 Array = npt.NDArray[np.float64]
 

@@ -26,8 +26,8 @@ from scipy import optimize, special, stats
 
 from physion.analysis.statistics.correlation import correlate_resampled
 from physion.analysis.statistics.jackknife import jackknife
-from physion.errors import BadInputError
-from physion.seeds import generator
+from physion.core.errors import BadInputError
+from physion.core.seeds import generator
 
 Array = npt.NDArray[np.float64]
 

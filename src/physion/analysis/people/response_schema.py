@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis.tables.csv_table import require_columns
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 Kind = Literal["text", "integer", "number", "flag", "choice", "time"]
 """``text``; whole or any ``number``; ``flag``: True or False; ``choice``: one of ``choices``;

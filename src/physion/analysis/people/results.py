@@ -60,8 +60,8 @@ from physion.analysis.tables.attributes import (
 )
 from physion.analysis.tables.attributes import COLUMNS as ATTRIBUTE_COLUMNS
 from physion.analysis.tables.csv_table import read_csv, read_table
-from physion.errors import BadInputError, UnknownNameError
-from physion.stimulus_names import scenario_of
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.names import scenario_of
 
 
 @dataclass(frozen=True)

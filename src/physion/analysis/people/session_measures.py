@@ -10,7 +10,7 @@ import pandas as pd
 
 from physion.analysis.people.completeness import Expected, expected_by_session
 from physion.analysis.people.participants import Responses
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 
 def longest_streak(yes: npt.ArrayLike) -> int:

@@ -22,7 +22,7 @@ from physion.analysis.published.tables import (
     in_paper_order,
 )
 from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.stimulus_names import SCENARIOS
+from physion.core.names import SCENARIOS
 
 EXPECTED = {"training": "all", "readout": "observed+simulated"}
 """The setting that the paper's main figure shows."""

@@ -11,7 +11,7 @@ from scipy import stats
 from physion.analysis.mixed.linear import fit_linear
 from physion.analysis.published.claims import CLAIMS, PEOPLE, Claim, Contrast, Rows
 from physion.analysis.published.tables import PARTICLES, PublishedTables
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 SINGLE_FILE = "_seed_0_1_2"
 """In the name of the file of SVG's runs that the earlier state of the table held once."""

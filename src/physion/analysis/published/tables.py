@@ -22,8 +22,8 @@ from physion.analysis.tables.csv_table import as_numbers, read_csv, refuse_dupli
 from physion.analysis.tables.predictions import READOUTS
 from physion.analysis.tables.responses import read_humans
 from physion.analysis.tables.stimuli import scenario_name
-from physion.errors import BadInputError, UnknownNameError
-from physion.stimulus_names import SCENARIOS, is_ledge
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.names import SCENARIOS, is_ledge
 
 MODELS = {
     "SVG": "SVG",

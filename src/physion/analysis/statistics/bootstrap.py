@@ -13,8 +13,8 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from physion.errors import BadInputError
-from physion.seeds import generator
+from physion.core.errors import BadInputError
+from physion.core.seeds import generator
 
 Array = npt.NDArray[np.float64]
 

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.errors import BadInputError, MissingExtraError
+from physion.core.errors import BadInputError, MissingExtraError
 
 Array = npt.NDArray[np.float64]
 

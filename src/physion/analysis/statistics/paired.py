@@ -16,8 +16,8 @@ from physion.analysis.statistics.agreement import pearson
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.correlation import correlate_resampled, correlation_from_sums
 from physion.analysis.statistics.jackknife import jackknife
-from physion.errors import BadInputError
-from physion.seeds import generator
+from physion.core.errors import BadInputError
+from physion.core.seeds import generator
 
 Array = npt.NDArray[np.float64]
 

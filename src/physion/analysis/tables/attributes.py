@@ -16,8 +16,8 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis.tables.csv_table import refuse_duplicates, require_columns
-from physion.errors import BadInputError
-from physion.stimulus_names import canonical_name, scenario_of
+from physion.core.errors import BadInputError
+from physion.core.names import canonical_name, scenario_of
 
 ATTRIBUTES = ("elements", "distractors", "occluders")
 """``elements``: objects that the physics is about beside probe, agent and zone: dominoes between

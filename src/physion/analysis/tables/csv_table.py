@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.digests import check_digest, digest_path
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
+from physion.core.files import check_digest, digest_path
 
 Array = npt.NDArray[np.float64]
 

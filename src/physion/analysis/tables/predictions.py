@@ -9,8 +9,8 @@ import pandas as pd
 
 from physion.analysis.tables.csv_table import as_booleans, as_numbers, read_csv, require_columns
 from physion.analysis.tables.stimuli import scenario_name
-from physion.errors import BadInputError
-from physion.stimulus_names import OFFICIAL_SCENARIOS, SCENARIOS, canonical_name, scenario_of
+from physion.core.errors import BadInputError
+from physion.core.names import OFFICIAL_SCENARIOS, SCENARIOS, canonical_name, scenario_of
 
 REQUIRED = (
     "Model",

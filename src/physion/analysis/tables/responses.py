@@ -19,8 +19,8 @@ import pandas as pd
 
 from physion.analysis.tables.csv_table import as_booleans, as_numbers, read_csv, refuse_duplicates
 from physion.analysis.tables.stimuli import scenario_name
-from physion.errors import BadInputError
-from physion.stimulus_names import SCENARIOS, canonical_name
+from physion.core.errors import BadInputError
+from physion.core.names import SCENARIOS, canonical_name
 
 DominoesLook = Literal["plain", "redyellow", "pooled"]
 """Which people count for Dominoes: those who saw free colours with flashing overlays (the ones of

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from pathlib import Path
 
-from physion.errors import BadInputError, UnknownNameError
-from physion.stimulus_names import OFFICIAL_SCENARIOS, SCENARIOS, canonical_name, scenario_of
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.names import OFFICIAL_SCENARIOS, SCENARIOS, canonical_name, scenario_of
 
 MEAN = "mean"
 """Name of the row that averages the scores of the scenarios with equal weights."""

@@ -26,7 +26,7 @@ from physion.analysis.tables.submission_rows import (
     shorten,
 )
 from physion.analysis.tables.submission_trials import Reference, coverage, labels, leaks
-from physion.stimulus_names import canonical_name
+from physion.core.names import canonical_name
 
 __all__ = ["Checked", "Fault", "Reference", "read_index", "validate"]
 

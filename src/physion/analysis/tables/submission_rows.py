@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis.tables.predictions import DISTINGUISHING, READOUTS, REQUIRED
-from physion.stimulus_names import scenario_of
+from physion.core.names import scenario_of
 
 SUM_TOLERANCE = 1e-3
 """Largest difference of the sum of the two probabilities from 1, for rounding to three decimals."""

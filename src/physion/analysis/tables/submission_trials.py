@@ -15,7 +15,7 @@ import pandas as pd
 
 from physion.analysis.tables.predictions import DATASETS, DISTINGUISHING, READOUTS
 from physion.analysis.tables.submission_rows import Fault, booleans, each
-from physion.stimulus_names import canonical_name, is_ledge, scenario_of
+from physion.core.names import canonical_name, is_ledge, scenario_of
 
 TESTING = ("testing", "test")
 """Names of the split that may be predicted."""

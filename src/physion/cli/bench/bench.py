@@ -15,10 +15,10 @@ import pandas as pd
 
 from physion.cli.output import Stages, console
 from physion.cli.text_table import text_table
-from physion.compute.machine import processor
-from physion.errors import BadInputError
-from physion.scenes.sampling.registry import scenarios
-from physion.version import MADE_WITH
+from physion.compute.tasks import processor
+from physion.core.errors import BadInputError
+from physion.core.version import MADE_WITH
+from physion.scenes.sampling.build import scenarios
 
 COLUMNS = {
     "scenario": "scenario",

@@ -76,7 +76,7 @@ def _unflagged(options: Options) -> Responses:
     )
     from physion.analysis.people.exclusions import check_excluded, flag_sessions, without_flagged
     from physion.analysis.people.results import read_any_responses, rules_called
-    from physion.errors import BadInputError
+    from physion.core.errors import BadInputError
 
     if not options.responses:
         raise BadInputError("give the answers of people: --responses FILE")

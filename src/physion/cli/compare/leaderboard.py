@@ -142,8 +142,8 @@ def _provenance(options: Options, labels: Path | None) -> dict[str, str]:
     """Return program, date, licence, and the digests of the files about people, as text."""
     from datetime import UTC, datetime
 
-    from physion.digests import file_sha256
-    from physion.version import __version__
+    from physion.core.files import file_sha256
+    from physion.core.version import __version__
 
     given = [*options.responses, options.sessions, labels]
     files = [path for path in given if path is not None]
@@ -164,7 +164,7 @@ def _people(options: Options) -> dict[str, Any]:
     """Return the responses, and the options about them."""
     from physion.analysis.people.completeness import find_expected, read_expected
     from physion.analysis.people.results import read_any_responses, rules_called
-    from physion.errors import BadInputError
+    from physion.core.errors import BadInputError
 
     if not options.responses:
         about = (options.sessions, options.rules, options.expected, options.accept_rules)

@@ -91,7 +91,7 @@ def _fractions(options: Options) -> pd.DataFrame:
         with_labels,
     )
     from physion.cli.official.read import official_data
-    from physion.errors import BadInputError
+    from physion.core.errors import BadInputError
 
     if options.responses:
         from physion.analysis.people.people import accuracy_by_stimulus

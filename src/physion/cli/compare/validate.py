@@ -46,7 +46,7 @@ class Options:
 def main(options: Options) -> int:
     """Print the faults; return 1 if one of them is an error."""
     from physion.analysis.tables.submission import validate
-    from physion.errors import BadInputError
+    from physion.core.errors import BadInputError
 
     if not options.predictions and not options.responses:
         raise BadInputError("no file of predictions or --responses was given")
@@ -90,7 +90,7 @@ def _reference(options: Options) -> Reference:
     from physion.analysis.tables.responses import LABELS_FILE, find_next_to, read_labels
     from physion.analysis.tables.stimuli import read_stimulus_list
     from physion.analysis.tables.submission import Reference, read_index
-    from physion.errors import BadInputError
+    from physion.core.errors import BadInputError
 
     labels = options.labels
     if labels is None and options.humans is not None:

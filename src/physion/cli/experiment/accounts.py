@@ -40,7 +40,7 @@ class Options:
 def main(options: Options) -> int:
     """Change the accounts as asked; list them."""
     from physion.cli.experiment.experiment import require_extra
-    from physion.errors import BadInputError
+    from physion.core.errors import BadInputError
 
     require_extra()
     from physion.experiment.experimenter.access.accounts import remove_account
@@ -68,7 +68,7 @@ def main(options: Options) -> int:
 
 def _add(options: Options, name: str) -> None:
     from physion.cli.experiment.typed_password import read_password
-    from physion.errors import BadInputError
+    from physion.core.errors import BadInputError
     from physion.experiment.experimenter.access.accounts import add_account
 
     if options.role is None:
@@ -78,7 +78,7 @@ def _add(options: Options, name: str) -> None:
 
 def _change(options: Options, name: str) -> None:
     from physion.cli.experiment.typed_password import read_password
-    from physion.errors import BadInputError
+    from physion.core.errors import BadInputError
     from physion.experiment.experimenter.access.accounts import change_account
 
     asked = options.new_password or options.password_file is not None

@@ -29,7 +29,7 @@ from typing import Annotated
 
 import tyro
 
-from physion.errors import MissingExtraError, UnknownNameError
+from physion.core.errors import MissingExtraError, UnknownNameError
 
 SUBVERBS = {
     "init": "physion.cli.experiment.init",

@@ -36,7 +36,7 @@ class Options:
 def main(options: Options) -> int:
     """Delete; print the number of ids or sessions."""
     from physion.cli.experiment.experiment import require_extra
-    from physion.errors import BadInputError
+    from physion.core.errors import BadInputError
 
     if [bool(options.participant), options.all, bool(options.session)].count(True) != 1:
         raise BadInputError(

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.experiment.study.study_checks import NO_CONTACT
 
 if TYPE_CHECKING:
@@ -210,8 +210,8 @@ def _study(options: Options, scenarios: tuple[str, ...]) -> Study:
 
 def _password(path: Path | None) -> str:
     """Return the first line of the password file, or a random password (96 bits)."""
+    from physion.core.files import read_plain
     from physion.experiment.study.identity import MAX_PASSWORD, MIN_PASSWORD
-    from physion.plain_files import read_plain
 
     if path is None:
         return secrets.token_urlsafe(12)

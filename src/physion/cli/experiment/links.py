@@ -62,9 +62,9 @@ def main(options: Options) -> int:
 
 def _print_personal(options: Options, study: Study) -> int:
     """Print the signed links of the ids in a file: scenario, id and URL, separated by tabs."""
+    from physion.core.files import read_ids
     from physion.experiment.study.identity import Secrets
     from physion.experiment.study.recruitment import signed_links
-    from physion.plain_files import read_ids
 
     assert options.ids is not None
     ids = sorted(read_ids(options.ids))

@@ -112,7 +112,7 @@ def summary(study: Study, plan: SimulationPlan, visits: list[Visit]) -> dict[str
 
 def _check(options: Options) -> None:
     """Check that the options are valid and consistent."""
-    from physion.errors import BadInputError
+    from physion.core.errors import BadInputError
 
     if options.participants < 1 or options.at_once < 1:
         raise BadInputError("--participants and --at-once must be 1 or more")

@@ -12,7 +12,7 @@ def read_password(path: Path | None) -> str:
     """Return the first line of a file, or a password typed twice at the terminal."""
     from getpass import getpass
 
-    from physion.errors import BadInputError
+    from physion.core.errors import BadInputError
 
     if path is not None:
         return password_in(path)
@@ -26,8 +26,8 @@ def read_password(path: Path | None) -> str:
 
 def password_in(path: Path) -> str:
     """Return the first line of a file without surrounding spaces."""
-    from physion.errors import BadInputError
-    from physion.plain_files import read_plain
+    from physion.core.errors import BadInputError
+    from physion.core.files import read_plain
 
     try:
         return read_plain(path, MAX_BYTES).decode().splitlines()[0].strip()

@@ -17,7 +17,7 @@ def read_trials(folder: Path, scenario: str | None = None, limit: int | None = N
 
     ``official`` means the package, unless there is a folder of that name.
     """
-    from physion.errors import UnknownNameError
+    from physion.core.errors import UnknownNameError
     from physion.scenes.tdw.read_logs import SCENARIOS, read_scenes
 
     data = official_data(folder)

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import physion
-from physion.digests import file_sha256
-from physion.errors import BadInputError
-from physion.sealed import read_sealed, write_sealed
+from physion.core.errors import BadInputError
+from physion.core.files import file_sha256, read_sealed, write_sealed
 
 if TYPE_CHECKING:
     from physion.cli.run.options import Options

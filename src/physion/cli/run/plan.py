@@ -9,7 +9,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 if TYPE_CHECKING:
     from physion.scenes.tdw.read_logs import ImportedTrial
@@ -46,7 +46,7 @@ def plan_official(scenes: Path, humans: Path | None, limit: int | None) -> RunPl
     """
     from physion.analysis.tables.responses import read_humans
     from physion.cli.official.read import read_trials
-    from physion.stimulus_names import canonical_name
+    from physion.core.names import canonical_name
     from physion.trials.making.plan import check_names, plan_scenes
 
     limit = LIMIT if limit is None else limit or None
@@ -79,7 +79,7 @@ def balanced_trials(trials: Iterable[ImportedTrial], limit: int | None) -> list[
     The choice depends on names and outcomes alone; a larger limit includes the trials of a smaller
     one. Without a limit all trials are returned.
     """
-    from physion.seeds import stable_hash
+    from physion.core.seeds import stable_hash
 
     groups: dict[str, list[ImportedTrial]] = defaultdict(list)
     for trial in sorted(trials, key=lambda trial: stable_hash("limit", trial.scene.name)):

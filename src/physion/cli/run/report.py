@@ -18,9 +18,9 @@ def write_report(
     import pandas as pd
 
     from physion.cli.output import print_warnings
+    from physion.core.names import canonical_name
     from physion.report.build import compare_files
     from physion.report.page.movies import movies_of
-    from physion.stimulus_names import canonical_name
     from physion.trials.dataset import Dataset
 
     dataset = Dataset(folder / "trials")

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 from physion.cli.output import Stages, console
 from physion.cli.run.finished import finished, record_finished
 from physion.cli.run.options import Options
-from physion.errors import BadInputError
-from physion.trials.layout import INDEX
+from physion.core.errors import BadInputError
+from physion.trials.index import INDEX
 
 __all__ = ["Options", "main"]
 

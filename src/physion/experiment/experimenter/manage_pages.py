@@ -13,7 +13,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import Response
 
-from physion.errors import PhysionError
+from physion.core.errors import PhysionError
 from physion.experiment.experimenter.export_pages import ExportPages
 from physion.experiment.experimenter.page_context import (
     FORGET_WORD,

@@ -12,7 +12,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
-from physion.errors import PhysionError
+from physion.core.errors import PhysionError
 from physion.experiment.experimenter.access.access_control import HEADERS, AccessControl
 from physion.experiment.experimenter.access.login import PATH, Login
 from physion.experiment.experimenter.session_list import KINDS

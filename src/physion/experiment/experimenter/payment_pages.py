@@ -10,7 +10,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import Response
 
-from physion.errors import PhysionError
+from physion.core.errors import PhysionError
 from physion.experiment.experimenter.access.access_control import HEADERS
 from physion.experiment.experimenter.archive import file_name
 from physion.experiment.experimenter.export_pages import ExportPages

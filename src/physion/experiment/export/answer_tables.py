@@ -16,7 +16,7 @@ import pyarrow as pa
 from sqlalchemy import Connection, Engine
 
 from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS
-from physion.errors import PhysionError
+from physion.core.errors import PhysionError
 from physion.experiment.export.arrow_types import arrow_schema, as_frame
 from physion.experiment.export.session_rows import EXPORTED_KINDS, SessionSelection, read_sessions
 from physion.experiment.export.trial_rows import read_trials

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 from sqlalchemy import Connection, select
 
+from physion.core.names import canonical_name
 from physion.experiment.export.session_rows import SessionTable
 from physion.experiment.store.tables import SESSIONS
 from physion.experiment.study.courses.variants import under
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.stimuli import Stimulus
 from physion.experiment.study.study import ALL_SCENARIOS, Study
-from physion.stimulus_names import canonical_name
 
 
 def expected_stimuli(

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from physion.atomic import folder_lock, sync_folder
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
+from physion.core.files import folder_lock, sync_folder
 
 MANIFEST = "export.json"
 FORMAT = "physion experiment export"

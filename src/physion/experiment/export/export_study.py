@@ -35,6 +35,7 @@ import pyarrow.compute as pc
 from sqlalchemy import Connection, Engine, select
 
 from physion.analysis.people.response_schema import Column, data_dictionary
+from physion.core.version import __version__
 from physion.experiment.export.answer_tables import snapshot
 from physion.experiment.export.conventions.bids import BidsWriter
 from physion.experiment.export.conventions.psych_ds import write_psych_ds
@@ -52,7 +53,6 @@ from physion.experiment.export.spreadsheet import RULE
 from physion.experiment.export.write_tables import WrittenTables, write_tables
 from physion.experiment.store.tables import STUDIES
 from physion.experiment.study.study import EARLY_ENDS, Study
-from physion.version import __version__
 
 Layout = Literal["both", "psych-ds", "bids"]
 GONE = "its stimulus is no longer in the study folder"

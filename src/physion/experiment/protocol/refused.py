@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from physion.errors import PhysionError
+from physion.core.errors import PhysionError
 from physion.experiment.protocol.messages import REFUSALS, Completion, SessionState
 
 

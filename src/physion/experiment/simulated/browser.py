@@ -7,7 +7,7 @@ import time
 
 import httpx2
 
-from physion.errors import PhysionError
+from physion.core.errors import PhysionError
 from physion.experiment.protocol import messages as wire
 
 GO_ON = ("out_of_order", "already_answered", "wrong_stage", "not_shown")

@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import httpx2
 
-from physion.errors import PhysionError, UnknownNameError
+from physion.core.errors import PhysionError, UnknownNameError
 from physion.experiment.protocol import messages as wire
 from physion.experiment.protocol.public_study import PublicStudy
 from physion.experiment.protocol.stages import ENDED, Phase

@@ -15,9 +15,9 @@ from typing import Literal
 
 import numpy as np
 
+from physion.core.seeds import generator
 from physion.experiment.study.questions import Answer, Question
 from physion.experiment.study.stimuli import Stimulus
-from physion.seeds import generator
 
 ABILITY = (1.2, 0.35)
 """Mean and standard deviation over people, in log odds of a correct answer."""

@@ -13,7 +13,7 @@ from types import TracebackType
 
 import httpx2
 
-from physion.errors import PhysionError
+from physion.core.errors import PhysionError
 
 HOST = "127.0.0.1"
 POLL_S = 0.02

@@ -16,9 +16,9 @@ from sqlalchemy import Connection, Engine, create_engine, event, text
 from sqlalchemy.engine import URL, ExceptionContext, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
 
-from physion.atomic import folder_lock
-from physion.errors import BadInputError, PhysionError
-from physion.seeds import stable_hash
+from physion.core.errors import BadInputError, PhysionError
+from physion.core.files import folder_lock
+from physion.core.seeds import stable_hash
 
 DATABASE_FILE = "responses.sqlite"
 BUSY_MS = 10_000

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import Connection, Engine, Table, delete, select, update
 
-from physion.errors import BadInputError, PhysionError
+from physion.core.errors import BadInputError, PhysionError
 from physion.experiment.store.database import (
     check_version,
     close_writer,

@@ -9,7 +9,7 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, func, select, update
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.experiment.store.sessions import insert_or_skip
 from physion.experiment.store.tables import SESSIONS, STUDIES
 from physion.experiment.study.questions import Question, columns_of

@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 from sqlalchemy import Connection
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
-from physion.errors import PhysionError
+from physion.core.errors import PhysionError
 from physion.experiment.protocol.refused import Refused
 from physion.experiment.store.database import close_writer
 

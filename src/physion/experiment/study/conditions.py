@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.experiment.study.stimuli import NAME
 from physion.experiment.study.study_checks import Key, flag, listed, number, pattern, whole
 

@@ -7,7 +7,7 @@ import io
 from collections.abc import Iterator
 from pathlib import Path
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 
 
 def csv_rows(

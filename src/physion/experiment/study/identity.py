@@ -19,9 +19,8 @@ from pathlib import Path
 from secrets import token_hex, token_urlsafe
 from typing import Any, Literal
 
-from physion.atomic import write_atomic
-from physion.errors import BadInputError
-from physion.plain_files import read_plain
+from physion.core.errors import BadInputError
+from physion.core.files import read_plain, write_atomic
 
 SECRET_FILE = "secret.json"
 VERSION = 1

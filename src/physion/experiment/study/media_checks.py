@@ -11,10 +11,10 @@ from pathlib import Path
 import av
 from PIL import Image
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
+from physion.core.files import check_plain
 from physion.experiment.study.stimuli import Stimulus
 from physion.experiment.study.study import Study
-from physion.plain_files import check_plain
 
 
 def check_media(study: Study) -> None:

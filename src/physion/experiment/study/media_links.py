@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.experiment.study.courses.variants import StudyKey, variants
 from physion.experiment.study.identity import Secrets, check_signature, sign
 from physion.experiment.study.orders import trial_order

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import Literal
 
+from physion.core.seeds import stable_hash
 from physion.experiment.protocol.stages import Block, SessionTrials
 from physion.experiment.study.courses.attention import count_checks, with_checks
 from physion.experiment.study.courses.blocks import block_scenarios, draw_test, seed_with_order
@@ -19,7 +20,6 @@ from physion.experiment.study.courses.variants import StudyKey
 from physion.experiment.study.identity import Secrets, sign
 from physion.experiment.study.stimuli import PHASES, Stimulus
 from physion.experiment.study.study import ALL_SCENARIOS, Study
-from physion.seeds import stable_hash
 
 Order = dict[str, tuple[Stimulus, ...]]
 

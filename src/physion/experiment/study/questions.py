@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.experiment.study.study_checks import Key, flag, listed, one_of, pattern, whole
 
 KINDS = ("text", "choice", "choices", "scale")

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl, quote, unquote, urlencode, urlsplit, urlunsplit
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.experiment.protocol.messages import Completion, Enter, Source
 from physion.experiment.protocol.public_study import Recruiter
 from physion.experiment.study.courses.variants import under

@@ -14,11 +14,10 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from physion.atomic import write_atomic
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.files import read_plain, write_atomic
+from physion.core.names import canonical_name
 from physion.experiment.study.csv_rows import csv_rows
-from physion.plain_files import read_plain
-from physion.stimulus_names import canonical_name
 
 STIMULI_FILE = "stimuli.csv"
 MEDIA_FOLDER = "media"

@@ -22,8 +22,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from physion.atomic import write_atomic
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
+from physion.core.files import check_plain, read_ids, read_plain, write_atomic
+from physion.core.names import canonical_name
 from physion.experiment.study import comprehension, conditions, questions
 from physion.experiment.study.comprehension import ComprehensionQuestion, parse_comprehension
 from physion.experiment.study.conditions import Condition, parse_conditions
@@ -53,8 +54,6 @@ from physion.experiment.study.study_file import (
     parse_toml,
 )
 from physion.experiment.study.texts import TEXTS_FOLDER, read_consent_file, read_texts
-from physion.plain_files import check_plain, read_ids, read_plain
-from physion.stimulus_names import canonical_name
 
 __all__ = [
     "ALL_SCENARIOS",

@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.experiment.study.study_checks import KEYS, TABLES, Key
 
 MOST_ENTRIES = 50

@@ -22,9 +22,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.files import read_plain
 from physion.experiment.study.study_file import parse_toml
-from physion.plain_files import read_plain
 
 TEXTS_FOLDER = "texts"
 MAX_BYTES = 1_000_000

@@ -14,7 +14,7 @@ from typing import Any, NoReturn, TypeVar
 from pydantic import ValidationError
 from starlette.requests import Request
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.experiment.protocol.messages import Message
 from physion.experiment.web.refusals import describe_faults
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from physion.plain_files import read_plain
+from physion.core.files import read_plain
 
 MAX_MEDIA_BYTES = 64 * 2**20
 """Size limit of one movie or map."""

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Literal
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.models.build import make_config
-from physion.models.checkpoints.trained import SHIPPED, load_named
+from physion.models.checkpoint import SHIPPED, load_named
 from physion.models.particles.config import ParticleOptions, own_config
 from physion.models.particles.released.config import released_config
 from physion.models.particles.released.simulator import ReleasedSimulator

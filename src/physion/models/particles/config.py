@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
+from physion.models.interface import TrainingSettings
 from physion.models.particles.bodies import ParticleSettings
-from physion.models.settings import TrainingSettings
 
 Size = Literal["small", "paper", "released"]
 RANDOM, SHIPPED = "random", "shipped"

@@ -13,12 +13,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from physion.models.anchors.smallest_gap import FAR, TOLERANCE, minimise
-from physion.models.particles.bodies import CLOTH, Poses, SceneParticles
+from physion.models.baselines.motion import FAR, TOLERANCE, minimise
+from physion.models.particles.bodies import CLOTH, Poses, SceneParticles, surface_points
 from physion.models.particles.neighbours import gap_over_time
 from physion.models.particles.rigid_motion import rotation_from_vector, vector_from_rotation
-from physion.models.particles.surface import surface_points
 from physion.numerics.kernel import kernel
+from physion.physics.rigid.bodies import collision_hulls
 from physion.physics.rigid.collision.closest_points import (
     CLOSE,
     OVERLAPPING,
@@ -27,7 +27,6 @@ from physion.physics.rigid.collision.closest_points import (
     new_simplex,
 )
 from physion.physics.rigid.collision.penetration import Polytope, new_polytope, penetration
-from physion.physics.rigid.hulls import collision_hulls
 from physion.scenes.scene import FRAME_TIME, Scene
 
 F64 = NDArray[np.float64]

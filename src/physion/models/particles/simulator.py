@@ -30,25 +30,46 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from physion.errors import BadInputError
-from physion.models.batch import LAST_OBSERVED, Batch, Motion, Provenance, Rollout, Spec
+from physion.clips.batch import (
+    LAST_OBSERVED,
+    Batch,
+    Motion,
+    Provenance,
+    Rollout,
+    Spec,
+    cut_to_observed,
+)
+from physion.core.errors import BadInputError
+from physion.core.seeds import generator
+from physion.models.baselines.motion import FAR
 from physion.models.interface import Diet
+from physion.models.noisy_simulation import best_threshold
 from physion.models.particles.bodies import (
+    CLOTH,
     KINEMATIC,
     RIGID,
+    ParticleSettings,
     Poses,
+    SceneParticles,
+    join_poses_in_time,
+    later_poses,
+    particle_positions,
+    poses_of,
+    put_by_events,
+    scene_particles,
 )
 from physion.models.particles.config import ParticleConfig, ParticleOptions
-from physion.models.particles.futures import (
-    Futures,
-    join_futures,
-    observed_start,
-    shown_particles,
-    smallest_gaps,
-    unseen_outcomes,
+from physion.models.particles.gap import smallest_distance
+from physion.models.particles.graph import (
+    Drift,
+    Graph,
+    ObjectState,
+    SceneLayout,
+    drift_of,
+    make_graph,
+    move,
+    move_loose,
 )
-from physion.models.particles.graph import Drift, Graph, drift_of, make_graph, move, move_loose
-from physion.models.particles.layout import ObjectState, SceneLayout
 from physion.models.particles.networks import MessageNetwork, ObjectNetwork
 from physion.models.particles.rigid_motion import (
     fit_rigid,
@@ -57,18 +78,142 @@ from physion.models.particles.rigid_motion import (
     rotation_from_vector,
     vector_from_rotation,
 )
-from physion.models.particles.rollout import Start, disturbed_start, roll_out
-from physion.models.particles.windows import (
+from physion.models.particles.rollout import (
+    Start,
     Window,
     disturbed,
+    disturbed_start,
     read_window,
+    roll_out,
     rotated,
     start_probabilities,
 )
-from physion.models.threshold import best_threshold
 from physion.models.torch_model import TorchModel, digest_of, initial_weights
+from physion.physics.labels import label_contact
 from physion.scenes.scene import FRAME_TIME
-from physion.seeds import generator
+
+# Imagined motions of trials: their start, how near agent and patient come, and what is shown.
+
+F64 = NDArray[np.float64]
+Futures = list[tuple[SceneParticles, Poses]]
+"""Particles and motion of every sample of a trial."""
+
+
+def observed_start(motion: Motion, frames: range, settings: ParticleSettings) -> Start:
+    """Return the observed motion of a scene in these frames, and the steps to its end."""
+    scene = motion.scene
+    own = scene_particles(scene, settings, scene.present(LAST_OBSERVED))
+    poses = poses_of(own, motion, frames)
+    # What was put somewhere between the last two steps did not move there.
+    put = np.isin(own.things, put_by_events(scene, frames[-2], frames[-1]))
+    poses.centers[-2, put], poses.rotations[-2, put] = (
+        poses.centers[-1, put],
+        poses.rotations[-1, put],
+    )
+    limit = scene.ending.frame_limits()[1] - 1 - LAST_OBSERVED
+    return Start(own, poses, limit // frames.step)
+
+
+def unseen_outcomes(
+    motions: Sequence[Motion],
+) -> tuple[list[Motion], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return the trials (n) whose outcome follows the observed part, of whole motions.
+
+    Returns
+    -------
+    observed : list of Motion
+        Their observed parts.
+    contact : ndarray
+        Whether agent and patient touch (n,).
+    cloth : ndarray
+        Whether one of them is a cloth (n,).
+    """
+    observed, contact, cloth = [], [], []
+    for motion in motions:
+        scene, trajectory = motion.scene, motion.trajectory
+        if len(trajectory) <= LAST_OBSERVED:
+            continue
+        label = label_contact(scene, trajectory)
+        if not label.observed:
+            observed.append(Motion(scene, cut_to_observed(scene, trajectory)))
+            contact.append(label.contact)
+            things = [scene.index(name) for name in (scene.roles.agent, scene.roles.patient)]
+            cloth.append(max(things) >= len(scene.bodies))
+    return observed, np.array(contact, np.bool_), np.array(cloth, np.bool_)
+
+
+def join_futures(
+    observed: Sequence[Start], imagined: Sequence[Poses], samples: int
+) -> list[Futures]:
+    """Return whole motions of ``samples`` futures of each trial, which follow one another."""
+    joined = [
+        (start.particles, join_poses_in_time(start.poses, later))
+        for start, later in zip(observed, imagined, strict=True)
+    ]
+    return [joined[row : row + samples] for row in range(0, len(joined), samples)]
+
+
+def smallest_gaps(
+    motions: Sequence[Motion],
+    futures: Sequence[Futures],
+    config: ParticleConfig,
+    *,
+    first: int,
+    touch: F64,
+) -> F64:
+    """Return the smallest gaps (B, S) of agent and patient, metres, less ``touch``.
+
+    After a contact that was observed, by the rule of the label, they are -`FAR`, below every
+    threshold that a reader can fit.
+
+    Parameters
+    ----------
+    motions, futures
+        Observed motion and futures of each trial.
+    config
+        Settings of the search for the smallest distance.
+    first
+        Row of the motions from which they count, that of frame 44.
+    touch
+        Distances (2,) at which two bodies, and a cloth and a body, touch, metres.
+    """
+    gaps = np.zeros((len(motions), len(futures[0])))
+    for row, (motion, own) in enumerate(zip(motions, futures, strict=True)):
+        for column, (particles, poses) in enumerate(own):
+            later = later_poses(poses, first)
+            distance = smallest_distance(
+                motion.scene, particles, later, config.gap_spacing, config.gap_limit
+            )
+            pair = [particles.agent, particles.patient]
+            soft = min(pair) >= 0 and CLOTH in particles.kinds[pair]
+            gaps[row, column] = distance - touch[int(soft)]
+        if label_contact(motion.scene, motion.trajectory).observed:
+            gaps[row] = -FAR
+    return gaps
+
+
+def shown_particles(futures: Sequence[Futures], observed: int) -> dict[str, NDArray[np.generic]]:
+    """Return the particles of the frames after the first ``observed`` ones.
+
+    They are ``particles`` (B, S, F, P, 3) in metres and ``things`` (B, P), the index of the object
+    of each in `Scene.names`; NaN and -1 where a trial has fewer frames or particles than another.
+    """
+    clouds = [
+        [particle_positions(particles, poses)[observed:] for particles, poses in own]
+        for own in futures
+    ]
+    samples, parts = len(futures[0]), [cloud for own in clouds for cloud in own]
+    frames, count = (max(cloud.shape[axis] for cloud in parts) for axis in (0, 1))
+    shape = (len(futures), samples, frames, count, 3)
+    positions = np.full(shape, np.nan, np.float32)
+    things = np.full((len(futures), count), -1, np.int64)
+    for row, own in enumerate(clouds):
+        particles = futures[row][0][0]
+        things[row, : len(particles.owners)] = particles.things[particles.owners]
+        for sample, cloud in enumerate(own):
+            positions[row, sample, : cloud.shape[0], : cloud.shape[1]] = cloud
+    return {"particles": positions, "things": things}
+
 
 VERSIONS = {"messages": 3, "objects": 4}
 """By network; to be raised with every change of what equal weights predict, or of the training."""
@@ -85,8 +230,6 @@ _HYPOTHESES = 16
 """Random choices of particles in a robust fit."""
 _INLIER = 0.1
 """Distance in spacings within which a particle agrees with a rigid motion."""
-
-F64 = NDArray[np.float64]
 
 
 class ParticleSimulator(TorchModel):

@@ -4,14 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from physion.numerics.kernel import kernel
-from physion.numerics.linear_algebra import dot, multiply, norm
-from physion.physics.cloth.near_solids import Solids
-from physion.scenes.scene import Body, Vec3
+from physion.numerics.linear_algebra import dot, inverse, multiply, norm, ordered_mean, ordered_sum
+from physion.numerics.rotations import rotation_matrix
+from physion.physics.cloth.contacts import (
+    MIN_DISTANCE,
+    BodyPoses,
+    ClothOptions,
+    Neighbours,
+    Solids,
+    friction_hold,
+    new_poses,
+)
+from physion.scenes.scene import Body, Quat, Vec3
 from physion.scenes.shapes.primitives import ConvexPiece, shape
 
 Points = NDArray[np.float64]
@@ -133,3 +143,278 @@ def fill_lattices(shapes: Sequence[tuple[str, Vec3] | None], spacing: float) -> 
         np.concatenate([filled.ravel() for _, filled in lattices] or [np.zeros(0, np.bool_)]),
         spacing,
     )
+
+
+# Solids filled with particles that move as a whole: records, particles, poses and rotations.
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+class SolidBody(NamedTuple):
+    """What of a body decides how it settles: shape and factors, pose, mass in kg."""
+
+    shape: str
+    scale: Vec3
+    position: Vec3
+    rotation: Quat
+    mass: float
+
+
+class SolidParticles(NamedTuple):
+    """Particles of N solids, P in all, each solid's in one block.
+
+    - ``first`` (N + 1,): where the block of each solid begins.
+    - ``local`` (3, P): metres from the centre of the solid's particles, in its frame.
+    - ``center`` (N, 3): that centre in the frame of the body, metres.
+    - ``inverse`` (N, 3, 3): inverse of J (see `solid_contacts`) in the frame of the solid, 1 / m^2.
+    - ``weight`` (N,): one over the mass of a particle, 1 / kg.
+    - ``radius`` (N,): distance from the centre to the farthest particle, metres.
+    """
+
+    first: I64
+    local: F64
+    center: F64
+    inverse: F64
+    weight: F64
+    radius: F64
+
+
+class SolidState(NamedTuple):
+    """State of N solids: centres (N, 3), quaternions (N, 4), velocities (N, 3), spins (N, 3)."""
+
+    center: F64
+    q: F64
+    velocity: F64
+    spin: F64
+
+
+def solid_particles(bodies: tuple[SolidBody, ...], spacing: float) -> SolidParticles:
+    """Return the particles of solids, ``spacing`` metres apart."""
+    clouds, centers, inverses, weights, radii = [], [], [], [], []
+    for body in bodies:
+        origin, filled = fill_shape(body.shape, body.scale, spacing)
+        cloud = origin + spacing * np.argwhere(filled)
+        center = ordered_mean(cloud, axis=0)
+        cloud = cloud - center
+        squares = dot(cloud, cloud)
+        spread = ordered_sum(
+            squares[:, None, None] * np.eye(3) - cloud[:, :, None] * cloud[:, None, :], axis=0
+        )
+        # A row of particles has no inertia about itself; that of their size makes J regular.
+        spread = spread + len(cloud) * (spacing / 2) ** 2 * np.eye(3)
+        clouds.append(cloud)
+        centers.append(center)
+        inverses.append(inverse(spread))
+        weights.append(len(cloud) / body.mass)
+        radii.append(float(np.sqrt(squares.max())))
+    ends = np.cumsum([len(cloud) for cloud in clouds])
+    return SolidParticles(
+        np.concatenate([[0], ends]).astype(np.int64),
+        np.ascontiguousarray(np.concatenate(clouds).T),
+        np.array(centers),
+        np.array(inverses),
+        np.array(weights),
+        np.array(radii),
+    )
+
+
+@kernel
+def place_bodies(state: SolidState, solids: SolidParticles, poses: BodyPoses) -> None:
+    """Fill ``poses`` with those of the bodies whose solids have the given state."""
+    for body in range(len(state.q)):
+        rot = rotation_matrix(state.q[body])
+        poses.rot[body] = rot
+        for k in range(3):
+            poses.x[body, k] = state.center[body, k]
+            for m in range(3):
+                poses.x[body, k] -= rot[k, m] * solids.center[body, m]
+
+
+@kernel
+def place_particles(
+    state: SolidState, solids: SolidParticles, poses: BodyPoses, body: int, out: F64
+) -> None:
+    """Fill ``out`` (3, P) with the particles of a solid, metres, world."""
+    for p in range(solids.first[body], solids.first[body + 1]):
+        for k in range(3):
+            out[k, p] = state.center[body, k]
+            for m in range(3):
+                out[k, p] += poses.rot[body, k, m] * solids.local[m, p]
+
+
+@kernel
+def rotate_by(q: F64, angle: F64) -> None:
+    """Rotate a quaternion (4,) by a small rotation vector ``angle`` (3,) of the world, radians."""
+    half = 0.5 * angle
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    q[0] = w - half[0] * x - half[1] * y - half[2] * z
+    q[1] = x + half[0] * w + half[1] * z - half[2] * y
+    q[2] = y + half[1] * w + half[2] * x - half[0] * z
+    q[3] = z + half[2] * w + half[0] * y - half[1] * x
+    length = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    for k in range(4):
+        q[k] /= length
+
+
+@kernel
+def spin_between(old: F64, new: F64, step: float, out: F64) -> None:
+    """Fill ``out`` (3,) with the spin in rad/s that turns ``old`` (4,) into ``new`` in ``step``."""
+    w, x, y, z = new[0], new[1], new[2], new[3]
+    a, b, c, d = old[0], -old[1], -old[2], -old[3]
+    sign = 1.0 if w * a - x * b - y * c - z * d >= 0 else -1.0
+    out[0] = sign * 2 * (w * b + x * a + y * d - z * c) / step
+    out[1] = sign * 2 * (w * c - x * d + y * a + z * b) / step
+    out[2] = sign * 2 * (w * d + x * c - y * b + z * a) / step
+
+
+# Contacts of solids filled with particles: corrections of particles, and the best fit to them.
+#
+# Contacts correct the particles of each solid, every one by the mean of its corrections, and shape
+# matching then moves the solid as a whole to the place that fits the corrected particles best. For
+# small corrections dp of n particles at r from the centre, the best fit is the translation sum(dp)
+# / n and the rotation J^-1 sum(r x dp), where J is the sum of |r|^2 1 - r r^T (the inertia of
+# particles of mass 1).
+
+# Contact of two solid particles p and s of masses m_p, m_s: as for cloth (`contacts`), but p gets
+# the fraction w_p / (w_p + w_s) of each correction, with w = 1 / m.
+
+
+@kernel
+def correct_solids(
+    state: SolidState,
+    added: int,
+    solids: SolidParticles,
+    options: ClothOptions,
+    touching: I64,
+    near: Neighbours,
+    start: F64,
+    searched: BodyPoses,
+) -> None:
+    """Make one pass over the contacts of all particles, then move each solid to the best fit.
+
+    Parameters
+    ----------
+    state : SolidState
+        Centres and rotations are changed.
+    added : int
+        Number of solids that are there: the first ones.
+    solids, options
+        Particles of all solids; distances and friction.
+    touching : (T,)
+        Particles that may touch something, in ascending order.
+    near : Neighbours
+        Solid particles near each particle, as they were searched.
+    start : (3, P)
+        Particles before the substep, metres, world.
+    searched : BodyPoses
+        Poses with which ``near`` was searched.
+    """
+    rest_distance, rest_square = options.rest_distance, options.rest_distance**2
+    weight, center = solids.weight, state.center
+    poses = new_poses(len(state.q))
+    place_bodies(state, solids, poses)
+    rot = poses.rot
+    move, offset = _motion_since(searched, poses, added)
+    total, moment = np.zeros((added, 3)), np.zeros((added, 3))
+    here = np.empty(3)
+    body = 0
+    for p in touching:
+        while p >= solids.first[body + 1]:
+            body += 1
+        for k in range(3):
+            here[k] = center[body, k]
+            for m in range(3):
+                here[k] += rot[body, k, m] * solids.local[m, p]
+        px, py, pz = here[0], here[1], here[2]
+        mx, my, mz = px - start[0, p], py - start[1, p], pz - start[2, p]
+        sx = sy = sz = 0.0
+        contacts = 0
+        for c in range(near.counts[p]):
+            b = near.body[p, c]
+            fx, fy, fz = near.position[p, c, 0], near.position[p, c, 1], near.position[p, c, 2]
+            qx = offset[b, 0] + move[b, 0, 0] * fx + move[b, 0, 1] * fy + move[b, 0, 2] * fz
+            qy = offset[b, 1] + move[b, 1, 0] * fx + move[b, 1, 1] * fy + move[b, 1, 2] * fz
+            qz = offset[b, 2] + move[b, 2, 0] * fx + move[b, 2, 1] * fy + move[b, 2, 2] * fz
+            dx, dy, dz = px - qx, py - qy, pz - qz
+            square = dx * dx + dy * dy + dz * dz
+            if square >= rest_square:
+                continue
+            distance = np.sqrt(square)
+            if distance < MIN_DISTANCE:
+                continue
+            fraction = weight[body] / (weight[body] + weight[b])
+            depth = rest_distance - distance
+            dx, dy, dz = dx / distance, dy / distance, dz / distance
+            ux = mx - near.displacement[p, c, 0] - (qx - fx)
+            uy = my - near.displacement[p, c, 1] - (qy - fy)
+            uz = mz - near.displacement[p, c, 2] - (qz - fz)
+            along = ux * dx + uy * dy + uz * dz
+            ux, uy, uz = ux - along * dx, uy - along * dy, uz - along * dz
+            hold = friction_hold(ux * ux + uy * uy + uz * uz, options.friction * depth)
+            sx += fraction * (dx * depth - hold * ux)
+            sy += fraction * (dy * depth - hold * uy)
+            sz += fraction * (dz * depth - hold * uz)
+            contacts += 1
+        depth = options.floor + options.floor_gap - pz
+        if depth > 0:
+            hold = friction_hold(mx * mx + my * my, options.floor_friction * depth)
+            sx -= hold * mx
+            sy -= hold * my
+            sz += depth
+            contacts += 1
+        if contacts:
+            sx, sy, sz = sx / contacts, sy / contacts, sz / contacts
+            total[body, 0] += sx
+            total[body, 1] += sy
+            total[body, 2] += sz
+            rx, ry, rz = px - center[body, 0], py - center[body, 1], pz - center[body, 2]
+            moment[body, 0] += ry * sz - rz * sy
+            moment[body, 1] += rz * sx - rx * sz
+            moment[body, 2] += rx * sy - ry * sx
+    _move_to_fit(state, solids, rot, total, moment)
+
+
+@kernel
+def _motion_since(then: BodyPoses, now: BodyPoses, count: int) -> tuple[F64, F64]:
+    """Return how the first ``count`` bodies moved between two poses.
+
+    A point p of body b has moved to move[b] p + offset[b]: ``move`` (count, 3, 3) is a rotation,
+    ``offset`` (count, 3) is in metres.
+    """
+    move, offset = np.zeros((count, 3, 3)), np.zeros((count, 3))
+    for b in range(count):
+        for k in range(3):
+            for m in range(3):
+                for j in range(3):
+                    move[b, k, m] += now.rot[b, k, j] * then.rot[b, m, j]
+            offset[b, k] = now.x[b, k]
+            for m in range(3):
+                offset[b, k] -= move[b, k, m] * then.x[b, m]
+    return move, offset
+
+
+@kernel
+def _move_to_fit(
+    state: SolidState, solids: SolidParticles, rot: F64, total: F64, moment: F64
+) -> None:
+    """Move solids, which are rotated by ``rot`` (N, 3, 3), to the best fit to their corrections.
+
+    ``total`` (M, 3) is the sum of the corrections of the first M solids, metres, ``moment`` (M, 3)
+    their moment about the centre of the solid, m^2.
+    """
+    center = state.center
+    local, angle = np.empty(3), np.empty(3)
+    for b in range(len(total)):
+        number = solids.first[b + 1] - solids.first[b]
+        for k in range(3):
+            center[b, k] += total[b, k] / number
+            local[k] = 0.0
+            for m in range(3):
+                local[k] += rot[b, m, k] * moment[b, m]
+        for k in range(3):
+            angle[k] = 0.0
+            for m in range(3):
+                for j in range(3):
+                    angle[k] += rot[b, k, m] * solids.inverse[b, m, j] * local[j]
+        rotate_by(state.q[b], angle)

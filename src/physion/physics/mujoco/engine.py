@@ -9,22 +9,219 @@ The same scene gives the same bytes in every process: MuJoCo runs in one thread.
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+from typing import Any
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.errors import BadSceneError
+from physion.core.errors import BadSceneError
+from physion.numerics.elementary import log_of
 from physion.numerics.linear_algebra import apply, dot, inverse, norm, unit
 from physion.numerics.rotations import conjugate, multiply_quaternions, rotate_vectors
-from physion.physics.mujoco.contacts import ContactRows
-from physion.physics.mujoco.model import compile_model
-from physion.physics.mujoco.settings import MujocoSettings
-from physion.physics.rigid.actors import find_actors
+from physion.physics.engine import settings_tag
+from physion.physics.rigid.bodies import FLOOR_MATERIAL, Actors, collision_hulls, find_actors
 from physion.physics.rigid.motion import MIN_SPIN
-from physion.physics.trajectory import State, Trajectory
-from physion.scenes.scene import FRAME_TIME, Scene
+from physion.physics.trajectory import ENVIRONMENT, Contacts, State, Trajectory, summarise_contacts
+from physion.scenes.scene import FRAME_TIME, GRAVITY, Scene, SurfaceMaterial
+
+# Contacts of a simulation: collect them step by step, and sum them up pair by pair.
 
 F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+class ContactRows:
+    """Touching points of all steps so far."""
+
+    def __init__(self) -> None:
+        self._frames: list[I64] = []
+        self._pairs: list[I64] = []
+        self._values: list[F64] = []
+
+    def add(
+        self, frame: int, pairs: I64, points: F64, normals: F64, impulses: F64, gaps: F64
+    ) -> None:
+        """Add the touching points of a step that leads to ``frame``.
+
+        Parameters
+        ----------
+        frame
+            Index of the frame in the trajectory.
+        pairs : (C, 2)
+            Scene bodies, or the floor.
+        points, normals : (C, 3)
+            Metres; unit vectors from the first to the second body. World axes.
+        impulses, gaps : (C,)
+            Newton seconds along the normal; metres, negative where surfaces overlap.
+        """
+        if len(pairs) == 0:
+            return
+        self._frames.append(np.full(len(pairs), frame))
+        self._pairs.append(pairs)
+        self._values.append(np.column_stack([points, normals, impulses, gaps]))
+
+    def touches(self, frame: int, pair: tuple[int, int]) -> bool:
+        """Return whether two bodies touch in ``frame``, the latest one."""
+        for at, pairs in zip(reversed(self._frames), reversed(self._pairs), strict=True):
+            if at[0] != frame:
+                break
+            if (np.sort(pairs, axis=1) == sorted(pair)).all(axis=1).any():
+                return True
+        return False
+
+    def contacts(self) -> Contacts:
+        """Return one row for each touching pair and frame: its deepest point, its whole impulse."""
+        if not self._frames:
+            return Contacts.empty()
+        pairs, values = np.concatenate(self._pairs), np.concatenate(self._values)
+        return summarise_contacts(np.concatenate(self._frames), pairs, values, ENVIRONMENT)
+
+
+# Constants of the MuJoCo engine: time step, contact, friction, rest.
+
+
+@dataclass(frozen=True, slots=True)
+class MujocoSettings:
+    """Constants of the MuJoCo engine, the same for all scenarios.
+
+    - ``substeps``: steps of MuJoCo for each frame of 0.01 s.
+    - ``gravity``: metres per second squared, downwards.
+    - ``contact_time``: seconds in which a contact settles, `solref[0]` of MuJoCo: its contacts are
+      damped springs. Shorter ones are stiffer. Of .005, .01 and .02, this one agrees best with
+      the outcomes of the official scenes.
+    - ``friction_factor``: factor of the mean dynamic friction of both materials. MuJoCo has one
+      coefficient for sticking and sliding. 2 as in the official simulator, whose flat contacts
+      have twice the friction of Coulomb's law; 1.5 agrees less with its outcomes.
+    - ``torsion``: friction against rotation about the normal, metres.
+    - ``max_angular_velocity``: radians per second, about the centre of mass (Unity: 7).
+    - ``rest_energy``: kinetic energy by mass in m²/s² below which a body counts as still;
+      ``rest_time``: seconds after which a still body is at rest.
+    - ``floor``: friction and restitution of the floor (Unity's default material).
+    """
+
+    substeps: int = 4
+    gravity: float = GRAVITY
+    contact_time: float = 0.01
+    friction_factor: float = 2.0
+    torsion: float = 0.02
+    max_angular_velocity: float = 7.0
+    rest_energy: float = 1e-4
+    rest_time: float = 0.4
+    floor: SurfaceMaterial = FLOOR_MATERIAL
+
+    def tag(self) -> str:
+        """Return eight hexadecimal digits that change whenever a setting does."""
+        return settings_tag(self)
+
+
+# MuJoCo's model of a scene: a free body for every actor, a convex mesh for every piece.
+
+LEAST_DAMPING = 0.01
+"""Smallest damping ratio of a contact, so that its spring is not infinitely slow to settle."""
+
+
+def compile_model(
+    scene: Scene, actors: Actors, active: tuple[bool, ...], settings: MujocoSettings
+) -> tuple[Any, I64]:
+    """Return MuJoCo's model, and for each of its geoms the body, or `ENVIRONMENT` for the floor.
+
+    Friction is a property of each pair of geoms, because MuJoCo would take the larger coefficient
+    of two materials, and the official simulator takes their mean.
+    """
+    spec = mujoco.MjSpec()
+    spec.option.timestep = FRAME_TIME / settings.substeps
+    spec.option.gravity = [0.0, 0.0, -settings.gravity]
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    places = [_add_actor(spec, actors, actor) for actor in range(actors.count)]
+    places.append(spec.worldbody)
+    floor = spec.worldbody.add_geom()
+    floor.name, floor.type = _geom_name(ENVIRONMENT, 0), mujoco.mjtGeom.mjGEOM_PLANE
+    floor.size, floor.pos = [0.0, 0.0, 1.0], [0.0, 0.0, scene.floor]
+    pieces: list[list[str]] = []
+    for i, body in enumerate(scene.bodies):
+        hulls = collision_hulls(body.shape, body.scale) if active[i] and not body.scenery else []
+        pieces.append([_geom_name(i, k) for k in range(len(hulls))])
+        for name, hull in zip(pieces[-1], hulls, strict=True):
+            corners = actors.pivot[i] + rotate_vectors(actors.rotation[i], hull.corners)
+            _add_hull(spec, places[actors.actor_of[i]], name, corners)
+    for i, body in enumerate(scene.bodies):
+        if actors.actor_of[i] == actors.count:
+            continue
+        _add_pairs(spec, pieces[i], [floor.name], body.contact, settings.floor, settings)
+        for j, other in enumerate(scene.bodies):
+            # A pair of moving bodies is met twice.
+            first = actors.actor_of[j] == actors.count or i < j
+            if first and actors.actor_of[i] != actors.actor_of[j]:
+                _add_pairs(spec, pieces[i], pieces[j], body.contact, other.contact, settings)
+    model = spec.compile()
+    names = [model.geom(geom).name for geom in range(model.ngeom)]
+    return model, np.array([int(name.partition(" ")[0]) for name in names], np.int64)
+
+
+def _geom_name(body: int, piece: int) -> str:
+    return f"{body} {piece}"
+
+
+def _add_actor(spec: Any, actors: Actors, actor: int) -> Any:
+    """Add the free body of an actor, with its mass and its origin at the centre of mass."""
+    body = spec.worldbody.add_body()
+    body.add_freejoint()
+    body.explicitinertial = True
+    body.mass, body.ipos = actors.mass[actor], [0.0, 0.0, 0.0]
+    inertia = actors.inertia[actor]
+    body.fullinertia = [*np.diagonal(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+    body.pos, body.quat = actors.x[actor], actors.q[actor]
+    return body
+
+
+def _add_hull(spec: Any, place: Any, name: str, corners: F64) -> None:
+    """Add a convex piece with these corners (K, 3) to a body; it collides in pairs only."""
+    mesh = spec.add_mesh()
+    mesh.name = name
+    mesh.uservert = corners.ravel().tolist()
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+    geom = place.add_geom()
+    geom.name, geom.type, geom.meshname = name, mujoco.mjtGeom.mjGEOM_MESH, name
+    geom.contype = geom.conaffinity = 0
+
+
+def _add_pairs(
+    spec: Any,
+    pieces: list[str],
+    others: list[str],
+    a: SurfaceMaterial,
+    b: SurfaceMaterial,
+    settings: MujocoSettings,
+) -> None:
+    """Let ``pieces`` of a body of material ``a`` collide with ``others`` of material ``b``."""
+    sliding = settings.friction_factor * (a.dynamic_friction + b.dynamic_friction) / 2
+    solref = contact_spring((a.restitution + b.restitution) / 2, settings.contact_time)
+    for piece in pieces:
+        for other in others:
+            pair = spec.add_pair()
+            pair.geomname1, pair.geomname2 = piece, other
+            pair.condim = 4
+            pair.friction = [sliding, sliding, settings.torsion, 0.0, 0.0]
+            pair.solref = solref
+
+
+def contact_spring(restitution: float, contact_time: float) -> list[float]:
+    """Return time constant and damping ratio of a contact, MuJoCo's ``solref``.
+
+    A spring with the damping ratio z throws a body back with exp(-pi z / sqrt(1 - z²)) of its
+    speed, so that z = L / sqrt(pi² + L²) with L = -log(restitution). The frequency of the spring,
+    1 / (time constant times z), is the same for all materials.
+    """
+    if restitution <= 0.0:
+        return [contact_time, 1.0]
+    log = -float(log_of(restitution))
+    damping = max(log / math.sqrt(math.pi * math.pi + log * log), LEAST_DAMPING)
+    return [contact_time / damping, damping]
+
 
 VERSION = 1
 """Version of the engine: to be raised when scenes move differently under the same settings."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from physion.numerics.elementary import cos_of, sin_of
 from physion.numerics.kernel import in_place_kernel
-from physion.physics.rigid.solver_records import F64, Flags
+from physion.physics.rigid.solver import F64, Flags
 
 MIN_SPIN = 1e-12
 """Radians per second: keeps the cap of the angular velocity from dividing by zero."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.numerics.kernel import in_place_kernel
-from physion.physics.rigid.solver_records import Bodies
+from physion.physics.rigid.solver import Bodies
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

@@ -6,10 +6,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from physion.compute.executor import Executor, TaskOutcome
-from physion.compute.progress import Progress
 from physion.compute.run_tasks import FATAL_ERRNOS
-from physion.errors import BadInputError, PhysionError
+from physion.compute.tasks import Executor, Progress, TaskOutcome
+from physion.core.errors import BadInputError, PhysionError
 from physion.readout.plans.tasks import EvaluationTask, TrainingTask
 
 C = TypeVar("C")

@@ -6,8 +6,8 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from physion.compute.progress import Progress, tracked
-from physion.errors import PhysionError
+from physion.compute.tasks import Progress, tracked
+from physion.core.errors import PhysionError
 from physion.readout.plans.failures import describe_failure
 from physion.readout.plans.speed import Speed, measure_speed
 from physion.readout.plans.tasks import TrainingTask

@@ -11,9 +11,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeGuard
 
-from physion.compute.executor import Executor
-from physion.compute.progress import Progress
-from physion.digests import is_whole
+from physion.compute.tasks import Executor, Progress
+from physion.core.files import is_whole
 from physion.readout.folds import plan_folds, select_scenario
 from physion.readout.plans.cells import find_task, run_cells
 from physion.readout.plans.failures import describe_failure, stop_if_fatal

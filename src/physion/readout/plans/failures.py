@@ -6,8 +6,8 @@ import errno
 import traceback
 from pathlib import Path
 
-from physion.errors import MEMORY_SETTINGS, PhysionError
-from physion.models.raised import is_out_of_memory
+from physion.core.errors import MEMORY_SETTINGS, PhysionError
+from physion.models.build import is_out_of_memory
 
 _NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import physion
-from physion.models.from_file import is_file_name
+from physion.models.build import is_file_name
 from physion.readout.plans.selection import ModelChoice
 from physion.trials.dataset import Dataset
 

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from physion.models.build import build_model
-from physion.models.from_file import is_file_name, load_from_file
+from physion.models.build import build_model, is_file_name, load_from_file
 from physion.models.interface import Learns, Trained
 from physion.readout.model_calls import is_network
 from physion.readout.plans.keys import choice_key, code_key, key_of

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from physion.errors import BadInputError
-from physion.sealed import read_sealed, write_sealed
+from physion.core.errors import BadInputError
+from physion.core.files import read_sealed, write_sealed
 
 FOLDER = "plan"
 """Folder of the records in an output folder."""

@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from physion.readout.plans.tasks import EvaluationTask
-from physion.readout.table import Evaluation, read_table
+from physion.readout.tables import Evaluation, read_table
 
 MEAN = "mean"
 """Name of the rows with the mean of the scenarios."""
@@ -30,7 +30,7 @@ _COLUMNS = {
 class StoredEvaluation:
     """Evaluation of a plan, of which the table is read only if it is asked for.
 
-    - ``path``, ``problems``, ``rollout_errors``: as in `physion.readout.table.Evaluation`.
+    - ``path``, ``problems``, ``rollout_errors``: as in `physion.readout.tables.Evaluation`.
     - ``count``: number of predictions.
     - ``scores``: rows of JSON values: ``model``, ``init``, ``readout``, ``scenario``, ``hits`` and
       ``trials`` (numbers of right predictions, and of all).

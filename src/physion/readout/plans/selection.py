@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.training.protocols import Training
 
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
-from physion.compute.progress import Progress
-from physion.errors import PhysionError
+from physion.compute.tasks import Progress
+from physion.core.errors import PhysionError
 from physion.readout.trainings import PlannedTraining, SharedTrainConfig, Trainer
-from physion.training.overrides import TrainingOverrides
+from physion.training.loop import TrainingOverrides
 from physion.trials.dataset import Dataset
 
 _STEPS, _TRIALS, _LIMIT = 6, 2, 10.0

@@ -9,10 +9,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from physion.compute.executor import Executor
-from physion.compute.progress import Progress
-from physion.errors import BadInputError
-from physion.models.settings import TrainingSettings
+from physion.compute.tasks import Executor, Progress
+from physion.core.errors import BadInputError
+from physion.models.interface import TrainingSettings
 from physion.readout.plans.cells import find_task, run_cells
 from physion.readout.plans.failures import describe_failure, stop_if_fatal
 from physion.readout.plans.keys import code_key, dataset_key, key_of
@@ -27,7 +26,7 @@ from physion.readout.trainings import (
     Trainer,
     plan_trainings,
 )
-from physion.training.overrides import TrainingOverrides
+from physion.training.loop import TrainingOverrides
 from physion.trials.dataset import Dataset
 
 if TYPE_CHECKING:
@@ -269,7 +268,7 @@ class TrainingPlan:
         return self.shared.devices * self.shared.nodes > 1
 
     def _train(self, task: TrainingTask, meter: Meter) -> dict[str, Any]:
-        from physion.models.checkpoints.checkpoint import WEIGHTS
+        from physion.models.checkpoint import WEIGHTS
 
         trainer = self._trainer(task)
         result = trainer.train(task.planned, task.seed, meter)

@@ -2,22 +2,102 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Callable, Sequence
 
-from physion.numerics.elementary import cos, exp, power, sin
-from physion.numerics.random_normals import standard_normal
-from physion.rendering.textures.noise import (
-    F32,
-    SIZE,
-    Painter,
-    cells,
-    flat,
-    grid,
-    noise,
-    smooth,
-    tint,
-    uniform,
-)
+import numpy as np
+from numpy.typing import NDArray
+
+from physion.numerics.elementary import cos, exp, power, sin, standard_normal, tanh
+from physion.numerics.linear_algebra import inverse_real_transform, norm, ordered_mean, outer
+
+# Building blocks of procedural textures: seamless noise, Voronoi cells, coordinates, tints.
+
+F32 = NDArray[np.float32]
+
+SIZE = 512
+"""Texels along the side of a texture."""
+SPECTRUM_REACH = 2.2
+"""Frequency, as a multiple of the scale of the spectrum, up to which noise has a spectrum."""
+
+Painter = Callable[[np.random.Generator], tuple[F32, F32]]
+"""Returns linear albedo (SIZE, SIZE, 3) in 0..1 and height (SIZE, SIZE) of a texture; heights are
+in units of the texture's side."""
+
+
+def noise(rng: np.random.Generator, u: float, v: float) -> F32:
+    """Draw seamless Gaussian noise (SIZE, SIZE) with mean 0 and standard deviation 1.
+
+    Its spectrum is white noise times exp(-(fu / u)^2 - (fv / v)^2): ``u`` and ``v`` are about the
+    numbers of waves over the texture. It is drawn only where this weight is not negligible.
+    """
+    reach_u, reach_v = (min(int(SPECTRUM_REACH * n) + 1, SIZE // 2 - 1) for n in (u, v))
+    fu, fv = np.arange(reach_u + 1), np.arange(-reach_v, reach_v + 1)
+    weight = outer(exp(-((fv / v) ** 2)), exp(-((fu / u) ** 2)))
+    drawn = standard_normal(rng, (2, *weight.shape))
+    spectrum = np.zeros((SIZE, SIZE // 2 + 1), np.complex128)
+    spectrum[fv, : reach_u + 1] = weight * (drawn[0] + 1j * drawn[1])
+    spectrum[0, 0] = 0.0
+    waves = inverse_real_transform(spectrum)
+    centered = waves - ordered_mean(waves.reshape(-1))
+    deviation = np.sqrt(ordered_mean((centered * centered).reshape(-1)))
+    return np.asarray(waves / deviation, np.float32)
+
+
+def uniform(
+    rng: np.random.Generator, low: float, high: float, shape: int | tuple[int, ...]
+) -> NDArray[np.float64]:
+    """Draw numbers from the uniform distribution between ``low`` and ``high``.
+
+    `numpy.random.Generator.uniform` does the same in C, where a compiler may round the product and
+    the sum together; the bits then depend on the processor (numpy issue 22993).
+    """
+    return low + (high - low) * rng.random(shape)
+
+
+def grid() -> tuple[F32, F32]:
+    """Return the coordinates u and v (SIZE, SIZE) of the centres of texels, 0..1."""
+    centers = (np.arange(SIZE, dtype=np.float32) + np.float32(0.5)) / np.float32(SIZE)
+    u, v = np.meshgrid(centers, centers)
+    return u, v
+
+
+def tint(value: F32, color: Sequence[float]) -> F32:
+    """Return the albedo (SIZE, SIZE, 3) of a linear colour times ``value`` (SIZE, SIZE)."""
+    return np.asarray(value[..., None] * np.asarray(color, np.float32), np.float32)
+
+
+def flat() -> F32:
+    """Return the height (SIZE, SIZE) of a flat surface, 0."""
+    return np.zeros((SIZE, SIZE), np.float32)
+
+
+def cells(rng: np.random.Generator, count: int) -> tuple[F32, F32, NDArray[np.int64]]:
+    """Draw a seamless Voronoi diagram of ``count`` random points.
+
+    Returns
+    -------
+    nearest, second, index
+        (SIZE, SIZE) each: distances to the nearest and to the second nearest point, in units of
+        the texture's side, and the index of the nearest.
+    """
+    # Imported late: what only reads scenes and trials starts faster.
+    from scipy.spatial import KDTree
+
+    u, v = grid()
+    points = rng.random((count, 2))
+    texels = np.stack([u.ravel(), v.ravel()], 1).astype(np.float64)
+    _, which = KDTree(points, boxsize=1.0).query(texels, k=2)
+    # The distances that the tree returns may be rounded differently on another processor.
+    offset = texels[:, None] - points[which]
+    distance = norm(offset - np.round(offset)).astype(np.float32).reshape(SIZE, SIZE, 2)
+    return distance[..., 0], distance[..., 1], which[:, 0].reshape(SIZE, SIZE)
+
+
+def smooth(value: F32, low: float, high: float) -> F32:
+    """Return a smooth step: 0 below ``low``, 1 above ``high``, 3 t^2 - 2 t^3 between."""
+    t = np.clip((value - low) / (high - low), 0.0, 1.0)
+    return np.asarray(t * t * (3.0 - 2.0 * t), np.float32)
+
 
 GREY = (1.0, 1.0, 1.0)
 
@@ -223,4 +303,155 @@ MATERIAL_PAINTERS: dict[str, Painter] = {
     "moon": _paint_moon,
     "wicker": _paint_wicker,
     "fur": _paint_fur,
+}
+
+
+# Painters of the textures of woods: figure, grain and pores.
+
+
+def _paint_ash(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint sawn ash: a trunk's rings cut lengthwise, with a pointed figure in the middle."""
+    u, v = grid()
+    warp = 0.026 * noise(rng, 2.5, 0.8) + 0.003 * noise(rng, 10, 2)
+    depth = 0.10 + 0.16 * sin(2 * np.pi * (v + 0.1)) + 0.02 * noise(rng, 1.5, 2)
+    away = (u - 0.06 + warp) % 1.0 - 0.5  # boards side by side mirror each other, without a seam
+    rings = np.sqrt(away**2 + depth**2) * 58.0
+    phase = rings - np.floor(rings)
+    line = exp(-(((phase - 0.75) / 0.20) ** 2))
+    pores = np.clip(noise(rng, 220, 8) - 0.6, 0, None)
+    fade = np.clip(0.75 + 0.25 * noise(rng, 3, 2), 0.2, 1.2)
+    streak = np.clip(0.85 + 0.45 * noise(rng, 200, 14), 0.1, 1.6)
+    value = 0.95 - 0.40 * line * fade * streak - 0.07 * pores + 0.02 * noise(rng, 4, 2)
+    return tint(np.clip(value, 0.05, 1.0), (0.98, 0.90, 0.76)), flat()
+
+
+def _paint_cedar(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint red cedar glued from narrow staves, each cut from another board."""
+    u, v = grid()
+    staves = 5
+    index = np.minimum((u * staves).astype(int), staves - 1)
+    shade = np.array([0.82, 1.08, 0.70, 0.95, 1.15])[index]
+    warp = 0.10 * noise(rng, 6, 1.2) + 0.7 * index
+    phase = (u * 26 + warp * 6 + 0.5 * sin(2 * np.pi * (v + 0.31 * index))) % 1.0
+    grain = exp(-(((phase - 0.5) / 0.22) ** 2))
+    fibre = noise(rng, 160, 5)
+    joint = np.abs(u * staves - np.round(u * staves)) < 0.018
+    value = shade * (0.92 - 0.30 * grain + 0.05 * fibre) * np.where(joint, 0.55, 1.0)
+    red = np.clip(value, 0.04, 1.4)
+    color = np.stack([0.46 * red, 0.27 * power(red, 1.15), 0.20 * power(red, 1.2)], -1)
+    return np.clip(color, 0, 1), flat()
+
+
+def _paint_oak(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint quarter-sawn oak: straight grain, long dark pores, pale flecks across."""
+    u, _ = grid()
+    bands = sin(2 * np.pi * (16 * u + 0.35 * noise(rng, 3, 1.0)))
+    pores = np.clip(noise(rng, 130, 9) - 0.9, 0, 1.5)
+    flecks = np.clip(noise(rng, 14, 30) - 1.7, 0, 0.8)
+    value = 0.74 + 0.07 * bands + 0.05 * noise(rng, 70, 3) - 0.32 * pores + 0.22 * flecks
+    return tint(np.clip(value, 0.08, 1.0), (1.0, 0.88, 0.70)), flat()
+
+
+def _paint_pine(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint pale pine: wide growth rings that bend around knots."""
+    u, v = grid()
+    bent, dark = np.zeros_like(u), np.zeros_like(u)
+    for x, y, size in ((0.26, 0.3, 0.030), (0.71, 0.62, 0.038), (0.5, 0.93, 0.022)):
+        du = (u - x + 0.5) % 1.0 - 0.5
+        dv = ((v - y + 0.5) % 1.0 - 0.5) / 1.5
+        away = np.sqrt(du**2 + dv**2) / size
+        bent -= 2.2 * size * tanh(du / size) * exp(-((away / 2.4) ** 2))
+        rings = 0.75 + 0.25 * sin(9.0 * away)
+        dark = np.maximum(dark, rings * 0.5 * (1.0 - tanh(4.0 * (away - 1.0))))
+    phase = (11 * (u + bent) + 0.4 * noise(rng, 2, 1.0)) % 1.0
+    late = exp(-(((phase - 0.7) / 0.16) ** 2))
+    value = 0.93 - 0.24 * late + 0.025 * noise(rng, 120, 5) + 0.02 * noise(rng, 3, 2)
+    value = np.clip(value * (1.0 - 0.62 * dark), 0.05, 1.0)
+    color = np.stack([value, 0.87 * power(value, 1.15), 0.66 * power(value, 1.45)], -1)
+    return np.asarray(color, np.float32), flat()
+
+
+def _paint_walnut(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint dark walnut: broad light and dark waves under fine streaks."""
+    u, v = grid()
+    flow = 5 * u + 0.22 * sin(2 * np.pi * v) + 0.5 * noise(rng, 2.0, 1.2)
+    waves = sin(2 * np.pi * flow) + 0.5 * sin(2 * np.pi * (3 * flow + 0.2))
+    fine = noise(rng, 90, 4)
+    pores = np.clip(noise(rng, 150, 10) - 1.1, 0, 1.2)
+    value = 0.40 + 0.13 * waves + 0.06 * fine - 0.14 * pores
+    return tint(np.clip(value, 0.06, 1.0), (1.0, 0.80, 0.62)), flat()
+
+
+WOOD_PAINTERS: dict[str, Painter] = {
+    "wood_ash": _paint_ash,
+    "wood_cedar": _paint_cedar,
+    "wood_oak": _paint_oak,
+    "wood_pine": _paint_pine,
+    "wood_walnut": _paint_walnut,
+}
+
+
+# Painters of the textures of rooms: carpet, plaster, tiles, paving.
+
+
+def _paint_carpet(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint loops of wool in rows, some of them paler."""
+    u, v = grid()
+    rows = sin(2 * np.pi * 70 * v) * sin(2 * np.pi * (70 * u + 0.5 * np.floor(70 * v)))
+    fleck = noise(rng, 110, 90)
+    height = 0.3 * rows + 0.8 * fleck + 0.4 * noise(rng, 45, 36)
+    value = 0.52 * exp(0.48 * height + 0.03 * noise(rng, 4, 4))
+    return np.clip(tint(value, (1.0, 1.0, 1.0)), 0.02, 1), 0.0002 * height
+
+
+def _paint_plaster(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint trowelled plaster: broad strokes and grit."""
+    strokes = noise(rng, 8, 26) + 0.6 * noise(rng, 34, 16)
+    grit = noise(rng, 120, 120)
+    value = 0.90 + 0.012 * strokes + 0.008 * grit + 0.015 * noise(rng, 2, 2)
+    return tint(np.clip(value, 0, 1), (1, 1, 1)), 0.0003 * strokes * np.clip(
+        0.5 + noise(rng, 2, 2), 0, 2
+    ) + 0.00015 * grit
+
+
+def _paint_smooth_plaster(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint a painted wall with faint traces of the roller."""
+    value = 0.95 + 0.004 * noise(rng, 90, 90) + 0.006 * noise(rng, 2, 2)
+    return tint(np.clip(value, 0, 1), (1, 1, 1)), 0.00012 * noise(rng, 60, 60)
+
+
+def _paint_tiles(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint four by four stoneware tiles, mottled, in different shades, with pale joints."""
+    u, v = grid()
+    count = 4
+    column, row = (u * count).astype(int), (v * count).astype(int)
+    shade = uniform(rng, 0.74, 1.2, (count, count))[row, column]
+    clouds = 0.5 * noise(rng, 9, 9) + 0.35 * noise(rng, 26, 26) + 0.15 * noise(rng, 80, 80)
+    value = shade * np.clip(1.0 + 0.30 * clouds, 0.2, None)
+    color = np.stack([0.150 * value, 0.058 * power(value, 1.15), 0.040 * power(value, 1.2)], -1)
+    du = np.abs(u * count - np.round(u * count))
+    dv = np.abs(v * count - np.round(v * count))
+    joint = np.clip(1.5 - np.minimum(du, dv) / 0.008, 0.0, 1.0)[..., None]
+    color = color * (1 - joint) + joint * np.array([0.24, 0.20, 0.18])
+    return np.clip(np.nan_to_num(color), 0, 1), 0.0009 * clouds - 0.002 * joint[..., 0]
+
+
+def _paint_paving(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint the grey setts of a yard, in courses."""
+    u, v = grid()
+    row = (v * 16).astype(int)
+    shifted = (u * 8 + 0.5 * (row % 2)) % 8
+    shade = uniform(rng, 0.7, 1.1, (16, 8))[row, shifted.astype(int)]
+    du, dv = np.abs(shifted - np.round(shifted)), np.abs(v * 16 - np.round(v * 16))
+    joint = (np.minimum(du, dv) < 0.06) * 0.35
+    value = 0.55 * shade * (1 + 0.12 * noise(rng, 60, 60)) * (1 - joint)
+    return tint(np.clip(value, 0, 1), (1.0, 0.98, 0.94)), flat()
+
+
+ROOM_PAINTERS: dict[str, Painter] = {
+    "carpet": _paint_carpet,
+    "plaster": _paint_plaster,
+    "smooth_plaster": _paint_smooth_plaster,
+    "tiles": _paint_tiles,
+    "paving": _paint_paving,
 }

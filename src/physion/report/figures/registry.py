@@ -12,7 +12,7 @@ import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from physion.registry import Registry
+from physion.core.registry import Registry
 from physion.report.figures.theme import Plot
 from physion.report.inputs import ReportInputs
 

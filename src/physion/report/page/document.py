@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 
-from physion.version import MADE_WITH
+from physion.core.version import MADE_WITH
 
 SVG_LIMIT = 500_000
 """Bytes above which a figure is embedded as PNG: thousands of points are slow to draw as SVG."""

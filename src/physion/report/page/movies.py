@@ -10,10 +10,10 @@ from pathlib import Path
 
 from PIL import Image
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
+from physion.core.names import canonical_name
 from physion.report.page.document import data_uri
 from physion.scenes.scene import OBSERVED_FRAMES
-from physion.stimulus_names import canonical_name
 
 _MIME = {
     ".mp4": "video/mp4",

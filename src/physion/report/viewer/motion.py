@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.physics.labels import contact_frames
 from physion.physics.trajectory import Trajectory
-from physion.rendering.geometry import solid
+from physion.rendering.camera import solid
 from physion.scenes.scene import Scene
 from physion.scenes.shapes.primitives import shape
 

@@ -16,8 +16,8 @@ from importlib.resources import files
 from string import Template
 from typing import Any
 
-from physion.errors import BadInputError
-from physion.version import MADE_WITH
+from physion.core.errors import BadInputError
+from physion.core.version import MADE_WITH
 
 SCRIPTS = (
     "dom",

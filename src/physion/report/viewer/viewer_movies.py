@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.rendering.renderer import PASSES, Frame
 from physion.report.viewer.passes import Ranges, paint, ranges_of
 from physion.trials.trial_file import Trial

@@ -10,9 +10,9 @@ from typing import Any
 
 import pandas as pd
 
-from physion.atomic import write_atomic
-from physion.compute.progress import Progress, tracked
-from physion.errors import BadInputError, UnknownNameError
+from physion.compute.tasks import Progress, tracked
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.files import write_atomic
 from physion.report.viewer import facts as viewer_facts
 from physion.report.viewer import motion as viewer_motion
 from physion.report.viewer import viewer_movies

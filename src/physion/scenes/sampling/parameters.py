@@ -17,8 +17,8 @@ from typing import Annotated, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.dataclass_json import check_keys, field_types
-from physion.errors import BadInputError, BadSceneError, UnknownNameError
+from physion.core.errors import BadInputError, BadSceneError, UnknownNameError
+from physion.core.settings import check_keys, field_types
 from physion.numerics.rotations import axis_angle_quaternion, multiply_quaternions
 from physion.scenes.scene import Ending, Quat, Vec3
 
@@ -286,8 +286,7 @@ def _read_names(single: bool, value: Any, where: str, annotation: NamesOf) -> An
 
 def _known_names(kind: str) -> frozenset[str]:
     from physion.scenes.looks import MATERIALS, TEXTURES
-    from physion.scenes.shapes.primitives import shapes
-    from physion.scenes.shapes.prop_names import PROP_CATEGORIES, PROPS
+    from physion.scenes.shapes.primitives import PROP_CATEGORIES, PROPS, shapes
 
     return frozenset(
         {

@@ -2,14 +2,218 @@
 
 from __future__ import annotations
 
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any
+
 import numpy as np
 
-from physion.errors import BadInputError
-from physion.scenes.sampling.parameters import check_params
-from physion.scenes.sampling.preset import get_preset
-from physion.scenes.sampling.registry import scenarios
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.seeds import named_seed
+from physion.core.settings import check_keys, shown
+from physion.scenes.sampling.build import scenarios
+from physion.scenes.sampling.parameters import Quantity, check_params, check_together, read_params
 from physion.scenes.scene import Scene
-from physion.seeds import named_seed
+
+# Presets: named parameters of a scenario, among them the published configurations.
+#
+# A preset file is TOML:
+#
+# - ``scenario``: the scenario of all presets in the file.
+# - ``[shared]``: parameters that all presets of the file have.
+# - ``[presets.NAME]``: a preset. ``params`` are its parameters, ``about`` a description,
+#   ``based_on``
+#   the preset that it changes (an earlier one of the file, or one that comes with the scenario).
+#   Published configurations also have ``official`` (name), ``seed`` and ``published`` (results).
+#
+# Keys and units of parameters are those of the scenario's parameters; ``physion ls presets
+# SCENARIO PRESET`` prints them.
+
+DEFAULT, FAMILIARIZATION, DEBUG = "default", "familiarization", "debug"
+"""Names of presets that every scenario of this package has besides the published ones."""
+Trials = Annotated[int, Quantity("", 0, 1_000_000)]
+_PRESET_KEYS = ("about", "based_on", "official", "seed", "published", "params")
+_FILE_KEYS = ("scenario", "shared", "presets")
+
+
+@dataclass(frozen=True)
+class Published:
+    """What the original study reports about a configuration (docs/official-system.md, section 3).
+
+    - ``trials``, ``contact``: number of trials generated for testing, and of those with contact.
+    - ``frames``: mean length. ``tested``: number of trials among the published 150.
+    - ``readout_trials``, ``readout_contact``: the same for the readout set.
+    """
+
+    trials: Trials
+    contact: Trials
+    frames: Annotated[float, Quantity("frames", 0.0, 10000.0)]
+    tested: Trials = 0
+    readout_trials: Trials = 0
+    readout_contact: Trials = 0
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Named parameters of a scenario.
+
+    ``official`` is the name of the published configuration that the preset reproduces, and ``seed``
+    the seed it was generated with.
+    """
+
+    name: str
+    scenario: str
+    params: Any
+    about: str = ""
+    official: str | None = None
+    seed: int | None = None
+    published: Published | None = None
+
+
+@cache
+def load_presets(scenario: str) -> Mapping[str, Preset]:
+    """Return the presets that come with a scenario, in the order of their file.
+
+    A scenario from outside this package has one preset, ``default``, with its default parameters.
+    """
+    kind = scenarios.get(scenario).params
+    file = resources.files("physion.scenes.scenarios").joinpath("presets", f"{scenario}.toml")
+    if not file.is_file():
+        return {DEFAULT: Preset(DEFAULT, scenario, kind())}
+    return parse_presets(file.read_text(encoding="utf-8"), f"presets/{scenario}.toml", own=False)
+
+
+def get_preset(scenario: str, name: str) -> Preset:
+    """Return a preset of ``scenario`` by its name, or from a file by ``FILE.toml:NAME``.
+
+    ``NAME`` may be left out if the file holds one preset. Raises `UnknownNameError` with the
+    closest names, and `BadInputError` for a bad file.
+    """
+    path, _, chosen = name.partition(".toml")
+    if path != name:
+        return _from_file(Path(path + ".toml"), chosen.removeprefix(":"), scenario)
+    known = load_presets(scenario)
+    if name not in known:
+        raise UnknownNameError(f"preset of {scenario}", name, known)
+    return known[name]
+
+
+def default_presets(scenario: str, split: str) -> tuple[str, ...]:
+    """Return the presets that the trials of a split use one after the other.
+
+    The familiarization split has its own preset. Every other split uses the published
+    configurations with trials in the test. (The others were used for practice, or are a copy of
+    another configuration under a second name.)
+    """
+    known = load_presets(scenario)
+    if split == FAMILIARIZATION and FAMILIARIZATION in known:
+        return (FAMILIARIZATION,)
+    tested = [preset for preset in known.values() if preset.published and preset.published.tested]
+    chosen = [
+        p.name for i, p in enumerate(tested) if p.params not in [q.params for q in tested[:i]]
+    ]
+    return tuple(chosen) or (DEFAULT,)
+
+
+def read_preset_file(path: Path) -> Mapping[str, Preset]:
+    """Read a preset file; `BadInputError` names file, preset, key and what is allowed."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise BadInputError(f"preset file {path} cannot be read: {error}") from error
+    return parse_presets(text, str(path))
+
+
+def parse_presets(text: str, where: str, *, own: bool = True) -> Mapping[str, Preset]:
+    """Read the text of a preset file; ``where`` names the file in errors.
+
+    With ``own`` (a file of the user) presets may be based on those that come with the scenario.
+    """
+    try:
+        data = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise BadInputError(f"{where} is not TOML: {error}") from error
+    check_keys(data, _FILE_KEYS, where)
+    scenario = data.get("scenario")
+    if not isinstance(scenario, str):
+        raise BadInputError(f"{where} needs scenario = one of {scenarios.names()}")
+    kind = scenarios.get(scenario).params
+    common = _table(data, "shared", where)
+    shared = read_params(kind, common, f"{where}: shared")
+    known = load_presets(scenario) if own else {}
+    presets: dict[str, Preset] = {}
+    for name, entry in _table(data, "presets", where).items():
+        here = f"{where}: preset {name!r}"
+        if not isinstance(entry, Mapping):
+            raise BadInputError(f"{here} must be a table")
+        check_keys(entry, _PRESET_KEYS, here)
+        base = shared
+        if "based_on" in entry:
+            chosen = entry["based_on"]
+            if not isinstance(chosen, str):
+                raise BadInputError(f"{here}: based_on must name a preset, not {shown(chosen)}")
+            if chosen in presets:
+                base = presets[chosen].params
+            elif chosen in known:
+                base = read_params(kind, common, f"{where}: shared", known[chosen].params)
+            else:
+                raise BadInputError(
+                    f"{here}: based_on {chosen!r} is neither before it in {where} nor among the "
+                    f"presets of {scenario}"
+                )
+        params = read_params(kind, _table(entry, "params", here), here, base)
+        check_together(params, here)
+        presets[name] = _preset(name, scenario, params, entry, here)
+    return presets
+
+
+def _preset(name: str, scenario: str, params: Any, entry: Mapping[str, Any], here: str) -> Preset:
+    for key, kind in (("about", str), ("official", str), ("seed", int)):
+        if key in entry and type(entry[key]) is not kind:
+            wanted = "a text" if kind is str else "a whole number"
+            raise BadInputError(f"{here}: {key} must be {wanted}, not {shown(entry[key])}")
+    published = _published(_table(entry, "published", here), here) if "published" in entry else None
+    return Preset(
+        name,
+        scenario,
+        params,
+        entry.get("about", ""),
+        entry.get("official"),
+        entry.get("seed"),
+        published,
+    )
+
+
+def _published(table: Mapping[str, Any], here: str) -> Published:
+    missing = [key for key in ("trials", "contact", "frames") if key not in table]
+    if missing:
+        raise BadInputError(f"{here}: published lacks {', '.join(missing)}")
+    read = read_params(Published, table, f"{here}: published", Published(0, 0, 0.0))
+    assert isinstance(read, Published)
+    return read
+
+
+def _from_file(path: Path, name: str, scenario: str) -> Preset:
+    presets = read_preset_file(path)
+    if not name and len(presets) != 1:
+        raise BadInputError(f"{path} holds {sorted(presets)}; choose one as {path}:NAME")
+    preset = presets.get(name) if name else next(iter(presets.values()))
+    if preset is None:
+        raise UnknownNameError(f"preset of {path}", name, presets)
+    if preset.scenario != scenario:
+        raise BadInputError(f"{path} has presets of {preset.scenario}, not of {scenario}")
+    return preset
+
+
+def _table(data: Mapping[str, Any], key: str, where: str) -> Mapping[str, Any]:
+    table = data.get(key, {})
+    if not isinstance(table, Mapping):
+        raise BadInputError(f"{where}: {key} must be a table")
+    return table
 
 
 def sample_scene(
@@ -26,7 +230,7 @@ def sample_scene(
     scenario
         Name of a scenario (``physion ls scenarios``).
     seed
-        Number of the scene, or the seed of a trial from `physion.seeds.trial_seed`.
+        Number of the scene, or the seed of a trial from `physion.core.seeds.trial_seed`.
     params
         Parameters of the scenario; by default those of ``preset``, or else the scenario's own.
     preset

@@ -5,12 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
+from typing import Protocol
 
 import numpy as np
 
-from physion.numerics.linear_algebra import norm
-from physion.scenes.sampling.build import Palette, move_up
-from physion.scenes.sampling.clearance import GAP, raise_above
+from physion.core.seeds import child_generator
+from physion.numerics.elementary import cos, sin, tan
+from physion.numerics.linear_algebra import apply, inverse, multiply, norm
+from physion.numerics.rotations import rotate_vectors
+from physion.scenes.sampling.build import Palette, SceneParams, build_scene, move_up
 from physion.scenes.sampling.parameters import (
     LEAST_MASS,
     Counts,
@@ -18,12 +22,134 @@ from physion.scenes.sampling.parameters import (
     Fraction,
     Slope,
     draw_count,
+    retry,
     uniform,
 )
-from physion.scenes.sampling.rules import BodyRule, draw_body
-from physion.scenes.scene import Body, Joint, Look
+from physion.scenes.sampling.placement import (
+    BodyRule,
+    PushRule,
+    ZoneRule,
+    draw_body,
+    draw_push,
+    draw_zone,
+    world_bounds,
+)
+from physion.scenes.scene import Body, Joint, Look, Roles, Scene, Vec3
+from physion.scenes.shapes.meshes import Points
 from physion.scenes.shapes.primitives import shape
 from physion.scenes.shapes.props import NATURAL_SIZES
+
+# Tests for overlap of bodies, and the height by which a body must be raised to avoid one.
+#
+# A shape is represented by its convex pieces, as in collisions.
+
+GAP = 0.001
+"""Gap left below a body that had to be raised, metres."""
+TOUCH = 1e-6
+"""Overlaps smaller than this (metres) count as touching."""
+EXACT = 1e-12
+"""Distances to a plane smaller than this (metres) are rounding errors."""
+DEEP = 1e6
+"""Depth (metres) of the three starting corners in `_rise`, below every body."""
+MAX_EXCHANGES = 200
+
+
+def _slope_grid() -> Points:
+    angles = 2 * np.pi * np.arange(16) / 16
+    slopes = tan(np.radians([0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 87.0, 89.5]))
+    directions = np.stack([cos(angles), sin(angles)], axis=1)
+    return np.asarray((slopes[:, None, None] * directions).reshape(-1, 2))
+
+
+SLOPES = _slope_grid()
+"""(K, 2): slopes along x and y, up to nearly upright."""
+
+
+def raise_above(body: Body, obstacles: Sequence[Body]) -> Body:
+    """Return the body, raised above all ``obstacles`` that it would start in or under."""
+    rise = required_rise(body, obstacles)
+    return move_up(body, rise + GAP) if rise > 0 else body
+
+
+def required_rise(body: Body, obstacles: Sequence[Body]) -> float:
+    """Return by how many metres ``body`` must rise until no obstacle is inside or above it."""
+    (x0, y0, bottom), (x1, y1, _) = world_bounds(body)
+    parts = _corners(body)
+    pairs = []
+    for obstacle in obstacles:
+        low, high = world_bounds(obstacle)
+        if high[2] <= bottom + TOUCH or high[0] <= x0 or high[1] <= y0:
+            continue
+        if low[0] >= x1 or low[1] >= y1:
+            continue
+        pairs += [(_rough_rise(u, part), u, part) for u in _corners(obstacle) for part in parts]
+    need = 0.0
+    for rough, under, part in sorted(pairs, key=lambda pair: -pair[0]):
+        if rough <= need + TOUCH:
+            break
+        need = max(need, _rise(under, part))
+    return need
+
+
+def is_clear_of(body: Body, others: Sequence[Body]) -> bool:
+    """Return whether the bounding box of ``body`` in x and y overlaps none of theirs."""
+    low, high = world_bounds(body)
+    boxes = [world_bounds(other) for other in others]
+    return all((high[:2] < b[0, :2]).any() or (low[:2] > b[1, :2]).any() for b in boxes)
+
+
+def _corners(body: Body) -> list[Points]:
+    """Return the corners (K, 3) of each convex piece in world coordinates."""
+    offset = np.array(body.position)
+    return [
+        rotate_vectors(body.rotation, piece * body.scale) + offset
+        for piece in _unit_corners(body.shape)
+    ]
+
+
+@cache
+def _unit_corners(name: str) -> tuple[Points, ...]:
+    return tuple(piece.mesh.vertices for piece in shape(name).pieces)
+
+
+def _rough_rise(under: Points, part: Points) -> float:
+    """Return an upper bound of the height by which ``part`` must rise to be above ``under``.
+
+    Consider a plane z = u x + v y + c. It lies above all of ``under`` and below all of the risen
+    ``part`` if the rise is max(z - u x - v y) over ``under`` plus max(u x + v y - z) over ``part``.
+    The minimum over all slopes (u, v) is exact (`_rise`); over a grid of slopes it is a bound.
+    """
+    over = (under[:, 2:] - multiply(under[:, :2], SLOPES.T)).max(axis=0)
+    return float((over + (multiply(part[:, :2], SLOPES.T) - part[:, 2:]).max(axis=0)).min())
+
+
+def _rise(under: Points, part: Points) -> float:
+    """Return the exact rise (see `_rough_rise`); minus infinity if the footprints do not overlap.
+
+    The differences between points of ``under`` and points of ``part`` form a convex body, and the
+    rise is the height at which the z axis leaves this body at the top. The simplex method finds
+    it: three differences form a triangle around the axis; in each step one corner is exchanged for
+    the difference farthest above the plane of the triangle, until none is above.
+    """
+    corners = np.array([[1.0, 0.0, -DEEP], [-0.5, 0.75, -DEEP], [-0.5, -0.75, -DEEP]])
+    for _ in range(MAX_EXCHANGES):
+        # Row i gives the barycentric weight of corner i at the point (x, y, 1); weights sum to 1.
+        weights = inverse(np.vstack([corners[:, :2].T, np.ones(3)]))
+        u, v, height = apply(weights.T, corners[:, 2])
+        over = under[:, 2] - u * under[:, 0] - v * under[:, 1]
+        below = part[:, 2] - u * part[:, 0] - v * part[:, 1]
+        top, bottom = over.argmax(), below.argmin()
+        rise = float(over[top] - below[bottom])
+        if rise <= height + EXACT * norm((u, v, 1.0)):
+            return -np.inf if (corners[:, 2] == -DEEP).any() else rise
+        farthest = under[top] - part[bottom]
+        step = apply(weights, (farthest[0], farthest[1], 1.0))
+        # Exchange the corner whose weight at the origin reaches zero first.
+        at_origin = np.maximum(weights[:, 2], 0.0)
+        limits = np.divide(at_origin, step, out=np.full(3, np.inf), where=step > 1e-12)
+        corners[limits.argmin()] = farthest
+    return _rough_rise(under, part)
+
 
 UNIT_VOLUME = 0.125
 """Volume of the cube with sides of 0.5 m whose mass the rules give, cubic metres."""
@@ -222,3 +348,125 @@ def _draw_stand_body(
     size = NATURAL_SIZES[body.shape.removeprefix("prop:")]
     x, y, z = (side * natural for side, natural in zip(body.scale, size, strict=True))
     return replace(body, scale=(x, y, z))
+
+
+# Sampling shared by contain and link: a ball hits a stand that carries a stack of bodies.
+
+TRIES = 100
+MAX_FRAMES = 452
+STACK_MASS = 0.25
+"""Factor of the masses of the stack's bodies (docs/official-system.md, 3.4)."""
+
+
+class StandParams(SceneParams, Protocol):
+    """Parameters that a scenario with a stand has."""
+
+    @property
+    def length(self) -> float:
+        """Distance in metres; the probe starts at x = -length / 2."""
+        ...
+
+    @property
+    def stand(self) -> StandRule:
+        """Rule of the stand in the centre."""
+        ...
+
+    @property
+    def stack(self) -> FilledStackRule:
+        """Rule of the stack on or in it."""
+        ...
+
+    @property
+    def choice(self) -> tuple[int, int]:
+        """First and last index in the stack at which the agent may be."""
+        ...
+
+    @property
+    def zone(self) -> ZoneRule:
+        """Rule of the patient."""
+        ...
+
+    @property
+    def probe(self) -> BodyRule:
+        """Rule of the body that is pushed."""
+        ...
+
+    @property
+    def push(self) -> PushRule:
+        """Rule of the push."""
+        ...
+
+    @property
+    def monochrome(self) -> bool:
+        """Whether the bodies of the stack have one colour."""
+        ...
+
+
+@dataclass
+class _DrawnStand:
+    stand: Stand
+    stack: list[Body]
+    probe: Body
+
+
+def sample_standing(
+    scenario: str,
+    params: StandParams,
+    seed: np.random.SeedSequence,
+    base_color: Vec3 | None,
+    attachment_color: Vec3,
+) -> Scene:
+    """Sample a stand in the centre, a stack in or on it, and a ball at -x pushed towards its foot.
+
+    ``base_color`` and ``attachment_color`` are fixed in the official configurations; None draws
+    the colour.
+    """
+    rng, palette = child_generator(seed, "placement"), Palette.of(seed)
+    member = params.stack.member
+    agent_look = palette.agent_look(member.textures)
+    base_look = _set_look_color(palette.look(params.stand.base.textures), base_color)
+    attachment_look = _set_look_color(
+        palette.look(params.stand.attachment.textures), attachment_color
+    )
+    probe_look = palette.look(params.probe.textures)
+    zone = draw_zone(rng, params.zone, palette.look(params.zone.textures))
+    looks = draw_looks(rng, params.stack, palette, params.monochrome)
+    agent = choose_position(rng, len(looks), params.choice)
+    looks[agent] = agent_look
+    push_rng = child_generator(seed, "push")
+    drawn: list[_DrawnStand] = []
+
+    def attempt() -> str | None:
+        stand = draw_stand(rng, params.stand, zone, base_look, attachment_look)
+        obstacles = (zone, *stand.holders)
+        stack = draw_stack(rng, params.stack, stand.start, obstacles, looks, "member", STACK_MASS)
+        fitting = lower_below_cap(stack, stand)
+        start = (-params.length / 2, 0.0, 0.0)
+        probe = draw_body(push_rng, params.probe, "probe", start, probe_look, angular_drag=0.0)
+        probe = raise_above(probe, (zone,))
+        if fitting is None:
+            return "the stack does not fit under the cap"
+        if not is_clear_of(probe, (*stand.bodies, *fitting)):
+            return "the probe would start inside the stand"
+        drawn.append(_DrawnStand(stand, fitting, probe))
+        return None
+
+    retry(TRIES, scenario, attempt)
+    result = drawn[0]
+    target = replace(result.stack[agent], name="target")
+    others = [body for i, body in enumerate(result.stack) if i != agent]
+    return build_scene(
+        scenario,
+        seed,
+        params,
+        bodies=(zone, target, result.probe, *result.stand.bodies, *others),
+        roles=Roles("target", "zone", "probe"),
+        max_frames=MAX_FRAMES,
+        aim_height=height_of_top(result.stack[-1]) / 2,
+        pushes=(draw_push(push_rng, params.push, result.probe),),
+        joints=result.stand.joints,
+    )
+
+
+def _set_look_color(look: Look, color: Vec3 | None) -> Look:
+    return look if color is None else replace(look, color=color)

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from physion.scenes.sampling.build import Palette, build_scene
+from physion.core.seeds import child_generator
+from physion.scenes.sampling.build import Palette, build_scene, scenario
 from physion.scenes.sampling.parameters import Length, Room, uniform
-from physion.scenes.sampling.placement import CameraRule, SceneryRule
-from physion.scenes.sampling.registry import scenario
-from physion.scenes.sampling.rules import (
+from physion.scenes.sampling.placement import (
     BodyRule,
+    CameraRule,
     PushRule,
+    SceneryRule,
     ZoneRule,
     draw_body,
     draw_push,
@@ -21,7 +22,6 @@ from physion.scenes.sampling.rules import (
     require_apart,
 )
 from physion.scenes.scene import Roles, Scene
-from physion.seeds import child_generator
 
 MAX_FRAMES = 152
 

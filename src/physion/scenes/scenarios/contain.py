@@ -6,12 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physion.scenes.sampling.build import scenario
 from physion.scenes.sampling.parameters import Counts, Length, Room
-from physion.scenes.sampling.placement import CameraRule, SceneryRule
-from physion.scenes.sampling.registry import scenario
-from physion.scenes.sampling.rules import BodyRule, PushRule, ZoneRule
-from physion.scenes.sampling.stacks import FilledStackRule, StandRule
-from physion.scenes.sampling.standing import sample_standing
+from physion.scenes.sampling.placement import BodyRule, CameraRule, PushRule, SceneryRule, ZoneRule
+from physion.scenes.sampling.stacks import FilledStackRule, StandRule, sample_standing
 from physion.scenes.scene import Scene, Vec3
 
 ATTACHMENT_COLOR: Vec3 = (0.8, 0.8, 0.8)

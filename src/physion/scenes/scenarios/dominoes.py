@@ -6,24 +6,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physion.core.seeds import child_generator
 from physion.numerics.elementary import arctan2
 from physion.numerics.rotations import rotate_vectors
-from physion.scenes.sampling.build import Palette, build_scene
+from physion.scenes.sampling.build import Palette, build_scene, scenario
 from physion.scenes.sampling.parameters import Count, Fraction, Length, Room, retry, uniform
-from physion.scenes.sampling.placement import CameraRule, SceneryRule, world_bounds
-from physion.scenes.sampling.registry import scenario
-from physion.scenes.sampling.rules import (
+from physion.scenes.sampling.placement import (
     BodyRule,
+    CameraRule,
     PushRule,
+    SceneryRule,
     ZoneRule,
     draw_body,
     draw_push,
     draw_zone,
     raise_to_floor,
     require_apart,
+    world_bounds,
 )
 from physion.scenes.scene import Body, Look, Roles, Scene
-from physion.seeds import child_generator
 
 MAX_FRAMES = 302
 ZONE_GAP = 0.1

@@ -10,7 +10,8 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from physion.scenes.sampling.build import Palette, build_scene
+from physion.core.seeds import child_generator
+from physion.scenes.sampling.build import Palette, build_scene, scenario
 from physion.scenes.sampling.parameters import (
     SMALLEST_SIDE,
     FloorPosition,
@@ -33,13 +34,16 @@ from physion.scenes.sampling.parameters import (
     uniform,
     yaw,
 )
-from physion.scenes.sampling.placement import CameraRule, SceneryRule, world_bounds
-from physion.scenes.sampling.registry import scenario
-from physion.scenes.sampling.rules import ZoneRule, draw_zone
+from physion.scenes.sampling.placement import (
+    CameraRule,
+    SceneryRule,
+    ZoneRule,
+    draw_zone,
+    world_bounds,
+)
 from physion.scenes.scene import Body, Cloth, Roles, Scene, Vec3
-from physion.scenes.shapes.prop_names import PREFIX
+from physion.scenes.shapes.primitives import PREFIX
 from physion.scenes.shapes.props import NATURAL_SIZES
-from physion.seeds import child_generator
 
 MAX_FRAMES = 151
 TRIES = 100

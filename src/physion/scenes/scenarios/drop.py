@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physion.core.seeds import child_generator
+from physion.numerics.elementary import standard_normal
 from physion.numerics.linear_algebra import unit
-from physion.numerics.random_normals import standard_normal
-from physion.scenes.sampling.build import Palette, build_scene
+from physion.scenes.sampling.build import Palette, build_scene, scenario
 from physion.scenes.sampling.parameters import (
     Length,
     Lengths,
@@ -17,11 +18,17 @@ from physion.scenes.sampling.parameters import (
     as_quaternion,
     uniform,
 )
-from physion.scenes.sampling.placement import CameraRule, SceneryRule, world_bounds
-from physion.scenes.sampling.registry import scenario
-from physion.scenes.sampling.rules import BodyRule, ZoneRule, draw_body, draw_zone, raise_to_floor
+from physion.scenes.sampling.placement import (
+    BodyRule,
+    CameraRule,
+    SceneryRule,
+    ZoneRule,
+    draw_body,
+    draw_zone,
+    raise_to_floor,
+    world_bounds,
+)
 from physion.scenes.scene import Body, Quat, Roles, Scene
-from physion.seeds import child_generator
 
 PRIMITIVES = (
     "bowl",

@@ -8,7 +8,8 @@ from typing import Annotated
 
 import numpy as np
 
-from physion.scenes.sampling.build import Palette, build_scene
+from physion.core.seeds import child_generator
+from physion.scenes.sampling.build import Palette, as_record, build_scene, scenario, scene_name
 from physion.scenes.sampling.parameters import (
     FloorPosition,
     Frictions,
@@ -24,20 +25,20 @@ from physion.scenes.sampling.parameters import (
     uniform,
     yaw,
 )
-from physion.scenes.sampling.placement import CameraRule, SceneryRule, world_corners
-from physion.scenes.sampling.registry import as_record, scenario, scene_name
-from physion.scenes.sampling.rules import (
+from physion.scenes.sampling.placement import (
     BodyRule,
+    CameraRule,
     PushRule,
+    SceneryRule,
     ZoneRule,
     draw_body,
     draw_push,
     draw_zone,
     raise_to_floor,
+    world_corners,
 )
 from physion.scenes.scenarios import collide
 from physion.scenes.scene import Body, Roles, Scene, SurfaceMaterial
-from physion.seeds import child_generator
 
 TEMPLATES = ("ramp", "ledge", "collision")
 MAX_FRAMES = 302

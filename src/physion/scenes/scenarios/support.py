@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from physion.scenes.sampling.build import Palette, build_scene
-from physion.scenes.sampling.clearance import is_clear_of, raise_above
+from physion.core.seeds import child_generator
+from physion.scenes.sampling.build import Palette, build_scene, scenario
 from physion.scenes.sampling.parameters import Length, Room, retry
-from physion.scenes.sampling.placement import CameraRule, SceneryRule
-from physion.scenes.sampling.registry import scenario
-from physion.scenes.sampling.rules import (
+from physion.scenes.sampling.placement import (
     BodyRule,
+    CameraRule,
     PushRule,
+    SceneryRule,
     ZoneRule,
     draw_body,
     draw_push,
@@ -24,10 +24,11 @@ from physion.scenes.sampling.stacks import (
     draw_looks,
     draw_stack,
     height_of_top,
+    is_clear_of,
+    raise_above,
     set_mass_by_volume,
 )
 from physion.scenes.scene import Body, Roles, Scene
-from physion.seeds import child_generator
 
 MAX_FRAMES = 602
 TRIES = 100

@@ -155,7 +155,7 @@ def solid_properties(mesh: Mesh) -> tuple[float, Points]:
     """Return the volume and the centroid (3,) of the solid inside a closed mesh.
 
     The mass properties of bodies are those of their collision pieces: see
-    `physion.physics.rigid.mass`.
+    `physion.physics.rigid.bodies`.
     """
     volume, first, _ = solid_moments(mesh.vertices[mesh.faces])
     return volume, first / volume

@@ -14,7 +14,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from physion.errors import BadInputError, PhysionError, UnknownNameError
+from physion.core.errors import BadInputError, PhysionError, UnknownNameError
+from physion.core.names import CONTROLLERS
+from physion.core.seeds import generator
 from physion.numerics.rotations import rotate_vectors
 from physion.scenes.looks import prop_look
 from physion.scenes.scene import (
@@ -30,17 +32,16 @@ from physion.scenes.scene import (
     Scene,
     Vec3,
 )
-from physion.scenes.shapes.primitives import shapes
-from physion.scenes.shapes.prop_names import ModelBounds, prop_for, read_model_bounds
-from physion.scenes.tdw.commands import CommandReader, LoggedObject, vector
-from physion.scenes.tdw.log_lines import (
+from physion.scenes.shapes.primitives import ModelBounds, prop_for, read_model_bounds, shapes
+from physion.scenes.tdw.commands import (
+    CommandReader,
     ImportFailure,
+    LoggedObject,
     find_logs,
     read_command_log,
     read_metadata,
+    vector,
 )
-from physion.seeds import generator
-from physion.stimulus_names import CONTROLLERS
 
 SCENARIOS = {controller: scenario for scenario, controller in CONTROLLERS.items()}
 """Scenario by ``controller_name`` of the official metadata. Some Roll trials were made by the

@@ -19,18 +19,15 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from physion.compute.executor import Executor, TaskOutcome
-from physion.compute.progress import Progress, tracked
-from physion.errors import BadInputError, BadSceneError, PhysionError
+from physion.compute.tasks import Executor, Progress, TaskOutcome, tracked
+from physion.core.errors import BadInputError, BadSceneError, PhysionError
+from physion.core.files import read_sealed, write_sealed
+from physion.core.seeds import child_generator, stable_hash, trial_seed
 from physion.physics.engine import Engine, make_engine, simulate_many
-from physion.physics.jitter import jitter_scene
-from physion.physics.labels import label_contact
+from physion.physics.labels import jitter_scene, label_contact
 from physion.physics.trajectory import Trajectory
-from physion.scenes.sampling.preset import get_preset
-from physion.scenes.sampling.sample import sample_scene
+from physion.scenes.sampling.sample import get_preset, sample_scene
 from physion.scenes.scene import Scene
-from physion.sealed import read_sealed, write_sealed
-from physion.seeds import child_generator, stable_hash, trial_seed
 from physion.trials.making.plan import GenerateSettings, TrialTask
 
 BALANCED = ("readout", "testing", "familiarization")

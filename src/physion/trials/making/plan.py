@@ -11,15 +11,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.seeds import trial_seed
 from physion.physics.engine import DEFAULT_ENGINE, engines
-from physion.scenes.sampling.preset import default_presets, get_preset
-from physion.scenes.sampling.registry import scenarios as known_scenarios
+from physion.scenes.sampling.build import scenarios as known_scenarios
+from physion.scenes.sampling.sample import default_presets, get_preset
 from physion.scenes.scene import FRAME_TIME, PLAYBACK_RATE, Scene
-from physion.seeds import trial_seed
-from physion.trials.layout import SAFE_NAME, TrialPaths
-from physion.trials.metadata import MAX_SIDE
-from physion.trials.schema import PASSES
+from physion.trials.index import MAX_SIDE, SAFE_NAME, TrialPaths
+from physion.trials.trial_file import PASSES
 
 SPLITS = ("training", "readout", "testing", "familiarization")
 """Splits: for a model's own training, for its readout, for the test that models and people take,

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from physion.golden import FILE, golden_digests
+from physion.core.seeds import trial_seed
+from physion.core.version import FILE, golden_digests
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
 from physion.physics.particles import particles_over_time
 from physion.rendering.renderer import PASSES, Renderer
-from physion.scenes.sampling.registry import scenarios
+from physion.scenes.sampling.build import scenarios
 from physion.scenes.sampling.sample import sample_scene
-from physion.seeds import trial_seed
 from physion.trials.making.choose import robustness
 
 DATASET = "golden"
@@ -74,7 +74,7 @@ def main() -> None:
     options = parser.parse_args()
     text = json.dumps({name: trial_digests(name) for name in sorted(scenarios.names())}, indent=1)
     if options.write:
-        (Path(__file__).parents[2] / FILE).write_text(text + "\n")
+        (Path(__file__).parents[2] / "core" / FILE).write_text(text + "\n")
     else:
         print(text)
 

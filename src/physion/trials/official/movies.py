@@ -18,10 +18,10 @@ import numpy as np
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from numpy.typing import NDArray
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.scenes.scene import OBSERVED_FRAMES
-from physion.trials.metadata import MAX_FRAMES, MAX_SIDE
-from physion.trials.official.read_hdf5 import OfficialFile
+from physion.trials.index import MAX_FRAMES, MAX_SIDE
+from physion.trials.official.read_file import OfficialFile
 from physion.trials.video import MovieEncoder
 
 _BT709 = 1

@@ -19,7 +19,7 @@ import pytest
 
 from physion.cli.experiment.experiment import SUBVERBS
 from physion.cli.main import main
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.experiment.study.identity import Secrets, check_password
 from physion.experiment.study.init import study_folder
 from physion.experiment.study.init.generated_trials import choose_familiarization, choose_trials

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from physion.cli.main import main
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
+from physion.core.names import OFFICIAL_SCENARIOS, canonical_name
 from physion.experiment.study.init.official_lists import choose_listed, list_scenario, read_list
 from physion.experiment.study.study import load_study
-from physion.stimulus_names import OFFICIAL_SCENARIOS, canonical_name
 from physion.trials.video import encode_movie, read_frames
 from support.experiment.tiny_dataset import make_tiny_dataset
 from support.experiment.tiny_study import FULL, OBSERVED, draw, draw_map, read_number

@@ -10,8 +10,9 @@ import pytest
 from physion.analysis.tables.responses import read_humans
 from physion.cli.main import main
 from physion.compute.local import SerialExecutor
+from physion.core.errors import BadInputError
+from physion.core.names import canonical_name
 from physion.data import official
-from physion.errors import BadInputError
 from physion.experiment.study.init.official_scenes import (
     HIDDEN,
     OfficialSelection,
@@ -21,7 +22,6 @@ from physion.experiment.study.init.official_scenes import (
 from physion.experiment.study.study import load_study
 from physion.physics.replay import ReplayTask, replay_trial
 from physion.scenes.tdw.read_logs import ImportedTrial
-from physion.stimulus_names import canonical_name
 from physion.trials.dataset import Dataset
 
 

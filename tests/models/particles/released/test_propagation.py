@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.models.particles.released import propagation
 from physion.models.particles.released.propagation import EdgeBlock, StepWeights, propagate
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from physion import seeds
-from physion.errors import BadInputError
+from physion.core import seeds
+from physion.core.errors import BadInputError
 from physion.models.particles.neighbours import radius_edges
 from physion.models.particles.released import (
     Normalisation,

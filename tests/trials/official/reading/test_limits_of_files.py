@@ -8,8 +8,8 @@ import h5py
 import numpy as np
 import pytest
 
-from physion.errors import BadInputError
-from physion.trials.official.read_hdf5 import OfficialFile
+from physion.core.errors import BadInputError
+from physion.trials.official.read_file import OfficialFile
 
 
 def test_many_small_arrays_are_bounded_together(
@@ -23,7 +23,7 @@ def test_many_small_arrays_are_bounded_together(
                 f"frames/{frame:04}/objects/positions",
                 data=np.zeros((1000, 3)), chunks=(1000, 3), compression="gzip",
             )  # fmt: skip
-    monkeypatch.setattr("physion.trials.official.read_hdf5.MAX_FILE_BYTES", 80_000)
+    monkeypatch.setattr("physion.trials.official.read_file.MAX_FILE_BYTES", 80_000)
     with OfficialFile.open(path) as official:
         for _ in range(5):  # the same array counts once
             official.numbers("frames/0000/objects/positions", (None, 3))

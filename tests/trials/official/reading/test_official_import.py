@@ -19,19 +19,16 @@ from PIL import Image
 from physion.cli import import_trials as import_verb
 from physion.compute.local import SerialExecutor
 from physion.compute.run_tasks import RunReport
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.numerics.rotations import rotation_matrix
 from physion.rendering.camera import View
 from physion.scenes.shapes.primitives import shape
 from physion.trials.dataset import Dataset
-from physion.trials.files import write_files
-from physion.trials.index import build_index, write_index
-from physion.trials.layout import TrialPaths
+from physion.trials.index import TrialPaths, build_index, write_files, write_index
 from physion.trials.making.verify import verify_dataset
-from physion.trials.official.reading.import_folder import import_official
-from physion.trials.official.writing.export_folder import export_official
-from physion.trials.schema import seal, storage
-from physion.trials.trial_file import Trial, TrialWriter
+from physion.trials.official.export_folder import export_official
+from physion.trials.official.import_folder import import_official
+from physion.trials.trial_file import Trial, TrialWriter, seal, storage
 from physion.trials.video import count_frames, encode_movie, read_frames
 from support.official_hand_made import (
     CLOTH,

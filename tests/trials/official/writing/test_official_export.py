@@ -17,16 +17,16 @@ from PIL import Image
 
 from physion.cli import export as export_verb
 from physion.compute.local import SerialExecutor
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.physics.cloth.simulate import ClothSettings
 from physion.rendering.camera import View
 from physion.scenes.scene import Body, Camera, Joint, Roles, Scene
 from physion.scenes.shapes.primitives import shape
 from physion.trials.dataset import Dataset
+from physion.trials.official.export_folder import export_official
 from physion.trials.official.names import CLOTH_DISTANCE
-from physion.trials.official.writing.export_folder import export_official
-from physion.trials.official.writing.hdf5 import _of_stack
-from physion.trials.official.writing.objects import OfficialObjects
+from physion.trials.official.write_file import _of_stack
+from physion.trials.official.write_objects import OfficialObjects
 from physion.trials.trial_file import Trial
 from physion.trials.video import count_frames
 from support.official_hand_made import CLOTH, FRAMES, PART, RIGID, SIZE, TOUCH, make_dataset

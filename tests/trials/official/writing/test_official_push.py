@@ -9,9 +9,9 @@ import pytest
 
 from physion.physics.engine import simulate
 from physion.scenes.scene import Body, Camera, Push, Roles, Scene
-from physion.trials.official.axes import swap_axes
-from physion.trials.official.writing.hdf5 import _push
-from physion.trials.official.writing.objects import OfficialObjects
+from physion.trials.official.names import swap_axes
+from physion.trials.official.write_file import _push
+from physion.trials.official.write_objects import OfficialObjects
 
 
 @pytest.mark.parametrize("shape", ["bowl", "pipe"])

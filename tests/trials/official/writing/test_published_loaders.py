@@ -33,11 +33,10 @@ from PIL import Image
 
 from physion.cli import export as export_verb
 from physion.compute.local import SerialExecutor
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.trials.dataset import Dataset
-from physion.trials.layout import TrialPaths
-from physion.trials.official.writing.export_folder import export_official
-from physion.trials.official.writing.layouts import LAYOUTS, evaluator_name
+from physion.trials.index import TrialPaths
+from physion.trials.official.export_folder import LAYOUTS, evaluator_name, export_official
 from physion.trials.video import count_frames, read_frames
 from support.official_hand_made import CLOTH, FRAMES, RIGID, TOUCH, make_dataset
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 from sqlalchemy import Engine
 
-from physion.errors import PhysionError
+from physion.core.errors import PhysionError
 from physion.experiment.study.study import Study
 
 LOG = logging.getLogger(__name__)

@@ -20,7 +20,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-from physion.errors import PhysionError
+from physion.core.errors import PhysionError
 from physion.experiment.study.study import Study
 
 LOG = logging.getLogger(__name__)

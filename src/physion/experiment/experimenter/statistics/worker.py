@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from sqlalchemy import Engine
 
-from physion.errors import PhysionError
+from physion.core.errors import PhysionError
 from physion.experiment.experimenter.archive import export_archive
 from physion.experiment.experimenter.overview import Overview, compute_overview
 from physion.experiment.experimenter.payment_table import Performance, performances

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from sqlalchemy import ColumnElement, Connection, and_, case, func, or_, select
 
+from physion.core.seeds import stable_hash
 from physion.experiment.protocol.refused import Refused
 from physion.experiment.store.entry.visitor import Visitor
 from physion.experiment.store.lab.managing import is_paused
@@ -19,7 +20,6 @@ from physion.experiment.study.identity import Secrets
 from physion.experiment.study.orders import individual_order_seed, prepared_order_seed
 from physion.experiment.study.recruitment import ending_completion
 from physion.experiment.study.study import ALL_SCENARIOS, Study
-from physion.seeds import stable_hash
 
 
 def choose_course(

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from sqlalchemy import Engine
 
-from physion.atomic import sync_folder
-from physion.errors import BadInputError, PhysionError
+from physion.core.errors import BadInputError, PhysionError
+from physion.core.files import sync_folder
 from physion.experiment.store.database import (
     DATABASE_FILE,
     check_version,

@@ -12,9 +12,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 
+from physion.core.seeds import stable_hash
 from physion.experiment.study.stimuli import ATTENTION, Stimulus
 from physion.experiment.study.study import Study
-from physion.seeds import stable_hash
 
 _INSTRUCTED = re.compile(r"instructed_[0-9]+_(yes|no)")
 

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from functools import cache
 from itertools import permutations
 
+from physion.core.seeds import stable_hash
 from physion.experiment.study.stimuli import Stimulus
 from physion.experiment.study.study import ALL_SCENARIOS, Study
-from physion.seeds import stable_hash
 
 MOST_PERMUTED = 4
 """Up to this many blocks all orders are used; more have a Latin square."""

@@ -13,12 +13,12 @@ from typing import Any, Literal
 
 import pandas as pd
 
-from physion.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.names import SCENARIOS
+from physion.core.seeds import generator
 from physion.experiment.study.init.media import StimulusSource
-from physion.seeds import generator
-from physion.stimulus_names import SCENARIOS
 from physion.trials.dataset import Dataset
-from physion.trials.layout import TrialPaths
+from physion.trials.index import TrialPaths
 
 Look = Literal["free", "redyellow"]
 SPLITS = {"familiarization": "familiarization", "test": "testing"}

@@ -18,12 +18,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from physion.atomic import write_atomic
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
+from physion.core.files import read_plain, write_atomic
 from physion.experiment.study.stimuli import MAX_SIDE, MEDIA_FOLDER, Stimulus
-from physion.plain_files import read_plain
 from physion.scenes.scene import OBSERVED_FRAMES
-from physion.trials.files import encode_png
+from physion.trials.index import encode_png
 from physion.trials.official.movies import SourceMovie
 from physion.trials.video import MovieEncoder, read_frames
 

@@ -19,15 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from physion.errors import BadInputError
-from physion.experiment.study.csv_rows import csv_rows
-from physion.experiment.study.init.generated_trials import StimulusSelection, check_even
-from physion.experiment.study.init.media import StimulusSource
-from physion.experiment.study.stimuli import MAX_FRAMES, is_name
-from physion.plain_files import read_plain
-from physion.scenes.scene import OBSERVED_FRAMES
-from physion.seeds import generator
-from physion.stimulus_names import (
+from physion.core.errors import BadInputError
+from physion.core.files import read_plain
+from physion.core.names import (
     FOLDERS,
     OFFICIAL_SCENARIOS,
     SCENARIOS,
@@ -35,6 +29,12 @@ from physion.stimulus_names import (
     plain_name,
     scenario_of,
 )
+from physion.core.seeds import generator
+from physion.experiment.study.csv_rows import csv_rows
+from physion.experiment.study.init.generated_trials import StimulusSelection, check_even
+from physion.experiment.study.init.media import StimulusSource
+from physion.experiment.study.stimuli import MAX_FRAMES, is_name
+from physion.scenes.scene import OBSERVED_FRAMES
 
 MAX_LIST_BYTES = 50_000_000
 ID, LABEL, MAP = "stim_ID", "target_hit_zone_label", "map_url"

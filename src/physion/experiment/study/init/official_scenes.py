@@ -15,16 +15,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from physion.compute.executor import Executor
-from physion.compute.progress import Progress
-from physion.errors import BadInputError, UnknownNameError
+from physion.compute.tasks import Executor, Progress
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.names import canonical_name
+from physion.core.seeds import stable_hash
 from physion.experiment.study.init.generated_trials import SPLITS, check_even, in_paper_order
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
 from physion.rendering.renderer import Renderer
 from physion.scenes.tdw.read_logs import ImportedTrial
-from physion.seeds import stable_hash
-from physion.stimulus_names import canonical_name
 from physion.trials.making.plan import TrialTask, check_names, plan_scenes
 
 Group = tuple[str, str, bool]

@@ -12,9 +12,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from physion.atomic import folder_lock, remove_leftovers, write_atomic
-from physion.compute.progress import Progress, tracked
-from physion.errors import BadInputError
+from physion.compute.tasks import Progress, tracked
+from physion.core.errors import BadInputError
+from physion.core.files import folder_lock, remove_leftovers, write_atomic
 from physion.experiment.study.identity import SECRET_FILE, Secrets, set_password
 from physion.experiment.study.init.media import StimulusSource, import_stimulus
 from physion.experiment.study.stimuli import (

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from physion.models.interface import TrainingSettings
 from physion.models.particles.bodies import ParticleSettings
 from physion.models.particles.config import ParticleConfig
 from physion.models.particles.released.dpi import STEPS as DPI_STEPS
 from physion.models.particles.released.gns import STEPS as GNS_STEPS
-from physion.models.settings import TrainingSettings
 from physion.physics.particles import CLOTH_SPACING, LIMIT, SPACING
 
 RADIUS = 0.08

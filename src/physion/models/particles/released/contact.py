@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from physion.models.anchors.smallest_gap import FAR
+from physion.models.baselines.motion import FAR
 from physion.models.particles.bodies import Poses, SceneParticles
 from physion.scenes.scene import Scene
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.models.particles.released.propagation import EdgeBlock
 
 NEAR_FLOOR = 0.1

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.numerics.kernel import in_place_kernel
 
 Rows = NDArray[np.floating[Any]]

@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from physion.errors import BadInputError
-from physion.models.batch import LAST_OBSERVED, Batch, Motion
+from physion.clips.batch import LAST_OBSERVED, Batch, Motion
+from physion.core.errors import BadInputError
 from physion.models.particles.bodies import (
     CLOTH,
     FREE,
@@ -21,11 +21,9 @@ from physion.models.particles.bodies import (
     poses_of,
     scene_particles,
 )
-from physion.models.particles.cell_list import radius_edges_on_device
 from physion.models.particles.config import ParticleOptions
-from physion.models.particles.futures import Futures
-from physion.models.particles.layout import ObjectState, SceneLayout, with_loose
-from physion.models.particles.neighbours import radius_edges
+from physion.models.particles.graph import ObjectState, SceneLayout, with_loose
+from physion.models.particles.neighbours import radius_edges, radius_edges_on_device
 from physion.models.particles.released.config import ReleasedConfig
 from physion.models.particles.released.contact import (
     CLOTH_SCALE,
@@ -39,7 +37,7 @@ from physion.models.particles.released.graph import released_graph
 from physion.models.particles.released.layers import Widths
 from physion.models.particles.rigid_motion import fit_rigid
 from physion.models.particles.rollout import Start
-from physion.models.particles.simulator import ParticleSimulator
+from physion.models.particles.simulator import Futures, ParticleSimulator
 from physion.models.torch_model import digest_of
 from physion.scenes.scene import FRAME_TIME
 

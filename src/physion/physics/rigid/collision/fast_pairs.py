@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.numerics.kernel import in_place_kernel
-from physion.physics.rigid.collision.hull_records import Hulls
-from physion.physics.rigid.collision.pair_distance import PairSpace
+from physion.physics.rigid.collision.faces import Hulls
+from physion.physics.rigid.collision.pairs import PairSpace
 from physion.physics.rigid.collision.search import SearchScene
 from physion.physics.rigid.collision.sweep import time_of_impact
 

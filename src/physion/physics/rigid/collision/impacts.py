@@ -29,6 +29,7 @@ from __future__ import annotations
 import numpy as np
 
 from physion.numerics.kernel import in_place_kernel
+from physion.physics.rigid.collision.faces import Hulls
 from physion.physics.rigid.collision.fast_pairs import (
     ALONG,
     DEPTH,
@@ -37,12 +38,11 @@ from physion.physics.rigid.collision.fast_pairs import (
     any_fast,
     first_hit,
 )
-from physion.physics.rigid.collision.hull_records import Hulls
-from physion.physics.rigid.collision.pair_distance import PairSpace
+from physion.physics.rigid.collision.pairs import PairSpace
 from physion.physics.rigid.collision.search import SearchScene, update_boxes
 from physion.physics.rigid.motion import fill_rotations, move_pose
 from physion.physics.rigid.sleeping import SleepState
-from physion.physics.rigid.solver_records import F64, Bodies
+from physion.physics.rigid.solver import F64, Bodies
 
 DEPENETRATION = 10.0
 """Speed in m/s for each metre of overlap at the start of a step (PhysX)."""

@@ -14,11 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.numerics.kernel import in_place_kernel
-from physion.physics.rigid.collision.floor_update import update_floor
-from physion.physics.rigid.collision.hull_records import Hulls
+from physion.physics.rigid.collision.faces import Hulls
 from physion.physics.rigid.collision.manifold import Manifolds, clear_manifold
-from physion.physics.rigid.collision.pair_distance import PairSpace, still_apart
-from physion.physics.rigid.collision.pair_update import keep_pair, update_pair
+from physion.physics.rigid.collision.pairs import (
+    PairSpace,
+    keep_pair,
+    still_apart,
+    update_floor,
+    update_pair,
+)
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from physion.numerics.kernel import in_place_kernel
 from physion.physics.rigid.collision.closest_points import OVERLAPPING, closest_points, fill_closest
-from physion.physics.rigid.collision.hull_records import Hulls
-from physion.physics.rigid.collision.pair_distance import PairSpace
+from physion.physics.rigid.collision.faces import Hulls
+from physion.physics.rigid.collision.pairs import PairSpace
 from physion.physics.rigid.collision.penetration import penetration
 
 F64 = NDArray[np.float64]

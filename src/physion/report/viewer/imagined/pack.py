@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.report.viewer.imagined.particles import pack_particles
 from physion.report.viewer.imagined.pictures import PICTURES, pack_pictures
 from physion.report.viewer.imagined.trial import ImaginedTrial, caption

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.report.viewer.imagined.trial import ImaginedTrial, evenly
 from physion.report.viewer.motion import pack_grid, role_of
 from physion.scenes.scene import OBSERVED_FRAMES, Scene

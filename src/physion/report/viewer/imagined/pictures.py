@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from physion.errors import BadInputError
+from physion.core.errors import BadInputError
 from physion.report.viewer.imagined.trial import Arrays, ImaginedTrial, evenly
 from physion.report.viewer.passes import AGENT, OTHERS, PATIENT
 

@@ -1,0 +1,282 @@
+"""What a source of batches offers.
+
+Code under a predicting protocol gets an `ObservedSource`, which cannot reach a frame after the
+observed part: it opens the observed movies, and motions that were cut when they were read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physion.clips.batch import LAST_OBSERVED, Batch, Motion, Spec, clip_frames
+from physion.clips.states import motion_digest
+from physion.core.errors import BadInputError, UnknownNameError
+
+Part = Literal["context", "later", "whole"]
+"""Part of a clip: its context, the frames after the context, or both."""
+
+
+class FutureFrameError(BadInputError):
+    """Error for a request of a frame after the observed part from an `ObservedSource`."""
+
+
+class ObservedSource(Protocol):
+    """Source of the observed part of trials."""
+
+    @property
+    def spec(self) -> Spec:
+        """What the batches hold."""
+        ...
+
+    @property
+    def trials(self) -> tuple[str, ...]:
+        """Names of all trials."""
+        ...
+
+    def context(self, trials: Sequence[str]) -> Batch:
+        """Return the context of clips; motions end with the last observed frame.
+
+        Raises `UnknownNameError` for an unknown trial.
+        """
+        ...
+
+    def key(self, trial: str, part: Part) -> str:
+        """Return the hexadecimal SHA-256 of all that determines the part of a trial's clip."""
+        ...
+
+
+class WholeSource(ObservedSource, Protocol):
+    """Source of whole trials, for training and for the protocol *full*; motions are whole."""
+
+    def length(self, trial: str) -> int:
+        """Return the number of frames of a trial's motion."""
+        ...
+
+    def later(self, trials: Sequence[str]) -> Batch:
+        """Return the frames of clips that follow the context."""
+        ...
+
+    def whole(self, trials: Sequence[str]) -> Batch:
+        """Return whole clips."""
+        ...
+
+    def window(self, trials: Sequence[str], starts: Sequence[int], length: int) -> Batch:
+        """Return ``length`` frames of every trial, ``spec.stride`` apart, from its start frame."""
+        ...
+
+
+# Batches of a dataset's clips, put together from readers of single clips.
+#
+# `ObservedBatches` reads the observed part; all that it refers to ends with the last observed
+# frame. `WholeBatches` reads whole trials.
+
+_VERSION = 1
+"""To be increased with every change that can alter what a source gives for equal files."""
+
+
+class ClipReader(Protocol):
+    """Reader of some arrays of a clip."""
+
+    def read(self, trial: str, frames: NDArray[np.int64]) -> Mapping[str, NDArray[Any]]:
+        """Return arrays of `Batch` by name, without the axis B, of ``frames``, which increase."""
+        ...
+
+    def identity(self, trial: str) -> str:
+        """Return text that differs if the arrays of any frames of the trial may differ."""
+        ...
+
+
+class TrialReaders:
+    """What is read of trials: their lengths in frames, arrays of clips, and motions.
+
+    Parameters
+    ----------
+    lengths
+        Number of frames by trial.
+    readers
+        Readers of the arrays that the `Spec` asks for.
+    state
+        Motions by trial, or None if the `Spec` does not ask for them.
+    """
+
+    def __init__(
+        self,
+        lengths: Mapping[str, int],
+        readers: Sequence[ClipReader],
+        state: Mapping[str, Motion] | None = None,
+    ) -> None:
+        self._lengths, self._readers, self._state = lengths, tuple(readers), state
+        self._state_digests: dict[str, str] = {}
+
+    @property
+    def trials(self) -> tuple[str, ...]:
+        """Names of all trials."""
+        return tuple(self._lengths)
+
+    def length(self, trial: str) -> int:
+        """Return the number of frames of a trial; `UnknownNameError` for an unknown one."""
+        if trial not in self._lengths:
+            raise UnknownNameError("trial", trial, self._lengths)
+        return self._lengths[trial]
+
+    def batch(self, trials: Sequence[str], frames: Sequence[Sequence[int]]) -> Batch:
+        """Return the clips of ``trials`` that show these frames (B, T)."""
+        if not trials:
+            raise BadInputError("a batch needs at least one trial")
+        shown, valid, clips = [], [], []
+        for trial, wanted in zip(trials, frames, strict=True):
+            indices, exist = clip_frames(wanted, self.length(trial))
+            shown.append(indices)
+            valid.append(exist)
+            clips.append(self._clip(trial, indices))
+        state = None if self._state is None else tuple(self._state[trial] for trial in trials)
+        arrays: dict[str, Any] = {
+            name: np.stack([clip[name] for clip in clips]) for name in clips[0]
+        }
+        return Batch(tuple(trials), np.stack(shown), np.stack(valid), state=state, **arrays)
+
+    def _clip(self, trial: str, frames: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+        return {
+            name: values
+            for reader in self._readers
+            for name, values in reader.read(trial, frames).items()
+        }
+
+    def identity(self, trial: str) -> list[str]:
+        """Return texts that differ if anything that is read of the trial may differ."""
+        self.length(trial)
+        texts = [reader.identity(trial) for reader in self._readers]
+        if self._state is not None:
+            if trial not in self._state_digests:
+                self._state_digests[trial] = motion_digest(self._state[trial])
+            texts.append(f"state {self._state_digests[trial]}")
+        return texts
+
+
+class ObservedBatches:
+    """Source of the observed part of trials, which are read by ``readers``."""
+
+    def __init__(self, spec: Spec, readers: TrialReaders) -> None:
+        self._spec, self._readers = spec, readers
+
+    @property
+    def spec(self) -> Spec:
+        """What the batches hold."""
+        return self._spec
+
+    @property
+    def trials(self) -> tuple[str, ...]:
+        """Names of all trials."""
+        return self._readers.trials
+
+    def context(self, trials: Sequence[str]) -> Batch:
+        """Return the context of clips; motions end with the last observed frame."""
+        frames = self._spec.context_frames()
+        if max(frames) > LAST_OBSERVED:
+            raise FutureFrameError(
+                f"frame {max(frames)} comes after the observed part, whose last frame is "
+                f"{LAST_OBSERVED}"
+            )
+        return self._readers.batch(trials, [frames] * len(trials))
+
+    def key(self, trial: str, part: Part) -> str:
+        """Return the hexadecimal SHA-256 of all that determines the context of a trial."""
+        if part != "context":
+            raise FutureFrameError(
+                f"trial {trial!r}: a source of the observed part has no part {part!r} of a clip"
+            )
+        return clip_key(self._spec, part, self._readers.identity(trial))
+
+
+class WholeBatches:
+    """Source of whole trials, which are read by ``readers``; the context is that of ``observed``.
+
+    Movies of the observed part and of the whole trial are encoded apart, so the first frames of
+    `whole` differ from those of `context` by the rounding of the encoder.
+    """
+
+    def __init__(self, observed: ObservedBatches, readers: TrialReaders) -> None:
+        self._observed, self._readers = observed, readers
+
+    @property
+    def spec(self) -> Spec:
+        """What the batches hold."""
+        return self._observed.spec
+
+    @property
+    def trials(self) -> tuple[str, ...]:
+        """Names of all trials."""
+        return self._readers.trials
+
+    def length(self, trial: str) -> int:
+        """Return the number of frames of a trial's motion."""
+        return self._readers.length(trial)
+
+    def context(self, trials: Sequence[str]) -> Batch:
+        """Return the context of clips; motions end with the last observed frame."""
+        return self._observed.context(trials)
+
+    def later(self, trials: Sequence[str]) -> Batch:
+        """Return the frames of clips that follow the context."""
+        if not self.spec.future:
+            raise BadInputError("the spec has no future: there are no frames after the context")
+        return self._read(trials, [self.spec.future_frames()] * len(trials))
+
+    def whole(self, trials: Sequence[str]) -> Batch:
+        """Return whole clips."""
+        return self._read(trials, [self.spec.all_frames()] * len(trials))
+
+    def window(self, trials: Sequence[str], starts: Sequence[int], length: int) -> Batch:
+        """Return ``length`` frames of every trial, ``spec.stride`` apart, from its start frame."""
+        if length < 1 or len(starts) != len(trials):
+            raise BadInputError(
+                f"a window needs at least 1 frame and a start for each trial, not {length} frames "
+                f"and {len(starts)} starts for {len(trials)} trials"
+            )
+        stride = self.spec.stride
+        frames: list[Sequence[int]] = []
+        for trial, start in zip(trials, starts, strict=True):
+            if not 0 <= start < self.length(trial):
+                raise BadInputError(
+                    f"trial {trial!r} has {self.length(trial)} frames: a window cannot start at "
+                    f"{start}"
+                )
+            frames.append(range(start, start + length * stride, stride))
+        return self._read(trials, frames)
+
+    def _read(self, trials: Sequence[str], frames: Sequence[Sequence[int]]) -> Batch:
+        """Return the clips of ``trials`` that show ``frames`` (B, T)."""
+        return self._readers.batch(trials, frames)
+
+    def key(self, trial: str, part: Part) -> str:
+        """Return the hexadecimal SHA-256 of all that determines the part of a trial's clip."""
+        if part == "context":
+            return self._observed.key(trial, part)
+        return clip_key(self.spec, part, self._readers.identity(trial))
+
+
+def clip_key(spec: Spec, part: Part, identity: Sequence[str]) -> str:
+    """Return the hexadecimal SHA-256 of ``identity`` and of what ``spec`` says of a part.
+
+    Statistics of the weights (``mean``, ``std``) do not count: a source does not use them.
+    """
+    frames = {
+        "context": spec.context_frames,
+        "later": spec.future_frames,
+        "whole": spec.all_frames,
+    }[part]()
+    values = {
+        "version": _VERSION,
+        "frames": frames,
+        "inputs": sorted(set(spec.inputs)),
+        "size": spec.image_size if spec.sees_pictures else None,
+        "objects": spec.objects if "boxes" in spec.inputs else None,
+        "read": list(identity),
+    }
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()

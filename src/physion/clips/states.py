@@ -1,0 +1,133 @@
+"""Motions of trials, from trial files. This module needs h5py and hdf5plugin."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+
+from physion.clips.batch import Motion, cut_to_observed
+from physion.core.errors import UnknownNameError
+from physion.trials.index import IndexedFile
+from physion.trials.trial_file import Trial
+
+# Motions cut at the last observed frame, such that nothing leads to what was cut off.
+
+
+def cut_motion(motion: Motion) -> Motion:
+    """Return the observed part of a motion.
+
+    Its arrays are copies: a view of an array would still refer to all of it. Raises `BadInputError`
+    for a motion that is shorter than the observed part.
+    """
+    cut = cut_to_observed(motion.scene, motion.trajectory)
+    contacts = dataclasses.replace(cut.contacts, **_copies(cut.contacts))
+    return Motion(motion.scene, dataclasses.replace(cut, **(_copies(cut) | {"contacts": contacts})))
+
+
+class CutMotions(Mapping[str, Motion]):
+    """Observed parts of motions by name, cut when they are asked for."""
+
+    def __init__(self, motions: Mapping[str, Motion]) -> None:
+        self._motions = motions
+
+    def __getitem__(self, name: str) -> Motion:
+        return cut_motion(self._motions[name])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._motions)
+
+    def __len__(self) -> int:
+        return len(self._motions)
+
+
+def motion_digest(motion: Motion) -> str:
+    """Return the hexadecimal SHA-256 of a scene, including its appearance, and its trajectory."""
+    trajectory = motion.trajectory
+    texts = (
+        motion.scene.to_json(),
+        trajectory.digest(),
+        trajectory.engine,
+        str(trajectory.completed),
+    )
+    return hashlib.sha256("\n".join(texts).encode()).hexdigest()
+
+
+def _copies(values: object) -> dict[str, Any]:
+    """Return copies of the arrays of a dataclass by name."""
+    return {name: a.copy() for name, a in vars(values).items() if isinstance(a, np.ndarray)}
+
+
+_LEAST_BYTES, _FRACTION = 2**28, 8
+"""Motions that were read last are kept in memory up to one eighth of it, or this size."""
+
+
+class TrialMotions(Mapping[str, Motion]):
+    """Motions of trials by name, each read from its file when it is asked for.
+
+    With ``observed``, a motion is cut at the last observed frame when it is read.
+    """
+
+    def __init__(self, files: Mapping[str, IndexedFile], *, observed: bool) -> None:
+        self._files, self._observed = files, observed
+        self._kept: OrderedDict[str, Motion] = OrderedDict()
+        self._bytes, self._lock = 0, threading.Lock()
+
+    def __getitem__(self, trial: str) -> Motion:
+        with self._lock:
+            if trial in self._kept:
+                self._kept.move_to_end(trial)
+                return self._kept[trial]
+        if trial not in self._files:
+            raise UnknownNameError("trial", trial, self._files)
+        stored = self._files[trial]
+        opened = Trial(stored.read(), f"trial file {stored.path}")
+        motion = Motion(opened.scene, opened.trajectory)
+        if self._observed:
+            motion = cut_motion(motion)
+        with self._lock:
+            self._keep(trial, motion)
+        return motion
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._files)
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Another process reads the files itself; a lock cannot be sent to it.
+        return partial(TrialMotions, observed=self._observed), (self._files,)
+
+    def _keep(self, trial: str, motion: Motion) -> None:
+        """Keep a motion, and forget those that were used longest ago."""
+        if trial in self._kept:
+            return
+        self._kept[trial] = motion
+        self._bytes += _size(motion)
+        while self._bytes > _kept_bytes() and len(self._kept) > 1:
+            self._bytes -= _size(self._kept.popitem(last=False)[1])
+
+
+@cache
+def _kept_bytes() -> int:
+    """Return how many bytes of motions are kept in memory."""
+    names = ("SC_PAGE_SIZE", "SC_PHYS_PAGES")
+    if not all(name in getattr(os, "sysconf_names", {}) for name in names):
+        return _LEAST_BYTES
+    page, pages = (os.sysconf(name) for name in names)
+    return max(_LEAST_BYTES, page * pages // _FRACTION)
+
+
+def _size(motion: Motion) -> int:
+    """Return the bytes of the arrays of a motion."""
+    parts = (motion.trajectory, motion.trajectory.contacts)
+    values = [getattr(part, field.name) for part in parts for field in dataclasses.fields(part)]
+    return sum(int(getattr(value, "nbytes", 0)) for value in values)

@@ -1,0 +1,346 @@
+"""Checkpoints: one safetensors file, written atomically, with metadata as JSON in its header.
+
+Only safetensors and JSON are read, so that no code in a file can be executed. The metadata hold the
+SHA-256 of all tensors and of the metadata themselves, which is verified when a file is read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Mapping
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from physion.core.errors import BadInputError
+from physion.core.files import file_sha256, write_atomic
+from physion.core.version import __version__
+
+_METADATA = "physion"
+_VERSION = 1
+"""To be increased with every change of the files."""
+_MODEL, _OPTIMIZER = "model/", "optimizer/"
+WEIGHTS = "model.safetensors"
+"""Name of the file with the weights of a finished training."""
+_NAMED = 3
+"""Largest number of differences that a message names."""
+
+
+class DamagedFileError(BadInputError):
+    """Error for a checkpoint that was cut or changed, or that is none."""
+
+
+def hash_config(config: Mapping[str, Any]) -> str:
+    """Return the hexadecimal SHA-256 of JSON values, independent of the order of keys."""
+    text = json.dumps(config, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of this package, torch and Python."""
+    return {
+        "physion": __version__,
+        "torch": str(torch.__version__),
+        "python": platform.python_version(),
+    }
+
+
+def write_checkpoint(
+    path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]
+) -> None:
+    """Write tensors and metadata, JSON values, to a file that is replaced atomically."""
+    copies = {
+        name: value.detach().to("cpu", copy=True).contiguous() for name, value in tensors.items()
+    }
+    content = {**metadata, "version": _VERSION}
+    content["sha256"] = _digest(copies, content)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # One key only: safetensors stores several in a random order.
+    write_atomic(path, save(copies, {_METADATA: json.dumps(content, sort_keys=True)}))
+
+
+def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Return tensors and metadata of a file.
+
+    Raises
+    ------
+    DamagedFileError
+        If it cannot be read, its SHA-256 is wrong, or `write_checkpoint` did not write it.
+    BadInputError
+        If another version of this package wrote it.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            names = list(file.keys())
+            tensors = {name: file.get_tensor(name) for name in names} if header else {}
+    except (SafetensorError, OSError, ValueError) as error:
+        raise DamagedFileError(f"checkpoint {path} cannot be read ({error})") from error
+    if _METADATA not in header:
+        raise DamagedFileError(f"{path} is a safetensors file, but not a checkpoint of physion")
+    try:
+        metadata = json.loads(header[_METADATA])
+        stored = metadata.pop("sha256")
+        known = metadata["version"] == _VERSION
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise DamagedFileError(f"checkpoint {path} cannot be read: damaged metadata") from error
+    if stored != _digest(tensors, metadata):
+        raise DamagedFileError(f"checkpoint {path} is damaged: its SHA-256 is wrong")
+    if not known:
+        raise BadInputError(
+            f"checkpoint {path} has version {metadata['version']}, not {_VERSION}; read it with "
+            f"physion {metadata.get('versions', {}).get('physion', '')}, or move it elsewhere"
+        )
+    return tensors, metadata
+
+
+def is_checkpoint(path: Path) -> bool:
+    """Return whether a file is one that `write_checkpoint` wrote, whole or not."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            return _METADATA in (file.metadata() or {})
+    except (SafetensorError, OSError, ValueError):
+        return False
+
+
+def tensors_of(model: nn.Module, optimizer: Optimizer | None = None) -> dict[str, Tensor]:
+    """Return the tensors of a model, and those of an optimiser, by the names in a checkpoint."""
+    tensors = {_MODEL + name: value for name, value in model.state_dict().items()}
+    if optimizer is not None:
+        for index, values in optimizer.state_dict()["state"].items():
+            tensors |= {f"{_OPTIMIZER}{index}/{key}": value for key, value in values.items()}
+    return tensors
+
+
+def load_tensors(
+    path: Path,
+    tensors: Mapping[str, Tensor],
+    model: nn.Module,
+    optimizer: Optimizer | None = None,
+) -> None:
+    """Load tensors of the file ``path`` into a model, and into an optimiser.
+
+    Raises `BadInputError`, and changes nothing, for those of another network; the message names
+    the tensors that differ.
+    """
+    weights = _with_prefix(tensors, _MODEL)
+    differences = _compare_tensors(weights, model.state_dict())
+    if differences:
+        raise BadInputError(
+            f"checkpoint {path} holds the weights of another network: {_listed(differences)}"
+        )
+    model.load_state_dict(weights)
+    if optimizer is not None:
+        state: dict[int, dict[str, Tensor]] = {}
+        for name, value in _with_prefix(tensors, _OPTIMIZER).items():
+            index, _, key = name.partition("/")
+            state.setdefault(int(index), {})[key] = value
+        groups = optimizer.state_dict()["param_groups"]
+        optimizer.load_state_dict({"state": state, "param_groups": groups})
+
+
+def load_weights(path: Path, model: nn.Module) -> None:
+    """Load the weights of a trained model from its file into a model that was built alike.
+
+    Raises `BadInputError` for a damaged or foreign file, or the weights of another network.
+    """
+    tensors, _ = read_checkpoint(path)
+    load_tensors(path, tensors, model)
+
+
+def check_same(
+    path: Path,
+    what: str,
+    stored: Mapping[str, Any],
+    current: Mapping[str, Any],
+    advice: str = "delete it to start again",
+) -> None:
+    """Raise `BadInputError` that names the values of ``what`` that differ, and what to do."""
+    old, new = _flat(stored), _flat(current)
+    differences = [
+        f"{key} was {_shown(old, key)} and is {_shown(new, key)}"
+        for key in sorted({*old, *new})
+        if old.get(key) != new.get(key)
+    ]
+    if differences:
+        raise BadInputError(
+            f"checkpoint {path} belongs to another {what}: {_listed(differences)}; {advice}"
+        )
+
+
+def describe_tensors(tensors: Mapping[str, Tensor], model: nn.Module) -> str:
+    """Return which weights of a checkpoint differ from those of a model, as text; "" if none."""
+    return _listed(_compare_tensors(_with_prefix(tensors, _MODEL), model.state_dict()))
+
+
+def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of metadata, and of names, types, shapes and values of tensors."""
+    sha = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
+    for name in sorted(tensors):
+        value = tensors[name]
+        sha.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+        sha.update(value.reshape(-1).view(torch.uint8).numpy().data)
+    return sha.hexdigest()
+
+
+def _with_prefix(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+
+
+def _compare_tensors(stored: Mapping[str, Tensor], model: Mapping[str, Tensor]) -> list[str]:
+    """Return which tensors are missing, unknown, or of another shape or type."""
+    differences = [f"{name} is missing" for name in model if name not in stored]
+    differences += [f"{name} is unknown" for name in stored if name not in model]
+    for name in model:
+        if name in stored:
+            old, new = stored[name], model[name]
+            if (old.shape, old.dtype) != (new.shape, new.dtype):
+                differences.append(
+                    f"{name} is {_described(old)}, and {_described(new)} in the model"
+                )
+    return differences
+
+
+def _described(tensor: Tensor) -> str:
+    return f"{str(tensor.dtype).removeprefix('torch.')} {tuple(tensor.shape)}"
+
+
+def _listed(differences: list[str]) -> str:
+    more = len(differences) - _NAMED
+    return "; ".join(differences[:_NAMED]) + (f"; and {more} more" if more > 0 else "")
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        flat |= (
+            _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+        )
+    return flat
+
+
+def _shown(values: Mapping[str, Any], key: str) -> str:
+    if key not in values:
+        return "not there"
+    text = str(values[key])
+    return text if len(text) <= 20 else text[:16] + "..."
+
+
+# Weights of models that this package trained: those that come with it, and those of a user.
+
+RANDOM, SHIPPED = "random", "shipped"
+"""Names of weights that are no path of a file: those to be trained, and those of the package."""
+FOLDER = "physion.data.weights"
+"""Name of the folder with the weights that are installed with the package."""
+BUILT_AS = "built_as"
+"""Metadata of weights: what the method of this name said of the model that was trained."""
+DIGESTS = "sha256.json"
+"""File with the SHA-256 of every shipped file by the name of the model."""
+
+
+def shipped_digests() -> dict[str, str]:
+    """Return the SHA-256 of the shipped weights by model."""
+    text = (files(FOLDER) / DIGESTS).read_text()
+    return {str(name): str(value) for name, value in json.loads(text).items()}
+
+
+def load_named(model: Any, weights: str) -> None:
+    """Load weights into a model by their name, and set its ``init`` and ``trained``.
+
+    Parameters
+    ----------
+    model
+        Torch ``Module`` with a ``name`` and its initial weights.
+    weights
+        `RANDOM`, which leaves the model as it is; `SHIPPED`; or the path of a file, or of the
+        folder of a training.
+
+    Raises
+    ------
+    BadInputError
+        As `load_shipped` and `load_file`.
+    """
+    if weights == RANDOM:
+        return
+    if weights == SHIPPED:
+        model.init = load_shipped(model, model.name)
+    else:
+        model.init = load_file(model, weights)
+    model.trained = True
+
+
+def load_shipped(model: nn.Module, name: str) -> str:
+    """Load the weights that come with the package, and return their origin for the tables.
+
+    Raises
+    ------
+    BadInputError
+        If there are none for the model.
+    DamagedFileError
+        If the file was changed.
+    """
+    digests = shipped_digests()
+    if name not in digests:
+        known = f"only for {', '.join(digests)}" if digests else "nor for any other model"
+        raise BadInputError(
+            f"no weights are shipped for {name}, {known}; train it with physion train"
+        )
+    with as_file(files(FOLDER) / f"{name}.safetensors") as path:
+        found = file_sha256(path) if path.is_file() else "no file"
+        if found != digests[name]:
+            raise DamagedFileError(
+                f"the weights {path} that come with the package are damaged or changed; install "
+                "the package again"
+            )
+        _load(path, model)
+    return f"shipped:{digests[name][:12]}"
+
+
+def trained_file(path: Path) -> Path | None:
+    """Return the file with the weights of a training, given by its own path or its folder's.
+
+    None if ``path`` is neither.
+    """
+    file = path / WEIGHTS if path.is_dir() else path
+    return file if is_checkpoint(file) else None
+
+
+def load_file(model: nn.Module, file: str) -> str:
+    """Load a ``model.safetensors`` of ``physion train``, and return its origin for the tables.
+
+    ``file`` may be the folder of the training, too.
+
+    Raises `BadInputError` for a file that is missing, holds other weights, or weights of a model
+    that was built otherwise (`BUILT_AS`).
+    """
+    path = Path(file)
+    path = path / WEIGHTS if path.is_dir() else path
+    if not path.is_file():
+        raise BadInputError(
+            f"there are no weights at {path}; give random, shipped, or the model.safetensors of "
+            "a training"
+        )
+    _load(path, model)
+    return f"local:{file_sha256(path)[:12]}"
+
+
+def _load(path: Path, model: nn.Module) -> None:
+    stored, metadata = read_checkpoint(path)
+    # Large weights are shipped in half precision.
+    halves = {name for name, value in stored.items() if value.dtype == torch.float16}
+    tensors = {name: v.float() if name in halves else v for name, v in stored.items()}
+    built_as = getattr(model, "built_as", None)
+    if built_as is not None:
+        advice = "build the model that the weights belong to, or give weights of this one"
+        if differences := describe_tensors(tensors, model):
+            advice = f"{differences}; {advice}"
+        check_same(path, "model", metadata.get(BUILT_AS, {}), built_as(), advice)
+    load_tensors(path, tensors, model)

@@ -1,1 +1,0 @@
-"""RPIN: states of the regions of objects, and a network that predicts their boxes."""

@@ -1,0 +1,478 @@
+"""Settings of SVG, and its sizes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from physion.clips.batch import Batch, Provenance, Rollout
+from physion.core.errors import BadInputError
+from physion.core.seeds import generator
+from physion.models.build import make_config
+from physion.models.checkpoint import load_named
+from physion.models.interface import TrainingSettings
+from physion.models.torch_model import initial_weights
+from physion.models.vision import (
+    PictureModel,
+    VisionOptions,
+    context_pictures,
+    future_error,
+    gaussian_divergence,
+    gaussian_values,
+    moving_pixels,
+    normalized_pictures,
+    window_pictures,
+)
+
+Backbone = Literal["dcgan", "vgg"]
+LARGEST_IMAGE = 256
+
+
+@dataclass(frozen=True, slots=True)
+class SvgOptions(VisionOptions):
+    """What a user chooses of SVG; also see `VisionOptions`.
+
+    - ``backbone``: ``dcgan`` or ``vgg``; by default (empty) that of the size.
+    - ``image_size``: pixels per side, a power of 2 from 16 on; by default (0) that of the size, 64.
+    - ``samples``: futures of a trial, whose features the readout joins.
+    """
+
+    backbone: Backbone | Literal[""] = ""
+    image_size: int = 0
+    samples: int = 1
+
+    def __post_init__(self) -> None:
+        # Not super(): a dataclass with slots is made anew, which super() does not know.
+        VisionOptions.__post_init__(self)
+        if self.backbone not in ("", "dcgan", "vgg"):
+            raise BadInputError(f"SVG has the backbones dcgan and vgg, not {self.backbone!r}")
+        if isinstance(self.samples, bool) or not isinstance(self.samples, int) or self.samples < 1:
+            raise BadInputError(f"samples must be a whole number from 1 on, not {self.samples!r}")
+
+
+@dataclass(frozen=True, slots=True)
+class SvgConfig:
+    """All settings of SVG.
+
+    - ``backbone``, ``image_size``, ``width``: channels of the first stage of the encoder; they
+      double to at most 8 times as many.
+    - ``norm``: ``batch`` as published, or ``group``, which does not depend on the other clips.
+    - ``code``: g, size of the features. ``latent``: size of z. ``hidden``: units of the LSTMs;
+      ``layers``: of the LSTM that predicts, the others have one.
+    - ``past``, ``imagined``: frames of a training clip that are observed, and that follow.
+    - ``beta``: weight of the divergence.
+    - ``motion``: additional weight of moving pixels in the loss; published 0. Few pixels move, and
+      a short training would learn the scenery alone.
+    - ``skip``: whose frame's inner activations the decoder sees: ``last`` observed one, or the one
+      ``before`` it, as in the published code.
+    - ``stride``, ``context``, ``future``: see `physion.clips.batch.Spec`.
+    - ``training``: optimiser and schedule.
+    """
+
+    backbone: Backbone = "dcgan"
+    image_size: int = 64
+    width: int = 16
+    norm: Literal["batch", "group"] = "group"
+    code: int = 64
+    latent: int = 10
+    hidden: int = 128
+    layers: int = 2
+    past: int = 7
+    imagined: int = 9
+    beta: float = 1e-4
+    motion: float = 20.0
+    skip: Literal["last", "before"] = "last"
+    stride: int = 6
+    context: int = 7
+    future: int = 18
+    training: TrainingSettings = field(default_factory=TrainingSettings)
+
+    def __post_init__(self) -> None:
+        size = self.image_size
+        if size < 16 or size > LARGEST_IMAGE or size & (size - 1):
+            raise BadInputError(
+                f"SVG: image_size must be 16, 32, 64, 128 or {LARGEST_IMAGE}, not {size}"
+            )
+        if min(self.past, self.context) < 2 or self.imagined < 1:
+            raise BadInputError(
+                f"SVG: past {self.past} and context {self.context} must be at least 2, and "
+                f"imagined {self.imagined} at least 1"
+            )
+
+
+_SMALL = TrainingSettings(
+    steps=3000,
+    batch=16,
+    learning_rate=1e-3,
+    schedule="cosine",
+    warmup=100,
+    clip=1.0,
+    validate_every=500,
+    log_every=50,
+    checkpoint_every=500,
+)
+# Published for Physion, before the paper: 300 epochs of 600 steps.
+_PAPER = replace(
+    _SMALL, steps=180_000, batch=40, learning_rate=2e-3, schedule="constant", warmup=0, clip=0.0,
+    betas=(0.9, 0.999), validate_every=600,
+)  # fmt: skip
+
+
+def svg_config(options: SvgOptions) -> SvgConfig:
+    """Return the settings of a size."""
+    config = SvgConfig(training=_SMALL)
+    if options.size != "small":
+        config = SvgConfig(
+            "vgg",
+            width=64,
+            norm="batch",
+            code=128,
+            latent=64,
+            hidden=256,
+            past=4,
+            imagined=6,
+            motion=0.0,
+            skip="before" if options.size == "released" else "last",
+            training=_PAPER,
+        )
+    return replace(
+        config,
+        backbone=options.backbone or config.backbone,
+        image_size=options.image_size or config.image_size,
+    )
+
+
+# Networks of SVG: encoder and decoder of pictures, and LSTMs that predict codes.
+#
+# With the image size s, the encoder has n = log2(s / 4) stages, each half the size of the one
+# before, and makes one code of the 4 x 4 positions of the last. The decoder mirrors it; the input
+# of each of its stages is joined with the encoder's activations of the same size, the *skip
+# connections*.
+#
+# Source: Denton and Fergus 2018, section 4, and the code that the authors published.
+
+State = tuple[Tensor, Tensor]
+"""Output and cell of an LSTM, (layers, B, units)."""
+_SLOPE = 0.2
+_GROUPS = 8
+_VGG_LAYERS = 3
+"""Convolutions of a stage of VGG; the first two stages have two."""
+_INITIAL = 0.02
+"""Standard deviation of initial weights."""
+
+
+def stage_widths(config: SvgConfig) -> list[int]:
+    """Return the channels of the encoder's stages."""
+    stages = int(math.log2(config.image_size // 4))
+    return [config.width * min(2**stage, 8) for stage in range(stages)]
+
+
+class Encoder(nn.Module):
+    """Pictures (B, 3, H, W) to codes (B, g) in -1..1, and the activations of all stages."""
+
+    def __init__(self, config: SvgConfig) -> None:
+        super().__init__()
+        widths = stage_widths(config)
+        self.stages = nn.ModuleList()
+        for stage, (before, width) in enumerate(pairwise([3, *widths])):
+            if config.backbone == "dcgan":
+                layers = [*_conv(config, before, width, kernel=4, stride=2)]
+            else:
+                # The last convolution's output is the skip connection; pooling comes before.
+                layers = [nn.MaxPool2d(2)] if stage else []
+                inner = [before, *[width] * (2 if stage < 2 else _VGG_LAYERS)]
+                for a, b in pairwise(inner):
+                    layers += _conv(config, a, b)
+            self.stages.append(nn.Sequential(*layers))
+        pool = [nn.MaxPool2d(2)] if config.backbone == "vgg" else []
+        self.head = nn.Sequential(
+            *pool,
+            nn.Conv2d(widths[-1], config.code, 4),
+            # One position has no statistics of a group.
+            *([nn.BatchNorm2d(config.code)] if config.norm == "batch" else []),
+            nn.Tanh(),
+        )
+        initialize(self)
+
+    def forward(self, pictures: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Return codes, and activations from the largest to the smallest."""
+        skips, values = [], pictures
+        for stage in self.stages:
+            values = stage(values)
+            skips.append(values)
+        return self.head(values).flatten(1), skips
+
+
+class Decoder(nn.Module):
+    """Codes (B, g) and the encoder's activations to pictures (B, 3, H, W) in 0..1."""
+
+    def __init__(self, config: SvgConfig) -> None:
+        super().__init__()
+        widths = stage_widths(config)[::-1]
+        first = nn.ConvTranspose2d(config.code, widths[0], 4)
+        self.first = nn.Sequential(first, *_after(config, widths[0]))
+        self.enlarge = nn.Upsample(scale_factor=2) if config.backbone == "vgg" else nn.Identity()
+        self.stages = nn.ModuleList()
+        for stage, (width, after) in enumerate(pairwise([*widths, 0])):
+            last = stage + 1 == len(widths)
+            if config.backbone == "dcgan":
+                out = nn.ConvTranspose2d(2 * width, 3 if last else after, 4, 2, 1)
+                layers = [out, *([nn.Sigmoid()] if last else _after(config, after))]
+            else:
+                # As many convolutions as the encoder's stage of the same size.
+                count = 2 if len(widths) - stage <= 2 else _VGG_LAYERS
+                inner = [2 * width, *[width] * (count - 1)]
+                layers = [layer for a, b in pairwise(inner) for layer in _conv(config, a, b)]
+                if last:
+                    layers += [nn.Conv2d(width, 3, 3, padding=1), nn.Sigmoid()]
+                else:
+                    layers += _conv(config, width, after)
+            self.stages.append(nn.Sequential(*layers))
+        initialize(self)
+
+    def forward(self, codes: Tensor, skips: Sequence[Tensor]) -> Tensor:
+        """Return pictures; ``skips`` are ordered as those of `Encoder`."""
+        values = self.first(codes[:, :, None, None])
+        for stage, skip in zip(self.stages, reversed(skips), strict=True):
+            values = stage(torch.cat([self.enlarge(values), skip], 1))
+        out: Tensor = values
+        return out
+
+
+class CodePredictor(nn.Module):
+    """LSTM over sequences (B, T, inputs) to codes (B, T, g) in -1..1."""
+
+    def __init__(self, inputs: int, config: SvgConfig) -> None:
+        super().__init__()
+        self.embed = nn.Linear(inputs, config.hidden)
+        self.lstm = nn.LSTM(config.hidden, config.hidden, config.layers, batch_first=True)
+        self.out = nn.Linear(config.hidden, config.code)
+        initialize(self)
+
+    def forward(self, inputs: Tensor, state: State | None = None) -> tuple[Tensor, State]:
+        """Return codes, and the state after the last step."""
+        values, state = self.lstm(self.embed(inputs), state)
+        return torch.tanh(self.out(values)), state
+
+
+class GaussianPredictor(nn.Module):
+    """LSTM over codes (B, T, g) to mean and log variance (B, T, z) of Gaussians."""
+
+    def __init__(self, config: SvgConfig) -> None:
+        super().__init__()
+        self.embed = nn.Linear(config.code, config.hidden)
+        self.lstm = nn.LSTM(config.hidden, config.hidden, batch_first=True)
+        self.mean = nn.Linear(config.hidden, config.latent)
+        self.log_variance = nn.Linear(config.hidden, config.latent)
+        initialize(self)
+
+    def forward(self, codes: Tensor, state: State | None = None) -> tuple[Tensor, Tensor, State]:
+        """Return means, log variances, and the state after the last step."""
+        values, state = self.lstm(self.embed(codes), state)
+        return self.mean(values), self.log_variance(values), state
+
+
+def initialize(network: nn.Module) -> None:
+    """Draw the weights of convolutions and linear layers from N(0, 0.02^2); biases are 0.
+
+    Scales of normalisations are drawn from N(1, 0.02^2), as in the published code.
+    """
+    for part in network.modules():
+        if isinstance(part, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
+            nn.init.normal_(part.weight, 0.0, _INITIAL)
+            if part.bias is not None:
+                nn.init.zeros_(part.bias)
+        elif isinstance(part, nn.BatchNorm2d | nn.GroupNorm):
+            nn.init.normal_(part.weight, 1.0, _INITIAL)
+            nn.init.zeros_(part.bias)
+
+
+def _conv(
+    config: SvgConfig, inputs: int, outputs: int, *, kernel: int = 3, stride: int = 1
+) -> list[nn.Module]:
+    return [nn.Conv2d(inputs, outputs, kernel, stride, padding=1), *_after(config, outputs)]
+
+
+def _after(config: SvgConfig, channels: int) -> list[nn.Module]:
+    """Return the normalisation and nonlinearity that follow a convolution."""
+    if config.norm == "batch":
+        return [nn.BatchNorm2d(channels), nn.LeakyReLU(_SLOPE)]
+    groups = math.gcd(_GROUPS, channels)
+    return [nn.GroupNorm(groups, channels), nn.LeakyReLU(_SLOPE)]
+
+
+# SVG-LP: predicts the next picture from a code, and from a random variable with a learned prior.
+#
+# With codes h_t and inner activations of an encoder of picture x_t:
+#
+#     p_t = N(mean, var)(h_1, ..., h_(t-1))          prior, LSTM
+#     q_t = N(mean, var)(h_1, ..., h_t)              posterior, LSTM
+#     g_t = LSTM(h_(t-1), z_t; its state)            predicted code, z_t from q_t in training
+#     y_t = decoder(g_t, inner activations of the last observed frame)
+#     loss = mean_t [ mean_p (1 + w m_tp) (y_tp - x_tp)^2 + beta KL(q_t || p_t) ]
+#
+# with the moving pixels m (`physion.models.vision`), whose weight w is 0 as published. In
+# training h_(t-1) is the code of the true picture. To imagine, z_t is drawn from p_t, and h_t is
+# the code of y_t after the last observed frame.
+#
+# Features are the codes h_t of observed frames and the predicted codes g_t of imagined ones.
+#
+# Source: Denton and Fergus 2018, "Stochastic Video Generation with a Learned Prior", sections 3, 4
+# and appendix; docs/vision-models.md says in what the sizes differ from the published code.
+
+NAME = "svg"
+VERSION = 1
+"""To be raised with every change of what equal weights compute, or of the training."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImaginedClips:
+    """Predicted codes (N, F, g) and pictures (N, F, 3, H, W) in 0..1."""
+
+    codes: Tensor
+    pictures: Tensor
+
+
+class Svg(PictureModel):
+    """Model of the future of pictures, trained to predict the next one."""
+
+    def __init__(self, config: SvgConfig, options: SvgOptions) -> None:
+        super().__init__(NAME, VERSION, config, options, samples=options.samples, framewise=True)
+        self.config = config
+        if options.backbone:
+            self.name += f"-{options.backbone}"
+        if options.image_size:
+            self.name += f"-{options.image_size}"
+        with initial_weights("svg", options.seed):
+            self.encoder = Encoder(config)
+            self.decoder = Decoder(config)
+            self.predictor = CodePredictor(config.code + config.latent, config)
+            self.prior = GaussianPredictor(config)
+            self.posterior = GaussianPredictor(config)
+
+    def provenance(self) -> Provenance:
+        """Return name, weights and versions for the table of predictions."""
+        encoder = f"{self.config.backbone.upper()} {self.config.image_size} px"
+        return self.origin(encoder, "LSTM with learned prior", "next picture")
+
+    @torch.no_grad()
+    def encode(self, batch: Batch) -> Tensor:
+        """Return the codes (B, T, g) of the pictures of a batch, each of its frame alone."""
+        pictures = normalized_pictures(batch, self.spec, self.name)
+        codes: Tensor = self.encoder(pictures.flatten(0, 1))[0]
+        return codes.float().view(*pictures.shape[:2], -1)
+
+    @torch.no_grad()
+    def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
+        """Return the predicted codes (B, S, future, g) of ``samples`` futures.
+
+        They follow from ``seed`` and the name of the trial alone. With the knob ``show`` above 0,
+        ``shown`` holds the pictures under ``rgb`` (B, S, future, H, W, 3), uint8.
+        """
+        pictures = context_pictures(context, self.spec, self.name)
+        steps = self.spec.context - 1 + self.spec.future
+        shape = (samples, steps, self.config.latent)
+        draws = [generator(NAME, seed, trial).standard_normal(shape) for trial in context.trials]
+        noise = torch.from_numpy(np.concatenate(draws)).to(pictures)
+        imagined = self._roll_out(pictures, noise)
+        codes, shown = (
+            value.view(len(context), samples, *value.shape[1:])
+            for value in (imagined.codes.float(), imagined.pictures)
+        )
+        if knobs.get("show", 0) <= 0:
+            return Rollout(features=codes)
+        rgb = (shown.movedim(3, -1) * 255).round().to(torch.uint8)
+        return Rollout(features=codes, shown={"rgb": rgb})
+
+    def loss(self, batch: Batch) -> dict[str, Tensor]:
+        """Return the loss of training clips, and what it consists of.
+
+        Training: ``loss``, ``error`` (the first term), ``kl``. A validation is of what the model
+        imagines without seeing it: ``loss`` is the squared error of moving pixels of the frames
+        after the observed ones (`physion.models.vision`), ``error`` that of all pixels, and
+        ``objective`` the loss of the training.
+        """
+        pictures = window_pictures(batch, self.spec, self.name, self.window)
+        objective = self._objective(pictures, batch.valid)
+        if self.training:
+            return objective
+        config = self.config
+        steps = config.past - 1 + config.imagined
+        noise = torch.randn(len(pictures), steps, config.latent).to(pictures)
+        imagined = self._roll_out(pictures[:, : config.past], noise)
+        error = future_error(imagined.pictures, pictures, batch.valid)
+        parts = {"error": error.pixels, "objective": objective["loss"]}
+        return {"loss": error.moving, **parts}
+
+    def _objective(self, pictures: Tensor, valid: Tensor) -> dict[str, Tensor]:
+        """Return loss, error and divergence of clips (B, T, 3, H, W), means over the frames."""
+        config = self.config
+        clips, frames = pictures.shape[:2]
+        flat, skips = self.encoder(pictures.flatten(0, 1))
+        codes = flat.unflatten(0, (clips, frames))
+        mean, log_variance, _ = self.posterior(codes[:, 1:])
+        of_mean, of_log_variance, _ = self.prior(codes[:, :-1])
+        latents = gaussian_values(mean, log_variance, torch.randn_like(mean))
+        predicted, _ = self.predictor(torch.cat([codes[:, :-1], latents], -1))
+        # Frame t is decoded with the activations of frame t - 1, or of the last observed one.
+        limit = config.past - (1 if config.skip == "before" else 0)
+        rows = [min(frame, limit) - 1 for frame in range(1, frames)]
+        chosen = [skip.unflatten(0, (clips, frames))[:, rows].flatten(0, 1) for skip in skips]
+        shown = self.decoder(predicted.flatten(0, 1), chosen).unflatten(0, (clips, frames - 1))
+        squares = (shown - pictures[:, 1:]).pow(2).mean(2)
+        errors = (squares * (1 + config.motion * moving_pixels(pictures))).mean((2, 3))
+        divergences = gaussian_divergence(mean, log_variance, of_mean, of_log_variance)
+        weights = valid[:, 1:].to(errors.dtype)
+        error, divergence = (
+            (values * weights).sum() / weights.sum().clamp_min(1)
+            for values in (errors, divergences)
+        )
+        return {"loss": error + config.beta * divergence, "error": error, "kl": divergence}
+
+    def _roll_out(self, pictures: Tensor, noise: Tensor) -> ImaginedClips:
+        """Return what follows pictures (B, c, 3, H, W).
+
+        ``noise`` (B S, c - 1 + F, z) are standard normal numbers for z of the frames 1, 2, ...; the
+        S futures of a clip follow one another.
+        """
+        clips, observed = pictures.shape[:2]
+        samples = len(noise) // clips
+        flat, skips = self.encoder(pictures.flatten(0, 1))
+        codes = flat.unflatten(0, (clips, observed)).repeat_interleave(samples, 0)
+        row = observed - (2 if self.config.skip == "before" else 1)
+        skips = [
+            skip.unflatten(0, (clips, observed))[:, row].repeat_interleave(samples, 0)
+            for skip in skips
+        ]
+        mean, log_variance, _ = self.posterior(codes[:, 1:])
+        latents = gaussian_values(mean, log_variance, noise[:, : observed - 1])
+        _, state = self.predictor(torch.cat([codes[:, :-1], latents], -1))
+        _, _, prior_state = self.prior(codes[:, :-1])
+        last, predicted, shown = codes[:, -1:], [], []
+        for step in range(observed - 1, noise.shape[1]):
+            mean, log_variance, prior_state = self.prior(last, prior_state)
+            latent = gaussian_values(mean, log_variance, noise[:, step : step + 1])
+            code, state = self.predictor(torch.cat([last, latent], -1), state)
+            picture = self.decoder(code[:, 0], skips)
+            predicted.append(code[:, 0])
+            shown.append(picture)
+            last = self.encoder(picture)[0][:, None]
+        return ImaginedClips(torch.stack(predicted, 1), torch.stack(shown, 1))
+
+
+# Building of SVG by its name, with random, shipped or given weights.
+
+
+def svg(**options: Any) -> Svg:
+    """Build SVG; ``options`` are those of `SvgOptions`."""
+    chosen = make_config(SvgOptions, NAME, options)
+    model = Svg(svg_config(chosen), chosen)
+    load_named(model, chosen.weights)
+    return model

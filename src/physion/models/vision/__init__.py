@@ -1,1 +1,0 @@
-"""What the vision models that are trained from pictures have in common."""

@@ -1,1 +1,0 @@
-"""Features of trials: computed by models, stored in files, read piece by piece."""

@@ -1,1 +1,0 @@
-"""Sources of batches: from movies, from rendering on demand, and from states."""

@@ -1,1 +1,0 @@
-"""Import of official files: scenes, motions, labels and movies."""

@@ -1,1 +1,0 @@
-"""Datasets for others: tar shards, dataset card, Croissant metadata."""
