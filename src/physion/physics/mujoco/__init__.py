@@ -1,1 +1,0 @@
-"""The second engine: rigid bodies by MuJoCo's own solver."""
