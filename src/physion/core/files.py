@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from physion.core.errors import BadInputError, PhysionError
-from physion.core.settings import parse_json
 
 try:
     import fcntl
@@ -305,6 +304,8 @@ def read_sealed(path: Path) -> dict[str, Any]:
         text = content.decode()
     except UnicodeDecodeError as error:
         raise BadInputError(f"{path} cannot be read: {error}") from error
+    from physion.core.settings import parse_json
+
     values = parse_json(text, str(path))
     if not isinstance(values, dict) or _SEAL not in values:
         raise BadInputError(f"{path} is damaged: field 'sha256' is missing")

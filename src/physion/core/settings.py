@@ -1,9 +1,10 @@
-"""Read JSON that somebody else may have written into dataclasses, with every value checked.
+"""Read settings and JSON or TOML that somebody else may have written, with every value checked.
 
-Used for scenes, for metadata and labels of trial files, and (keys and field types) for the
-parameters of scenarios. The checks are stricter than those of libraries for this task: a number in
-quotes, NaN, an unknown or repeated key and JSON nested without end are all refused, and each error
-is one line that names the field.
+Dataclasses (or pydantic models) declare what is expected; pydantic checks it strictly: a number in
+quotes, an unknown key or NaN is refused. `parse_json` also refuses repeated keys and nesting
+without end. Each error is one line that names the field: ``scene.bodies[0].mass must be ...``.
+
+Scenes, presets, metadata of trial files, options of models and studies are all read here.
 """
 
 from __future__ import annotations
@@ -14,23 +15,71 @@ import functools
 import json
 import math
 import reprlib
+import tomllib
 import types
 import typing
 from collections import Counter
-from collections.abc import Iterable, Mapping
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypedDict, TypeVar
 
 from physion.core.errors import BadInputError
+from physion.core.files import read_plain
+
+if TYPE_CHECKING:  # pydantic is imported when something is read, since it takes 0.1 s
+    from pydantic import TypeAdapter, ValidationError
+    from pydantic_core import ErrorDetails
 
 T = TypeVar("T")
 
 MAX_DEPTH = 100
 """Deepest nesting of lists and objects that is read; real files have less than 10 levels."""
+MAX_BYTES = 1 << 28
+"""Largest file that is read."""
+
+
+class Strict(TypedDict):
+    """Type of `STRICT`."""
+
+    strict: bool
+    extra: typing.Literal["forbid"]
+    allow_inf_nan: bool
+
+
+STRICT: Strict = {"strict": True, "extra": "forbid", "allow_inf_nan": False}
+"""Configuration of all that is read; pydantic models take it as ``ConfigDict(**STRICT)``."""
 
 _REPR = reprlib.Repr()
 _REPR.maxlevel, _REPR.maxlist, _REPR.maxdict, _REPR.maxstring, _REPR.maxlong = 3, 4, 4, 60, 40
 
-_NAMES: dict[Any, str] = {bool: "true or false", int: "a whole number", str: "a text"}
+_EXPECTED = {
+    "bool": "true or false",
+    "int": "a whole number",
+    "float": "a finite number",
+    "finite": "a finite number",
+    "string": "a text",
+    "none": "null",
+    "tuple": "a list",
+    "list": "a list",
+    "dict": "an object",
+    "mapping": "an object",
+    "dataclass": "an object",
+    "model": "an object",
+}
+"""What a value must be, by the first word of pydantic's name for the error."""
+
+
+def read_json(
+    path: Path, kind: type[T], where: str = "", error: type[BadInputError] = BadInputError
+) -> T:
+    """Read a JSON file as ``kind`` (see `read_settings`); ``where`` names it in errors."""
+    return read_settings(kind, parse_json(_text(path), where or str(path), error), where, error)
+
+
+def read_toml(path: Path, kind: type[T], where: str = "") -> T:
+    """Read a TOML file as ``kind`` (see `read_settings`); ``where`` names it in errors."""
+    where = where or str(path)
+    return read_settings(kind, parse_toml(_text(path), where), where)
 
 
 def parse_json(text: str, where: str, error: type[BadInputError] = BadInputError) -> Any:
@@ -45,33 +94,40 @@ def parse_json(text: str, where: str, error: type[BadInputError] = BadInputError
 
     try:
         data = json.loads(text, object_pairs_hook=as_dict)
-    except error:
-        raise
     except RecursionError:
         raise error(f"{where} is nested deeper than {MAX_DEPTH} levels") from None
     except ValueError as problem:
         raise error(f"{where} is not JSON: {problem}") from problem
     level = [data]
     for _ in range(MAX_DEPTH):
-        level = [child for item in level for child in _children(item)]
+        level = [child for item in level for _, child in _children(item)]
         if not level:
             return data
     raise error(f"{where} is nested deeper than {MAX_DEPTH} levels")
 
 
-def read_dataclass(
+def parse_toml(text: str, where: str) -> dict[str, Any]:
+    """Parse TOML; raise `BadInputError` if it is broken."""
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as problem:
+        raise BadInputError(f"{where} is not TOML: {problem}") from problem
+
+
+def read_settings(
     kind: type[T], data: Any, where: str, error: type[BadInputError] = BadInputError
 ) -> T:
-    """Build a dataclass from parsed JSON, checking every field against its declared type.
+    """Build ``kind`` from parsed JSON or TOML, or from options, with every value checked.
 
     Parameters
     ----------
     kind
-        The dataclass. Its fields may be dataclasses, tuples, ``X | None``, numbers, texts,
-        booleans, and ``Mapping`` from texts to one of these, or to ``Any`` for any JSON value
-        whose numbers are finite. A whole number is accepted for a float.
+        A dataclass, a pydantic model (with `STRICT`), or any other type that pydantic can check,
+        such as ``dict[str, int]``. Fields that hold neither numbers, texts nor dataclasses are
+        declared as ``Any``.
     data
-        What `parse_json` returned.
+        Texts, numbers, lists and mappings. Tuples count as lists, and numbers of numpy as numbers.
+        A whole number is accepted for a float.
     where
         Name of the value in errors; fields are appended as in ``scene.bodies[0].mass``.
     error
@@ -80,19 +136,20 @@ def read_dataclass(
     Raises
     ------
     BadInputError
-        For an unknown or missing key and for a value of the wrong type, with the path of the field.
+        For an unknown or missing key and for a value of the wrong type, with the path of the field
+        and the closest known name.
     """
-    if not isinstance(data, dict):
-        raise error(f"{where} must be an object, not {shown(data)}")
-    hints = field_types(kind)
-    check_keys(data, hints, where, error)
-    values = {
-        key: read_value(hints[key], value, f"{where}.{key}", error) for key, value in data.items()
-    }
-    missing = _missing(kind, data)
-    if missing:
-        raise error(f"{where}: missing {', '.join(missing)}")
-    return kind(**values)
+    from pydantic import ValidationError
+
+    try:
+        # As JSON, since pydantic takes lists for tuples, and objects for dataclasses, only there.
+        (value,) = _adapter(kind).validate_json(json.dumps([data], default=_plain))
+    except ValidationError as problem:
+        raise error(_describe(problem, kind, data, where)) from None
+    except (TypeError, ValueError) as problem:
+        raise error(f"{where}: {problem}") from problem
+    _check_finite(data, where, error)
+    return typing.cast(T, value)
 
 
 def check_keys(
@@ -105,18 +162,12 @@ def check_keys(
     names = list(known)
     for key in data:
         if key not in names:
-            close = difflib.get_close_matches(str(key), names, n=1)
-            hint = f"did you mean {close[0]!r}? " if close else ""
-            raise error(f"{where}: unknown key {shown(key)}; {hint}known: {', '.join(names)}")
-
-
-def field_types(kind: Any) -> Mapping[str, Any]:
-    """Return the declared type of each field of a dataclass, with annotations, by field name."""
-    return _cached_field_types(kind)
+            raise error(f"{where}: {_unknown(key, names)}")
 
 
 @functools.cache
-def _cached_field_types(kind: Any) -> Mapping[str, Any]:
+def field_types(kind: Any) -> Mapping[str, Any]:
+    """Return the declared type of each field of a dataclass, with annotations, by field name."""
     hints = typing.get_type_hints(kind, include_extras=True)
     names = (field.name for field in dataclasses.fields(kind))
     return types.MappingProxyType({name: hints[name] for name in names})
@@ -127,86 +178,122 @@ def shown(value: Any) -> str:
     return _REPR.repr(value)
 
 
-def _missing(kind: Any, data: Mapping[str, Any]) -> list[str]:
-    """Return the fields without a default that ``data`` lacks, in quotes."""
-    none = dataclasses.MISSING
-    return [
-        repr(field.name)
-        for field in dataclasses.fields(kind)
-        if field.name not in data and field.default is none and field.default_factory is none
-    ]
+@functools.cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    """Return what checks a list of one ``kind``; within a list, dataclasses take `STRICT`."""
+    from pydantic import ConfigDict, TypeAdapter
+
+    return TypeAdapter(tuple[kind], config=ConfigDict(**STRICT))
 
 
-def _children(item: Any) -> Iterable[Any]:
-    if isinstance(item, dict):
-        return item.values()
-    return item if isinstance(item, list) else ()
+def _plain(value: Any) -> Any:
+    """Return a value that JSON does not know as one that it knows."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return dict(value)
+    to_list: Callable[[], Any] | None = getattr(value, "tolist", None)  # numbers of numpy
+    if to_list is not None:
+        return to_list()
+    raise TypeError(f"{shown(value)} is no text, number, list or object")
 
 
-def read_value(kind: Any, data: Any, where: str, error: type[BadInputError] = BadInputError) -> Any:
-    """Return parsed JSON as a value of the type ``kind``, or raise ``error`` that says ``where``.
-
-    Types are those that `read_dataclass` takes for fields.
-    """
-    origin = typing.get_origin(kind)
-    if origin is types.UnionType:
-        (chosen,) = (one for one in typing.get_args(kind) if one is not types.NoneType)
-        return None if data is None else read_value(chosen, data, where, error)
-    if dataclasses.is_dataclass(kind):
-        return read_dataclass(kind, data, where, error)  # type: ignore[arg-type]
-    if origin is tuple:
-        return _read_tuple(typing.get_args(kind), data, where, error)
-    if kind is float:
-        return _read_float(data, where, error)
-    if kind is Any:
-        return _read_any(data, where, error)
-    if kind in _NAMES:
-        if type(data) is not kind:
-            raise error(f"{where} must be {_NAMES[kind]}, not {shown(data)}")
-        return data
-    if not isinstance(data, dict):
-        raise error(f"{where} must be an object, not {shown(data)}")
-    item_kind = typing.get_args(kind)[1]
-    return {
-        key: read_value(item_kind, value, f"{where}[{shown(key)}]", error)
-        for key, value in data.items()
-    }
+def _text(path: Path) -> str:
+    try:
+        return read_plain(path, MAX_BYTES, follow_links=True).decode()
+    except UnicodeDecodeError as error:
+        raise BadInputError(f"{path} cannot be read: {error}") from error
 
 
-def _read_any(data: Any, where: str, error: type[BadInputError]) -> Any:
-    """Return any JSON value, or raise ``error`` for a number in it that is not finite."""
-    if isinstance(data, float):
-        return _read_float(data, where, error)
-    if isinstance(data, dict):
-        for key, value in data.items():
-            _read_any(value, f"{where}[{shown(key)}]", error)
-    elif isinstance(data, list):
-        for i, value in enumerate(data):
-            _read_any(value, f"{where}[{i}]", error)
-    return data
+def _children(item: Any) -> Iterable[tuple[Any, Any]]:
+    if isinstance(item, Mapping):
+        return item.items()
+    return enumerate(item) if isinstance(item, list | tuple) else ()
 
 
-def _read_tuple(
-    kinds: tuple[Any, ...], data: Any, where: str, error: type[BadInputError]
-) -> tuple[Any, ...]:
-    if not isinstance(data, list):
-        raise error(f"{where} must be a list, not {shown(data)}")
-    if kinds[-1] is Ellipsis:
-        kinds = (kinds[0],) * len(data)
-    if len(data) != len(kinds):
-        raise error(f"{where} must hold {len(kinds)} values, not {len(data)}")
-    return tuple(
-        read_value(kind, item, f"{where}[{i}]", error)
-        for i, (kind, item) in enumerate(zip(kinds, data, strict=True))
-    )
+def _check_finite(data: Any, where: str, error: type[BadInputError]) -> None:
+    """Raise ``error`` for a number that is not finite, also in a field of type ``Any``."""
+    if isinstance(data, float) and not math.isfinite(data):
+        raise error(f"{where} must be a finite number, not {data}")
+    for key, value in _children(data):
+        _check_finite(value, where + _step(key), error)
 
 
-def _read_float(data: Any, where: str, error: type[BadInputError]) -> float:
-    if not isinstance(data, bool) and isinstance(data, int | float):
-        try:
-            number = float(data)
-        except OverflowError:  # a whole number beyond the largest float
-            number = math.inf
-        if math.isfinite(number):
-            return number
-    raise error(f"{where} must be a finite number, not {shown(data)}")
+def _describe(problem: ValidationError, kind: Any, data: Any, where: str) -> str:
+    """Return the first error of pydantic as one line; a key that is unknown comes first."""
+    errors = problem.errors(include_url=False)
+    first = next((one for one in errors if _is_unknown(one)), errors[0])
+    path, expected, value = where, kind, data
+    keys = []
+    for key in first["loc"][1:]:  # without the list that holds the value
+        children = dict(_children(value))
+        if key in children:
+            keys.append(key)
+            path, expected, value = path + _step(key), _part(expected, key), children[key]
+    if first["type"] in ("missing", "missing_argument"):
+        if isinstance(first["loc"][-1], int):
+            return f"{path} must hold {len(typing.get_args(expected))} values, not {len(value)}"
+        missing = [repr(one["loc"][-1]) for one in errors if one["type"] == first["type"]
+                   and one["loc"][:-1] == first["loc"][:-1]]  # fmt: skip
+        return f"{path}: missing {', '.join(missing)}"
+    if _is_unknown(first):
+        holder = functools.reduce(_part, keys[:-1], kind)
+        place = where + "".join(map(_step, keys[:-1]))
+        return f"{place}: {_unknown(keys[-1], _fields(holder))}"
+    return f"{path} {_wanted(first, value)}"
+
+
+def _is_unknown(error: ErrorDetails) -> bool:
+    return error["type"] in ("extra_forbidden", "unexpected_keyword_argument")
+
+
+def _unknown(key: Any, known: Iterable[str]) -> str:
+    names = list(known)
+    close = difflib.get_close_matches(str(key), names, n=1)
+    hint = f"did you mean {close[0]!r}? " if close else ""
+    return f"unknown key {shown(key)}; {hint}known: {', '.join(names)}"
+
+
+def _wanted(error: ErrorDetails, value: Any) -> str:
+    """Return what was expected in place of ``value``."""
+    kind, limits = error["type"], error.get("ctx", {})
+    if kind in ("too_short", "too_long"):
+        count = limits.get("max_length", limits.get("min_length"))
+        return f"must hold {count} values, not {len(value)}"
+    if kind == "literal_error":
+        return f"must be {limits['expected']}, not {shown(value)}"
+    expected = _EXPECTED.get(kind.partition("_")[0])
+    if expected and kind.endswith(("_type", "_parsing", "_number", "_from_float")):
+        return f"must be {expected}, not {shown(value)}"
+    message = error["msg"].removeprefix("Value error, ")
+    return f"is {shown(value)}: {message[:1].lower()}{message[1:]}"
+
+
+def _step(key: Any) -> str:
+    """Return a key or number of a list as a part of a path: ``.mass``, ``[0]``, ``['a b']``."""
+    return f".{key}" if isinstance(key, str) and key.isidentifier() else f"[{shown(key)}]"
+
+
+def _part(kind: Any, key: Any) -> Any:
+    """Return the type of the field or item ``key`` of a type, or Any."""
+    known = _fields(kind)
+    if key in known:
+        return known[key]
+    arguments = typing.get_args(kind)
+    if typing.get_origin(kind) is typing.Annotated:
+        return _part(arguments[0], key)
+    if isinstance(kind, types.UnionType) or typing.get_origin(kind) is typing.Union:
+        return next((part for one in arguments if (part := _part(one, key)) is not Any), Any)
+    if isinstance(key, int) and arguments:
+        return arguments[min(key, len([one for one in arguments if one is not Ellipsis]) - 1)]
+    return arguments[-1] if arguments else Any
+
+
+def _fields(kind: Any) -> Mapping[str, Any]:
+    """Return the types of the fields of a dataclass or pydantic model, else nothing."""
+    if typing.get_origin(kind) is typing.Annotated:
+        return _fields(typing.get_args(kind)[0])
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+        return field_types(kind)
+    fields = getattr(kind, "model_fields", {})
+    return {name: field.annotation for name, field in fields.items()}

@@ -27,7 +27,7 @@ from typing import Any
 
 from physion.core.errors import BadInputError
 from physion.core.names import canonical_name
-from physion.core.settings import parse_json, read_dataclass
+from physion.core.settings import parse_json, read_settings
 from physion.scenes.scene import Scene
 from physion.scenes.tdw.read_logs import ImportedTrial, RecordedOutcome, TrialSet
 
@@ -160,7 +160,7 @@ def _trial(line: str, where: str) -> ImportedTrial:
         raise BadInputError(f"{where} holds no trial")
     return ImportedTrial(
         Scene.from_json(json.dumps(values["scene"])),
-        read_dataclass(RecordedOutcome, values["outcome"], f"{where}: outcome"),
+        read_settings(RecordedOutcome, values["outcome"], f"{where}: outcome"),
         tuple(str(note) for note in values["notes"]),
     )
 

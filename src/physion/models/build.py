@@ -13,13 +13,11 @@ from importlib.abc import ExecutionLoader
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-import numpy as np
-
 from physion.clips.batch import Spec
 from physion.core.errors import BadInputError, MissingExtraError, PhysionError, UnknownNameError
 from physion.core.registry import Registry
 from physion.core.seeds import stable_hash
-from physion.core.settings import field_types, read_value, shown
+from physion.core.settings import field_types, read_settings, shown
 from physion.models.interface import Model
 
 # Models in a user's Python file, named as ``FILE.py:Class``, without an installation.
@@ -341,10 +339,7 @@ def _as_declared(kind: Any, value: Any, where: str) -> Any:
     """
     if not _is_plain(kind) or dataclasses.is_dataclass(value):
         return value
-    # In Python, options may be tuples and numbers of numpy.
-    if isinstance(value, tuple | list):
-        return read_value(kind, [_without_numpy(item) for item in value], where)
-    return read_value(kind, _without_numpy(value), where)
+    return read_settings(kind, value, where)
 
 
 def _is_plain(kind: Any) -> bool:
@@ -354,7 +349,3 @@ def _is_plain(kind: Any) -> bool:
         parts = typing.get_args(kind)
         return all(_is_plain(part) or typing.get_origin(part) is Literal for part in parts)
     return kind in (bool, int, float, str, types.NoneType) or origin is tuple
-
-
-def _without_numpy(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else value

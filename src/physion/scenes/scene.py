@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 from physion.core.errors import BadInputError, BadSceneError
-from physion.core.settings import parse_json, read_dataclass, shown
+from physion.core.settings import parse_json, read_settings, shown
 
 Vec3: TypeAlias = tuple[float, float, float]
 Quat: TypeAlias = tuple[float, float, float, float]
@@ -339,7 +339,7 @@ class Scene:
             values = data.get(name) if isinstance(data, dict) else None
             if isinstance(values, list) and len(values) > MAX_THINGS:
                 raise BadSceneError(_too_many("scene", len(values), name))
-        return read_dataclass(cls, data, "scene", BadSceneError)
+        return read_settings(cls, data, "scene", BadSceneError)
 
 
 def _too_many(scene: str, count: int, what: str = "bodies and cloths") -> str:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from physion.core.errors import BadInputError
 from physion.core.files import read_plain, write_atomic
-from physion.core.settings import parse_json, read_dataclass
+from physion.core.settings import parse_json, read_settings
 from physion.physics.cloth.springs import sheet_triangles, sheet_vertices
 from physion.physics.labels import Labels
 from physion.physics.trajectory import Contacts, Trajectory
@@ -619,7 +619,7 @@ class Trial:
 
     def _read_json(self, kind: type[T], name: str) -> T:
         where = f"{self._where}: {name}"
-        return read_dataclass(kind, parse_json(self._reader.text(name), where), where)
+        return read_settings(kind, parse_json(self._reader.text(name), where), where)
 
     def shown(self, look: str | None = None) -> Scene:
         """Return the scene in the colours of ``look``, by default the trial's own."""

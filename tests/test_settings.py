@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from physion.core.errors import BadInputError, BadSceneError
-from physion.core.settings import MAX_DEPTH, parse_json, read_dataclass, shown
+from physion.core.settings import MAX_DEPTH, parse_json, read_settings, shown
 from physion.scenes.scene import Body, Camera, Roles, Scene
 
 
@@ -33,7 +33,7 @@ class Cart:
 
 def test_values_become_what_their_fields_declare() -> None:
     text = '{"wheels": [{"radius": 2}], "size": [1, 2.5], "owner": null, "notes": {"a": [1]}}'
-    cart = read_dataclass(Cart, parse_json(text, "cart"), "cart")
+    cart = read_settings(Cart, parse_json(text, "cart"), "cart")
     assert cart == Cart((Wheel(2.0),), (1.0, 2.5), notes={"a": [1]})
     assert isinstance(cart.wheels[0].radius, float)
 
@@ -43,7 +43,7 @@ def test_values_of_mappings_are_read_and_kept() -> None:
     text = (
         '{"wheels": [], "notes": ' + notes + ', "loads": {"l": 1}, "spares": {"s": {"radius": 1}}}'
     )
-    cart = read_dataclass(Cart, parse_json(text, "cart"), "cart")
+    cart = read_settings(Cart, parse_json(text, "cart"), "cart")
     assert cart.notes == {"a": [1, 2.5, {"b": None}], "c": True, "d": "NaN"}
     assert isinstance(cart.loads["l"], float) and cart.spares == {"s": Wheel(1.0)}
 
@@ -64,11 +64,11 @@ def test_values_of_mappings_are_read_and_kept() -> None:
         ('{"wheels": [], "covered": 1}', "cart.covered must be true or false, not 1"),
         ('{"wheels": [], "owner": 1}', "cart.owner must be a text, not 1"),
         ('{"wheels": [], "notes": []}', "cart.notes must be an object, not []"),
-        ('{"wheels": [], "notes": {"a": NaN}}', "cart.notes['a'] must be a finite number, not nan"),
-        ('{"wheels": [], "notes": {"a": [1, {"b": 1e999}]}}', "cart.notes['a'][1]['b'] must be a "),
-        ('{"wheels": [], "notes": {"a": -Infinity}}', "cart.notes['a'] must be a finite number"),
-        ('{"wheels": [], "loads": {"a": "1"}}', "cart.loads['a'] must be a finite number, not '1'"),
-        ('{"wheels": [], "spares": {"a": {}}}', "cart.spares['a']: missing 'radius'"),
+        ('{"wheels": [], "notes": {"a": NaN}}', "cart.notes.a must be a finite number, not nan"),
+        ('{"wheels": [], "notes": {"a": [1, {"b": 1e999}]}}', "cart.notes.a[1].b must be a "),
+        ('{"wheels": [], "notes": {"a": -Infinity}}', "cart.notes.a must be a finite number"),
+        ('{"wheels": [], "loads": {"a": "1"}}', "cart.loads.a must be a finite number, not '1'"),
+        ('{"wheels": [], "spares": {"a": {}}}', "cart.spares.a: missing 'radius'"),
         ('{"wheels": [], "wheels": []}', "cart: key 'wheels' is repeated in one object"),
         ('{"wheels": [], "notes": {"a": {"b": 1, "b": 1}}}', "cart: key 'b' is repeated in one"),
         ("{", "cart is not JSON: "),
@@ -77,7 +77,7 @@ def test_values_of_mappings_are_read_and_kept() -> None:
 )
 def test_errors_name_the_field_and_what_was_expected(text: str, message: str) -> None:
     with pytest.raises(BadSceneError) as error:
-        read_dataclass(Cart, parse_json(text, "cart", BadSceneError), "cart", BadSceneError)
+        read_settings(Cart, parse_json(text, "cart", BadSceneError), "cart", BadSceneError)
     assert str(error.value).startswith(message) and "\n" not in str(error.value)
 
 
