@@ -7,17 +7,15 @@ from collections.abc import Callable
 import numpy as np
 import pandas as pd
 
-from coverage_studies import F64, MODELS, SCENARIOS, Coverage, Size, Study, logistic
-from physion.analysis.leaderboard.ranks import rank_intervals
+from coverage_studies import F64, MODELS, SCENARIOS, Coverage, Size, Study
 from physion.analysis.metrics import all_metrics, metrics
-from physion.analysis.models.model_people import Models, sample_of_models
+from physion.analysis.models.model_people import sample_of_models
 from physion.analysis.models.model_tests import PooledStimuli, pool_scenarios
 from physion.analysis.models.paired_measures import paired_measures
 from physion.analysis.models.rollout_errors import CONSTANT_VELOCITY, rollout_error_table
 from physion.analysis.models.sampling_variance import sampling_variances
 from physion.analysis.models.score_tables import score_table
 from physion.analysis.sample import Resampled, Sample
-from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.calibration import reliability_curve
 from physion.analysis.statistics.correlation import correlate_resampled
 from physion.analysis.statistics.jackknife import Variance, jackknife
@@ -27,8 +25,6 @@ from physion.core.seeds import generator
 
 LEFT_OUT = ("accuracy_simulated", "r_same", "euclid_over_n")
 """Metrics that equal others where the simulated outcome is the official one, or up to a factor."""
-RANKED = (0.9, 0.8, 0.7, 0.6, 0.5)
-"""Slopes of the models that are ranked: logit slope s m + e with e standard normal."""
 
 
 def measures(coverage: Coverage, drawn: Resampled, size: Size, repeats: int) -> None:
@@ -191,47 +187,3 @@ def _good(scenario: str, study: Study, people: int) -> pd.DataFrame:
             "human_accuracy": study.right,
         }
     )  # fmt: skip
-
-
-def ranks(coverage: Coverage, size: Size, repeats: int) -> None:
-    """Ranks of five models that differ little, by r and by RMSD.
-
-    The true rank is that of the expected values.
-    """
-    names = [f"slope {slope}" for slope in RANKED]
-    shown = [name for name in ("r", "rmsd")
-             if coverage.wants(*(f"{model}: rank by {name}" for model in names))]  # fmt: skip
-    if not shown:
-        return
-    rng = generator("ranked models", *size)
-    values: dict[str, list[F64]] = {name: [] for name in shown}
-    found: dict[str, list[F64]] = {name: [] for name in shown}
-    for study in coverage.studies("both", size, repeats):
-        own = np.array(RANKED)[:, None] * (2 * study.label - 1) * study.easiness
-        p_contact = logistic(own + rng.normal(size=own.shape))
-        answers, models = study.answers(), len(names)
-        rows = pd.DataFrame(
-            {
-                "file": "f", "agent": np.repeat(names, size[1]), "scenario": "drop",
-                "stimulus": np.tile(answers.stimuli, models), "p_contact": p_contact.ravel(),
-                "predicted": (p_contact > 0.5).ravel(), "label": np.tile(study.label, models),
-                "p_yes": np.tile(study.p_yes, models), "count": size[0],
-                "human_accuracy": np.tile(study.right, models),
-            }
-        )  # fmt: skip
-        given = Models(tuple(names), p_contact, (p_contact > 0.5).astype(np.float64))
-        sample = sample_of_models(given, answers)
-        for name in shown:
-            metric = metrics.get(name)
-            values[name].append(metric(sample)[0])
-            table = rank_intervals(rows, {"drop": answers}, metric, "drop", Bootstrap())
-            found[name].append(table[["rank_low", "rank_high"]].to_numpy(dtype=np.float64))
-    for name in shown:
-        sign = -1 if metrics.get(name).better == "higher" else 1
-        expected = sign * np.mean(values[name], axis=0)
-        truth = 1 + np.argsort(np.argsort(expected))
-        for own_values, bounds in zip(values[name], found[name], strict=True):
-            own_rank = 1 + np.argsort(np.argsort(sign * own_values))
-            for k, model in enumerate(names):
-                coverage.add(f"{model}: rank by {name}", "both", size, float(own_rank[k]),
-                             *bounds[k], truth=float(truth[k]))  # fmt: skip

@@ -257,15 +257,6 @@ def test_a_rehearsal_with_simulated_participants_is_marked_on_every_page(
         assert set(pd.read_csv(path, dtype=str)["rehearsal"]) <= {"simulated participants"}, path
         original = report.parent / path.relative_to(page.parent)
         assert "rehearsal" not in pd.read_csv(original).columns if original.exists() else True
-    command = ["compare", "leaderboard", str(tmp_path / "predictions.csv"), "--responses",
-               str(tmp_path / "both.csv")]  # fmt: skip
-    both.to_csv(tmp_path / "both.csv", index=False)
-    assert main([*command, "--simulated", "--out", str(tmp_path / "board")]) == 0
-    assert f"physion: warning: {REHEARSAL}" in capsys.readouterr().err
-    for name in ("leaderboard", "leaderboard_by_scenario"):
-        rows = pd.read_csv(tmp_path / "board" / f"{name}.csv")
-        assert set(rows["rehearsal"]) == {"simulated participants"}
-    assert REHEARSAL in (tmp_path / "board" / "leaderboard.html").read_text(encoding="utf-8")
 
 
 def test_warnings_stand_above_everything(tmp_path: Path) -> None:

@@ -20,7 +20,6 @@ EXTRAS = {
     "video": ("transformers",),
     "tensorboard": ("tensorboardX",),
     "mujoco": ("mujoco-core",),
-    "diffusion": ("pyddm",),
     "experiment": (
         *("fastapi", "uvicorn", "sqlalchemy", "alembic", "psycopg"),
         *("argon2-cffi", "python-multipart", "httpx2"),

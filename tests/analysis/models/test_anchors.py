@@ -12,7 +12,6 @@ import pytest
 from sklearn.metrics import cohen_kappa_score
 
 from physion.analysis import Bootstrap, Comparison, compare_scores
-from physion.analysis.leaderboard.leaderboard import leaderboard
 from physion.analysis.metrics import metrics
 from physion.analysis.models.anchors import (
     ANCHOR_MODELS,
@@ -257,15 +256,10 @@ def test_predictions_of_an_anchor_take_the_place_of_the_computed_one(
         assert row_of(given.anchors, other)["accuracy"] == row_of(before, other)["accuracy"]
 
 
-def test_predictions_of_both_anchors_leave_one_person_with_another(tmp_path: Path) -> None:
+def test_predictions_of_both_anchors_leave_one_person_with_another() -> None:
     names = ("m", "outcome", "majority-of-people")
     parts = [predictions(name, k) for k, name in enumerate(names)]
     assert list(compared(pd.concat(parts)).anchors["agent"].unique()) == [TWO_PEOPLE]
-    files = [tmp_path / f"{name}.csv" for name in names]
-    for path, part in zip(files, parts, strict=True):
-        part.to_csv(path, index=False)
-    board = leaderboard(files, humans(), LABELS, bootstrap=QUICK)
-    assert list(board.anchors["model"]) == [TWO_PEOPLE]
     test = study(people=8, stimuli=16, scenarios=("collide",), seed=2).test
     stimuli = test.drop_duplicates("stimulus")["stimulus"]
     rows = [
@@ -279,11 +273,9 @@ def test_predictions_of_both_anchors_leave_one_person_with_another(tmp_path: Pat
 
 def test_every_anchor_of_the_package_is_known_by_name() -> None:
     """The analysis may not import the models, so it has their names a second time."""
-    folder = Path(__file__).parents[3] / "src" / "physion" / "models" / "anchors"
-    sources = [path.read_text() for path in sorted(folder.glob("*.py"))]
-    packaged = {
-        name for text in sources for name in re.findall(r'^NAME\b.* = "([\w-]+)"', text, re.M)
-    }
+    source = Path(__file__).parents[3] / "src" / "physion" / "models" / "build.py"
+    found = re.findall(r'"([\w-]+)": "physion\.models\.baselines\.', source.read_text())
+    packaged = set(found)
     assert {"outcome", "constant-motion"} <= packaged <= ANCHOR_MODELS
 
 
@@ -354,7 +346,7 @@ def test_where_observed_contacts_are_not_known_the_settings_say_so() -> None:
     assert everything.later.empty and "none is left" in everything.settings[SETTING]
 
 
-# --- single participants and the leaderboard -----------------------------------------------------
+# --- single participants -----------------------------------------------------
 
 
 def test_with_participants_anchors_stand_next_to_models() -> None:
@@ -379,43 +371,6 @@ def test_with_participants_anchors_stand_next_to_models() -> None:
     assert best.idxmax() == MAJORITY
     # Tests of models against each other are about what was predicted.
     assert found.tests.empty and found.pairs.empty and len(found.calibration) == 1
-
-
-def test_the_leaderboard_has_anchors_over_the_stimuli_of_all_files(tmp_path: Path) -> None:
-    files = []
-    for name, rows in (("m", slice(0, 16)), ("n", slice(8, 24)), ("constant-motion", slice(0, 24))):
-        predictions(name, len(name)).iloc[rows].to_csv(tmp_path / f"{name}.csv", index=False)
-        files.append(tmp_path / f"{name}.csv")
-    board = leaderboard(files, humans(), LABELS, bootstrap=QUICK)
-    assert list(board.table["kind"]) == ["model", "model", "anchor"]
-    assert board.table["rank"].tolist() == [1, 2, pd.NA]
-    assert list(board.anchors["model"]) == [TWO_PEOPLE, OUTCOME, MAJORITY]
-    assert list(board.anchors["kind"]) == ["people", "anchor", "anchor"]
-    assert set(board.anchors["stimuli"]) == {24} and list(board.anchors) == list(board.table)
-    expected = row_of(compared().anchors, MAJORITY)
-    found = board.anchors.set_index("model").loc[MAJORITY]
-    for column in ("accuracy", "kappa_from_averages", "r_low", "kappa_beyond_outcome_high"):
-        assert found[column] == expected[column]
-    assert leaderboard(files, bootstrap=QUICK).anchors.empty
-
-
-def test_the_leaderboard_has_kappa_of_people_with_each_other(tmp_path: Path) -> None:
-    responses = study(people=8, stimuli=16, scenarios=("collide", "roll"), seed=2)
-    one = responses.test.drop_duplicates("stimulus")
-    table = {"Model": "m", "Readout Type": "C", "Predicted Prob_true": 0.7,
-             "Predicted Outcome": True, "Actual Outcome": one["label"],
-             "Readout Test Data": one["scenario"], "Stimulus Name": one["stimulus"]}  # fmt: skip
-    pd.DataFrame(table).to_csv(tmp_path / "m.csv", index=False)
-    board = leaderboard([tmp_path / "m.csv"], None, None, responses, bootstrap=QUICK)
-    test = responses.test
-    values = []
-    for _, part in test.groupby("scenario"):
-        yes = part.pivot(index="session", columns="stimulus", values="yes").to_numpy()
-        values.append(np.mean([cohen_kappa_score(yes[i], yes[j])
-                               for i in range(len(yes)) for j in range(i)]))  # fmt: skip
-    row = board.anchors.set_index("model").loc[TWO_PEOPLE]
-    assert row["kappa"] == pytest.approx(np.mean(values))
-    assert row["kappa_low"] < row["kappa"] < row["kappa_high"]
 
 
 # --- official data -------------------------------------------------------------------------------

@@ -131,14 +131,12 @@ def test_simulated_is_written_in_the_data_for_good(
             assert visit.result.correct == sum(right)
 
 
-@pytest.mark.parametrize("verb", [["compare"], ["compare", "leaderboard"]])
 @pytest.mark.parametrize("with_sessions", [False, True])
 def test_models_are_not_compared_with_simulated_participants_alone(
     study: Study,
     served: tuple[ServerProcess, list[Visit], list[Visit]],
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
-    verb: list[str],
     with_sessions: bool,
 ) -> None:
     assert len(stored_sessions(study)) == 8
@@ -146,7 +144,7 @@ def test_models_are_not_compared_with_simulated_participants_alone(
     assert main(["experiment", "export", str(study.folder), "--out", str(data)]) == 0
     rows = [f"m,B,{s.scenario},0.9,True,{s.label},{s.stimulus}" for s in study.stimuli]
     predictions.write_text("\n".join([COLUMNS_OF_PREDICTIONS, *rows]) + "\n")
-    words = [*verb, str(predictions), "--responses", str(data / "trials.csv")]
+    words = ["compare", str(predictions), "--responses", str(data / "trials.csv")]
     words += ["--sessions", str(data / "sessions.csv")] if with_sessions else []
     capsys.readouterr()
     assert main([*words, "--out", str(tmp_path / "report")]) == 2

@@ -10,7 +10,6 @@ from physion.analysis.metrics import (
 from physion.analysis.metrics.registry import (
     Metric,
     all_metrics,
-    leaderboard_metrics,
     measure_metrics,
     metrics,
     register_metric,
@@ -23,7 +22,6 @@ __all__ = [
     "all_metrics",
     "average_person",
     "beyond_outcome",
-    "leaderboard_metrics",
     "measure_metrics",
     "metrics",
     "participants",

@@ -20,7 +20,6 @@ def _accuracy_of_people(sample: Sample) -> Array:
     resampled=("stimuli", "both"),
     in_scores=True,
     in_measures=True,
-    on_leaderboard=True,
     two_people=_accuracy_of_people,
 )
 def accuracy(sample: Sample) -> Array:
@@ -72,7 +71,6 @@ def human_accuracy(sample: Sample) -> Array:
     needs="people",
     in_scores=True,
     in_measures=True,
-    on_leaderboard=True,
 )
 def difference(sample: Sample) -> Array:
     """Return the accuracy of the model minus that of people on the same stimuli."""

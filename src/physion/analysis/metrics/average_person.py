@@ -51,7 +51,6 @@ def r_of_two_people(sample: Sample) -> Array:
     needs="people",
     in_scores=True,
     in_measures=True,
-    on_leaderboard=True,
     two_people=r_of_two_people,
 )
 def pearson_r(sample: Sample) -> Array:
@@ -95,7 +94,6 @@ def _kappa_of_two_people(sample: Sample) -> Array:
     needs="people",
     in_scores=True,
     in_measures=True,
-    on_leaderboard=True,
     two_people=_kappa_of_two_people,
 )
 def kappa_from_averages(sample: Sample) -> Array:
@@ -134,7 +132,6 @@ def _kappa(agreement: Array, expected: Array) -> Array:
     needs="people",
     in_scores=True,
     in_measures=True,
-    on_leaderboard=True,
 )
 def rmsd(sample: Sample) -> Array:
     """Return the root of the mean squared difference of P(contact) and P(yes)."""

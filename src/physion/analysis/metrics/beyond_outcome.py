@@ -28,7 +28,6 @@ BEYOND_OUTCOME = ("r_beyond_outcome", "kappa_beyond_outcome", "kappa_within_outc
     needs="people",
     in_scores=True,
     in_measures=True,
-    on_leaderboard=True,
 )
 def r_beyond_outcome(sample: Sample) -> Array:
     """Return the partial r of P(contact) with P(yes) given the outcome, (b, m).
@@ -64,7 +63,6 @@ def _beyond_of_two_people(sample: Sample) -> Array:
     needs="people",
     in_scores=True,
     in_measures=True,
-    on_leaderboard=True,
     two_people=_beyond_of_two_people,
 )
 def kappa_beyond_outcome(sample: Sample) -> Array:
@@ -107,7 +105,6 @@ def _within_of_two_people(sample: Sample) -> Array:
     needs="people",
     in_scores=True,
     in_measures=True,
-    on_leaderboard=True,
     two_people=_within_of_two_people,
 )
 def kappa_within_outcomes(sample: Sample) -> Array:

@@ -27,7 +27,6 @@ def _kappa_of_two_people(sample: Sample) -> Array:
     scale="correlation",
     needs="participants",
     in_measures=True,
-    on_leaderboard=True,
     by_participant=_kappa_by_participant,
     two_people=_kappa_of_two_people,
 )

@@ -1,8 +1,8 @@
 """Registry of the metrics: the one definition of every number that compares a model with people.
 
 A metric is one entry: a function of a `Sample`, decorated with `register_metric`. The tables of
-scores (`models.score_tables`), of measures (`models.model_people`), the leaderboard and the report
-ask this registry, so that a new metric appears in all of them. ``docs/how-to/add-a-metric.md``
+scores (`models.score_tables`), of measures (`models.model_people`) and the report ask this
+registry, so that a new metric appears in all of them. ``docs/how-to/add-a-metric.md``
 shows how to add one.
 """
 
@@ -34,8 +34,8 @@ class Metric:
     - ``needs``: ``outcome`` (of the trials), ``people`` (their averages by stimulus) or
       ``participants`` (their single answers);
     - ``resampled``: what an interval can be about; ``scale``: the one on which it is symmetric;
-    - ``in_scores``, ``in_measures``, ``on_leaderboard``: the tables that contain it: scores of
-      models by stimulus, measures with single participants, the leaderboard;
+    - ``in_scores``, ``in_measures``: the tables that contain it: scores of models by stimulus,
+      measures with single participants;
     - ``by_participant``: from a `Sample` to the value with each participant (n, m), if any;
     - ``two_people``: from a `Sample` to the value (b, 1) that one person has with another one in
       place of the model, if it is defined.
@@ -52,7 +52,6 @@ class Metric:
     scale: Scale
     in_scores: bool
     in_measures: bool
-    on_leaderboard: bool
     by_participant: Compute | None
     two_people: Compute | None
     position: int
@@ -93,7 +92,6 @@ def register_metric(
     scale: Scale = "identity",
     in_scores: bool = False,
     in_measures: bool = False,
-    on_leaderboard: bool = False,
     by_participant: Compute | None = None,
     two_people: Compute | None = None,
 ) -> Callable[[Compute], Compute]:
@@ -115,7 +113,6 @@ def register_metric(
             scale=scale,
             in_scores=in_scores,
             in_measures=in_measures,
-            on_leaderboard=on_leaderboard,
             by_participant=by_participant,
             two_people=two_people,
             position=next(_count),
@@ -139,8 +136,3 @@ def score_metrics() -> list[Metric]:
 def measure_metrics() -> list[Metric]:
     """Return the metrics in the table of measures with single participants."""
     return [metric for metric in all_metrics() if metric.in_measures]
-
-
-def leaderboard_metrics() -> list[Metric]:
-    """Return the metrics on the leaderboard."""
-    return [metric for metric in all_metrics() if metric.on_leaderboard]

@@ -8,11 +8,7 @@
 
 `physion compare validate FILE...`: checks files of predictions and names each bad row.
 
-`physion compare leaderboard FILES...`: one table of many files, sorted by any column.
-
 `physion compare power`: how many people and stimuli a study needs.
-
-`physion compare diffusion`: drift diffusion model of the answers and times of each participant.
 
 A file that is called like one of these words is meant by ./official and so on.
 """
@@ -29,9 +25,7 @@ import tyro
 SUBVERBS = {
     "official": "physion.cli.compare.official",
     "validate": "physion.cli.compare.validate",
-    "leaderboard": "physion.cli.compare.leaderboard",
     "power": "physion.cli.compare.power",
-    "diffusion": "physion.cli.compare.diffusion",
 }
 """Sub-commands and their modules."""
 

@@ -27,17 +27,11 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "compare": (
         "physion compare runs/models/predictions/*.csv --humans official",
-        "physion compare --responses study/export/responses.csv",
+        "physion compare --responses study/export/trials.csv",
     ),
     "compare official": ("physion compare official official --out runs/published",),
     "compare validate": ("physion compare validate predictions.csv --labels labels.csv",),
-    "compare leaderboard": (
-        "physion compare leaderboard runs/models/predictions/*.csv --humans official",
-    ),
     "compare power": ("physion compare power --effect 0.1 --people 20 40 --stimuli 60 100",),
-    "compare diffusion": (
-        "physion compare diffusion --responses data/trials.csv --out diffusion.csv",
-    ),
     "experiment": ("physion experiment init study --trials trials",),
     "experiment init": (
         "physion experiment init study --trials trials --test 80 --languages en",

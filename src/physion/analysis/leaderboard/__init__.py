@@ -1,1 +1,0 @@
-"""The leaderboard: one table of many prediction files."""
