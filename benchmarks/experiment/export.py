@@ -31,8 +31,15 @@ from sqlalchemy import insert
 from physion.compute.tasks import processor
 from physion.core.names import SCENARIOS
 from physion.experiment.export.export_study import export_study
-from physion.experiment.store.database import open_database, upgrade
-from physion.experiment.store.tables import ANSWERS, EVENTS, PARTICIPANTS, SESSIONS, STUDIES
+from physion.experiment.store.database import (
+    ANSWERS,
+    EVENTS,
+    PARTICIPANTS,
+    SESSIONS,
+    STUDIES,
+    open_database,
+    upgrade,
+)
 from physion.experiment.study.stimuli import Stimulus
 from physion.experiment.study.study import Study
 

@@ -19,12 +19,9 @@ from physion.experiment.experimenter.routes import build_router
 from physion.experiment.protocol.refused import Refused
 from physion.experiment.study.media_links import read_media
 from physion.experiment.study.texts import TEXTS_FOLDER, read_consent_file
-from physion.experiment.web.api import build_api
-from physion.experiment.web.bodies import BadBodyError
-from physion.experiment.web.guards import Guards
-from physion.experiment.web.media_serving import MediaFiles
-from physion.experiment.web.page_files import PACKAGE, read_page_file, read_page_files
-from physion.experiment.web.refusals import code_of, refuse
+from physion.experiment.web.api import BadBodyError, build_api
+from physion.experiment.web.files import PACKAGE, MediaFiles, read_page_file, read_page_files
+from physion.experiment.web.guards import Guards, code_of, refuse
 
 if TYPE_CHECKING:
     from physion.experiment.store.store import Store

@@ -14,8 +14,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 import sqlalchemy as sa
 
-from physion.experiment.store.database import open_database, sqlite_url
-from physion.experiment.store.tables import TOKENS
+from physion.experiment.store.database import TOKENS, open_database, sqlite_url
 from physion.experiment.study.study import Study
 from support.experiment.browser import SHORT, Visit, chromium, rows_of, served, signed_query
 

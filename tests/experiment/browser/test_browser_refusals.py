@@ -14,8 +14,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 import sqlalchemy as sa
 
-from physion.experiment.store.database import open_database, sqlite_url
-from physion.experiment.store.tables import RAW_IDS, SESSIONS
+from physion.experiment.store.database import RAW_IDS, SESSIONS, open_database, sqlite_url
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Recruitment, Study

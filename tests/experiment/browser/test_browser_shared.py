@@ -11,8 +11,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 import sqlalchemy as sa
 
-from physion.experiment.store.database import open_database, sqlite_url
-from physion.experiment.store.tables import PARTICIPANTS, SESSIONS
+from physion.experiment.store.database import PARTICIPANTS, SESSIONS, open_database, sqlite_url
 from physion.experiment.study.study import Recruitment, Study
 from support.experiment.browser import Visit, chromium, rows_of, served
 

@@ -26,8 +26,7 @@ from physion.experiment.experimenter.statistics.summaries import (
 from physion.experiment.experimenter.statistics.worker import StatisticsWorker
 from physion.experiment.experimenter.templating import minutes
 from physion.experiment.protocol.stages import Stage
-from physion.experiment.store.database import open_database, upgrade
-from physion.experiment.store.tables import ANSWERS, SESSIONS
+from physion.experiment.store.database import ANSWERS, SESSIONS, open_database, upgrade
 from physion.experiment.study.identity import Secrets
 from support.experiment.experimenter_rows import BROWSERS, insert_sessions
 from support.experiment.store_walk import STAGES

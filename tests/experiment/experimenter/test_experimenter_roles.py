@@ -18,9 +18,9 @@ from physion.experiment.experimenter.access.accounts import (
     remove_account,
 )
 from physion.experiment.experimenter.routes import build_router
-from physion.experiment.store.forget import forget_sessions
+from physion.experiment.store.database import ACTIONS, SESSIONS
+from physion.experiment.store.lab import forget_sessions
 from physion.experiment.store.store import Store
-from physion.experiment.store.tables import ACTIONS, SESSIONS
 from physion.experiment.study.identity import (
     FIRST_ACCOUNT,
     SECRET_FILE,

@@ -24,8 +24,7 @@ from physion.experiment.export.session_rows import (
     read_sessions,
 )
 from physion.experiment.export.trial_rows import read_trials
-from physion.experiment.store.database import open_database, upgrade
-from physion.experiment.store.tables import ANSWERS, SESSIONS
+from physion.experiment.store.database import ANSWERS, SESSIONS, open_database, upgrade
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Study
 from support.experiment.experimenter_rows import insert_sessions

@@ -19,8 +19,8 @@ from physion.experiment.experimenter.overview import compute_overview
 from physion.experiment.experimenter.statistics.flagging import Flags, find_flags
 from physion.experiment.experimenter.statistics.summaries import SummaryCache
 from physion.experiment.export.export_study import export_study
+from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.store import Store
-from physion.experiment.store.tables import SESSIONS
 from physion.experiment.study.courses.blocks import block_scenarios
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.settings import Attention

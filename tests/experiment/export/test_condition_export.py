@@ -20,8 +20,8 @@ from physion.experiment.experimenter.overview import compute_overview
 from physion.experiment.experimenter.statistics.flagging import Flags
 from physion.experiment.experimenter.statistics.summaries import SummaryCache
 from physion.experiment.export.export_study import export_study
+from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.store import Store
-from physion.experiment.store.tables import SESSIONS
 from physion.experiment.study.conditions import Condition
 from physion.experiment.study.identity import Secrets
 from support.experiment.store_walk import enter, page, rows, walk

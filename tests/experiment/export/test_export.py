@@ -25,8 +25,15 @@ from physion.experiment.export.answer_tables import read_tables
 from physion.experiment.export.export_study import GONE, NO_FILE, export_study
 from physion.experiment.export.spreadsheet import restore_cell
 from physion.experiment.export.write_tables import TABLES
-from physion.experiment.store.database import open_database, sqlite_url, upgrade
-from physion.experiment.store.tables import ANSWERS, RAW_IDS, SESSIONS, STUDIES
+from physion.experiment.store.database import (
+    ANSWERS,
+    RAW_IDS,
+    SESSIONS,
+    STUDIES,
+    open_database,
+    sqlite_url,
+    upgrade,
+)
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Recruitment, Study
 from support.experiment import experimenter_rows

@@ -15,8 +15,8 @@ from physion.analysis.people.participants import read_responses
 from physion.experiment.experimenter.statistics.summaries import SummaryCache
 from physion.experiment.export.export_study import export_study
 from physion.experiment.protocol.messages import Jump
+from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.store import Store
-from physion.experiment.store.tables import SESSIONS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.recruitment import make_pass

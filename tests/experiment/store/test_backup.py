@@ -12,9 +12,9 @@ import pytest
 
 from physion.cli.main import main
 from physion.core.errors import BadInputError, PhysionError
-from physion.experiment.store.lab.backup import back_up
+from physion.experiment.store.database import ANSWERS
+from physion.experiment.store.lab import back_up
 from physion.experiment.store.store import Store
-from physion.experiment.store.tables import ANSWERS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Study
 from support.experiment.store_walk import enter, give, rows, walk

@@ -12,9 +12,8 @@ from sqlalchemy import text
 
 from physion.core.errors import BadInputError
 from physion.experiment.protocol.messages import Jump, PageDone
-from physion.experiment.store.database import _load_migrations, open_database
+from physion.experiment.store.database import SESSIONS, _load_migrations, open_database
 from physion.experiment.store.store import Store
-from physion.experiment.store.tables import SESSIONS
 from physion.experiment.study.courses.blocks import block_scenarios, order_number
 from physion.experiment.study.identity import Secrets, hash_token
 from physion.experiment.study.media_links import read_media_path

@@ -11,9 +11,9 @@ import pytest
 
 from physion.experiment.export.export_study import export_study
 from physion.experiment.protocol.messages import Completion, Jump, PageDone
-from physion.experiment.store.comprehension import ATTEMPT
+from physion.experiment.store.answering import ATTEMPT
+from physion.experiment.store.database import EVENTS, SESSIONS
 from physion.experiment.store.store import Store
-from physion.experiment.store.tables import EVENTS, SESSIONS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Comprehension, EarlyEnd, Study

@@ -14,9 +14,9 @@ from sqlalchemy import update
 from physion.cli.main import main
 from physion.core.errors import BadInputError
 from physion.experiment.protocol.messages import Enter
-from physion.experiment.store.lab.managing import set_voided
+from physion.experiment.store.database import SESSIONS
+from physion.experiment.store.lab import set_voided
 from physion.experiment.store.store import Store
-from physion.experiment.store.tables import SESSIONS
 from physion.experiment.study.conditions import Condition
 from physion.experiment.study.courses.variants import under
 from physion.experiment.study.identity import Secrets

@@ -12,9 +12,9 @@ import pytest
 from physion.cli.main import main
 from physion.core.errors import BadInputError, PhysionError
 from physion.experiment.protocol.messages import Device, Enter, Event, Events
-from physion.experiment.store.forget import forget, forget_raw_ids, forget_sessions
+from physion.experiment.store.database import ANSWERS, EVENTS, RAW_IDS, SESSIONS, TOKENS
+from physion.experiment.store.lab import forget, forget_raw_ids, forget_sessions
 from physion.experiment.store.store import Store
-from physion.experiment.store.tables import ANSWERS, EVENTS, RAW_IDS, SESSIONS, TOKENS
 from physion.experiment.study.identity import Secrets, check_password, participant_hash
 from physion.experiment.study.study import Study
 from support.experiment.store_walk import enter, give, page, refusal, rows, run, walk

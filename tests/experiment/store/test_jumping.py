@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from physion.experiment.protocol.messages import Jump
+from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.sessions import stages_of
 from physion.experiment.store.store import Store
-from physion.experiment.store.tables import SESSIONS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Study

@@ -15,9 +15,9 @@ from physion.core.errors import BadInputError
 from physion.experiment.export.export_study import export_study
 from physion.experiment.export.spreadsheet import restore_cell
 from physion.experiment.protocol.messages import PageDone
-from physion.experiment.store.forget import forget_sessions
+from physion.experiment.store.database import SESSIONS
+from physion.experiment.store.lab import forget_sessions
 from physion.experiment.store.store import Store
-from physion.experiment.store.tables import SESSIONS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.questions import Question
 from physion.experiment.study.study import Study, load_study, write_settings

@@ -13,9 +13,9 @@ import pytest
 from physion.analysis.people.participants import read_responses
 from physion.experiment.export.export_study import export_study
 from physion.experiment.protocol.messages import Completion, Jump, SessionState
-from physion.experiment.store.forget import forget_sessions
+from physion.experiment.store.database import ANSWERS, PRACTICE_REPEATS, SESSIONS, SHOWINGS
+from physion.experiment.store.lab import forget_sessions
 from physion.experiment.store.store import Store
-from physion.experiment.store.tables import ANSWERS, PRACTICE_REPEATS, SESSIONS, SHOWINGS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.recruitment import make_pass

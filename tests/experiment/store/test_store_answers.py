@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from sqlalchemy import delete
 
 from physion.experiment.protocol.messages import Answer, PageDone
+from physion.experiment.store.database import ANSWERS, METADATA, SESSIONS, STUDIES
 from physion.experiment.store.store import Refused, Store
-from physion.experiment.store.tables import ANSWERS, METADATA, SESSIONS, STUDIES
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.media_links import read_media_path
 from physion.experiment.study.orders import trial_order

@@ -15,13 +15,14 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from physion.core.errors import BadInputError, PhysionError
 from physion.experiment.store.database import (
+    METADATA,
+    RAW_IDS,
     check_version,
     connect_writer,
     open_database,
     server_lock,
     upgrade,
 )
-from physion.experiment.store.tables import METADATA, RAW_IDS
 
 
 def test_upgrade_of_an_empty_database_gives_exactly_the_tables(database_url: str) -> None:

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from physion.experiment.protocol.messages import Completion, Device, Enter, SessionEnd
-from physion.experiment.store.forget import forget_sessions
+from physion.experiment.store.database import EVENTS, RAW_IDS, SESSIONS
+from physion.experiment.store.lab import forget_sessions
 from physion.experiment.store.store import Refused, Store
-from physion.experiment.store.tables import EVENTS, RAW_IDS, SESSIONS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import EarlyEnd, Study
 from support.experiment.store_walk import enter, give, page, refusal, request, rows, run, walk

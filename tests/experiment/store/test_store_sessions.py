@@ -14,10 +14,17 @@ from sqlalchemy import update
 
 from physion.core.errors import BadInputError, PhysionError
 from physion.experiment.protocol.messages import REFUSALS, Device, Enter, Event, Events, PageDone
-from physion.experiment.store.scores import percentile
+from physion.experiment.store.database import (
+    EVENTS,
+    PARTICIPANTS,
+    RAW_IDS,
+    SESSIONS,
+    STUDIES,
+    TOKENS,
+)
+from physion.experiment.store.judging import percentile
 from physion.experiment.store.sessions import ACTIVE_WITHIN
 from physion.experiment.store.store import Refused, Store
-from physion.experiment.store.tables import EVENTS, PARTICIPANTS, RAW_IDS, SESSIONS, STUDIES, TOKENS
 from physion.experiment.study.identity import Secrets, participant_hash
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Recruitment, Study

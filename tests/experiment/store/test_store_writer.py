@@ -17,10 +17,8 @@ from sqlalchemy import Connection, Engine, create_engine, event, text
 from sqlalchemy.engine import make_url
 
 from physion.experiment.protocol.messages import Enter, PageDone
-from physion.experiment.store.database import connect_writer, open_database
+from physion.experiment.store.database import EVENTS, Writer, connect_writer, open_database
 from physion.experiment.store.store import Refused, Store
-from physion.experiment.store.tables import EVENTS
-from physion.experiment.store.writer import Writer
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Study

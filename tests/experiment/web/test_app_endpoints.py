@@ -14,7 +14,7 @@ from sqlalchemy.exc import OperationalError
 
 from physion.experiment.protocol import messages as wire
 from physion.experiment.protocol.public_study import PublicStudy
-from physion.experiment.store.tables import ANSWERS, RAW_IDS, SESSIONS
+from physion.experiment.store.database import ANSWERS, RAW_IDS, SESSIONS
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Recruitment
 from support.experiment.app_walk import Person, Served, answer_body, served

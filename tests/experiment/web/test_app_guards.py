@@ -25,9 +25,8 @@ from starlette.testclient import TestClient
 from physion.experiment.protocol.messages import MAX_BODY
 from physion.experiment.study.study import Limits, Study
 from physion.experiment.web import connections, guards
-from physion.experiment.web.guards import Guards
+from physion.experiment.web.guards import Guards, content_policy
 from physion.experiment.web.rate_limits import Buckets, RateLimits, network_of
-from physion.experiment.web.security_headers import content_policy
 from support.experiment.live_app import HOST, exchange, read_all, running
 
 TOKENS = {"good", "other"}

@@ -16,12 +16,12 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 import av
 from sqlalchemy import select
 
-from physion.experiment.store.tables import SESSIONS
+from physion.experiment.store.database import SESSIONS
 from physion.experiment.study.identity import sign
 from physion.experiment.study.media_links import NO_TAG, sign_media
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.stimuli import Stimulus
-from physion.experiment.web.page_files import MEDIA_TYPES, PACKAGE
+from physion.experiment.web.files import MEDIA_TYPES, PACKAGE
 from support.experiment.app_walk import Person, Served, served
 from support.experiment.tiny_study import FULL, OBSERVED, read_number
 

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.experiment.study.study import Limits
-from physion.experiment.web.bearer import read_token
+from physion.experiment.web.api import read_token
 from physion.experiment.web.rate_limits import RateLimits
 from support.experiment.app_walk import served
 

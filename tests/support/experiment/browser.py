@@ -21,8 +21,7 @@ import pytest
 import sqlalchemy as sa
 
 from physion.experiment.simulated.server_process import ServerProcess
-from physion.experiment.store.database import open_database, sqlite_url
-from physion.experiment.store.tables import ANSWERS, EVENTS, SESSIONS
+from physion.experiment.store.database import ANSWERS, EVENTS, SESSIONS, open_database, sqlite_url
 from physion.experiment.study.identity import Secrets, participant_hash
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Plausibility, Recruitment, Study, Timing

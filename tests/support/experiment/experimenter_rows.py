@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import sqlalchemy as sa
 
-from physion.experiment.store.tables import (
+from physion.experiment.store.database import (
     ANSWERS,
     EVENTS,
     PARTICIPANTS,

@@ -12,8 +12,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from physion.experiment.simulated.server_process import ServerProcess
-from physion.experiment.store.database import open_database, sqlite_url
-from physion.experiment.store.tables import ANSWERS, SESSIONS
+from physion.experiment.store.database import ANSWERS, SESSIONS, open_database, sqlite_url
 from physion.experiment.study.study import Study
 
 MOTHER = """

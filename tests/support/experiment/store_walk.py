@@ -13,8 +13,8 @@ from sqlalchemy import select
 
 from physion.experiment.protocol import stages
 from physion.experiment.protocol.messages import Answer, AnswerStored, Enter, PageDone, SessionState
+from physion.experiment.store.database import ANSWERS
 from physion.experiment.store.store import Refused, Store
-from physion.experiment.store.tables import ANSWERS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Study
 from support.experiment.own_questions import OWN_ANSWERS, RIGHT

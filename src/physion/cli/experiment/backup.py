@@ -36,7 +36,7 @@ def main(options: Options) -> int:
     from physion.cli.experiment.experiment import require_extra
 
     require_extra()
-    from physion.experiment.store.lab.backup import back_up
+    from physion.experiment.store.lab import back_up
 
     made = back_up(
         options.study,

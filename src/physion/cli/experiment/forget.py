@@ -44,7 +44,7 @@ def main(options: Options) -> int:
         )
     require_extra()
     from physion.experiment.store.database import sqlite_url
-    from physion.experiment.store.forget import forget, forget_sessions
+    from physion.experiment.store.lab import forget, forget_sessions
 
     url = options.database or sqlite_url(options.study)
     if options.session:

@@ -22,9 +22,15 @@ from physion.experiment.experimenter.page_context import (
     redirect,
 )
 from physion.experiment.experimenter.session_list import page_number
-from physion.experiment.store.lab.actions import Action, LogPage, read_log
-from physion.experiment.store.lab.managing import is_paused, set_paused, set_voided
-from physion.experiment.store.tables import SESSIONS
+from physion.experiment.store.database import SESSIONS
+from physion.experiment.store.lab import (
+    Action,
+    LogPage,
+    is_paused,
+    read_log,
+    set_paused,
+    set_voided,
+)
 
 if TYPE_CHECKING:
     from physion.experiment.store.store import Store
@@ -102,7 +108,7 @@ class ManagePages:
         if self._exports.running:
             problem = "An export is in progress; wait until it ends."
             return self._context.render_problem(request, problem, 409)
-        from physion.experiment.store.forget import forget_session
+        from physion.experiment.store.lab import forget_session
 
         try:
             # A concurrent reader would keep the deleted bytes in the database's write-ahead log.

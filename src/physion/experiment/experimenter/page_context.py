@@ -19,7 +19,7 @@ from physion.experiment.experimenter.session_list import KINDS
 from physion.experiment.experimenter.statistics.process import StatisticsProcess
 from physion.experiment.experimenter.statistics.summaries import STATES
 from physion.experiment.experimenter.templating import make_environment
-from physion.experiment.store.lab.actions import Action, note_action
+from physion.experiment.store.lab import Action, note_action
 from physion.experiment.store.sessions import ACTIVE_WITHIN
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Study

@@ -71,7 +71,7 @@ class PaymentPages:
         if fields.get("word", "").strip().lower() != FORGET_WORD:
             problem = f"Nothing was deleted: type the word “{FORGET_WORD}” to confirm."
             return await self._list(request, problem, 422)
-        from physion.experiment.store.forget import forget_raw_ids
+        from physion.experiment.store.lab import forget_raw_ids
 
         if self._exports.running:
             return await self._list(request, "An export is in progress; wait until it ends.", 409)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from sqlalchemy import Engine, func, select
 
-from physion.experiment.store.tables import RAW_IDS, SESSIONS
+from physion.experiment.store.database import RAW_IDS, SESSIONS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import completion
 from physion.experiment.study.study import Study

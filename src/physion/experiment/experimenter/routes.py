@@ -25,10 +25,10 @@ from physion.experiment.experimenter.page_context import (
 )
 from physion.experiment.experimenter.payment_pages import PaymentPages
 from physion.experiment.experimenter.session_list import KINDS, SessionFilter
-from physion.experiment.store.lab.actions import note_action
+from physion.experiment.store.lab import note_action
 from physion.experiment.study.identity import FIRST_ACCOUNT, Account, Permission, Secrets
 from physion.experiment.study.study import Study
-from physion.experiment.web.page_files import read_page_files
+from physion.experiment.web.files import read_page_files
 
 if TYPE_CHECKING:
     from physion.experiment.store.store import Store

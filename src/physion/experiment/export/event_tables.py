@@ -15,7 +15,7 @@ from physion.analysis.people.response_schema import PHASES, Column
 from physion.experiment.export.arrow_types import arrow_schema
 from physion.experiment.export.iso_times import iso_times
 from physion.experiment.export.trial_rows import AT_ONCE, TrialBatch
-from physion.experiment.store.tables import EVENTS
+from physion.experiment.store.database import EVENTS
 
 _SESSION = Column("session", "text", "As in the sessions", required=True, may_be_empty=False)
 

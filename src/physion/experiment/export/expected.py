@@ -8,7 +8,7 @@ from sqlalchemy import Connection, select
 
 from physion.core.names import canonical_name
 from physion.experiment.export.session_rows import SessionTable
-from physion.experiment.store.tables import SESSIONS
+from physion.experiment.store.database import SESSIONS
 from physion.experiment.study.courses.variants import under
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.stimuli import Stimulus

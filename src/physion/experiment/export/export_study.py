@@ -51,7 +51,7 @@ from physion.experiment.export.session_rows import (
 )
 from physion.experiment.export.spreadsheet import RULE
 from physion.experiment.export.write_tables import WrittenTables, write_tables
-from physion.experiment.store.tables import STUDIES
+from physion.experiment.store.database import STUDIES
 from physion.experiment.study.study import EARLY_ENDS, Study
 
 Layout = Literal["both", "psych-ds", "bids"]

@@ -16,7 +16,7 @@ from sqlalchemy import Connection, select
 from physion.analysis.people.response_schema import TRIAL_COLUMNS, Column
 from physion.experiment.export.arrow_types import ARROW_TYPES, arrow_schema
 from physion.experiment.export.iso_times import iso_times
-from physion.experiment.store.tables import ANSWERS, PRACTICE_REPEATS
+from physion.experiment.store.database import ANSWERS, PRACTICE_REPEATS
 from physion.experiment.study.courses.attention import instructed_response
 from physion.experiment.study.courses.blocks import stimuli_by_session
 from physion.experiment.study.stimuli import ATTENTION

@@ -15,7 +15,7 @@ from sqlalchemy import Connection, select
 
 from physion.analysis.people.response_schema import Column
 from physion.experiment.export.arrow_types import ARROW_TYPES, arrow_schema
-from physion.experiment.store.tables import SESSIONS, STUDIES
+from physion.experiment.store.database import SESSIONS, STUDIES
 from physion.experiment.study.questions import Question, columns_of
 from physion.experiment.study.study import Study
 

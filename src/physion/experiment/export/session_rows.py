@@ -15,7 +15,7 @@ from physion.analysis.people.response_schema import SESSION_COLUMNS
 from physion.core.errors import UnknownNameError
 from physion.experiment.export.arrow_types import ARROW_TYPES, arrow_schema
 from physion.experiment.export.iso_times import iso_times
-from physion.experiment.store.tables import SESSIONS, STUDIES
+from physion.experiment.store.database import SESSIONS, STUDIES
 from physion.experiment.study.courses.blocks import block_scenarios
 from physion.experiment.study.courses.variants import under
 from physion.experiment.study.study import Study

@@ -16,7 +16,7 @@ from sqlalchemy.sql import ColumnElement
 from physion.analysis.people.response_schema import TRIAL_COLUMNS
 from physion.experiment.export.arrow_types import arrow_schema
 from physion.experiment.export.iso_times import iso_times
-from physion.experiment.store.tables import ANSWERS
+from physion.experiment.store.database import ANSWERS
 from physion.experiment.study.stimuli import LOOKS, PHASES, Stimulus
 from physion.experiment.study.study import Study
 

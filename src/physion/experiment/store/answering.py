@@ -3,39 +3,202 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from sqlalchemy import Connection, bindparam, select, update
+from sqlalchemy import Connection, bindparam, delete, func, insert, select, update
 
-from physion.experiment.protocol.messages import Answer, AnswerStored, Feedback
+from physion.experiment.protocol.messages import (
+    Answer,
+    AnswerStored,
+    Feedback,
+    Jump,
+    PageDone,
+    SessionState,
+    Showing,
+    Shown,
+)
 from physion.experiment.protocol.refused import Refused
-from physion.experiment.protocol.stages import Course
-from physion.experiment.store.plausibility import (
+from physion.experiment.protocol.stages import ENDED, PAGES, STAGES, Course
+from physion.experiment.store.database import (
+    ANSWERS,
+    EVENTS,
+    PRACTICE_REPEATS,
+    RAW_IDS,
+    SESSIONS,
+    SHOWINGS,
+)
+from physion.experiment.store.judging import (
     TOLERANCE_S,
     Presentation,
     earliest_answer,
+    judge_practice,
     judged,
     reasons,
+    repeated_response,
     speed,
 )
-from physion.experiment.store.practice import judge_practice, repeated_response
 from physion.experiment.store.sessions import (
+    ENTERED_AGAIN,
     Session,
     answered,
     change_session,
     insert_or_skip,
     stage_of,
     state_of,
+    storable,
     with_check,
 )
-from physion.experiment.store.showings import read_presentation
-from physion.experiment.store.tables import ANSWERS, SESSIONS
+from physion.experiment.study.comprehension import check_attempt
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.media_links import session_tag, sign_media
+from physion.experiment.study.media_links import MediaKind, session_tag, sign_media
 from physion.experiment.study.orders import trial_order
+from physion.experiment.study.questions import check_answers
 from physion.experiment.study.stimuli import ATTENTION, PHASES, Stimulus
 from physion.experiment.study.study import Study
+
+# Attempts at the comprehension check: the next page after each, and the end after too many.
+
+ATTEMPT = "comprehension_attempt"
+"""Kind of the event of an attempt; its data are its number, whether all was right, the answers."""
+
+
+def judge_attempt(
+    connection: Connection,
+    study: Study,
+    session: Session,
+    answers: Mapping[str, str],
+    now: float,
+) -> dict[str, Any]:
+    """Store an attempt as an event and return the columns of SESSIONS that it changes.
+
+    After a wrong answer the instructions are next; after the last attempt the session has ended.
+
+    Parameters
+    ----------
+    connection
+        Connection of the writer, in a transaction.
+    study, session
+        The study, and the session whose comprehension check is next.
+    answers
+        Answers from `study.comprehension.check_attempt`.
+    now
+        Time of the server in seconds since 1970.
+    """
+    attempts = session.comprehension_attempts + 1
+    right = all(answers[each.name] == each.right for each in study.comprehension_questions)
+    event = {
+        "session": session.session,
+        "kind": ATTEMPT,
+        "at_ms": 0.0,
+        "stored_at": now,
+        "data": {"attempt": attempts, "right": right, **answers},
+    }
+    connection.execute(insert(EVENTS), event)
+    columns: dict[str, Any] = {"comprehension_attempts": attempts}
+    if right:
+        return columns | {"comprehended_at": now}
+    if attempts >= study.comprehension.attempts:
+        return columns | {"screened_out_at": now, "screened_out_by": "comprehension"}
+    return columns | {"instructed_at": None}
+
+
+# Showings of trials: store that one begins, and read what an answer needs of them.
+
+MAX_STORED = 50
+"""Showings stored for one trial, so that nobody can fill the disk."""
+_OF_TRIAL = select(func.count(), func.max(SHOWINGS.c.began_at)).where(
+    SHOWINGS.c.session == bindparam("of_session"),
+    SHOWINGS.c.phase == bindparam("of_phase"),
+    SHOWINGS.c.trial == bindparam("of_trial"),
+)
+
+
+def store_showing(
+    connection: Connection,
+    course: Course,
+    session: Session,
+    showing: Showing,
+    now: float,
+) -> Shown:
+    """Store that the next trial begins; the same key is stored once.
+
+    It cannot have begun before the previous trial had ended (``Session.next_from``). A showing of a
+    trial that is answered already, which was delayed on its way, is not stored.
+
+    Raises
+    ------
+    Refused
+        Another trial or another page is next.
+    """
+    phase, trial = showing.phase, showing.trial
+    if trial < answered(session, phase):
+        return Shown(showings=_read(connection, session, phase, trial)[0])
+    if stage_of(session, course) != phase:
+        raise Refused("wrong_stage", "No trial of this phase is next.", state_of(session, course))
+    if trial != answered(session, phase):
+        raise Refused("out_of_order", "Another trial is next.", state_of(session, course))
+    count, _ = _read(connection, session, phase, trial)
+    if count < MAX_STORED:
+        row = {
+            "session": session.session,
+            "key": showing.key,
+            "phase": phase,
+            "trial": trial,
+            "began_at": max(now - showing.ago_ms / 1000, session.next_from or 0.0),
+            "stored_at": now,
+        }
+        count += connection.execute(insert_or_skip(connection, SHOWINGS), row).rowcount
+    return Shown(showings=count)
+
+
+def read_presentation(
+    connection: Connection,
+    study: Study,
+    course: Course,
+    session: Session,
+    answer: Answer,
+    fetched_at: float | None,
+) -> Presentation:
+    """Return what is known of the showings of the trial of an answer.
+
+    Parameters
+    ----------
+    connection
+        Connection of the writer.
+    study
+        The study; without its ``server_checks`` a trial need not have been announced.
+    course
+        What the session consists of.
+    session, answer
+        The session, and its answer to the next trial.
+    fetched_at
+        `FetchedMedia.sent_at` of the trial.
+
+    Raises
+    ------
+    Refused
+        The trial was never announced.
+    """
+    count, began_at = _read(connection, session, answer.phase, answer.trial)
+    if not study.plausibility.server_checks:
+        return Presentation(count, began_at or 0.0, None)
+    if began_at is None:
+        raise Refused("not_shown", "This trial was not shown yet.", state_of(session, course))
+    return Presentation(count, began_at, fetched_at)
+
+
+def _read(
+    connection: Connection, session: Session, phase: str, trial: int
+) -> tuple[int, float | None]:
+    """Return the number of showings of a trial, and the start of the last one."""
+    values = {"of_session": session.session, "of_phase": phase, "of_trial": trial}
+    count, began_at = connection.execute(_OF_TRIAL, values).one()
+    return count, began_at
+
 
 MAX_DETAILS = 16 * 1024
 _STORED = select(ANSWERS.c.key, ANSWERS.c.response).where(
@@ -257,3 +420,352 @@ def _build_feedback(
         ),
         frames=stimulus.full_frames,
     )
+
+
+# Submitted pages between the trials: validate their fields and write them to the session.
+
+MIN_AGE, MAX_AGE = 18, 130
+MAX_LABEL = 200
+"""Characters of a short text such as gender."""
+
+
+def _check_bool(value: Any) -> bool:
+    """Validate a boolean."""
+    if not isinstance(value, bool):
+        raise ValueError("true or false")
+    return value
+
+
+def _check_age(value: Any) -> int | None:
+    """Validate an age in years or null."""
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value):
+        raise ValueError(f"a whole number from {MIN_AGE} to {MAX_AGE}, or null")
+    if not MIN_AGE <= value <= MAX_AGE:
+        raise ValueError(f"a whole number from {MIN_AGE} to {MAX_AGE}, or null")
+    return int(value)
+
+
+def _check_label(value: Any) -> str | None:
+    """Validate a short text or null."""
+    if value is None:
+        return None
+    if not isinstance(value, str) or len(value) > MAX_LABEL:
+        raise ValueError(f"text of at most {MAX_LABEL} characters, or null")
+    return storable(value).strip() or None
+
+
+def _check_difficulty(value: Any) -> int:
+    """Validate a rating from 1 to 5."""
+    if isinstance(value, bool) or value not in (1, 2, 3, 4, 5):
+        raise ValueError("a whole number from 1 (very easy) to 5 (very hard)")
+    return int(value)
+
+
+def _check_text(value: Any) -> str:
+    """Validate a text, which may be empty."""
+    if not isinstance(value, str):
+        raise ValueError("text, which may be empty")
+    return storable(value).strip()
+
+
+def _check_index(value: Any) -> int:
+    """Validate an index from 0."""
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 100_000:
+        raise ValueError("a whole number of at least 0")
+    return value
+
+
+FIELDS: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
+    "consent": {"agreed": _check_bool},
+    "instructions": {},
+    "ready": {},
+    "block": {},
+    "demographics": {"age": _check_age, "gender": _check_label, "education": _check_label},
+    "feedback": {
+        "difficulty": _check_difficulty,
+        "technical_problems": _check_bool,
+        "text": _check_text,
+    },
+    "withdraw": {},
+}
+"""Required fields of each page with their validators; null means "prefer not to say"."""
+OPTIONAL: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
+    "consent": {"language": _check_label},
+    "ready": {"block": _check_index},
+    "block": {"block": _check_index},
+}
+"""Optional fields of each page."""
+
+
+def check_page(study: Study, done: PageDone) -> dict[str, Any]:
+    """Return the validated values of a page.
+
+    Raises
+    ------
+    Refused
+        A field is missing, invalid or unknown; the message names the first one.
+    """
+    if done.page == "questions":
+        return _check_own_questions(study, done.data)
+    if done.page == "comprehension":
+        try:
+            return dict(check_attempt(study.comprehension_questions, done.data))
+        except ValueError as error:
+            raise Refused("bad_request", f"data.{error}") from None
+    if done.page not in FIELDS:
+        raise Refused("bad_request", f"page: {done.page} is no page that is submitted")
+    optional = OPTIONAL.get(done.page, {})
+    expected = {**FIELDS[done.page], **{k: v for k, v in optional.items() if k in done.data}}
+    unknown = sorted(set(done.data) - set(expected))
+    if unknown:
+        name = ascii(unknown[0][:40])
+        raise Refused("bad_request", f"data: the page {done.page} has no field {name}")
+    values = {}
+    for name, check in expected.items():
+        if name not in done.data:
+            raise Refused("bad_request", f"data.{name} is missing")
+        try:
+            values[name] = check(done.data[name])
+        except (ValueError, OverflowError) as error:
+            raise Refused("bad_request", f"data.{name}: {error}") from None
+    return values
+
+
+def _check_own_questions(study: Study, data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the validated answers to the lab's own questions."""
+    given = {
+        name: storable(value) if isinstance(value, str) else value for name, value in data.items()
+    }
+    try:
+        return {"own_answers": check_answers(study.questions, given)}
+    except ValueError as error:
+        raise Refused("bad_request", f"data.{error}") from None
+
+
+def submit_page(
+    connection: Connection,
+    study: Study,
+    course: Course,
+    session: Session,
+    page: str,
+    values: Mapping[str, Any],
+    now: float,
+) -> SessionState:
+    """Apply a submitted page to the session; a page that was submitted before changes nothing.
+
+    Parameters
+    ----------
+    connection
+        Connection of the writer, in a transaction.
+    study
+        The study.
+    course
+        What the session consists of.
+    session
+        The session; it is updated.
+    page, values
+        Name of the page and its values from `check_page`.
+    now
+        Time of the server in seconds since 1970.
+
+    Raises
+    ------
+    Refused
+        The page is not the next one.
+    """
+    stage = stage_of(session, course)
+    if page == "withdraw" or values.get("agreed") is False:
+        if stage == "done":
+            raise Refused("wrong_stage", "This session is finished.", state_of(session, course))
+        if stage not in ENDED:
+            change_session(connection, session, withdrawn_at=now, last_seen=now)
+            if session.consented_at is None:
+                _forget_declined(connection, session)
+        return state_of(session, course)
+    if "block" in values and values["block"] < session.block and stage not in ENDED:
+        return state_of(session, course)  # a page of an earlier block, sent again
+    if stage in ENDED or STAGES.index(stage) < STAGES.index(page):  # type: ignore[arg-type]
+        raise Refused("wrong_stage", "This page is not next.", state_of(session, course))
+    if stage == page:
+        if stage == "comprehension":
+            columns = judge_attempt(connection, study, session, values, now)
+        else:
+            columns = {PAGES[stage].column: now, **_columns(study, session, page, values, now)}
+        times = dict.fromkeys(("last_seen", "progressed_at", "next_from"), now)
+        change_session(connection, session, **times, **columns)
+    return state_of(session, course)
+
+
+def _forget_declined(connection: Connection, session: Session) -> None:
+    """Delete the data of a person who declined: the device, and the raw id if no other session
+    needs it.
+    """
+    change_session(connection, session, device={})
+    again = (EVENTS.c.session == session.session) & (EVENTS.c.kind == ENTERED_AGAIN)
+    connection.execute(update(EVENTS).where(again).values(data={}))
+    other = select(SESSIONS.c.session).where(
+        SESSIONS.c.participant == session.participant, SESSIONS.c.session != session.session
+    )
+    own = RAW_IDS.c.participant == session.participant
+    connection.execute(delete(RAW_IDS).where(own, ~other.exists()))
+
+
+def _columns(
+    study: Study, session: Session, page: str, values: Mapping[str, Any], now: float
+) -> dict[str, Any]:
+    """Return the columns of SESSIONS that a page sets, besides the time at which it was sent."""
+    match page:
+        case "consent":
+            # Store the language in which the consent was read.
+            known = values.get("language") in study.languages
+            language = {"language": values["language"]} if known else {}
+            return {"consent_version": study.consent_version, **language}
+        case "block":
+            return {"block": session.block + 1, "ready_at": None, "practice_repeats": 0}
+        case "demographics":
+            return dict(values)
+        case "questions":
+            return {**values, "questions_study": study.digest}
+        case "feedback":
+            return {
+                "implausible": reasons(study, session, now),
+                "difficulty": values["difficulty"],
+                "technical_problems": values["technical_problems"],
+                "feedback": values["text"],
+            }
+        case _:
+            return {}
+
+
+# Memory of the movies and maps that the server has sent, for the trials not yet answered.
+#
+# It is not stored: after a restart nothing is known about the sessions that began before.
+
+MAX_SESSIONS = 20_000
+"""Sessions remembered; the least recently used are dropped first."""
+_Trial = tuple[str, int]
+
+
+class FetchedMedia:
+    """When the media of each trial were first sent, by the tag of the session in their URLs."""
+
+    def __init__(self, most: int = MAX_SESSIONS) -> None:
+        self._most = most
+        self._since = time.time()
+        self._complete = True
+        self._sent: OrderedDict[str, dict[_Trial, dict[MediaKind, float]]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def note(self, tag: str, phase: str, trial: int, kind: MediaKind, now: float) -> None:
+        """Record that a file was sent at the time ``now`` in seconds since 1970."""
+        with self._lock:
+            trials = self._sent.setdefault(tag, {})
+            trials.setdefault((phase, trial), {}).setdefault(kind, now)
+            self._sent.move_to_end(tag)
+            if len(self._sent) > self._most:
+                self._sent.popitem(last=False)
+                self._complete = False
+
+    def sent_at(self, tag: str, started_at: float, phase: str, trial: int) -> float | None:
+        """Return the time at which movie and map of a trial had both been asked for.
+
+        Parameters
+        ----------
+        tag
+            `media_links.session_tag` of the session.
+        started_at
+            When the session began.
+        phase, trial
+            The trial.
+
+        Returns
+        -------
+        The time in seconds since 1970; infinity if one of them was never asked for; None if it is
+        not known, because the session began before this server or was dropped from memory.
+        """
+        with self._lock:
+            trials = self._sent.get(tag)
+            if started_at < self._since or (trials is None and not self._complete):
+                return None
+            sent = (trials or {}).get((phase, trial), {})
+            return max(sent.get("movie", float("inf")), sent.get("map", float("inf")))
+
+    def forget(self, tag: str, phase: str, trial: int) -> None:
+        """Forget the media of a trial, which was answered."""
+        with self._lock:
+            trials = self._sent.get(tag)
+            if trials is not None:
+                trials.pop((phase, trial), None)
+
+
+# Move a preview to any page or trial.
+
+_ENDS = ("withdrawn_at", "closed_at", "screened_out_at", "screened_out_by")
+"""Columns of sessions that ended early."""
+
+
+def jump(
+    connection: Connection, course: Course, session: Session, to: Jump, now: float
+) -> SessionState:
+    """Move a preview to a page or trial: all before it is taken as done, all from it on as open.
+
+    Parameters
+    ----------
+    connection
+        Connection of the writer, in a transaction.
+    course
+        What the session consists of.
+    session
+        The session; it is updated.
+    to
+        The page, or the phase and the trial.
+    now
+        Time of the server in seconds since 1970.
+
+    Raises
+    ------
+    Refused
+        The session is no preview, or the study has no such page or trial.
+    """
+    if session.kind != "preview":
+        raise Refused("bad_request", "Only a preview can go to any page.")
+    if to.stage not in course.stages:
+        raise Refused("bad_request", f"stage: the study has no {to.stage}")
+    block = _block_of(course, to)
+    done = course.stages[: course.stages.index(to.stage)]
+    values: dict[str, Any] = dict.fromkeys(_ENDS)
+    values |= {"comprehension_attempts": 0, "practice_repeats": 0, "failed_checks": None,
+               "attention_failed": 0}  # fmt: skip
+    repeated = PRACTICE_REPEATS.c.session == session.session
+    connection.execute(delete(PRACTICE_REPEATS).where(repeated))
+    for stage, page in PAGES.items():
+        values[page.column] = now if stage in done else None
+    for phase in PHASES:
+        own = course.trials.blocks[block].of(phase)
+        here = to.trial if phase == to.stage else own.start
+        values[f"answered_{phase}"] = own.stop if phase in done else here
+        open_from = values[f"answered_{phase}"]
+        phases = (phase, ATTENTION) if phase == "test" else (phase,)
+        of_phase = (ANSWERS.c.session == session.session) & ANSWERS.c.phase.in_(phases)
+        connection.execute(delete(ANSWERS).where(of_phase, ANSWERS.c.trial >= open_from))
+    change_session(connection, session, block=block, **values)
+    return state_of(session, course)
+
+
+def _block_of(course: Course, to: Jump) -> int:
+    """Return the index of the block to which a jump goes; `Refused` if there is none."""
+    last = len(course.trials.blocks) - 1
+    if to.stage in PHASES:
+        for index, block in enumerate(course.trials.blocks):
+            if to.trial in block.of(to.stage):
+                return index
+        raise Refused("bad_request", f"trial: the last one is {course.trials[to.stage] - 1}")
+    if to.stage == "block" or (to.stage == "ready" and last > 0):
+        # No page follows the last block.
+        most = last - 1 if to.stage == "block" else last
+        if to.trial > most:
+            raise Refused("bad_request", f"trial: the last such block is {most}")
+        return to.trial
+    return 0 if course.stages.index(to.stage) <= course.stages.index("ready") else last

@@ -13,7 +13,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from physion.experiment.protocol.messages import BlockTrials, SessionSettings, SessionState
 from physion.experiment.protocol.refused import Refused
 from physion.experiment.protocol.stages import ENDED, PAGES, STAGES, Block, Course, Stage
-from physion.experiment.store.tables import SESSIONS, TOKENS
+from physion.experiment.store.database import SESSIONS, TOKENS
 from physion.experiment.study.courses.variants import under
 from physion.experiment.study.orders import session_trials
 from physion.experiment.study.stimuli import PHASES

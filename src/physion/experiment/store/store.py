@@ -6,12 +6,14 @@ import asyncio
 import contextlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from typing import Any, Literal, TypeVar
 
-from sqlalchemy import Connection, Engine, func, insert, select, text
+from sqlalchemy import ColumnElement, Connection, Engine, func, insert, select, text, update
 from sqlalchemy.exc import OperationalError
 
+from physion.core.errors import BadInputError
 from physion.experiment.protocol.messages import (
     Answer,
     AnswerStored,
@@ -32,43 +34,155 @@ from physion.experiment.protocol.messages import (
 )
 from physion.experiment.protocol.refused import Refused
 from physion.experiment.protocol.stages import ENDED, Phase
-from physion.experiment.store.answering import encode_details, store_answer
+from physion.experiment.store.answering import (
+    FetchedMedia,
+    check_page,
+    encode_details,
+    jump,
+    store_answer,
+    store_showing,
+    submit_page,
+)
 from physion.experiment.store.database import (
+    EVENTS,
+    RAW_IDS,
+    SESSIONS,
+    STUDIES,
+    Writer,
     connect_writer,
     open_database,
     server_lock,
     sqlite_url,
     upgrade,
 )
-from physion.experiment.store.entry.entering import enter_session
-from physion.experiment.store.entry.visitor import identify_visitor
-from physion.experiment.store.fetched_media import FetchedMedia
-from physion.experiment.store.lab.jumping import jump
-from physion.experiment.store.scores import Scores, percentile
-from physion.experiment.store.sent_pages import check_page, submit_page
+from physion.experiment.store.entry import enter_session, identify_visitor
+from physion.experiment.store.judging import Scores, percentile
 from physion.experiment.store.sessions import (
     Courses,
     Session,
     can_take_back,
     change_session,
+    insert_or_skip,
     mark_loaded,
     read_session,
     stage_of,
     state_of,
     storable_values,
 )
-from physion.experiment.store.showings import store_showing
-from physion.experiment.store.study_record import register
-from physion.experiment.store.tables import EVENTS, RAW_IDS, SESSIONS
-from physion.experiment.store.writer import Writer
 from physion.experiment.study.courses.attention import instructed_response
 from physion.experiment.study.courses.variants import under
 from physion.experiment.study.identity import Secrets, hash_token
 from physion.experiment.study.media_links import MediaKind, session_tag, sign_media
 from physion.experiment.study.orders import fixations, trial_order
+from physion.experiment.study.questions import Question, columns_of
 from physion.experiment.study.recruitment import completion, ending_completion
 from physion.experiment.study.stimuli import ATTENTION, Stimulus
-from physion.experiment.study.study import Study
+from physion.experiment.study.study import STUDY_FILE, Study
+
+# Registration of each served version of the study folder in the database.
+
+
+def register(connection: Connection, study: Study, now: float) -> None:
+    """Store the current version of the study; refuse it if existing sessions could not continue.
+
+    Previews that cannot continue are ended.
+
+    Raises
+    ------
+    BadInputError
+        There are sessions (of people or simulated participants) with other stimuli, of a scenario
+        that the study no longer has, or with answers to another question of the same name.
+    """
+    other = SESSIONS.c.session.in_(
+        select(SESSIONS.c.session)
+        .join(STUDIES, STUDIES.c.digest == SESSIONS.c.study)
+        .where(STUDIES.c.stimuli_digest != study.stimuli_digest)
+    )
+    gone = SESSIONS.c.scenario.not_in(study.offered)
+    count = sum(_by_scenario(connection, other).values())
+    if count:
+        raise BadInputError(
+            f"{count} sessions were made with another stimuli.csv, other media or other blocks; "
+            "their orders of trials would change. Restore the old stimuli and settings, or create "
+            "a new study folder (or give another database) for the new ones"
+        )
+    for scenario, of_scenario in _by_scenario(connection, gone).items():
+        raise BadInputError(
+            f"{of_scenario} sessions are of the scenario {scenario}, which {STUDY_FILE} no longer "
+            f"has: put {scenario} back into scenarios (to stop recruiting for it, distribute only "
+            "links of the other scenarios), or create a new study folder (or give another "
+            "database) without it"
+        )
+    _check_conditions(connection, study)
+    _check_questions(connection, study)
+    # Previews are not data: those that cannot continue are ended.
+    ended = (other | gone) & SESSIONS.c.finished_at.is_(None) & SESSIONS.c.withdrawn_at.is_(None)
+    connection.execute(update(SESSIONS).where(ended).values(withdrawn_at=now, closed_at=now))
+    connection.execute(
+        insert_or_skip(connection, STUDIES),
+        {
+            "digest": study.digest,
+            "name": study.name,
+            "version": study.version,
+            "stimuli_digest": study.stimuli_digest,
+            "settings": _settings(study),
+            "first_served": now,
+        },
+    )
+
+
+def _check_conditions(connection: Connection, study: Study) -> None:
+    """Refuse a study that lacks the condition of a session."""
+    names = [condition.name for condition in study.conditions]
+    lost = SESSIONS.c.condition.is_not(None) & SESSIONS.c.condition.not_in(names)
+    found = select(SESSIONS.c.condition, func.count()).where(lost, SESSIONS.c.kind != "preview")
+    for name, count in connection.execute(found.group_by(SESSIONS.c.condition)):
+        raise BadInputError(
+            f"{count} sessions are of the condition {name}, which {STUDY_FILE} no longer has: put "
+            "it back, or create a new study folder (or give another database) without it"
+        )
+
+
+def _check_questions(connection: Connection, study: Study) -> None:
+    """Refuse a question that was of another kind, or had another scale, when it was answered."""
+    forms = {column: form for each in study.questions for column, form in _forms(vars(each))}
+    answered = select(SESSIONS.c.questions_study).where(SESSIONS.c.kind != "preview").distinct()
+    versions = select(STUDIES.c.settings).where(STUDIES.c.digest.in_(answered))
+    for (settings,) in connection.execute(versions):
+        for entry in settings.get("questions", ()):
+            for column, form in _forms(entry):
+                if forms.get(column, form) != form:
+                    raise BadInputError(
+                        f"the question {column} was answered in another form ({form[1]}); give "
+                        f"the changed question another name in {STUDY_FILE}"
+                    )
+
+
+def _forms(entry: Mapping[str, Any]) -> list[tuple[str, tuple[str, str, int]]]:
+    """Return the columns of a question, each with what its values depend on."""
+    question = Question(**{**entry, "options": tuple(entry["options"])})
+    steps = question.steps if question.kind == "scale" else 0
+    return [(column, (question.name, question.kind, steps)) for column in columns_of(question)]
+
+
+def _by_scenario(connection: Connection, which: ColumnElement[bool]) -> dict[str, int]:
+    """Count the sessions that are not previews, by scenario in alphabetical order."""
+    columns = SESSIONS.c
+    counts = select(columns.scenario, func.count()).where(which, columns.kind != "preview")
+    rows = connection.execute(counts.group_by(columns.scenario).order_by(columns.scenario))
+    return dict(rows.all())
+
+
+def _settings(study: Study) -> dict[str, Any]:
+    """Return settings and texts as JSON values, without stimuli, whose labels stay private."""
+    left_out = {"folder", "stimuli", "allowed_ids"}
+    shallow = {name: value for name, value in vars(study).items() if name not in left_out}
+    return json.loads(json.dumps(shallow, default=_plain))  # type: ignore[no-any-return]
+
+
+def _plain(value: Any) -> Any:
+    return dict(value) if hasattr(value, "items") else asdict(value)
+
 
 __all__ = ["Refused", "Store"]
 T = TypeVar("T")

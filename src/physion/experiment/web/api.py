@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Literal, cast
+import math
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, TypeVar, cast
 
 from fastapi import APIRouter
+from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import Response
 
+from physion.core.errors import BadInputError
 from physion.experiment.protocol.messages import (
     Answer,
     Enter,
     Events,
     Health,
     Jump,
+    Message,
     PageDone,
     Showing,
     TrialMedia,
@@ -24,16 +28,109 @@ from physion.experiment.protocol.public_study import AskedQuestion, CheckedQuest
 from physion.experiment.study.media_links import sign_media
 from physion.experiment.study.recruitment import RECRUITERS, ending_completion, is_mturk_preview
 from physion.experiment.study.stimuli import PHASES
-from physion.experiment.web.bearer import read_token
-from physion.experiment.web.bodies import read_message
-from physion.experiment.web.guards import ISSUED_TOKEN
-from physion.experiment.web.refusals import Reply, refuse
+from physion.experiment.web.guards import (
+    ISSUED_TOKEN,
+    Reply,
+    describe_faults,
+    read_token,
+    refuse,
+)
 
 if TYPE_CHECKING:
     from physion.experiment.store.store import Store
     from physion.experiment.study.identity import Secrets
     from physion.experiment.study.questions import Question
     from physion.experiment.study.study import Study
+
+
+# Parse untrusted request bodies into messages of `physion.experiment.protocol.messages`.
+#
+# Apart from the types of the message, a body must be plain JSON: unique keys, no NaN or infinity,
+# no integer beyond 2**53, no NUL and no unpaired surrogate (databases cannot store them), and at
+# most `MAX_DEPTH` levels of nesting.
+
+MAX_DEPTH = 8
+EXACT = 2**53
+"""Integers up to here are exact in every JSON parser."""
+M = TypeVar("M", bound=Message)
+
+
+class BadBodyError(BadInputError):
+    """Error for an invalid body; the message gives the reason without repeating the value."""
+
+
+async def read_message(request: Request, message: type[M]) -> M:
+    """Read and validate the body of a request.
+
+    Raises
+    ------
+    BadBodyError
+        The body is not JSON, or not this message.
+    """
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if kind != "application/json":
+        raise BadBodyError("the body must be application/json")
+    return parse_message(await request.body(), message)
+
+
+def parse_message(body: bytes, message: type[M]) -> M:
+    """Validate the bytes of a body, as `read_message` does."""
+    try:
+        _check(json.loads(body, object_pairs_hook=_unique_keys, parse_constant=_no_constant), 0)
+    except BadBodyError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise BadBodyError("the body is not valid JSON") from error
+    try:
+        return message.model_validate_json(body, strict=True)
+    except ValidationError as error:
+        raise BadBodyError(describe_faults(error)) from error
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the object of JSON pairs; raise `BadBodyError` if a key is repeated."""
+    unique = dict(pairs)
+    if len(unique) != len(pairs):
+        raise BadBodyError("the body has the same key twice")
+    return unique
+
+
+def _no_constant(word: str) -> NoReturn:
+    """Refuse the constants NaN and Infinity."""
+    raise BadBodyError("the body has a number that is not finite")
+
+
+def _check(value: Any, depth: int) -> None:
+    """Check a JSON value and all values in it."""
+    kind = type(value)
+    if kind is str:
+        _check_text(value)
+    elif kind is float:
+        if not math.isfinite(value):
+            raise BadBodyError("the body has a number that is not finite")
+    elif kind is int:
+        if not -EXACT <= value <= EXACT:
+            raise BadBodyError("the body has a number that is too large")
+    elif kind is dict or kind is list:
+        if depth >= MAX_DEPTH:
+            raise BadBodyError("the body is nested too deeply")
+        if kind is dict:
+            for key in value:
+                _check_text(key)
+        for inner in value.values() if kind is dict else value:
+            _check(inner, depth + 1)
+
+
+def _check_text(text: str) -> None:
+    """Refuse a text with NUL or unpaired surrogates."""
+    if "\x00" in text:
+        raise BadBodyError("the body has a NUL character")
+    if not text.isascii():
+        try:
+            text.encode()
+        except UnicodeEncodeError as error:
+            raise BadBodyError("the body has an unpaired surrogate") from error
+
 
 SHOWN: tuple[Literal["movie"], Literal["map"]] = ("movie", "map")
 

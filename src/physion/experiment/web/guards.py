@@ -1,28 +1,179 @@
-"""ASGI middleware: limits on size and rate, security headers, errors that reveal nothing.
-
-It wraps only `receive` and `send` and starts no task of its own.
-"""
+"""Responses that refuse a request: the same body for all errors, without internal details."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 import math
+import re
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
+from pydantic import BaseModel, ValidationError
 from starlette.requests import ClientDisconnect
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from physion.experiment.protocol.messages import MAX_BODY
-from physion.experiment.web.bearer import read_token
+from physion.experiment.protocol.messages import (
+    MAX_BODY,
+    REFUSALS,
+    Completion,
+    Refusal,
+    SessionState,
+)
+from physion.experiment.study.recruitment import MTURK_HOSTS
 from physion.experiment.web.rate_limits import RateLimits
-from physion.experiment.web.refusals import Reply, refuse
-from physion.experiment.web.security_headers import HTTPS_ONLY, security_headers
 
 if TYPE_CHECKING:
     from physion.experiment.study.study import Study
+
+
+MESSAGES = {
+    "not_found": "There is nothing at this address.",
+    "not_allowed": "This address does not accept this method.",
+    "too_large": "The request is too large.",
+    "too_many": "Too many requests; wait a little and try again.",
+    "unavailable": "The server cannot reach its database.",
+    "server_error": "An error occurred on the server; try again, or write to the experimenter.",
+    "bad_request": "The request was not understood.",
+}
+
+
+# Read the bearer token of a request, in the same way for rate limits and for the endpoints.
+
+_BEARER = re.compile(rb"bearer ([A-Za-z0-9_-]{1,200})", re.IGNORECASE)
+"""A token of `identity.new_token`, without anything around it."""
+
+
+def read_token(headers: Iterable[tuple[bytes, bytes]]) -> str:
+    """Return the token of ``Authorization: Bearer TOKEN`` in the headers of an ASGI request.
+
+    Returns an empty string if there is no or more than one such header, or another value: if a
+    token could be written in two ways, the rate limits would count it as two tokens.
+    """
+    values = [value for name, value in headers if name == b"authorization"]
+    match = _BEARER.fullmatch(values[0]) if len(values) == 1 else None
+    return match[1].decode("ascii") if match else ""
+
+
+class Reply(Response):
+    """JSON response whose body is a message of `physion.experiment.protocol.messages`."""
+
+    media_type = "application/json"
+
+    def __init__(self, message: BaseModel, status: int = 200,
+                 headers: dict[str, str] | None = None) -> None:  # fmt: skip
+        super().__init__(message.model_dump_json(), status, headers)
+
+
+def refuse(code: str, message: str = "", state: SessionState | None = None, status: int = 0,
+           headers: dict[str, str] | None = None,
+           completion: Completion | None = None) -> Reply:  # fmt: skip
+    """Return the response for a refusal.
+
+    Parameters
+    ----------
+    code
+        A key of `REFUSALS`.
+    message
+        Sentence for people; the default of the code if empty.
+    state
+        SessionState of the session, if the client can continue from it.
+    status
+        HTTP status in place of that of the code; 0 for none.
+    headers
+        Additional headers.
+    completion
+        How the refused participant reports back to the recruiter.
+    """
+    body = Refusal(
+        error=code,
+        message=message or MESSAGES.get(code, code),
+        state=state,
+        completion=completion,
+    )
+    return Reply(body, status or REFUSALS[code], headers)
+
+
+def code_of(status: int) -> str:
+    """Return the refusal code for an HTTP status that was set by the framework."""
+    known = {401: "unknown_token", 403: "bad_link", 404: "not_found", 405: "not_allowed",
+             413: "too_large", 422: "bad_request", 429: "too_many", 503: "unavailable"}  # fmt: skip
+    return known.get(status, "bad_request" if status < 500 else "server_error")
+
+
+def describe_faults(error: ValidationError) -> str:
+    """Describe the first three faults of a message by field and reason, without the values."""
+    faults = error.errors(include_url=False, include_context=False, include_input=False)
+    lines = [f"{_field_path(fault['loc'])}: {fault['msg'][:120]}" for fault in faults[:3]]
+    more = f"; and {len(faults) - 3} more" if len(faults) > 3 else ""
+    return "; ".join(lines) + more
+
+
+def _field_path(location: tuple[Any, ...]) -> str:
+    """Return the path of a field with dots; unknown characters of the client's names become "?"."""
+    parts = [re.sub(r"[^A-Za-z0-9_-]", "?", str(part)[:40]) for part in location[:5]]
+    return ".".join(parts) or "body"
+
+
+# Security headers of every response, such as the content security policy.
+
+NOT_NEEDED = ("accelerometer", "camera", "display-capture", "geolocation", "gyroscope", "hid",
+              "magnetometer", "microphone", "midi", "payment", "serial", "usb",
+              "xr-spatial-tracking")  # fmt: skip
+
+
+def content_policy(study: Study) -> str:
+    """Return the content security policy: files of this server only, and media as blobs.
+
+    Blobs are needed because trials are preloaded. Forms may be sent to this server, and to MTurk if
+    the study may be embedded there, since tasks on MTurk are submitted by a form.
+    """
+    frames = " ".join(study.embed_from) or "'none'"
+    forms = " ".join(("'self'", *(MTURK_HOSTS if study.embed_from else ())))
+    return "; ".join((
+        "default-src 'none'",
+        "script-src 'self'",
+        "style-src 'self'",
+        "img-src 'self' blob:",
+        "media-src 'self' blob:",
+        "connect-src 'self'",
+        f"frame-ancestors {frames}",
+        "base-uri 'none'",
+        f"form-action {forms}",
+    ))  # fmt: skip
+
+
+def security_headers(study: Study) -> list[tuple[bytes, bytes]]:
+    """Return the raw headers of every response, with lower-case names.
+
+    No referrer is sent, since page URLs contain recruiters' ids. Cross-origin isolation also gives
+    the page the browser's high-resolution clock.
+    """
+    headers = {
+        "content-security-policy": content_policy(study),
+        "x-content-type-options": "nosniff",
+        "referrer-policy": "no-referrer",
+        "permissions-policy": ", ".join(f"{name}=()" for name in NOT_NEEDED),
+        "cross-origin-opener-policy": "same-origin",
+        "cross-origin-embedder-policy": "require-corp",
+        "cross-origin-resource-policy": "same-origin",
+        "x-robots-tag": "noindex, nofollow",
+    }
+    if not study.embed_from:
+        headers["x-frame-options"] = "DENY"
+    return [(name.encode(), value.encode("latin-1")) for name, value in headers.items()]
+
+
+HTTPS_ONLY = (b"strict-transport-security", b"max-age=31536000")
+"""Header added to responses over HTTPS."""
+
+
+# ASGI middleware: limits on size and rate, security headers, errors that reveal nothing.
+#
+# It wraps only `receive` and `send` and starts no task of its own.
 
 log = logging.getLogger("physion.experiment")
 

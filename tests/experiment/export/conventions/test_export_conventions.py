@@ -16,8 +16,7 @@ from physion.experiment.export.conventions.bids import BEH_COLUMNS
 from physion.experiment.export.conventions.column_labels import unique_file_labels
 from physion.experiment.export.export_study import export_study
 from physion.experiment.export.spreadsheet import restore_cell
-from physion.experiment.store.database import open_database, upgrade
-from physion.experiment.store.tables import PARTICIPANTS, SESSIONS
+from physion.experiment.store.database import PARTICIPANTS, SESSIONS, open_database, upgrade
 from physion.experiment.study.identity import Secrets
 from support.experiment.experimenter_rows import insert_sessions
 from support.experiment.tiny_study import make_tiny_study

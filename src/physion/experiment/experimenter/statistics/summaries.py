@@ -10,6 +10,7 @@ from typing import Any
 from sqlalchemy import Connection, Engine, Row, select
 
 from physion.experiment.protocol.stages import OF_BLOCK, Block, Course, SessionTrials
+from physion.experiment.store.database import ANSWERS, SESSIONS
 from physion.experiment.store.sessions import (
     ACTIVE_WITHIN,
     SESSION_COLUMNS,
@@ -18,7 +19,6 @@ from physion.experiment.store.sessions import (
     stage_of,
     stages_of,
 )
-from physion.experiment.store.tables import ANSWERS, SESSIONS
 from physion.experiment.study.courses.blocks import stimuli_by_session
 from physion.experiment.study.stimuli import ATTENTION
 from physion.experiment.study.study import Study

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from alembic import context
 
-from physion.experiment.store.tables import METADATA
+from physion.experiment.store.database import METADATA
 
 context.configure(
     connection=context.config.attributes["connection"],

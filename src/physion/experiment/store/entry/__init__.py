@@ -1,1 +1,0 @@
-"""Entering a study: who the visitor is, what a new session is assigned, and how one continues."""

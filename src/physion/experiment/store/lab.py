@@ -1,0 +1,477 @@
+"""Log of what experimenters did: who paused, voided, deleted, exported, and when."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import re
+import shutil
+import sqlite3
+import subprocess
+import time
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from sqlalchemy import Connection, Engine, Table, delete, func, insert, select, update
+
+from physion.core.errors import BadInputError, PhysionError
+from physion.core.files import sync_folder
+from physion.experiment.store.database import (
+    ACTIONS,
+    ANSWERS,
+    DATABASE_FILE,
+    EVENTS,
+    PAUSES,
+    PRACTICE_REPEATS,
+    RAW_IDS,
+    SESSIONS,
+    SHOWINGS,
+    TOKENS,
+    check_version,
+    close_writer,
+    connect_writer,
+    open_database,
+    server_lock,
+    sqlite_url,
+)
+from physion.experiment.study.identity import SECRET_FILE
+from physion.experiment.study.stimuli import MEDIA_FOLDER, STIMULI_FILE
+from physion.experiment.study.study import STUDY_FILE
+from physion.experiment.study.texts import TEXTS_FOLDER
+
+if TYPE_CHECKING:
+    from physion.experiment.store.store import Store
+
+
+Action = Literal[
+    "logged in",
+    "paused recruitment",
+    "resumed recruitment",
+    "made a session void",
+    "counted a session again",
+    "deleted a session",
+    "deleted ids",
+    "opened the payments",
+    "downloaded the payments",
+    "exported",
+]
+
+PAGE = 100
+"""Actions on one page of the log."""
+
+
+@dataclass(frozen=True)
+class LogPage:
+    """One page of the log, latest first; ``lines`` have the columns of the table ``actions``."""
+
+    lines: tuple[tuple[float, str, str, str, str], ...]
+    page: int
+    pages: int
+
+
+def note_action(
+    connection: Connection, action: Action, subject: str = "", account: str = "", role: str = ""
+) -> None:
+    """Add an action to the log, in the transaction of ``connection``.
+
+    ``subject``: what it was about, cut after 200 characters, never an id; ``account`` and ``role``
+    are empty for the command line.
+    """
+    connection.execute(
+        insert(ACTIONS),
+        {
+            "at": time.time(),
+            "account": account,
+            "role": role,
+            "action": action,
+            "subject": subject[:200],
+        },
+    )
+
+
+def read_log(connection: Connection, page: int) -> LogPage:
+    """Return a page of the log; a number beyond the last page gives the last page."""
+    total = connection.scalar(select(func.count()).select_from(ACTIONS)) or 0
+    pages = max(1, -(-total // PAGE))
+    page = min(max(1, page), pages)
+    columns = ACTIONS.c
+    rows = connection.execute(
+        select(columns.at, columns.account, columns.role, columns.action, columns.subject)
+        .order_by(columns.action_number.desc())
+        .limit(PAGE)
+        .offset((page - 1) * PAGE)
+    )
+    return LogPage(tuple((r.at, r.account, r.role, r.action, r.subject) for r in rows), page, pages)
+
+
+# Changes that an experimenter makes while a study is served: pause recruitment, void a session.
+
+
+def is_paused(connection: Connection) -> bool:
+    """Return whether recruitment is paused."""
+    going = select(PAUSES.c.paused_at).where(PAUSES.c.resumed_at.is_(None)).limit(1)
+    return connection.execute(going).first() is not None
+
+
+def set_paused(connection: Connection, paused: bool, now: float) -> bool:
+    """Pause or resume recruitment; return whether anything changed.
+
+    Parameters
+    ----------
+    connection
+        Connection of the writer, in a transaction.
+    paused
+        Whether new people are refused from now on. Those who have entered can go on.
+    now
+        Time of the server in seconds since 1970.
+    """
+    if is_paused(connection) == paused:
+        return False
+    if paused:
+        connection.execute(insert(PAUSES), {"paused_at": now, "resumed_at": None})
+    else:
+        going = PAUSES.c.resumed_at.is_(None)
+        connection.execute(update(PAUSES).where(going).values(resumed_at=now))
+    return True
+
+
+def set_voided(connection: Connection, session: str, voided: bool, now: float) -> bool:
+    """Void a session, or count it again; return whether anything changed.
+
+    A void session is not exported, gives no completion code if it is not finished, and its place is
+    given to another participant. Its answers are kept.
+
+    Parameters
+    ----------
+    connection
+        Connection of the writer, in a transaction.
+    session
+        Identifier of the session.
+    voided
+        Whether it is void from now on.
+    now
+        Time of the server in seconds since 1970.
+    """
+    columns = SESSIONS.c
+    change = columns.voided_at.is_(None) if voided else columns.voided_at.is_not(None)
+    values = {"voided_at": now if voided else None}
+    changed = update(SESSIONS).where(columns.session == session, change).values(**values)
+    return connection.execute(changed).rowcount > 0
+
+
+# Back up a study while it is served: a consistent copy of its database, settings and texts.
+
+DUMP_FILE = "responses.dump"
+"""Copy of a PostgreSQL database, for ``pg_restore``."""
+
+
+def back_up(
+    study: Path, out: Path, url: str | None = None, *, media: bool = False, secret: bool = False
+) -> Path:
+    """Copy database, settings, texts and stimuli into a new folder below ``out``; return it.
+
+    The folder is called by the time in UTC and complete or absent; only its owner may read it. A
+    server may be running. A copy of SQLite is checked for damage.
+
+    Parameters
+    ----------
+    study
+        The study folder.
+    out
+        Folder of all backups of the study; made if it is missing.
+    url
+        URL of the database; SQLite in the study folder if None.
+    media
+        Whether to copy the movies and maps too, which never change.
+    secret
+        Whether to copy ``secret.json``, with which ids can be guessed from their hashes.
+
+    Raises
+    ------
+    BadInputError
+        There is no such study or database, or a backup was made in the same second.
+    PhysionError
+        The database does not answer, the copy is damaged, or ``pg_dump`` is missing or fails.
+    """
+    if not (study / STUDY_FILE).is_file():
+        raise BadInputError(f"{study} is no study folder: it has no {STUDY_FILE}")
+    target = out / datetime.now(UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
+    if target.exists():
+        raise BadInputError(f"{target} is there already; wait a second and try again")
+    engine = open_database(url or sqlite_url(study), must_exist=True)
+    part = out / f".{target.name}.part"
+    out.mkdir(parents=True, exist_ok=True)
+    part.mkdir(mode=0o700)
+    try:
+        check_version(engine)
+        if engine.dialect.name == "postgresql":
+            _dump_postgresql(engine, part / DUMP_FILE)
+        else:
+            assert engine.url.database is not None
+            _copy_sqlite(Path(engine.url.database), part / DATABASE_FILE)
+        names = [STUDY_FILE, STIMULI_FILE, TEXTS_FOLDER]
+        names += [MEDIA_FOLDER] if media else []
+        names += [SECRET_FILE] if secret else []
+        for name in names:
+            _copy(study / name, part / name)
+        part.rename(target)
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+    finally:
+        engine.dispose()
+    sync_folder(out)
+    return target
+
+
+def _copy_sqlite(path: Path, copy: Path) -> None:
+    """Copy an SQLite database with the content of its write-ahead log, and check the copy."""
+    os.close(os.open(copy, os.O_CREAT | os.O_EXCL, 0o600))
+    try:
+        with closing(sqlite3.connect(path)) as source, closing(sqlite3.connect(copy)) as target:
+            source.backup(target)
+            # One file without a log, so that it can be moved.
+            target.execute("PRAGMA journal_mode=DELETE")
+            (found,) = target.execute("PRAGMA integrity_check").fetchone()
+    except sqlite3.Error as error:
+        raise PhysionError(f"{path} could not be copied: {error}") from error
+    if found != "ok":
+        raise PhysionError(f"the copy of {path} is damaged: {found}; check the disk")
+    _sync(copy)
+
+
+def _dump_postgresql(engine: Engine, copy: Path) -> None:
+    """Write a PostgreSQL database in the custom format of ``pg_dump``."""
+    address = engine.url
+    given = {
+        "--host": address.host or address.query.get("host"),
+        "--port": address.port or address.query.get("port"),
+        "--username": address.username,
+        "--dbname": address.database,
+    }
+    options = [f"{name}={value}" for name, value in given.items() if value]
+    # Not as an option, where other users of the machine could read it.
+    password = {"PGPASSWORD": address.password} if address.password else {}
+    os.close(os.open(copy, os.O_CREAT | os.O_EXCL, 0o600))
+    command = ["pg_dump", "--format=custom", f"--file={copy}", "--no-password", *options]
+    try:
+        done = subprocess.run(
+            command, env={**os.environ, **password}, capture_output=True, text=True, check=False
+        )
+    except FileNotFoundError as error:
+        raise PhysionError(
+            "pg_dump is missing: install the client programs of PostgreSQL"
+        ) from error
+    if done.returncode != 0:
+        lines = done.stderr.strip().splitlines()
+        raise PhysionError(f"pg_dump failed: {lines[0] if lines else done.returncode}")
+    _sync(copy)
+
+
+def _copy(source: Path, copy: Path) -> None:
+    """Copy a file or folder, with its permissions, and sync it."""
+    if source.is_dir():
+        shutil.copytree(source, copy, symlinks=True)
+    else:
+        shutil.copy2(source, copy, follow_symlinks=False)
+    for path in [copy, *copy.rglob("*")] if copy.is_dir() else [copy]:
+        if path.is_file() and not path.is_symlink():
+            _sync(path)
+
+
+def _sync(path: Path) -> None:
+    """Flush a file to disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+# Delete recruiters' ids, or all data of a session, so that the bytes cannot be recovered.
+#
+# The remaining keyed hash identifies a participant only to someone who has the study's key and the
+# id itself.
+
+_OF_SESSION = (ANSWERS, PRACTICE_REPEATS, SHOWINGS, EVENTS, TOKENS)
+"""Tables whose rows of a forgotten session are deleted."""
+_EMPTIED = dict.fromkeys((
+    "instructed_at", "comprehended_at", "screened_out_at", "screened_out_by", "failed_checks",
+    "ready_at", "demographics_at", "questions_at", "questions_study", "own_answers", "finished_at",
+    "loaded_at_phase", "loaded_at_trial", "block_at", "browser", "progressed_at", "next_from",
+    "implausible", "age", "gender", "education", "difficulty", "technical_problems", "feedback",
+)) | {"answered_familiarization": 0, "answered_test": 0, "block": 0, "comprehension_attempts": 0,
+      "practice_repeats": 0, "attention_failed": 0, "fast_answers": 0, "unfetched": 0,
+      "replayed": 0, "loads": 0, "device": {}}  # fmt: skip
+"""Column values that replace the data of a forgotten session."""
+
+
+def forget(url: str, participants: Sequence[str] | None) -> int:
+    """Delete the raw ids of these participants (hashes; None for all) and return their number.
+
+    In SQLite the deleted bytes are overwritten in the file and its log. PostgreSQL rewrites the
+    table; its write-ahead log and backups keep the old bytes for as long as they exist.
+
+    Raises
+    ------
+    BadInputError
+        A name is not a participant hash, or a participant has no id; then nothing is deleted.
+    PhysionError
+        The study is being served, or another program reads the database.
+    """
+    _check_participants(participants)
+
+    def work(connection: Connection) -> int:
+        count = _delete_raw_ids(connection, participants)
+        note_action(connection, "deleted ids", f"{count}")
+        return count
+
+    return _run_exclusively(url, work, (RAW_IDS,))
+
+
+def forget_sessions(url: str, references: Sequence[str]) -> int:
+    """Delete all data of the sessions with these references and return the number of sessions.
+
+    Deleted are answers, events, tokens, demographics, free text and device, and the raw id if the
+    person has no other session. The row of the session stays, marked as withdrawn, so that the same
+    id cannot take part again; a finished session no longer counts as a participant. Bytes are
+    overwritten as in `forget`.
+
+    Raises
+    ------
+    BadInputError
+        No session has one of the references; then nothing is deleted.
+    PhysionError
+        The study is being served, or another program reads the database.
+    """
+    wanted = list(dict.fromkeys(reference.strip().upper() for reference in references))
+
+    now = time.time()
+
+    def work(connection: Connection) -> int:
+        for reference in wanted:
+            _forget_session(connection, reference, now)
+            note_action(connection, "deleted a session", reference)
+        return len(wanted)
+
+    return _run_exclusively(url, work, (RAW_IDS, *_OF_SESSION, SESSIONS))
+
+
+def _run_exclusively(url: str, work: Callable[[Connection], int], tables: Sequence[Table]) -> int:
+    """Run ``work`` in one transaction while no server runs, then vacuum ``tables``.
+
+    Vacuuming overwrites the deleted rows, so that they cannot be recovered from the file.
+    """
+    engine = open_database(url, must_exist=True)
+    try:
+        check_version(engine)
+        with server_lock(engine):
+            connection = connect_writer(engine)
+            try:
+                with connection.begin():
+                    count = work(connection)
+            finally:
+                close_writer(connection)
+            _erase_deleted_bytes(engine, tables, compact=True)
+    finally:
+        engine.dispose()
+    return count
+
+
+async def forget_raw_ids(store: Store, participants: Sequence[str] | None = None) -> int:
+    """Delete raw ids as `forget` does, while the study is served.
+
+    The file is not vacuumed, which would delay answers: SQLite overwrites deleted rows by itself
+    (``secure_delete``). Participants who enter again leave their ids again.
+    """
+    _check_participants(participants)
+    count = await store.write(lambda connection: _delete_raw_ids(connection, participants))
+    await asyncio.to_thread(_erase_deleted_bytes, store.engine, (RAW_IDS,), compact=False)
+    return count
+
+
+async def forget_session(store: Store, reference: str) -> None:
+    """Delete all data of one session as `forget_sessions` does, while the study is served.
+
+    In PostgreSQL only the raw ids are rewritten, which is quick; the other deleted rows are
+    overwritten when the database vacuums by itself.
+    """
+    now = time.time()
+    await store.write(lambda connection: _forget_session(connection, reference, now))
+    await asyncio.to_thread(_erase_deleted_bytes, store.engine, (RAW_IDS,), compact=False)
+
+
+def _check_participants(participants: Sequence[str] | None) -> None:
+    """Raise `BadInputError` unless all names are participant hashes."""
+    for name in participants or ():
+        if not re.fullmatch(r"[0-9a-f]{32}", name):
+            raise BadInputError(
+                f"{name[:40]!r} is not a participant; give the 32 hexadecimal digits of the export"
+            )
+
+
+def _delete_raw_ids(connection: Connection, participants: Sequence[str] | None) -> int:
+    """Delete raw ids and return their number."""
+    if participants is None:
+        return connection.execute(delete(RAW_IDS)).rowcount
+    names = list(dict.fromkeys(participants))
+    for name in names:
+        known = select(RAW_IDS.c.participant).where(RAW_IDS.c.participant == name)
+        if connection.execute(known).first() is None:
+            raise BadInputError(f"there is no id of participant {name}; nothing was deleted")
+    for name in names:
+        connection.execute(delete(RAW_IDS).where(RAW_IDS.c.participant == name))
+    return len(names)
+
+
+def _forget_session(connection: Connection, reference: str, now: float) -> None:
+    """Delete the data of the session with this reference."""
+    columns = SESSIONS.c
+    query = select(columns.session, columns.participant, columns.withdrawn_at)
+    rows = connection.execute(query.where(columns.reference == reference)).all()
+    if len(rows) != 1:
+        raise BadInputError(
+            f"{len(rows) or 'no'} sessions have the reference {reference[:40]!r}; nothing was "
+            "deleted"
+        )
+    session, participant, withdrawn_at = rows[0]
+    for table in _OF_SESSION:
+        connection.execute(delete(table).where(table.c.session == session))
+    values = _EMPTIED | {"withdrawn_at": withdrawn_at or now, "closed_at": now}
+    connection.execute(update(SESSIONS).where(columns.session == session).values(**values))
+    # Declined and forgotten sessions have no device; if all are such, the id is not needed.
+    devices = select(columns.device).where(columns.participant == participant)
+    if not any(connection.execute(devices).scalars()):
+        connection.execute(delete(RAW_IDS).where(RAW_IDS.c.participant == participant))
+
+
+def _erase_deleted_bytes(engine: Engine, tables: Sequence[Table], *, compact: bool) -> None:
+    """Remove deleted bytes from disk: empty the log and, with ``compact``, vacuum the file."""
+    connection = engine.raw_connection()
+    try:
+        driver: Any = connection.driver_connection
+        if engine.dialect.name == "postgresql":
+            driver.autocommit = True
+            for table in tables:
+                driver.execute(f"VACUUM FULL {table.name}")
+            return
+        if compact:
+            driver.execute("VACUUM")
+        _empty_log(driver)
+    finally:
+        connection.invalidate()
+        connection.close()
+
+
+def _empty_log(driver: Any) -> None:
+    """Truncate SQLite's write-ahead log."""
+    busy = driver.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()[0]
+    if busy:
+        raise PhysionError(
+            "the data are deleted, but another program reads the database and keeps the old bytes; "
+            "close that program and run physion experiment forget again"
+        )

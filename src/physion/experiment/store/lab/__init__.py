@@ -1,1 +1,0 @@
-"""What the lab does with a stored study: back it up, pause it, void sessions, move previews."""
