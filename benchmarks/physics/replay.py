@@ -5,7 +5,7 @@
 writes benchmarks/results/replay.md and replay.json. The first engine also simulates every trial
 ``--repeats`` times with jitter; the others run once. Agreement is with the recorded outcomes; speed
 is physics time over processor time of one core, compilation left out by a first run. The other
-columns are described in docs/physics.md.
+columns are described in docs/explanation/physics.md.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def main() -> None:
         "# Official scenes, simulated again",
         f"{datetime.date.today()}, {processor_and_cores()}, "
         "`python benchmarks/physics/replay.py FOLDER --repeats "
-        f"{options.repeats} --engines {options.engines}`. docs/physics.md describes the columns.",
+        f"{options.repeats} --engines {options.engines}`. docs/explanation/physics.md describes the columns.",
         "Jittered runs: the first engine only.",
         "",
         *table(rows),

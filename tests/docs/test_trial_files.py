@@ -29,7 +29,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("page"))
         for block in BLOCKS:
-            exec(compile(block, "docs/trial-files.md", "exec"), namespace)
+            exec(compile(block, "docs/reference/trial-files.md", "exec"), namespace)
         namespace["folders"] = sorted(str(p) for p in Path().rglob("*") if p.is_file())
     return namespace
 

@@ -1,4 +1,4 @@
-"""docs/reliability.md names a test for every probe, and each of them exists."""
+"""docs/explanation/reliability.md names a test for every probe, and each of them exists."""
 
 from __future__ import annotations
 

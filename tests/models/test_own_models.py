@@ -201,7 +201,7 @@ def test_the_command_line_says_it_in_one_line(
             r"building it raised OSError: no weights \(model.py, line 3\)",
         ),
         ("class Model:\n  def __init__(self, size): pass", "building it raised TypeError.*size"),
-        ("class Model: pass", "lacks spec, provenance, digest; see docs/own-model.md"),
+        ("class Model: pass", "lacks spec, provenance, digest; see docs/tutorials/own-model.md"),
         (
             "class Model:\n  spec = {}\n  provenance = digest = print",
             "spec is a dict, expected a Spec",

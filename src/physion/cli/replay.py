@@ -3,7 +3,7 @@
 One row for each scenario and engine. With --repeats 8, eight more simulations of each trial under
 jitter give the probability of the recorded outcome: its mean (jittered), Brier and log score, and
 the ceiling, the probability that two such runs agree. final is the median distance between
-simulated and recorded final position of the agent in metres. docs/physics.md describes all columns.
+simulated and recorded final position of the agent in metres. docs/explanation/physics.md describes all columns.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ LEGEND = {
     "ms": "processor time per trial",
     "speed": "times real time",
 }
-"""Meaning of the columns (docs/physics.md)."""
+"""Meaning of the columns (docs/explanation/physics.md)."""
 
 
 @dataclass(frozen=True)

@@ -273,7 +273,7 @@ def _adapted(built: Any) -> Any:
 
 def _check_parts(model: Any, name: str) -> None:
     """Raise `BadInputError` if a model lacks what every model has."""
-    advice = "see docs/own-model.md for what a model has"
+    advice = "see docs/tutorials/own-model.md for what a model has"
     lacking = [part for part in ("spec", "provenance", "digest") if not hasattr(model, part)]
     if lacking:
         raise BadInputError(f"model {name!r} lacks {', '.join(lacking)}; {advice}")

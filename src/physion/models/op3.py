@@ -608,7 +608,7 @@ def _log_variance(raw: Tensor) -> Tensor:
 # thing.
 #
 # Source: Veerapaneni et al. 2020, "Entity Abstraction in Visual Model-Based Reinforcement
-# Learning"; docs/vision-models.md says in what the sizes differ from the published code.
+# Learning"; docs/reference/vision-models.md says in what the sizes differ from the published code.
 
 NAME = "op3"
 VERSION = 1

@@ -6,7 +6,7 @@ metres, kilograms, seconds and radians; axes are right-handed with z up; quatern
 then cloths), and B rigid bodies. Frame f shows the time f * `FRAME_TIME`.
 
 The results cover the whole trial, its outcome included: they must not be given to models or
-participants that predict. docs/trial-files.md has examples.
+participants that predict. docs/reference/trial-files.md has examples.
 """
 
 from __future__ import annotations
