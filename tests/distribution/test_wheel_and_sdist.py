@@ -102,7 +102,9 @@ def test_the_sdist_has_tests_docs_and_licences_and_nothing_else(built: Path) -> 
     assert {name.partition("/")[0] for name in files} <= TOP
     assert set(files) >= LICENSES
     here = "tests/distribution/test_wheel_and_sdist.py"
-    assert {here, "docs/explanation/architecture.md", "examples/my_model/my_encoder.py"} <= set(files)
+    assert {here, "docs/explanation/architecture.md", "examples/my_model/my_encoder.py"} <= set(
+        files
+    )
     assert not [name for name in files if {"__pycache__", "node_modules"} & set(name.split("/"))]
 
 

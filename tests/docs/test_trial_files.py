@@ -18,7 +18,7 @@ from physion.trials.index import INDEX_COLUMNS, Metadata
 from physion.trials.trial_file import FIELDS, GEOMETRY, PASSES, SCHEMA, Field, Trial
 from support.paths import ROOT
 
-PAGE = (ROOT / "docs" / "trial-files.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "reference" / "trial-files.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
 
 

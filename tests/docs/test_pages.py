@@ -1,0 +1,131 @@
+"""Links of the pages lead somewhere, their commands are accepted, and their code runs."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import tyro
+
+from physion.cli.help.verbs import find_module
+from physion.scenes.sampling.sample import parse_presets
+from support.paths import ROOT
+
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
+RUNNING = [
+    *("how-to/add-a-figure", "how-to/add-a-metric", "how-to/add-a-scenario", "how-to/add-a-shape"),
+    *("how-to/clusters", "how-to/official-data", "how-to/own-engine"),
+]
+"""Pages whose Python runs as printed; blocks that begin with a file name become that file."""
+
+
+def name_of(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    found = re.findall(rf"^ *```{language}\n(.*?)^ *```", page.read_text(), re.S | re.M)
+    return [str(block) for block in found]
+
+
+def commands(page: Path) -> list[str]:
+    """Return the lines of shell blocks that call ``physion``, without what stands around them."""
+    text = "".join(blocks(page, "sh")).replace("\\\n", " ")
+    lines = [re.split(r"\s#\s", part)[0].strip() for part in re.split(r"\n|&&", text)]
+    return [line for line in lines if re.match(r"(\.venv/bin/)?physion ", line)]
+
+
+def run(arguments: list[str], folder: Path) -> str:
+    environment = os.environ | {
+        "PYTHONPATH": f"{ROOT / 'src'}{os.pathsep}{folder}",
+        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+        "HOME": str(folder),
+        "OMP_NUM_THREADS": "1",
+    }
+    done = subprocess.run(
+        arguments, cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, f"{arguments}: {done.stdout}{done.stderr}"
+    return done.stdout
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_links_and_named_files_exist(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    links = [link for link in re.findall(r"\]\(([^)#\s]+)", text) if "://" not in link]
+    assert all((page.parent / link).exists() for link in links), links
+    paths = re.findall(r"`((?:src/physion|tests|benchmarks|examples)/[\w/.*-]+)`", text)
+    named = [path for path in paths if "NAME" not in path]
+    assert all(list(ROOT.glob(path.rstrip("/"))) for path in named), named
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if commands(p)], ids=name_of)
+def test_commands_are_accepted(page: Path) -> None:
+    for line in commands(page):
+        words = shlex.split(line.split("|")[0])[1:]
+        if words[-1] != "--help":
+            module, taken = find_module(words)
+            tyro.cli(module.Options, args=words[taken:])
+
+
+@pytest.mark.parametrize("page", RUNNING)
+def test_python_runs(page: str, tmp_path: Path) -> None:
+    scripts = []
+    for block in blocks(DOCS / f"{page}.md", "python"):
+        if match := re.match(r"# (\w+\.py)\n", block):
+            (tmp_path / match[1]).write_text(block, encoding="utf-8")
+        else:
+            scripts.append(block)
+    script = tmp_path / "the_page.py"
+    script.write_text("\n".join(scripts), encoding="utf-8")
+    assert scripts
+    run([sys.executable, str(script)], tmp_path)
+
+
+def test_the_preset_of_the_page_on_scenes_is_read() -> None:
+    (toml,) = blocks(DOCS / "reference" / "scenes.md", "toml")
+    presets = parse_presets(toml, "my.toml")
+    assert presets["heavy_ball_slope"].params.probe.mass == (8.0, 8.0)
+
+
+@pytest.mark.slow
+def test_the_python_of_the_readme_runs(tmp_path: Path) -> None:
+    for number, block in enumerate(blocks(ROOT / "README.md", "python")):
+        script = tmp_path / f"readme_{number}.py"
+        script.write_text(block, encoding="utf-8")
+        assert re.search(r"\d", run([sys.executable, str(script)], tmp_path))
+
+
+@pytest.mark.slow
+def test_the_first_report_is_made(tmp_path: Path) -> None:
+    for line in commands(DOCS / "tutorials" / "first-report.md"):
+        run(["bash", "-c", line], tmp_path)
+    assert (tmp_path / "runs" / "first" / "report" / "report.html").is_file()
+    assert (tmp_path / "trials" / "view.html").is_file()
+    assert len(list((tmp_path / "runs" / "models" / "predictions").glob("*.csv"))) == 2
+
+
+@pytest.mark.slow
+def test_the_page_on_own_models_leads_to_a_report(tmp_path: Path) -> None:
+    page = DOCS / "tutorials" / "own-model.md"
+    examples = {path.name: path.read_text() for path in (ROOT / "examples/my_model").glob("*.py")}
+    shown = re.findall(r"```python\n# (my_\w+\.py)\n(.*?)```", page.read_text(), re.S)
+    assert dict(shown) == examples
+    for name, text in examples.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    lines = commands(page)
+    assert [shlex.split(line)[1] for line in lines] == ["run", "evaluate", "compare"]
+    for line in lines:
+        run(["bash", "-c", line], tmp_path)
+    scripts = [block for block in blocks(page, "python") if not block.startswith("# my_")]
+    run([sys.executable, "-c", "\n".join(scripts)], tmp_path)
+    names = {path.name.partition("-")[0] for path in tmp_path.rglob("predictions/*.csv")}
+    assert names >= {"MyEncoder", "my"}
+    report = (tmp_path / "runs" / "report" / "report.html").read_text(encoding="utf-8")
+    assert "MyEncoder" in report and "my rule" in report
