@@ -94,7 +94,8 @@ def main() -> None:
         "# Official scenes, simulated again",
         f"{datetime.date.today()}, {processor_and_cores()}, "
         "`python benchmarks/physics/replay.py FOLDER --repeats "
-        f"{options.repeats} --engines {options.engines}`. docs/explanation/physics.md describes the columns.",
+        f"{options.repeats} --engines {options.engines}`. "
+        "docs/explanation/physics.md describes the columns.",
         "Jittered runs: the first engine only.",
         "",
         *table(rows),

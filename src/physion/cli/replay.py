@@ -3,7 +3,8 @@
 One row for each scenario and engine. With --repeats 8, eight more simulations of each trial under
 jitter give the probability of the recorded outcome: its mean (jittered), Brier and log score, and
 the ceiling, the probability that two such runs agree. final is the median distance between
-simulated and recorded final position of the agent in metres. docs/explanation/physics.md describes all columns.
+simulated and recorded final position of the agent in metres.
+docs/explanation/physics.md describes all columns.
 """
 
 from __future__ import annotations

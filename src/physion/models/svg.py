@@ -325,7 +325,7 @@ def _after(config: SvgConfig, channels: int) -> list[nn.Module]:
 # Features are the codes h_t of observed frames and the predicted codes g_t of imagined ones.
 #
 # Source: Denton and Fergus 2018, "Stochastic Video Generation with a Learned Prior", sections 3, 4
-# and appendix; docs/reference/vision-models.md says in what the sizes differ from the published code.
+# and appendix; docs/reference/vision-models.md says how the sizes differ from the published code.
 
 NAME = "svg"
 VERSION = 1

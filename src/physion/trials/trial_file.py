@@ -1,7 +1,7 @@
 """Writing and reading of trial files: scene, motion, contacts, labels, and image passes on request.
 
-`physion.trials.trial_file` declares the arrays; docs/reference/trial-files.md describes the format. A file is
-built in memory and then written atomically: written directly, a full disk would crash the HDF5
+This module declares the arrays; docs/reference/trial-files.md describes the format. A file is built
+in memory and then written atomically: written directly, a full disk would crash the HDF5
 library, and a killed process would leave incomplete files that look complete.
 """
 
