@@ -14,8 +14,8 @@ from physion.clips.batch import Provenance
 from physion.core.version import MADE_WITH, __version__
 from physion.readout.protocols import Readout
 from physion.readout.tables import ScenarioPredictions, make_table
-from physion.report.page.document import render_document
-from physion.report.viewer.text import render_viewer
+from physion.report.html import render_document
+from physion.report.viewer.build import render_viewer
 
 GENERATOR = f'<meta name="generator" content="physion {__version__}">'
 

@@ -28,7 +28,7 @@ import pandas as pd
 
 from physion.analysis import results
 from physion.core.names import SCENARIOS
-from physion.report import build, settings_text
+from physion.report import build, people
 
 RESULTS = Path(__file__).parents[1] / "results"
 PEOPLE, STIMULI, PRACTICE = 100, 150, 10
@@ -131,8 +131,8 @@ def write_study(folder: Path, seed: int = 0) -> tuple[Path, Path, Path]:
 
 
 PARTS: tuple[tuple[Any, str], ...] = (
-    (settings_text, "read_any_responses"),
-    (settings_text, "analyse_people"),
+    (people, "read_any_responses"),
+    (people, "analyse_people"),
     (results, "compare_everywhere"),
     (results, "compare_scores"),
     (results, "paired_tests"),

@@ -16,9 +16,8 @@ from physion.analysis import Bootstrap, Comparison, compare_scores
 from physion.analysis.metrics import score_metrics
 from physion.analysis.models.anchors import COMPUTED, MAJORITY, OUTCOME, TWO_PEOPLE
 from physion.analysis.tables.stimuli import MEAN, POOLED
-from physion.report import ReportInputs, build_report
-from physion.report.page import scores
-from physion.report.page.blocks import ANCHORS
+from physion.report import ReportInputs, build_report, scores
+from physion.report.html import ANCHORS
 
 Maker = Callable[..., Comparison]
 

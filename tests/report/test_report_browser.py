@@ -10,8 +10,7 @@ import pytest
 
 from physion.analysis import Comparison
 from physion.report import ReportInputs, build_report
-from physion.report.page.choose_trials import opening_trials
-from physion.report.page.trial_pages import page_name
+from physion.report.trials import opening_trials, page_name
 from physion.trials.video import encode_movie
 from support.browser import Browser
 

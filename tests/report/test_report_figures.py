@@ -26,17 +26,16 @@ from physion.analysis.models.mixed_fits import fits_of_models
 from physion.analysis.people.difficulty import below_chance_level
 from physion.analysis.tables.stimuli import MEAN
 from physion.core.names import SCENARIOS
+from physion.report import html as blocks
+from physion.report import scores
 from physion.report.figures import theme
-from physion.report.figures.by_stimulus.difficulty import difficulty_figure
-from physion.report.figures.by_stimulus.scatter import SQUARE, scatter_figure
-from physion.report.figures.measures import measure_figure
-from physion.report.figures.registry import all_figures, make_plots
-from physion.report.figures.training.generalization import generalization_figure
+from physion.report.figures.by_scenario import measure_figure
+from physion.report.figures.by_stimulus import SQUARE, difficulty_figure, scatter_figure
+from physion.report.figures.theme import make_plots
+from physion.report.figures.training import generalization_figure
+from physion.report.html import Picture, number, protocol_names
 from physion.report.inputs import ReportInputs
-from physion.report.page import blocks, scores
-from physion.report.page.document import Picture
-from physion.report.page.page import render_page
-from physion.report.words import number, protocol_names
+from physion.report.page import render_page
 from support.paths import ROOT
 
 Maker = Callable[..., Comparison]
@@ -336,15 +335,9 @@ def test_models_are_held_against_the_first_in_the_files(make_comparison: Maker) 
 # --- one file each ------------------------------------------------------------------------------
 
 
-def test_each_figure_is_one_module() -> None:
-    modules = [entry.make.__module__ for entry in all_figures()]
-    assert len(modules) == len(set(modules)) >= 10
-    assert all(name.startswith("physion.report.figures.") for name in modules)
-
-
 def test_a_figure_of_another_package_is_found(tmp_path: Path) -> None:
     (tmp_path / "own_figure.py").write_text(
-        "from physion.report.figures.registry import BY_SCENARIO, register_figure\n"
+        "from physion.report.figures.theme import BY_SCENARIO, register_figure\n"
         "@register_figure('own', section=BY_SCENARIO, order=15)\n"
         "def own(inputs): return None\n"
     )
@@ -354,7 +347,7 @@ def test_a_figure_of_another_package_is_found(tmp_path: Path) -> None:
         "[physion.figures]\nown = own_figure:own\n"
     )
     code = (
-        "from physion.report.figures.registry import all_figures\n"
+        "from physion.report.figures.theme import all_figures\n"
         "print(*(entry.name for entry in all_figures()))"
     )
     paths = os.pathsep.join([str(tmp_path), str(ROOT / "src")])

@@ -16,10 +16,10 @@ from physion.analysis import Bootstrap, Comparison
 from physion.analysis.tables.stimuli import MEAN
 from physion.core.errors import BadInputError
 from physion.report import ReportInputs, build_report, compare_files
+from physion.report.html import Picture
 from physion.report.inputs import EXPECTED_METHODS
-from physion.report.page.document import Picture
-from physion.report.page.page import render_page
-from physion.report.page.trials import shown_stimuli
+from physion.report.page import render_page
+from physion.report.trials import shown_stimuli
 
 Maker = Callable[..., Comparison]
 VOID = {"meta", "img", "source", "br", "hr", "link", "input"}

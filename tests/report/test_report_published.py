@@ -12,7 +12,7 @@ import pytest
 
 from physion.analysis.models.figure_tables import SCENARIO_ZONE
 from physion.analysis.published.summary import PublishedResults, published_results
-from physion.report.published_report import build_published_report, published_plots
+from physion.report.published import build_published_report, published_plots
 
 FIGURES = [*(f"panel_{name}" for name in "acde"), "figure_s1", "figure_s3"]
 

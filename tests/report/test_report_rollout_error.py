@@ -13,7 +13,8 @@ from matplotlib.collections import PolyCollection
 from physion.analysis import Comparison
 from physion.analysis.models.rollout_errors import COLUMNS, CONSTANT_VELOCITY, REQUIRED
 from physion.cli.main import main
-from physion.report.figures.by_scenario.rollout_error import draw, rollout_error
+from physion.report.figures.by_scenario import draw_rollout_error as draw
+from physion.report.figures.by_scenario import rollout_error
 from physion.report.figures.theme import DARK, LIGHT, figure_bytes
 from physion.report.inputs import ReportInputs
 

@@ -15,19 +15,24 @@ from PIL import Image
 
 from physion.analysis import Comparison
 from physion.report import ReportInputs, build_report
-from physion.report.page.cards import MOST_ANSWERS, answers, card, outcome, pick_readouts
-from physion.report.page.choose_trials import (
+from physion.report.html import PageMovies, make_poster
+from physion.report.page import DISAGREE, OPENING, render_page
+from physion.report.people import read_by_model
+from physion.report.scores import inputs_sentence, weights_sentence
+from physion.report.trials import (
+    MOST_ANSWERS,
     OPENING_RULE,
     WIDE,
+    answers,
+    card,
     opening_trials,
+    outcome,
+    page_name,
+    pick_readouts,
+    trial_pages,
     who_was_right,
     widest_gaps,
 )
-from physion.report.page.model_inputs import inputs_sentence, weights_sentence
-from physion.report.page.movies import PageMovies, make_poster
-from physion.report.page.page import DISAGREE, OPENING, render_page
-from physion.report.page.trial_pages import page_name, trial_pages
-from physion.report.settings_text import read_by_model
 from physion.trials.video import encode_movie
 
 Maker = Callable[..., Comparison]

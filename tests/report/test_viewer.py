@@ -18,12 +18,11 @@ import pytest
 from physion.cli import view
 from physion.cli.main import main as cli
 from physion.core.errors import BadInputError, UnknownNameError
+from physion.report.viewer import build as viewer
 from physion.report.viewer import facts as viewer_facts
-from physion.report.viewer import write_viewer as viewer
+from physion.report.viewer.build import ViewerOptions, build_viewer, choose_trials, embed_json
 from physion.report.viewer.motion import STEPS, pack_grid, pack_motion, pack_shapes
-from physion.report.viewer.text import embed_json
-from physion.report.viewer.viewer_movies import fitted
-from physion.report.viewer.write_viewer import ViewerOptions, build_viewer, choose_trials
+from physion.report.viewer.movies import fitted
 from physion.scenes.shapes.meshes import Mesh, solid_properties
 from physion.scenes.shapes.primitives import shape
 from physion.trials.dataset import Dataset

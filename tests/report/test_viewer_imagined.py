@@ -13,11 +13,9 @@ import numpy as np
 import pytest
 
 from physion.core.errors import BadInputError
-from physion.report.viewer.imagined.pack import pack_imagined
-from physion.report.viewer.imagined.particles import REACH
-from physion.report.viewer.imagined.trial import ImaginedTrial, caption
+from physion.report.viewer.build import ViewerOptions, build_viewer
+from physion.report.viewer.imagined import REACH, ImaginedTrial, caption, pack_imagined
 from physion.report.viewer.motion import STEPS
-from physion.report.viewer.write_viewer import ViewerOptions, build_viewer
 from support.viewer_dataset import PLANS, make_dataset, make_scene
 
 SCENE = make_scene(PLANS[0])

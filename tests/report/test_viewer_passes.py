@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from physion.rendering.renderer import PASSES, Frame
-from physion.report.viewer.passes import (
+from physion.report.viewer.movies import (
     AGENT,
     NOWHERE,
     OTHERS,

@@ -13,9 +13,7 @@ import pytest
 from PIL import Image
 
 from physion.core.errors import BadInputError
-from physion.report.viewer.imagined.pack import pack_imagined
-from physion.report.viewer.imagined.pictures import ROWS, SIDE, SLOTS
-from physion.report.viewer.imagined.trial import ImaginedTrial
+from physion.report.viewer.imagined import ROWS, SIDE, SLOTS, ImaginedTrial, pack_imagined
 from support.viewer_dataset import PLANS, make_scene
 
 SCENE = make_scene(PLANS[0])

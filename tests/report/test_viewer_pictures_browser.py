@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 
 from physion.cli.imagined_trials import imagine_with
-from physion.report.viewer.imagined.trial import ImaginedTrial
-from physion.report.viewer.write_viewer import ViewerOptions, build_viewer
+from physion.report.viewer.build import ViewerOptions, build_viewer
+from physion.report.viewer.imagined import ImaginedTrial
 from physion.trials.dataset import Dataset
 from support.browser import Browser
 from support.viewer_dataset import Plan, make_dataset

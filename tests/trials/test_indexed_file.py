@@ -15,8 +15,8 @@ from physion.clips.batch import Spec
 from physion.clips.clips import observed_source, whole_source
 from physion.compute.local import SerialExecutor
 from physion.core.errors import BadInputError
-from physion.report.page.movies import movies_of
-from physion.report.viewer.write_viewer import ViewerOptions, build_viewer
+from physion.report.html import movies_of
+from physion.report.viewer.build import ViewerOptions, build_viewer
 from physion.trials.dataset import Dataset
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, plan_scenes

@@ -19,8 +19,7 @@ from physion.models.interface import Encodes, HasReader, Imagines, Learns, Model
 from physion.readout.decisions import fraction_of_futures
 from physion.readout.features import Outcomes
 from physion.readout.model_calls import call_model, check_identity, is_network, model_name, to_array
-from physion.report.viewer.imagined.pack import SHOWABLE
-from physion.report.viewer.imagined.trial import Imagine, ImaginedTrial
+from physion.report.viewer.imagined import SHOWABLE, Imagine, ImaginedTrial
 from physion.trials.dataset import Dataset
 
 Arrays = NDArray[Any]

@@ -13,8 +13,8 @@ import tyro
 from physion.cli.model_options import parse_options
 from physion.cli.output import Stages, console
 from physion.core.errors import BadInputError
-from physion.report.viewer.imagined.trial import Imagine
-from physion.report.viewer.write_viewer import ViewerOptions, build_viewer
+from physion.report.viewer.build import ViewerOptions, build_viewer
+from physion.report.viewer.imagined import Imagine
 from physion.trials.dataset import Dataset
 
 

@@ -1,45 +1,50 @@
-"""Writers of a report, from a comparison or from files: a folder with page, tables and figures."""
+"""Writers of the files of a report: folders, tables, figures."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from html import escape
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from physion.analysis import (
-    Bootstrap,
-    read_human_zone,
-    read_humans,
-    read_labels,
-    read_predictions,
-)
+from physion.analysis import Bootstrap, read_human_zone, read_humans, read_labels, read_predictions
 from physion.analysis.models.contradictions import check_coverage
+from physion.analysis.models.figure_tables import response_time_table
 from physion.analysis.models.rollout_errors import read_rollout_errors, rollout_error_table
 from physion.analysis.people.completeness import Expected, find_expected, read_expected
+from physion.analysis.people.difficulty import below_chance_level
 from physion.analysis.people.exclusions import PREREGISTERED
-from physion.analysis.people.results import read_attributes
+from physion.analysis.people.results import PeopleResults, read_attributes
 from physion.analysis.results import ComparisonResults, compare
 from physion.analysis.tables.responses import LABELS_FILE, DominoesLook, find_next_to
-from physion.analysis.tables.stimuli import (
-    check_excluded_names,
-    in_order,
-    read_stimulus_list,
-)
+from physion.analysis.tables.stimuli import check_excluded_names, in_order, read_stimulus_list
 from physion.core.errors import BadInputError
 from physion.core.files import write_atomic
 from physion.core.version import MADE_WITH
-from physion.report.figures.registry import make_plots
+from physion.report import html as blocks
+from physion.report import people as people_blocks
+from physion.report import people as session_blocks
+from physion.report.figures import theme
+from physion.report.figures.by_stimulus import CAPTION as DIFFICULTY
+from physion.report.figures.by_stimulus import RESPONSE_TIME_CAPTION as RESPONSE_TIME
+from physion.report.figures.by_stimulus import difficulty_figure, response_time_figure
+from physion.report.figures.theme import Plot, make_plots
+from physion.report.html import (
+    Picture,
+    Section,
+    check_movies,
+    figure,
+    page_kind,
+    plural,
+    render_document,
+)
 from physion.report.inputs import ReportInputs
-from physion.report.page.movies import check_movies
-from physion.report.page.page import render_page
-from physion.report.page.trial_pages import FOLDER, trial_pages
-from physion.report.page.trials import shown_stimuli
-from physion.report.people_report import PeopleReport, build_people_report
-from physion.report.settings_text import (
+from physion.report.page import render_page
+from physion.report.people import (
     describe_attributes,
     describe_expected,
     describe_intervals,
@@ -47,7 +52,151 @@ from physion.report.settings_text import (
     people_from_files,
     read_by_model,
 )
-from physion.report.write import prepare_folder, write_csv, write_plot
+from physion.report.trials import FOLDER, shown_stimuli, trial_pages
+
+
+def prepare_folder(folder: Path) -> Path:
+    """Make ``folder`` with its ``tables`` and ``figures``, and return the path of the latter."""
+    if folder.exists() and not folder.is_dir():
+        raise BadInputError(f"{folder} is a file; give a folder for the report")
+    for name in ("tables", "figures"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    return folder / "figures"
+
+
+def write_plot(plot: Plot, folder: Path, rehearsal: bool = False) -> Picture:
+    """Write a figure as SVG with text, PDF and PNG with its table; return what the page shows.
+
+    The page shows an SVG with outlined letters, which needs no font. ``rehearsal``: as in
+    `write_csv`.
+    """
+    write_csv(folder / f"{plot.name}.csv", plot.table, rehearsal)
+    figure = plot.draw(plot.table, theme.LIGHT)
+    light = {kind: theme.figure_bytes(figure, kind) for kind in ("svg", "png")}
+    # The dark figure is for the page only, so it is made only in the format used there.
+    kind = page_kind(light)
+    dark = {kind: theme.figure_bytes(plot.draw(plot.table, theme.DARK), kind)}
+    files = {
+        "svg": theme.figure_bytes(figure, "svg", text=True),
+        "pdf": theme.figure_bytes(figure, "pdf"),
+        "png": light["png"],
+    }
+    for ending, content in files.items():
+        write_atomic(folder / f"{plot.name}.{ending}", content)
+    return Picture(plot.name, light, dark, plot.words)
+
+
+def write_csv(path: Path, table: pd.DataFrame, rehearsal: bool = False) -> None:
+    """Write a table as CSV, completely or not at all.
+
+    ``rehearsal``: the participants are simulated, which every row then states.
+    """
+    marked = mark_rehearsal(table) if rehearsal else table
+    write_atomic(path, marked.to_csv(index=False, lineterminator="\n").encode())
+
+
+def mark_rehearsal(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the table with the column ``rehearsal``, which states that nothing is about people."""
+    return table.assign(rehearsal="simulated participants")
+
+
+# Report about people alone, without predictions: page, tables and figures.
+
+TITLE = "People on physical prediction"
+
+
+@dataclass(frozen=True)
+class PeopleReport:
+    """Results about people with the settings of the page.
+
+    - ``people``: every analysis of them.
+    - ``methods``: settings made outside the analysis, as text.
+    - ``movies``: movie by stimulus, to which the page links.
+    - ``title``: the heading.
+    """
+
+    people: PeopleResults
+    methods: Mapping[str, str] = field(default_factory=dict)
+    movies: Mapping[str, Path] = field(default_factory=dict)
+    title: str = TITLE
+
+
+def build_people_report(report: PeopleReport, folder: Path) -> Path:
+    """Write ``report.html``, ``report.json``, ``tables/*.csv`` and ``figures/*``; return the page.
+
+    Every file is complete or absent, the page is written last, and the same results give the same
+    bytes. Raises `BadInputError`, before anything is written, if ``folder`` is a file.
+    """
+    pictures = prepare_folder(folder)
+    tables = {f"people_{name}": t for name, t in report.people.tables.items() if len(t.columns)}
+    rehearsal = bool(report.people.mark)
+    for name, table in tables.items():
+        write_csv(folder / "tables" / f"{name}.csv", table, rehearsal)
+    numbers: dict[str, Any] = {
+        name: json.loads(table.to_json(orient="records", double_precision=15))
+        for name, table in tables.items()
+    }
+    shown = [write_plot(plot, pictures, rehearsal) for plot in people_plots(report.people)]
+    warnings = list(report.people.warnings)
+    methods = _methods(report)
+    content = {"package": MADE_WITH, "methods": methods, "warnings": warnings, **numbers}
+    text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
+    write_atomic(folder / "report.json", f"{text}\n".encode())
+    page = folder / "report.html"
+    write_atomic(page, render_people_page(report, shown, folder).encode())
+    return page
+
+
+def people_plots(people: PeopleResults) -> list[Plot]:
+    """Return the figures: difficulty of stimuli and, if times are known, response times."""
+    by_stimulus = people.tables["by_stimulus"]
+    rows = by_stimulus.sort_values(["scenario", "stimulus"], kind="stable")
+    tail = below_chance_level(rows.reset_index(drop=True))
+    plots = [Plot("difficulty", DIFFICULTY, tail, difficulty_figure)]
+    times = response_time_table(by_stimulus)
+    if times["mean_log_rt"].notna().any():
+        plots.append(Plot("response_time", RESPONSE_TIME, times, response_time_figure))
+    return plots
+
+
+def render_people_page(report: PeopleReport, pictures: Sequence[Picture], folder: Path) -> str:
+    """Return the page as text; ``folder``: its folder, for relative links to movies."""
+    people = report.people
+    shown = "\n".join(figure(picture) for picture in pictures)
+    links = blocks.relative_links(report.movies, folder)
+    sections = [
+        Section("People", people_blocks.people_alone(people)),
+        Section(
+            "Stimulus by stimulus",
+            shown + people_blocks.fooled_by(people.tables["by_stimulus"], links),
+        ),
+        Section("Sessions left out", session_blocks.sessions_alone(people)),
+        Section("How this was made", blocks.definition_list(_methods(report))),
+        Section("What was left out", session_blocks.dropped(people)),
+    ]
+    return render_document(report.title, _summary(people), sections, people.mark)
+
+
+def _summary(people: PeopleResults) -> str:
+    """Return the sentences at the top of the page."""
+    flags, test = people.tables["flags"], people.kept.test
+    scenarios = in_order(test["scenario"])
+    words = (
+        f"{plural(test['participant'].nunique(), 'participant')} on "
+        f"{plural(test['stimulus'].nunique(), 'stimulus')} of "
+        f"{plural(len(scenarios), 'scenario')} ({', '.join(scenarios)}). No predictions were "
+        f"given. Flagged and left out: {int(flags['flagged'].sum())} of "
+        f"{plural(len(flags), 'session')}; the main results are given with them too."
+    )
+    warned = blocks.warnings(people.warnings, people.mark)
+    return f'{warned}<p class="lead">{escape(words)}</p>'
+
+
+def _methods(report: PeopleReport) -> dict[str, str]:
+    return {**report.methods, **session_blocks.rules_text(report.people)}
+
+
+# Writers of a report, from a comparison or from files: a folder with page, tables and figures.
 
 ZONE_FILE = "human_accuracy_by_scenario.csv"
 

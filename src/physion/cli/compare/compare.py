@@ -112,7 +112,7 @@ def _given(options: Options) -> dict[str, Any]:
     """The options that were given, by the names that `compare_files` has for them."""
     from physion.analysis.statistics.bootstrap import Bootstrap
     from physion.core.errors import BadInputError
-    from physion.report.page.movies import movies_of
+    from physion.report.html import movies_of
 
     same = ("responses", "sessions", "rules", "expected", "accept_rules", "attributes", "zone",
             "dominoes", "exclude", "trial_pages", "simulated", "where")  # fmt: skip

@@ -39,7 +39,7 @@ def main(options: Options) -> int:
     from physion.analysis.published.summary import published_results
     from physion.cli.official.read import study_folder
     from physion.cli.output import console
-    from physion.report.published_report import build_published_report, published_numbers
+    from physion.report.published import build_published_report, published_numbers
 
     results = published_results(study_folder(options.folder))
     page = None if options.out is None else build_published_report(results, options.out)

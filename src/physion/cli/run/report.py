@@ -20,7 +20,7 @@ def write_report(
     from physion.cli.output import print_warnings
     from physion.core.names import canonical_name
     from physion.report.build import compare_files
-    from physion.report.page.movies import movies_of
+    from physion.report.html import movies_of
     from physion.trials.dataset import Dataset
 
     dataset = Dataset(folder / "trials")

@@ -9,7 +9,7 @@ from typing import Any
 
 from physion.physics.labels import contact_frames
 from physion.report.viewer.motion import role_of
-from physion.report.viewer.passes import thing_colors
+from physion.report.viewer.movies import thing_colors
 from physion.scenes.scene import Scene
 from physion.trials.trial_file import Trial
 

@@ -21,15 +21,23 @@ from physion.analysis.published.summary import TITLES, PublishedResults
 from physion.analysis.tables.stimuli import MEAN
 from physion.core.files import write_atomic
 from physion.core.version import MADE_WITH
-from physion.report.figures.by_scenario.model_and_people import model_and_people_figure
-from physion.report.figures.by_stimulus.difficulty import difficulty_figure
-from physion.report.figures.conditions import grouped_figure
-from physion.report.figures.measures import measure_figure
+from physion.report.build import prepare_folder, write_csv, write_plot
+from physion.report.figures.by_scenario import measure_figure, model_and_people_figure
+from physion.report.figures.by_stimulus import difficulty_figure
 from physion.report.figures.theme import Plot, Theme
-from physion.report.page.blocks import PageColumn, details, p_value, paragraph, rows_table, table
-from physion.report.page.document import Section, figure, render_document
-from physion.report.words import number
-from physion.report.write import prepare_folder, write_csv, write_plot
+from physion.report.figures.training import grouped_figure
+from physion.report.html import (
+    PageColumn,
+    Section,
+    details,
+    figure,
+    number,
+    p_value,
+    paragraph,
+    render_document,
+    rows_table,
+    table,
+)
 
 TITLE = "The published results of the original study, recomputed from its released tables"
 

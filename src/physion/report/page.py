@@ -7,15 +7,24 @@ from html import escape
 from pathlib import Path
 
 from physion.analysis.tables.stimuli import MEAN, in_order
-from physion.report.figures.registry import BY_SCENARIO, BY_STIMULUS, TRAINING, all_figures
+from physion.report import html as blocks
+from physion.report import people as people_blocks
+from physion.report import people as session_blocks
+from physion.report import scores
+from physion.report import scores as tests_of_models
+from physion.report.figures.theme import BY_SCENARIO, BY_STIMULUS, TRAINING, all_figures
+from physion.report.html import (
+    PageMovies,
+    Picture,
+    Section,
+    figure,
+    plural,
+    protocol_names,
+    render_document,
+)
 from physion.report.inputs import EXPECTED_METHODS, ReportInputs
-from physion.report.page import blocks, people_blocks, scores, session_blocks, tests_of_models
-from physion.report.page.document import Picture, Section, figure, render_document
-from physion.report.page.model_inputs import inputs_sentence, weights_sentence
-from physion.report.page.movies import PageMovies
-from physion.report.page.trial_pages import FOLDER, page_name
-from physion.report.page.trials import gaps, opening
-from physion.report.words import plural, protocol_names
+from physion.report.scores import inputs_sentence, weights_sentence
+from physion.report.trials import FOLDER, gaps, opening, page_name
 
 
 def render_page(

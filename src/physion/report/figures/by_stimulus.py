@@ -1,0 +1,346 @@
+"""P(contact) of models against the fraction of people who say yes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from physion.analysis.models import figure_tables as tables
+from physion.analysis.statistics.agreement import pearson
+from physion.analysis.tables.stimuli import in_order
+from physion.report.figures.by_scenario import measure_figure
+from physion.report.figures.theme import (
+    BY_STIMULUS,
+    HATCHES,
+    LIGHT,
+    Plot,
+    Theme,
+    label,
+    legend,
+    panels,
+    register_figure,
+    style,
+    title,
+)
+from physion.report.html import number
+from physion.report.inputs import ReportInputs
+
+SQUARE = 1.16
+"""Distance from the left edge of one scenario's square to that of the next; a square is 1 wide."""
+
+
+@register_figure("scatter", section=BY_STIMULUS, heading="Models against people", order=60)
+def scatter(inputs: ReportInputs) -> Plot | None:
+    """Return P(contact) against the fraction of people who say yes."""
+    comparison, shown = inputs.comparison, inputs.scatter_agents()
+    if not comparison.has_people:
+        return None
+    caption = (
+        "P(contact) of each model (rows) against the fraction of people who say yes, by scenario; "
+        "one point a stimulus."
+    )
+    if len(comparison.changed):
+        caption += " Hollow: the simulated outcome is not the official one."
+    rest = comparison.models[inputs.scatter_limit :]
+    if rest:
+        caption += f" Not drawn, but in tables/stimuli.csv: {', '.join(map(str, rest))}."
+    return Plot("scatter", caption, tables.scatter_table(comparison, shown), scatter_figure)
+
+
+def scatter_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
+    """Draw P(contact) of each model against the fraction of people who say yes, by stimulus.
+
+    ``table``: see `figure_tables.scatter_table`. A panel a model, in it a square a scenario, so
+    that no colour is needed; hollow points are stimuli whose simulated outcome is not the official
+    one.
+    """
+    agents = list(table["agent"].unique())
+    scenarios = in_order(table["scenario"])
+    columns = max(1, min(4, 8 // len(scenarios)))
+    width = 11 / columns
+    height = (width - 0.4) / (SQUARE * len(scenarios))
+    with matplotlib.rc_context(style(theme)):
+        figure, axes = panels(
+            len(agents), columns, (width, height + 0.52), above=0.4, sharex=True, sharey=True
+        )
+        for axis, agent in zip(axes, agents, strict=True):
+            _squares(axis, table[table["agent"] == agent], scenarios, theme)
+        figure.supxlabel("share of people who say yes", fontsize=10)
+        figure.supylabel("P(contact) of the model", fontsize=10)
+        if (table["label"] != table["simulated"]).any():
+            legend(figure, _scatter_handles(theme), 2)
+    return figure
+
+
+def _squares(axis: Axes, rows: pd.DataFrame, scenarios: Sequence[str], theme: Theme) -> None:
+    """Draw the squares of one model next to each other on one axis, which is fast."""
+    left = SQUARE * np.arange(len(scenarios))
+    frame = np.array([(0, 0), (1, 1), (np.nan, np.nan), (0, 1), (0, 0), (1, 0), (np.nan, np.nan)])
+    lines = np.concatenate([frame + np.array([x, 0]) for x in left])
+    axis.plot(*lines.T, color=theme.faint, linewidth=0.8, zorder=0)
+    x = rows["p_yes"] + rows["scenario"].map(dict(zip(scenarios, left, strict=True)))
+    changed = rows["label"] != rows["simulated"]
+    for hollow in (False, True):
+        if (changed == hollow).any():
+            # A line with markers is fast to draw and small in SVG.
+            axis.plot(x[changed == hollow], rows["p_contact"][changed == hollow],
+                      **_point(hollow, theme))  # fmt: skip
+    for index, scenario in zip(left, scenarios, strict=True):
+        subset = rows[rows["scenario"] == scenario]
+        words = f"{scenario}, {_describe_r(subset['p_contact'], subset['p_yes'])}"
+        axis.text(index, 1.05, words, fontsize=7.5, va="bottom")
+    pooled = f"{_describe_r(rows['p_contact'], rows['p_yes'])} pooled, {len(rows)} stimuli"
+    join = ", " if len(scenarios) > 3 else "\n"
+    axis.set_title(f"{label(rows['agent'].iloc[0], 90)}{join}{pooled}", fontsize=8.5, loc="left",
+                   pad=15)  # fmt: skip
+    axis.set_xlim(-0.04, left[-1] + 1.04)
+    axis.set_ylim(-0.04, 1.04)
+    axis.set_aspect("equal")
+    axis.set_xticks(np.ravel(np.column_stack([left, left + 1])), ["0", "1"] * len(left), fontsize=8)
+    axis.set_yticks([0, 0.5, 1])
+    axis.spines[["left", "bottom"]].set_visible(False)
+
+
+def _describe_r(x: pd.Series, y: pd.Series) -> str:
+    return f"r = {number(pearson(x, y))}"
+
+
+def _point(hollow: bool, theme: Theme) -> dict[str, Any]:
+    colour = theme.palette[0]
+    style_of_point = {"linestyle": "", "marker": "o", "markersize": 3.2, "color": colour}
+    if hollow:
+        return style_of_point | {"markerfacecolor": "none", "markeredgewidth": 0.9}
+    return style_of_point | {"alpha": 0.55, "markeredgewidth": 0}
+
+
+def _scatter_handles(theme: Theme) -> list[Line2D]:
+    names = ("stimulus", "stimulus whose simulated outcome differs")
+    return [
+        Line2D([], [], label=name, **_point(hollow, theme))
+        for name, hollow in zip(names, (False, True), strict=True)
+    ]
+
+
+# Correlation with people within hard, chance and easy stimuli.
+
+
+@register_figure("thirds", section=BY_STIMULUS, heading="Hard, chance and easy stimuli", order=70)
+def thirds(inputs: ReportInputs) -> Plot | None:
+    """Return r within hard, chance and easy stimuli."""
+    if not inputs.comparison.has_people:
+        return None
+    caption = (
+        "Pearson's r with the average person within the stimuli on which people are right up to a "
+        "third of the time (hard), from two thirds on (easy), and between (chance); all scenarios "
+        "pooled, intervals draw stimuli. Within hard and easy stimuli the answers of people nearly "
+        "determine the outcome, so a model that is always right has r below 0 in hard ones."
+    )
+    answers = None if inputs.people is None else inputs.people.kept.test
+    if answers is not None:
+        caption += (
+            " Dashed: mean r between random halves of the people within the same stimuli; grey: "
+            "the middle 95 % of these r. A half is a noisier average than all people, with whom "
+            "models are correlated."
+        )
+    table = tables.thirds_table(inputs.comparison, answers)
+    return Plot("thirds", f"{caption} Dotted: chance.", table, draw)
+
+
+def draw(table: pd.DataFrame, theme: Theme) -> Figure:
+    """Draw the table of the figure."""
+    return measure_figure(table, "r", theme)
+
+
+# Calibration of P(contact).
+
+
+@register_figure("calibration", section=BY_STIMULUS, heading="Calibration of P(contact)", order=80)
+def calibration(inputs: ReportInputs) -> Plot:
+    """Return the reliability curves."""
+    caption = (
+        "Reliability: of the stimuli to which a model gives about this P(contact), the fraction "
+        "that ends in contact, in ten bins with Wilson's 95 % intervals; the area of a point is "
+        "proportional to its stimuli. The outcome is the official one. Dotted: calibrated. The "
+        "Brier score is the mean squared difference of P(contact) and outcome: 0 is perfect, 0.25 "
+        "that of P = 0.5."
+    )
+    table = tables.calibration_table(inputs.comparison)
+    return Plot("calibration", caption, table, calibration_figure)
+
+
+def calibration_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
+    """Draw reliability curves: the fraction of contact by predicted P(contact); one panel a model.
+
+    ``table``: see `figure_tables.calibration_table`. The area of a point is proportional to its
+    stimuli.
+    """
+    agents = list(table["agent"].unique())
+    columns = 3 if len(agents) <= 6 else 5
+    with matplotlib.rc_context(style(theme)):
+        width = 11 / columns
+        figure, axes = panels(len(agents), columns, (width, width + 0.2), above=0.5,
+                              sharex=True, sharey=True)  # fmt: skip
+        for axis, agent in zip(axes, agents, strict=True):
+            rows = table[(table["agent"] == agent) & (table["stimuli"] > 0)]
+            axis.plot([0, 1], [0, 1], color=theme.faint, linewidth=1, linestyle=":")
+            axis.vlines(rows["mean_p"], rows["low"], rows["high"], color=theme.palette[0],
+                        linewidth=1.1)  # fmt: skip
+            axis.plot(rows["mean_p"], rows["share"], color=theme.palette[0], linewidth=0.8)
+            fraction = rows["stimuli"] / rows["stimuli"].sum()
+            axis.scatter(rows["mean_p"], rows["share"], s=8 + 160 * fraction, zorder=3,
+                         color=theme.palette[0], edgecolors=theme.ink, linewidths=0.6)  # fmt: skip
+            words = label(agent, 30 if columns == 5 else 44)
+            brier = table.loc[table["agent"] == agent, "brier"].iloc[0]
+            axis.set_title(f"{words}\nBrier {brier:.3f}", fontsize=8, loc="left")
+            axis.set_xlim(-0.03, 1.03)
+            axis.set_ylim(-0.03, 1.03)
+            axis.set_aspect("equal")
+            axis.set_xticks([0, 0.5, 1])
+            axis.set_yticks([0, 0.5, 1])
+        figure.supxlabel("P(contact) of the model", fontsize=10)
+        figure.supylabel("share of stimuli with contact", fontsize=10)
+    return figure
+
+
+# Accuracy of people by stimulus, with the stimuli that mislead them.
+
+BINS = np.linspace(0, 1, 21)
+"""Edges of the bars in the distribution of accuracy."""
+
+TAIL = (
+    ("not below chance", 0),
+    ("below chance by the study's rule alone", 4),
+    ("below chance also when corrected", 5),
+)
+"""Parts of these bars, and their positions in the palette."""
+
+
+CAPTION = (
+    "Accuracy of people by stimulus. The tail: stimuli that people get wrong more often than by "
+    "guessing, by the study's rule (accuracy + 1.96 standard errors below 0.5, not corrected for "
+    "the number of stimuli), and those that an exact binomial test also finds after correction "
+    "(false discovery rate 5 % by Benjamini and Hochberg, all stimuli together)."
+)
+
+
+@register_figure("difficulty", section=BY_STIMULUS, heading="Stimuli that mislead people", order=90)
+def difficulty(inputs: ReportInputs) -> Plot | None:
+    """Return the distribution of people's accuracy over stimuli."""
+    if not inputs.comparison.has_people:
+        return None
+    by_stimulus = None if inputs.people is None else inputs.people.tables["by_stimulus"]
+    table = tables.difficulty_table(inputs.comparison, by_stimulus)
+    return Plot("difficulty", CAPTION, table, difficulty_figure)
+
+
+def difficulty_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
+    """Draw the distribution of people's accuracy over stimuli, by scenario, with the tail below
+    chance.
+
+    ``table``: from `difficulty.below_chance_level`.
+    """
+    scenarios = in_order(table["scenario"])
+    with matplotlib.rc_context(style(theme)):
+        size = (11 / 4, 2.1)
+        figure, axes = panels(len(scenarios), 4, size, above=0.7, sharex=True, sharey=True)
+        for axis, scenario in zip(axes, scenarios, strict=True):
+            rows = table[table["scenario"] == scenario]
+            _tail_bars(axis, rows, theme)
+            axis.axvline(0.5, color=theme.ink, linestyle=":", linewidth=1)
+            axis.axvline(rows["accuracy"].mean(), color=theme.ink, linestyle="--", linewidth=1.2)
+            title(axis, scenario)
+            axis.set_xlim(0, 1)
+            tail = int((rows["released"] | rows["exact"]).sum())
+            axis.text(0.03, 0.95, f"{tail} of {len(rows)}\nbelow chance", fontsize=8, va="top",
+                      transform=axis.transAxes)  # fmt: skip
+        figure.supxlabel("accuracy of people on a stimulus", fontsize=10)
+        figure.supylabel("stimuli", fontsize=10)
+        handles: list[Patch | Line2D] = [
+            Patch(facecolor=_tail_colour(index, theme), hatch=_tail_hatch(index),
+                  edgecolor=theme.paper, label=words)
+            for words, index in TAIL
+        ]  # fmt: skip
+        handles.append(Line2D([], [], color=theme.ink, linestyle="--", label="mean"))
+        handles.append(Line2D([], [], color=theme.ink, linestyle=":", label="chance"))
+        legend(figure, handles, 5)
+    return figure
+
+
+def _tail_bars(axis: Axes, rows: pd.DataFrame, theme: Theme) -> None:
+    """Draw stacked bars; those without height are not drawn."""
+    corrected = rows["exact"].to_numpy(dtype=bool)
+    alone = rows["released"].to_numpy(dtype=bool) & ~corrected
+    below = np.zeros(len(BINS) - 1)
+    for (_, index), subset in zip(TAIL, (~(alone | corrected), alone, corrected), strict=True):
+        count, _ = np.histogram(rows["accuracy"][subset], BINS)
+        some = count > 0
+        axis.bar(BINS[:-1][some], count[some], np.diff(BINS)[some], below[some], align="edge",
+                 facecolor=_tail_colour(index, theme), edgecolor=theme.paper,
+                 hatch=_tail_hatch(index), linewidth=0.6)  # fmt: skip
+        below += count
+
+
+def _tail_colour(index: int, theme: Theme) -> str:
+    return theme.palette[index]
+
+
+def _tail_hatch(index: int) -> str:
+    return {0: "", 4: HATCHES[1], 5: HATCHES[3]}[index]
+
+
+# Response times of people against their accuracy, by stimulus.
+
+RESPONSE_TIME_CAPTION = (
+    "Mean over people of the natural logarithm of their response times to a stimulus, against the "
+    "accuracy of people on it, with the least-squares line. Preregistered: the less accurate, the "
+    "slower."
+)
+
+
+@register_figure("response_time", section=BY_STIMULUS, heading="Response times", order=100)
+def response_time(inputs: ReportInputs) -> Plot | None:
+    """Return response times against accuracy."""
+    if inputs.people is None:
+        return None
+    table = tables.response_time_table(inputs.people.tables["by_stimulus"])
+    if table["mean_log_rt"].isna().all():
+        return None
+    return Plot("response_time", RESPONSE_TIME_CAPTION, table, response_time_figure)
+
+
+def response_time_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
+    """Draw the mean log response time of a stimulus against its accuracy, by scenario, with a line.
+
+    ``table``: see `figure_tables.response_time_table`.
+    """
+    scenarios = in_order(table["scenario"])
+    with matplotlib.rc_context(style(theme)):
+        size = (11 / 4, 2.5)
+        figure, axes = panels(len(scenarios), 4, size, above=0.3, sharex=True, sharey=True)
+        for index, (axis, scenario) in enumerate(zip(axes, scenarios, strict=True)):
+            rows = table[(table["scenario"] == scenario) & table["mean_log_rt"].notna()]
+            x = rows["accuracy"].to_numpy(dtype=np.float64)
+            y = rows["mean_log_rt"].to_numpy(dtype=np.float64)
+            colour, marker = theme.mark(index)
+            axis.plot(x, y, linestyle="", marker=marker, color=colour, markersize=3.6, alpha=0.7,
+                      markeredgewidth=0)  # fmt: skip
+            r = pearson(x, y)
+            if np.isfinite(r):
+                slope, level = np.polyfit(x, y, 1)
+                ends = np.array([x.min(), x.max()])
+                axis.plot(ends, level + slope * ends, color=theme.ink, linewidth=1.3)
+            title(axis, scenario)
+            axis.set_title(f"r = {number(r)}", fontsize=8.5, loc="right")
+            axis.set_xlim(-0.03, 1.03)
+            axis.set_xticks([0, 0.5, 1])
+        figure.supxlabel("accuracy of people on a stimulus", fontsize=10)
+        figure.supylabel("mean log response time (log ms)", fontsize=10)
+    return figure

@@ -1,0 +1,436 @@
+"""Sentences on what each model was given of a trial, and on the weights that it started from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+
+import numpy as np
+import pandas as pd
+
+from physion.analysis.metrics import Metric, score_metrics
+from physion.analysis.metrics.beyond_outcome import BEYOND_OUTCOME
+from physion.analysis.mixed.result import effect_name
+from physion.analysis.models.anchors import TWO_PEOPLE
+from physion.analysis.models.comparison import Comparison
+from physion.analysis.models.mixed_fits import MixedTable
+from physion.analysis.models.model_tests import permutations_of
+from physion.analysis.models.observed_contact import SETTING
+from physion.analysis.tables.stimuli import MEAN, POOLED, in_order
+from physion.report.html import (
+    ANCHORS,
+    PageColumn,
+    definition_list,
+    details,
+    interval,
+    listed,
+    number,
+    paragraph,
+    rows_table,
+    table,
+    undefined,
+)
+from physion.report.inputs import ReportInputs
+
+WITHOUT = "none"
+"""Value of the column *Init* of models without weights."""
+INPUT_WORDS = {
+    "rgb": "the pixels of the movie",
+    "ids": "which object every pixel belongs to",
+    "depth": "the distance of every pixel",
+    "boxes": "a box around every object",
+    "camera": "the camera",
+    "state": "the true state of the scene: shapes, motion and, for models that use them, masses",
+    "outcomes": "the outcome itself",
+    "answers of people": "the answers of people",
+    "base rate": "nothing of the trial but how often contact occurs",
+}
+"""Words for the values of the column *Inputs* of the predictions."""
+
+
+def inputs_sentence(inputs: ReportInputs) -> str:
+    """Return what each model was given, the models of equal inputs together; "" if none says so."""
+    groups: dict[str, list[str]] = {}
+    for model in dict.fromkeys(inputs.comparison.stimuli["model"].astype(str)):
+        groups.setdefault(inputs.model_inputs.get(model, ""), []).append(model)
+    unknown = groups.pop("", [])
+    if not groups:
+        return ""
+    parts = [f"{listed(models)}: {_describe(given)}" for given, models in groups.items()]
+    if unknown:
+        parts.append(f"{listed(unknown)}: not stated")
+    people = "People saw the movie. " if inputs.comparison.has_people else ""
+    return f"{people}What each model was given: {'; '.join(parts)}."
+
+
+def weights_sentence(inputs: ReportInputs) -> str:
+    """Return the initial weights of each model that has any; "" if there is none."""
+    groups: dict[str, list[str]] = {}
+    for model in dict.fromkeys(inputs.comparison.stimuli["model"].astype(str)):
+        groups.setdefault(inputs.model_weights.get(model, WITHOUT), []).append(model)
+    groups.pop(WITHOUT, None)
+    if not groups:
+        return ""
+    parts = [f"{listed(models)}: {weights}" for weights, models in groups.items()]
+    return f"Weights that each network started from: {'; '.join(parts)}."
+
+
+def _describe(given: str) -> str:
+    names = [name.strip() for name in given.split(",")]
+    return listed([INPUT_WORDS.get(name, name) for name in names])
+
+
+# Tables of scores, anchors below the models: scores, beyond the outcome, by scenario.
+
+_SAME_EVENT = ("accuracy_simulated", "r_same")
+"""Metrics that say something only where a simulated outcome is not the official one."""
+
+_LIKENESS = ("r", "kappa_from_averages")
+"""Metrics of likeness to people, which those beyond the outcome are read next to."""
+
+_ANCHORS = (
+    "The recorded outcome answers as a perfect simulator would. The majority of people answers "
+    "what most of them did: no yes or no agrees with them more often, so its kappa is the ceiling. "
+    "One person with another: what a person reaches."
+)
+
+_BEYOND = (
+    "Whoever predicts outcomes well resembles people, because people predict them well too. These "
+    "numbers take out that part: a model that resembles people by the outcome alone has 0. Kappa "
+    "beyond the outcome supposes that half of the answers are yes, and is too low where most "
+    "outcomes are alike; kappa within outcomes is right there too."
+)
+
+
+def scores(comparison: Comparison) -> str:
+    """Return all tables of scores: mean over scenarios and pooled, beyond the outcome, later."""
+    plain = shown_metrics(comparison, beyond=False)
+    parts = [
+        paragraph(_ANCHORS) if comparison.has_people else "",
+        scores_table(comparison.all_scores, MEAN, plain, "Mean over scenarios"),
+        details("All stimuli pooled", scores_table(comparison.all_scores, POOLED, plain)),
+    ]
+    if comparison.has_people:
+        parts += ["<h3>Beyond the outcome</h3>", paragraph(_BEYOND), *_beyond(comparison)]
+    parts += ["<h3>Without contacts in the observed part</h3>", _later(comparison)]
+    return "\n".join(part for part in parts if part)
+
+
+def _beyond(comparison: Comparison) -> list[str]:
+    beyond = shown_metrics(comparison, beyond=True)
+    tables = [
+        scores_table(comparison.all_scores, MEAN, beyond, "Mean over scenarios"),
+        details("All stimuli pooled", scores_table(comparison.all_scores, POOLED, beyond)),
+    ]
+    for metric in score_metrics():
+        if metric.name in BEYOND_OUTCOME:
+            title = f"By scenario: {metric.heading}"
+            tables.append(details(title, matrix(comparison, metric.name)))
+    return tables
+
+
+def _later(comparison: Comparison) -> str:
+    """Return the scores without observed contacts, or why there are none."""
+    left_out = comparison.settings[SETTING]
+    if comparison.later.empty:
+        return paragraph(f"{left_out[0].upper()}{left_out[1:]}.")
+    words = (
+        "Where agent and patient touch in the observed part there is nothing left to predict. "
+        f"Left out: {left_out}."
+    )
+    several = comparison.has_people
+    names = (
+        ("accuracy", "human_accuracy", *_LIKENESS, *BEYOND_OUTCOME) if several else ("accuracy",)
+    )
+    chosen = [metric for metric in score_metrics() if metric.name in names]
+    return paragraph(words) + scores_table(comparison.later, MEAN, chosen, "Mean over scenarios")
+
+
+def shown_metrics(comparison: Comparison, beyond: bool) -> list[Metric]:
+    """Return the metrics of a table that say something about this comparison.
+
+    ``beyond``: those beyond the outcome with those of likeness, or all others. Without people those
+    that need them are left out, and those about simulated outcomes if all simulated outcomes are
+    the official ones.
+    """
+    names = (*_LIKENESS, *BEYOND_OUTCOME)
+    return [
+        metric
+        for metric in score_metrics()
+        if (comparison.has_people or metric.needs == "outcome")
+        and (metric.name in names if beyond else metric.name not in BEYOND_OUTCOME)
+        and not (comparison.changed.empty and metric.name in _SAME_EVENT)
+    ]
+
+
+def scores_table(
+    scores: pd.DataFrame, which: str, metrics: Sequence[Metric], caption: str = ""
+) -> str:
+    """Return a table of scores: a row a model, the metrics, and after r its noise ceiling.
+
+    Parameters
+    ----------
+    scores
+        As `Comparison.all_scores`; anchors follow the models as a group.
+    which
+        A scenario, `MEAN` or `POOLED`.
+    metrics
+        The columns. Reasons of what is undefined in them are listed below the table.
+    caption
+        Text above the table.
+    """
+    rows = scores[scores["scenario"] == which]
+    header = ["model", "readout", "stimuli"]
+    for metric in metrics:
+        header += [metric.heading, "ceiling of r"] if metric.name == "r" else [metric.heading]
+    lines: dict[str, list[list[str]]] = {"model": [], "anchor": []}
+    for _, row in rows.iterrows():
+        line = [escape(_describe_model(row)), escape(row["readout"]), str(row["stimuli"])]
+        for metric in metrics:
+            line.append(_cell(row, metric))
+            if metric.name == "r":
+                line.append(number(row["ceiling"]))
+        lines[row["kind"]].append(line)
+    listing = table(header, lines["model"], caption, (ANCHORS, lines["anchor"]))
+    return listing + _reasons(rows, metrics)
+
+
+def _cell(row: pd.Series, metric: Metric) -> str:
+    """Return a score with its interval; empty where it has no meaning for two people."""
+    if row["agent"] == TWO_PEOPLE and metric.two_people is None:
+        return ""
+    return interval(row, metric.name)
+
+
+def _reasons(rows: pd.DataFrame, metrics: Sequence[Metric]) -> str:
+    """Return the reasons that are about columns of the table, as a list."""
+    others = {metric.label for metric in score_metrics()} - {metric.label for metric in metrics}
+    items = []
+    for _, row in rows.iterrows():
+        parts = [part for part in str(row["reason"]).split("; ") if part]
+        about = [part for part in parts if part.partition(":")[0] not in others]
+        if about:
+            items.append(f"<li>{escape(row['agent'])}: {escape('; '.join(about))}</li>")
+    return f'<ul class="notes">{"".join(items)}</ul>' if items else ""
+
+
+def _describe_model(row: pd.Series) -> str:
+    """Return the model's name with what distinguishes it from others, but without the readout."""
+    head = " · ".join(name for name in (row["model"], row["readout"]) if name)
+    return str(row["model"]) + str(row["agent"]).removeprefix(head)
+
+
+def matrix(comparison: Comparison, key: str) -> str:
+    """Return a score by model (rows) and scenario (columns), people on top, anchors below."""
+    columns = [*in_order(comparison.stimuli["scenario"]), MEAN, POOLED]
+    first = []
+    if comparison.has_people and key in _PEOPLE:
+        first.append([f"<em>{_PEOPLE[key]}</em>", *_people_cells(comparison, key, columns)])
+    lines: dict[str, list[list[str]]] = {"model": first, "anchor": []}
+    for agent, rows in comparison.all_scores.groupby("agent", sort=False):
+        subset = rows.set_index("scenario")
+        if agent == TWO_PEOPLE and (key in _PEOPLE or subset[key].isna().all()):
+            continue
+        cells = [
+            interval(subset.loc[name], key) if name in subset.index else undefined("no predictions")
+            for name in columns
+        ]
+        lines[subset["kind"].iloc[0]].append([escape(str(agent)), *cells])
+    return table(["", *columns], lines["model"], below=(ANCHORS, lines["anchor"]))
+
+
+_PEOPLE = {"accuracy": "people", "r": "ceiling"}
+"""Title of the row on top, by metric."""
+
+
+def _people_cells(comparison: Comparison, key: str, columns: Sequence[str]) -> list[str]:
+    people = comparison.people.set_index("scenario").assign(reason="")
+    if key == "accuracy":
+        return [interval(people.loc[name], key) if name in people.index else "" for name in columns]
+    return [number(people.loc[name, "ceiling"]) if name in people.index else "" for name in columns]
+
+
+def definitions(comparison: Comparison) -> str:
+    """Return the definitions of the columns of the tables of scores."""
+    chosen = [*shown_metrics(comparison, beyond=False)]
+    if comparison.has_people:
+        chosen += [one for one in score_metrics() if one.name in BEYOND_OUTCOME]
+    meaning = {metric.heading: metric.definition for metric in chosen}
+    meaning |= {
+        "NaN": "undefined; the reason is below the table or shown on hovering",
+        "all, all-but, only": "a model's training: on all scenarios, on all but the tested one, on "
+        "the tested one alone; in the files the last two are “all but this” and “same”",
+    }
+    return f"<h3>What the numbers mean</h3>{definition_list(meaning)}"
+
+
+# Parts of the page with tests: models against each other, mixed models, calibration.
+
+
+def tests(inputs: ReportInputs) -> str:
+    """Return paired tests of models, then mixed models."""
+    parts = []
+    if inputs.paired is not None:
+        parts += ["<h3>Models against each other</h3>", _paired(inputs.paired)]
+    if inputs.paired_measures is not None and len(inputs.paired_measures):
+        parts.append(_paired_measures(inputs.paired_measures))
+    if inputs.mixed:
+        parts.append("<h3>Mixed models</h3>")
+        parts.append(paragraph(_MIXED))
+        parts += [_mixed(model) for model in inputs.mixed]
+    return "\n".join(parts)
+
+
+_MIXED = (
+    "Random intercepts and slopes as the formula says. Logistic models: maximum likelihood by "
+    "Laplace approximation, Wald z. Linear models: restricted maximum likelihood, t with degrees "
+    "of freedom by Satterthwaite. b of a logistic model is in log odds. Rows of one model and "
+    "scenario that differ in readout or training share their stimuli, which the models of "
+    "accuracies do not know: their p are too small; the paired tests above do without that."
+)
+
+
+def _paired(rows: pd.DataFrame) -> str:
+    """Return a summary as text, and the table of all pairs."""
+    counts = {
+        key: (
+            int((rows[f"{key}_holm"] < 0.05).sum()),
+            int((rows[f"{key}_bh"] < 0.05).sum()),
+            int(rows[key].notna().sum()),
+        )
+        for key in ("p_accuracy", "p_r")
+    }
+    words = (
+        "Every two models on the stimuli that both answered, all scenarios together. Accuracy: "
+        "exact test of McNemar. r with the average person: permutation test that swaps the two "
+        f"models stimulus by stimulus ({permutations_of(len(rows))} permutations), jackknife "
+        "interval over stimuli. Correction over all pairs: by "
+        "Holm (chance of any false alarm) and by Benjamini and Hochberg (share of false alarms). "
+        f"Of {counts['p_accuracy'][2]} pairs, {counts['p_accuracy'][0]} differ in accuracy by "
+        f"Holm and {counts['p_accuracy'][1]} by Benjamini and Hochberg (5 %); of "
+        f"{counts['p_r'][2]}, {counts['p_r'][0]} and {counts['p_r'][1]} in r."
+    )
+    columns = [
+        PageColumn("first", "first", "text"),
+        PageColumn("second", "second", "text"),
+        PageColumn("stimuli", "stimuli", "count"),
+        PageColumn("accuracy, first less second", "accuracy_difference", digits=3),
+        PageColumn("only first right", "only_first", "count"),
+        PageColumn("only second right", "only_second", "count"),
+        PageColumn("p", "p_accuracy", "p"),
+        PageColumn("Holm", "p_accuracy_holm", "p"),
+        PageColumn("B-H", "p_accuracy_bh", "p"),
+        PageColumn("r, first less second", "r_difference", "interval"),
+        PageColumn("p", "p_r", "p"),
+        PageColumn("Holm", "p_r_holm", "p"),
+        PageColumn("B-H", "p_r_bh", "p"),
+    ]
+    if rows["r_difference"].isna().all():
+        columns = columns[:9]
+    listing = rows_table(rows, columns)
+    if len(rows) > 10:
+        listing = details(f"All {len(rows)} pairs", listing)
+    return paragraph(words) + listing
+
+
+def _paired_measures(rows: pd.DataFrame) -> str:
+    """Return a summary by scenario and measure, and the table of all pairs over all scenarios."""
+    counts = rows.assign(
+        holm=rows["p_holm"] < 0.05, pairs=1, measure=rows["measure"].map(_MEASURES)
+    )
+    summary = counts.groupby(["scenario", "measure"], sort=False)[["pairs", "holm"]].sum()
+    columns = [
+        PageColumn("scenario", "scenario", "text"),
+        PageColumn("measure", "measure", "text"),
+        PageColumn("pairs", "pairs", "count"),
+        PageColumn("differ (Holm, 5 %)", "holm", "count"),
+    ]
+    words = (
+        "Permutation tests that swap two models stimulus by stimulus, in each scenario and over "
+        "all of them; every pair with its interval is in tables/paired_measures.csv"
+    )
+    last = counts[counts["scenario"] == counts["scenario"].iloc[-1]]
+    pair = [
+        PageColumn("first", "first", "text"),
+        PageColumn("second", "second", "text"),
+        PageColumn("measure", "measure", "text"),
+        PageColumn("stimuli", "stimuli", "count"),
+        PageColumn("first less second", "difference", "interval", 3, "low", "high"),
+        PageColumn("p", "p", "p"),
+        PageColumn("Holm", "p_holm", "p"),
+        PageColumn("B-H", "p_bh", "p"),
+    ]
+    name = str(last["scenario"].iloc[0])
+    return details("RMSD, kappa and r by scenario", rows_table(
+        summary.reset_index(), columns, words
+    ) + rows_table(last, pair, f"Every pair: {name}"))  # fmt: skip
+
+
+_MEASURES = {"rmsd": "RMSD", "kappa_from_averages": "kappa, from averages", "r": "r"}
+
+
+def _mixed(model: MixedTable) -> str:
+    formula = f"<p><code>{escape(model.formula)}</code></p>"
+    if model.fit is None:
+        return details(f"{model.about}: not fitted", formula + paragraph(model.reason))
+    fit = model.fit
+    rows = fit.table.assign(
+        term=fit.table["term"].str.replace(r"(\w+)\[T\.(.*)\]", r"\1: \2", regex=True)
+    )
+    columns = [
+        PageColumn("term", "term", "text"),
+        PageColumn("b", "b", "interval", 3, "low", "high"),
+        PageColumn("SE", "se", digits=3),
+        PageColumn("z", "z"),
+        PageColumn("t", "t"),
+        PageColumn("df", "df", digits=1),
+        PageColumn("p", "p", "p"),
+    ]
+    logistic = "z" in rows
+    known = [c for c in columns if c.key in rows and not (logistic and c.key == "df")]
+    spreads = ", ".join(
+        f"{effect_name(row['group'], row['effect'])} {number(row['sd'], 3)} ({int(row['levels'])})"
+        for _, row in fit.random.iterrows()
+    )
+    note = f"{fit.rows} rows, {fit.left_out} left out; standard deviations (levels): {spreads}"
+    for _, row in fit.correlations.iterrows():
+        note += f"; correlation of {row['first']} and {row['second']} by {row['group']}: "
+        note += number(row["r"])
+    note = ". ".join([note, *fit.warnings]) + "."
+    listing = rows_table(rows, known) + f'<p class="note">{escape(note)}</p>'
+    return details(f"{model.about}{_together(model)}", formula + listing)
+
+
+def _together(model: MixedTable) -> str:
+    """Return the test that all coefficients of the model's term are zero, as text."""
+    if model.fit is None or not model.term:
+        return ""
+    test = model.fit.joint_test(model.term)
+    p = "p < 0.001" if test.p < 0.001 else f"p = {number(test.p, 3)}"
+    if np.isinf(test.df2):
+        return f". All together: χ²({test.df1}) = {number(test.statistic * test.df1, 1)}, {p}"
+    return f". All together: F({test.df1}, {number(test.df2, 1)}) = {number(test.statistic)}, {p}"
+
+
+def calibration(inputs: ReportInputs) -> str:
+    """Brier score and its parts, a row a model."""
+    rows = inputs.calibration
+    if rows is None:
+        return ""
+    columns = [
+        PageColumn("model", "model", "text"),
+        PageColumn("stimuli", "stimuli", "count"),
+        PageColumn("Brier", "brier", digits=3),
+        PageColumn("reliability", "reliability", digits=3),
+        PageColumn("resolution", "resolution", digits=3),
+        PageColumn("uncertainty", "uncertainty", digits=3),
+        PageColumn("within bins", "within", digits=3),
+        PageColumn("skill", "skill", digits=3),
+        PageColumn("calibration error", "calibration_error", digits=3),
+    ]
+    words = (
+        "Brier score = reliability − resolution + uncertainty + within bins (ten of equal width); "
+        "skill is 1 − Brier / uncertainty, above 0 where a model beats the base rate"
+    )
+    known = rows.replace([np.inf, -np.inf], np.nan)
+    return details("Brier score and its parts", rows_table(known, columns, words))

@@ -1,0 +1,460 @@
+"""Choice of the stimuli that a page shows as movies; it depends on the tables alone."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Container, Iterator, Mapping
+from html import escape
+
+import numpy as np
+import pandas as pd
+
+from physion.analysis.models.comparison import Comparison
+from physion.analysis.tables.stimuli import in_order
+from physion.report.html import (
+    PageMovies,
+    details,
+    listed,
+    number,
+    paragraph,
+    percent,
+    plural,
+    protocol_names,
+    render_document,
+    stimulus_link,
+    table,
+)
+from physion.report.inputs import ReportInputs
+
+ACCURACY_STEP = 0.05
+"""Stimuli whose accuracies of people lie in one such step count as equally clear to people."""
+
+OPENING_RULE = (
+    "Of each scenario the stimulus that most people judged rightly is shown (accuracies within the "
+    "same 5 % count as equal) and, of these, the one that the models missed most; scenarios with "
+    "and without contact alternate where people allow it. So these trials are clear to people, and "
+    "no sample of all."
+)
+OPENING_RULE_ALONE = (
+    "Of each scenario the stimulus that the models missed most is shown; scenarios with and "
+    "without contact alternate."
+)
+
+
+WIDE = 0.5
+"""Smallest |P(contact) - P(yes)| that counts as a disagreement."""
+
+
+def opening_trials(comparison: Comparison, movies: Container[str] = ()) -> list[str]:
+    """Return one stimulus of each scenario, in the order of the scenarios.
+
+    In turn, the best by: a movie in ``movies``; a simulated outcome that is the official one;
+    the number of models that answered; a majority of people that was right; contact in the first,
+    third, ... scenario and none in the others; people's accuracy in steps of `ACCURACY_STEP`; the
+    mean distance of the models' P(contact) from the outcome; the first name. Without people their
+    part is left out.
+    """
+    found = []
+    for position, scenario in enumerate(in_order(comparison.stimuli["scenario"])):
+        rows = comparison.stimuli[comparison.stimuli["scenario"] == scenario]
+        found.append(_best(rows, movies, contact=position % 2 == 0))
+    return found
+
+
+def _best(rows: pd.DataFrame, movies: Container[str], contact: bool) -> str:
+    rows = rows.assign(miss=(rows["p_contact"] - rows["label"].astype(float)).abs())
+    table = rows.groupby("stimulus", as_index=False).agg(
+        models=("agent", "size"),
+        label=("label", "first"),
+        simulated=("simulated", "first"),
+        accuracy=("human_accuracy", "first"),
+        miss=("miss", "mean"),
+    )
+    accuracy = table["accuracy"].astype(float)
+    # A little is added so that 0.95 is not counted below 19 steps of 0.05.
+    steps = np.floor(accuracy / ACCURACY_STEP + 1e-9)
+    table = table.assign(
+        movie=[name in movies for name in table["stimulus"]],
+        same=table["label"] == table["simulated"],
+        right=accuracy > 0.5,
+        turn=table["label"].astype(bool) == contact,
+        step=steps.fillna(0.0),
+    )
+    order = ["movie", "same", "models", "right", "turn", "step", "miss", "stimulus"]
+    best = table.sort_values(order, ascending=[False] * 7 + [True], kind="stable")
+    return str(best["stimulus"].iloc[0])
+
+
+def opinions(comparison: Comparison) -> pd.DataFrame:
+    """Return the rows of ``comparison.stimuli`` of models that predict something themselves.
+
+    Left out are models that were shown the outcome (readout *full*) and those that give all
+    stimuli of every scenario the same P(contact); if none is left, all rows are returned.
+    """
+    rows = comparison.stimuli
+    values = rows.groupby(["agent", "scenario"])["p_contact"].nunique()
+    varied = values[values > 1].reset_index()["agent"].unique()
+    kept = rows[rows["agent"].isin(varied) & (rows["readout"] != "full")]
+    return rows if kept.empty else kept
+
+
+def widest_gaps(comparison: Comparison, count: int) -> pd.DataFrame:
+    """Return the stimuli on which a model and people differ most, at most ``count`` rows.
+
+    Models alternate, each with all of its readouts (see `opinions` for models without a turn): each
+    adds the stimulus with its largest |P(contact) - P(yes)|, at least `WIDE`, that is not yet
+    chosen; ties are resolved by name. Stimuli whose simulated outcome is not the official one are
+    skipped, since there the physics differs and not the model. The result has rows of
+    ``comparison.stimuli`` with the column ``size``, each of the model that added it.
+    """
+    rows = opinions(comparison)
+    rows = rows[(rows["label"] == rows["simulated"]) & (rows["gap"].abs() >= WIDE)]
+    rows = rows.assign(size=rows["gap"].abs())
+    ranked = rows.sort_values(["size", "stimulus"], ascending=[False, True], kind="stable")
+    names = list(dict.fromkeys(rows["model"]))
+    queues = [list(ranked.index[ranked["model"] == name]) for name in names]
+    chosen: list[int] = []
+    seen: set[str] = set()
+    while len(chosen) < count and any(queues):
+        for queue in queues:
+            while queue and rows.loc[queue[0], "stimulus"] in seen:
+                queue.pop(0)
+            if queue and len(chosen) < count:
+                chosen.append(queue.pop(0))
+                seen.add(str(rows.loc[chosen[-1], "stimulus"]))
+    return rows.loc[chosen]
+
+
+def who_was_right(comparison: Comparison) -> pd.DataFrame:
+    """Return how often the majority of people and each model were right on the same stimuli.
+
+    A row a model (``agent``) with counts: ``stimuli``, ``both``, ``people``, ``model``, ``neither``
+    right, ``divided``: exactly half of the people were right. The outcome is the official one.
+    """
+    rows = comparison.stimuli
+    people, divided = rows["human_accuracy"] > 0.5, rows["human_accuracy"] == 0.5
+    model = rows["predicted"].astype(bool) == rows["label"].astype(bool)
+    counted = rows.assign(
+        both=people & model,
+        people=people & ~model,
+        model_alone=~people & ~divided & model,
+        neither=~people & ~divided & ~model,
+        divided=divided,
+    )
+    keys = ["both", "people", "model_alone", "neither", "divided"]
+    sums = counted.groupby("agent", sort=False)[keys].sum().astype(int)
+    sums.insert(0, "stimuli", counted.groupby("agent", sort=False).size())
+    return sums.reset_index().rename(columns={"model_alone": "model"})
+
+
+# Cards of a page: a stimulus with its movie, its outcome, and the answers of people and models.
+
+MOST_ANSWERS = 10
+"""Largest number of models that a card shows at once; more of them open on a click."""
+READOUT_ORDER = ("observed+simulated", "observed")
+"""Readouts of which a card shows the first that a model has."""
+KEY = (
+    "Bars: the fraction of people who say yes, and each model's P(contact); the line marks one "
+    "half. ✓: the majority, or the model's answer, is right; ✗: it is wrong."
+)
+READOUT_KEY = "Of a model with several readouts the cards show observed+simulated, else observed."
+
+
+def card(rows: pd.DataFrame, movie: str, links: Mapping[str, str], named: str = "") -> str:
+    """Return one stimulus as a card.
+
+    Parameters
+    ----------
+    rows
+        The rows of ``comparison.stimuli`` of this stimulus.
+    movie
+        Its movie as HTML.
+    links
+        Addresses by stimulus; the name links there.
+    named
+        Name of a model (``agent``) that is shown in bold and with this readout.
+    """
+    first = rows.iloc[0]
+    return (
+        f"<article><header><h3>{escape(first['scenario'])}</h3>{outcome(first)}</header>"
+        f"{movie}{answers(pick_readouts(rows, named), named)}"
+        f'<p class="name">{stimulus_link(first["stimulus"], links)}</p></article>'
+    )
+
+
+def pick_readouts(rows: pd.DataFrame, named: str = "") -> pd.DataFrame:
+    """Return the rows of one readout of each model: that of ``named``, else by `READOUT_ORDER`.
+
+    Readouts that were shown the outcome (*full*) are left out where another one is there.
+    """
+    seen = rows[(rows["readout"] != "full") | (rows["agent"] == named)]
+    rows = rows if seen.empty else seen
+    parts = []
+    for _, own in rows.groupby("model", sort=False):
+        if (own["agent"] == named).any():
+            parts.append(own[own["agent"] == named])
+            continue
+        known = [name for name in READOUT_ORDER if (own["readout"] == name).any()]
+        parts.append(own[own["readout"] == known[0]] if known else own)
+    return pd.concat(parts)
+
+
+def outcome(row: pd.Series) -> str:
+    """Return what happened as a label, as HTML; with the simulated outcome if it differs."""
+    kind = "contact" if row["label"] else "no contact"
+    words = kind
+    if bool(row["simulated"]) != bool(row["label"]):
+        words += ", not in the movie" if row["label"] else ", but in the movie"
+    return f'<span class="outcome {kind.replace(" ", "-")}">{words}</span>'
+
+
+def describe(rows: pd.DataFrame) -> str:
+    """Return a sentence about the movie of a stimulus, for readers who do not see it."""
+    first = rows.iloc[0]
+    happened = "they touch" if first["simulated"] else "they do not touch"
+    return f"Movie of {first['stimulus']} ({first['scenario']}): {happened}"
+
+
+def answers(rows: pd.DataFrame, named: str = "") -> str:
+    """Return the answers of people, if there are any, and of the models as labelled bars."""
+    first = rows.iloc[0]
+    items = []
+    if np.isfinite(first["p_yes"]):
+        value = f"{percent(first['p_yes'])} <small>of {first['count']:.0f}</small>"
+        right = None if first["human_accuracy"] == 0.5 else first["human_accuracy"] > 0.5
+        items.append(_answer("people say yes", "", value, first["p_yes"], right, "human"))
+    for _, row in rows.iterrows():
+        alone = (rows["model"] == row["model"]).sum() == 1
+        right = bool(row["predicted"]) == bool(row["label"])
+        kind = "model named" if row["agent"] == named else "model"
+        label = row["model"] if alone else row["agent"]
+        value = number(row["p_contact"])
+        items.append(_answer(str(label), str(row["agent"]), value, row["p_contact"], right, kind))
+    # People come first and count as one.
+    most = MOST_ANSWERS + len(items) - len(rows)
+    shown = f'<ul class="answers">{"".join(items[:most])}</ul>'
+    if len(items) > most:
+        rest = f'<ul class="answers">{"".join(items[most:])}</ul>'
+        shown += details(f"{plural(len(items) - most, 'further model')}", rest)
+    return shown
+
+
+def _answer(
+    name: str, title: str, value: str, fraction: float, right: bool | None, kind: str
+) -> str:
+    """Return one answer; a ``meter`` would be coloured as good or bad by browsers."""
+    mark, word = {True: ("✓", "right"), False: ("✗", "wrong"), None: ("–", "divided")}[right]
+    hover = f' title="{escape(title)}"' if title else ""
+    return (
+        f'<li class="{kind}"><span{hover}>{escape(name)}</span><b>{value}</b>'
+        f'<em class="{word}" role="img" aria-label="{word}">{mark}</em>'
+        f'<i aria-hidden="true"><s style="width:{100 * fraction:.0f}%"></s></i></li>'
+    )
+
+
+# Parts of the page that show trials: one of each scenario, and the largest disagreements.
+
+INDEX = "trials/index.html"
+"""Address of the list of trial pages, relative to the report."""
+
+
+def shown_stimuli(inputs: ReportInputs) -> list[str]:
+    """Return the stimuli whose movies the page or the trial pages show."""
+    if inputs.trial_pages:
+        return list(dict.fromkeys(inputs.comparison.stimuli["stimulus"]))
+    found = opening_trials(inputs.comparison, inputs.movies)
+    if inputs.comparison.has_people:
+        found += list(widest_gaps(inputs.comparison, inputs.movie_count)["stimulus"])
+    return list(dict.fromkeys(found))
+
+
+def opening(inputs: ReportInputs, movies: PageMovies, links: Mapping[str, str]) -> str:
+    """Return a card for one stimulus of each scenario, with its movie playing."""
+    stimuli = inputs.comparison.stimuli
+    cards = []
+    for stimulus in opening_trials(inputs.comparison, inputs.movies):
+        rows = stimuli[stimuli["stimulus"] == stimulus]
+        cards.append(card(rows, movies.show(stimulus, describe(rows)), links))
+    people = inputs.comparison.has_people
+    note = [OPENING_RULE if people else OPENING_RULE_ALONE, KEY, READOUT_KEY]
+    if inputs.trial_pages:
+        listing = f'<p><a href="{INDEX}">A page for every stimulus</a></p>'
+    else:
+        listing = ""
+    return (
+        f"<p>{escape(_question(inputs))}</p>{_grid(cards)}"
+        f'<p class="note">{escape(" ".join(note))}</p>{listing}'
+    )
+
+
+def _question(inputs: ReportInputs) -> str:
+    who = "People and models" if inputs.comparison.has_people else "The models"
+    shown = ", and the movies go on to show it" if inputs.movies else ""
+    return (
+        f"{inputs.question} {who} answer from the first 1.5 seconds; the label says what "
+        f"happened{shown}."
+    )
+
+
+def gaps(inputs: ReportInputs, movies: PageMovies, links: Mapping[str, str]) -> str:
+    """Return who was right how often, and a card for each of the largest differences."""
+    if not inputs.comparison.has_people:
+        return ""
+    chosen = widest_gaps(inputs.comparison, inputs.movie_count)
+    counts = _counts(inputs)
+    if chosen.empty:
+        return counts + paragraph(
+            "No movie: no P(contact) is one half away from the fraction of people who say yes, "
+            "where the simulated outcome is the official one."
+        )
+    stimuli = inputs.comparison.stimuli
+    cards = []
+    for _, row in chosen.iterrows():
+        rows = stimuli[stimuli["stimulus"] == row["stimulus"]]
+        movie = movies.show(row["stimulus"], describe(rows))
+        cards.append(card(rows, movie, links, named=row["agent"]))
+    words = (
+        "The stimuli whose P(contact) is farthest from the fraction of people who say yes, at "
+        "least by one half; the models, in bold, take turns. Only stimuli whose simulated outcome "
+        "is the official one." + _silent(inputs)
+    )
+    return f"{counts}{paragraph(words)}{_grid(cards)}"
+
+
+def _silent(inputs: ReportInputs) -> str:
+    """Return which models add no stimulus, and why."""
+    speaking = set(opinions(inputs.comparison)["model"])
+    models = dict.fromkeys(inputs.comparison.stimuli["model"])
+    silent = [str(name) for name in models if name not in speaking]
+    if not silent:
+        return ""
+    return (
+        f" No turn for {listed(silent)}: shown the outcome, or of one P(contact) for all stimuli "
+        "of a scenario."
+    )
+
+
+def _counts(inputs: ReportInputs) -> str:
+    rows = who_was_right(inputs.comparison)
+    heads = {
+        "stimuli": "stimuli",
+        "both": "both right",
+        "people": "only people right",
+        "model": "only the model right",
+        "neither": "both wrong",
+    }
+    if rows["divided"].any():
+        heads["divided"] = "people divided"
+    cells = [
+        [escape(str(row["agent"])), *(str(row[key]) for key in heads)] for _, row in rows.iterrows()
+    ]
+    return table(["model", *heads.values()], cells, "The majority of people and each model")
+
+
+def _grid(cards: list[str]) -> str:
+    return f'<div class="cards">{"".join(cards)}</div>'
+
+
+# A page for each stimulus, and the list of them; written on demand next to the report.
+
+FOLDER = "trials"
+"""Name of the folder that holds one page for each stimulus; it lies next to ``report.html``."""
+
+
+def page_name(stimulus: str) -> str:
+    """Return the file name of a stimulus' page; characters that are unsafe in names are replaced.
+
+    A hash of the name keeps two stimuli apart that would be called alike.
+    """
+    safe = re.sub(r"[^A-Za-z0-9_-]+", "-", stimulus)[:100]
+    if safe == stimulus and stimulus != "index":
+        return f"{stimulus}.html"
+    return f"{safe}-{hashlib.sha256(stimulus.encode()).hexdigest()[:12]}.html"
+
+
+def trial_pages(inputs: ReportInputs) -> Iterator[tuple[str, str]]:
+    """Yield file name and text of every page: one for each stimulus, then the list.
+
+    Each page contains its movie and needs no other file. Raises `BadInputError` for a movie that
+    cannot be read.
+    """
+    groups = dict(list(inputs.comparison.stimuli.groupby("stimulus", sort=False)))
+    names = _ordered(inputs)
+    for position, stimulus in enumerate(names):
+        before = names[position - 1] if position else None
+        after = names[position + 1] if position + 1 < len(names) else None
+        page = _page(inputs, groups[stimulus], before, after)
+        yield page_name(stimulus), protocol_names(page)
+    yield "index.html", protocol_names(_index(inputs, [groups[name] for name in names]))
+
+
+def _ordered(inputs: ReportInputs) -> list[str]:
+    """Return the stimuli by scenario, then by name."""
+    rows = inputs.comparison.stimuli.drop_duplicates("stimulus")
+    return [
+        str(name)
+        for scenario in in_order(rows["scenario"])
+        for name in sorted(rows.loc[rows["scenario"] == scenario, "stimulus"])
+    ]
+
+
+def _page(inputs: ReportInputs, rows: pd.DataFrame, before: str | None, after: str | None) -> str:
+    first = rows.iloc[0]
+    movies = PageMovies(inputs.movies, inputs.page_bytes)
+    movie = movies.show(first["stimulus"], describe(rows))
+    links = [("the report", "../report.html"), ("all stimuli", "index.html")]
+    links += [("previous", page_name(before))] if before is not None else []
+    links += [("next", page_name(after))] if after is not None else []
+    ways = " · ".join(f'<a href="{escape(to)}">{words}</a>' for words, to in links)
+    body = (
+        f"{paragraph(_facts(first))}"
+        f'<div class="trial">{movie}<div><p>{escape(inputs.question)} {outcome(first)}</p>'
+        f"{answers(rows)}</div></div>"
+        f'<p class="note">{escape(KEY)}</p>{_answers(rows)}'
+    )
+    lead = f'<p class="ways">{ways}</p>{body}'
+    return render_document(first["stimulus"], lead, [], inputs.mark)
+
+
+def _facts(first: pd.Series) -> str:
+    """Return scenario, outcomes and people's answers as one sentence."""
+    words = {True: "contact", False: "no contact"}
+    official, simulated = words[bool(first["label"])], words[bool(first["simulated"])]
+    outcomes = f"official outcome {official}, simulated {simulated}"
+    if pd.isna(first["p_yes"]):
+        return f"Scenario {first['scenario']}; {outcomes}."
+    return (
+        f"Scenario {first['scenario']}; {outcomes}; {first['count']:.0f} people, of whom "
+        f"{percent(first['p_yes'])} say yes and {percent(first['human_accuracy'])} are right."
+    )
+
+
+def _answers(rows: pd.DataFrame) -> str:
+    """Return the table of the models' answers."""
+    people = rows["p_yes"].notna().all()
+    cells = []
+    for _, row in rows.iterrows():
+        line = [escape(str(row["model"])), escape(str(row["readout"])), number(row["p_contact"], 3)]
+        line.append("contact" if row["predicted"] else "no contact")
+        line.append("yes" if bool(row["predicted"]) == bool(row["label"]) else "no")
+        cells.append([*line, number(row["gap"])] if people else line)
+    header = ["model", "readout", "P(contact)", "answer", "right"]
+    return table([*header, "P less people"] if people else header, cells)
+
+
+def _index(inputs: ReportInputs, groups: list[pd.DataFrame]) -> str:
+    people = inputs.comparison.has_people
+    cells = []
+    for rows in groups:
+        first = rows.iloc[0]
+        right = (rows["predicted"].astype(bool) == rows["label"].astype(bool)).sum()
+        name = str(first["stimulus"])
+        line = [f'<a href="{escape(page_name(name))}"><code>{escape(name)}</code></a>']
+        line += [escape(str(first["scenario"])), outcome(first)]
+        line += [percent(first["human_accuracy"])] if people else []
+        cells.append([*line, f"{right} of {len(rows)}"])
+    header = ["stimulus", "scenario", "outcome", *(["people right"] if people else [])]
+    body = table([*header, "models right"], cells)
+    lead = '<p class="ways"><a href="../report.html">the report</a></p>'
+    return render_document("Every stimulus", lead + body, [], inputs.mark)

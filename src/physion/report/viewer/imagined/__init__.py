@@ -1,1 +1,0 @@
-"""What models saw and imagined of trials, for the viewer."""
