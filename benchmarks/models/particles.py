@@ -51,7 +51,7 @@ from physion.clips.clips import observed_source, whole_source
 from physion.compute.tasks import processor
 from physion.core.names import canonical_name
 from physion.data import official
-from physion.models.interface import Fits
+from physion.models.interface import can
 from physion.models.particles.bodies import poses_of, scene_particles
 from physion.models.particles.graph import (
     ObjectState,
@@ -168,7 +168,7 @@ def trained(
     start = time.process_time()
     train_model(
         model, whole_source(dataset, model.spec), trials, name="benchmark", folder=None,
-        settings=dataclasses.replace(model.settings, steps=steps), seed=model.options.seed,
+        settings=dataclasses.replace(model.training_settings, steps=steps), seed=model.options.seed,
         accelerator="cpu",
     )  # fmt: skip
     return model, time.process_time() - start
@@ -179,7 +179,7 @@ def classified(
 ) -> tuple[float, float]:
     """Return accuracy and AUC of the state classifier, fitted on some trials, on others."""
     model = build_model("state-classifier")
-    assert isinstance(model, Fits)
+    assert can(model, "fit")
     (fit, labels), (test, contacts) = (
         (observed_source(source, model.spec).context(names), motions_of(source, names)[1])
         for source, names in ((dataset, fitted_on), (tested, trials))

@@ -201,7 +201,9 @@ def learn(folder: Path, names: list[str], steps: int, seeds: int) -> Rows:
                 model,
                 source,
                 trials,
-                settings=dataclasses.replace(model.settings, steps=steps or model.settings.steps),
+                settings=dataclasses.replace(
+                    model.training_settings, steps=steps or model.training_settings.steps
+                ),
                 seed=seed,
                 name="all",
                 folder=None,
@@ -326,7 +328,7 @@ def boxes(folder: Path, steps: int) -> Rows:
             model,
             source,
             trials,
-            settings=dataclasses.replace(model.settings, steps=steps, held_out=0.0),
+            settings=dataclasses.replace(model.training_settings, steps=steps, held_out=0.0),
             seed=0,
             name="all",
             folder=None,

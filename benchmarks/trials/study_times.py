@@ -35,7 +35,7 @@ from physion.clips.batch import LAST_OBSERVED, Batch, Motion, cut_to_observed
 from physion.clips.clips import observed_source, whole_source
 from physion.compute.local import SerialExecutor
 from physion.core.seeds import generator
-from physion.models.interface import ChoosesWindows, Encodes
+from physion.models.interface import can
 from physion.models.particles.rollout import roll_out
 from physion.models.particles.simulator import join_futures, observed_start
 from physion.readout.features import encode_clips, imagine_clips
@@ -185,7 +185,7 @@ def read_times(model: Any, dataset: Dataset, features: int) -> tuple[Windows, di
         stored = FeatureWindows(model.spec, trials, values, lengths, rows, model.window)
         again = CORE.least(lambda: stored.read(cycled(stored, len(trials), 0))) / len(trials)
         return stored, {"read_window": again, "read_window_new": again}
-    chooses = model if isinstance(model, ChoosesWindows) else None
+    chooses = model if can(model, "start_probabilities") else None
     for _ in range(2):  # what all sources have in common is loaded by the first
         source = whole_source(dataset, model.spec)
         windows = ClipWindows(source, trials, model.window, chooses)
@@ -218,7 +218,7 @@ def train_times(
 def evaluate_times(model: Any, dataset: Dataset, clips: int, clock: Clock) -> dict[str, Any]:
     """Return the seconds of a trial in an evaluation, and the number of features of a frame."""
     trials = dataset.trials("training")
-    if not isinstance(model, Encodes):
+    if not can(model, "encode"):
         source = whole_source(dataset, model.spec)
         read = once(source.whole, trials) / len(trials)
         motions = list(source.whole(trials).state or ())

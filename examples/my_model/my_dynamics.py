@@ -13,7 +13,7 @@ class MyDynamics(MyEncoder):
 
     diet = "features"  # trained on what `encode` gives; "clips" would be trained on pictures
     window = 3  # frames of a training clip
-    settings = TrainingSettings(steps=200, batch=16, learning_rate=1e-3)
+    training_settings = TrainingSettings(steps=200, batch=16, learning_rate=1e-3)
 
     def __init__(self, channels: int = 32) -> None:
         super().__init__(channels)

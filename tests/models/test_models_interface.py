@@ -19,7 +19,7 @@ from physion.core.errors import BadInputError, MissingExtraError, UnknownNameErr
 from physion.core.registry import Registry
 from physion.models import Batch, Provenance, Spec, build_model, models
 from physion.models.build import ModelFactory
-from physion.models.interface import Encodes, Fits, Imagines, Learns, Model, Predicts
+from physion.models.interface import Model, can
 from physion.readout.predictor import ways
 from support.tiny_models import FROZEN, TINY, tiny
 
@@ -118,11 +118,11 @@ def test_every_model_keeps_to_the_interface(name: str) -> None:
     assert provenance.init in {"random", "none"}
     assert provenance.model and provenance.versions
     json.dumps(model.spec.context_frames())
-    assert any(isinstance(model, what) for what in (Encodes, Imagines, Predicts, Fits))
+    assert any(can(model, what) for what in ("encode", "imagine", "predict", "fit"))
     assert ways(model)
     digest = model.digest()
     assert len(digest) == 64 and int(digest, 16) >= 0 and tiny(name).digest() == digest
-    if isinstance(model, Learns):
+    if can(model, "loss"):
         assert isinstance(model, nn.Module) and model.window >= 1
 
 

@@ -119,7 +119,7 @@ class Model:
 ENCODES = "    def encode(self, batch):\n        clips, steps = batch.rgb.shape[:2]\n        "
 PREDICTS = '    answers = "observed"\n    def predict(self, batch):\n        '
 IMAGINES = (
-    '    reader = "gap"\n    samples, seed, knobs = 2, 0, {}\n'
+    '    decision = "gap"\n    samples, seed, knobs = 2, 0, {}\n'
     "    def imagine(self, context, samples, seed, **knobs):\n"
     "        clips = len(context)\n        "
 )

@@ -83,8 +83,8 @@ def test_a_pickled_particle_model_is_the_same(name: str, weights: str) -> None:
     model: Any = build_model(name, weights=weights, seed=3, samples=2)
     again = pickle.loads(pickle.dumps(model))
     assert again.digest() == model.digest() and again.provenance() == model.provenance()
-    assert (again.trained, again.samples, again.reader) == (
-        model.trained, model.samples, model.reader,
+    assert (again.trained, again.samples, again.decision) == (
+        model.trained, model.samples, model.decision,
     )  # fmt: skip
 
 

@@ -96,7 +96,7 @@ class NextBrightness(TorchModel):
         super().__init__()
         self.diet: Diet = diet
         self.spec = replace(SPEC, inputs=("state",)) if diet == "states" else SPEC
-        self.window, self.settings = 4, settings
+        self.window, self.training_settings = 4, settings
         inputs = {"clips": 3, "features": 6, "states": 3}[diet]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)

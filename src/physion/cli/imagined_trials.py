@@ -15,7 +15,7 @@ from physion.clips.source import WholeSource
 from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError
 from physion.models.build import OutOfMemoryError, build_model
-from physion.models.interface import Encodes, HasReader, Imagines, Learns, Model, Trained
+from physion.models.interface import Model, ask, can
 from physion.readout.decisions import fraction_of_futures
 from physion.readout.features import Outcomes
 from physion.readout.model_calls import call_model, check_identity, is_network, model_name, to_array
@@ -65,7 +65,7 @@ def imagine_with(
     models = [build_model(name, **options) for name in names]
     for model in models:
         check_identity(model)
-        if not isinstance(model, Imagines):
+        if not can(model, "imagine"):
             raise BadInputError(
                 f"model {model_name(model)!r} imagines no future (it has no method imagine), so "
                 "that no prediction can be shown; choose a model that does, such as dpi"
@@ -87,7 +87,7 @@ def imagine_with(
 def describe_weights(model: Model) -> str:
     """Return where the weights of a model come from, or that they are untrained."""
     init = model.provenance().init
-    if isinstance(model, Learns) and not (isinstance(model, Trained) and model.trained):
+    if can(model, "loss") and not ask(model, "trained"):
         return f"untrained, weights {init}"
     return "no weights" if init == "none" else f"weights {init}"
 
@@ -125,7 +125,7 @@ def _without_movies(dataset: Dataset, trials: Sequence[str]) -> bool:
 def _imagine_group(model: Model, source: WholeSource, trials: Sequence[str]) -> list[ImaginedTrial]:
     """Return what a model imagines of each trial; the first future is shown."""
     batch = _context(model, source.context(trials))
-    samples, seed = (model.samples, model.seed) if isinstance(model, HasReader) else (1, 0)
+    samples, seed = ask(model, "samples"), ask(model, "seed") or 0
     rollout = call_model(model, "imagine", batch, samples, seed, show=1.0)
     if not isinstance(rollout, Rollout):
         raise BadInputError(
@@ -160,7 +160,7 @@ def _row(arrays: Mapping[str, Arrays], row: int) -> dict[str, Arrays]:
 
 def _context(model: Model, batch: Batch) -> Batch:
     """Return the context of trials, with its features if the model also encodes."""
-    if not isinstance(model, Encodes):
+    if not can(model, "encode"):
         return batch
     return dataclasses.replace(batch, features=_encoded(model, batch))
 
@@ -226,7 +226,7 @@ def _true_arrays(
         return {}
     whole = source.whole(trials)
     true = {} if whole.rgb is None else {"rgb": whole.rgb[:, spec.context :]}
-    if "slots" in shown and isinstance(model, Encodes):
+    if "slots" in shown and can(model, "encode"):
         features = _encoded(model, whole)[:, spec.context :]
         true["slots"] = _as_slots(model, features, shown["slots"])
     return true

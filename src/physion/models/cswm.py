@@ -320,7 +320,7 @@ class Cswm(VisionModel):
             framewise=config.stacked == 1,
         )
         super().__init__(NAME, VERSION, config, config.training, options, spec)
-        self.config = config
+        self.config = self.settings = config
         self.window = config.stacked + config.memory - 1 + config.transitions
         with initial_weights("cswm", options.seed):
             self.extractor = SlotExtractor(

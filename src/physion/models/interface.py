@@ -1,8 +1,15 @@
-"""Model interface: what a model may offer, as protocols.
+"""What a model is: the base class `Model`, and the two questions that may be asked of any model.
 
-A model offers a capability by having its method; it needs no base class. The harness owns data,
-optimiser, schedule, device and disk: it gives a torch ``Module`` tensors on its device, any other
-model numpy arrays. This module does not import torch, so that simulators run without it.
+A model offers a capability by having its method. The base class documents all of them and holds
+the defaults of the optional ones; a class that is not derived from it works as well. Whoever uses
+models therefore asks with `can` and `ask`, never with ``isinstance``:
+
+- ``can(model, "encode")``: has the model this method itself?
+- ``ask(model, "samples")``: its attribute or method, or the default of the base class.
+
+The harness owns data, optimiser, schedule, device and disk: it gives a torch ``Module`` tensors on
+its device, any other model numpy arrays. This module does not import torch, so that simulators run
+without it.
 """
 
 from __future__ import annotations
@@ -10,7 +17,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,27 +96,61 @@ class TrainingSettings:
 Diet = Literal["clips", "features", "states"]
 
 
-@runtime_checkable
-class Model(Protocol):
-    """What every model has."""
+class Model:
+    """Base class of models; each defines ``spec``, `provenance`, `digest` and some of five methods.
 
-    @property
-    def spec(self) -> Spec:
-        """What the model asks for."""
-        ...
+    The five are `encode` (features of clips), `imagine` (futures), `predict` (P(contact)), `fit`
+    (a predictor, fitted on labelled trials) and `loss` (training without labels, of a torch
+    ``Module``). All other attributes and methods are optional.
+
+    Attributes
+    ----------
+    spec
+        What the model asks for.
+    settings
+        All that a user can set, a dataclass; None for a model without options.
+    samples, seed
+        Futures of a trial, and the seed of their random numbers; None: that of the evaluation.
+    knobs
+        Values among which the decision chooses, by the name of an argument of `imagine`, such as a
+        level of noise.
+    answers
+        Protocol under which `predict` or `fit` answers: ``observed``, ``observed+simulated``, or
+        ``full`` for a model that is shown the outcome.
+    trained
+        Whether the weights are pretrained, so that training is skipped.
+    diet
+        What a model with a `loss` is trained on: ``clips`` (what `Spec` asks for), ``features`` (of
+        its own `encode`), or ``states`` (whole motions).
+    window
+        Frames of a training clip, at ``spec.stride``, from a random start; 0: as `Spec` asks for.
+    training_settings
+        Optimiser and schedule of its training.
+    calibration_trials
+        Largest number of training trials that `calibrate` is given.
+    """
+
+    spec: Spec
+    settings: Any = None
+    samples: int = 1
+    seed: int | None = None
+    knobs: Mapping[str, tuple[float, ...]] = MappingProxyType({})
+    answers: str = ""
+    trained: bool = False
+    diet: Diet = "clips"
+    window: int = 0
+    training_settings: TrainingSettings = TrainingSettings()
+    calibration_trials: int = 0
 
     def provenance(self) -> Provenance:
         """Return name, weights and versions for the table of predictions."""
-        ...
+        raise NotImplementedError
 
     def digest(self) -> str:
         """Return the hexadecimal SHA-256 of code version, settings and weights as they are now."""
-        ...
+        raise NotImplementedError
 
-
-@runtime_checkable
-class Encodes(Protocol):
-    """Model that computes features of clips."""
+    # The capabilities: a model has at least one of them.
 
     def encode(self, batch: Batch) -> Any:
         """Return features (B, T', D), float32, of the frames of ``batch``.
@@ -116,167 +158,103 @@ class Encodes(Protocol):
         T' is T, or less for a model that combines frames. With ``spec.framewise`` it is T, and any
         number of frames may be given.
         """
-        ...
-
-
-@runtime_checkable
-class EncodesApart(Encodes, Protocol):
-    """Model whose features do not depend on all of its weights, such as those of its dynamics."""
-
-    def encoder_digest(self) -> str:
-        """Return the hexadecimal SHA-256 of all that determines the features of `encode`."""
-        ...
-
-
-@runtime_checkable
-class Imagines(Protocol):
-    """Model that imagines the future of a clip.
-
-    If the model also encodes, ``context.features`` holds the features of the context.
-    """
+        raise NotImplementedError
 
     def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
         """Return ``samples`` futures of every clip.
 
-        ``seed`` and the names of the trials determine all random numbers. ``knobs`` are the
-        settings that a reader fits, such as a level of noise.
+        ``seed`` and the names of the trials determine all random numbers. ``knobs`` are values that
+        a decision fits. If the model encodes, ``context.features`` holds the features of the
+        context.
         """
-        ...
+        raise NotImplementedError
 
+    def predict(self, batch: Batch) -> Any:
+        """Return P(agent touches patient) (B,) in 0..1 from the context of every clip."""
+        raise NotImplementedError
 
-@runtime_checkable
-class Learns(Protocol):
-    """Model that is trained without labels; also a torch ``Module``.
+    def fit(self, batch: Batch, labels: NDArray[np.bool_], seed: int) -> Any:
+        """Return an object with `predict`, fitted on clips and their outcomes (B,).
 
-    - ``diet``: what it is trained on: ``clips`` (what `Spec` asks for), ``features`` (of its own
-      `Encodes.encode`), or ``states`` (whole motions).
-    - ``window``: frames of a training clip, at ``spec.stride``, from a random start.
-    - ``settings``: optimiser and schedule.
-    """
+        It takes the place of a decision; the model stays as it is.
+        """
+        raise NotImplementedError
 
-    diet: Diet
-    window: int
-    settings: TrainingSettings
+    def loss(self, batch: Batch) -> Mapping[str, Tensor]:
+        """Return the scalar ``loss`` of a batch, and parts of it to be logged."""
+        raise NotImplementedError
+
+    # What else a model may say.
+
+    @property
+    def decision(self) -> str:
+        """Name in `physion.readout.decisions` of what turns features or rollouts into P(contact).
+
+        Empty: ``logistic`` for a model that encodes, ``gap`` for others.
+        """
+        return ""
+
+    @property
+    def trials_together(self) -> int:
+        """Trials that a process imagines at a time, of a network that is sent to all processes.
+
+        0: the main process imagines all, as on a GPU. Models that are no networks always imagine
+        in all processes.
+        """
+        return 0
 
     def prepare(self, sample: Batch) -> None:
         """Set statistics, such as the mean of the features, from a sample of training clips.
 
         They must be weights or buffers: a model that is loaded or resumed is not prepared again.
         """
-        ...
-
-    def loss(self, batch: Batch) -> Mapping[str, Tensor]:
-        """Return the scalar ``loss`` of a batch, and parts of it to be logged."""
-        ...
-
-
-@runtime_checkable
-class ChoosesWindows(Protocol):
-    """Model that is trained on states, and on some windows of a trial more often than on others."""
-
-    def start_probabilities(self, motion: Motion) -> NDArray[np.float64]:
-        """Return how often a window starts at each frame from 0 on; the sum is 1.
-
-        A window that starts at the last of them ends within the trial, if it is long enough.
-        """
-        ...
-
-
-@runtime_checkable
-class HasBaseline(Protocol):
-    """Model that can say how well a predictor that has learnt nothing does."""
 
     def baseline(self, batch: Batch) -> Tensor:
-        """Return the scalar loss of the trivial predictor, in the unit of `Learns.loss`."""
-        ...
-
-
-@runtime_checkable
-class Calibrates(Protocol):
-    """Model that sets some of its buffers after training, such as a threshold on its rollouts.
-
-    ``calibration_trials``: largest number of training trials that it is given.
-    """
-
-    calibration_trials: int
+        """Return the scalar loss of a trivial predictor, in the unit of `loss`."""
+        raise NotImplementedError
 
     def calibrate(self, whole: Batch) -> None:
-        """Set buffers from whole training trials; they are stored with the weights."""
-        ...
+        """Set buffers, such as a threshold on rollouts, from whole training trials.
+
+        It is called after the training; the buffers are stored with the weights.
+        """
+
+    def start_probabilities(self, motion: Motion) -> NDArray[np.float64]:
+        """Return how often a training window starts at each frame from 0 on; the sum is 1.
+
+        A window that starts at the last of them ends within the trial, if it is long enough.
+        Without this method all windows are equally frequent.
+        """
+        raise NotImplementedError
+
+    def encoder_digest(self) -> str:
+        """Return the hexadecimal SHA-256 of all that determines the features of `encode`.
+
+        It differs from `digest` where some weights, such as those of dynamics, do not matter.
+        """
+        return self.digest()
+
+    def built_as(self) -> dict[str, Any]:
+        """Return JSON values that weights belong to, such as name and version of the model.
+
+        They are stored with the weights of a training and compared when these are loaded.
+        """
+        return {}
+
+    def with_outcomes(self, outcomes: Mapping[str, bool]) -> Any:
+        """Return the model with the outcomes of all trials by name; only baselines look at them."""
+        return self
 
 
-@runtime_checkable
-class Trained(Protocol):
-    """Model that may come with weights that were trained before.
-
-    ``trained``: they were, and the harness does not train it again before it predicts.
-    """
-
-    trained: bool
+def can(model: object, method: str) -> bool:
+    """Return whether a model has a method itself, not only the default of `Model`."""
+    found = getattr(model, method, None)
+    return callable(found) and getattr(found, "__func__", found) is not getattr(Model, method)
 
 
-@runtime_checkable
-class Predicts(Protocol):
-    """Model that gives P(contact) itself, without a readout.
-
-    ``answers``: protocol under which it answers: ``observed``, ``observed+simulated``, or ``full``
-    for a model that is shown the outcome.
-    """
-
-    answers: str
-
-    def predict(self, batch: Batch) -> Any:
-        """Return P(agent touches patient) (B,) in 0..1 from the context of every clip."""
-        ...
-
-
-@runtime_checkable
-class Fits(Protocol):
-    """Model that is fitted on the readout trials of a scenario, in place of a readout."""
-
-    answers: str
-
-    def fit(self, batch: Batch, labels: NDArray[np.bool_], seed: int) -> Predicts:
-        """Return a predictor fitted on clips and their outcomes (B,); the model stays as it is."""
-        ...
-
-
-@runtime_checkable
-class SeesOutcomes(Protocol):
-    """Model that is given the outcomes, to compare others with; it answers under *full*."""
-
-    def with_outcomes(self, outcomes: Mapping[str, bool]) -> Model:
-        """Return the model with the outcomes of all trials by name."""
-        ...
-
-
-@runtime_checkable
-class HasReader(Protocol):
-    """Model that names the reader which turns its rollouts or features into P(contact).
-
-    - ``reader``: name in `physion.readout.decisions.readers`.
-    - ``samples``: futures of a trial, and ``seed`` of their random numbers.
-    - ``knobs``: values that the reader chooses from, by name.
-    """
-
-    reader: str
-    samples: int
-    seed: int
-    knobs: Mapping[str, tuple[float, ...]]
-
-
-@runtime_checkable
-class ImaginesInProcesses(Protocol):
-    """Network whose outcomes are imagined by all processes, to each of which it is pickled.
-
-    - ``trials_together``: trials that a process imagines at a time; 0 if all are to be imagined by
-      the main process, as on a GPU.
-    """
-
-    @property
-    def trials_together(self) -> int: ...
-
-
-def features_digest(model: Model) -> str:
-    """Return the digest under which the features of a model are stored."""
-    return model.encoder_digest() if isinstance(model, EncodesApart) else model.digest()
+def ask(model: object, name: str) -> Any:
+    """Return an optional attribute or method of a model, or the default that `Model` has."""
+    if hasattr(model, name):
+        return getattr(model, name)
+    default = getattr(Model, name)
+    return default.__get__(model) if hasattr(default, "__get__") else default

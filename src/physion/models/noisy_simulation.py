@@ -26,6 +26,7 @@ from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.seeds import stable_hash
 from physion.core.version import __version__
 from physion.models.build import make_config
+from physion.models.interface import Model
 from physion.models.state_noise import NoiseLevels, ObservedTrial, simulate_contacts
 from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine
 from physion.physics.labels import label_contact
@@ -128,16 +129,16 @@ def cut_trial(scene: Scene, trajectory: Trajectory) -> ObservedTrial:
     )
 
 
-class NoisySimulation:
+class NoisySimulation(Model):
     """Model that simulates the rest of a trial several times with noise; see the module.
 
     ``engine`` is an engine object for use in this process; by default the one named in the config.
     """
 
-    reader = "noise"
+    decision = "noise"
 
     def __init__(self, config: NoisySimulationConfig, engine: Engine | None = None) -> None:
-        self.config = config
+        self.config = self.settings = config
         self.spec = Spec(inputs=("state",), anchor="end", stride=1, context=1, future=0)
         self.samples, self.seed = config.samples, config.seed
         self.knobs = {"scale": config.scales}

@@ -525,7 +525,7 @@ class SlotInference(nn.Module):
 
     def __init__(self, config: Op3Config) -> None:
         super().__init__()
-        self.config = config
+        self.config = self.settings = config
         self.decoder = SlotDecoder(config)
         self.refinement = Refinement(config)
         self.dynamics = SlotDynamics(config)
@@ -633,7 +633,7 @@ class Op3(PictureModel):
 
     def __init__(self, config: Op3Config, options: Op3Options) -> None:
         super().__init__(NAME, VERSION, config, options, samples=options.samples, framewise=False)
-        self.config = config
+        self.config = self.settings = config
         if options.slots:
             self.name += f"-{options.slots}-slots"
         with initial_weights("op3", options.seed):

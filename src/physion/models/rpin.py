@@ -436,7 +436,7 @@ class Rpin(VisionModel):
             framewise=False,
         )
         super().__init__(NAME, VERSION, config, config.training, options, spec)
-        self.config = config
+        self.config = self.settings = config
         self.window = config.history + config.rollout
         with initial_weights("rpin", options.seed):
             self.backbone = Backbone(config.width, config.depth, config.groups)

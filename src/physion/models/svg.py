@@ -345,7 +345,7 @@ class Svg(PictureModel):
 
     def __init__(self, config: SvgConfig, options: SvgOptions) -> None:
         super().__init__(NAME, VERSION, config, options, samples=options.samples, framewise=True)
-        self.config = config
+        self.config = self.settings = config
         if options.backbone:
             self.name += f"-{options.backbone}"
         if options.image_size:

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from physion.clips.batch import Provenance, Spec
 from physion.core.seeds import stable_hash
 from physion.models.build import FileLoader
+from physion.models.interface import Model
 
 _KNOWN_PACKAGES = {"abc", "builtins", "physion", "torch", "typing"}
 """Packages whose versions, not sources, belong to the digest of a model."""
@@ -26,7 +27,7 @@ _sources: dict[type, str] = {}
 """What `source_of` has read, by class."""
 
 
-class TorchModel(nn.Module):
+class TorchModel(nn.Module, Model):
     """Torch ``Module`` with `provenance` and `digest`; subclasses set ``spec``.
 
     ``init`` says where the weights come from; it stands in every row of the predictions.

@@ -61,7 +61,7 @@ class VisionModel(TorchModel):
     """
 
     diet: Diet = "clips"
-    reader = "logistic"
+    decision = "logistic"
     samples, seed = 1, 0
 
     def __init__(
@@ -76,7 +76,7 @@ class VisionModel(TorchModel):
         super().__init__()
         self.name = f"{name}-{options.size}"
         self.version, self.options, self.spec = version, options, spec
-        self.settings = training
+        self.training_settings = training
         self.trained = False
         self.knobs: Mapping[str, tuple[float, ...]] = {}
         self._config = {k: v for k, v in dataclasses.asdict(config).items() if k != "training"}

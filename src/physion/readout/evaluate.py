@@ -17,7 +17,7 @@ from physion.core.errors import BadInputError
 from physion.core.files import is_whole
 from physion.core.version import __version__
 from physion.models.build import build_model
-from physion.models.interface import Learns, Model
+from physion.models.interface import Model, ask, can
 from physion.readout.folds import Fold, plan_folds, select_scenario
 from physion.readout.model_calls import check_identity
 from physion.readout.predictor import Predictor, choose_readouts
@@ -216,10 +216,11 @@ def _digest(
     columns += ["observed_movie_sha256", "recorded_contact", "observed_contact"]
     settings = dataclasses.asdict(config)
     settings["readouts"] = [readout.value for readout in readouts]
-    model_config = getattr(model, "config", None)
-    options = dataclasses.asdict(model_config) if dataclasses.is_dataclass(model_config) else {}  # type: ignore[arg-type]
-    if isinstance(model, Learns):
-        options["training settings"] = dataclasses.asdict(config.apply(model.settings))
+    options = dataclasses.asdict(chosen) if (chosen := ask(model, "settings")) else {}
+    if can(model, "loss"):
+        options["training settings"] = dataclasses.asdict(
+            config.apply(ask(model, "training_settings"))
+        )
     parts = [_VERSION, __version__, settings, dataclasses.asdict(model.provenance())]
     sha = hashlib.sha256(json.dumps([*parts, options], sort_keys=True, default=str).encode())
     sha.update(model.digest().encode())

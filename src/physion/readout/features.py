@@ -29,7 +29,7 @@ from physion.compute.tasks import Executor, Progress, tracked
 from physion.core.errors import BadInputError, PhysionError
 from physion.core.files import write_atomic
 from physion.models.build import LoadedFiles, OutOfMemoryError
-from physion.models.interface import Model, features_digest
+from physion.models.interface import Model, ask
 from physion.readout.model_calls import (
     MEMORY_ADVICE,
     call_model,
@@ -464,7 +464,7 @@ class RolloutStore:
         Where outcomes are kept; None keeps nothing.
     executor
         Runs the model, some trials and one value of the knobs a task. A network that is not
-        `ImaginesInProcesses` uses `FeatureStore.imagined` instead.
+        with ``trials_together`` uses `FeatureStore.imagined` instead.
     """
 
     def __init__(self, folder: Path | None, executor: Executor) -> None:
@@ -708,7 +708,7 @@ class FeatureStore:
         Parameters
         ----------
         model
-            Model that encodes; see `physion.models.interface.Encodes`.
+            Model that encodes; see `physion.models.interface.Model`.
         source
             Source of the clips. Parts other than ``context`` need a `WholeSource`.
         trials
@@ -734,7 +734,9 @@ class FeatureStore:
             batch = _feature_store_read(read, group)
             return encode_clips(model, batch)
 
-        work = _Work("features", lambda: features_digest(model), compute, model_name(model), part)
+        work = _Work(
+            "features", lambda: ask(model, "encoder_digest")(), compute, model_name(model), part
+        )
         rows = self._rows(work, source, trials, progress)
         return StoredFeatures(trials, [rows[trial] for trial in trials])
 
@@ -755,7 +757,7 @@ class FeatureStore:
         Parameters
         ----------
         model
-            Model that imagines; see `physion.models.interface.Imagines`.
+            Model that imagines; see `physion.models.interface.Model`.
         source
             Source of the context.
         context

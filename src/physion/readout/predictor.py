@@ -19,18 +19,7 @@ from physion.clips.source import ObservedSource, WholeSource
 from physion.compute.local import SerialExecutor
 from physion.compute.tasks import Executor, Progress
 from physion.core.errors import BadInputError
-from physion.models.interface import (
-    Encodes,
-    Fits,
-    HasReader,
-    Imagines,
-    ImaginesInProcesses,
-    Learns,
-    Model,
-    Predicts,
-    SeesOutcomes,
-    Trained,
-)
+from physion.models.interface import Model, ask, can
 from physion.readout.decisions import FeatureReader, Reading, RolloutReader, readers
 from physion.readout.features import (
     FeatureStore,
@@ -64,21 +53,19 @@ def reader_name(model: Model, wanted: str = "") -> str:
     """Return the name of the reader: ``wanted``, the model's own, or the one that fits it."""
     if wanted:
         return wanted
-    if isinstance(model, HasReader):
-        return model.reader
-    return "logistic" if isinstance(model, Encodes) else "gap"
+    return ask(model, "decision") or ("logistic" if can(model, "encode") else "gap")
 
 
 def build_reader(model: Model, wanted: str, config: ReadoutConfig) -> FeatureReader | RolloutReader:
     """Return the reader of a model; raise `BadInputError` if it does not fit the model."""
     name = reader_name(model, wanted)
     reader = readers.get(name)(config)
-    if reader.input == "features" and not isinstance(model, Encodes):
+    if reader.input == "features" and not can(model, "encode"):
         raise BadInputError(
             f"reader {name!r} reads features, but model {model.provenance().model} has no "
             "method encode; use the reader gap or noise"
         )
-    if reader.input == "rollouts" and not isinstance(model, Imagines):
+    if reader.input == "rollouts" and not can(model, "imagine"):
         raise BadInputError(
             f"reader {name!r} reads rollouts, but model {model.provenance().model} has no "
             "method imagine; use the reader logistic"
@@ -92,15 +79,15 @@ def ways(model: Model, reader: str = "") -> dict[Readout, Way]:
     Raises `BadInputError` for a model without any.
     """
     found: dict[Readout, Way] = {}
-    if isinstance(model, Encodes):
+    if can(model, "encode"):
         found[Readout.OBSERVED] = Way.FEATURES
         if model.spec.future:
             found[Readout.FULL] = Way.FEATURES
-    if isinstance(model, Imagines):
+    if can(model, "imagine"):
         by_features = readers.get(reader_name(model, reader))(ReadoutConfig()).input == "features"
         found[Readout.OBSERVED_SIMULATED] = Way.FEATURES if by_features else Way.ROLLOUTS
-    if isinstance(model, Predicts | Fits):
-        found[Readout.named(model.answers)] = Way.ANSWERS
+    if can(model, "predict") or can(model, "fit"):
+        found[Readout.named(ask(model, "answers"))] = Way.ANSWERS
     if not found:
         raise BadInputError(
             f"{_name(model)} has none of the methods encode, imagine, predict and fit, so that it "
@@ -178,8 +165,7 @@ class Predictor:
             from physion.training.devices import Devices, make_fabric, move_to_device
 
             move_to_device(make_fabric(Devices(self.config.accelerator), "32-true"), self.model)
-        if isinstance(self.model, SeesOutcomes):
-            self.model = self.model.with_outcomes(self._outcomes)
+        self.model = ask(self.model, "with_outcomes")(self._outcomes)
 
     def predict(self, fold: Fold) -> list[ScenarioPredictions]:
         """Return the predictions of a fold, one entry per scenario and protocol."""
@@ -214,11 +200,11 @@ class Predictor:
     def _train(self, fold: Fold) -> TrainingLosses | None:
         """Train the model from its initial weights on the training trials of a fold."""
         model = self.model
-        if self.config.untrained or not (is_network(model) and isinstance(model, Learns)):
+        if self.config.untrained or not (is_network(model) and can(model, "loss")):
             return None
-        if isinstance(model, Trained) and model.trained:
+        if ask(model, "trained"):
             return None
-        if model.diet == "features" and Readout.OBSERVED_SIMULATED not in self.ways:
+        if ask(model, "diet") == "features" and Readout.OBSERVED_SIMULATED not in self.ways:
             return None
         from physion.training.train import train_model
 
@@ -231,7 +217,7 @@ class Predictor:
             model,
             self._whole,
             fold.train,
-            settings=self.config.apply(model.settings),
+            settings=self.config.apply(ask(model, "training_settings")),
             seed=self.config.seed,
             name=fold.training.name,
             folder=self._sub("training"),
@@ -260,7 +246,7 @@ class Predictor:
             reading, fit, test, labels = self._read_features(split, readout)
         else:
             reading, fit, test, labels = self._read_rollouts(split)
-        fits = way is not Way.ANSWERS or isinstance(self.model, Fits)
+        fits = way is not Way.ANSWERS or can(self.model, "fit")
         return ScenarioPredictions(
             scenario=split.scenario,
             protocol=readout,
@@ -282,7 +268,7 @@ class Predictor:
         )
 
     def _note(self, note: str) -> str:
-        untrained = self.config.untrained and isinstance(self.model, Learns)
+        untrained = self.config.untrained and can(self.model, "loss")
         return "; ".join(part for part in ("untrained" if untrained else "", note) if part)
 
     def _describe(self, fit: Sequence[str], labels: str) -> str:
@@ -334,16 +320,14 @@ class Predictor:
         return [context, imagined]
 
     def _rollout_settings(self) -> tuple[int, int, Mapping[str, tuple[float, ...]]]:
-        model = self.model
-        if isinstance(model, HasReader):
-            return model.samples, model.seed, model.knobs
-        return 1, self.config.seed, {}
+        samples, seed, knobs = (ask(self.model, name) for name in ("samples", "seed", "knobs"))
+        return samples, self.config.seed if seed is None else seed, knobs
 
     def _imagined_outcomes(self, trials: Sequence[str]) -> dict[Knobs, dict[str, Any]]:
         """Return contacts and gaps of the trials that could be imagined, at all knobs."""
         samples, seed, knobs = self._rollout_settings()
         model = self.model
-        shared = model.trials_together if isinstance(model, ImaginesInProcesses) else 0
+        shared = ask(model, "trials_together")
         if shared or not is_network(model):
             return self._rollouts.outcomes(
                 model,
@@ -398,7 +382,7 @@ class Predictor:
         read = source.whole if readout.sees_future else source.context
         asked: Any = self.model
         accuracy = _UNKNOWN
-        if isinstance(self.model, Fits):
+        if can(self.model, "fit"):
             fit_batch = read(split.fit)
             labels = self._labels(split.fit, "recorded")
             asked = call_model(self.model, "fit", fit_batch, labels, self.config.seed)

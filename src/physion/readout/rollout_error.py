@@ -19,7 +19,7 @@ from physion.clips.batch import LAST_OBSERVED, Motion, Spec
 from physion.clips.clips import observed_source, whole_source
 from physion.compute.tasks import Progress
 from physion.core.errors import BadInputError
-from physion.models.interface import HasReader, Model
+from physion.models.interface import Model, ask
 from physion.models.particles.bodies import Poses, SceneParticles, poses_of
 from physion.readout.model_calls import model_name
 from physion.scenes.scene import Scene
@@ -103,7 +103,7 @@ def rollout_error(
         no motion, as those imported from a movie.
     """
     moves = check_moves_objects(model)
-    seed = model.seed if isinstance(model, HasReader) else 0
+    seed = ask(model, "seed") or 0
     observed, whole = observed_source(dataset, model.spec), whole_source(dataset, model.spec)
     scenarios = dict(zip(dataset.index["trial"], dataset.index["scenario"], strict=True))
     parts = []

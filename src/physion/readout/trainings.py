@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from physion.compute.tasks import Progress
 from physion.core.errors import BadInputError, MissingExtraError
 from physion.models.build import build_model
-from physion.models.interface import Model
+from physion.models.interface import Model, ask
 from physion.readout.folds import READOUT, TESTING, TRAINING, plan_folds, select_scenario
 from physion.training.loop import TrainingOverrides
 from physion.training.protocols import Training, training_sets
@@ -83,7 +83,7 @@ class Trainer:
     dataset
         Trials.
     model
-        `Learns` and a torch ``Module``.
+        A torch ``Module`` with a loss.
     folder
         Output folder of `evaluate`; None keeps nothing.
     overrides
@@ -117,7 +117,7 @@ class Trainer:
         except ModuleNotFoundError as error:
             raise MissingExtraError("training", "models") from error
         check_trainable(model)
-        self.model, self.settings = model, overrides.apply(model.settings)
+        self.model, self.settings = model, overrides.apply(ask(model, "training_settings"))
         opened = open_devices if open_devices is not None else shared.open_devices
         self.fabric = opened(self.settings.precision)
         self.source = whole_source(dataset, model.spec, rendered=shared.rendered)

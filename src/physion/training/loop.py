@@ -38,7 +38,7 @@ from physion.models.checkpoint import (
     versions,
     write_checkpoint,
 )
-from physion.models.interface import HasBaseline, TrainingSettings
+from physion.models.interface import TrainingSettings, ask, can
 from physion.training.windows import Request, Windows, step_request, validation_requests
 
 # Losses of a model: checked, wrapped for Fabric, and averaged over held-out clips.
@@ -82,7 +82,7 @@ def evaluating(model: nn.Module, fabric: Fabric) -> Iterator[None]:
 def call(model: Any, method: str, batch: Batch) -> Any:
     """Return what a method of a model returns; what it raises names model, method and line."""
     try:
-        return getattr(model, method)(batch)
+        return ask(model, method)(batch)
     except PhysionError:
         raise
     except Exception as error:
@@ -519,7 +519,7 @@ class TrainingLoop:
     Parameters
     ----------
     model
-        `Learns` and a torch ``Module``, already on its device.
+        A torch ``Module`` with a loss, already on its device.
     data
         Windows for training and validation.
     settings
@@ -718,7 +718,7 @@ class TrainingLoop:
         shared = (windows, requests, self._fabric, self._seed)
         with evaluating(model, self._fabric):
             values = mean_over(lambda batch: losses_of(model, batch), *shared)
-            if last and isinstance(model, HasBaseline):
+            if last and can(model, "baseline"):
                 trivial = mean_over(lambda batch: {LOSS: call(model, "baseline", batch)}, *shared)
                 state.baseline = trivial[LOSS]
         state.validation = values[LOSS]

@@ -33,13 +33,7 @@ from physion.models.checkpoint import (
     tensors_of,
     versions,
 )
-from physion.models.interface import (
-    Calibrates,
-    ChoosesWindows,
-    Learns,
-    TrainingSettings,
-    features_digest,
-)
+from physion.models.interface import TrainingSettings, ask, can
 from physion.training.devices import Devices, make_fabric, memory_advice, move_to_device
 from physion.training.loop import (
     TrainingData,
@@ -83,8 +77,7 @@ def model_card(
     provenance = {name: value for name, value in metadata["provenance"].items() if value}
     counts = Counter(trial.partition("_")[0] for trial in trials)
     scenarios = ", ".join(f"{name} {count}" for name, count in sorted(counts.items()))
-    config = getattr(model, "config", None)
-    options = dataclasses.asdict(config) if dataclasses.is_dataclass(config) else {}  # type: ignore[arg-type]
+    options = dataclasses.asdict(chosen) if (chosen := ask(model, "settings")) else {}
     losses = {
         f"training, mean of the last {settings.log_every} steps": state.loss,
         "held-out trials": state.validation,
@@ -173,7 +166,7 @@ def train_model(
     Parameters
     ----------
     model
-        `Learns` and a torch ``Module``, with its initial weights.
+        A torch ``Module`` with a loss, with its initial weights.
     source
         Source of clips with the model's ``spec``.
     trials
@@ -207,7 +200,7 @@ def train_model(
     check_trainable(model)
     if not trials:
         raise BadInputError(f"there is no trial to train {model.provenance().model!r} on")
-    settings = settings if settings is not None else model.settings
+    settings = settings if settings is not None else ask(model, "training_settings")
     fabric = fabric or make_fabric(Devices(accelerator), settings.precision)
     config = _config(model, source, trials, settings, seed)
     config_hash = hash_config(config)
@@ -228,7 +221,7 @@ def train_model(
         "config_hash": config_hash,
         "versions": versions(),
         "provenance": dataclasses.asdict(model.provenance()),
-        **({BUILT_AS: model.built_as()} if hasattr(model, BUILT_AS) else {}),
+        BUILT_AS: ask(model, "built_as")(),
     }
     with _writing(kept, fabric), memory_advice(settings):
         stored = kept.resumable() if kept is not None else None
@@ -264,7 +257,7 @@ def train_model(
 
 def check_trainable(model: Any) -> None:
     """Raise `BadInputError` if a model has nothing to train."""
-    if not (isinstance(model, nn.Module) and isinstance(model, Learns)):
+    if not (isinstance(model, nn.Module) and can(model, "loss")):
         raise BadInputError(f"model {model.provenance().model!r} has nothing to train")
 
 
@@ -278,7 +271,7 @@ def _config(
     chosen = dataclasses.asdict(settings)
     return {
         "model": model.digest(),
-        "features": features_digest(model) if model.diet == "features" else "",
+        "features": ask(model, "encoder_digest")() if ask(model, "diet") == "features" else "",
         "trials": keys.hexdigest(),
         "settings": {
             name: list(value) if isinstance(value, tuple) else value
@@ -286,8 +279,8 @@ def _config(
             if name not in _NOT_HASHED
         },
         "seed": seed,
-        "diet": model.diet,
-        "window": model.window,
+        "diet": ask(model, "diet"),
+        "window": ask(model, "window") or model.spec.total,
     }
 
 
@@ -312,11 +305,12 @@ def _windows(
     fabric: Fabric,
 ) -> TrainingData:
     rows, held = hold_out(len(trials), settings.held_out, seed)
-    if model.diet != "features":
+    window = ask(model, "window") or model.spec.total
+    if ask(model, "diet") != "features":
         chosen, rest = (tuple(trials[row] for row in part) for part in (rows, held))
-        chooses = model if isinstance(model, ChoosesWindows) else None
-        training = ClipWindows(source, chosen, model.window, chooses)
-        held_out = ClipWindows(source, rest, model.window)
+        chooses = model if can(model, "start_probabilities") else None
+        training = ClipWindows(source, chosen, window, chooses)
+        held_out = ClipWindows(source, rest, window)
         return TrainingData(training, held_out if len(held) else None)
     if features is None:
         raise BadInputError(f"model {model.provenance().model!r} is trained on features")
@@ -330,8 +324,7 @@ def _windows(
             ) from error
     frames = [source.length(trial) for trial in trials]
     first, second = (
-        FeatureWindows(model.spec, trials, values, frames, part, model.window)
-        for part in (rows, held)
+        FeatureWindows(model.spec, trials, values, frames, part, window) for part in (rows, held)
     )
     return TrainingData(first, second if len(held) else None)
 
@@ -355,11 +348,13 @@ def _prepare(model: Any, data: TrainingData, seed: int, fabric: Fabric) -> None:
 def calibrate(model: Any, source: WholeSource, trials: Sequence[str], seed: int) -> None:
     """Let a model set what depends on its trained weights from whole training trials.
 
-    Nothing happens to a model that is not `physion.models.interface.Calibrates`.
+    Nothing happens to a model without a method ``calibrate``.
     """
-    if not isinstance(model, Calibrates):
+    if not can(model, "calibrate"):
         return
-    order = generator("calibrate", seed).permutation(len(trials))[: model.calibration_trials]
+    order = generator("calibrate", seed).permutation(len(trials))[
+        : ask(model, "calibration_trials")
+    ]
     chosen = source.whole([trials[row] for row in np.sort(order)])
     torch.manual_seed(stable_hash("calibrate", seed) % 2**63)
     network: Any = model

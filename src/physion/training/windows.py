@@ -13,7 +13,7 @@ from physion.clips.batch import Batch, Spec, clip_frames
 from physion.clips.source import WholeSource
 from physion.core.errors import BadInputError
 from physion.core.seeds import generator
-from physion.models.interface import ChoosesWindows
+from physion.models.interface import Model
 
 Floats = NDArray[np.float32]
 
@@ -69,7 +69,7 @@ class ClipWindows:
     source: WholeSource
     trials: tuple[str, ...]
     length: int
-    chooses: ChoosesWindows | None = None
+    chooses: Model | None = None
     _probabilities: dict[int, NDArray[np.float64]] = field(default_factory=dict, repr=False)
 
     def starts(self, trials: Sequence[int], rng: np.random.Generator) -> NDArray[np.int64]:
@@ -90,7 +90,7 @@ class ClipWindows:
         rng = generator("sample", seed)
         return self.read(_draw(self, min(SAMPLE_CLIPS, len(self.trials)), rng, distinct=True))
 
-    def _chosen(self, model: ChoosesWindows, row: int) -> NDArray[np.float64]:
+    def _chosen(self, model: Model, row: int) -> NDArray[np.float64]:
         if row not in self._probabilities:
             (motion,) = self.source.whole([self.trials[row]]).state or ()
             self._probabilities[row] = model.start_probabilities(motion)

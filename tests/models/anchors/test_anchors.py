@@ -12,7 +12,7 @@ import pytest
 from physion.clips.batch import Batch
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.models import build_model
-from physion.models.interface import Encodes, Fits, Imagines, Model, Predicts, SeesOutcomes
+from physion.models.interface import Model, can
 from support.crossing_bodies import batch_of, crossing, replace_future, some_crossings
 
 PEOPLE = {f"crossing_1_{row:04d}": row / 60 for row in range(60)}
@@ -32,12 +32,12 @@ def fitted(name: str, fit: Batch, labels: np.ndarray) -> Any:
     """Return the anchor, fitted if it can be."""
     options = {"majority-of-people": {"humans": PEOPLE}, "state-classifier": {"trees": 20}}
     model = build_model(name, **options.get(name, {}))
-    return model.fit(fit, labels, 3) if isinstance(model, Fits) else model
+    return model.fit(fit, labels, 3) if can(model, "fit") else model
 
 
 def answers(model: Any, batch: Batch) -> np.ndarray:
     """Return what the model says about a batch, by its method."""
-    if isinstance(model, Imagines):
+    if can(model, "imagine"):
         return np.asarray(model.imagine(batch, 2, 0).gap)
     return np.asarray(model.predict(batch))
 
@@ -73,7 +73,7 @@ def test_anchors_that_look_at_no_trial_say_so() -> None:
 
 
 def test_only_the_outcome_is_shown_outcomes() -> None:
-    assert [name for name in OTHERS if isinstance(build_model(name), SeesOutcomes)] == ["outcome"]
+    assert [name for name in OTHERS if can(build_model(name), "with_outcomes")] == ["outcome"]
 
 
 @pytest.mark.parametrize(
@@ -83,10 +83,10 @@ def test_only_the_outcome_is_shown_outcomes() -> None:
 )  # fmt: skip
 def test_answers_are_given_under_their_protocol(name: str, protocol: str) -> None:
     model = build_model(name)
-    assert isinstance(model, Predicts | Fits) and model.answers == protocol
+    assert any(can(model, what) for what in ("predict", "fit")) and model.answers == protocol
 
 
-@pytest.mark.parametrize("name", [n for n in OTHERS if not isinstance(build_model(n), Encodes)])
+@pytest.mark.parametrize("name", [n for n in OTHERS if not can(build_model(n), "encode")])
 def test_an_answer_depends_on_its_own_trial_alone(name: str) -> None:
     model, batch = seen_by(name)
     together = answers(model, batch)

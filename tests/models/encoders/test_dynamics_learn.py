@@ -66,7 +66,7 @@ def test_the_next_feature_is_nearer_than_the_last_one(
         model,
         source,
         source.trials,
-        settings=dataclasses.replace(model.settings, steps=300),
+        settings=dataclasses.replace(model.training_settings, steps=300),
         seed=seed,
         name="all",
         folder=None,

@@ -152,12 +152,12 @@ def test_released_training_is_adam_that_is_created_anew_at_every_step() -> None:
 
 def test_training_follows_the_size() -> None:
     settings = {
-        size: build_model("pVGG-mlp", size=size, weights="random", hidden=2).settings  # type: ignore[attr-defined]
+        size: build_model("pVGG-mlp", size=size, weights="random", hidden=2).training_settings  # type: ignore[attr-defined]
         for size in ("paper", "released")
     }
     assert settings["released"] == RELEASED_TRAINING != settings["paper"]
     model: Any = build_model("pVGG-mlp", **TINY, fine_tuned=True)
-    assert model.settings == FINE_TUNING
+    assert model.training_settings == FINE_TUNING
 
 
 def test_without_standardisation_features_stay_as_they_are() -> None:

@@ -15,7 +15,7 @@ from physion.core.errors import BadInputError
 from physion.models import Batch, build_model
 from physion.models.checkpoint import WEIGHTS, load_weights
 from physion.models.encoders.encoder import FINE_TUNING, FineTunedEncoder
-from physion.models.interface import TrainingSettings, features_digest
+from physion.models.interface import TrainingSettings
 from physion.readout.evaluate import evaluate
 from physion.readout.logistic import ReadoutConfig
 from physion.readout.settings import EvaluationConfig
@@ -161,32 +161,32 @@ def test_a_training_changes_both_digests_and_its_weights_give_the_same_features(
     tmp_path: Path,
 ) -> None:
     model = make()
-    before = model.digest(), features_digest(model)
+    before = model.digest(), model.encoder_digest()
     source = MovingValues(count=8, spec=model.spec)
     result = train_model(
         model, source, source.trials, seed=0, name="all", folder=tmp_path, settings=QUICK,
         fabric=make_fabric(Devices("cpu")),
     )  # fmt: skip
-    after = model.digest(), features_digest(model)
+    after = model.digest(), model.encoder_digest()
     assert len({*before, *after}) == 4
-    assert features_digest(make()) == before[1], "which depends on no random number of its own"
+    assert make().encoder_digest() == before[1], "which depends on no random number of its own"
     assert result.folder is not None and np.isfinite(result.baseline)
     loaded, batch = make(), clips()
     load_weights(result.folder / WEIGHTS, loaded)
-    assert (loaded.digest(), features_digest(loaded)) == after
+    assert (loaded.digest(), loaded.encoder_digest()) == after
     assert torch.equal(loaded.encode(batch), model.encode(batch))
     assert not torch.equal(loaded.encode(batch), make().encode(batch))
 
 
 def test_the_dynamics_do_not_change_the_digest_of_the_encoder() -> None:
     model = make()
-    before = features_digest(model)
+    before = model.encoder_digest()
     with torch.no_grad():
         model.dynamics.outer.bias += 1
-    assert features_digest(model) == before
+    assert model.encoder_digest() == before
     with torch.no_grad():
         next(model.encoder.parameters()).view(-1)[0] += 1e-3
-    assert features_digest(model) != before
+    assert model.encoder_digest() != before
 
 
 def test_statistics_of_batch_normalisation_stay_as_they_are() -> None:

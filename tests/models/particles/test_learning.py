@@ -71,7 +71,7 @@ def result(dataset: Dataset) -> Result:
         model,
         whole_source(dataset, model.spec),
         dataset.trials("training"),
-        settings=dataclasses.replace(model.settings, steps=STEPS),
+        settings=dataclasses.replace(model.training_settings, steps=STEPS),
         seed=0,
         name="all",
         folder=None,

@@ -103,9 +103,9 @@ def future(model: ReleasedSimulator, *motions: Motion) -> tuple[SceneParticles, 
 def test_the_published_network_and_settings(name: str, weights: int) -> None:
     model = build_model(name, size="released")
     assert isinstance(model, ReleasedSimulator)
-    assert model.provenance().model == f"{name}-released" and model.reader == "touch"
+    assert model.provenance().model == f"{name}-released" and model.decision == "touch"
     assert sum(value.numel() for value in model.parameters()) == weights
-    settings = model.settings
+    settings = model.training_settings
     assert (settings.batch, settings.accumulate, settings.learning_rate) == (1, 2, 1e-4)
     assert settings.schedule == "plateau" and model.diet == "states" and model.window == 3
     assert model.config.keep_rigid == (name == "gns-ransac")

@@ -519,7 +519,7 @@ def test_weights_of_a_file_are_loaded_and_named(tmp_path: Path) -> None:
     path = tmp_path / "model.safetensors"
     write_checkpoint(path, tensors_of(source), {"built_as": source.built_as()})
     loaded = model_of("dpi", weights=str(path))
-    assert loaded.trained and loaded.reader == "touch" and loaded.init.startswith("local:")
+    assert loaded.trained and loaded.decision == "touch" and loaded.init.startswith("local:")
     assert loaded.digest() == source.digest() != model_of("dpi").digest()
     with pytest.raises(BadInputError, match="model was dpi-small and is gns-small"):
         model_of("gns", weights=str(path))

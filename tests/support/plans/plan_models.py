@@ -21,7 +21,7 @@ class Imagining(NextBrightness):
     """Network that encodes and imagines; ``seed`` draws its initial weights."""
 
     samples, knobs = 1, {}
-    reader = "logistic"
+    decision = "logistic"
 
     def __init__(self, seed: int = 0, hidden: int = 4) -> None:
         super().__init__(settings=SIX, hidden=hidden)

@@ -20,6 +20,7 @@ from physion.core.names import canonical_name
 from physion.core.version import __version__
 from physion.models.baselines.motion import motions, require_motion, settings_digest, touched
 from physion.models.build import make_config
+from physion.models.interface import Model
 from physion.scenes.scene import OBSERVED_FRAMES
 
 NAME, VERSION = "chance", 1
@@ -30,7 +31,7 @@ class BaseRateConfig:
     """`BaseRate` has no settings."""
 
 
-class BaseRate:
+class BaseRate(Model):
     """Model that gives every trial of a scenario the same probability.
 
     P(contact) is (k + 1) / (n + 2) with k contacts among the n fitted trials (Laplace's rule of
@@ -40,7 +41,7 @@ class BaseRate:
     answers = "observed"
 
     def __init__(self, config: BaseRateConfig) -> None:
-        self.config = config
+        self.config = self.settings = config
         self.spec = Spec(inputs=("state",), stride=1, context=1, future=0, anchor="end")
 
     def fit(self, batch: Batch, labels: NDArray[np.bool_], seed: int) -> FittedBaseRate:
@@ -93,20 +94,20 @@ class OutcomeConfig:
     outcomes: Mapping[str, bool] | None = None
 
 
-class Outcome:
+class Outcome(Model):
     """Model that answers 1 if agent and patient touch, else 0.
 
     The outcome is the known one of a stimulus (`OutcomeConfig`, `with_outcomes`), else that of its
     whole motion. Accuracy is 1 by construction; its likeness to people is that of a perfect
     simulator. The protocol is ``full``: it sees everything. The evaluator gives it the outcomes of
-    the dataset (`physion.models.interface.SeesOutcomes`), which only an anchor may have: its
+    the dataset (`Model.with_outcomes`), which only an anchor may have: its
     predictions say something about outcomes and people, and nothing about a model.
     """
 
     answers = "full"
 
     def __init__(self, config: OutcomeConfig) -> None:
-        self.config = config
+        self.config = self.settings = config
         self.outcomes = read_outcomes(config.outcomes or {})
         self.spec = Spec(inputs=("state",), stride=1, context=1, future=0)
 
@@ -297,7 +298,7 @@ class MajorityOfPeopleConfig:
     humans: Mapping[str, float] | str | Path | None = None
 
 
-class MajorityOfPeople:
+class MajorityOfPeople(Model):
     """Model whose P(contact) is the fraction of people who answered yes.
 
     Its yes or no is that of the majority: no model that gives one answer to a stimulus can agree
@@ -307,7 +308,7 @@ class MajorityOfPeople:
     answers = "observed"
 
     def __init__(self, config: MajorityOfPeopleConfig) -> None:
-        self.config = config
+        self.config = self.settings = config
         self.spec = Spec(inputs=("state",), stride=1, context=1, future=0)
         self.fractions = _fractions(config.humans)
 

@@ -27,6 +27,7 @@ from physion.clips.batch import (
 from physion.core.errors import BadInputError
 from physion.core.version import __version__
 from physion.models.build import make_config
+from physion.models.interface import Model
 from physion.numerics.kernel import kernel
 from physion.numerics.linear_algebra import apply, multiply, norm
 from physion.numerics.rotations import axis_angle_matrix, rotate_vectors, rotation_matrices
@@ -439,7 +440,7 @@ class AlreadyTouchedConfig:
             )
 
 
-class AlreadyTouched:
+class AlreadyTouched(Model):
     """Model that knows one thing: whether agent and patient touched in the observed part.
 
     P(contact) is 1 - margin if they did, else the base rate: the fraction of contacts among the
@@ -449,7 +450,7 @@ class AlreadyTouched:
     answers = "observed"
 
     def __init__(self, config: AlreadyTouchedConfig) -> None:
-        self.config = config
+        self.config = self.settings = config
         self.spec = Spec(inputs=("state",), stride=1, context=1, future=0, anchor="end")
 
     def fit(self, batch: Batch, labels: NDArray[np.bool_], seed: int) -> TouchedOrBaseRate:
@@ -525,7 +526,7 @@ class ConstantMotionConfig:
             )
 
 
-class ConstantMotion:
+class ConstantMotion(Model):
     """Simulator without forces: constant velocity and angular velocity from frame 44 on.
 
     Gravity, contacts and joints have no effect; a body that lies or flies goes on alike. The gap is
@@ -534,13 +535,13 @@ class ConstantMotion:
     better.
     """
 
-    reader = "gap"
+    decision = "gap"
     samples = 1
     seed = 0
     knobs: Mapping[str, tuple[float, ...]] = MappingProxyType({})
 
     def __init__(self, config: ConstantMotionConfig) -> None:
-        self.config = config
+        self.config = self.settings = config
         self.spec = Spec(inputs=("state",), stride=1, context=1, future=config.frames, anchor="end")
 
     def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
@@ -599,7 +600,7 @@ class StateClassifierConfig:
             raise BadInputError(f"{STATE_CLASSIFIER_NAME}: trees and leaf must be at least 1")
 
 
-class StateClassifier:
+class StateClassifier(Model):
     """Extremely randomised trees on the true state of agent, patient and probe at one instant.
 
     It sees positions, rotations, velocities and sizes (`state_features`) and knows nothing of
@@ -613,7 +614,7 @@ class StateClassifier:
     answers = "observed"
 
     def __init__(self, config: StateClassifierConfig) -> None:
-        self.config = config
+        self.config = self.settings = config
         self.spec = Spec(inputs=("state",), stride=1, context=1, future=0, anchor="end")
 
     def fit(self, batch: Batch, labels: NDArray[np.bool_], seed: int) -> FittedTrees:
@@ -654,7 +655,7 @@ class FittedTrees:
     answers = "observed"
 
     def __init__(self, config: StateClassifierConfig, trees: ExtraTreesClassifier) -> None:
-        self.config = config
+        self.config = self.settings = config
         self.trees = trees
 
     def predict(self, batch: Batch) -> NDArray[np.float64]:

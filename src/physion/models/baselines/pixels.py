@@ -14,6 +14,7 @@ from physion.core.errors import BadInputError
 from physion.core.version import __version__
 from physion.models.baselines.motion import settings_digest
 from physion.models.build import make_config
+from physion.models.interface import Model
 from physion.scenes.looks import RED, ROLE_HUES, STRONG_SATURATION, STRONG_VALUE, YELLOW
 
 # Anchor `copy-last-frame`: pixels, and a future that looks like the last observed frame.
@@ -35,7 +36,7 @@ class CopyLastFrameConfig:
     future: int = 18
 
 
-class CopyLastFrame:
+class CopyLastFrame(Model):
     """Model whose features are pixels and that imagines that nothing changes.
 
     Features: red, green and blue in 0..1 of all pixels, row by row. The imagined features repeat
@@ -43,7 +44,7 @@ class CopyLastFrame:
     """
 
     def __init__(self, config: CopyLastFrameConfig) -> None:
-        self.config = config
+        self.config = self.settings = config
         self.spec = Spec(
             image_size=config.image_size,
             stride=config.stride,
@@ -130,7 +131,7 @@ class BlobCentroidsConfig:
     future: int = 18
 
 
-class BlobCentroids:
+class BlobCentroids(Model):
     """Encoder of six numbers a frame: centroid and area of the red and of the yellow pixels.
 
     It is meant for the look with a red agent and a yellow patient. Pixels count as red or yellow by
@@ -139,7 +140,7 @@ class BlobCentroids:
     """
 
     def __init__(self, config: BlobCentroidsConfig) -> None:
-        self.config = config
+        self.config = self.settings = config
         self.spec = Spec(
             image_size=config.image_size,
             stride=config.stride,

@@ -40,7 +40,7 @@ from physion.models.encoders.weights import (
     input_statistics,
 )
 from physion.models.interface import Diet, TrainingSettings
-from physion.models.torch_model import digest_of, initial_weights
+from physion.models.torch_model import TorchModel, digest_of, initial_weights
 from physion.models.vision import normalized_pictures
 
 # Networks that predict the next feature from those of the context: (B, c, D) to (B, D).
@@ -236,7 +236,7 @@ class Label:
     size: str = ""
 
 
-class EncoderModel(nn.Module):
+class EncoderModel(TorchModel):
     """Image encoder with dynamics on its features; subclasses say how it is trained.
 
     Parameters
@@ -249,7 +249,7 @@ class EncoderModel(nn.Module):
         Optimiser and schedule.
     """
 
-    reader = "logistic"
+    decision = "logistic"
     samples, seed = 1, 0
     suffix = ""
     """End of the names of models of this class."""
@@ -258,7 +258,8 @@ class EncoderModel(nn.Module):
 
     def __init__(self, config: EncoderConfig, label: Label, training: TrainingSettings) -> None:
         super().__init__()
-        self.config, self.label, self.settings = config, label, training
+        self.config = self.settings = config
+        self.label, self.training_settings = label, training
         self.trained = False
         self.init = ""  # of a training; by default the origin of the encoder's weights
         self._weights = EncoderWeights(config.weights, config.seed)

@@ -242,11 +242,12 @@ _VERSION = 1
 class VideoEncoder(TorchModel):
     """Frozen video encoder; its protocols are *observed* and *full*."""
 
-    reader = "logistic"
+    decision = "logistic"
 
     def __init__(self, family: VideoFamily, size: str, config: VideoConfig) -> None:
         super().__init__()
         self.family, self.size, self.config = family, size, config
+        self.settings = config
         self.spec = Spec(
             image_size=config.image_size,
             stride=config.stride,

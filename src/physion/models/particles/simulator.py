@@ -245,10 +245,11 @@ class ParticleSimulator(TorchModel):
 
     def __init__(self, name: str, config: ParticleConfig, options: ParticleOptions) -> None:
         super().__init__()
-        self.config, self.options = config, options
+        self.config = self.settings = config
+        self.options = options
         self._made_of: tuple[Any, ...] = (name, config, options)
         self.name = f"{name}-{options.size}"
-        self.settings = config.training
+        self.training_settings = config.training
         self.window = 3 + config.pushforward
         self.trained = False
         self.samples, self.seed = options.samples, options.seed
@@ -281,8 +282,8 @@ class ParticleSimulator(TorchModel):
         return _TOGETHER if self.device.type == "cpu" else 0
 
     @property
-    def reader(self) -> str:
-        """Name of the reader: a fitted threshold, or the one that came with the weights."""
+    def decision(self) -> str:
+        """Name of the decision: a fitted threshold, or the one that came with the weights."""
         return "touch" if self.trained else "gap"
 
     def provenance(self) -> Provenance:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from physion.models.build import build_model, is_file_name, load_from_file
-from physion.models.interface import Learns, Trained
+from physion.models.interface import ask, can
 from physion.readout.model_calls import is_network
 from physion.readout.plans.keys import choice_key, code_key, key_of
 from physion.readout.plans.records import Records
@@ -96,14 +96,14 @@ class KnownModels:
 def _ask(choice: ModelChoice) -> ModelFacts:
     """Build a model and return the facts about it."""
     model: Any = build_model(choice.name, **choice.options)
-    learns = is_network(model) and isinstance(model, Learns)
+    learns = is_network(model) and can(model, "loss")
     return ModelFacts(
         learns=learns,
-        trained=isinstance(model, Trained) and bool(model.trained),
+        trained=bool(ask(model, "trained")),
         seeded=_has_seed(choice, model),
         init=model.provenance().init,
-        diet=model.diet if learns else "",
-        steps=model.settings.steps if learns else 0,
+        diet=ask(model, "diet") if learns else "",
+        steps=ask(model, "training_settings").steps if learns else 0,
     )
 
 
@@ -111,7 +111,7 @@ def _has_seed(choice: ModelChoice, model: Any) -> bool:
     if is_file_name(choice.name):
         factory: Any = load_from_file(choice.name)
         return SEED in inspect.signature(factory).parameters
-    config = getattr(model, "config", None)
+    config = ask(model, "settings")
     return dataclasses.is_dataclass(config) and any(
         field.name == SEED for field in dataclasses.fields(config)
     )

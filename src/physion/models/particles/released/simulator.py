@@ -86,8 +86,8 @@ class ReleasedSimulator(ParticleSimulator):
         self.seconds = options.stride * FRAME_TIME
 
     @property
-    def reader(self) -> str:
-        """Name of the reader: the published distances, nothing is fitted."""
+    def decision(self) -> str:
+        """Name of the decision: the published distances, nothing is fitted."""
         return "touch"
 
     def digest(self) -> str:
