@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from physion.analysis.tables.csv_table import read_csv
+from physion.analysis.tables import read_csv
 from physion.core import files as atomic
 from physion.core import files as digests
 from physion.core.errors import BadInputError

@@ -22,7 +22,7 @@ NAMES = {
     "Dataset": "physion.trials.dataset",
     "Renderer": "physion.rendering.renderer",
     "build_model": "physion.models.build",
-    "compare": "physion.analysis.results",
+    "compare": "physion.analysis.compare",
     "evaluate": "physion.readout.evaluate",
     "generate": "physion.trials.making.generate",
     "label_contact": "physion.physics.labels",

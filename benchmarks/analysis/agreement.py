@@ -3,7 +3,7 @@
     OMP_NUM_THREADS=1 python benchmarks/analysis/agreement.py
 
 Side by side in one run: Cohen's kappa of every pair of 100 people who answered 150 stimuli, by
-scikit-learn pair by pair and by `physion.analysis.statistics.kappa` at once, with the largest
+scikit-learn pair by pair and by `physion.analysis.statistics.agreement` at once, with the largest
 difference of the two; then 1000 bootstraps of the mean pairwise kappa, drawing people, stimuli or
 both; then 20 models beside the 100 people with every interval in each of eight scenarios, from
 tables, with the tests of all pairs of models, zones and calibration. Times are the best of
@@ -28,10 +28,10 @@ import pandas as pd
 import sklearn
 from sklearn.metrics import cohen_kappa_score
 
-from physion.analysis.models.people_comparison import compare_everywhere
-from physion.analysis.people.answers import ScenarioAnswers
-from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.analysis.statistics.kappa import pair_values, pairwise_kappa, resampled_mean_kappa
+from physion.analysis.compare import compare_everywhere
+from physion.analysis.intervals import Bootstrap
+from physion.analysis.people.measures import ScenarioAnswers
+from physion.analysis.statistics.agreement import pair_values, pairwise_kappa, resampled_mean_kappa
 from physion.compute.tasks import processor
 from physion.core.names import SCENARIOS
 

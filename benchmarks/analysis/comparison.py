@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from physion.analysis import results
+from physion.analysis import compare as results
 from physion.core.names import SCENARIOS
 from physion.report import build, people
 

@@ -8,19 +8,16 @@ import numpy as np
 import pandas as pd
 
 from coverage_studies import F64, MODELS, SCENARIOS, Coverage, Size, Study
+from physion.analysis.intervals import Variance, jackknife
 from physion.analysis.metrics import all_metrics, metrics
-from physion.analysis.models.model_people import sample_of_models
-from physion.analysis.models.model_tests import PooledStimuli, pool_scenarios
-from physion.analysis.models.paired_measures import paired_measures
-from physion.analysis.models.rollout_errors import CONSTANT_VELOCITY, rollout_error_table
-from physion.analysis.models.sampling_variance import sampling_variances
-from physion.analysis.models.score_tables import score_table
+from physion.analysis.model_tests import PooledStimuli, paired_measures, pool_scenarios
+from physion.analysis.rollout_errors import CONSTANT_VELOCITY, rollout_error_table
 from physion.analysis.sample import Resampled, Sample
-from physion.analysis.statistics.calibration import reliability_curve
-from physion.analysis.statistics.correlation import correlate_resampled
-from physion.analysis.statistics.jackknife import Variance, jackknife
+from physion.analysis.scores import sample_of_models, sampling_variances, score_table
+from physion.analysis.statistics.agreement import correlate_resampled
 from physion.analysis.statistics.paired import compare_models
-from physion.analysis.tables.stimuli import MEAN, POOLED
+from physion.analysis.statistics.regression import reliability_curve
+from physion.analysis.tables import MEAN, POOLED
 from physion.core.seeds import generator
 
 LEFT_OUT = ("accuracy_simulated", "r_same", "euclid_over_n")

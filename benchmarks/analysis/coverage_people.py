@@ -6,14 +6,18 @@ import numpy as np
 import pandas as pd
 
 from coverage_studies import Coverage, Size, Study, logistic
-from physion.analysis.mixed.linear import fit_linear
-from physion.analysis.mixed.logistic import fit_logistic
-from physion.analysis.people.biases import learning, side_bias, yes_bias
+from physion.analysis.intervals import Bootstrap
+from physion.analysis.mixed.fit import fit_linear, fit_logistic
+from physion.analysis.people.effects import (
+    HYPOTHESES,
+    learning,
+    regress_hypotheses,
+    side_bias,
+    yes_bias,
+)
 from physion.analysis.people.exclusions import flag_effect
-from physion.analysis.people.hypotheses import HYPOTHESES, regress_hypotheses
-from physion.analysis.people.participants import Responses
-from physion.analysis.people.people import accuracy_by_scenario, agreement_by_scenario
-from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.people.measures import accuracy_by_scenario, agreement_by_scenario
+from physion.analysis.people.responses import Responses
 from physion.core.seeds import generator
 
 

@@ -18,9 +18,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from physion.analysis.models.model_people import Models
-from physion.analysis.people.answers import ScenarioAnswers
+from physion.analysis.people.measures import ScenarioAnswers
 from physion.analysis.sample import Resampled
+from physion.analysis.scores import Models
 from physion.core.seeds import generator
 
 F64 = NDArray[np.float64]

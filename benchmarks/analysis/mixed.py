@@ -30,8 +30,7 @@ import numpy as np
 import pandas as pd
 
 from mixed_fixtures import CASES, as_csv, ask_r
-from physion.analysis.mixed.linear import fit_linear
-from physion.analysis.mixed.logistic import fit_logistic
+from physion.analysis.mixed.fit import fit_linear, fit_logistic
 from physion.analysis.mixed.result import MixedFit
 from physion.compute.tasks import processor_and_cores
 from support.simulated_answers import AnswerDesign, simulate_answers

@@ -39,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noise_simulations import F64, Simulations
-from physion.analysis.statistics.correlation import correlation_within_groups
+from physion.analysis.statistics.agreement import correlation_within_groups
 from physion.compute.tasks import processor
 from physion.core.seeds import generator
 from physion.models.state_noise import NoiseLevels

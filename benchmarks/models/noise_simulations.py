@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.analysis.tables.responses import read_humans
+from physion.analysis.tables import read_humans
 from physion.core.names import canonical_name
 from physion.core.seeds import stable_hash
 from physion.data import official

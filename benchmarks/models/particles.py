@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score
 
 from physion import Dataset, build_model, sample_scene, simulate
-from physion.analysis.tables.responses import read_humans
+from physion.analysis.tables import read_humans
 from physion.clips.batch import LAST_OBSERVED, Batch, Motion, cut_to_observed
 from physion.clips.clips import observed_source, whole_source
 from physion.compute.tasks import processor

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from physion.core.version import __version__
 
 if TYPE_CHECKING:
-    from physion.analysis.results import compare
+    from physion.analysis.compare import compare
     from physion.models.build import build_model
     from physion.physics.engine import simulate
     from physion.physics.labels import label_contact
@@ -45,7 +45,7 @@ _MODULES = {
     "Dataset": "physion.trials.dataset",
     "Renderer": "physion.rendering.renderer",
     "build_model": "physion.models.build",
-    "compare": "physion.analysis.results",
+    "compare": "physion.analysis.compare",
     "evaluate": "physion.readout.evaluate",
     "generate": "physion.trials.making.generate",
     "label_contact": "physion.physics.labels",

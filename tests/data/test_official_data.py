@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from physion.analysis.published.summary import published_results
-from physion.analysis.tables.responses import read_humans
+from physion.analysis.published.claims import published_results
+from physion.analysis.tables import read_humans
 from physion.core.errors import BadInputError
 from physion.core.names import SCENARIOS, canonical_name
 from physion.data import OfficialData, official

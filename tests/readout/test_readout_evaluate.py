@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis.tables.predictions import check_predictions
+from physion.analysis.tables import check_predictions
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.models import build_model, models
 from physion.readout.evaluate import evaluate, evaluate_model

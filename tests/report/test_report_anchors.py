@@ -14,8 +14,8 @@ import pytest
 
 from physion.analysis import Bootstrap, Comparison, compare_scores
 from physion.analysis.metrics import score_metrics
-from physion.analysis.models.anchors import COMPUTED, MAJORITY, OUTCOME, TWO_PEOPLE
-from physion.analysis.tables.stimuli import MEAN, POOLED
+from physion.analysis.scores import COMPUTED, MAJORITY, OUTCOME, TWO_PEOPLE
+from physion.analysis.tables import MEAN, POOLED
 from physion.report import ReportInputs, build_report, scores
 from physion.report.html import ANCHORS
 

@@ -19,12 +19,11 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 
-from physion.analysis import Comparison
-from physion.analysis.models import figure_tables
-from physion.analysis.models.anchors import COMPUTED
-from physion.analysis.models.mixed_fits import fits_of_models
-from physion.analysis.people.difficulty import below_chance_level
-from physion.analysis.tables.stimuli import MEAN
+from physion.analysis import Comparison, figure_tables
+from physion.analysis.model_tests import fits_of_models
+from physion.analysis.people.effects import below_chance_level
+from physion.analysis.scores import COMPUTED
+from physion.analysis.tables import MEAN
 from physion.core.names import SCENARIOS
 from physion.report import html as blocks
 from physion.report import scores

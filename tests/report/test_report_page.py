@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 from physion.analysis import Bootstrap, Comparison
-from physion.analysis.tables.stimuli import MEAN
+from physion.analysis.tables import MEAN
 from physion.core.errors import BadInputError
 from physion.report import ReportInputs, build_report, compare_files
 from physion.report.html import Picture

@@ -12,10 +12,10 @@ import pandas as pd
 import pytest
 
 from physion.analysis import Bootstrap
-from physion.analysis.models.model_tests import permutations_of
-from physion.analysis.people.participants import PERSON, REHEARSAL
-from physion.analysis.statistics.kappa import cross_kappa
-from physion.analysis.tables.attributes import attributes_from_table
+from physion.analysis.model_tests import permutations_of
+from physion.analysis.people.responses import PERSON, REHEARSAL
+from physion.analysis.statistics.agreement import cross_kappa
+from physion.analysis.tables import attributes_from_table
 from physion.cli.main import main
 from physion.core.errors import BadInputError, ExclusionError, UnknownNameError
 from physion.report import compare_files

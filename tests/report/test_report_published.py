@@ -10,8 +10,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from physion.analysis.models.figure_tables import SCENARIO_ZONE
-from physion.analysis.published.summary import PublishedResults, published_results
+from physion.analysis.figure_tables import SCENARIO_ZONE
+from physion.analysis.published.claims import PublishedResults, published_results
 from physion.report.published import build_published_report, published_plots
 
 FIGURES = [*(f"panel_{name}" for name in "acde"), "figure_s1", "figure_s3"]

@@ -11,7 +11,7 @@ import pytest
 from matplotlib.collections import PolyCollection
 
 from physion.analysis import Comparison
-from physion.analysis.models.rollout_errors import COLUMNS, CONSTANT_VELOCITY, REQUIRED
+from physion.analysis.rollout_errors import COLUMNS, CONSTANT_VELOCITY, REQUIRED
 from physion.cli.main import main
 from physion.report.figures.by_scenario import draw_rollout_error as draw
 from physion.report.figures.by_scenario import rollout_error

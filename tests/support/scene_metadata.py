@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from physion.analysis.tables.attributes import COLUMNS
+from physion.analysis.tables import COLUMNS
 from physion.core.names import canonical_name
 
 

@@ -5,8 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from physion.analysis.people.participants import Responses, clean
-from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, check_table
+from physion.analysis.people.responses import (
+    SESSION_COLUMNS,
+    TRIAL_COLUMNS,
+    Responses,
+    check_table,
+    clean,
+)
 
 PRACTICE = 10
 

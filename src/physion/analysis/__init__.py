@@ -2,13 +2,12 @@
 
 from typing import TYPE_CHECKING, Any
 
-from physion.analysis.models.comparison import Comparison, compare_scores
-from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.analysis.tables.predictions import read_predictions
-from physion.analysis.tables.responses import read_human_zone, read_humans, read_labels
+from physion.analysis.comparison import Comparison, compare_scores
+from physion.analysis.intervals import Bootstrap
+from physion.analysis.tables import read_human_zone, read_humans, read_labels, read_predictions
 
 if TYPE_CHECKING:
-    from physion.analysis.results import ComparisonResults
+    from physion.analysis.compare import ComparisonResults
 
 __all__ = [
     "Bootstrap",
@@ -25,7 +24,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """Import what needs the mixed models, which take seconds to import, when it is asked for."""
     if name == "ComparisonResults":
-        from physion.analysis.results import ComparisonResults
+        from physion.analysis.compare import ComparisonResults
 
         return ComparisonResults
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.people.answers import ScenarioAnswers, mean_over_people
-from physion.analysis.statistics.agreement import pair_difference
-from physion.analysis.statistics.kappa import (
+from physion.analysis.people.measures import ScenarioAnswers, mean_over_people
+from physion.analysis.statistics.agreement import (
     correctness,
     cross_kappa,
+    pair_difference,
     resampled_kappa,
     resampled_mean_kappa,
 )

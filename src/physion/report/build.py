@@ -12,16 +12,21 @@ from typing import Any
 import pandas as pd
 
 from physion.analysis import Bootstrap, read_human_zone, read_humans, read_labels, read_predictions
-from physion.analysis.models.contradictions import check_coverage
-from physion.analysis.models.figure_tables import response_time_table
-from physion.analysis.models.rollout_errors import read_rollout_errors, rollout_error_table
-from physion.analysis.people.completeness import Expected, find_expected, read_expected
-from physion.analysis.people.difficulty import below_chance_level
-from physion.analysis.people.exclusions import PREREGISTERED
+from physion.analysis.compare import ComparisonResults, compare
+from physion.analysis.comparison import check_coverage
+from physion.analysis.figure_tables import response_time_table
+from physion.analysis.people.effects import below_chance_level
+from physion.analysis.people.exclusions import PREREGISTERED, Expected, find_expected, read_expected
 from physion.analysis.people.results import PeopleResults, read_attributes
-from physion.analysis.results import ComparisonResults, compare
-from physion.analysis.tables.responses import LABELS_FILE, DominoesLook, find_next_to
-from physion.analysis.tables.stimuli import check_excluded_names, in_order, read_stimulus_list
+from physion.analysis.rollout_errors import read_rollout_errors, rollout_error_table
+from physion.analysis.tables import (
+    LABELS_FILE,
+    DominoesLook,
+    check_excluded_names,
+    find_next_to,
+    in_order,
+    read_stimulus_list,
+)
 from physion.core.errors import BadInputError
 from physion.core.files import write_atomic
 from physion.core.version import MADE_WITH

@@ -17,9 +17,8 @@ import numpy as np
 import pandas as pd
 from PIL import Image
 
-from physion.analysis.models.comparison import Comparison
-from physion.analysis.tables.predictions import DATASETS, PROTOCOLS
-from physion.analysis.tables.stimuli import in_order
+from physion.analysis.comparison import Comparison
+from physion.analysis.tables import DATASETS, PROTOCOLS, in_order
 from physion.core.errors import BadInputError
 from physion.core.names import canonical_name
 from physion.core.version import MADE_WITH

@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from physion.analysis.results import ComparisonResults
+from physion.analysis.compare import ComparisonResults
 
 EXPECTED_METHODS = ("Engine", "Renderer", "Readout", "Encoder weights", "Noise of the simulation")
 """Settings made outside the analysis; those that the caller omits are printed as not stated."""

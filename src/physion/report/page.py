@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 
-from physion.analysis.tables.stimuli import MEAN, in_order
+from physion.analysis.tables import MEAN, in_order
 from physion.report import html as blocks
 from physion.report import people as people_blocks
 from physion.report import people as session_blocks

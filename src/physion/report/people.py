@@ -9,23 +9,20 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from physion.analysis.intervals import Bootstrap
 from physion.analysis.metrics import measure_metrics
-from physion.analysis.models.anchors import TWO_PEOPLE
-from physion.analysis.people.completeness import Expected
-from physion.analysis.people.difficulty import below_chance_level
-from physion.analysis.people.exclusions import RULES, ExclusionRules, streak_limit
-from physion.analysis.people.hypotheses import HYPOTHESES
-from physion.analysis.people.participants import Kind, check_labels
+from physion.analysis.people.effects import HYPOTHESES, below_chance_level
+from physion.analysis.people.exclusions import RULES, ExclusionRules, Expected, streak_limit
+from physion.analysis.people.responses import ParticipantsKind as Kind
+from physion.analysis.people.responses import check_labels, keep_where
 from physion.analysis.people.results import (
     PeopleResults,
     analyse_people,
     read_any_responses,
     rules_called,
 )
-from physion.analysis.select_sessions import keep_where
-from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.analysis.tables.csv_table import read_csv
-from physion.analysis.tables.stimuli import MEAN, in_order
+from physion.analysis.scores import TWO_PEOPLE
+from physion.analysis.tables import MEAN, in_order, read_csv
 from physion.report.html import (
     ANCHORS,
     PageColumn,

@@ -10,15 +10,15 @@ from typing import Any
 
 import pandas as pd
 
-from physion.analysis.models.figure_tables import (
+from physion.analysis.figure_tables import (
     GROUPED_COLUMNS,
     MEASURE_COLUMNS,
     PARTICIPANTS,
     SCENARIO_ZONE,
 )
-from physion.analysis.published.cells import grid
-from physion.analysis.published.summary import TITLES, PublishedResults
-from physion.analysis.tables.stimuli import MEAN
+from physion.analysis.published.claims import TITLES, PublishedResults
+from physion.analysis.published.tables import grid
+from physion.analysis.tables import MEAN
 from physion.core.files import write_atomic
 from physion.core.version import MADE_WITH
 from physion.report.build import prepare_folder, write_csv, write_plot

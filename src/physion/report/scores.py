@@ -8,15 +8,12 @@ from html import escape
 import numpy as np
 import pandas as pd
 
-from physion.analysis.metrics import Metric, score_metrics
-from physion.analysis.metrics.beyond_outcome import BEYOND_OUTCOME
+from physion.analysis.comparison import SETTING, Comparison
+from physion.analysis.metrics import BEYOND_OUTCOME, Metric, score_metrics
 from physion.analysis.mixed.result import effect_name
-from physion.analysis.models.anchors import TWO_PEOPLE
-from physion.analysis.models.comparison import Comparison
-from physion.analysis.models.mixed_fits import MixedTable
-from physion.analysis.models.model_tests import permutations_of
-from physion.analysis.models.observed_contact import SETTING
-from physion.analysis.tables.stimuli import MEAN, POOLED, in_order
+from physion.analysis.model_tests import MixedTable, permutations_of
+from physion.analysis.scores import TWO_PEOPLE
+from physion.analysis.tables import MEAN, POOLED, in_order
 from physion.report.html import (
     ANCHORS,
     PageColumn,

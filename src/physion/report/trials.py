@@ -10,8 +10,8 @@ from html import escape
 import numpy as np
 import pandas as pd
 
-from physion.analysis.models.comparison import Comparison
-from physion.analysis.tables.stimuli import in_order
+from physion.analysis.comparison import Comparison
+from physion.analysis.tables import in_order
 from physion.report.html import (
     PageMovies,
     details,

@@ -6,10 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis.mixed.design import build_design
-from physion.analysis.mixed.formula import split_formula
-from physion.analysis.mixed.linear import fit_linear
-from physion.analysis.mixed.logistic import fit_logistic
+from physion.analysis.mixed.design import build_design, split_formula
+from physion.analysis.mixed.fit import fit_linear, fit_logistic
 from physion.core.errors import BadInputError, UnknownNameError
 from support.simulated_answers import AnswerDesign, simulate_answers
 

@@ -12,12 +12,8 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
-from physion.analysis.mixed.design import build_design
-from physion.analysis.mixed.factor import Factor
-from physion.analysis.mixed.groupings import Groupings
-from physion.analysis.mixed.linear import fit_linear
-from physion.analysis.mixed.linear_model import LinearModel
-from physion.analysis.mixed.logistic import LogisticModel, fit_logistic
+from physion.analysis.mixed.design import Groupings, build_design
+from physion.analysis.mixed.fit import Factor, LinearModel, LogisticModel, fit_linear, fit_logistic
 from support.simulated_answers import AnswerDesign, simulate_answers
 
 CROSSED = "(1|participant) + (1|stimulus)"

@@ -14,8 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis.mixed.linear import fit_linear
-from physion.analysis.mixed.logistic import fit_logistic
+from physion.analysis.mixed.fit import fit_linear, fit_logistic
 from physion.analysis.mixed.result import MixedFit, effect_name
 from support.mixed_cases import CASES, STORED, digest, published
 from support.official import official_folder

@@ -11,12 +11,14 @@ from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 from statsmodels.regression.mixed_linear_model import MixedLM
 
-from physion.analysis.mixed.design import Design, build_design
-from physion.analysis.mixed.formula import RandomTerm, split_formula
-from physion.analysis.mixed.linear import fit_linear
-from physion.analysis.mixed.linear_slopes import SlopesModel
-from physion.analysis.mixed.logistic import LogisticModel, fit_logistic
-from physion.analysis.mixed.random_effects import RandomEffects
+from physion.analysis.mixed.design import (
+    Design,
+    RandomEffects,
+    RandomTerm,
+    build_design,
+    split_formula,
+)
+from physion.analysis.mixed.fit import LogisticModel, SlopesModel, fit_linear, fit_logistic
 from physion.core.errors import BadInputError
 
 FORMULAS = {
@@ -210,7 +212,7 @@ def test_perfectly_correlated_effects_are_said() -> None:
 
 
 def test_a_model_that_does_not_converge_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("physion.analysis.mixed.optimum.CLOSE", -1.0)
+    monkeypatch.setattr("physion.analysis.mixed.fit.CLOSE", -1.0)
     fitted = fit_linear("time ~ x + (x|person)", simulate())
     assert not fitted.converged and "NOT CONVERGED" in fitted.summary()
     assert any("did not converge" in w and "|| group" in w for w in fitted.warnings)

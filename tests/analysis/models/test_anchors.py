@@ -12,20 +12,12 @@ import pytest
 from sklearn.metrics import cohen_kappa_score
 
 from physion.analysis import Bootstrap, Comparison, compare_scores
+from physion.analysis.compare import compare_everywhere
+from physion.analysis.comparison import SETTING
 from physion.analysis.metrics import metrics
-from physion.analysis.models.anchors import (
-    ANCHOR_MODELS,
-    COMPUTED,
-    MAJORITY,
-    OUTCOME,
-    TWO_PEOPLE,
-    kind_of,
-)
-from physion.analysis.models.observed_contact import SETTING
-from physion.analysis.models.people_comparison import compare_everywhere
 from physion.analysis.sample import sample_of_rows
-from physion.analysis.tables.responses import read_humans, read_labels
-from physion.analysis.tables.stimuli import MEAN, POOLED
+from physion.analysis.scores import ANCHOR_MODELS, COMPUTED, MAJORITY, OUTCOME, TWO_PEOPLE, kind_of
+from physion.analysis.tables import MEAN, POOLED, read_humans, read_labels
 from physion.core.errors import BadInputError
 from support.simulated_people import study
 

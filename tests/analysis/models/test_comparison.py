@@ -10,12 +10,17 @@ import pandas as pd
 import pytest
 
 from physion.analysis import Bootstrap, compare_scores, read_predictions
-from physion.analysis.models.comparison import NO_LABEL, NOT_PREDICTED, NOT_SEEN
-from physion.analysis.people.participants import EXCLUDED, LEDGE
-from physion.analysis.results import compare
-from physion.analysis.tables.predictions import check_predictions, name_models
-from physion.analysis.tables.responses import read_humans, read_labels
-from physion.analysis.tables.stimuli import MEAN, POOLED
+from physion.analysis.compare import compare
+from physion.analysis.comparison import NO_LABEL, NOT_PREDICTED, NOT_SEEN
+from physion.analysis.people.responses import EXCLUDED, LEDGE
+from physion.analysis.tables import (
+    MEAN,
+    POOLED,
+    check_predictions,
+    name_models,
+    read_humans,
+    read_labels,
+)
 from physion.core.errors import BadInputError
 
 QUICK = Bootstrap(resamples=200)

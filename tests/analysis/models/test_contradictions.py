@@ -10,9 +10,9 @@ import pandas as pd
 import pytest
 
 from physion.analysis import Bootstrap, compare_scores, read_humans, read_labels
-from physion.analysis.models.contradictions import check_coverage
-from physion.analysis.results import compare
-from physion.analysis.tables.predictions import check_predictions, name_models
+from physion.analysis.compare import compare
+from physion.analysis.comparison import check_coverage
+from physion.analysis.tables import check_predictions, name_models
 from physion.cli.main import main
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.report import compare_files

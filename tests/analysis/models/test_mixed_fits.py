@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis.models.mixed_fits import MixedTable, fits_of_people
+from physion.analysis.intervals import Bootstrap
+from physion.analysis.model_tests import MixedTable, fits_of_people
 from physion.analysis.people.results import PeopleResults, analyse_people
-from physion.analysis.statistics.bootstrap import Bootstrap
 from support.simulated_people import as_responses, simulate_study
 
 KNOWN = {"correct": -0.12, "yes": 0.05, "hundred": -0.4, "scenario[T.roll]": 0.25}

@@ -15,31 +15,27 @@ from sklearn.metrics import brier_score_loss, cohen_kappa_score
 from statsmodels.stats.contingency_tables import mcnemar
 from statsmodels.stats.multitest import multipletests
 
+from physion.analysis.compare import PeopleComparison, compare_everywhere
+from physion.analysis.intervals import Bootstrap, Variance, degrees_of_freedom
 from physion.analysis.metrics import measure_metrics, metrics
-from physion.analysis.models.measures import measure_models, measure_table
-from physion.analysis.models.model_people import (
+from physion.analysis.people.effects import difficulty_third, r_by_third
+from physion.analysis.people.measures import ScenarioAnswers, answers_of, split_halves
+from physion.analysis.sample import Resampled
+from physion.analysis.scores import (
+    RELEASED_R,
     Models,
+    human_zones,
+    measure_models,
+    measure_table,
     model_pairs,
     models_of,
+    released_r_zone,
+    released_zone,
     sample_of_models,
+    sampling_variances,
 )
-from physion.analysis.models.people_comparison import PeopleComparison, compare_everywhere
-from physion.analysis.models.sampling_variance import sampling_variances
-from physion.analysis.models.zones import RELEASED_R, human_zones, released_r_zone, released_zone
-from physion.analysis.people.answers import ScenarioAnswers, answers_of
-from physion.analysis.people.difficulty import difficulty_third, r_by_third
-from physion.analysis.people.people import split_halves
-from physion.analysis.sample import Resampled
 from physion.analysis.statistics import agreement
-from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.analysis.statistics.calibration import (
-    brier,
-    calibration_table,
-    decompose,
-    reliability_curve,
-)
-from physion.analysis.statistics.jackknife import Variance, degrees_of_freedom
-from physion.analysis.statistics.kappa import correctness
+from physion.analysis.statistics.agreement import correctness
 from physion.analysis.statistics.paired import (
     benjamini_hochberg,
     compare_models,
@@ -47,6 +43,12 @@ from physion.analysis.statistics.paired import (
     mcnemar_exact,
     r_permutation_p,
     swap_coins,
+)
+from physion.analysis.statistics.regression import (
+    brier,
+    calibration_table,
+    decompose,
+    reliability_curve,
 )
 from physion.core.errors import BadInputError
 from support.simulated_people import study

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from physion.analysis import Bootstrap
-from physion.analysis.models.model_tests import PooledStimuli
-from physion.analysis.models.paired_measures import COLUMNS, paired_measures
+from physion.analysis.model_tests import COLUMNS, PooledStimuli, paired_measures
 from physion.analysis.statistics import agreement
 
 

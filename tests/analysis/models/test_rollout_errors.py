@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis.models.rollout_errors import (
+from physion.analysis.rollout_errors import (
     COLUMNS,
     CONSTANT_VELOCITY,
     REQUIRED,

@@ -8,7 +8,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from physion.analysis.people.check_responses import check_responses
+from physion.analysis.check import check_responses
 from physion.cli.main import main
 from support.simulated_people import simulate_study
 

@@ -9,15 +9,17 @@ import pandas as pd
 import pytest
 
 from physion.analysis import Bootstrap
-from physion.analysis.people.completeness import (
+from physion.analysis.people.exclusions import (
     NOT_EXPECTED,
+    RULES,
+    check_excluded,
     completeness_warnings,
     drop_unexpected,
     find_expected,
+    flag_sessions,
     read_expected,
 )
-from physion.analysis.people.exclusions import RULES, check_excluded, flag_sessions
-from physion.analysis.people.participants import Responses
+from physion.analysis.people.responses import Responses
 from physion.analysis.people.results import analyse_people
 from physion.core.errors import BadInputError, ExclusionError, UnknownNameError
 from support.simulated_people import as_responses, simulate_study, study

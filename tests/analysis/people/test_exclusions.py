@@ -23,13 +23,14 @@ from physion.analysis.people.exclusions import (
     count_flags,
     flag_effect,
     flag_sessions,
+    longest_alternation,
+    longest_streak,
     streak_limit,
     with_and_without,
 )
-from physion.analysis.people.participants import DROPPED_COLUMNS, Responses, missing_times
-from physion.analysis.people.people import accuracy_by_scenario
-from physion.analysis.people.session_measures import longest_alternation, longest_streak
-from physion.analysis.statistics.clustered_logit import clustered_logit
+from physion.analysis.people.measures import accuracy_by_scenario
+from physion.analysis.people.responses import DROPPED_COLUMNS, Responses, missing_times
+from physion.analysis.statistics.regression import clustered_logit
 from physion.core.errors import BadInputError
 from support.simulated_people import as_responses, simulate_study, study
 

@@ -9,8 +9,14 @@ import pandas as pd
 import pytest
 
 from physion.analysis.statistics import agreement
-from physion.analysis.tables.responses import read_human_zone, read_humans, read_labels, with_labels
-from physion.analysis.tables.stimuli import read_stimulus_list, scenario_name
+from physion.analysis.tables import (
+    read_human_zone,
+    read_humans,
+    read_labels,
+    read_stimulus_list,
+    scenario_name,
+    with_labels,
+)
 from physion.core.errors import BadInputError, PhysionError, UnknownNameError
 from physion.core.names import OFFICIAL_SCENARIOS, SCENARIOS, canonical_name, is_ledge, scenario_of
 

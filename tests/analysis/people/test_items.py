@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from physion.analysis.people.items import item_statistics
+from physion.analysis.people.measures import item_statistics
 from support.simulated_people import study
 
 

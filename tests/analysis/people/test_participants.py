@@ -9,25 +9,23 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis.people.answers import answers_of, mean_over_people
-from physion.analysis.people.official_responses import read_official_responses
-from physion.analysis.people.participants import (
+from physion.analysis.people.measures import answers_of, mean_over_people
+from physion.analysis.people.responses import (
     CONFLICT,
     COPY,
     EXCLUDED,
     LEDGE,
     NO_ANSWER,
     PERSON,
+    SESSION_COLUMNS,
     SIMULATED,
+    TRIAL_COLUMNS,
     UNKNOWN,
     check_labels,
-    read_responses,
-)
-from physion.analysis.people.response_schema import (
-    SESSION_COLUMNS,
-    TRIAL_COLUMNS,
     check_table,
     data_dictionary,
+    read_official_responses,
+    read_responses,
 )
 from physion.core.errors import BadInputError
 from support.simulated_people import as_responses, simulate_study, study

@@ -15,46 +15,48 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
 
-from physion.analysis.people.answers import answers_of
-from physion.analysis.people.biases import (
+from physion.analysis.intervals import Bootstrap
+from physion.analysis.people.effects import (
+    HYPOTHESES,
     accuracy_by_background,
+    answer_rows,
     background,
-    learning,
-    side_bias,
-    yes_bias,
-)
-from physion.analysis.people.difficulty import (
     below_chance_level,
     below_chance_level_p,
     difficulty_third,
-)
-from physion.analysis.people.hypotheses import (
-    HYPOTHESES,
-    answer_rows,
+    learning,
     regress_hypotheses,
+    side_bias,
     with_attributes,
+    yes_bias,
 )
-from physion.analysis.people.participants import Responses
-from physion.analysis.people.people import (
+from physion.analysis.people.measures import (
     accuracy_by_participant,
     accuracy_by_scenario,
     accuracy_by_stimulus,
     agreement_by_scenario,
+    answers_of,
     spearman_brown,
     split_halves,
 )
+from physion.analysis.people.responses import Responses
 from physion.analysis.statistics import agreement
-from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.analysis.statistics.correlation import correlate_resampled, correlate_rows
-from physion.analysis.statistics.kappa import pair_values, pairwise_kappa
-from physion.analysis.tables.attributes import (
+from physion.analysis.statistics.agreement import (
+    correlate_resampled,
+    correlate_rows,
+    pair_values,
+    pairwise_kappa,
+)
+from physion.analysis.tables import (
     ATTRIBUTES,
     MISLABELLED,
     attributes_from_names,
     attributes_from_table,
     better_attributes,
+    read_humans,
+    read_labels,
+    with_labels,
 )
-from physion.analysis.tables.responses import read_humans, read_labels, with_labels
 from physion.core.errors import BadInputError
 from support.scene_metadata import attributes_from_metadata
 from support.simulated_people import study

@@ -7,12 +7,16 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from physion.analysis.people.check_responses import check_responses
-from physion.analysis.people.completeness import expected_by_session
-from physion.analysis.people.exclusions import flag_sessions
-from physion.analysis.people.participants import clean, scenario_set, scenarios_in
-from physion.analysis.people.people import accuracy_by_scenario
-from physion.analysis.people.response_schema import TRIAL_COLUMNS, check_table
+from physion.analysis.check import check_responses
+from physion.analysis.people.exclusions import expected_by_session, flag_sessions
+from physion.analysis.people.measures import accuracy_by_scenario
+from physion.analysis.people.responses import (
+    TRIAL_COLUMNS,
+    check_table,
+    clean,
+    scenario_set,
+    scenarios_in,
+)
 from physion.analysis.people.results import analyse_people
 from physion.core.errors import BadInputError
 

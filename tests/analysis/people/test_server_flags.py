@@ -5,7 +5,7 @@ from __future__ import annotations
 import pandas as pd
 
 from physion.analysis.people.exclusions import flag_from_server
-from physion.analysis.people.participants import VOID, Responses
+from physion.analysis.people.responses import VOID, Responses
 
 SESSIONS = pd.DataFrame({
     "session": ["a", "b", "c"], "implausible": ["", "no media, short", ""],

@@ -9,24 +9,22 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis.published.cells import (
-    accuracy_table,
-    copies_of_observed,
-    count_tested,
-    describe_averages,
-    grid,
-    wilson,
-)
-from physion.analysis.published.panels import panel_a
-from physion.analysis.published.summary import TITLES, PublishedResults, results_of
+from physion.analysis.intervals import Bootstrap
+from physion.analysis.published.claims import TITLES, PublishedResults, results_of
 from physion.analysis.published.tables import (
     MODELS,
     OBSERVED_AGAIN,
     PARTICLES,
     PublishedTables,
+    accuracy_table,
+    copies_of_observed,
+    count_tested,
+    describe_averages,
+    grid,
+    panel_a,
     read_published,
+    wilson,
 )
-from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.core.errors import BadInputError
 from physion.core.names import OFFICIAL_SCENARIOS, SCENARIOS
 

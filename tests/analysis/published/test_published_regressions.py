@@ -8,8 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis.published.claims import CLAIMS, END_TO_END, VISION, Contrast
-from physion.analysis.published.regressions import (
+from physion.analysis.published.claims import (
+    CLAIMS,
+    END_TO_END,
+    VISION,
+    Contrast,
     _meets,
     contrast_rows,
     fit_contrast,

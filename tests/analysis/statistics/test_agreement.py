@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
 
+from physion.analysis.intervals import Bootstrap
 from physion.analysis.metrics import score_metrics
 from physion.analysis.sample import sample_of_rows
 from physion.analysis.statistics import agreement
 from physion.analysis.statistics.agreement import why_no_r
-from physion.analysis.statistics.bootstrap import Bootstrap
 
 Array = npt.NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.intervals import Bootstrap
 from physion.core.errors import BadInputError
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from physion.analysis.statistics.jackknife import (
+from physion.analysis.intervals import (
     Scale,
     Variance,
     delete_one,

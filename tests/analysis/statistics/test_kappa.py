@@ -13,8 +13,8 @@ from hypothesis.extra import numpy as hnp
 from scipy import stats
 from sklearn.metrics import cohen_kappa_score
 
-from physion.analysis.statistics import kappa
-from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.intervals import Bootstrap
+from physion.analysis.statistics import agreement as kappa
 from physion.core.errors import BadInputError
 
 Array = npt.NDArray[np.float64]

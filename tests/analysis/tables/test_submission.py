@@ -7,8 +7,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from physion.analysis.tables.submission import Checked, Reference, read_index, validate
-from physion.analysis.tables.submission_rows import SHOWN
+from physion.analysis.check import SHOWN, Checked, Reference, read_index, validate
 from physion.core.errors import BadInputError
 
 STIMULI = [f"pilot_it2_drop_simple_box_{i:04d}" for i in range(6)]

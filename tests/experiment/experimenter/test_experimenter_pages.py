@@ -24,7 +24,7 @@ import httpx2
 import sqlalchemy as sa
 
 from physion.analysis.people.exclusions import PREREGISTERED, RULES, flag_sessions
-from physion.analysis.people.participants import clean
+from physion.analysis.people.responses import clean
 from physion.experiment.export.answer_tables import read_tables
 from physion.experiment.export.export_study import export_study
 from physion.experiment.simulated.server_process import ServerProcess

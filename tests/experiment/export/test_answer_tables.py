@@ -10,7 +10,7 @@ import pytest
 import sqlalchemy as sa
 from pandas.testing import assert_frame_equal
 
-from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, check_table
+from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS, check_table
 from physion.core.errors import PhysionError, UnknownNameError
 from physion.experiment.experimenter.statistics.summaries import SummaryCache
 from physion.experiment.export import trial_rows

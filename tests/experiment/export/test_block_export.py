@@ -11,9 +11,8 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from physion.analysis.people.check_responses import check_responses
-from physion.analysis.people.completeness import read_expected
-from physion.analysis.people.exclusions import flag_sessions
+from physion.analysis.check import check_responses
+from physion.analysis.people.exclusions import flag_sessions, read_expected
 from physion.analysis.people.results import read_any_responses
 from physion.experiment.experimenter.overview import compute_overview
 from physion.experiment.experimenter.statistics.flagging import Flags, find_flags

@@ -11,10 +11,10 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from physion.analysis.people.biases import accuracy_by_background, background
-from physion.analysis.people.people import accuracy_by_condition
+from physion.analysis.people.effects import accuracy_by_background, background
+from physion.analysis.people.measures import accuracy_by_condition
+from physion.analysis.people.responses import keep_where
 from physion.analysis.people.results import read_any_responses
-from physion.analysis.select_sessions import keep_where
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.experiment.experimenter.overview import compute_overview
 from physion.experiment.experimenter.statistics.flagging import Flags

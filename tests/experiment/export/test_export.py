@@ -11,11 +11,9 @@ import pytest
 import sqlalchemy as sa
 from pandas.testing import assert_frame_equal
 
-from physion.analysis.people.completeness import read_expected
-from physion.analysis.people.exclusions import flag_sessions
-from physion.analysis.people.participants import read_responses
-from physion.analysis.people.response_schema import check_table
-from physion.analysis.tables.csv_table import read_table
+from physion.analysis.people.exclusions import flag_sessions, read_expected
+from physion.analysis.people.responses import check_table, read_responses
+from physion.analysis.tables import read_table
 from physion.cli.experiment import export as experiment_export
 from physion.cli.main import main
 from physion.core.errors import BadInputError, PhysionError

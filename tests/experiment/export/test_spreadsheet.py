@@ -13,8 +13,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from physion.analysis.people.response_schema import Column
-from physion.analysis.tables.csv_table import read_csv
+from physion.analysis.people.responses import Column
+from physion.analysis.tables import read_csv
 from physion.experiment.export.spreadsheet import guard_cell, restore_cell
 from physion.experiment.export.table_writer import TableWriter
 from physion.experiment.study.stimuli import LOOKS, NAME

@@ -9,9 +9,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from physion.analysis.people.completeness import read_expected
-from physion.analysis.people.exclusions import flag_sessions
-from physion.analysis.people.participants import read_responses
+from physion.analysis.people.exclusions import flag_sessions, read_expected
+from physion.analysis.people.responses import read_responses
 from physion.experiment.experimenter.statistics.summaries import SummaryCache
 from physion.experiment.export.export_study import export_study
 from physion.experiment.protocol.messages import Jump

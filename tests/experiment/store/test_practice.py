@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from physion.analysis.people.participants import read_responses
+from physion.analysis.people.responses import read_responses
 from physion.experiment.export.export_study import export_study
 from physion.experiment.protocol.messages import Completion, Jump, SessionState
 from physion.experiment.store.database import ANSWERS, PRACTICE_REPEATS, SESSIONS, SHOWINGS

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis.tables.predictions import read_predictions
+from physion.analysis.tables import read_predictions
 from physion.readout.evaluate import evaluate
 from physion.readout.plans.evaluation_plan import EvaluationPlan
 from physion.readout.plans.results import MEAN, StoredEvaluation, summarise_accuracy

@@ -8,21 +8,264 @@ code, which differs from it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.people.completeness import Expected
-from physion.analysis.people.participants import Responses
-from physion.analysis.people.session_measures import session_measures
-from physion.analysis.statistics.clustered_logit import clustered_logit
-from physion.analysis.tables.stimuli import in_order
+from physion.analysis.people.responses import Responses, scenarios_in
+from physion.analysis.statistics.regression import clustered_logit
+from physion.analysis.tables import in_order, read_table
 from physion.core.errors import BadInputError, ExclusionError, UnknownNameError
+from physion.core.names import OFFICIAL_SCENARIOS, canonical_name
+
+# Completeness of sessions: the stimuli that a session must have answered, and answers to others.
+#
+# The study's list of test stimuli decides (`read_expected`). Without one, a session must have the
+# stimuli that at least half of the scenario's sessions answered, so that one answer to an unknown
+# stimulus does not make every other session incomplete.
+
+Expected = Mapping[str, frozenset[str]]
+"""Canonical names of the test stimuli by session or, for all sessions of it, by scenario."""
+
+EXPECTED_FILE = "expected.csv"
+"""File with the study's list of stimuli, in the folder of the exported responses."""
+
+NOT_EXPECTED = "stimulus is not on the study's list"
+
+
+def read_expected(path: Path) -> dict[str, frozenset[str]]:
+    """Read the stimuli that a session must have from a list of them (CSV or parquet).
+
+    Columns: ``stimulus``, and ``session`` (if each has a list of its own) or ``scenario``, whose
+    values are the keys of the result. Raises `BadInputError`.
+    """
+    table = read_table(path, ("stimulus",))
+    if "session" not in table and "scenario" not in table:
+        raise BadInputError(f"{path} must say whose stimuli these are: column session or scenario")
+    names = table["stimulus"].astype(str).map(canonical_name)
+    if "session" in table:
+        whose = table["session"].astype(str)
+    else:
+        lower = table["scenario"].astype(str).str.strip().str.lower()
+        whose = lower.replace(OFFICIAL_SCENARIOS)
+    return {str(key): frozenset(group) for key, group in names.groupby(whose)}
+
+
+def find_expected(responses: Sequence[Path]) -> Path | None:
+    """Return the list `EXPECTED_FILE` next to the responses of an export, or None."""
+    paths = [file.parent / EXPECTED_FILE for file in responses]
+    return next((path for path in paths if path.is_file()), None)
+
+
+def check_expected(responses: Responses, expected: Expected | None) -> None:
+    """Raise `BadInputError` for a list that names none of these sessions and scenarios."""
+    known = {*responses.sessions["session"], *_each(responses.sessions["scenario"])}
+    if expected is not None and not known & set(expected):
+        raise BadInputError(
+            f"the list of expected stimuli names {next(iter(expected), 'nothing')!r}, which is "
+            "neither a session nor a scenario of the responses"
+        )
+
+
+def stimuli_of_most(test: pd.DataFrame) -> dict[str, frozenset[str]]:
+    """Return by scenario the stimuli that at least half of its sessions with answers answered.
+
+    ``test``: rows of the test phase. A scenario whose sessions saw different stimuli has none.
+    """
+    sessions = test.groupby("scenario")["session"].nunique()
+    answered = test.groupby(["scenario", "stimulus"])["session"].nunique().reset_index()
+    of_most = answered[2 * answered["session"] >= answered["scenario"].map(sessions)]
+    found = {str(name): frozenset(rows["stimulus"]) for name, rows in of_most.groupby("scenario")}
+    return {str(name): found.get(str(name), frozenset()) for name in sessions.index}
+
+
+def expected_by_session(
+    responses: Responses, expected: Expected | None
+) -> dict[str, frozenset[str]]:
+    """Return the stimuli that each session must have answered.
+
+    Those of the list of the session, else of its scenarios, else `stimuli_of_most`; none for a
+    scenario without either.
+    """
+    given = dict(expected or {})
+    of_scenario = {**stimuli_of_most(responses.test), **given}
+    found = {}
+    for session, scenarios in responses.sessions[["session", "scenario"]].to_numpy():
+        parts = [of_scenario.get(name, frozenset()) for name in scenarios_in(scenarios)]
+        found[str(session)] = given.get(session, frozenset().union(*parts))
+    return found
+
+
+def drop_unexpected(responses: Responses, expected: Expected | None) -> Responses:
+    """Return the responses without test answers to stimuli that are not on the study's list.
+
+    Sessions without a list keep all answers. Flag sessions first: rules about the sequence of
+    answers need all of them.
+    """
+    if expected is None:
+        return responses
+    in_list = responses.trials["session"].isin(_listed(responses, expected))
+    return responses.drop_rows(
+        _not_expected(responses, expected) & in_list, "stimuli", NOT_EXPECTED
+    )
+
+
+def completeness_warnings(responses: Responses, expected: Expected | None) -> list[str]:
+    """Return what users should know about completeness, at most one sentence a scenario.
+
+    They are about answers to stimuli that are not expected, and about scenarios whose sessions
+    cannot be judged because they saw different stimuli.
+    """
+    of_session = expected_by_session(responses, expected)
+    listed = _listed(responses, expected or {})
+    others = responses.trials[_not_expected(responses, expected)]
+    found = []
+    for scenario in in_order(responses.test["scenario"]):
+        sessions = set(responses.test.loc[responses.test["scenario"] == scenario, "session"])
+        rows = others[others["scenario"] == scenario]
+        if not any(of_session[session] for session in sessions):
+            found.append(
+                f"{scenario}: no stimulus was answered by half of the {len(sessions)} sessions, so "
+                "no session with answers counts as incomplete; give the study's list (--expected)"
+            )
+        elif len(rows):
+            which, consequence = (
+                ("are not on the study's list", "are left out")
+                if sessions & listed
+                else ("fewer than half of the sessions answered", "do not count for completeness")
+            )
+            found.append(
+                f"{scenario}: answers to stimuli that {which} {consequence}: {len(rows)}, the "
+                f"first to {rows['stimulus'].iloc[0]!r}"
+            )
+    return found
+
+
+def _listed(responses: Responses, expected: Expected) -> set[str]:
+    """Return the sessions for which the list names stimuli, by session or by scenario."""
+    rows = responses.sessions
+    of_scenario = [any(name in expected for name in scenarios_in(s)) for s in rows["scenario"]]
+    given = rows["session"].isin(set(expected)) | np.array(of_scenario, dtype=bool)
+    return set(rows.loc[given, "session"])
+
+
+def _each(sets: pd.Series) -> set[str]:
+    """Return each scenario of some `scenario_set`."""
+    return {name for scenarios in sets.unique() for name in scenarios_in(scenarios)}
+
+
+def _not_expected(responses: Responses, expected: Expected | None) -> pd.Series:
+    """Return which rows of the trials are test answers to a stimulus that is not expected."""
+    of_session = expected_by_session(responses, expected)
+    trials = responses.trials
+    pairs = zip(trials["session"], trials["stimulus"], strict=True)
+    found = [stimulus not in of_session[session] for session, stimulus in pairs]
+    return pd.Series(found, index=trials.index, dtype=bool) & (trials["phase"] == "test")
+
+
+# Measures of a session for the exclusion rules: streaks, alternations, accuracy, response
+# times.
+
+
+def longest_streak(yes: npt.ArrayLike) -> int:
+    """Return the length of the longest run of one answer; 0 without answers."""
+    answers = np.asarray(yes, dtype=bool)
+    return _longest_run(answers[1:] == answers[:-1]) + 1 if len(answers) else 0
+
+
+def longest_alternation(yes: npt.ArrayLike, begins_with: bool | None = None) -> int:
+    """Return the length of the longest run of answers in which each differs from the one before.
+
+    ``begins_with``: count only from the first answer of this value on, in each run.
+    """
+    answers = np.asarray(yes, dtype=bool)
+    if not len(answers):
+        return 0
+    if begins_with is None:
+        return _longest_run(answers[1:] != answers[:-1]) + 1
+    breaks = np.flatnonzero(answers[1:] == answers[:-1]) + 1
+    stretches = np.split(answers, breaks)
+    return max(len(part) - int(part[0] != begins_with) for part in stretches)
+
+
+def _longest_run(same: npt.NDArray[np.bool_]) -> int:
+    """Return the length of the longest run of True."""
+    ends = np.flatnonzero(np.concatenate(([True], ~same, [True])))
+    return int(np.max(np.diff(ends))) - 1
+
+
+def session_measures(responses: Responses, expected: Expected | None = None) -> pd.DataFrame:
+    """Return the measures for the rules, one row a session, in the order of ``responses.sessions``.
+
+    A session of several blocks is measured as a whole, over the answers in the order given.
+
+    ``expected``: the test stimuli by scenario, or by session if people see subsets; by default
+    those that at least half of the scenario's sessions answered (`completeness`). Columns:
+    ``session``, ``participant``, ``scenario``, ``expected`` (number of stimuli), ``missing`` (those
+    of them without an answer), ``trials``, ``accuracy``, ``yes``, ``mean_log_rt``,
+    ``median_log_rt``, ``no_log_rt`` (trials without a response time above 0), ``longest_streak``,
+    ``longest_alternation``, ``longest_alternation_from_first``, ``familiarization_trials``,
+    ``familiarization_correct``. Raises `BadInputError` if no session has a test answer.
+    """
+    test = responses.test
+    if test.empty:
+        raise BadInputError(
+            f"{len(responses.sessions)} session(s) hold practice alone and no test answer: "
+            "give responses with test trials"
+        )
+    wanted = expected_by_session(responses, expected)
+    by_session = {
+        str(session): rows.sort_values("trial", kind="stable")
+        for session, rows in test.groupby("session", sort=False)
+    }
+    begins: dict[str, bool] = {}
+    for session, scenario in responses.sessions[["session", "scenario"]].to_numpy():
+        if session in by_session:
+            begins.setdefault(scenario, bool(by_session[session]["yes"].iloc[0]))
+    scenario_of = dict(responses.sessions[["session", "scenario"]].to_numpy())
+    records = {
+        session: _session_record(rows, begins[scenario_of[session]])
+        for session, rows in by_session.items()
+    }
+    nothing = {"trials": 0, "longest_streak": 0, "longest_alternation": 0,
+               "longest_alternation_from_first": 0, "no_log_rt": 0}  # fmt: skip
+    keys = responses.sessions[["session", "participant", "scenario"]]
+    measures = pd.DataFrame([records.get(session, nothing) for session in keys["session"]])
+    measures = pd.concat([keys.reset_index(drop=True), measures], axis=1)
+    answered = {name: frozenset(rows["stimulus"]) for name, rows in by_session.items()}
+    names = measures["session"]
+    measures["expected"] = [len(wanted[name]) for name in names]
+    measures["missing"] = [len(wanted[name] - answered.get(name, frozenset())) for name in names]
+    practice = responses.trials[responses.trials["phase"] == "familiarization"]
+    counts = practice.groupby("session")["correct"].agg(["size", "sum"])
+    counts = counts.reindex(measures["session"])
+    measures["familiarization_trials"] = counts["size"].fillna(0).to_numpy(dtype=int)
+    measures["familiarization_correct"] = counts["sum"].to_numpy(dtype=np.float64)
+    return measures
+
+
+def _session_record(rows: pd.DataFrame, begins: bool) -> dict[str, float]:
+    yes, log_rt = rows["yes"].to_numpy(dtype=bool), rows["log_rt"].to_numpy(dtype=np.float64)
+    known = log_rt[np.isfinite(log_rt)]
+    return {
+        "trials": len(rows),
+        "accuracy": float(rows["correct"].mean()),
+        "yes": float(yes.mean()),
+        "mean_log_rt": float(np.mean(known)) if len(known) else np.nan,
+        "median_log_rt": float(np.median(known)) if len(known) else np.nan,
+        "no_log_rt": len(log_rt) - len(known),
+        "longest_streak": longest_streak(yes),
+        "longest_alternation": longest_alternation(yes),
+        "longest_alternation_from_first": longest_alternation(yes, begins),
+    }
+
 
 RULES = (
     "streak",

@@ -24,8 +24,8 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import optimize, special, stats
 
-from physion.analysis.statistics.correlation import correlate_resampled
-from physion.analysis.statistics.jackknife import jackknife
+from physion.analysis.intervals import jackknife
+from physion.analysis.statistics.agreement import correlate_resampled
 from physion.core.errors import BadInputError
 from physion.core.seeds import generator
 

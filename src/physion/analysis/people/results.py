@@ -8,58 +8,58 @@ from pathlib import Path
 
 import pandas as pd
 
-from physion.analysis.people.biases import (
+from physion.analysis.intervals import Bootstrap
+from physion.analysis.people.effects import (
     accuracy_by_background,
     background,
     learning,
+    regress_hypotheses,
     side_bias,
+    with_attributes,
     yes_bias,
-)
-from physion.analysis.people.completeness import (
-    Expected,
-    check_expected,
-    completeness_warnings,
-    drop_unexpected,
 )
 from physion.analysis.people.exclusions import (
     PREREGISTERED,
     RULE_SETS,
     RULES,
     ExclusionRules,
+    Expected,
     check_excluded,
+    check_expected,
+    completeness_warnings,
     count_flags,
     describe_confirmed,
+    drop_unexpected,
     flag_effect,
     flag_sessions,
     with_and_without,
     without_flagged,
 )
-from physion.analysis.people.hypotheses import regress_hypotheses, with_attributes
-from physion.analysis.people.items import item_statistics
-from physion.analysis.people.official_responses import read_official_responses
-from physion.analysis.people.participants import (
-    REHEARSAL,
-    Kind,
-    Responses,
-    missing_times,
-    read_responses,
-)
-from physion.analysis.people.people import (
+from physion.analysis.people.measures import (
     accuracy_by_condition,
     accuracy_by_participant,
     accuracy_by_scenario,
     accuracy_by_stimulus,
     agreement_by_scenario,
+    item_statistics,
 )
-from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.analysis.tables.attributes import (
+from physion.analysis.people.responses import (
+    REHEARSAL,
+    Responses,
+    missing_times,
+    read_official_responses,
+    read_responses,
+)
+from physion.analysis.people.responses import ParticipantsKind as Kind
+from physion.analysis.tables import (
     ATTRIBUTES,
     attributes_from_names,
     attributes_from_table,
     better_attributes,
+    read_csv,
+    read_table,
 )
-from physion.analysis.tables.attributes import COLUMNS as ATTRIBUTE_COLUMNS
-from physion.analysis.tables.csv_table import read_csv, read_table
+from physion.analysis.tables import COLUMNS as ATTRIBUTE_COLUMNS
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.names import scenario_of
 

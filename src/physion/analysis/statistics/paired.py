@@ -12,10 +12,12 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
-from physion.analysis.statistics.agreement import pearson
-from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.analysis.statistics.correlation import correlate_resampled, correlation_from_sums
-from physion.analysis.statistics.jackknife import jackknife
+from physion.analysis.intervals import Bootstrap, jackknife
+from physion.analysis.statistics.agreement import (
+    correlate_resampled,
+    correlation_from_sums,
+    pearson,
+)
 from physion.core.errors import BadInputError
 from physion.core.seeds import generator
 

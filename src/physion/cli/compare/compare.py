@@ -110,7 +110,7 @@ def main(options: Options) -> int:
 
 def _given(options: Options) -> dict[str, Any]:
     """The options that were given, by the names that `compare_files` has for them."""
-    from physion.analysis.statistics.bootstrap import Bootstrap
+    from physion.analysis.intervals import Bootstrap
     from physion.core.errors import BadInputError
     from physion.report.html import movies_of
 

@@ -18,7 +18,7 @@ import tyro
 if TYPE_CHECKING:
     import pandas as pd
 
-    from physion.analysis.published.summary import PublishedResults
+    from physion.analysis.published.claims import PublishedResults
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Options:
 
 def main(options: Options) -> int:
     """Print the tables, and write the page if asked."""
-    from physion.analysis.published.summary import published_results
+    from physion.analysis.published.claims import published_results
     from physion.cli.official.read import study_folder
     from physion.cli.output import console
     from physion.report.published import build_published_report, published_numbers
@@ -53,7 +53,7 @@ def main(options: Options) -> int:
 
 
 def _print(results: PublishedResults) -> None:
-    from physion.analysis.published.cells import grid
+    from physion.analysis.published.tables import grid
 
     tables, words = results.tables, results.descriptions
     accuracies = tables["accuracies"]
@@ -81,7 +81,7 @@ def _print(results: PublishedResults) -> None:
 
 
 def _title(name: str) -> str:
-    from physion.analysis.published.summary import TITLES
+    from physion.analysis.published.claims import TITLES
 
     return TITLES[name]
 

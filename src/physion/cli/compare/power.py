@@ -83,7 +83,7 @@ def main(options: Options) -> int:
 
 def _fractions(options: Options) -> pd.DataFrame:
     """Return ``p_yes``, ``count`` and ``label`` of the stimuli that people answered."""
-    from physion.analysis.tables.responses import (
+    from physion.analysis.tables import (
         LABELS_FILE,
         find_next_to,
         read_humans,
@@ -94,7 +94,7 @@ def _fractions(options: Options) -> pd.DataFrame:
     from physion.core.errors import BadInputError
 
     if options.responses:
-        from physion.analysis.people.people import accuracy_by_stimulus
+        from physion.analysis.people.measures import accuracy_by_stimulus
         from physion.analysis.people.results import read_any_responses
 
         test = read_any_responses(options.responses, options.sessions).test

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 if TYPE_CHECKING:
-    from physion.analysis.tables.submission import Checked, Reference
+    from physion.analysis.check import Checked, Reference
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Options:
 
 def main(options: Options) -> int:
     """Print the faults; return 1 if one of them is an error."""
-    from physion.analysis.tables.submission import validate
+    from physion.analysis.check import validate
     from physion.core.errors import BadInputError
 
     if not options.predictions and not options.responses:
@@ -70,8 +70,8 @@ def _responses(
     options: Options, labels: Mapping[str, bool] | None
 ) -> tuple[Checked, dict[str, bool]]:
     """Check the responses, and return the outcomes of the stimuli that people answered."""
-    from physion.analysis.people.check_responses import check_responses
-    from physion.analysis.people.completeness import find_expected, read_expected
+    from physion.analysis.check import check_responses
+    from physion.analysis.people.exclusions import find_expected, read_expected
 
     path = options.expected or find_expected(options.responses)
     checked, responses = check_responses(
@@ -87,9 +87,8 @@ def _responses(
 
 
 def _reference(options: Options) -> Reference:
-    from physion.analysis.tables.responses import LABELS_FILE, find_next_to, read_labels
-    from physion.analysis.tables.stimuli import read_stimulus_list
-    from physion.analysis.tables.submission import Reference, read_index
+    from physion.analysis.check import Reference, read_index
+    from physion.analysis.tables import LABELS_FILE, find_next_to, read_labels, read_stimulus_list
     from physion.core.errors import BadInputError
 
     labels = options.labels

@@ -128,7 +128,7 @@ def _choose_made(options: Options, trials: Path, scenario: tuple[str, ...]) -> S
 
 def _choose_official(options: Options) -> StimulusSelection:
     """Select official scenes, render the trials that are missing, and take the stimuli of them."""
-    from physion.analysis.tables.responses import read_humans
+    from physion.analysis.tables import read_humans
     from physion.cli.official.read import official_data, read_trials
     from physion.cli.output import Stages
     from physion.compute.local import LocalExecutor

@@ -44,7 +44,7 @@ def plan_official(scenes: Path, humans: Path | None, limit: int | None) -> RunPl
     ``limit`` is the number of testing trials of a scenario, balanced by recorded outcome; as many
     others are fitted. 0 takes all.
     """
-    from physion.analysis.tables.responses import read_humans
+    from physion.analysis.tables import read_humans
     from physion.cli.official.read import read_trials
     from physion.core.names import canonical_name
     from physion.trials.making.plan import check_names, plan_scenes

@@ -1,6 +1,6 @@
 """The data of a study as two data frames: one row per session, one row per trial.
 
-Columns, types and order are those of `physion.analysis.people.response_schema`. Sessions are sorted
+Columns, types and order are those of `physion.analysis.people.responses`. Sessions are sorted
 by start time; trials by session, then familiarization before test, in the order in which they were
 shown. Labels are read from the study folder. Sessions that are left out are counted by reason
 (`session_rows.SessionTable.left_out`).
@@ -15,7 +15,7 @@ import pandas as pd
 import pyarrow as pa
 from sqlalchemy import Connection, Engine
 
-from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS
+from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS
 from physion.core.errors import PhysionError
 from physion.experiment.export.arrow_types import arrow_schema, as_frame
 from physion.experiment.export.session_rows import EXPORTED_KINDS, SessionSelection, read_sessions

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import pandas as pd
 import pyarrow as pa
 
-from physion.analysis.people.response_schema import Column
+from physion.analysis.people.responses import Column
 
 ARROW_TYPES = {
     "text": pa.string(),

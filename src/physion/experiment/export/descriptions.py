@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from textwrap import fill
 from typing import Any, Literal
 
-from physion.analysis.people.response_schema import Column
+from physion.analysis.people.responses import Column
 from physion.experiment.export.conventions.bids import TEXT_RULE
 from physion.experiment.export.spreadsheet import RULE
 from physion.experiment.study.stimuli import LOOKS, STIMULUS_PHASES

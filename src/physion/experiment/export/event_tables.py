@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 from sqlalchemy import Connection, select
 
-from physion.analysis.people.response_schema import PHASES, Column
+from physion.analysis.people.responses import PHASES, Column
 from physion.experiment.export.arrow_types import arrow_schema
 from physion.experiment.export.iso_times import iso_times
 from physion.experiment.export.trial_rows import AT_ONCE, TrialBatch

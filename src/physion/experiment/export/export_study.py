@@ -34,7 +34,7 @@ import numpy as np
 import pyarrow.compute as pc
 from sqlalchemy import Connection, Engine, select
 
-from physion.analysis.people.response_schema import Column, data_dictionary
+from physion.analysis.people.responses import Column, data_dictionary
 from physion.core.version import __version__
 from physion.experiment.export.answer_tables import snapshot
 from physion.experiment.export.conventions.bids import BidsWriter

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 from sqlalchemy import Connection, select
 
-from physion.analysis.people.response_schema import TRIAL_COLUMNS, Column
+from physion.analysis.people.responses import TRIAL_COLUMNS, Column
 from physion.experiment.export.arrow_types import ARROW_TYPES, arrow_schema
 from physion.experiment.export.iso_times import iso_times
 from physion.experiment.store.database import ANSWERS, PRACTICE_REPEATS

@@ -13,7 +13,7 @@ from typing import Any
 import pyarrow as pa
 from sqlalchemy import Connection, select
 
-from physion.analysis.people.response_schema import Column
+from physion.analysis.people.responses import Column
 from physion.experiment.export.arrow_types import ARROW_TYPES, arrow_schema
 from physion.experiment.store.database import SESSIONS, STUDIES
 from physion.experiment.study.questions import Question, columns_of

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 from sqlalchemy import Connection, select
 
-from physion.analysis.people.response_schema import SESSION_COLUMNS
+from physion.analysis.people.responses import SESSION_COLUMNS
 from physion.core.errors import UnknownNameError
 from physion.experiment.export.arrow_types import ARROW_TYPES, arrow_schema
 from physion.experiment.export.iso_times import iso_times

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pyarrow import csv
 
-from physion.analysis.people.response_schema import Column
+from physion.analysis.people.responses import Column
 from physion.experiment.export.arrow_types import arrow_schema
 from physion.experiment.export.spreadsheet import guard_cell
 

@@ -13,7 +13,7 @@ import pyarrow as pa
 from sqlalchemy import Connection, Float, Integer, case, cast, func, select
 from sqlalchemy.sql import ColumnElement
 
-from physion.analysis.people.response_schema import TRIAL_COLUMNS
+from physion.analysis.people.responses import TRIAL_COLUMNS
 from physion.experiment.export.arrow_types import arrow_schema
 from physion.experiment.export.iso_times import iso_times
 from physion.experiment.store.database import ANSWERS

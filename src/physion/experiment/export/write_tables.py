@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from sqlalchemy import Connection
 
-from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, Column
+from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS, Column
 from physion.experiment.export.conventions.bids import BidsWriter
 from physion.experiment.export.descriptions import STIMULI_COLUMNS
 from physion.experiment.export.event_tables import (

@@ -175,7 +175,7 @@ def _simulated(motion: Motion, trial: str) -> bool:
 
 # Strict reader of the fraction of people who answered yes, by stimulus.
 #
-# `physion.analysis.tables.responses` reads the same files for the comparison with people; models
+# `physion.analysis.tables` reads the same files for the comparison with people; models
 # cannot import it, because the analysis must run on tables alone.
 
 FILES = re.compile(r"human_accuracy-[a-zA-Z]+(-redyellow)?_pilot-.*\.csv$")

@@ -16,10 +16,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from physion.analysis.models import figure_tables as tables
-from physion.analysis.models.figure_tables import ANCHOR, HALVES_ZONE, SCENARIO_ZONE
-from physion.analysis.models.rollout_errors import CONSTANT_VELOCITY
-from physion.analysis.tables.stimuli import MEAN
+from physion.analysis import figure_tables as tables
+from physion.analysis.figure_tables import ANCHOR, HALVES_ZONE, SCENARIO_ZONE
+from physion.analysis.rollout_errors import CONSTANT_VELOCITY
+from physion.analysis.tables import MEAN
 from physion.report.figures.theme import (
     BY_SCENARIO,
     LIGHT,

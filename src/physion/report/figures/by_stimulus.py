@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from physion.analysis.models import figure_tables as tables
+from physion.analysis import figure_tables as tables
 from physion.analysis.statistics.agreement import pearson
-from physion.analysis.tables.stimuli import in_order
+from physion.analysis.tables import in_order
 from physion.report.figures.by_scenario import measure_figure
 from physion.report.figures.theme import (
     BY_STIMULUS,

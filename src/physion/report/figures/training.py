@@ -16,7 +16,7 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from physion.analysis.models import figure_tables as tables
+from physion.analysis import figure_tables as tables
 from physion.report.figures.theme import (
     LIGHT,
     TRAINING,

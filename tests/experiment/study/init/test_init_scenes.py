@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from physion.analysis.tables.responses import read_humans
+from physion.analysis.tables import read_humans
 from physion.cli.main import main
 from physion.compute.local import SerialExecutor
 from physion.core.errors import BadInputError

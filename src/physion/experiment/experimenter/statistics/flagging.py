@@ -111,7 +111,7 @@ def find_flags(study: Study, engine: Engine) -> Mapping[str, Flags]:
     Previews have no flags: the rules are applied to exported data, which excludes previews.
     """
     from physion.analysis.people.exclusions import RULE_SETS, RULES, flag_sessions
-    from physion.analysis.people.participants import clean
+    from physion.analysis.people.responses import clean
     from physion.experiment.export.answer_tables import read_tables
     from physion.experiment.export.expected import expected_names
 

@@ -27,7 +27,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from pyarrow import csv
 
-from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, Column
+from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS, Column
 from physion.experiment.export.conventions.column_labels import column_levels, unique_file_labels
 from physion.experiment.export.spreadsheet import guard_cell
 from physion.experiment.export.trial_rows import TrialBatch

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-from physion.analysis.people.response_schema import Column
+from physion.analysis.people.responses import Column
 
 KIND_NAMES = {
     "text": "text",

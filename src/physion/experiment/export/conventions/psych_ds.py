@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from physion.analysis.people.response_schema import Column
+from physion.analysis.people.responses import Column
 from physion.experiment.export.conventions.column_labels import (
     KIND_NAMES,
     column_levels,

@@ -1,0 +1,287 @@
+"""All results of a comparison, computed here so that the report only draws."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from physion.analysis.comparison import Comparison, compare_scores
+from physion.analysis.intervals import Bootstrap
+from physion.analysis.model_tests import (
+    MixedTable,
+    calibration_scores,
+    fits_of_models,
+    fits_of_people,
+    paired_measures,
+    paired_tests,
+    permutations_of,
+    pool_comparison,
+    pool_scenarios,
+)
+from physion.analysis.people.measures import HALVES, accuracy_by_stimulus, all_answers, split_halves
+from physion.analysis.people.results import PeopleResults
+from physion.analysis.scores import (
+    TWO_PEOPLE,
+    add_anchors,
+    human_zones,
+    mean_measures,
+    measure_models,
+    measure_table,
+    model_pairs,
+    models_of,
+    released_r_zone,
+    with_kind,
+)
+from physion.analysis.tables import check_excluded_names, require_columns
+from physion.core.errors import BadInputError
+
+# All models compared with all participants: every scenario, their mean, and what was excluded.
+
+
+@dataclass(frozen=True)
+class PeopleComparison:
+    """Tables that compare models with single participants.
+
+    - ``scores``: `measures.measure_table` of every scenario, then of their mean with equal
+      weights (NaN if one of them is undefined), with ``kind`` (model or anchor; the computed
+      anchors come last in each scenario), ``zone_low``, ``zone_high`` (of single participants) and
+      ``in_zone`` (yes, no, or empty if either is undefined).
+    - ``zones``: `zones.human_zones` of every scenario, and for several scenarios also the paper's
+      band of r (`zones.released_r_zone`), whose scenario is the mean.
+    - ``pairs``: `model_people.model_pairs` of every scenario.
+    - ``tests``: `paired.compare_models` on the stimuli of all scenarios together;
+      ``measure_tests``: `paired_measures.paired_measures`.
+    - ``calibration``: `calibration.calibration_table`, likewise.
+    - ``dropped``: ``agent``, ``scenario``, ``reason``, ``stimuli``.
+    """
+
+    scores: pd.DataFrame
+    zones: pd.DataFrame
+    pairs: pd.DataFrame
+    tests: pd.DataFrame
+    measure_tests: pd.DataFrame
+    calibration: pd.DataFrame
+    dropped: pd.DataFrame
+
+
+def compare_everywhere(
+    predictions: pd.DataFrame,
+    test: pd.DataFrame,
+    bootstrap: Bootstrap | None = None,
+    *,
+    halves: int = HALVES,
+    permutations: int = 2000,
+) -> PeopleComparison:
+    """Compare the models of ``predictions`` with the people of ``test`` in every scenario.
+
+    Parameters
+    ----------
+    predictions
+        One row a model and stimulus with ``agent``, ``stimulus`` (canonical name), ``p_contact``,
+        ``predicted``. Predictions of stimuli that nobody saw are counted as dropped.
+    test
+        Test rows of `participants.Responses`.
+    bootstrap
+        Level of the intervals, and draws of the tests.
+    halves
+        Number of random splits of the people into halves.
+    permutations
+        Permutations of the test of differences in r.
+    """
+    columns = ["agent", "stimulus", "p_contact", "predicted"]
+    require_columns(predictions, columns, "the predictions")
+    draws = bootstrap or Bootstrap()
+    scenario_by_stimulus = test.drop_duplicates("stimulus").set_index("stimulus")["scenario"]
+    rows = predictions[columns].assign(scenario=predictions["stimulus"].map(scenario_by_stimulus))
+    agents = list(rows["agent"].unique())
+    dropped = [_unseen(rows)]
+    measured, scored, zones, pairs = [], [], [], []
+    for answers in all_answers(test):
+        subset = rows[rows["scenario"] == answers.scenario]
+        models, unmatched = models_of(subset, answers, agents)
+        dropped.append(unmatched.assign(scenario=answers.scenario))
+        scored.append((models, answers))
+        measured.append(
+            measure_models(add_anchors(models, answers), answers, two_people=TWO_PEOPLE)
+        )
+        zones.append(human_zones(answers, split_halves(answers.yes, halves, draws.seed)))
+        pairs.append(model_pairs(models, answers).assign(scenario=answers.scenario))
+    zone = pd.concat(zones, ignore_index=True)
+    if len(measured) > 1:
+        zone = pd.concat([zone, released_r_zone(zone)], ignore_index=True)
+    tables = [measure_table(one, draws.level) for one in measured]
+    if len(measured) > 1:
+        tables.append(measure_table(mean_measures(measured), draws.level))
+    pooled = pool_scenarios(scored)
+    return PeopleComparison(
+        scores=with_kind(_with_zone(pd.concat(tables, ignore_index=True), zone), "model"),
+        zones=zone,
+        pairs=pd.concat(pairs, ignore_index=True),
+        tests=paired_tests(pooled, draws, permutations),
+        measure_tests=paired_measures(pooled, draws.level, permutations, draws.seed),
+        calibration=calibration_scores(pooled),
+        dropped=pd.concat(dropped, ignore_index=True)[["agent", "scenario", "reason", "stimuli"]],
+    )
+
+
+def _unseen(rows: pd.DataFrame) -> pd.DataFrame:
+    counts = rows[rows["scenario"].isna()].groupby("agent", sort=False).size()
+    table = pd.DataFrame({"agent": counts.index, "stimuli": counts.to_numpy()})
+    return table.assign(scenario="unknown", reason="people did not see it")
+
+
+def _with_zone(scores: pd.DataFrame, zones: pd.DataFrame) -> pd.DataFrame:
+    subset = zones.loc[zones["of"] == "participants", ["scenario", "measure", "low", "high"]]
+    subset = subset.rename(columns={"low": "zone_low", "high": "zone_high"})
+    joined = scores.merge(subset, on=["scenario", "measure"], how="left")
+    known = joined[["value", "zone_low", "zone_high"]].notna().all(axis=1)
+    inside = joined["value"].between(joined["zone_low"], joined["zone_high"])
+    words = inside.map({True: "yes", False: "no"})
+    return joined.assign(in_zone=words.where(known, ""))
+
+
+@dataclass(frozen=True)
+class ComparisonResults:
+    """Results of a comparison of models with people.
+
+    - ``comparison``: from `comparison.compare_scores`.
+    - ``predictions``: from `predictions.read_predictions`, for what needs readout and training.
+    - ``people``: results about single participants; None if only their averages are known.
+    - ``beside``: models and single participants, from `people_comparison.compare_everywhere`.
+    - ``comparison_all``: the comparison with all complete sessions, including flagged ones.
+    - ``paired``: from `model_tests.paired_tests`, all scenarios pooled; None for one model.
+    - ``paired_measures``: from `paired_measures.paired_measures`; None for one model or no people.
+    - ``calibration``: from `model_tests.calibration_scores`.
+    - ``mixed``: from `mixed_fits`.
+    - ``warnings``: what may make the results wrong, one sentence each.
+    """
+
+    comparison: Comparison
+    predictions: pd.DataFrame | None = None
+    people: PeopleResults | None = None
+    beside: PeopleComparison | None = None
+    comparison_all: Comparison | None = None
+    paired: pd.DataFrame | None = None
+    paired_measures: pd.DataFrame | None = None
+    calibration: pd.DataFrame | None = None
+    mixed: tuple[MixedTable, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def compare(
+    predictions: pd.DataFrame,
+    humans: pd.DataFrame | None = None,
+    labels: Mapping[str, bool] | None = None,
+    *,
+    people: PeopleResults | None = None,
+    zone: pd.DataFrame | None = None,
+    zone_origin: str = "",
+    exclude: Iterable[str] = (),
+    exclude_ledge: bool = True,
+    bootstrap: Bootstrap | None = None,
+) -> ComparisonResults:
+    """Compare models with people, and compute all that a report shows.
+
+    Parameters
+    ----------
+    predictions
+        From `predictions.read_predictions`.
+    humans, labels, zone, zone_origin
+        Averages of people, recorded outcomes and the human zone, as in `compare_scores`.
+    people
+        From `people.results.analyse_people`, in place of ``humans``, ``labels`` and ``zone``.
+    exclude, exclude_ledge, bootstrap
+        As in `compare_scores`.
+
+    Returns
+    -------
+    results
+        Scores by model and scenario with intervals, differences of models, calibration, mixed
+        models, and, with ``people``, models next to single participants.
+
+    Raises
+    ------
+    BadInputError
+        For ``people`` beside averages, and as `compare_scores`.
+    UnknownNameError
+        For a name in ``exclude`` that no table contains.
+    """
+    draws = bootstrap or Bootstrap()
+    settings: dict[str, Any] = {
+        "exclude": tuple(exclude),
+        "exclude_ledge": exclude_ledge,
+        "bootstrap": draws,
+    }
+    column = "stimulus" if "stimulus" in predictions else "Stimulus Name"
+    predicted = set(predictions[column].astype(str))
+    if people is not None:
+        if humans is not None or labels is not None or zone is not None:
+            raise BadInputError("give averages of people or their single responses, not both")
+        check_excluded_names(settings["exclude"], predicted | people.stimuli)
+        return _with_participants(predictions, people, draws, settings)
+    seen = set() if humans is None else set(humans["stimulus"])
+    check_excluded_names(settings["exclude"], {*predicted, *seen, *(labels or {})})
+    comparison = compare_scores(
+        predictions, humans, labels, zone=zone, zone_origin=zone_origin, **settings
+    )
+    return _with_averages(comparison, predictions, draws)
+
+
+def _with_averages(
+    comparison: Comparison, predictions: pd.DataFrame, draws: Bootstrap
+) -> ComparisonResults:
+    """Complete a comparison with people's averages, or without people, by tests and fits."""
+    pooled = pool_comparison(comparison)
+    several = len(comparison.agents) > 1
+    return ComparisonResults(
+        comparison,
+        predictions=predictions,
+        paired=paired_tests(pooled, draws) if several else None,
+        paired_measures=paired_measures(pooled, draws.level, seed=draws.seed)
+        if several and comparison.has_people
+        else None,
+        calibration=calibration_scores(pooled),
+        mixed=tuple(fits_of_models(comparison)),
+        warnings=comparison.warnings,
+    )
+
+
+def _with_participants(
+    predictions: pd.DataFrame,
+    people: PeopleResults,
+    draws: Bootstrap,
+    settings: Mapping[str, Any],
+) -> ComparisonResults:
+    """Compare models with the sessions that are not flagged, and with all complete ones.
+
+    ``settings`` are the options of `compare_scores`, which resamples with ``draws``.
+    """
+    main = compare_scores(
+        predictions,
+        people.tables["by_stimulus"],
+        people.labels(),
+        zone=people.zone(),
+        zone_origin="from the responses themselves",
+        participants=True,
+        **settings,
+    )
+    everybody = accuracy_by_stimulus(people.whole.test, draws)
+    whole = compare_scores(predictions, everybody, people.labels(), **settings)
+    agents = len(main.agents)
+    permutations = permutations_of(agents * (agents - 1) // 2)
+    beside = compare_everywhere(main.stimuli, people.kept.test, draws, permutations=permutations)
+    return ComparisonResults(
+        main,
+        predictions=predictions,
+        people=people,
+        comparison_all=whole,
+        beside=beside,
+        paired=beside.tests if agents > 1 else None,
+        paired_measures=beside.measure_tests if agents > 1 else None,
+        calibration=beside.calibration,
+        mixed=(*fits_of_people(people), *fits_of_models(main)),
+        warnings=(*people.warnings, *main.warnings),
+    )

@@ -1,0 +1,386 @@
+"""Tables of the figures: each figure draws exactly its table.
+
+Tables of scores (`MEASURE_COLUMNS`) have models, then anchors; the others have models alone.
+Each function returns one table, plain rows and columns, that is written next to the figure as CSV.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from physion.analysis.compare import PeopleComparison
+from physion.analysis.comparison import Comparison
+from physion.analysis.intervals import jackknife, mean_of, variance_of_mean
+from physion.analysis.people.effects import THIRDS, below_chance_level, difficulty_third, r_by_third
+from physion.analysis.scores import COMPUTED, anchor_stimuli, kind_of, released_zone
+from physion.analysis.statistics.agreement import correlate_resampled, correlate_rows
+from physion.analysis.statistics.regression import brier, reliability_curve
+from physion.analysis.tables import DATASETS, MEAN, POOLED, PROTOCOLS, READOUTS, in_order
+from physion.core.names import OFFICIAL_SCENARIOS, SCENARIOS
+
+Array = npt.NDArray[np.float64]
+
+PARTICIPANTS = "95 % of participants"
+HALVES = "95 % of random halves"
+SCENARIO_ZONE = "paper's band: bootstrap of scenario means"
+HALVES_ZONE = "paper's band: r of halves, mean over scenarios"
+"""What the zone of a row is, in words of the figure's key."""
+
+ANCHOR = "anchor"
+"""``kind`` of anchors in the tables of scores."""
+
+MEASURE_COLUMNS = (
+    "panel", "agent", "kind", "value", "low", "high", "people", "people_is", "zone_low",
+    "zone_high", "zone", "reason",
+)  # fmt: skip
+"""``panel``: scenario or `MEAN`; ``kind``: what the mark says: the readout, or `ANCHOR`; ``people``
+and ``people_is``: the dashed line and its name; ``zone``: what the band is."""
+
+GROUPED_COLUMNS = ("panel", "agent", "group", "value", "low", "high", "people", "stimuli", "reason")
+
+GENERALIZATION_COLUMNS = ("agent", "trained", "tested", "stimuli", "accuracy", "people",
+                          "difference")  # fmt: skip
+
+ALL_BUT, ONLY, ANOTHER = PROTOCOLS["all but this"], PROTOCOLS["same"], "another scenario"
+
+
+def accuracy_table(comparison: Comparison) -> pd.DataFrame:
+    """Return accuracy by scenario and model, with people; `MEASURE_COLUMNS`."""
+    people = _accuracy_of_people(comparison)
+    return _measure(_scores(comparison, "accuracy"), people, "people")
+
+
+def r_table(comparison: Comparison, zones: pd.DataFrame | None = None) -> pd.DataFrame:
+    """Return Pearson's r with the average person; the dashed line is its noise ceiling.
+
+    Columns: `MEASURE_COLUMNS`. ``zones`` (`zones.human_zones`): the range of single participants
+    with the average of the others; in the mean the paper's band, as in `zones.released_r_zone`.
+    """
+    people = comparison.people.set_index("scenario")[["ceiling"]].set_axis(["people"], axis=1)
+    people = _with_zone(people, zones, "r", released=False)
+    if zones is not None and MEAN in people.index:
+        halves = zones[(zones["measure"] == "r") & (zones["of"] == "halves")]
+        people.loc[MEAN, ["zone_low", "zone_high"]] = halves[["low", "high"]].mean().tolist()
+        people.loc[MEAN, "zone"] = HALVES_ZONE
+    return _measure(_scores(comparison, "r"), people, "ceiling")
+
+
+def kappa_table(comparison: Comparison, with_people: PeopleComparison) -> pd.DataFrame:
+    """Return mean kappa with participants, and the mean kappa of people with each other.
+
+    Columns: `MEASURE_COLUMNS`. Intervals draw people and stimuli.
+    """
+    rows = with_people.scores[with_people.scores["measure"] == "kappa"].rename(
+        columns={"model": "agent", "scenario": "panel", "low_both": "low", "high_both": "high"}
+    )[["panel", "agent", "value", "low", "high", "reason"]]
+    readouts = comparison.scores.drop_duplicates("agent").set_index("agent")["readout"]
+    rows = rows[rows["agent"].isin([*comparison.agents, *COMPUTED])]
+    rows = rows.assign(kind=rows["agent"].map(readouts).fillna(""))
+    zones = with_people.zones
+    subset = zones[(zones["measure"] == "kappa") & (zones["of"] == "participants")]
+    people = subset.set_index("scenario")[["mean"]].set_axis(["people"], axis=1)
+    if len(people) > 1:
+        people.loc[MEAN] = people["people"].mean()
+    people = _with_zone(people, zones, "kappa", released=True)
+    return _measure(rows, people, "people with people")
+
+
+def _scores(comparison: Comparison, key: str) -> pd.DataFrame:
+    table = comparison.all_scores
+    rows = table[table["scenario"] != POOLED].drop(columns="kind")
+    names = {"scenario": "panel", "readout": "kind", key: "value", f"{key}_low": "low",
+             f"{key}_high": "high"}  # fmt: skip
+    return rows[["agent", *names, "reason"]].rename(columns=names)
+
+
+def _anchors_last(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of models, then of anchors, which are marked; undefined ones are left out."""
+    anchor = rows["agent"].map(kind_of) == "anchor"
+    defined = rows["agent"].isin(rows.loc[rows["value"].notna(), "agent"])
+    marked = rows.assign(kind=rows["kind"].mask(anchor, ANCHOR))
+    return pd.concat([marked[~anchor], marked[anchor & defined]], ignore_index=True)
+
+
+def _accuracy_of_people(comparison: Comparison) -> pd.DataFrame:
+    if not comparison.has_people:
+        return pd.DataFrame(columns=["people", "zone_low", "zone_high", "zone"])
+    table = comparison.people.set_index("scenario")
+    people = table[["accuracy", "zone_low", "zone_high"]].rename(columns={"accuracy": "people"})
+    people["zone"] = np.where(people["zone_low"].notna(), PARTICIPANTS, "")
+    return _released(people)
+
+
+def _released(people: pd.DataFrame) -> pd.DataFrame:
+    """Add the paper's band in the row of the mean, if there are scenarios to draw."""
+    values = people.drop(index=MEAN, errors="ignore")["people"]
+    if MEAN in people.index and len(values) > 2 and values.notna().all():
+        _, low, high = released_zone(values.to_numpy(dtype=np.float64))
+        people.loc[MEAN, ["zone_low", "zone_high"]] = low, high
+        people.loc[MEAN, "zone"] = SCENARIO_ZONE
+    return people
+
+
+def _with_zone(
+    people: pd.DataFrame, zones: pd.DataFrame | None, measure: str, released: bool
+) -> pd.DataFrame:
+    people = people.assign(zone_low=np.nan, zone_high=np.nan, zone="")
+    if zones is None:
+        return people
+    subset = zones[(zones["measure"] == measure) & (zones["of"] == "participants")]
+    for _, row in subset.iterrows():
+        if row["scenario"] in people.index and np.isfinite(row["low"]):
+            people.loc[row["scenario"], ["zone_low", "zone_high"]] = row["low"], row["high"]
+            people.loc[row["scenario"], "zone"] = PARTICIPANTS
+    return _released(people) if released else people
+
+
+def _measure(rows: pd.DataFrame, people: pd.DataFrame, people_is: str) -> pd.DataFrame:
+    table = _anchors_last(rows).join(people, on="panel")
+    table = table.assign(people_is=people_is, zone=table["zone"].fillna(""))
+    names = [*in_order(table.loc[table["panel"] != MEAN, "panel"]), MEAN]
+    if len(names) == 2:
+        names = names[:1]  # the mean over one scenario is that scenario
+    table = table[table["panel"].isin(names)]
+    order = table["panel"].map({name: rank for rank, name in enumerate(names)})
+    table = table.assign(order=order).sort_values("order", kind="stable")
+    return table.reset_index(drop=True)[list(MEASURE_COLUMNS)]
+
+
+# --- by stimulus --------------------------------------------------------------------------------
+
+
+def scatter_table(comparison: Comparison, agents: Sequence[str]) -> pd.DataFrame:
+    """Return P(contact) and the fraction of yes, a row a model and stimulus, in the order of
+    ``agents``.
+    """
+    columns = ["agent", "scenario", "stimulus", "p_yes", "p_contact", "label", "simulated"]
+    rows = comparison.stimuli[comparison.stimuli["agent"].isin(agents)]
+    return rows[columns].reset_index(drop=True)
+
+
+def difficulty_table(comparison: Comparison, by_stimulus: pd.DataFrame | None) -> pd.DataFrame:
+    """Return the stimuli with people's accuracy and its tests; see `difficulty.below_chance_level`.
+
+    ``by_stimulus``: all that people answered; without it those that any model predicts.
+    """
+    if by_stimulus is None:
+        by_stimulus = comparison.stimuli.drop_duplicates("stimulus")
+        by_stimulus = by_stimulus.rename(columns={"human_accuracy": "accuracy"})
+    rows = by_stimulus.sort_values(["scenario", "stimulus"], kind="stable").reset_index(drop=True)
+    return below_chance_level(rows)
+
+
+def response_time_table(by_stimulus: pd.DataFrame) -> pd.DataFrame:
+    """Return ``scenario``, ``stimulus``, ``count``, ``accuracy``, ``mean_log_rt``."""
+    return by_stimulus[["scenario", "stimulus", "count", "accuracy", "mean_log_rt"]]
+
+
+def calibration_table(comparison: Comparison) -> pd.DataFrame:
+    """Return the reliability curve of each model on all its stimuli, with its ``brier`` score.
+
+    The outcome is the official one.
+    """
+    parts = []
+    chosen = comparison.stimuli[comparison.stimuli["agent"].isin(comparison.models)]
+    for agent, rows in chosen.groupby("agent", sort=False):
+        truth = rows["label"].to_numpy(dtype=np.float64)
+        curve = reliability_curve(rows["p_contact"], truth)
+        curve.insert(0, "agent", agent)
+        parts.append(curve.assign(brier=brier(rows["p_contact"], truth)))
+    return pd.concat(parts, ignore_index=True)
+
+
+def thirds_table(
+    comparison: Comparison, answers: pd.DataFrame | None = None, level: float = 0.95
+) -> pd.DataFrame:
+    """Return r with the average person within the stimuli that are hard, chance and easy for
+    people.
+
+    `MEASURE_COLUMNS` and ``stimuli``, their number; a panel a third; all scenarios pooled,
+    intervals about other stimuli of the third. With the ``answers`` of participants (``test`` of
+    `participants.Responses`) the dashed line is the r of halves of them with each other.
+    """
+    people = _halves_by_third(comparison, answers)
+    stimuli = pd.concat([comparison.stimuli, anchor_stimuli(comparison.stimuli)])
+    parts = []
+    for name, words in THIRD_WORDS.items():
+        rows = [
+            {"agent": agent, "kind": subset["readout"].iloc[0]} | _third(subset, name, level)
+            for agent, subset in stimuli.groupby("agent", sort=False)
+        ]
+        parts.append(pd.DataFrame(rows).assign(panel=words, **people[name]))
+    table = _anchors_last(pd.concat(parts, ignore_index=True))
+    order = table["panel"].map({words: at for at, words in enumerate(THIRD_WORDS.values())})
+    table = table.assign(order=order).sort_values("order", kind="stable", ignore_index=True)
+    return table[[*MEASURE_COLUMNS, "stimuli"]]
+
+
+THIRD_WORDS = dict(zip(THIRDS, ("hard (up to 1/3)", "chance", "easy (from 2/3)"), strict=True))
+
+
+def _third(subset: pd.DataFrame, name: str, level: float) -> dict[str, float | str]:
+    """Return r of one model within one third, with its interval."""
+    rows = subset.sort_values("stimulus", kind="stable")
+    part = rows[(difficulty_third(rows["human_accuracy"]) == name).to_numpy()]
+    x, y = (part[[key]].to_numpy(np.float64).T for key in ("p_contact", "p_yes"))
+    result: dict[str, float | str] = {"stimuli": len(part), "low": np.nan, "high": np.nan}
+    r = float(correlate_rows(x, y)[0]) if len(part) else np.nan
+    if not np.isfinite(r):
+        return result | {"value": np.nan, "reason": "fewer than 3 stimuli, or constant answers"}
+    without = 1 - np.eye(len(part))
+    variance = jackknife(correlate_resampled(x, np.broadcast_to(y, without.shape), without))
+    result["low"], result["high"] = variance.of(0).interval(r, level, "correlation")
+    return result | {"value": r, "reason": ""}
+
+
+def _halves_by_third(
+    comparison: Comparison, answers: pd.DataFrame | None
+) -> dict[str, dict[str, float | str]]:
+    """Return the r of halves of the people by third, for the columns of each third's panel."""
+    none: dict[str, float | str] = {"people": np.nan, "people_is": "", "zone_low": np.nan,
+                                    "zone_high": np.nan, "zone": ""}  # fmt: skip
+    if answers is None:
+        return dict.fromkeys(THIRDS, none)
+    labels = comparison.stimuli.drop_duplicates("stimulus").set_index("stimulus")["label"]
+    asked = answers[answers["stimulus"].isin(labels.index)]
+    yes = asked.pivot(index="session", columns="stimulus", values="yes").astype("float64")
+    truth = labels.loc[yes.columns].to_numpy(dtype=np.float64)
+    rows = r_by_third(np.full((1, len(truth)), np.nan), yes.to_numpy(), truth)
+    halves = rows[rows["model"] == -1].set_index("third")
+    return {
+        str(name): {"people": row["r"], "people_is": "half of the people with the others",
+                    "zone_low": row["low"], "zone_high": row["high"], "zone": HALVES}
+        for name, row in halves.iterrows()
+    }  # fmt: skip
+
+
+# --- readout and training -----------------------------------------------------------------------
+
+
+def effects_table(
+    comparison: Comparison, predictions: pd.DataFrame, level: float = 0.95
+) -> pd.DataFrame:
+    """Return accuracy by readout and by training protocol, averaged over seeds, then over
+    scenarios.
+
+    ``predictions``: from `predictions.read_predictions`. `GROUPED_COLUMNS`; the panel of readouts
+    has one training protocol (*all* if it occurs), that of trainings one readout. A panel is absent
+    if no model has two conditions. Intervals are about other stimuli.
+    """
+    rows = _with_training(comparison, predictions)
+    if len(rows.drop_duplicates(["readout", "training"])) < 2:
+        return pd.DataFrame(columns=list(GROUPED_COLUMNS))
+    trainings = [str(name) for name in rows["training"].unique()]
+    readouts = [name for name in _READOUT_ORDER if name in set(rows["readout"])]
+    readouts += sorted(set(rows["readout"]) - set(readouts))
+    training = "all" if "all" in trainings else _most_common(rows["training"])
+    readout = (
+        "observed+simulated" if "observed+simulated" in readouts else _most_common(rows["readout"])
+    )
+    words = f" (trained on {training})" if training else ""
+    order = [name for name in ("all", ALL_BUT, ONLY, ANOTHER) if name in trainings]
+    order += sorted(set(trainings) - set(order))
+    parts = [
+        _effect(rows[rows["training"] == training], "readout", readouts, f"by readout{words}",
+                level),
+        _effect(rows[rows["readout"] == readout], "training", order,
+                f"by training (readout {readout})", level),
+    ]  # fmt: skip
+    table = pd.concat([part for part in parts if len(part)] or [parts[0]], ignore_index=True)
+    people = comparison.people.set_index("scenario")["accuracy"] if comparison.has_people else {}
+    return table.assign(people=people.get(MEAN, np.nan))
+
+
+_READOUT_ORDER = tuple(READOUTS[letter] for letter in "CBA")
+
+
+def _with_training(comparison: Comparison, predictions: pd.DataFrame) -> pd.DataFrame:
+    """Return the stimuli of the models with ``trained`` (as in the predictions) and
+    ``training``.
+    """
+    result = pd.Series("", index=predictions.index, dtype=object)
+    for column in reversed(DATASETS[1:3]):
+        if column in predictions:
+            result = result.where(result != "", predictions[column])
+    subset = predictions[["agent", "stimulus"]].assign(trained=result)
+    chosen = comparison.stimuli[comparison.stimuli["agent"].isin(comparison.models)]
+    rows = chosen.merge(subset, on=["agent", "stimulus"], how="left")
+    ours = rows["trained"].map(lambda name: OFFICIAL_SCENARIOS.get(str(name).lower(), name))
+    rows["trained"] = ours.where(ours != "same", rows["scenario"]).replace("all but this", ALL_BUT)
+    rows["training"] = rows["trained"].where(~rows["trained"].isin(SCENARIOS), ANOTHER)
+    rows["training"] = rows["training"].mask(rows["trained"] == rows["scenario"], ONLY)
+    return rows
+
+
+def _most_common(values: pd.Series) -> str:
+    return str(values.value_counts().index[0])
+
+
+def _effect(
+    rows: pd.DataFrame, column: str, groups: Sequence[str], panel: str, level: float
+) -> pd.DataFrame:
+    if rows.groupby("model")[column].nunique().max() < 2:
+        return pd.DataFrame(columns=list(GROUPED_COLUMNS))
+    right = rows.assign(right=(rows["predicted"] == rows["label"]).astype(np.float64))
+    records = []
+    for (model, group), subset in right.groupby(["model", column], sort=False):
+        values, variances = [], []
+        for _, part in subset.groupby("scenario"):
+            mean = part.groupby("stimulus")["right"].mean().sort_index().to_numpy(np.float64)
+            values.append(mean.mean())
+            variances.append(variance_of_mean(mean, counts=True))
+        value = float(np.mean(values))
+        low, high = mean_of(variances).interval(value, level, "fraction")
+        records.append((panel, model, group, value, low, high, np.nan,
+                        subset["stimulus"].nunique(), ""))  # fmt: skip
+    table = pd.DataFrame(records, columns=list(GROUPED_COLUMNS))
+    rank = {name: at for at, name in enumerate(groups)}
+    models = {name: at for at, name in enumerate(rows["model"].unique())}
+    keys = {"group": rank, "agent": models}
+    return table.sort_values(
+        ["group", "agent"], key=lambda values: values.map(keys[str(values.name)]), kind="stable"
+    )
+
+
+def generalization_table(comparison: Comparison, predictions: pd.DataFrame) -> pd.DataFrame:
+    """Return accuracy less that of people, trained on x tested on; `GENERALIZATION_COLUMNS`.
+
+    Seeds are averaged; models of one training alone are left out. If no model was tested on another
+    scenario than it was trained on, the diagonal becomes one row `ONLY`. Without people the
+    difference is to 0.5, the accuracy of guessing, and ``people`` is NaN.
+    """
+    rows = _with_training(comparison, predictions)
+    parts = {*SCENARIOS, ALL_BUT}
+    several = rows.groupby(["model", "readout"])["training"].nunique().max() > 1
+    if not set(rows["trained"]) & parts or not several:
+        return pd.DataFrame(columns=list(GENERALIZATION_COLUMNS))
+    if not (rows["training"] == ANOTHER).any():
+        rows["trained"] = rows["training"]  # nothing off the diagonal: one row is enough
+    rows = rows.assign(
+        right=rows["predicted"] == rows["label"], agent=rows["model"] + " · " + rows["readout"]
+    )
+    rows = rows[rows.groupby("agent")["trained"].transform("nunique") > 1]
+    keys = ["agent", "trained", "scenario"]
+    table = rows.groupby(keys, sort=False).agg(
+        stimuli=("stimulus", "nunique"), accuracy=("right", "mean"),
+        people=("human_accuracy", "mean"),
+    ).reset_index().rename(columns={"scenario": "tested"})  # fmt: skip
+    base = table["people"] if comparison.has_people else 0.5
+    table["difference"] = table["accuracy"] - base
+    first = ["all", ALL_BUT, ONLY, *SCENARIOS]
+    order = {name: at for at, name in enumerate(first)}
+    rank = {
+        "agent": {name: at for at, name in enumerate(table["agent"].unique())},
+        "trained": order,
+        "tested": order,
+    }
+    ordered = table.sort_values(
+        ["agent", "trained", "tested"],
+        key=lambda values: values.map(rank[str(values.name)]).fillna(len(first)),
+        kind="stable",
+    )
+    return ordered[list(GENERALIZATION_COLUMNS)].reset_index(drop=True)

@@ -1,0 +1,520 @@
+"""Biases and covariates of answers: response bias, side bias, practice, background."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+from scipy import stats
+
+from physion.analysis.intervals import Bootstrap
+from physion.analysis.people.measures import (
+    ScenarioAnswers,
+    accuracy_by_participant,
+    all_answers,
+    draws_of_people,
+    mean_over_people,
+    split_halves,
+)
+from physion.analysis.statistics.agreement import correlate_rows
+from physion.analysis.statistics.paired import benjamini_hochberg
+from physion.analysis.statistics.regression import clustered_logit
+from physion.analysis.tables import ATTRIBUTES, in_order, require_columns
+from physion.core.errors import BadInputError
+
+Array = npt.NDArray[np.float64]
+
+BACKGROUND = ("condition", "age", "gender", "education", "difficulty", "technical_problems")
+"""Columns of the sessions about the condition, the participant and problems."""
+
+
+# --- yes or no ----------------------------------------------------------------------------------
+
+
+def yes_bias(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
+    """Test whether people say yes too often; one row a scenario.
+
+    Columns: ``scenario``, ``people``, ``base_rate`` (fraction of stimuli with contact, weighted by
+    answers), ``yes`` (fraction of yes), ``bias`` (yes - base_rate) with ``_low``, ``_high``,
+    ``d_prime`` and ``criterion`` (means over people; below 0: bias towards yes) with intervals,
+    ``reason``. Intervals draw people. Hit and false-alarm rates use the log-linear correction (half
+    an answer added to each side), so that d' is finite for people who are always right.
+    """
+    draws = bootstrap or Bootstrap()
+    records = []
+    for answers in all_answers(test):
+        weights = draws_of_people(answers, draws)
+        given = ~np.isnan(answers.yes)
+        own_base = np.array([answers.label[row].mean() for row in given])
+        own_yes = np.nanmean(answers.yes, axis=1)
+        d_prime, criterion, reason = _signal_detection(answers)
+        record: dict[str, Any] = {
+            "scenario": answers.scenario,
+            "people": len(own_yes),
+            "base_rate": float(np.mean(own_base)),
+            "yes": float(np.mean(own_yes)),
+        }
+        values = {"bias": own_yes - own_base, "d_prime": d_prime, "criterion": criterion}
+        for name, by_person in values.items():
+            record |= _mean_with_interval(name, by_person, weights, draws)
+        records.append({**record, "reason": reason})
+    return pd.DataFrame(records)
+
+
+def _signal_detection(answers: ScenarioAnswers) -> tuple[Array, Array, str]:
+    """Return d' and criterion of each person; NaN if all stimuli seen have the same outcome."""
+    given = ~np.isnan(answers.yes)
+    touch = given & (answers.label == 1)
+    miss = given & (answers.label == 0)
+    yes = np.where(given, answers.yes, 0.0)
+    hits, of_hits = np.sum(yes * touch, axis=1), touch.sum(axis=1)
+    alarms, of_alarms = np.sum(yes * miss, axis=1), miss.sum(axis=1)
+    z_hit = stats.norm.ppf((hits + 0.5) / (of_hits + 1))
+    z_alarm = stats.norm.ppf((alarms + 0.5) / (of_alarms + 1))
+    undefined = (of_hits == 0) | (of_alarms == 0)
+    d_prime = np.where(undefined, np.nan, z_hit - z_alarm)
+    criterion = np.where(undefined, np.nan, -(z_hit + z_alarm) / 2)
+    reason = "d' and criterion: stimuli of one outcome alone" if undefined.any() else ""
+    return d_prime, criterion, reason
+
+
+def _mean_with_interval(
+    name: str, by_person: Array, weights: Array, draws: Bootstrap
+) -> dict[str, float]:
+    known = np.isfinite(by_person)
+    drawn = mean_over_people(by_person[:, None], weights)[:, 0]
+    low, high = draws.interval(drawn) if known.sum() > 1 else (np.nan, np.nan)
+    mean = float(np.mean(by_person[known])) if known.any() else np.nan
+    return {name: mean, f"{name}_low": low, f"{name}_high": high}
+
+
+# --- left or right ------------------------------------------------------------------------------
+
+
+def side_bias(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
+    """Test whether people press the left button too often; one row a scenario.
+
+    A person keeps one order of buttons, so side and answer are confounded within people but not
+    between people. Columns: ``scenario``, ``yes_left``, ``yes_right`` (people with either order),
+    ``left`` (fraction of left presses, mean of the two groups, so that a bias towards yes cancels)
+    with ``_low``, ``_high`` (people drawn within each group) and ``p`` (Welch's test of the
+    fraction of yes in the two groups), ``unknown`` (people whose order is unknown), ``reason``.
+    """
+    draws = bootstrap or Bootstrap()
+    records = []
+    for scenario in in_order(test["scenario"]):
+        rows = test[test["scenario"] == scenario]
+        order = rows["buttons"] if "buttons" in rows else pd.Series("", index=rows.index)
+        by_person = rows.assign(order=order).groupby("session")[["yes", "order"]].agg(
+            {"yes": "mean", "order": "first"}
+        )  # fmt: skip
+        groups = {name: by_person.loc[by_person["order"] == name, "yes"].to_numpy(dtype=np.float64)
+                  for name in ("yes-no", "no-yes")}  # fmt: skip
+        record = {"scenario": scenario} | _side_record(groups, scenario, draws)
+        known = len(groups["yes-no"]) + len(groups["no-yes"])
+        records.append({**record, "unknown": len(by_person) - known})
+    return pd.DataFrame(records)
+
+
+def _side_record(groups: dict[str, Array], scenario: str, draws: Bootstrap) -> dict[str, Any]:
+    first, second = groups["yes-no"], groups["no-yes"]
+    record: dict[str, Any] = {"yes_left": len(first), "yes_right": len(second)}
+    nothing = dict.fromkeys(("left", "left_low", "left_high", "p"), np.nan)
+    if min(len(first), len(second)) < 2:
+        return {**record, **nothing, "reason": "fewer than two people of one order of buttons"}
+    # Left presses are the yes of one group and the no of the other.
+    drawn = [
+        draws.weights(f"{name} of {scenario}", len(by_person)) @ by_person / len(by_person)
+        for name, by_person in groups.items()
+    ]
+    low, high = draws.interval((drawn[0] + 1 - drawn[1]) / 2)
+    constant = np.std(first) == 0 and np.std(second) == 0
+    p = np.nan if constant else float(stats.ttest_ind(first, second, equal_var=False).pvalue)
+    left = float((np.mean(first) + 1 - np.mean(second)) / 2)
+    return {**record, "left": left, "left_low": low, "left_high": high, "p": p,
+            "reason": "p: nobody differs within the groups" if constant else ""}  # fmt: skip
+
+
+# --- practice and people ------------------------------------------------------------------------
+
+
+def learning(test: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
+    """Test whether people improve over the test trials, without feedback; one row a scenario, then
+    all.
+
+    Logistic regression of correctness on the position in the order, in units of 100 trials, with
+    standard errors clustered by participant (`clustered_logit`); for all scenarios together with an
+    intercept for each. Columns: ``scenario``, ``b`` (log odds per 100 trials), ``se``, ``t``,
+    ``df``, ``p``, ``low``, ``high``, ``rows``, ``clusters``, ``reason``, ``first_half`` and
+    ``second_half`` (accuracy in either half of the trials). Orders are random, so stimuli need no
+    adjustment.
+    """
+    table = test.assign(hundred=test["trial"].to_numpy(dtype=np.float64) / 100)
+    parts = [(name, table[table["scenario"] == name]) for name in in_order(table["scenario"])]
+    if len(parts) > 1:
+        parts.append(("all", table))
+    fits = []
+    for name, rows in parts:
+        fixed = "scenario" if name == "all" else None
+        fit = clustered_logit(rows, "correct", ["hundred"], fixed=fixed, level=level)
+        fit = fit[fit["term"] == "hundred"].drop(columns="term")
+        late = rows["trial"] >= (rows["trial"].max() + 1) / 2
+        fit.insert(0, "scenario", name)
+        fits.append(
+            fit.assign(
+                first_half=float(rows.loc[~late, "correct"].mean()),
+                second_half=float(rows.loc[late, "correct"].mean()),
+            )
+        )
+    return pd.concat(fits, ignore_index=True)
+
+
+def background(sessions: pd.DataFrame) -> pd.DataFrame:
+    """Count the answers to the questionnaire: one row a question and answer.
+
+    Columns: ``question``, ``answer`` (``(none)`` if not answered), ``sessions``, ``share``
+    (fraction).
+    """
+    parts = []
+    for column in _asked(sessions):
+        values = sessions[column].astype(object)
+        named = values.where(values.notna() & (values != ""), "(none)")
+        counts = named.value_counts(sort=False)
+        counts = counts.sort_index(key=lambda index: index.map(str))
+        parts.append(
+            pd.DataFrame(
+                {
+                    "question": column,
+                    "answer": [str(value) for value in counts.index],
+                    "sessions": counts.to_numpy(),
+                    "share": counts.to_numpy() / max(len(sessions), 1),
+                }
+            )
+        )
+    columns = ["question", "answer", "sessions", "share"]
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
+
+
+def accuracy_by_background(test: pd.DataFrame, sessions: pd.DataFrame) -> pd.DataFrame:
+    """Test whether accuracy depends on age, gender, education or reported difficulty.
+
+    Accuracies are taken relative to the mean of their scenario, since scenarios differ. One row a
+    question: ``question``, ``sessions``, ``test`` (``spearman`` for numbers, ``kruskal-wallis`` for
+    groups of at least two sessions), ``statistic``, ``df``, ``p``, ``reason``. Exploratory: as many
+    tests as questions, p not corrected.
+    """
+    require_columns(sessions, ["session"], "the table of sessions")
+    by_person = accuracy_by_participant(test)
+    by_person["relative"] = by_person["accuracy"] - by_person.groupby("scenario")[
+        "accuracy"
+    ].transform("mean")
+    # A session of several scenarios counts once.
+    by_person = by_person.groupby("session", as_index=False, sort=False)["relative"].mean()
+    joined = by_person.merge(sessions.drop(columns=["participant", "scenario"], errors="ignore"),
+                       on="session", how="left")  # fmt: skip
+    return pd.DataFrame([_association(joined, column) for column in _asked(joined)])
+
+
+def _asked(table: pd.DataFrame) -> list[str]:
+    """Return the columns of `BACKGROUND` that a table has; no condition if all cells are empty."""
+    known = "condition" in table and (table["condition"].fillna("") != "").any()
+    return [name for name in BACKGROUND if name in table and (name != "condition" or known)]
+
+
+def _association(joined: pd.DataFrame, column: str) -> dict[str, Any]:
+    values = joined[column].astype(object)
+    rows = joined[values.notna() & (values != "")]
+    record: dict[str, Any] = {"question": column, "sessions": len(rows), "test": "", "df": np.nan}
+    record |= {"statistic": np.nan, "p": np.nan, "reason": ""}
+    if column in ("age", "difficulty"):
+        record["test"] = "spearman"
+        numbers = rows[column].astype(np.float64)
+        if len(rows) < 3 or numbers.nunique() < 2 or rows["relative"].nunique() < 2:
+            return {**record, "reason": "too few answers, or all alike"}
+        test_result = stats.spearmanr(numbers, rows["relative"])
+        return {**record, "statistic": float(test_result.statistic), "p": float(test_result.pvalue)}
+    record["test"] = "kruskal-wallis"
+    groups = [part["relative"] for _, part in rows.groupby(column) if len(part) >= 2]
+    if len(groups) < 2 or rows["relative"].nunique() < 2:
+        return {**record, "reason": "fewer than two groups of two, or all accuracies alike"}
+    test_result = stats.kruskal(*groups)
+    return {**record, "df": len(groups) - 1, "statistic": float(test_result.statistic),
+            "p": float(test_result.pvalue)}  # fmt: skip
+
+
+# Difficulty of stimuli for people: below chance, hard, at chance, easy.
+
+THIRDS = ("hard", "chance", "easy")
+EDGES = (1 / 3, 2 / 3)
+"""Accuracies that separate the three; 33 and 67 % in the paper."""
+
+
+def below_chance_level_released(
+    accuracy: npt.ArrayLike, count: npt.ArrayLike
+) -> npt.NDArray[np.bool_]:
+    """Return whether accuracy + 1.96 standard errors is below 0.5: the study's rule.
+
+    The standard error is that of the normal approximation at the observed fraction, which is 0 for
+    a fraction of 0; there is no correction for testing 150 stimuli.
+    """
+    p, n = _fractions(accuracy, count)
+    return np.asarray(p + 1.96 * np.sqrt(p * (1 - p) / n) < 0.5)
+
+
+def below_chance_level_p(accuracy: npt.ArrayLike, count: npt.ArrayLike) -> Array:
+    """Return the exact binomial p of at most so many right answers of ``count`` by guessing."""
+    p, n = _fractions(accuracy, count)
+    return np.asarray(stats.binom.cdf(np.rint(p * n), n, 0.5), dtype=np.float64)
+
+
+def below_chance_level(by_stimulus: pd.DataFrame, level: float = 0.05) -> pd.DataFrame:
+    """Find the stimuli that people get wrong more often than by guessing, by two rules.
+
+    ``by_stimulus`` has ``stimulus``, ``scenario``, ``accuracy`` and ``count``, from
+    `people.accuracy_by_stimulus` or `responses.read_humans`. Added columns: ``released``
+    (`below_chance_level_released`), ``p`` (`below_chance_level_p`), ``p_adjusted`` (Benjamini and
+    Hochberg over all rows given), ``exact`` (p_adjusted < ``level``).
+    """
+    p = below_chance_level_p(by_stimulus["accuracy"], by_stimulus["count"])
+    adjusted = benjamini_hochberg(p)
+    return by_stimulus[["scenario", "stimulus", "accuracy", "count"]].assign(
+        released=below_chance_level_released(by_stimulus["accuracy"], by_stimulus["count"]),
+        p=p,
+        p_adjusted=adjusted,
+        exact=adjusted < level,
+    )
+
+
+def difficulty_third(accuracy: npt.ArrayLike, edges: tuple[float, float] = EDGES) -> pd.Series:
+    """Return ``hard`` up to the first edge, ``easy`` from the second, ``chance`` between; NaN stays
+    NaN.
+    """
+    values = np.asarray(accuracy, dtype=np.float64)
+    names = np.select([values <= edges[0], values >= edges[1]], ["hard", "easy"], "chance")
+    return pd.Series(names, dtype=object).where(np.isfinite(values), np.nan)
+
+
+def r_by_third(
+    p_contact: npt.ArrayLike, yes: npt.ArrayLike, label: npt.ArrayLike, halves: int = 200,
+    seed: int = 0,
+) -> pd.DataFrame:  # fmt: skip
+    """Return r of models with the average person within hard, chance and easy stimuli of one
+    scenario.
+
+    Parameters
+    ----------
+    p_contact
+        (m, s), NaN if a model does not predict a stimulus.
+    yes
+        (n, s): answers of people.
+    label
+        (s,): official outcomes.
+    halves, seed
+        Number of random splits of the people, and their seed.
+
+    Returns
+    -------
+    ``third``, ``stimuli``, ``model`` (row index; -1: the two halves of the people, whose ``low``
+    and ``high`` are the 2.5th and 97.5th percentile of r), ``r`` (halves: mean), ``low``, ``high``;
+    NaN if r is undefined.
+
+    Notes
+    -----
+    The thirds depend on the same answers as r: within a third accuracy hardly varies, so r there
+    mostly tells whether P(contact) follows the outcome (easy) or its opposite (hard).
+    """
+    answers, truth = np.asarray(yes, np.float64), np.asarray(label, np.float64)
+    models = np.atleast_2d(np.asarray(p_contact, np.float64))
+    p_yes = mean_over_people(answers)
+    third = difficulty_third(np.where(truth == 1, p_yes, 1 - p_yes)).to_numpy()
+    rows: list[tuple[str, int, int, float, float, float]] = []
+    for name in THIRDS:
+        members = np.flatnonzero(third == name)
+        r = correlate_rows(
+            models[:, members], np.broadcast_to(p_yes[members], (len(models), len(members)))
+        )
+        rows += [(name, len(members), k, float(value), np.nan, np.nan) for k, value in enumerate(r)]
+        among = split_halves(answers[:, members], halves, seed) if len(members) else np.empty(0)
+        among = among[np.isfinite(among)]
+        low, high = np.percentile(among, [2.5, 97.5]) if len(among) else (np.nan, np.nan)
+        mean = float(np.mean(among)) if len(among) else np.nan
+        rows.append((name, len(members), -1, mean, float(low), float(high)))
+    return pd.DataFrame(rows, columns=["third", "stimuli", "model", "r", "low", "high"])
+
+
+def _fractions(accuracy: npt.ArrayLike, count: npt.ArrayLike) -> tuple[Array, Array]:
+    p, n = np.asarray(accuracy, dtype=np.float64), np.asarray(count, dtype=np.float64)
+    if not ((p >= 0) & (p <= 1)).all() or not (n >= 1).all():
+        raise BadInputError("accuracies must lie in 0..1, with at least one person a stimulus")
+    return p, n
+
+
+# The four preregistered hypotheses: attributes that make stimuli hard, and slower answers to them.
+#
+# By stimulus, which needs only the table of `people.accuracy_by_stimulus` or of the official
+# files: regression of a stimulus' accuracy (or log response time) on the attribute, with an
+# intercept for each scenario. By single answers: ``HYPOTHESES[...].formula`` on `answer_rows`, for
+# the mixed models.
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A hypothesis: ``predictor`` changes ``outcome`` in the direction of ``sign``.
+
+    ``formula`` is its mixed model of single answers, with scenario fixed and participants and
+    stimuli random; ``family``: whether that model is ``logistic`` or ``linear``.
+    """
+
+    name: str
+    about: str
+    predictor: str
+    outcome: str
+    sign: int
+    formula: str
+    family: str
+
+
+def _harder(name: str, predictor: str, about: str) -> Hypothesis:
+    formula = f"correct ~ {predictor} + scenario + (1|participant) + (1|stimulus)"
+    return Hypothesis(name, about, predictor, "accuracy", -1, formula, "logistic")
+
+
+HYPOTHESES: Mapping[str, Hypothesis] = {
+    hypothesis.name: hypothesis
+    for hypothesis in (
+        _harder("H1", "elements", "Stimuli with more elements are harder"),
+        _harder("H2", "distractors", "Stimuli with distractors are harder"),
+        _harder("H3", "occluders", "Stimuli with occluders are harder"),
+        Hypothesis(
+            "H4",
+            "People take longer to answer stimuli that they get wrong more often",
+            "accuracy",
+            "mean_log_rt",
+            -1,
+            "log_rt ~ accuracy + scenario + (1|participant) + (1|stimulus)",
+            "linear",
+        ),
+    )
+}
+"""The preregistered hypotheses by name."""
+
+COLUMNS = (
+    "hypothesis", "scenario", "predictor", "outcome", "stimuli", "left_out", "b", "se", "t", "df",
+    "p", "low", "high", "r", "spearman", "as_predicted", "reason",
+)  # fmt: skip
+
+
+def with_attributes(by_stimulus: pd.DataFrame, attributes: pd.DataFrame) -> pd.DataFrame:
+    """Return ``by_stimulus`` with the columns of `attributes.ATTRIBUTES`, NaN if unknown."""
+    require_columns(by_stimulus, ["stimulus", "scenario", "accuracy"], "the table by stimulus")
+    columns = ["stimulus", *ATTRIBUTES]
+    return by_stimulus.merge(attributes[columns], on="stimulus", how="left", validate="one_to_one")
+
+
+def answer_rows(test: pd.DataFrame, stimuli: pd.DataFrame) -> pd.DataFrame:
+    """Return single answers with the attributes of their stimuli, for mixed models.
+
+    ``stimuli``: from `with_attributes`. Columns: ``participant``, ``scenario``, ``stimulus``,
+    ``correct``, ``log_rt``, ``accuracy`` (of the stimulus, over all people), `ATTRIBUTES`.
+    """
+    columns = ["participant", "scenario", "stimulus", "correct", "log_rt"]
+    own = stimuli[["stimulus", "accuracy", *ATTRIBUTES]]
+    return test[columns].merge(own, on="stimulus", how="left", validate="many_to_one")
+
+
+def regress_hypotheses(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
+    """Test each hypothesis in each scenario and, in row ``all``, over all with an intercept for
+    each.
+
+    ``stimuli``: from `with_attributes`, with ``mean_log_rt`` for H4. Columns: ``b`` (change of the
+    outcome per unit of the predictor), ``se`` (HC3, valid for unequal variances), ``t``, ``df``,
+    ``p`` (two-sided), ``low``, ``high``, ``r`` (Pearson's, within scenarios) and ``spearman`` (in
+    ``all`` of values less their scenario's mean), ``as_predicted`` (for p < 1 - ``level`` *yes* if
+    b has the predicted sign, else *opposite*; for a larger p *not shown*), ``left_out`` (stimuli
+    without predictor or outcome), ``reason``. The reason also reports if distractors and occluders
+    always occur together: then their effects cannot be separated.
+    """
+    records = []
+    for hypothesis in HYPOTHESES.values():
+        parts = [(name, stimuli[stimuli["scenario"] == name]) for name in
+                 in_order(stimuli["scenario"])]  # fmt: skip
+        if len(parts) > 1:
+            parts.append(("all", stimuli))
+        records += [_record(hypothesis, name, rows, level) for name, rows in parts]
+    return pd.DataFrame(records, columns=list(COLUMNS))
+
+
+def _record(hypothesis: Hypothesis, name: str, rows: pd.DataFrame, level: float) -> dict[str, Any]:
+    record: dict[str, Any] = dict.fromkeys(COLUMNS, np.nan)
+    record |= {"hypothesis": hypothesis.name, "scenario": name, "reason": "",
+               "predictor": hypothesis.predictor, "outcome": hypothesis.outcome}  # fmt: skip
+    missing = [c for c in (hypothesis.predictor, hypothesis.outcome) if c not in rows]
+    if missing:
+        return {**record, "stimuli": 0, "left_out": len(rows),
+                "reason": f"no column {missing[0]}"}  # fmt: skip
+    known = rows[[hypothesis.predictor, hypothesis.outcome]].notna().all(axis=1)
+    used = rows[known]
+    # A scenario with one stimulus, or one value, does not determine a slope within scenarios.
+    varied = used.groupby("scenario")[hypothesis.predictor].transform("nunique") > 1
+    used = used[varied]
+    record |= {"stimuli": len(used), "left_out": len(rows) - len(used), "as_predicted": ""}
+    if len(used) < 5:
+        why = "the predictor is not known" if not known.any() else "the predictor does not vary"
+        return {**record, "reason": f"{why}, or fewer than 5 stimuli"}
+    x, y = (_within(used, c) for c in (hypothesis.predictor, hypothesis.outcome))
+    if np.allclose(y, 0):
+        return {**record, "reason": "the outcome does not vary"}
+    of_scenario = used.groupby("scenario")["scenario"].transform("size").to_numpy(dtype=np.float64)
+    record |= _slope(x, y, of_scenario, level)
+    record["r"] = float(np.corrcoef(x, y)[0, 1])
+    record["spearman"] = float(stats.spearmanr(x, y).statistic)
+    record["as_predicted"] = _verdict(record, hypothesis.sign, level)
+    record["reason"] = _confounded(hypothesis, used)
+    return record
+
+
+def _verdict(record: Mapping[str, Any], sign: int, level: float) -> str:
+    """Return whether the test shows an effect in the direction of ``sign``, or in the other."""
+    if not record["p"] < 1 - level:
+        return "not shown"
+    return "yes" if np.sign(record["b"]) == sign else "opposite"
+
+
+def _within(rows: pd.DataFrame, column: str) -> Array:
+    """Subtract the mean of its scenario from a column: equivalent to an intercept for each
+    scenario.
+    """
+    values = rows[column].astype(np.float64)
+    return np.asarray(values - values.groupby(rows["scenario"]).transform("mean"))
+
+
+def _slope(x: Array, y: Array, of_scenario: Array, level: float) -> dict[str, float]:
+    """Fit least squares through the origin of centred values, with the HC3 standard error.
+
+    ``of_scenario``: number of stimuli of each stimulus' scenario, whose subtracted mean adds 1 /
+    of_scenario to the leverage.
+    """
+    squares = float(np.sum(x * x))
+    b = float(np.sum(x * y)) / squares
+    residuals = y - b * x
+    leverage = x * x / squares + 1 / of_scenario
+    meat = float(np.sum((x * residuals / (1 - leverage)) ** 2))
+    se, df = np.sqrt(meat) / squares, len(x) - round(float(np.sum(1 / of_scenario))) - 1
+    t = b / se if se > 0 else np.nan
+    half = float(stats.t.ppf(0.5 + level / 2, df)) * se
+    return {"b": b, "se": float(se), "t": float(t), "df": df, "low": b - half, "high": b + half,
+            "p": float(2 * stats.t.sf(abs(t), df))}  # fmt: skip
+
+
+def _confounded(hypothesis: Hypothesis, rows: pd.DataFrame) -> str:
+    pair = ("distractors", "occluders")
+    if hypothesis.predictor not in pair or not set(pair) <= set(rows.columns):
+        return ""
+    both = rows[list(pair)].dropna()
+    if len(both) and (both["distractors"] == both["occluders"]).all():
+        return "as many occluders as distractors in every stimulus: not to be told apart"
+    return ""

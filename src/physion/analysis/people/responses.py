@@ -1,0 +1,798 @@
+"""Answers of single participants: read, checked and cleaned; everything dropped is counted.
+
+`read_responses` reads the export of our experiment (`response_schema`); `official_responses` reads
+the raw columns of the original study. Both return `Responses`, the input of exclusions, of the
+analyses of people and of the comparison with models.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from physion.analysis.tables import (
+    in_order,
+    read_csv,
+    read_table,
+    refuse_duplicates,
+    require_columns,
+)
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.names import OFFICIAL_SCENARIOS, canonical_name, is_ledge, scenario_of
+
+# Schema of participant-level data, shared by the experiment's export and the analysis.
+#
+# Two tables make a study's data: one row a participant and trial (`TRIAL_COLUMNS`) and one row a
+# session (`SESSION_COLUMNS`). The experiment exports exactly these columns and writes its data
+# dictionary with `data_dictionary`; the analysis refuses a file that violates them and names the
+# row.
+
+Kind = Literal["text", "integer", "number", "flag", "choice", "time"]
+"""``text``; whole or any ``number``; ``flag``: True or False; ``choice``: one of ``choices``;
+``time``: a moment in ISO 8601 with its offset from UTC."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of participant-level data: its meaning and its allowed values.
+
+    ``required``: the column must exist. ``may_be_empty``: a cell may be empty (unknown). The bounds
+    ``low`` and ``high`` are inclusive and in ``unit``.
+    """
+
+    name: str
+    kind: Kind
+    about: str
+    unit: str = ""
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+    required: bool = False
+    may_be_empty: bool = True
+
+
+PHASES = ("familiarization", "test")
+DAY_MS = 86_400_000.0
+
+
+def _must(name: str, kind: Kind, about: str, **rest: Any) -> Column:
+    return Column(name, kind, about, required=True, may_be_empty=False, **rest)
+
+
+TRIAL_COLUMNS: tuple[Column, ...] = (
+    _must("participant", "text", "Keyed hash of the participant's id; never the id itself"),
+    _must("session", "text", "One run through the experiment by one participant, unique"),
+    _must("scenario", "text", "Scenario of the trial"),
+    _must("stimulus", "text", "Name of the trial that was shown"),
+    _must("phase", "choice", "With feedback (familiarization) or without (test)", choices=PHASES),
+    _must(
+        "trial",
+        "integer",
+        "Place in the order of its phase in the session, from 0; attention "
+        "checks, which are not in this table, have places too",
+        low=0,
+    ),
+    Column(
+        "response",
+        "choice",
+        "Will the agent touch the patient? Empty: no answer was given",
+        choices=("yes", "no"),
+        required=True,
+    ),
+    _must("label", "flag", "Does the agent touch the patient?"),
+    _must("simulated", "flag", "Made by a program for piloting: no person"),
+    Column(
+        "rt_ms",
+        "number",
+        "Response time: from the moment the buttons are enabled to the answer",
+        unit="ms",
+        low=-DAY_MS,
+        high=DAY_MS,
+        required=True,
+    ),
+    Column(
+        "buttons",
+        "choice",
+        "The two buttons from left to right",
+        choices=("yes-no", "no-yes"),
+    ),
+    Column("correct", "flag", "response equals label; recomputed, and refused if it contradicts"),
+    Column("input", "choice", "How the answer was given", choices=("mouse", "touch", "keyboard")),
+    Column("look", "choice", "Colours of the stimulus", choices=("free", "redyellow")),
+    Column("fixation_ms", "number", "How long the cross was shown", unit="ms", low=0, high=DAY_MS),
+    Column("cue_ms", "number", "How long the first frame was cued", unit="ms", low=0, high=DAY_MS),
+    Column("frames_expected", "integer", "Frames of the observed movie", low=0),
+    Column("frames_shown", "integer", "Frames that the browser presented", low=0),
+    Column("frames_dropped", "integer", "Frames that the browser decoded and dropped", low=0),
+    Column("movie_ms", "number", "From the first to the last frame", unit="ms", low=0, high=DAY_MS),
+    Column("visibility_changes", "integer", "How often the page was hidden or shown again", low=0),
+    Column("window_width", "integer", "Inner width of the window", unit="px", low=0),
+    Column("window_height", "integer", "Inner height of the window", unit="px", low=0),
+    Column(
+        "break_ms",
+        "number",
+        "Duration of the break before the trial; empty: there was none",
+        unit="ms",
+        low=0,
+        high=DAY_MS,
+    ),
+    Column("resumed", "flag", "The page was loaded anew while this trial was the next one"),
+    Column(
+        "showings", "integer", "How often the movie was shown, over all loads of the page", low=0
+    ),
+    Column(
+        "void",
+        "choice",
+        "What interrupted the movie, so that the answer does not count: the "
+        "page was hidden, a dialog open, or the window too small; empty: nothing",
+        choices=("hidden", "dialog", "window"),
+    ),
+    Column("answered_at", "time", "When the server stored the answer"),
+    Column(
+        "block",
+        "integer",
+        "Index of the block in a session of several scenarios, from 0; empty: a session of one",
+        low=0,
+    ),
+    Column("condition", "text", "Between-subject condition of the session; empty: there is none"),
+)
+"""One row a participant and trial."""
+
+SESSION_COLUMNS: tuple[Column, ...] = (
+    _must("participant", "text", "As in the trials"),
+    _must("session", "text", "As in the trials; unique here"),
+    _must("scenario", "text", "Scenario of the session; several, one block each, in the order "
+          "shown and separated by spaces"),
+    _must("simulated", "flag", "As in the trials"),
+    Column("study", "text", "Name and version of the study"),
+    Column("recruited_by", "text", "Where the participant came from"),
+    Column("started_at", "time", "When the session began"),
+    Column("finished_at", "time", "When the last page was sent; empty: not finished"),
+    Column("consent_version", "text", "Version of the consent text that was agreed to"),
+    Column("consented_at", "time", "When it was agreed to"),
+    Column("instructed_at", "time", "When the instructions were done"),
+    Column("comprehension_attempts", "integer",
+           "How often the questions about the instructions were answered", low=0),
+    Column("screened_out", "choice", "Which check ended the session early; empty: none did",
+           choices=("comprehension", "practice")),
+    Column("ready_at", "time", "When the page between practice and test was sent; of the last "
+           "block begun, if there are several"),
+    Column("buttons", "choice", "The buttons from left to right", choices=("yes-no", "no-yes")),
+    Column("language", "text", "Language of the pages"),
+    Column("order_number", "integer", "Prepared order of trials, from 1; 0: an order of its own",
+           low=0),
+    Column("loads", "integer", "How often the page was loaded; more than 1: it was resumed", low=0),
+    Column("replayed", "integer", "Trials shown more often than the study allows", low=0),
+    Column("implausible", "text", "Why no person can have made the session, as the server judged: "
+           "fast answers, no media, short; empty: nothing is wrong"),
+    Column("practice_repeats", "integer",
+           "How often the practice was repeated; in the last block begun, if there are several",
+           low=0),
+    Column("attention_failed", "integer", "Number of failed attention checks", low=0),
+    Column("failed_checks", "text", "Checks of the lab that the session failed: practice, "
+           "attention; empty: none"),
+    Column("age", "integer", "Age", unit="years", low=0, high=130),
+    Column("gender", "text", "Gender, in the words of the questionnaire"),
+    Column("education", "text", "Highest education, in the words of the questionnaire"),
+    Column("difficulty", "integer", "How difficult was the task? 1 very easy, 5 very hard",
+           low=1, high=5),
+    Column("technical_problems", "flag", "Did the participant report technical problems?"),
+    Column("feedback", "text", "Free text"),
+    Column("user_agent", "text", "Browser and system, as the browser says"),
+    Column("refresh_hz", "number", "Refresh rate of the screen", unit="Hz", low=0, high=1000),
+    Column("screen_width", "integer", "Width of the screen", unit="px", low=0),
+    Column("screen_height", "integer", "Height of the screen", unit="px", low=0),
+    Column("pixel_ratio", "number", "Device pixels in one CSS pixel", low=0, high=100),
+    Column("touch", "flag", "Does the device have a touch screen?"),
+    Column("condition", "text", "Between-subject condition; empty: the study has none"),
+)  # fmt: skip
+"""One row a session; demographics are asked at its end, so that they are empty in broken ones."""
+
+
+def data_dictionary(columns: Sequence[Column]) -> list[dict[str, Any]]:
+    """Return the columns as plain values for JSON: name, kind, about, unit, low, high, choices,
+    ...
+    """
+    return [{**asdict(column), "choices": list(column.choices)} for column in columns]
+
+
+def check_table(table: pd.DataFrame, columns: Sequence[Column], where: str) -> pd.DataFrame:
+    """Return ``table`` with the types of its ``columns``; columns not in the schema are dropped.
+
+    Cells may be text, as from CSV, or typed, as from parquet. Resulting types: str for text, choice
+    and time (empty if unknown), Int64 for integer, float64 (NaN) for number, boolean for flag (bool
+    if no cell may be empty). An optional column that is absent stays absent. Raises `BadInputError`
+    for a missing column or the first invalid cell.
+    """
+    require_columns(table, [column.name for column in columns if column.required], where)
+    present = [column for column in columns if column.name in table.columns]
+    typed = {column.name: _typed(table[column.name], column, where) for column in present}
+    return pd.DataFrame(typed, index=table.index).reset_index(drop=True)
+
+
+def _typed(values: pd.Series, column: Column, where: str) -> pd.Series:
+    text = values.astype(object).where(values.notna(), "").astype(str).str.strip()
+    empty = text == ""
+    if not column.may_be_empty:
+        _refuse(empty, text, column, where, "a value")
+    match column.kind:
+        case "integer" | "number":
+            return _numbers(text, empty, column, where)
+        case "flag":
+            return _flags(text, empty, column, where)
+        case "choice":
+            text = text.str.lower()
+            bad = ~empty & ~text.isin(column.choices)
+            _refuse(bad, text, column, where, " or ".join(column.choices))
+        case "time":
+            moments = pd.to_datetime(
+                text.where(~empty), errors="coerce", utc=True, format="ISO8601"
+            )
+            _refuse(~empty & moments.isna(), text, column, where, "a time in ISO 8601")
+        case "text":
+            pass
+    return text
+
+
+def _numbers(text: pd.Series, empty: pd.Series, column: Column, where: str) -> pd.Series:
+    numbers = pd.to_numeric(text.where(~empty), errors="coerce").astype(np.float64)
+    low = -np.inf if column.low is None else column.low
+    high = np.inf if column.high is None else column.high
+    good = np.isfinite(numbers) & (numbers >= low) & (numbers <= high)
+    whole = column.kind == "integer"
+    if whole:
+        good &= numbers == np.floor(numbers)
+    expected = f"a {'whole ' if whole else ''}number from {low:g} to {high:g}"
+    _refuse(~empty & ~good, text, column, where, expected)
+    return numbers.astype("Int64") if whole else numbers
+
+
+def _flags(text: pd.Series, empty: pd.Series, column: Column, where: str) -> pd.Series:
+    words = {"true": True, "1": True, "1.0": True, "yes": True}
+    words |= {"false": False, "0": False, "0.0": False, "no": False}
+    flags = text.str.lower().map(words)
+    _refuse(~empty & flags.isna(), text, column, where, "True or False")
+    return flags.astype("boolean") if column.may_be_empty else flags.astype(bool)
+
+
+def _refuse(bad: pd.Series, text: pd.Series, column: Column, where: str, expected: str) -> None:
+    if bad.any():
+        row = int(np.flatnonzero(bad)[0])
+        raise BadInputError(
+            f"{where}: row {row + 1} of column {column.name!r} holds {text.iloc[row][:80]!r}; "
+            f"expected {expected}"
+        )
+
+
+Refuse = Literal["refuse", "drop"]
+ParticipantsKind = Literal["people", "simulated", "all"]
+"""Whose sessions are kept: those of people, of simulated participants, or of both."""
+
+NO_ANSWER = "no answer was given"
+COPY = "exact copy of another row"
+CONFLICT = "another row of the same session is about the same stimulus"
+UNKNOWN = "stimulus is not known"
+SIMULATED = "session of a simulated participant"
+PERSON = "session of a person, in a rehearsal"
+REHEARSAL = "Rehearsal: participants are simulated, so no number here is about people"
+"""Mark of every result that simulated participants are in."""
+EXCLUDED = "on the list of stimuli to leave out"
+LEDGE = "Roll stimulus with a ledge"
+VOID = "the movie was interrupted"
+SEVERAL = " + "
+"""Between the scenarios of a session that has several."""
+NO_TIME = "no response time above 0: the answer counts, its time does not"
+
+DROPPED_COLUMNS = ("step", "scenario", "reason", "sessions", "rows")
+
+
+@dataclass(frozen=True)
+class Responses:
+    """Participant-level data of a study.
+
+    - ``trials``: one row a participant and trial, sorted by scenario, session, phase and trial.
+      Columns: ``participant``, ``session``, ``scenario`` (ours), ``stimulus`` (canonical name),
+      ``phase`` (familiarization or test), ``trial`` (int), ``yes``, ``label`` and ``correct``
+      (bool), ``rt_ms`` (from the moment of the buttons; NaN where not known), ``log_rt`` (natural
+      logarithm of it; NaN where not above 0), and whatever else of `TRIAL_COLUMNS` was given.
+    - ``sessions``: one row a session (`SESSION_COLUMNS`, as far as given), in the order in which
+      they began, or else in which they stand in the file. ``scenario`` is a `scenario_set`.
+    - ``dropped``: what was left out: ``step``, ``scenario``, ``reason``, ``sessions`` (with at
+      least one such row) and ``rows``.
+    """
+
+    trials: pd.DataFrame
+    sessions: pd.DataFrame
+    dropped: pd.DataFrame
+
+    @property
+    def test(self) -> pd.DataFrame:
+        """Rows of the test phase."""
+        return self.trials[self.trials["phase"] == "test"]
+
+    @property
+    def simulated_sessions(self) -> frozenset[str]:
+        """Sessions of simulated participants; the mark of a trial or of the session counts."""
+        tables = [table for table in (self.trials, self.sessions) if "simulated" in table]
+        return frozenset().union(*(table.loc[table["simulated"], "session"] for table in tables))
+
+    def keep_sessions(self, sessions: Collection[str], reason: str) -> Responses:
+        """Return these sessions only; the others are counted as dropped for ``reason``."""
+        is_dropped = ~self.trials["session"].isin(sessions)
+        kept = self.sessions[self.sessions["session"].isin(sessions)].reset_index(drop=True)
+        return replace(_without(self, is_dropped, "sessions", reason), sessions=kept)
+
+    def drop_void(self) -> Responses:
+        """Return the responses without answers to trials whose movie was interrupted.
+
+        Flag sessions first: they have answered these trials.
+        """
+        if "void" not in self.trials:
+            return self
+        return _without(self, self.trials["void"].fillna("") != "", "trials", VOID)
+
+    def drop_stimuli(self, exclude: Iterable[str] = (), ledge: bool = True) -> Responses:
+        """Return the responses without the stimuli of a list and, as in the study, without Roll's
+        ledges.
+
+        Flag sessions first: rules about the sequence of answers need all answers.
+        """
+        unwanted = {canonical_name(name) for name in exclude}
+        stimuli = self.trials["stimulus"]
+        is_gone = stimuli.map(is_ledge).astype(bool) if ledge else stimuli.isna()
+        cleaned = _without(self, is_gone, "stimuli", LEDGE)
+        return _without(cleaned, cleaned.trials["stimulus"].isin(unwanted), "stimuli", EXCLUDED)
+
+    def drop_rows(self, is_dropped: pd.Series, step: str, reason: str) -> Responses:
+        """Return the responses without the trials where ``is_dropped`` is True, and count these."""
+        return _without(self, is_dropped, step, reason)
+
+
+def read_responses(
+    trials: Path,
+    sessions: Path | None = None,
+    *,
+    known: Collection[str] | None = None,
+    unknown: Refuse = "refuse",
+    conflicts: Refuse = "refuse",
+    participants: ParticipantsKind = "people",
+) -> Responses:
+    """Read the responses of our experiment's export.
+
+    Parameters
+    ----------
+    trials, sessions
+        CSV or parquet files with the columns of `response_schema`.
+    known
+        Names of the stimuli that may occur; None: any.
+    unknown
+        What to do with other stimuli.
+    conflicts
+        What to do with a second answer of one session to one stimulus (``drop`` keeps the first).
+    participants
+        Whose sessions to keep; the others are dropped and counted.
+
+    Raises
+    ------
+    BadInputError
+        For files that break the schema or contradict themselves, and if no session is left.
+    """
+    table = check_table(read_table(trials, ()), TRIAL_COLUMNS, str(trials))
+    people = None
+    if sessions is not None:
+        people = check_table(read_table(sessions, ()), SESSION_COLUMNS, str(sessions))
+    cleaned = clean(
+        table, people, where=str(trials), known=known, unknown=unknown, conflicts=conflicts
+    )
+    return _of_kind(cleaned, participants, str(trials))
+
+
+def _of_kind(cleaned: Responses, kind: ParticipantsKind, where: str) -> Responses:
+    """Return the sessions of one kind of participants; `BadInputError` if there is none."""
+    if kind == "all":
+        return cleaned
+    simulated = cleaned.simulated_sessions
+    answered = set(cleaned.trials["session"])
+    if kind == "people" and answered <= simulated:
+        raise BadInputError(
+            f"{where}: only simulated participants were found ({len(answered)} sessions), and "
+            "these are left out; export the study again when people have taken part, or rehearse "
+            "the analysis with --simulated"
+        )
+    if kind == "simulated" and not answered & simulated:
+        raise BadInputError(
+            f"{where}: no simulated participant was found; leave out --simulated, or make some "
+            "with physion experiment simulate"
+        )
+    if kind == "simulated":
+        return cleaned.keep_sessions(simulated, PERSON)
+    if not simulated:
+        return cleaned
+    return cleaned.keep_sessions(set(cleaned.sessions["session"]) - simulated, SIMULATED)
+
+
+def clean(
+    trials: pd.DataFrame,
+    sessions: pd.DataFrame | None = None,
+    *,
+    where: str = "responses",
+    known: Collection[str] | None = None,
+    unknown: Refuse = "refuse",
+    conflicts: Refuse = "refuse",
+) -> Responses:
+    """Return the responses of a table that `check_table` has typed; see `read_responses`.
+
+    Raises `BadInputError` for a session with two participants, or with two scenarios in one block
+    or without blocks, a stimulus with two
+    labels or in two scenarios, a ``correct`` that contradicts response and label, or a trial whose
+    session is not in ``sessions``.
+    """
+    if trials.empty:
+        raise BadInputError(f"{where} has no row")
+    table = trials.assign(
+        scenario=_scenarios(trials["scenario"]), stimulus=trials["stimulus"].map(canonical_name)
+    )
+    people = _sessions(table, sessions, where)
+    nothing = pd.DataFrame(columns=list(DROPPED_COLUMNS))
+    cleaned = Responses(table.reset_index(drop=True), people, nothing)
+    cleaned = _without(cleaned, cleaned.trials["response"] == "", "reading", NO_ANSWER)
+    if cleaned.trials.empty:
+        raise BadInputError(f"{where} holds no answer")
+    cleaned = _without(cleaned, cleaned.trials.duplicated(), "reading", COPY)
+    cleaned = _known(cleaned, known, unknown, where)
+    cleaned = _one_answer_each(cleaned, conflicts, where)
+    return replace(cleaned, trials=_derived(cleaned.trials, where))
+
+
+def _scenarios(names: pd.Series) -> pd.Series:
+    """Return our spelling of the eight scenarios; another scenario keeps its name."""
+    return names.map({name: _ours(name) for name in names.unique()})
+
+
+def _ours(name: str) -> str:
+    return OFFICIAL_SCENARIOS.get(name.strip().lower(), name.strip().lower())
+
+
+def _sessions(trials: pd.DataFrame, given: pd.DataFrame | None, where: str) -> pd.DataFrame:
+    """Return the table of sessions, checked against the trials.
+
+    The scenario of a session of several blocks is the `scenario_set` of its scenarios.
+    """
+    keys = ["session", "participant", "scenario"]
+    pairs = trials[keys[:2]].drop_duplicates()
+    twice = pd.concat([pairs[pairs["session"].duplicated()], _unexplained_scenarios(trials)])
+    if len(twice):
+        raise BadInputError(
+            f"{where}: session {twice['session'].iloc[0]!r} belongs to two participants or, "
+            "without blocks, to two scenarios"
+        )
+    answered = trials.groupby("session", sort=False)["scenario"].unique()
+    cleaned = pairs.assign(scenario=pairs["session"].map(answered.map(scenario_set)))
+    cleaned = cleaned.reset_index(drop=True)
+    if given is None:
+        return cleaned
+    refuse_duplicates(given["session"], "table of sessions")
+    listed = given["scenario"].str.split().map(lambda names: scenario_set(map(_ours, names)))
+    given = given.assign(scenario=listed)
+    joined = cleaned.merge(given[keys], on="session", how="left", suffixes=("", "_given"))
+    # An unfinished session lacks the scenarios of its last blocks.
+    both = zip(joined["scenario"], joined["scenario_given"].fillna(""), strict=True)
+    absent = [not set(scenarios_in(here)) <= set(scenarios_in(there)) for here, there in both]
+    wrong = (joined["participant"] != joined["participant_given"]) | np.array(absent, dtype=bool)
+    if wrong.any():
+        raise BadInputError(
+            f"{where}: session {joined.loc[wrong, 'session'].iloc[0]!r} is not, or is another one, "
+            "in the table of sessions"
+        )
+    if "started_at" in given:
+        began = pd.to_datetime(given["started_at"], errors="coerce", utc=True, format="ISO8601")
+        given = given.loc[began.sort_values(kind="stable", na_position="last").index]
+    return given.reset_index(drop=True)
+
+
+def _unexplained_scenarios(trials: pd.DataFrame) -> pd.DataFrame:
+    """Return rows of sessions with two scenarios that are not, one each, those of their blocks."""
+    pairs = trials.assign(block=trials.get("block", pd.NA))
+    pairs = pairs[["session", "block", "scenario"]].drop_duplicates()
+    several = pairs[pairs.groupby("session")["scenario"].transform("nunique") > 1]
+    own = several.groupby(["session", "block"], dropna=False)["scenario"].transform("nunique")
+    return several[several["block"].isna() | (own > 1)]
+
+
+def scenario_set(scenarios: Iterable[str]) -> str:
+    """Return the scenarios of a session as one text, the same for all orders of its blocks."""
+    return SEVERAL.join(in_order(pd.Series(list(scenarios), dtype=str)))
+
+
+def scenarios_in(name: str) -> list[str]:
+    """Return the scenarios of a `scenario_set`."""
+    return name.split(SEVERAL)
+
+
+def _known(
+    cleaned: Responses, known: Collection[str] | None, unknown: Refuse, where: str
+) -> Responses:
+    if known is None:
+        return cleaned
+    names = {canonical_name(name) for name in known}
+    is_unknown = ~cleaned.trials["stimulus"].isin(names)
+    if is_unknown.any() and unknown == "refuse":
+        first = cleaned.trials.loc[is_unknown, "stimulus"].iloc[0]
+        raise BadInputError(
+            f"{where}: stimulus {first!r} is not known "
+            f"({int(is_unknown.sum())} such rows); give all stimuli, or ask to drop unknown ones"
+        )
+    return _without(cleaned, is_unknown, "reading", UNKNOWN)
+
+
+def _one_answer_each(cleaned: Responses, conflicts: Refuse, where: str) -> Responses:
+    rows = cleaned.trials.sort_values("trial", kind="stable")
+    second = rows.duplicated(["session", "phase", "stimulus"])
+    second |= rows.duplicated(["session", "phase", "trial"])
+    second = second.reindex(cleaned.trials.index)
+    if second.any() and conflicts == "refuse":
+        row = cleaned.trials[second].iloc[0]
+        raise BadInputError(
+            f"{where}: session {row['session']!r} has two answers to trial {row['trial']} "
+            f"({row['stimulus']!r}, {row['phase']}); clean the file, or ask to keep the first"
+        )
+    return _without(cleaned, second, "reading", CONFLICT)
+
+
+def _derived(trials: pd.DataFrame, where: str) -> pd.DataFrame:
+    """Add booleans, log response times and order; refuse contradictions."""
+    yes, label = trials["response"] == "yes", trials["label"].astype(bool)
+    correct = yes == label
+    if "correct" in trials:
+        wrong = (trials["correct"].astype("boolean") != correct).fillna(False).astype(bool)
+        if wrong.any():
+            row = trials[wrong].iloc[0]
+            raise BadInputError(
+                f"{where}: session {row['session']!r}, stimulus {row['stimulus']!r}: correct is "
+                f"{row['correct']}, but the response {row['response']} and the label disagree"
+            )
+    labels = trials.groupby("stimulus")["label"].nunique()
+    if (labels > 1).any():
+        raise BadInputError(f"{where}: stimulus {labels[labels > 1].index[0]!r} has two labels")
+    in_test = trials[trials["phase"] == "test"]
+    scenarios = in_test.groupby("stimulus")["scenario"].unique()
+    several = scenarios[scenarios.map(len) > 1]
+    if len(several):
+        raise BadInputError(
+            f"{where}: stimulus {several.index[0]!r} is in two scenarios, "
+            f"{' and '.join(several.iloc[0])}; give its versions names of their own"
+        )
+    rt = trials["rt_ms"].to_numpy(dtype=np.float64)
+    derived = trials.drop(columns="response").assign(
+        trial=trials["trial"].astype(np.int64),
+        yes=yes, label=label, correct=correct, log_rt=log_ms(rt),
+    )  # fmt: skip
+    order = ["scenario", "session", "phase", "trial"]
+    return derived.sort_values(order, kind="stable").reset_index(drop=True)
+
+
+def log_ms(rt_ms: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Return the natural logarithm of response times in ms; NaN if not above 0 or unknown."""
+    values = np.asarray(rt_ms, dtype=np.float64)
+    return np.log(values, out=np.full_like(values, np.nan), where=values > 0)
+
+
+def _without(cleaned: Responses, is_dropped: pd.Series, step: str, reason: str) -> Responses:
+    """Return the responses without the rows where ``is_dropped`` is True, and count these."""
+    if not is_dropped.any():
+        return cleaned
+    counts = _counted(cleaned.trials[is_dropped], step, reason)
+    parts = [part for part in (cleaned.dropped, counts) if len(part)]
+    return replace(
+        cleaned,
+        trials=cleaned.trials[~is_dropped].reset_index(drop=True),
+        dropped=pd.concat(parts, ignore_index=True),
+    )
+
+
+def _counted(rows: pd.DataFrame, step: str, reason: str) -> pd.DataFrame:
+    """Count ``rows`` by scenario, with `DROPPED_COLUMNS`."""
+    counts = rows.groupby("scenario", sort=False)["session"].agg(sessions="nunique", rows="size")
+    return counts.reset_index().assign(step=step, reason=reason)[list(DROPPED_COLUMNS)]
+
+
+def missing_times(responses: Responses) -> pd.DataFrame:
+    """Count the test answers without a usable response time, as rows of ``dropped``.
+
+    They are not in `Responses.dropped`, since the answers themselves are kept.
+    """
+    test = responses.test
+    return _counted(test[test["log_rt"].isna()], "response times", NO_TIME)
+
+
+def check_labels(responses: Responses, labels: Mapping[str, bool]) -> None:
+    """Raise `BadInputError` with the first stimulus whose label contradicts the official one."""
+    label_of = responses.trials.drop_duplicates("stimulus").set_index("stimulus")["label"]
+    official = label_of.index.map({canonical_name(name): value for name, value in labels.items()})
+    wrong = pd.Series(official, index=label_of.index).notna() & (official != label_of.to_numpy())
+    if wrong.any():
+        raise BadInputError(
+            f"the responses say that {label_of.index[wrong.to_numpy()][0]!r} ends otherwise than "
+            f"the labels say ({int(wrong.sum())} such stimuli)"
+        )
+
+
+# Reader of participant-level answers in the raw columns of the original study.
+#
+# The study's exports are ``human_responses-<study>-<iteration>.csv`` (150 test trials a session)
+# and ``familiarization_human_responses-...`` (10 trials). Their ``rt`` starts before the cue.
+
+RT_OFFSET_MS = 2500.0
+"""What the study takes off ``rt``. The cue of 2000 ms and 1500 ms of movie come before the buttons,
+so that about 1000 ms of waiting remain in its response times: they compare with each other, not
+with response times of our experiment (`BUTTONS_OFFSET_MS` would)."""
+
+BUTTONS_OFFSET_MS = 3500.0
+"""Cue and movie by the study's plan: the response time from about the moment of the buttons on."""
+
+COLUMNS = ("gameID", "trialNum", "stim_ID", "response", "target_hit_zone_label", "rt")
+"""Columns that must be there; ``prolificIDAnon`` (or ``prolificID``), ``correct``, ``choices``,
+``condition`` are read where they are."""
+
+_STUDY = re.compile(r"human_responses-(?P<study>[a-zA-Z]+)")
+_PEOPLE = ("prolificIDAnon", "prolificID")
+
+
+def read_official_responses(
+    files: Sequence[Path],
+    *,
+    scenario: str | None = None,
+    rt_offset_ms: float = RT_OFFSET_MS,
+    known: Collection[str] | None = None,
+    unknown: Refuse = "refuse",
+    conflicts: Refuse = "refuse",
+) -> Responses:
+    """Read responses from the raw files of the study, test and familiarization together.
+
+    The scenario of a file is ``scenario``, else that in its name, else that of its stimuli. A
+    session is a ``gameID``; its participant is the Prolific id if there is one. ``rt_offset_ms`` is
+    subtracted from ``rt``. The other parameters are those of `participants.read_responses`.
+    """
+    if not files:
+        raise BadInputError("no file of responses was given")
+    raw = pd.concat([_file(path, scenario, rt_offset_ms) for path in files], ignore_index=True)
+    where = f"{files[0]}" if len(files) == 1 else f"{files[0]} and {len(files) - 1} more"
+    table = check_table(raw, TRIAL_COLUMNS, where)
+    return clean(table, where=where, known=known, unknown=unknown, conflicts=conflicts)
+
+
+def _file(path: Path, scenario: str | None, offset: float) -> pd.DataFrame:
+    """Read one file into our columns; text stays text."""
+    raw = read_csv(path, COLUMNS)
+    condition = raw["condition"] if "condition" in raw else pd.Series("prediction", index=raw.index)
+    is_practice = condition.str.contains("familiarization")
+    if "condition" not in raw and path.name.startswith("familiarization"):
+        is_practice |= True
+    # Where the number is missing, the order of the rows is the order of the answers.
+    order = raw.groupby(["gameID", is_practice], sort=False).cumcount().astype(str)
+    position = raw["trialNum"].where(~raw["trialNum"].str.lower().isin(("", "nan")), order)
+    table = pd.DataFrame(
+        {
+            "participant": _participant(raw),
+            "session": raw["gameID"],
+            "scenario": scenario or _scenario(path, raw["stim_ID"]),
+            "stimulus": raw["stim_ID"].map(canonical_name),
+            "phase": np.where(is_practice, "familiarization", "test"),
+            "trial": position,
+            "response": raw["response"].str.lower().where(raw["response"].str.lower() != "nan", ""),
+            "label": raw["target_hit_zone_label"],
+            "simulated": False,
+            "rt_ms": _response_time(raw["rt"], offset, path),
+        }
+    )
+    if "correct" in raw:
+        table["correct"] = raw["correct"]
+    if "choices" in raw:
+        table["buttons"] = raw["choices"].map(_buttons)
+    return table
+
+
+def _participant(raw: pd.DataFrame) -> pd.Series:
+    for column in _PEOPLE:
+        if column in raw:
+            return raw[column].where(raw[column] != "", raw["gameID"])
+    return raw["gameID"]
+
+
+def _scenario(path: Path, stimuli: pd.Series) -> str:
+    match = _STUDY.search(path.name)
+    if match and match["study"].lower() in OFFICIAL_SCENARIOS:
+        return OFFICIAL_SCENARIOS[match["study"].lower()]
+    scenarios = {scenario_of(canonical_name(name)) for name in stimuli.unique()} - {None}
+    if len(scenarios) != 1:
+        raise BadInputError(
+            f"{path}: neither its name nor its stimuli say which scenario it is; name the scenario"
+        )
+    return str(scenarios.pop())
+
+
+def _response_time(rt: pd.Series, offset: float, path: Path) -> pd.Series:
+    known = ~rt.str.lower().isin(("", "nan"))
+    numbers = pd.to_numeric(rt.where(known), errors="coerce")
+    broken = known & ~np.isfinite(numbers)
+    if broken.any():
+        row = int(np.flatnonzero(broken)[0])
+        raise BadInputError(f"{path}: row {row + 1} of column 'rt' holds {rt.iloc[row]!r}")
+    return numbers - offset
+
+
+def _buttons(choices: str) -> str:
+    """Return the order of the buttons from ``["YES", "NO"]``, ``['NO' 'YES']`` or ``YES,NO``."""
+    words = re.findall(r"yes|no", choices.lower())
+    return "-".join(words) if sorted(words) == ["no", "yes"] else ""
+
+
+# Choose the sessions to analyse by the values of their columns, such as ``condition=fast``.
+
+SELECT_SESSIONS_COLUMNS = (
+    "condition",
+    "language",
+    "recruited_by",
+    "gender",
+    "education",
+    "buttons",
+    "study",
+)
+"""Columns by which sessions can be chosen, in the table of sessions or in the trials."""
+
+
+def keep_where(responses: Responses, chosen: Sequence[str]) -> Responses:
+    """Return the responses of the sessions that have the given values; the others are counted.
+
+    Parameters
+    ----------
+    responses
+        Answers of participants.
+    chosen
+        Texts such as ``condition=fast``. Several of one column are alternatives; of several
+        columns, a session must fit all.
+
+    Raises
+    ------
+    BadInputError
+        A text has no ``=``, the responses lack the column, or no session has such a value.
+    UnknownNameError
+        The column is not in `COLUMNS`.
+    """
+    wanted: dict[str, set[str]] = {}
+    for text in chosen:
+        column, equals, value = text.partition("=")
+        if not equals:
+            raise BadInputError(
+                f"--where {text}: give a column and a value, such as condition=fast"
+            )
+        if column not in SELECT_SESSIONS_COLUMNS:
+            raise UnknownNameError("column of sessions", column, SELECT_SESSIONS_COLUMNS)
+        wanted.setdefault(column, set()).add(value)
+    for column, values in wanted.items():
+        found = _values(responses, column)
+        missing = sorted(values - set(found))
+        if missing:
+            known = ", ".join(sorted(set(found))) or "none"
+            raise BadInputError(
+                f"no session has {column}={missing[0]}; the values of {column} are: {known}"
+            )
+        kept = set(found.index[found.isin(values)])
+        responses = responses.keep_sessions(kept, f"{column} is not {' or '.join(sorted(values))}")
+    return responses
+
+
+def _values(responses: Responses, column: str) -> pd.Series:
+    """Return the values of a column that are not empty, by session."""
+    for table in (responses.sessions, responses.trials):
+        if column in table:
+            values = table.drop_duplicates("session").set_index("session")[column].astype(str)
+            return values[values != ""]
+    raise BadInputError(f"the responses have no column {column}; give the table of sessions too")

@@ -1,0 +1,156 @@
+"""Errors of imagined motion over time, by scenario and model, next to constant velocity.
+
+The mean over trials at each time after the last observed frame; intervals are about other trials.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from physion.analysis.intervals import Variance, mean_of, variance_of_mean
+from physion.analysis.tables import MEAN, as_numbers, in_order, read_csv
+from physion.core.errors import BadInputError
+
+CONSTANT_VELOCITY = "constant velocity"
+"""Name of the baseline: objects go on as they moved in the last observed step."""
+REQUIRED = ("Model", "Scenario", "Stimulus Name", "Frames", "Error", "Constant Velocity Error")
+"""Columns of a file of errors, which ``physion evaluate --rollout-error`` writes."""
+COLUMNS = ("panel", "agent", "kind", "seconds", "trials", "value", "low", "high")
+"""``panel``: scenario or `MEAN`; ``kind``: model or baseline; ``seconds`` of physics after the last
+observed frame; ``value``: mean error in metres, with its interval."""
+_FRAME = 0.01
+_FARTHEST = 1e6
+
+Array = npt.NDArray[np.float64]
+
+
+def read_rollout_errors(paths: Sequence[Path]) -> pd.DataFrame:
+    """Read files of errors: columns ``agent``, ``scenario``, ``stimulus``, ``seconds``, ``error``,
+    ``baseline``.
+
+    A model that is in several files is named with each file. Raises `BadInputError` for a file that
+    is no such table.
+    """
+    tables = {path: read_csv(path, REQUIRED) for path in paths}
+    count = Counter(name for table in tables.values() for name in set(table["Model"]))
+    parts = []
+    for path, table in tables.items():
+        agent = [f"{m}, {path.stem}" if count[m] > 1 else m for m in table["Model"]]
+        numbers = {
+            name: as_numbers(table[column], 0, _FARTHEST, str(path))
+            for name, column in (
+                ("seconds", "Frames"),
+                ("error", "Error"),
+                ("baseline", "Constant Velocity Error"),
+            )
+        }
+        names = {"scenario": table["Scenario"], "stimulus": table["Stimulus Name"]}
+        part = pd.DataFrame({"agent": agent, **names, **numbers})
+        part["seconds"] *= _FRAME
+        repeated = part.duplicated(["agent", "stimulus", "seconds"])
+        if repeated.any():
+            row = int(np.flatnonzero(repeated)[0])
+            raise BadInputError(
+                f"{path}: row {row + 1} repeats a model, stimulus and frame: "
+                f"{part['stimulus'].iloc[row]!r}"
+            )
+        parts.append(part)
+    return pd.concat(parts, ignore_index=True)
+
+
+def rollout_error_table(errors: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
+    """Return mean errors with intervals; `COLUMNS`.
+
+    The baseline is that of the first model, since the step of a model decides its last velocity. A
+    panel `MEAN` with the mean over scenarios follows if there are several.
+
+    Parameters
+    ----------
+    errors
+        From `read_rollout_errors`.
+    level
+        Level of the intervals, which are symmetric in the logarithm of the mean error. Errors are
+        skewed, which `jackknife.degrees_of_freedom` takes into account.
+    """
+    agents = list(dict.fromkeys(errors["agent"]))
+    scenarios = in_order(set(errors["scenario"]))
+    curves = [(agent, "model", "error", agent) for agent in agents]
+    curves.append((CONSTANT_VELOCITY, "baseline", "baseline", agents[0]))
+    rows: list[pd.DataFrame] = []
+    for name, kind, column, agent in curves:
+        own = errors[errors["agent"] == agent]
+        means = {
+            scenario: _means(own[own["scenario"] == scenario], column)
+            for scenario in scenarios
+            if (own["scenario"] == scenario).any()
+        }
+        if len(means) > 1:
+            means[MEAN] = _mean_over_scenarios(list(means.values()))
+        rows += [
+            _rows(values, level).assign(panel=panel, agent=name, kind=kind)
+            for panel, values in means.items()
+        ]
+    table = pd.concat(rows, ignore_index=True)[list(COLUMNS)]
+    order = {panel: place for place, panel in enumerate([*scenarios, MEAN])}
+    return table.sort_values(
+        "panel", key=lambda panels: panels.map(order), kind="stable", ignore_index=True
+    )
+
+
+def _means(rows: pd.DataFrame, column: str) -> pd.DataFrame:
+    """Return ``trials``, ``value`` (mean), ``variance`` of the mean and its ``df``, by time."""
+    wide = rows.pivot(index="stimulus", columns="seconds", values=column).sort_index()
+    values: Array = wide.to_numpy(dtype=np.float64)
+    variance = variance_of_mean(values)
+    return pd.DataFrame(
+        {
+            "trials": np.isfinite(values).sum(axis=0),
+            "value": np.nanmean(values, axis=0),
+            "variance": variance.value,
+            "df": variance.df,
+        },
+        index=wide.columns,
+    )
+
+
+def _mean_over_scenarios(parts: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Return the mean of scenarios at the times that all have."""
+    times = sorted(set.intersection(*(set(part.index) for part in parts)))
+    aligned = [part.loc[times] for part in parts]
+    variance = mean_of(
+        [Variance(part["variance"].to_numpy(), part["df"].to_numpy()) for part in aligned]
+    )
+    return pd.DataFrame(
+        {
+            "trials": np.sum([part["trials"] for part in aligned], axis=0),
+            "value": np.mean([part["value"] for part in aligned], axis=0),
+            "variance": variance.value,
+            "df": variance.df,
+        },
+        index=pd.Index(times),
+    )
+
+
+def _rows(means: pd.DataFrame, level: float) -> pd.DataFrame:
+    variance = Variance(means["variance"].to_numpy(), means["df"].to_numpy())
+    bounds = np.array(
+        [
+            variance.of(k).interval(float(value), level, "positive")
+            for k, value in enumerate(means["value"])
+        ]
+    ).reshape(-1, 2)
+    return pd.DataFrame(
+        {
+            "seconds": means.index.to_numpy(dtype=np.float64),
+            "trials": means["trials"].to_numpy(dtype=int),
+            "value": means["value"].to_numpy(dtype=np.float64),
+            "low": bounds[:, 0],
+            "high": bounds[:, 1],
+        }
+    )

@@ -1,0 +1,886 @@
+"""Tables of scores: one row a model and scenario, then their mean and the pooled stimuli."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from physion.analysis.intervals import (
+    Bootstrap,
+    Integers,
+    Variance,
+    add,
+    delete_one,
+    jackknife,
+    mean_of,
+    second_order,
+    variance_of_mean,
+)
+from physion.analysis.metrics import measure_metrics, metrics, score_metrics
+from physion.analysis.people.measures import ScenarioAnswers, difference_of_pairs, mean_over_people
+from physion.analysis.sample import RESAMPLED, Resampled, Sample, pool, sample_of_rows
+from physion.analysis.statistics import agreement
+from physion.analysis.statistics.agreement import correctness, correlate_rows, cross_kappa, rmsd
+from physion.analysis.statistics.regression import check_probabilities
+from physion.analysis.tables import MEAN, POOLED, in_order
+from physion.core.errors import BadInputError
+from physion.core.seeds import generator
+
+Array = npt.NDArray[np.float64]
+Compute = Callable[[Sample], dict[str, Array]]
+"""Function from a `Sample` to the values of every metric, each of shape (1 + n,): of all stimuli,
+then without each of the n stimuli of all scenarios."""
+
+Explain = Callable[[pd.DataFrame], dict[str, str]]
+"""Function from rows of stimuli to reasons for what is undefined, by the label of the metric."""
+
+
+def score_table(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
+    """Return the scores of every model.
+
+    Parameters
+    ----------
+    stimuli
+        One row a model and stimulus, as `comparison.Comparison.stimuli`.
+    level
+        Level of the intervals, which are about other stimuli of the same number in each scenario,
+        with the same people (`jackknife`).
+
+    Returns
+    -------
+    For each ``agent`` its scenarios, then `MEAN` and `POOLED`. Columns: ``agent``, ``model``,
+    ``readout``, ``scenario``; counts of ``stimuli`` and of ``changed`` ones, whose simulated
+    outcome is not the official one; every metric of `metrics.score_metrics` with ``_low`` and
+    ``_high``; ``ceiling`` of r and ``floor`` of the RMSD; ``reason``: why a score or an interval is
+    NaN, or means less than it seems to (for example if all labels are of one class); else empty.
+    """
+    # Sorted, so that rounding does not depend on the order of the files.
+    ordered = stimuli.sort_values("stimulus", kind="stable")
+    parts = [
+        _agent_rows(rows, level, _of_models, _why_undefined)
+        for _, rows in ordered.groupby("agent", sort=False)
+    ]
+    table = pd.concat(parts, ignore_index=True)
+    rank = {agent: position for position, agent in enumerate(stimuli["agent"].unique())}
+    return table.sort_values("agent", key=lambda a: a.map(rank), kind="stable").reset_index(
+        drop=True
+    )
+
+
+def two_people_table(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
+    """Return the scores of one person with another, with the columns of `score_table`.
+
+    ``stimuli`` has a row for each stimulus, whose predictions do not matter. Metrics that are not
+    defined for two people are NaN.
+    """
+    ordered = stimuli.sort_values("stimulus", kind="stable")
+    return _agent_rows(ordered, level, _of_two_people, _why_no_pair)
+
+
+def _agent_rows(rows: pd.DataFrame, level: float, scores: Compute, why: Explain) -> pd.DataFrame:
+    names = in_order(rows["scenario"])
+    parts = [rows[rows["scenario"] == name] for name in names]
+    weights, strata = delete_one([len(part) for part in parts])
+    samples = [sample_of_rows(part, each) for part, each in zip(parts, weights, strict=True)]
+    by_scenario = [scores(sample) for sample in samples]
+    mean = {key: np.mean([values[key] for values in by_scenario], axis=0) for key in by_scenario[0]}
+    reasons = [why(part) for part in parts]
+    records = []
+    for at, (name, part, because) in enumerate(zip(names, parts, reasons, strict=True)):
+        own = np.concatenate([[True], strata == at])
+        values_of = {key: values[own] for key, values in by_scenario[at].items()}
+        records.append(_record(name, part, values_of, None, level, [*because.values()]))
+    one_class = [name for name, part in zip(names, parts, strict=True) if _one_class(part)]
+    undefined: dict[str, list[str]] = {}
+    for name, because in zip(names, reasons, strict=True):
+        for label in because:
+            undefined.setdefault(label, []).append(name)
+    whys = [f"{label}: undefined in {', '.join(where)}" for label, where in undefined.items()]
+    whys += [f"labels: of one class in {', '.join(one_class)}"] if one_class else []
+    records.append(_record(MEAN, rows, mean, strata, level, whys))
+    for key in ("ceiling", "floor"):
+        records[-1][key] = float(np.mean([record[key] for record in records[:-1]]))
+    pooled = scores(pool(samples))
+    records.append(_record(POOLED, rows, pooled, strata, level, [*why(rows).values()]))
+    table = pd.DataFrame(records)
+    for position, column in enumerate(("agent", "model", "readout")):
+        table.insert(position, column, rows[column].iloc[0])
+    return table
+
+
+def _of_models(sample: Sample) -> dict[str, Array]:
+    """Return the values of every metric by stimulus."""
+    return {metric.name: metric(sample)[:, 0] for metric in score_metrics()}
+
+
+def _of_two_people(sample: Sample) -> dict[str, Array]:
+    """Return the values of every metric for one person with another, likewise."""
+    return {metric.name: metric.of_two_people(sample)[:, 0] for metric in score_metrics()}
+
+
+def _why_undefined(rows: pd.DataFrame) -> dict[str, str]:
+    """Return why metrics of a model are undefined, by their label."""
+    if why := agreement.why_no_r(rows["p_contact"], rows["p_yes"]):
+        return {"r": why}
+    why = agreement.why_no_r_within(rows["p_contact"], rows["p_yes"], rows["label"])
+    return {"r beyond the outcome": why} if why else {}
+
+
+def _why_no_pair(rows: pd.DataFrame) -> dict[str, str]:
+    """Return why kappa of two people is undefined."""
+    if (rows["count"] < 2).any():
+        return {"kappa": "kappa: needs two answers to every stimulus"}
+    return {}
+
+
+def _one_class(rows: pd.DataFrame) -> bool:
+    """Return whether several stimuli all have the same label."""
+    return len(rows) > 1 and rows["label"].nunique() == 1
+
+
+def _record(
+    name: str,
+    rows: pd.DataFrame,
+    values_of: dict[str, Array],
+    strata: Integers | None,
+    level: float,
+    whys: list[str],
+) -> dict[str, Any]:
+    reasons = [*whys]
+    if name != MEAN and _one_class(rows):
+        word = "contact" if bool(rows["label"].iloc[0]) else "no contact"
+        reasons.append(f"labels: all {word}, so accuracy cannot tell knowing from always saying it")
+    record: dict[str, Any] = {
+        "scenario": name,
+        "stimuli": len(rows),
+        "changed": int((rows["label"] != rows["simulated"]).sum()),
+    }
+    for key, values in values_of.items():
+        metric = metrics.get(key)
+        variance = jackknife(values[1:], strata, counts=metric.counts)
+        low, high = variance.interval(float(values[0]), level, metric.scale)
+        if np.isfinite(values[0]) and np.isnan(low) and len(rows) > 1:
+            name = metric.label or key
+            reasons.append(f"{name}: no interval, too few stimuli or undefined without one of them")
+        record |= {key: float(values[0]), f"{key}_low": low, f"{key}_high": high}
+    if len(rows) > 1 and record["accuracy_low"] == record["accuracy_high"]:
+        reasons.append("accuracy: all answers alike, so the interval has no width")
+    if len(rows) == 1:
+        reasons.append("intervals: one stimulus")
+    if np.isfinite(values_of["r"][0]) and np.isnan(values_of["r_same"][0]):
+        reasons.append("r, same outcome: too few or constant where the outcomes agree")
+    record["ceiling"] = agreement.ceiling(rows["p_yes"], rows["count"])
+    record["floor"] = agreement.rmsd_floor(rows["p_yes"], rows["count"])
+    if np.isfinite(values_of["r"][0]) and np.isnan(record["ceiling"]):
+        reasons.append("ceiling: people too few or too alike to estimate it")
+    record["reason"] = "; ".join(reasons)
+    return record
+
+
+def people_table(
+    people: pd.DataFrame, zone: pd.DataFrame | None, level: float = 0.95
+) -> pd.DataFrame:
+    """Return the people by scenario and, in row `MEAN`, averaged over scenarios.
+
+    ``people`` has a row a stimulus, from `responses.with_labels`.
+
+    Columns: ``scenario``, ``stimuli``, ``people`` (median number a stimulus), ``base_rate``
+    (fraction of stimuli with contact), ``yes`` (mean fraction who say yes), ``accuracy`` with
+    ``_low`` and ``_high`` (jackknife over stimuli), ``reliability`` and ``ceiling`` (see
+    `agreement`), and ``zone_low``, ``zone_high``: the middle 95 % of participants if ``zone``
+    contains it, else NaN; always NaN in the mean, since nobody took part in more than one scenario.
+    """
+    zones = {} if zone is None else zone.set_index("scenario")[["low", "high"]].T.to_dict()
+    records, variances = [], []
+    for name in in_order(people["scenario"]):
+        rows = people[people["scenario"] == name].sort_values("stimulus", kind="stable")
+        variances.append(variance_of_mean(rows["accuracy"].to_numpy(dtype=np.float64)))
+        records.append(_people_record(name, rows, variances[-1], zones.get(name, {}), level))
+    table = pd.DataFrame(records)
+    low, high = mean_of(variances).interval(float(table["accuracy"].mean()), level, "fraction")
+    averaged = ["people", "base_rate", "yes", "accuracy", "reliability", "ceiling"]
+    mean = {"scenario": MEAN, "stimuli": len(people), "accuracy_low": low, "accuracy_high": high}
+    mean |= {column: float(table[column].mean(skipna=False)) for column in averaged}
+    return pd.concat([table, pd.DataFrame([mean])], ignore_index=True)
+
+
+def _people_record(
+    name: str, rows: pd.DataFrame, variance: Variance, zone: dict[str, float], level: float
+) -> dict[str, Any]:
+    low, high = variance.interval(float(rows["accuracy"].mean()), level, "fraction")
+    return {
+        "scenario": name,
+        "stimuli": len(rows),
+        "people": float(np.median(rows["count"])),
+        "base_rate": float(np.mean(rows["label"].to_numpy(dtype=bool))),
+        "yes": float(rows["p_yes"].mean()),
+        "accuracy": float(rows["accuracy"].mean()),
+        "accuracy_low": low,
+        "accuracy_high": high,
+        "reliability": agreement.reliability(rows["p_yes"], rows["count"]),
+        "ceiling": agreement.ceiling(rows["p_yes"], rows["count"]),
+        "zone_low": zone.get("low", np.nan),
+        "zone_high": zone.get("high", np.nan),
+    }
+
+
+# Models and the single participants of one scenario as arrays over the same stimuli.
+
+
+@dataclass(frozen=True)
+class Models:
+    """Predictions of models for the stimuli of one scenario, in the order of its answers.
+
+    ``p_contact`` (m, s) in 0..1 and ``predicted`` (m, s) 1 or 0; NaN if a model does not predict
+    the stimulus. Raises `BadInputError` for other values or for shapes that do not fit.
+    """
+
+    names: tuple[str, ...]
+    p_contact: Array
+    predicted: Array
+
+    def __post_init__(self) -> None:
+        if not self.p_contact.shape == self.predicted.shape:
+            raise BadInputError("P(contact) and predicted outcomes differ in shape")
+        if len(self.names) != len(self.p_contact) or len(set(self.names)) != len(self.names):
+            raise BadInputError("each model needs one name of its own and one row")
+        check_probabilities(self.p_contact, gaps=True)
+        if not (np.isnan(self.predicted) | np.isin(self.predicted, (0, 1))).all():
+            raise BadInputError("predicted outcomes must be 0, 1 or NaN")
+        if (np.isnan(self.predicted) != np.isnan(self.p_contact)).any():
+            raise BadInputError("a stimulus needs both P(contact) and a predicted outcome")
+
+
+def models_of(
+    rows: pd.DataFrame, answers: ScenarioAnswers, agents: Sequence[str] | None = None
+) -> tuple[Models, pd.DataFrame]:
+    """Return the models of a table, and a table of what has no counterpart.
+
+    Parameters
+    ----------
+    rows
+        Table with ``agent``, ``stimulus``, ``p_contact``, ``predicted``.
+    answers
+        Answers of people to the scenario, whose stimuli are used.
+    agents
+        Names of the models in the order to use, whether they occur in ``rows`` or not; None: those
+        that occur.
+
+    Returns
+    -------
+    The models, and the table ``agent``, ``reason``, ``stimuli``. Raises `BadInputError` if a model
+    predicts a stimulus twice.
+    """
+    twice = rows[rows.duplicated(["agent", "stimulus"])]
+    if len(twice):
+        raise BadInputError(
+            f"{twice['agent'].iloc[0]!r} answers {twice['stimulus'].iloc[0]!r} twice"
+        )
+    names = tuple(map(str, rows["agent"].unique() if agents is None else agents))
+    grids = [
+        rows.pivot(index="agent", columns="stimulus", values=column)
+        .reindex(index=list(names), columns=list(answers.stimuli))
+        .to_numpy(dtype=np.float64)
+        for column in ("p_contact", "predicted")
+    ]
+    unseen = rows[~rows["stimulus"].isin(answers.stimuli)].groupby("agent", sort=False).size()
+    unmatched = [(agent, "people did not see it", int(n)) for agent, n in unseen.items()]
+    gaps = np.isnan(grids[0]).sum(axis=1)
+    unmatched += [(name, "the model does not predict it", int(n))
+             for name, n in zip(names, gaps, strict=True) if n]  # fmt: skip
+    dropped = pd.DataFrame(unmatched, columns=["agent", "reason", "stimuli"])
+    return Models(names, grids[0], grids[1]), dropped
+
+
+def sample_of_models(
+    models: Models,
+    answers: ScenarioAnswers,
+    stimuli: Array | None = None,
+    people: Array | None = None,
+    drawn: Resampled | None = None,
+) -> Sample:
+    """Return models and people with weights of stimuli (b, s) and of people (b, n).
+
+    Weights that are None count everything once.
+    """
+    resamples = 1 if people is None else len(people)
+    if stimuli is None:
+        stimuli = np.ones((resamples, len(answers.stimuli)))
+    p_yes, right = mean_over_people(answers.yes, people), mean_over_people(answers.correct, people)
+    everybody = np.ones((len(stimuli), len(answers.sessions)))
+    return Sample(
+        p_contact=models.p_contact,
+        predicted=models.predicted,
+        label=answers.label,
+        shown=answers.label,
+        p_yes=np.atleast_2d(p_yes),
+        human_accuracy=np.atleast_2d(right),
+        differ=np.atleast_2d(difference_of_pairs(answers.yes, people)),
+        stimuli=stimuli,
+        answers=answers,
+        people=everybody if people is None else people,
+        drawn=drawn,
+    )
+
+
+def model_pairs(models: Models, answers: ScenarioAnswers) -> pd.DataFrame:
+    """Return kappa and error consistency of every two models.
+
+    Columns: ``first``, ``second``, ``stimuli``, ``kappa``, ``error_consistency``; NaN if undefined.
+    """
+    right = correctness(models.predicted, answers.label)
+    kappa, errors = (cross_kappa(a, a) for a in (models.predicted, right))
+    has = (~np.isnan(models.predicted)).astype(np.float64)
+    rows = [
+        (models.names[i], models.names[j], int((has @ has.T)[i, j]), kappa[i, j], errors[i, j])
+        for i, j in zip(*np.triu_indices(len(models.names), 1), strict=True)
+    ]
+    return pd.DataFrame(rows, columns=["first", "second", "stimuli", "kappa", "error_consistency"])
+
+
+# How much a measure of models varies with other people, other stimuli, or both.
+#
+# An interval is about the expected value of the measure with other people, or stimuli, of the same
+# number. The averages of people are noisy, which raises the RMSD and lowers r, in the value and in
+# its expectation alike; `agreement.ceiling` and `agreement.rmsd_floor` state how much.
+#
+# References
+# ----------
+# P. McCullagh, *Resampling and exchangeable arrays*, Bernoulli 6, 2000, 285-301: no bootstrap is
+# exact for people crossed with stimuli.
+# A. B. Owen, *The pigeonhole bootstrap*, Annals of Applied Statistics 1, 2007, 386-411: drawing
+#   both
+# counts the noise of single answers three times.
+
+Computes = Mapping[str, Callable[[Sample], Array]]
+"""By name of the metric, functions from a `Sample` to values (b, m)."""
+
+PAIRS = 2000
+"""Most pairs of people for the correction of second order."""
+
+SPLITS = 10
+"""Random halves of the stimuli for the part of people that all stimuli share."""
+
+
+def sampling_variances(
+    models: Models, answers: ScenarioAnswers, computes: Computes, drawn: Resampled
+) -> dict[str, Variance]:
+    """Return the variance of measures over other people, stimuli, or both; each of shape (m,).
+
+    - stimuli: jackknife over stimuli; people stay the same.
+    - people: jackknife over people, less its excess of second order (`jackknife.second_order`),
+      which may take at most half of it; stimuli stay the same.
+    - both: the jackknife over stimuli contains the noise of single answers, since every stimulus
+      has answers of its own, but not what a person does in all stimuli. The variance of that part
+      is the covariance, over people, of the jackknife values from one half of the stimuli with
+      those from the other half. It is added, or nothing if it is below 0.
+    """
+    if drawn == "people":
+        return _over_people(models, answers, computes)
+    over_stimuli = _over_stimuli(models, answers, computes)
+    if drawn == "stimuli":
+        return over_stimuli
+    shared = _shared_by_stimuli(models, answers, computes)
+    return {name: add([over_stimuli[name], shared[name]]) for name in computes}
+
+
+def _over_stimuli(
+    models: Models, answers: ScenarioAnswers, computes: Computes
+) -> dict[str, Variance]:
+    without = 1 - np.eye(len(answers.stimuli))
+    sample = sample_of_models(models, answers, without, None, "stimuli")
+    predicted = ~np.isnan(models.p_contact).T
+    variances = {}
+    for name, compute in computes.items():
+        values = compute(sample)
+        # One person with another has one column, for which every stimulus counts.
+        used = predicted if values.shape == predicted.shape else None
+        counts = name in metrics and metrics.get(name).counts
+        variances[name] = jackknife(values, used=used, counts=counts)
+    return variances
+
+
+def _over_people(
+    models: Models, answers: ScenarioAnswers, computes: Computes
+) -> dict[str, Variance]:
+    n = len(answers.sessions)
+    if n < 2:
+        return _undefined(models, answers, computes)
+    pairs = _pairs(n)
+    one, two = 1 - np.eye(n), np.ones((len(pairs), n))
+    np.put_along_axis(two, pairs, 0.0, axis=1)
+    whole = sample_of_models(models, answers)
+    sample = sample_of_models(models, answers, None, np.concatenate([one, two]), "people")
+    variances = {}
+    for name, compute in computes.items():
+        values = compute(sample)
+        found = jackknife(values[:n])
+        if len(pairs):
+            excess = second_order(compute(whole)[0], values[:n], values[n:], pairs)
+            excess = np.where(np.isfinite(excess), excess, 0.0)
+            found = Variance(np.maximum(found.value - excess, found.value / 2), found.df)
+        variances[name] = found
+    return variances
+
+
+def _pairs(n: int) -> npt.NDArray[np.int_]:
+    """Return all pairs of n people, or `PAIRS` of them; none for two people alone."""
+    pairs = np.stack(np.triu_indices(n, 1), axis=1)
+    if n < 3:
+        return pairs[:0]
+    if len(pairs) > PAIRS:
+        chosen = generator("pairs of people", n).choice(len(pairs), PAIRS, replace=False)
+        pairs = pairs[np.sort(chosen)]
+    return pairs
+
+
+def _shared_by_stimuli(
+    models: Models, answers: ScenarioAnswers, computes: Computes
+) -> dict[str, Variance]:
+    """Return the variance over people of what each of them does in all stimuli."""
+    people, stimuli = len(answers.sessions), len(answers.stimuli)
+    if people < 2:
+        return _undefined(models, answers, computes)
+    splits = max(2, min(SPLITS, 1000 // people))
+    rng = generator("halves of stimuli", stimuli)
+    order = rng.permuted(np.tile(np.arange(stimuli), (splits, 1)), axis=1)
+    first = (order < stimuli // 2).astype(np.float64)
+    halves = np.stack([first, 1 - first], axis=1).reshape(2 * splits, stimuli)
+    sample = sample_of_models(
+        models,
+        answers,
+        np.repeat(halves, people, axis=0),
+        np.tile(1 - np.eye(people), (2 * splits, 1)),
+        "both",
+    )
+    variances = {}
+    for name, compute in computes.items():
+        values = compute(sample).reshape(splits, 2, people, -1)
+        apart = values - values.mean(axis=2, keepdims=True)
+        products = np.sum(apart[:, 0] * apart[:, 1], axis=1) * (people - 1) / people
+        shared = _mean_of_defined(products)
+        df = np.full(shared.shape, people - 1.0)
+        variances[name] = Variance(np.maximum(shared, 0.0), df)
+    return variances
+
+
+def _mean_of_defined(values: Array) -> Array:
+    """Return the mean over the first axis of what is defined; NaN where nothing is."""
+    known = np.isfinite(values)
+    count = known.sum(axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(count > 0, np.where(known, values, 0.0).sum(axis=0) / count, np.nan)
+
+
+def _undefined(models: Models, answers: ScenarioAnswers, computes: Computes) -> dict[str, Variance]:
+    whole = sample_of_models(models, answers)
+    nothing = {name: np.full(compute(whole)[0].shape, np.nan) for name, compute in computes.items()}
+    return {name: Variance(values, values) for name, values in nothing.items()}
+
+
+# Anchors of the tables of results: what a model's score is worth.
+#
+# Three are computed from the answers of people and the official outcomes, without a model:
+#
+# - `OUTCOME`: answers with the official outcome, as a perfect simulator would;
+# - `MAJORITY`: answers as most people did (no where they are divided equally): no answer of yes or
+#   no
+#   agrees with single people more often, so its kappa is the ceiling of models;
+# - `TWO_PEOPLE`: one person in place of the model, compared with another one.
+#
+# Others come as predictions of models whose names are in `ANCHOR_MODELS`. Predictions of `outcome`
+# or `majority-of-people` take the place of the computed anchor, which then stands in no table.
+
+OUTCOME = "recorded outcome"
+MAJORITY = "majority of people"
+TWO_PEOPLE = "one person with another"
+COMPUTED = (OUTCOME, MAJORITY, TWO_PEOPLE)
+"""Names of the anchors that need no predictions."""
+
+ANCHOR_MODELS = frozenset(
+    {
+        "outcome",
+        "majority-of-people",
+        "state-classifier",
+        "already-touched",
+        "constant-motion",
+        "blob-centroids",
+        "copy-last-frame",
+        "chance",
+    }
+)
+"""Names of models whose predictions are anchors."""
+
+GIVEN_AS = {OUTCOME: "outcome", MAJORITY: "majority-of-people"}
+"""Names of the models whose predictions take the place of a computed anchor."""
+
+Kind = Literal["model", "anchor"]
+
+
+def kind_of(agent: str) -> Kind:
+    """Return whether an agent is a model or an anchor, by the name of the model alone."""
+    model = agent.partition(" · ")[0]
+    return "anchor" if model in ANCHOR_MODELS or agent in COMPUTED else "model"
+
+
+def not_given(agents: Iterable[str]) -> list[str]:
+    """Return those of `OUTCOME` and `MAJORITY` of which no predictions were given.
+
+    ``agents``: names of everything of which there are predictions.
+    """
+    models = {agent.partition(" · ")[0] for agent in agents}
+    return [name for name, model in GIVEN_AS.items() if model not in models]
+
+
+def seen_stimuli(stimuli: pd.DataFrame) -> pd.DataFrame:
+    """Return each stimulus that people answered once, as rows of `TWO_PEOPLE`.
+
+    ``stimuli`` and the result have the columns of `comparison.Comparison.stimuli`; the predictions
+    are the outcomes and mean nothing. It is empty without people.
+    """
+    seen = stimuli[stimuli["p_yes"].notna()].drop_duplicates("stimulus")
+    return _answering(seen, TWO_PEOPLE, seen["label"].astype(bool))
+
+
+def anchor_stimuli(stimuli: pd.DataFrame) -> pd.DataFrame:
+    """Return the answers of `OUTCOME` and `MAJORITY` to the stimuli that people answered.
+
+    ``stimuli`` and the result have the columns of `comparison.Comparison.stimuli`; the result is
+    about each stimulus once, and P(contact) is 0 or 1. Without people, and for anchors whose
+    predictions were given (`GIVEN_AS`), it has no rows.
+    """
+    seen = seen_stimuli(stimuli)
+    answers = {OUTCOME: seen["label"].astype(bool), MAJORITY: seen["p_yes"] > 0.5}
+    names = not_given(str(agent) for agent in stimuli["agent"].unique())
+    parts = [_answering(seen, name, answers[name]) for name in names]
+    return pd.concat(parts, ignore_index=True) if parts else seen.iloc[:0]
+
+
+def _answering(seen: pd.DataFrame, name: str, yes: pd.Series) -> pd.DataFrame:
+    """Return the rows of ``seen`` with the answers ``yes`` of an anchor."""
+    table = seen.assign(
+        agent=name, model=name, readout="", predicted=yes, p_contact=yes.astype(float)
+    )
+    return table.assign(gap=table["p_contact"] - table["p_yes"]).reset_index(drop=True)
+
+
+def anchor_scores(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
+    """Return `with_kind` of the scores of the computed anchors; empty without people.
+
+    ``stimuli``: as for `anchor_stimuli`.
+    """
+    seen, answers = seen_stimuli(stimuli), anchor_stimuli(stimuli)
+    if seen.empty:
+        return pd.DataFrame()
+    parts = [score_table(answers, level)] if len(answers) else []
+    parts.append(two_people_table(seen, level))
+    return with_kind(pd.concat(parts, ignore_index=True))
+
+
+def with_kind(scores: pd.DataFrame, names: str = "agent") -> pd.DataFrame:
+    """Return a table with the column ``kind`` after that of the names of models."""
+    table = scores.copy()
+    kinds = [kind_of(str(name)) for name in scores[names]]
+    table.insert(list(table.columns).index(names) + 1, "kind", kinds)
+    return table
+
+
+def add_anchors(models: Models, answers: ScenarioAnswers) -> Models:
+    """Return the models with `OUTCOME` and `MAJORITY` as the last two, unless they were given."""
+    rows = {OUTCOME: answers.label, MAJORITY: answers.p_yes() > 0.5}
+    names = not_given(models.names)
+    added = [rows[name].astype(np.float64)[None] for name in names]
+    return Models(
+        (*models.names, *names),
+        np.vstack([models.p_contact, *added]),
+        np.vstack([models.predicted, *added]),
+    )
+
+
+# Measures of models with the single participants of a scenario, and their intervals.
+#
+# A *measure* of a model compares it with the people of the scenario; the *zone* of a measure is
+# the range of single people (or pairs, or halves of them) from the 2.5th to the 97.5th percentile.
+# Intervals are about other people, other stimuli, or both; they answer different questions, so
+# each is named. `sampling_variance` contains the method.
+
+TABLE_COLUMNS = (
+    *("model", "scenario", "measure", "stimuli", "value"),
+    *(f"{end}_{what}" for what in RESAMPLED for end in ("low", "high")),
+    *("pair_low", "pair_median", "pair_high", "undefined", "reason"),
+)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Measures of one model in one scenario, with their sampling variances.
+
+    - ``model``, ``scenario``; ``stimuli``: number of stimuli that the model predicts;
+    - ``values[measure]``; ``reasons[measure]``: why the value is NaN;
+    - ``variances[what][measure]`` for each of `sample.RESAMPLED`, absent if the measure does not
+      depend on what is drawn;
+    - ``by_participant[measure]`` (people,), for measures with a value for each participant.
+    """
+
+    model: str
+    scenario: str
+    stimuli: int
+    values: dict[str, float]
+    reasons: dict[str, str]
+    variances: dict[Resampled, dict[str, Variance]]
+    by_participant: dict[str, Array]
+
+
+def measure_models(
+    models: Models, answers: ScenarioAnswers, two_people: str = ""
+) -> list[Measured]:
+    """Compute every measure of every model, and its sampling variances.
+
+    ``two_people``: name of a further row, at the end, with the measures of one person with another
+    that are defined; empty: there is none.
+    """
+    sample = sample_of_models(models, answers)
+    chosen = measure_metrics()
+    values = {metric.name: metric(sample)[0] for metric in chosen}
+    each = {m.name: m.by_participant(sample) for m in chosen if m.by_participant is not None}
+    variances = {
+        what: sampling_variances(
+            models, answers, {m.name: m for m in chosen if what in m.resampled}, what
+        )
+        for what in RESAMPLED
+    }
+    rows = []
+    for k, name in enumerate(models.names):
+        of_model = {measure: float(value[k]) for measure, value in values.items()}
+        undefined = [measure for measure, value in of_model.items() if not np.isfinite(value)]
+        rows.append(
+            Measured(
+                model=name,
+                scenario=answers.scenario,
+                stimuli=int(np.sum(~np.isnan(models.p_contact[k]))),
+                values=of_model,
+                reasons={measure: _why(measure, k, models, answers) for measure in undefined},
+                variances={what: _of_model(found, k) for what, found in variances.items()},
+                by_participant={measure: value[:, k] for measure, value in each.items()},
+            )
+        )
+    return [*rows, _two_people(two_people, models, answers, sample)] if two_people else rows
+
+
+def _of_model(variances: Mapping[str, Variance], k: int) -> dict[str, Variance]:
+    return {name: variance.of(k) for name, variance in variances.items()}
+
+
+def _two_people(name: str, models: Models, answers: ScenarioAnswers, sample: Sample) -> Measured:
+    computes: dict[str, Callable[[Sample], Array]] = {
+        metric.name: metric.of_two_people
+        for metric in measure_metrics()
+        if metric.two_people is not None
+    }
+    values = {measure: float(compute(sample)[0, 0]) for measure, compute in computes.items()}
+    undefined = [measure for measure, value in values.items() if not np.isfinite(value)]
+    return Measured(
+        model=name,
+        scenario=answers.scenario,
+        stimuli=len(answers.stimuli),
+        values=values,
+        reasons=dict.fromkeys(undefined, "needs two answers to every stimulus, not all alike"),
+        variances={
+            what: _of_model(sampling_variances(models, answers, computes, what), 0)
+            for what in RESAMPLED
+        },
+        by_participant={},
+    )
+
+
+def measure_table(measured: Sequence[Measured], level: float = 0.95) -> pd.DataFrame:
+    """Return one row a model and measure.
+
+    Columns: ``model``, ``scenario``, ``measure``, ``stimuli``, ``value``; ``low`` and ``high`` with
+    ``_people``, ``_stimuli``, ``_both`` (interval by what is drawn, at this ``level``); for
+    measures by participant also ``pair_low``, ``pair_median``, ``pair_high`` (percentiles over
+    participants) and ``undefined`` (participants for whom it is NaN); ``reason``.
+    """
+    records = []
+    for one in measured:
+        for measure, value in one.values.items():
+            variances = {what: one.variances[what].get(measure) for what in RESAMPLED}
+            record, reasons = _interval_columns(measure, value, variances, level)
+            if measure in one.reasons:
+                reasons.insert(0, one.reasons[measure])
+            if measure in one.by_participant:
+                record |= _measures_over_people(one.by_participant[measure])
+            records.append(
+                {
+                    "model": one.model,
+                    "scenario": one.scenario,
+                    "measure": measure,
+                    "stimuli": one.stimuli,
+                    **record,
+                    "reason": "; ".join(reasons),
+                }
+            )
+    return pd.DataFrame(records).reindex(columns=list(TABLE_COLUMNS))
+
+
+def mean_measures(measured: Sequence[Sequence[Measured]]) -> list[Measured]:
+    """Return the means over scenarios, whose people and stimuli are drawn independently.
+
+    ``measured`` holds the rows of each scenario, with the same models in the same order. A mean is
+    NaN if it is undefined in one of the scenarios.
+    """
+    return [_mean(rows) for rows in zip(*measured, strict=True)]
+
+
+def _mean(rows: Sequence[Measured]) -> Measured:
+    values, reasons = {}, {}
+    variances: dict[Resampled, dict[str, Variance]] = {what: {} for what in RESAMPLED}
+    for measure in rows[0].values:
+        values[measure] = float(np.mean([one.values[measure] for one in rows]))
+        undefined = [one.scenario for one in rows if not np.isfinite(one.values[measure])]
+        if undefined:
+            reasons[measure] = f"undefined in {', '.join(undefined)}"
+        for what in RESAMPLED:
+            if all(measure in one.variances[what] for one in rows):
+                variances[what][measure] = mean_of([one.variances[what][measure] for one in rows])
+    stimuli = sum(one.stimuli for one in rows)
+    return Measured(rows[0].model, MEAN, stimuli, values, reasons, variances, {})
+
+
+def _interval_columns(
+    measure: str, value: float, variances: Mapping[Resampled, Variance | None], level: float
+) -> tuple[dict[str, Any], list[str]]:
+    """Return ``value`` with ``low_`` and ``high_`` by what is drawn, and reasons for what is
+    NaN.
+    """
+    record: dict[str, Any] = {"value": value}
+    reasons = []
+    for what in RESAMPLED:
+        low, high = np.nan, np.nan
+        variance = variances[what]
+        if variance is None:
+            reasons.append(f"no interval over {what}: they do not enter")
+        elif np.isfinite(value):
+            scale = metrics.get(measure).scale
+            low, high = variance.interval(value, level, scale)
+            if np.isnan(low):
+                reasons.append(f"no interval over {what}: too few, or undefined without some")
+        record |= {f"low_{what}": low, f"high_{what}": high}
+    return record, reasons
+
+
+def _measures_over_people(values: Array) -> dict[str, float]:
+    known = values[np.isfinite(values)]
+    low, median, high = np.percentile(known, [2.5, 50, 97.5]) if len(known) else [np.nan] * 3
+    return {"pair_low": float(low), "pair_median": float(median), "pair_high": float(high),
+            "undefined": len(values) - len(known)}  # fmt: skip
+
+
+def _why(measure: str, k: int, models: Models, answers: ScenarioAnswers) -> str:
+    known = ~np.isnan(models.p_contact[k])
+    if not known.any():
+        return "the model predicts none of the stimuli"
+    if measure in ("r", "r_beyond_outcome"):
+        x, y = models.p_contact[k, known], answers.p_yes()[known]
+        why = agreement.why_no_r(x, y)
+        return why or agreement.why_no_r_within(x, y, answers.label[known])
+    return f"{measure}: it and the people always give the same one answer"
+
+
+# Human zones: the range of the same measures among people, to compare models with.
+
+RELEASED_R = "halves, mean of scenarios (the paper's band)"
+"""Name in ``of`` for the paper's grey band of r; see `released_r_zone`."""
+
+
+def human_zones(answers: ScenarioAnswers, halves: Array | None = None) -> pd.DataFrame:
+    """Return the range of each measure among single people.
+
+    Columns: ``scenario``, ``measure``, ``of``, ``values`` (their number), ``mean``, ``low``,
+    ``median``, ``high`` (2.5th, 50th, 97.5th percentile), ``undefined``.
+
+    ``of`` names whose values they are: ``participants`` (each with the average of the others, or
+    the mean kappa with the others: what a model must reach to be indistinguishable from a
+    participant), ``pairs`` (kappa of two people, comparable to a model's kappa with single people)
+    and ``halves`` (r of two halves of the people; ``halves`` is from `people.split_halves`). A
+    person answers 0 or 1 and no probability, which makes r and RMSD worse; halves are averages and
+    reach better values.
+    """
+    yes, n = answers.yes, len(answers.sessions)
+    others = mean_over_people(yes, 1 - np.eye(n))
+    right = answers.correct
+    kappa, errors = cross_kappa(yes, yes), cross_kappa(right, right)
+    for matrix in (kappa, errors):
+        np.fill_diagonal(matrix, np.nan)
+    distances = [rmsd_of(first, second) for first, second in zip(yes, others, strict=True)]
+    upper = np.triu_indices(n, 1)
+    ranges: list[tuple[str, str, npt.ArrayLike]] = [
+        ("accuracy", "participants", mean_over_people(right.T)),
+        ("r", "participants", correlate_rows(yes, others)),
+        ("rmsd", "participants", distances),
+        ("euclid_over_n", "participants", distances / np.sqrt(np.sum(~np.isnan(yes), axis=1))),
+        ("kappa", "participants", mean_over_people(kappa)),
+        ("error_consistency", "participants", mean_over_people(errors)),
+        ("kappa", "pairs", kappa[upper]),
+        ("error_consistency", "pairs", errors[upper]),
+    ]
+    if halves is not None:
+        ranges.append(("r", "halves", halves))
+    return pd.DataFrame(
+        [
+            {"scenario": answers.scenario, "measure": measure, "of": of, **_zone(values)}
+            for measure, of, values in ranges
+        ]
+    )
+
+
+def rmsd_of(first: Array, second: Array) -> float:
+    """Return the RMSD of two vectors where both are finite."""
+    known = np.isfinite(first) & np.isfinite(second)
+    return rmsd(first[known], second[known])
+
+
+def _zone(values: npt.ArrayLike) -> dict[str, float]:
+    array = np.asarray(values, dtype=np.float64)
+    known = array[np.isfinite(array)]
+    low, median, high = np.percentile(known, [2.5, 50, 97.5]) if len(known) else [np.nan] * 3
+    return {"values": len(array), "mean": float(np.mean(known)) if len(known) else np.nan,
+            "low": float(low), "median": float(median), "high": float(high),
+            "undefined": len(array) - len(known)}  # fmt: skip
+
+
+def released_zone(
+    scenario_values: Sequence[float], bootstrap: Bootstrap | None = None
+) -> tuple[float, float, float]:
+    """Return the grey band of the published panels for accuracy and kappa: mean, low, high.
+
+    It is a bootstrap over the values of the eight scenarios. It shows how far their mean would vary
+    with other scenarios, and not how participants differ, so it is no human zone, although the
+    paper names it so. The released code drew without a seed.
+    """
+    values = np.asarray(scenario_values, dtype=np.float64)
+    if not len(values) or not np.isfinite(values).all():
+        raise BadInputError("the released zone needs one defined value for each scenario")
+    draws = bootstrap or Bootstrap()
+    low, high = draws.interval(draws.weights("scenarios", len(values)) @ values / len(values))
+    return float(np.mean(values)), low, high
+
+
+def released_r_zone(zones: pd.DataFrame) -> pd.DataFrame:
+    """Return the grey band of the published panel for r, as one row with the columns of
+    `human_zones`.
+
+    ``zones`` holds the rows of `human_zones` of several scenarios. The band is the mean over them
+    of the 2.5th and of the 97.5th percentile of r between random halves of the people, uncorrected
+    for the halved number of people; NaN if a scenario has none. ``values`` counts the scenarios.
+    """
+    halves = zones[(zones["measure"] == "r") & (zones["of"] == "halves")]
+    bounds = halves[["mean", "low", "median", "high"]].mean(skipna=False)
+    counts = {"values": len(halves), "undefined": int(halves["low"].isna().sum())}
+    names = {"scenario": MEAN, "measure": "r", "of": RELEASED_R}
+    return pd.DataFrame([names | bounds.to_dict() | counts])[list(zones.columns)]

@@ -1,0 +1,339 @@
+"""Calibration of P(contact): Brier score, its decomposition, and the reliability curve."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+from scipy import special, stats
+
+from physion.analysis.tables import require_columns
+from physion.core.errors import BadInputError
+
+Array = npt.NDArray[np.float64]
+
+BINS = 10
+
+
+def brier(p: npt.ArrayLike, label: npt.ArrayLike) -> float:
+    """Return the mean squared difference of probability and outcome, 0 (perfect) to 1.
+
+    A constant P of 0.5 has 0.25; NaN for empty arrays.
+    """
+    values, truth = _checked(p, label)
+    return float(np.mean((values - truth) ** 2)) if len(values) else float("nan")
+
+
+@dataclass(frozen=True)
+class Decomposition:
+    """Decomposition of the Brier score: reliability - resolution + uncertainty + within.
+
+    - ``reliability``: mean squared distance of a bin's fraction of contact from its mean P: 0 is
+      best;
+    - ``resolution``: variance of the bins' fractions of contact: large is good;
+    - ``uncertainty``: base rate times one minus base rate, independent of the model;
+    - ``within``: remainder of bins with more than one value of P (Stephenson and others, 2008:
+      variance of P within bins less twice its covariance with the outcome); 0 if every bin has one
+      value;
+    - ``skill``: 1 - brier / uncertainty, above 0 if the model is better than the base rate; NaN for
+      one outcome alone;
+    - ``calibration_error``: mean distance (not squared) of fraction and mean P, weighted by bin
+      size.
+    """
+
+    brier: float
+    reliability: float
+    resolution: float
+    uncertainty: float
+    within: float
+    skill: float
+    calibration_error: float
+    reason: str
+
+
+def decompose(p: npt.ArrayLike, label: npt.ArrayLike, bins: int = BINS) -> Decomposition:
+    """Return the Brier score and its parts, with ``bins`` of equal width (`reliability_curve`)."""
+    values, truth = _checked(p, label)
+    if not len(values):
+        nan = float("nan")
+        return Decomposition(nan, nan, nan, nan, nan, nan, nan, "no stimulus")
+    bin_of = _bin(values, bins)
+    n = np.bincount(bin_of, minlength=bins).astype(np.float64)
+    full = n > 0
+    mean_p = np.bincount(bin_of, values, bins)[full] / n[full]
+    fraction = np.bincount(bin_of, truth, bins)[full] / n[full]
+    weight, base = n[full] / len(values), float(np.mean(truth))
+    index = np.cumsum(full)[bin_of] - 1
+    off_p, off_y = values - mean_p[index], truth - fraction[index]
+    score, uncertainty = brier(values, truth), base * (1 - base)
+    one = uncertainty == 0
+    return Decomposition(
+        brier=score,
+        reliability=float(np.sum(weight * (mean_p - fraction) ** 2)),
+        resolution=float(np.sum(weight * (fraction - base) ** 2)),
+        uncertainty=uncertainty,
+        within=float(np.mean(off_p**2) - 2 * np.mean(off_p * off_y)),
+        skill=float("nan") if one else 1 - score / uncertainty,
+        calibration_error=float(np.sum(weight * np.abs(mean_p - fraction))),
+        reason="skill: all stimuli have one outcome" if one else "",
+    )
+
+
+def reliability_curve(
+    p: npt.ArrayLike, label: npt.ArrayLike, bins: int = BINS, level: float = 0.95
+) -> pd.DataFrame:
+    """Return one row for each bin of equal width in 0..1, including empty ones.
+
+    Columns: ``from``, ``to`` (the last bin includes 1), ``stimuli``, ``mean_p``, ``share``
+    (fraction of stimuli with contact) with ``low``, ``high`` (Wilson's interval); NaN in empty
+    bins.
+    """
+    values, truth = _checked(p, label)
+    bin_of = _bin(values, bins)
+    n = np.bincount(bin_of, minlength=bins).astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean_p, fraction = (
+            np.bincount(bin_of, values, bins) / n,
+            np.bincount(bin_of, truth, bins) / n,
+        )
+        z = float(stats.norm.ppf(0.5 + level / 2))
+        centre = (fraction + z * z / (2 * n)) / (1 + z * z / n)
+        half = z / (1 + z * z / n) * np.sqrt(fraction * (1 - fraction) / n + (z / (2 * n)) ** 2)
+    edges = np.linspace(0, 1, bins + 1)
+    return pd.DataFrame(
+        {
+            "from": edges[:-1],
+            "to": edges[1:],
+            "stimuli": n.astype(int),
+            "mean_p": mean_p,
+            "share": fraction,
+            "low": centre - half,
+            "high": centre + half,
+        }
+    )
+
+
+def calibration_table(
+    names: list[str], p_contact: npt.ArrayLike, label: npt.ArrayLike, bins: int = BINS
+) -> pd.DataFrame:
+    """Apply `decompose` to each model: ``p_contact`` (m, s), NaN for stimuli that a model lacks."""
+    values, truth = np.asarray(p_contact, np.float64), np.asarray(label, np.float64)
+    rows = []
+    for name, p_of_model in zip(names, values, strict=True):
+        known = ~np.isnan(p_of_model)
+        parts = decompose(p_of_model[known], truth[known], bins)
+        rows.append({"model": name, "stimuli": int(known.sum()), **vars(parts)})
+    return pd.DataFrame(rows)
+
+
+def _bin(values: Array, bins: int) -> npt.NDArray[np.intp]:
+    if bins < 1:
+        raise BadInputError(f"{bins} bins: at least 1 is needed")
+    return np.minimum((values * bins).astype(np.intp), bins - 1)
+
+
+def _checked(p: npt.ArrayLike, label: npt.ArrayLike) -> tuple[Array, Array]:
+    values, truth = np.asarray(p, dtype=np.float64), np.asarray(label, dtype=np.float64)
+    if values.shape != truth.shape or values.ndim != 1:
+        raise BadInputError(f"{values.shape} probabilities and {truth.shape} outcomes do not pair")
+    check_probabilities(values)
+    if not np.isin(truth, (0, 1)).all():
+        raise BadInputError("outcomes must be 0 or 1")
+    return values, truth
+
+
+def check_probabilities(p: npt.ArrayLike, gaps: bool = False) -> None:
+    """Raise `BadInputError` with the first value outside 0..1 (``gaps``: NaN is allowed)."""
+    values = np.asarray(p, dtype=np.float64)
+    good = (values >= 0) & (values <= 1) | (np.isnan(values) & gaps)
+    if not good.all():
+        index = tuple(int(i) for i in np.argwhere(~good)[0])
+        raise BadInputError(f"probability {values[index]} at {index} does not lie in 0..1")
+
+
+# Logistic regression of answers with standard errors clustered by participant.
+#
+# References
+# ----------
+# R. M. Bell and D. F. McCaffrey, *Bias reduction in standard errors for linear regression with
+# multi-stage samples*, Survey Methodology 28, 2002, 169-181: the standard errors (CR2) and their
+# degrees of freedom, which make intervals wide enough where few participants have a property.
+# J. E. Pustejovsky and E. Tipton, *Small-sample methods for cluster-robust variance estimation and
+# hypothesis testing in fixed effects models*, Journal of Business and Economic Statistics 36,
+#   2018,
+# 672-683: with weights.
+
+COLUMNS = ("term", "b", "se", "t", "df", "p", "low", "high", "rows", "clusters", "reason")
+ALONE = "one participant alone determines it"
+
+
+def clustered_logit(
+    rows: pd.DataFrame,
+    outcome: str,
+    terms: Sequence[str],
+    *,
+    fixed: str | None = None,
+    cluster: str = "participant",
+    level: float = 0.95,
+) -> pd.DataFrame:
+    """Fit a logistic regression of a bool column on numeric ones; one row a term.
+
+    Parameters
+    ----------
+    rows
+        The table.
+    outcome, terms
+        Columns of the response and of the predictors.
+    fixed
+        Column whose every value gets an intercept of its own (the first is the base).
+    cluster
+        Column by which rows are dependent.
+    level
+        Level of the intervals.
+
+    Returns
+    -------
+    ``term``, ``b`` (log odds), ``se``, ``t``, ``df``, ``p`` (two-sided), ``low``, ``high``
+    (interval of b), ``rows``, ``clusters``, ``reason``. If a term is constant, or separates right
+    from wrong perfectly, its numbers are NaN and the reason states it; if a single cluster
+    determines it, there is no standard error.
+    """
+    require_columns(rows, [outcome, cluster, *terms, *([fixed] if fixed else [])], "the rows")
+    y = rows[outcome].to_numpy(dtype=np.float64)
+    names, design = _design(rows, terms, fixed)
+    groups = rows[cluster].astype("category").cat.codes.to_numpy()
+    clusters = len(np.unique(groups))
+    reason = _why_not(rows, y, design, terms, clusters)
+    b, se, df = (np.full(len(names), np.nan) for _ in range(3))
+    if not reason:
+        b, converged = _fit(y, design)
+        if not converged or np.abs(b).max() > 15:
+            reason, b = "a term separates the outcomes, or nearly so", np.full(len(names), np.nan)
+        else:
+            se, df = clustered_errors(y, design, groups, b)
+    t = b / se
+    half = special.stdtrit(df, 0.5 + level / 2) * se
+    table = pd.DataFrame({"term": names, "b": b, "se": se, "t": t, "df": df})
+    return table.assign(
+        p=2 * stats.t.sf(np.abs(t), df),
+        low=b - half,
+        high=b + half,
+        rows=len(rows),
+        clusters=clusters,
+        reason=[reason or (ALONE if np.isnan(one) else "") for one in se],
+    )[list(COLUMNS)]
+
+
+def clustered_errors(
+    y: Array, design: Array, groups: npt.NDArray[np.int_], b: Array
+) -> tuple[Array, Array]:
+    """Return standard errors of logistic regression and their degrees of freedom.
+
+    Parameters
+    ----------
+    y
+        (n,): outcomes, 1 or 0.
+    design
+        (n, p): predictors.
+    groups
+        (n,): cluster of each row, 0 to G - 1.
+    b
+        (p,): the estimates.
+
+    Returns
+    -------
+    se, df
+        (p,); NaN for a coefficient that a single cluster determines.
+
+    Notes
+    -----
+    With the fitted probabilities m, X = sqrt(m (1 - m)) times the design, e = (y - m) / sqrt(m (1 -
+    m)) and M = (X'X)^-1, a cluster g changes the coefficients by M X_g' A_g e_g, where::
+
+        A_g = (I - X_g M X_g')^(-1/2)
+
+    makes the sum of squares of these changes an unbiased estimate of the variance if rows are
+    independent. It is then a quadratic form in e with the matrix B, whose expectation is tr B and
+    whose variance is 2 tr B^2; that of a chi-square with (tr B)^2 / tr B^2 degrees of freedom.
+    """
+    fitted = special.expit(design @ b)
+    root_weight = np.sqrt(fitted * (1 - fitted))
+    x, e = design * root_weight[:, None], (y - fitted) / root_weight
+    half = np.linalg.cholesky(np.linalg.inv(x.T @ x))  # half half' = M
+    part = x @ half
+    size, p = int(groups.max()) + 1, part.shape[1]
+
+    def total(values: Array) -> Array:
+        return np.asarray(np.bincount(groups, values, minlength=size), dtype=np.float64)
+
+    gram = np.empty((size, p, p))
+    for i in range(p):
+        for j in range(p):
+            gram[:, i, j] = total(part[:, i] * part[:, j])
+    residual = np.stack([total(part[:, i] * e) for i in range(p)], axis=1)
+    leverage, vectors = np.linalg.eigh(gram)
+    alone = leverage > 1 - 1e-9
+    factor = 1 / np.sqrt(np.where(alone, 1.0, 1 - leverage))
+    adjust = np.einsum("gij,gj,gkj->gik", vectors, factor, vectors)
+    changes = np.einsum("ci,gij,gj->gc", half, adjust, residual)
+    adjusted = np.einsum("gij,cj->gci", adjust, half)
+    squares = np.einsum("gci,gij,gcj->gc", adjusted, gram, adjusted)
+    across = np.einsum("gij,gcj->gci", gram, adjusted)
+    df = np.empty(p)
+    for c in range(p):
+        form = np.diag(squares[:, c]) - across[:, c] @ across[:, c].T
+        df[c] = np.trace(form) ** 2 / np.sum(form**2)
+    in_direction = np.abs(np.einsum("gij,ci->gcj", vectors, half)) > 1e-9 * np.abs(half).max()
+    lost = (in_direction & alone[:, None, :]).any(axis=(0, 2))
+    return (
+        np.where(lost, np.nan, np.sqrt(np.sum(changes**2, axis=0))),
+        np.where(lost, np.nan, df),
+    )
+
+
+def _design(rows: pd.DataFrame, terms: Sequence[str], fixed: str | None) -> tuple[list[str], Array]:
+    names, columns = ["(intercept)"], [np.ones(len(rows))]
+    for term in terms:
+        names.append(term)
+        columns.append(rows[term].to_numpy(dtype=np.float64))
+    if fixed:
+        for value in sorted(rows[fixed].unique())[1:]:
+            names.append(f"{fixed}: {value}")
+            columns.append((rows[fixed] == value).to_numpy(dtype=np.float64))
+    return names, np.column_stack(columns)
+
+
+def _why_not(
+    rows: pd.DataFrame,
+    y: Array,
+    design: Array,
+    terms: Sequence[str],
+    clusters: int,
+) -> str:
+    if not len(rows) or np.ptp(y) == 0:
+        return "all answers are alike"
+    if not np.isfinite(design).all():
+        return "a term has missing values"
+    constant = [term for term in terms if rows[term].nunique() < 2]
+    if constant:
+        return f"{', '.join(constant)} is the same in all rows"
+    if clusters < 2:
+        return "one participant alone"
+    if np.linalg.matrix_rank(design) < design.shape[1]:
+        return "the terms cannot be told apart"
+    return ""
+
+
+def _fit(y: Array, design: Array) -> tuple[Array, bool]:
+    import warnings
+
+    from statsmodels.genmod.families import Binomial  # half a second to import
+    from statsmodels.genmod.generalized_linear_model import GLM
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of separation, which the caller finds by the estimates
+        fit = GLM(y, design, family=Binomial()).fit()
+    return np.asarray(fit.params), bool(fit.converged)

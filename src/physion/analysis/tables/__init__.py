@@ -1,1 +1,0 @@
-"""Tables of predictions and answers: readers, checks and scores."""
