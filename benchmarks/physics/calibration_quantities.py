@@ -49,7 +49,6 @@ QUANTITIES = {
     for q in (
         Quantity("friction_sweeps", (3, 0), field="friction_sweeps"),
         Quantity("persistent_manifolds", (True, False), field="persistent_manifolds"),
-        Quantity("continuous", (False, True), field="continuous"),
         Quantity(
             "floor_friction",
             tuple(material(value) for value in (0.6, 0.4, 0.8)),

@@ -1,7 +1,8 @@
 """Sums and products of small arrays in a fixed order, in place of BLAS and LAPACK.
 
 BLAS chooses its kernel, and with it the order of a sum, by processor and by the shape of the
-arrays. Here every sum runs over one axis from the first to the last entry.
+arrays. Here every sum runs over one axis from the first to the last entry. The inverse Fourier
+transform is here for the same reason.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from physion.numerics.elementary import cos, sin
 from physion.numerics.kernel import kernel
 
 F64 = NDArray[np.float64]
+C128 = NDArray[np.complex128]
+
 SHORT = 8
 """Length of an axis up to which a loop over it is faster than `numpy.add.accumulate`."""
 
@@ -127,8 +130,6 @@ def inverse(m: Any) -> Any:
 # Inverse Fourier transform of real images, with the same bytes on every processor.
 #
 # Libraries take the roots of unity from the C library and choose the order of sums by processor.
-
-C128 = NDArray[np.complex128]
 
 
 def inverse_real_transform(spectrum: C128) -> NDArray[np.float64]:

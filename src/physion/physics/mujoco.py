@@ -22,19 +22,20 @@ from physion.numerics.linear_algebra import apply, dot, inverse, norm, unit
 from physion.numerics.rotations import conjugate, multiply_quaternions, rotate_vectors
 from physion.physics.engine import settings_tag
 from physion.physics.rigid.bodies import FLOOR_MATERIAL, Actors, collision_hulls, find_actors
-from physion.physics.rigid.motion import MIN_SPIN
+from physion.physics.rigid.step import MIN_SPIN
 from physion.physics.trajectory import ENVIRONMENT, Contacts, State, Trajectory, summarise_contacts
 from physion.scenes.scene import FRAME_TIME, GRAVITY, Scene, SurfaceMaterial
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
 
 try:
     import mujoco
 except ModuleNotFoundError as error:
     raise MissingExtraError("the engine mujoco", "mujoco") from error
 
-# Contacts of a simulation: collect them step by step, and sum them up pair by pair.
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
+# Contacts, collected step by step and summed up for each pair.
 
 
 class ContactRows:

@@ -30,6 +30,8 @@ F64 = NDArray[np.float64]
 I16 = NDArray[np.int16]
 I32 = NDArray[np.int32]
 Bools = NDArray[np.bool_]
+U8 = NDArray[np.uint8]
+Records = NDArray[np.void]
 
 SAMPLES = np.array([[0.0, 0.0], [-0.125, -0.375], [0.375, -0.125], [-0.375, 0.125], [0.125, 0.375]])
 """Offsets (S, 2) of the samples from the centre of a pixel: the centre, then a rotated grid."""
@@ -484,9 +486,6 @@ def occluded_fraction(occlusion: DepthMap, px: float, py: float, pz: float) -> f
 # Fields of one kind stand side by side in one array of records. With one array for each field, in
 # nested NamedTuples, the colour pass took 1.5 times as long: numba passes each array to each
 # kernel by value and counts references to it.
-
-U8 = NDArray[np.uint8]
-Records = NDArray[np.void]
 
 CAMERA = np.dtype([("position", "f8", 3), ("rays", "f8", (3, 3))], align=True)
 """The camera: its position in metres; the matrix from a pixel (x, y, 1) to the world vector from

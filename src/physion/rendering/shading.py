@@ -6,9 +6,9 @@ to the camera is
 
     room (ambient + environment) + emission + lit room (Lambert + specular)
 
-with the terms of `_shade_point`, from the equations of `physion.rendering.shading`; ``lit`` is
-the fraction of the directional light that shadows leave, and ``room`` the ambient occlusion near
-the room's walls. Everything but ``lit`` and the occlusion under objects depends on the point alone.
+with the terms of `_shade_point`, whose equations stand below; ``lit`` is the fraction of the
+directional light that shadows leave, and ``room`` the ambient occlusion near the room's walls.
+Everything but ``lit`` and the occlusion under objects depends on the point alone.
 It is therefore kept for surfaces that never move.
 
 References
@@ -19,8 +19,6 @@ Heckbert, P. (1989). Fundamentals of texture mapping and image warping. MSc thes
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -28,7 +26,6 @@ from numpy.typing import NDArray
 
 from physion.numerics.elementary import coarse_log2_of, exp_of
 from physion.numerics.kernel import kernel
-from physion.rendering.camera import MeshPart
 from physion.rendering.rasterizer import (
     SAMPLES,
     LightMaps,
@@ -39,39 +36,10 @@ from physion.rendering.rasterizer import (
     occluded_fraction,
 )
 from physion.rendering.textures.atlas import mip_level, sample_texture
-from physion.scenes.scene import Look
-from physion.scenes.shapes.primitives import Shape
-from physion.scenes.shapes.prop_shapes import PropShape
 
-# Colours of a prop's own parts: shades, flower pots, the sea of a globe.
-#
-# Agent and patient are never painted: their one colour tells which they are.
-
-
-def painted(part: MeshPart, shape: Shape, add: Callable[[Look], int]) -> MeshPart:
-    """Return a mesh with the materials of the prop's own parts; other shapes stay as they are.
-
-    Parameters
-    ----------
-    part
-        The mesh of ``shape``, all of one material.
-    shape
-        The shape of the body.
-    add
-        Takes a look and returns the index of its material.
-
-    Notes
-    -----
-    Triangles of two materials become two surfaces. A pixel that shows both is then shaded for
-    each, and the edge between them is anti-aliased.
-    """
-    if not (isinstance(shape, PropShape) and shape.own_looks):
-        return part
-    assert len(shape.paint) == len(part.faces), "a prop has no triangle without area"
-    rows = np.array([part.materials[0], *(add(look) for look in shape.own_looks)], np.int32)
-    pairs = part.groups.astype(np.int64) * len(rows) + shape.paint
-    groups = np.unique(pairs, return_inverse=True)[1].reshape(-1).astype(np.int32)
-    return dataclasses.replace(part, materials=rows[shape.paint], groups=groups)
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+U8 = NDArray[np.uint8]
 
 
 # Reflection of light at a point of a surface: diffuse, specular, the mirrored room, its corners.
@@ -82,7 +50,6 @@ def painted(part: MeshPart, shape: Shape, add: Callable[[Look], int]) -> MeshPar
 # Schlick, C. (1994). An inexpensive BRDF model for physically-based rendering. Computer Graphics
 #     Forum 13(3).
 
-F64 = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 LN2 = 0.6931471805599453
@@ -195,9 +162,6 @@ def corner_occlusion(position: Vector, normal: Vector, low: F64, high: F64) -> f
         left *= 1.0 - CORNER_OCCLUSION * across * exp_of(-to_high / CORNER_RANGE)
     return float(left)
 
-
-I32 = NDArray[np.int32]
-U8 = NDArray[np.uint8]
 
 TONES = 16384
 """Entries of the tone table."""

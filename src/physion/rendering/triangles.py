@@ -1,31 +1,256 @@
-"""A scene as triangles in this order: the room, the bodies that never move, those that move.
+"""A scene as triangles: the meshes of its bodies, and all of them in one order.
 
-The order lets the renderer draw and shade the first two once for all frames.
+First comes the room, then the bodies that never move, then those that move. The order lets the
+renderer draw and shade the first two once for all frames.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from physion.numerics.elementary import arccos, cos
 from physion.numerics.linear_algebra import apply, dot, norm, unit
 from physion.numerics.rotations import rotation_matrices
 from physion.physics.trajectory import Trajectory
-from physion.rendering.camera import F32, F64, I32, MeshPart, sheet, solid
 from physion.rendering.light import to_linear
 from physion.rendering.rasterizer import MATERIAL, Records
 from physion.rendering.rooms import Panel, Room
-from physion.rendering.shading import painted
 from physion.rendering.textures.atlas import Atlas, Finish, build_atlas, finish
 from physion.scenes.scene import Look, Scene
-from physion.scenes.shapes.primitives import shape
+from physion.scenes.shapes.primitives import Shape, shape
+from physion.scenes.shapes.prop_shapes import PropShape
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+I32 = NDArray[np.int32]
 
 ROOM = -1
 """Object index of the room."""
+FLAT = np.radians(1.0)
+"""Angle in radians below which triangles that meet at an edge lie in one flat face."""
+UV_MARGIN = 0.002
+"""Distance in texture coordinates that a bounding box keeps from the seam of its texture."""
+UV_SPAN = 0.996
+"""Part of the texture that it therefore spans: 1 - 2 `UV_MARGIN`."""
+
+
+# Meshes ready to be drawn: corner normals, texture coordinates, smooth surfaces.
+
+
+@dataclass(frozen=True)
+class MeshPart:
+    """One mesh in the axes of its body. V vertices, T triangles.
+
+    - ``vertices`` (V, 3): metres. ``faces`` (T, 3): counter-clockwise seen from outside.
+    - ``normals`` (T, 3, 3): unit normal of each corner.
+    - ``uv`` (T, 3, 2): texture coordinates of each corner; the texture repeats every unit.
+    - ``tangents`` (T, 2, 3): world directions of growing u and v; zero without a normal map.
+    - ``groups`` (T,): triangles of one number make one smooth surface, so that a pixel that shows
+      several of them is shaded once.
+    - ``materials`` (T,): index of the material.
+    - ``two_sided``: whether the back of the triangles is drawn too.
+    """
+
+    vertices: F64
+    faces: I32
+    normals: F32
+    uv: F32
+    tangents: F32
+    groups: I32
+    materials: I32
+    two_sided: bool = False
+
+
+def face_normals(vertices: F64, faces: I32) -> F64:
+    """Return the unit normals (T, 3); zero for a triangle without area."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    cross = np.cross(b - a, c - a)
+    length = norm(cross)[:, None]
+    return np.asarray(np.divide(cross, length, out=np.zeros_like(cross), where=length > 0))
+
+
+def solid(vertices: F64, faces: I32, scale: F64, crease: float, material: int) -> MeshPart:
+    """Return the mesh of a body in metres.
+
+    Parameters
+    ----------
+    vertices, faces
+        (V, 3) at unit scale and (T, 3).
+    scale
+        (3,) factors along the axes of the body.
+    crease
+        Angle in radians, at unit scale, below which triangles that meet at an edge form one smooth
+        surface.
+    material
+        Index of the material of all triangles.
+
+    Notes
+    -----
+    The normal of a corner is the mean of the normals of the triangles of its surface that meet
+    there, weighted by their angles (Thurmer and Wuthrich 1998). Texture coordinates are taken
+    before scaling, from the side of the unit box that a triangle faces. A texture therefore
+    stretches with its body, as in the original stimuli.
+
+    References
+    ----------
+    Thurmer, G. and Wuthrich, C. (1998). Computing vertex normals from polygonal facets. Journal of
+        Graphics Tools 3(1).
+    """
+    unit, faces = _merge(np.asarray(vertices, np.float64), np.asarray(faces, np.int32))
+    scaled = unit * scale
+    groups = _smooth_groups(faces, face_normals(unit, faces), cos(max(crease, FLAT)))
+    normals = face_normals(scaled, faces)
+    key = faces.astype(np.int64) + len(unit) * groups[:, None].astype(np.int64)
+    _, corner_index = np.unique(key.ravel(), return_inverse=True)
+    angles = _corner_angles(scaled, faces).reshape(-1, 1)
+    weighted = np.repeat(normals, 3, axis=0) * angles
+    total = np.zeros((int(corner_index.max()) + 1, 3))
+    np.add.at(total, corner_index, weighted)
+    corner = total[corner_index]
+    length = norm(corner)[:, None]
+    flat = np.repeat(normals, 3, axis=0)
+    corner = np.where(length > 1e-12, corner / np.maximum(length, 1e-12), flat)
+    count = len(faces)
+    return MeshPart(
+        vertices=scaled,
+        faces=faces,
+        normals=corner.reshape(count, 3, 3).astype(np.float32),
+        uv=_box_uv(unit, faces),
+        tangents=np.zeros((count, 2, 3), np.float32),
+        groups=groups,
+        materials=np.full(count, material, np.int32),
+    )
+
+
+def sheet(resolution: int, material: int) -> MeshPart:
+    """Return a cloth of ``resolution`` x ``resolution`` vertices, which each frame fills in."""
+    index = np.arange(resolution * resolution, dtype=np.int32).reshape(resolution, resolution)
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    faces = np.concatenate(
+        [np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)]
+    )
+    u, v = np.divmod(faces, resolution)
+    count = len(faces)
+    return MeshPart(
+        vertices=np.zeros((resolution * resolution, 3)),
+        faces=faces,
+        normals=np.zeros((count, 3, 3), np.float32),
+        uv=(np.stack([u, v], -1) / (resolution - 1)).astype(np.float32),
+        tangents=np.zeros((count, 2, 3), np.float32),
+        groups=np.zeros(count, np.int32),
+        materials=np.full(count, material, np.int32),
+        two_sided=True,
+    )
+
+
+def _merge(vertices: F64, faces: I32) -> tuple[F64, I32]:
+    """Join vertices at the same position (to a micrometre); drop triangles that become lines."""
+    _, first, inverse = np.unique(
+        np.round(vertices, 6), axis=0, return_index=True, return_inverse=True
+    )
+    merged = inverse.reshape(-1)[faces].astype(np.int32)
+    kept = (
+        (merged[:, 0] != merged[:, 1])
+        & (merged[:, 1] != merged[:, 2])
+        & (merged[:, 2] != merged[:, 0])
+    )
+    return vertices[first], np.ascontiguousarray(merged[kept])
+
+
+def _smooth_groups(faces: I32, normals: F64, threshold: float) -> I32:
+    """Return the smooth surface (T,) of each triangle.
+
+    Two triangles with a common edge belong together if the cosine of the angle between their
+    ``normals`` exceeds ``threshold``.
+    """
+    count = len(faces)
+    edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], -1).reshape(-1, 2), axis=1)
+    owner = np.repeat(np.arange(count), 3)
+    order = np.lexsort((edges[:, 1], edges[:, 0]))
+    edges, owner = edges[order], owner[order]
+    same = (edges[1:] == edges[:-1]).all(axis=1)
+    a, b = owner[:-1][same], owner[1:][same]
+    soft = dot(normals[a], normals[b]) > threshold
+    return _components(count, a[soft], b[soft])
+
+
+def _components(count: int, a: NDArray[np.intp], b: NDArray[np.intp]) -> I32:
+    """Return the connected component of each of ``count`` nodes joined by the pairs (a, b).
+
+    Every node takes the smallest label among its neighbours, then its label's label, until
+    nothing changes.
+    """
+    label = np.arange(count)
+    while True:
+        before = label.copy()
+        smaller = np.minimum(label[a], label[b])
+        np.minimum.at(label, label[a], smaller)
+        np.minimum.at(label, label[b], smaller)
+        label = label[label]
+        if (label == before).all():
+            return np.unique(label, return_inverse=True)[1].reshape(-1).astype(np.int32)
+
+
+def _corner_angles(vertices: F64, faces: I32) -> F64:
+    """Return the angle in radians of each corner of each triangle, (T, 3)."""
+    corners = vertices[faces]
+    ahead = np.roll(corners, -1, axis=1) - corners
+    behind = np.roll(corners, 1, axis=1) - corners
+    scale = norm(ahead) * norm(behind)
+    cosine = dot(ahead, behind) / np.maximum(scale, 1e-300)
+    return arccos(np.clip(cosine, -1.0, 1.0))
+
+
+def _box_uv(unit: F64, faces: I32) -> F32:
+    """Return texture coordinates (T, 3, 2) in 0..1 on the side of the bounding box they face."""
+    low, size = unit.min(axis=0), np.ptp(unit, axis=0)
+    relative = (unit - low) / np.where(size > 0, size, 1.0)
+    relative = UV_MARGIN + UV_SPAN * relative
+    axis = np.abs(face_normals(unit, faces)).argmax(axis=1)
+    # v, the direction of the grain, is z on the sides and x on top, as on an upright plank.
+    pairs = np.array([[1, 2], [0, 2], [1, 0]])[axis]
+    corners = relative[faces]
+    return np.take_along_axis(corners, pairs[:, None, :].repeat(3, 1), axis=2).astype(np.float32)
+
+
+# Colours of a prop's own parts: shades, flower pots, the sea of a globe.
+#
+# Agent and patient are never painted: their one colour tells which they are.
+
+
+def painted(part: MeshPart, shape: Shape, add: Callable[[Look], int]) -> MeshPart:
+    """Return a mesh with the materials of the prop's own parts; other shapes stay as they are.
+
+    Parameters
+    ----------
+    part
+        The mesh of ``shape``, all of one material.
+    shape
+        The shape of the body.
+    add
+        Takes a look and returns the index of its material.
+
+    Notes
+    -----
+    Triangles of two materials become two surfaces. A pixel that shows both is then shaded for
+    each, and the edge between them is anti-aliased.
+    """
+    if not (isinstance(shape, PropShape) and shape.own_looks):
+        return part
+    assert len(shape.paint) == len(part.faces), "a prop has no triangle without area"
+    rows = np.array([part.materials[0], *(add(look) for look in shape.own_looks)], np.int32)
+    pairs = part.groups.astype(np.int64) * len(rows) + shape.paint
+    groups = np.unique(pairs, return_inverse=True)[1].reshape(-1).astype(np.int32)
+    return replace(part, materials=rows[shape.paint], groups=groups)
+
+
+# The scene as a whole: all meshes in one order, posed in every frame.
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,8 @@
-"""Contact and friction of cloth particles with solid particles and the floor."""
+"""Contact of cloth particles with the floor and with the particles of bodies.
+
+Poses of the bodies between two frames, the search for particles nearby (`find_neighbours`), the
+correction of positions with friction (`correct_contacts`), and the gaps that are left.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +15,11 @@ from physion.numerics.kernel import kernel
 from physion.numerics.rotations import rotation_matrix
 from physion.physics.cloth.springs import MIN_LENGTH
 
-# Solid particles near points: records of bodies filled with particles, their poses, the search.
-
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
+
+
+# Solid particles near points: records of bodies filled with particles, their poses, the search.
 
 MAX_NEIGHBOURS = 100
 """Most solid particles in contact with one cloth particle (limit of the official container);

@@ -8,7 +8,9 @@ With few passes on a fine sheet, springs and contacts stay soft. In the official
 whether a sheet that hangs between other bodies still presses on the patient, so that a stiffer
 solver would agree less with them.
 
-Bodies are not moved by cloth: the official solids weigh 25 to 500 kg, the sheet half a kilogram.
+Before the cloth falls, bodies that may not move by themselves settle on the floor, as in Flex
+(`settle_solids`). Bodies are not moved by cloth: the official solids weigh 25 to 500 kg, the sheet
+half a kilogram.
 Cloth does not touch itself or other cloth (official: self-collision off).
 """
 
@@ -55,20 +57,321 @@ from physion.physics.engine import settings_tag
 from physion.physics.trajectory import ENVIRONMENT, Contacts, Floats, State, Trajectory
 from physion.scenes.scene import FRAME_TIME, GRAVITY, Quat, Scene, Vec3
 
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+REST_SPEED = 0.001
+"""Metres per second: while all particles are slower, solids count as settled."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClothSettings:
+    """Constants of the cloth simulation. The defaults are those of the official cloth trials.
+
+    "official" means that the command logs set it, "default" a default of TDW's Flex container
+    (docs/official-system.md, section 3.8).
+
+    - ``substeps`` of a frame and ``iterations`` of each: passes over the constraints (default).
+    - ``rest_distance``: metres that cloth particles keep from solid particles: the effective
+      thickness of the cloth (default: solid rest distance).
+    - ``particle_spacing``: metres between the particles that fill a body (official).
+    - ``floor_gap``: metres that cloth keeps from the floor (official: collision distance).
+    - ``particle_friction``: friction coefficient with solid particles. The default was read as 0.5;
+      1, which is sent for shapes, explains held-out official trials better
+      (benchmarks/results/calibration_cloth.md).
+    - ``floor_friction``: the same for the floor (official: static and dynamic friction).
+    - ``damping``: drag per second (default; confirmed by the first contact frames of the official
+      trials: without it cloth would land three frames earlier).
+    - ``gravity``: metres per second squared, downwards (official).
+    - ``search_margin``: metres beyond the rest distance in which solid particles are searched: how
+      far a particle may move in the passes of one substep.
+    """
+
+    substeps: int = 3
+    iterations: int = 8
+    rest_distance: float = 0.125
+    particle_spacing: float = 0.035
+    floor_gap: float = 0.025
+    particle_friction: float = 1.0
+    floor_friction: float = 1.0
+    damping: float = 1.0
+    gravity: float = GRAVITY
+    search_margin: float = 0.02
+
+    def tag(self) -> str:
+        """Return eight hexadecimal digits that change whenever a setting does."""
+        return settings_tag(self)
+
+
+@dataclass(frozen=True)
+class ClothMotion:
+    """Motion of the cloths of a scene: F frames, V vertices of all cloths.
+
+    - ``vertices`` (F, V, 3): metres; one cloth after the other, each row by row along x then y.
+    - ``distance`` (F,): gap in metres between agent and patient: the smallest distance of their
+      particles less the rest distance, negative where they press on each other. NaN unless one is a
+      cloth and the other a body.
+    - ``contacts``: a row for each cloth and body (or floor) in each frame in which they touch: the
+      point on the cloth's underside, the normal from the body to the cloth, and the impulse on the
+      cloth.
+    """
+
+    vertices: Floats
+    distance: Floats
+    contacts: Contacts
+
+
+def simulate_cloth(
+    scene: Scene,
+    rigid_positions: NDArray[np.floating],
+    rigid_rotations: NDArray[np.floating],
+    settings: ClothSettings | None = None,
+    *,
+    vertices: NDArray[np.floating] | None = None,
+    velocities: NDArray[np.floating] | None = None,
+    until_gap: float | None = None,
+) -> ClothMotion:
+    """Simulate the cloths of ``scene`` on its bodies, whose motion is given.
+
+    A cloth that starts inside a body is pushed out at once.
+
+    Parameters
+    ----------
+    scene : Scene
+        Bodies, cloths, floor, agent and patient.
+    rigid_positions, rigid_rotations : (F, N, 3), (F, N, 4)
+        Pivots in metres and quaternions (w, x, y, z) of ``scene.bodies`` in every frame.
+    settings : ClothSettings, optional
+        By default those of the official trials.
+    vertices, velocities : (V, 3), optional
+        State from which the cloths start, in metres and m/s: that of frame 0. By default they are
+        flat and at rest, and frame 0 follows the first step.
+    until_gap : float, optional
+        Gap in metres between agent and patient below which the motion ends with that frame; without
+        effect if there are several cloths.
+
+    Raises
+    ------
+    BadInputError
+        If arrays have other shapes.
+    BadSceneError
+        If bodies appear or vanish.
+    """
+    if any(event.kind != "move" for event in scene.events):
+        raise BadSceneError(
+            f"scene {scene.name!r}: bodies may not appear or vanish beside cloth; leave out these "
+            "events or the cloth"
+        )
+    rules = settings if settings is not None else ClothSettings()
+    positions = np.ascontiguousarray(rigid_positions, np.float64)
+    rotations = np.ascontiguousarray(rigid_rotations, np.float64)
+    frames, bodies = len(positions), len(scene.bodies)
+    if not frames or positions.shape != (frames, bodies, 3):
+        raise BadInputError(
+            f"cloth: positions have the shape {positions.shape}, not (frames, {bodies}, 3)"
+        )
+    if rotations.shape != (frames, bodies, 4):
+        raise BadInputError(
+            f"cloth: rotations have the shape {rotations.shape}, not {(frames, bodies, 4)}"
+        )
+    if vertices is None:
+        # Frame 0 follows the first step, in which the bodies count as standing where it ends.
+        positions = np.concatenate([positions[:1], positions])
+        rotations = np.concatenate([rotations[:1], rotations])
+    solids = fill_bodies(scene.bodies, rules.particle_spacing)
+    flat = [sheet_vertices(cloth) for cloth in scene.cloths]
+    at = _start(vertices, flat, "vertices")
+    speed = _start(velocities, [np.zeros_like(sheet) for sheet in flat], "velocities")
+    records = [
+        _run(scene, n, at[n], speed[n], solids, positions, rotations, rules, until_gap)
+        for n in range(len(scene.cloths))
+    ]
+    if vertices is None:
+        records = [ClothRecord(*(part[1:] for part in record)) for record in records]
+    frames = min((len(record.vertices) for record in records), default=frames)
+    asked = [record.distance for record in records if not np.isnan(record.distance).all()]
+    return ClothMotion(
+        np.concatenate(
+            [record.vertices for record in records] or [np.zeros((frames, 0, 3))], axis=1
+        ).astype(np.float32),
+        (asked[0] if asked else np.full(frames, np.nan)).astype(np.float32),
+        _contacts(scene, records, rules),
+    )
+
+
+def _options(scene: Scene, settings: ClothSettings) -> ClothOptions:
+    """Return the numbers that the compiled loops need."""
+    return ClothOptions(
+        FRAME_TIME,
+        settings.substeps,
+        settings.iterations,
+        settings.rest_distance,
+        settings.search_margin,
+        scene.floor,
+        settings.floor_gap,
+        settings.particle_friction,
+        settings.floor_friction,
+        settings.damping,
+        settings.gravity,
+    )
+
+
+def add_cloth(
+    scene: Scene,
+    rigid: Trajectory,
+    settings: ClothSettings | None = None,
+    *,
+    start: State | None = None,
+    until_contact: bool = False,
+) -> Trajectory:
+    """Return the trajectory of the scene's bodies with the motion of its cloths added.
+
+    Contacts of both are merged in the order of frames. The result is never ``completed``, because
+    cloth does not sleep. `BadInputError` if the bodies are not those of the scene.
+
+    Parameters
+    ----------
+    scene, rigid
+        The scene, and the trajectory of its bodies.
+    settings : ClothSettings, optional
+        By default those of the official trials.
+    start : State, optional
+        The state from which ``rigid`` started, if it was not the scene's.
+    until_contact : bool
+        End with the first frame in which cloth and patient touch, if nothing appears or vanishes:
+        the label is then known.
+    """
+    with_state = start is not None and len(start.cloth_vertices) > 0
+    motion = simulate_cloth(
+        scene,
+        rigid.positions,
+        rigid.rotations,
+        settings,
+        vertices=start.cloth_vertices if start is not None and with_state else None,
+        velocities=start.cloth_velocities if start is not None and with_state else None,
+        until_gap=CLOTH_CONTACT_GAP if until_contact and not scene.events else None,
+    )
+    frames = len(motion.vertices)
+    both = (rigid.contacts, motion.contacts)
+    frame = np.concatenate([c.frame for c in both])
+    order = np.argsort(frame, kind="stable")
+    order = order[frame[order] < frames]
+    return replace(
+        rigid,
+        positions=rigid.positions[:frames],
+        rotations=rigid.rotations[:frames],
+        velocities=rigid.velocities[:frames],
+        angular_velocities=rigid.angular_velocities[:frames],
+        cloth_vertices=motion.vertices,
+        cloth_distance=motion.distance,
+        contacts=Contacts(
+            *(
+                np.concatenate([getattr(c, name) for c in both])[order]
+                for name in ("frame", "bodies", "point", "normal", "impulse")
+            )
+        ),
+        completed=False,
+    )
+
+
+def _start(given: NDArray[np.floating] | None, default: list[F64], what: str) -> list[F64]:
+    """Return a given state (V, 3) split by cloth, or the default; always as new arrays."""
+    count = sum(len(sheet) for sheet in default)
+    if given is None:
+        return [sheet.copy() for sheet in default]
+    if np.shape(given) != (count, 3):
+        raise BadInputError(f"cloth: {what} have the shape {np.shape(given)}, not {(count, 3)}")
+    ends = np.cumsum([len(sheet) for sheet in default])[:-1]
+    return [part.astype(np.float64).copy() for part in np.split(np.asarray(given), ends)]
+
+
+def _run(
+    scene: Scene,
+    number: int,
+    points: F64,
+    velocities: F64,
+    solids: Solids,
+    positions: F64,
+    rotations: F64,
+    settings: ClothSettings,
+    until_gap: float | None,
+) -> ClothRecord:
+    """Simulate one cloth of the scene, to the end or until its gap is below ``until_gap``."""
+    cloth, frames, bodies = scene.cloths[number], len(positions), len(scene.bodies)
+    watched = _other_body(scene, cloth.name)
+    record = ClothRecord(
+        np.zeros((frames, len(points), 3)),
+        np.full(frames, np.nan),
+        np.full((frames, bodies + 1), np.inf),
+        np.zeros((frames, bodies + 1, 2, 3)),
+        np.zeros((frames, bodies + 1)),
+    )
+    particles = (
+        surface_particles(scene.bodies[watched], settings.particle_spacing)
+        if watched >= 0
+        else np.zeros((0, 3))
+    )
+    scenery = MovingSolids(solids, positions, rotations, watched, particles)
+    stop_below = -np.inf
+    if until_gap is not None and len(scene.cloths) == 1:
+        stop_below = until_gap + settings.rest_distance
+    frames = run_cloth(
+        np.ascontiguousarray(points.T),
+        np.ascontiguousarray(velocities.T),
+        sheet_springs(cloth),
+        scenery,
+        _options(scene, settings),
+        stop_below,
+        record,
+    )
+    record.distance[:] -= settings.rest_distance
+    return ClothRecord(*(part[:frames] for part in record))
+
+
+def _other_body(scene: Scene, cloth: str) -> int:
+    """Return the body that is agent or patient where ``cloth`` is the other one; -1 if none is."""
+    roles = (scene.roles.agent, scene.roles.patient)
+    if cloth not in roles:
+        return -1
+    other = scene.index(roles[1] if roles[0] == cloth else roles[0])
+    return other if other < len(scene.bodies) else -1
+
+
+def _contacts(scene: Scene, records: list[ClothRecord], settings: ClothSettings) -> Contacts:
+    """Return the contacts of all cloths, sorted by frame, then by pair."""
+    rows = []
+    for number, (cloth, record) in enumerate(zip(scene.cloths, records, strict=True)):
+        # A correction by d metres within one step is a change of velocity by d / step.
+        mass = cloth.mass / cloth.resolution**2
+        impulse = record.normal_correction * mass * settings.substeps / FRAME_TIME
+        touching = (record.gap <= 0) | (record.normal_correction > 0)
+        for frame, body in np.argwhere(touching & np.isfinite(record.gap)):
+            floor = body == len(scene.bodies)
+            point, normal = record.contact[frame, body]
+            pair = (ENVIRONMENT if floor else body, len(scene.bodies) + number)
+            rows.append((frame, pair, point, normal, impulse[frame, body]))
+    rows.sort(key=lambda row: (row[0], row[1]))
+    if not rows:
+        return Contacts.empty()
+    frame, pair, point, normal, push = zip(*rows, strict=True)
+    return Contacts(
+        np.array(frame, np.int32),
+        np.array(pair, np.int32),
+        np.array(point, np.float32),
+        np.array(normal, np.float32),
+        np.array(push, np.float32),
+    )
+
+
 # Settling of solids filled with particles: fall on the floor, and push each other apart.
 #
 # The official cloth trials add solids one after the other, a little above the floor, and let them
 # settle for some frames each. Particles of two solids keep the rest distance, so a solid that is
 # added closer than that to another is thrown aside, and may fall over.
 #
-# The method is that of Flex (see `solver`): solids move freely in every substep, and passes over
-# their contacts (`solid_contacts`) then correct them.
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-
-REST_SPEED = 0.001
-"""Metres per second: while all particles are slower, solids count as settled."""
+# The method is that of the cloth: solids move freely in every substep, and passes over their
+# contacts
+# (`physion.physics.cloth.solids.correct_solids`) then correct them.
 
 
 @kernel
@@ -261,144 +564,6 @@ def _lowest(state: SolidState, number: int, solids: SolidParticles) -> float:
     return float(rotate_vectors(state.q[number], local)[:, 2].min() + state.center[number, 2])
 
 
-Points = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class ClothSettings:
-    """Constants of the cloth simulation. The defaults are those of the official cloth trials.
-
-    "official" means that the command logs set it, "default" a default of TDW's Flex container
-    (docs/official-system.md, section 3.8).
-
-    - ``substeps`` of a frame and ``iterations`` of each: passes over the constraints (default).
-    - ``rest_distance``: metres that cloth particles keep from solid particles: the effective
-      thickness of the cloth (default: solid rest distance).
-    - ``particle_spacing``: metres between the particles that fill a body (official).
-    - ``floor_gap``: metres that cloth keeps from the floor (official: collision distance).
-    - ``particle_friction``: friction coefficient with solid particles. The default was read as 0.5;
-      1, which is sent for shapes, explains held-out official trials better
-      (benchmarks/results/calibration_cloth.md).
-    - ``floor_friction``: the same for the floor (official: static and dynamic friction).
-    - ``damping``: drag per second (default; confirmed by the first contact frames of the official
-      trials: without it cloth would land three frames earlier).
-    - ``gravity``: metres per second squared, downwards (official).
-    - ``search_margin``: metres beyond the rest distance in which solid particles are searched: how
-      far a particle may move in the passes of one substep.
-    """
-
-    substeps: int = 3
-    iterations: int = 8
-    rest_distance: float = 0.125
-    particle_spacing: float = 0.035
-    floor_gap: float = 0.025
-    particle_friction: float = 1.0
-    floor_friction: float = 1.0
-    damping: float = 1.0
-    gravity: float = GRAVITY
-    search_margin: float = 0.02
-
-    def tag(self) -> str:
-        """Return eight hexadecimal digits that change whenever a setting does."""
-        return settings_tag(self)
-
-
-@dataclass(frozen=True)
-class ClothMotion:
-    """Motion of the cloths of a scene: F frames, V vertices of all cloths.
-
-    - ``vertices`` (F, V, 3): metres; one cloth after the other, each row by row along x then y.
-    - ``distance`` (F,): gap in metres between agent and patient: the smallest distance of their
-      particles less the rest distance, negative where they press on each other. NaN unless one is a
-      cloth and the other a body.
-    - ``contacts``: a row for each cloth and body (or floor) in each frame in which they touch: the
-      point on the cloth's underside, the normal from the body to the cloth, and the impulse on the
-      cloth.
-    """
-
-    vertices: Floats
-    distance: Floats
-    contacts: Contacts
-
-
-def simulate_cloth(
-    scene: Scene,
-    rigid_positions: NDArray[np.floating],
-    rigid_rotations: NDArray[np.floating],
-    settings: ClothSettings | None = None,
-    *,
-    vertices: NDArray[np.floating] | None = None,
-    velocities: NDArray[np.floating] | None = None,
-    until_gap: float | None = None,
-) -> ClothMotion:
-    """Simulate the cloths of ``scene`` on its bodies, whose motion is given.
-
-    A cloth that starts inside a body is pushed out at once.
-
-    Parameters
-    ----------
-    scene : Scene
-        Bodies, cloths, floor, agent and patient.
-    rigid_positions, rigid_rotations : (F, N, 3), (F, N, 4)
-        Pivots in metres and quaternions (w, x, y, z) of ``scene.bodies`` in every frame.
-    settings : ClothSettings, optional
-        By default those of the official trials.
-    vertices, velocities : (V, 3), optional
-        State from which the cloths start, in metres and m/s: that of frame 0. By default they are
-        flat and at rest, and frame 0 follows the first step.
-    until_gap : float, optional
-        Gap in metres between agent and patient below which the motion ends with that frame; without
-        effect if there are several cloths.
-
-    Raises
-    ------
-    BadInputError
-        If arrays have other shapes.
-    BadSceneError
-        If bodies appear or vanish.
-    """
-    if any(event.kind != "move" for event in scene.events):
-        raise BadSceneError(
-            f"scene {scene.name!r}: bodies may not appear or vanish beside cloth; leave out these "
-            "events or the cloth"
-        )
-    rules = settings if settings is not None else ClothSettings()
-    positions = np.ascontiguousarray(rigid_positions, np.float64)
-    rotations = np.ascontiguousarray(rigid_rotations, np.float64)
-    frames, bodies = len(positions), len(scene.bodies)
-    if not frames or positions.shape != (frames, bodies, 3):
-        raise BadInputError(
-            f"cloth: positions have the shape {positions.shape}, not (frames, {bodies}, 3)"
-        )
-    if rotations.shape != (frames, bodies, 4):
-        raise BadInputError(
-            f"cloth: rotations have the shape {rotations.shape}, not {(frames, bodies, 4)}"
-        )
-    if vertices is None:
-        # Frame 0 follows the first step, in which the bodies count as standing where it ends.
-        positions = np.concatenate([positions[:1], positions])
-        rotations = np.concatenate([rotations[:1], rotations])
-    solids = fill_bodies(scene.bodies, rules.particle_spacing)
-    flat = [sheet_vertices(cloth) for cloth in scene.cloths]
-    at = _start(vertices, flat, "vertices")
-    speed = _start(velocities, [np.zeros_like(sheet) for sheet in flat], "velocities")
-    records = [
-        _run(scene, n, at[n], speed[n], solids, positions, rotations, rules, until_gap)
-        for n in range(len(scene.cloths))
-    ]
-    if vertices is None:
-        records = [ClothRecord(*(part[1:] for part in record)) for record in records]
-    frames = min((len(record.vertices) for record in records), default=frames)
-    asked = [record.distance for record in records if not np.isnan(record.distance).all()]
-    return ClothMotion(
-        np.concatenate(
-            [record.vertices for record in records] or [np.zeros((frames, 0, 3))], axis=1
-        ).astype(np.float32),
-        (asked[0] if asked else np.full(frames, np.nan)).astype(np.float32),
-        _contacts(scene, records, rules),
-    )
-
-
 def settle_solids(scene: Scene, settings: ClothSettings | None = None) -> Scene:
     """Return the scene with its kinematic bodies settled on the floor, as in Flex.
 
@@ -429,168 +594,4 @@ def settle_solids(scene: Scene, settings: ClothSettings | None = None) -> Scene:
             else body
             for body in scene.bodies
         ),
-    )
-
-
-def _options(scene: Scene, settings: ClothSettings) -> ClothOptions:
-    """Return the numbers that the compiled loops need."""
-    return ClothOptions(
-        FRAME_TIME,
-        settings.substeps,
-        settings.iterations,
-        settings.rest_distance,
-        settings.search_margin,
-        scene.floor,
-        settings.floor_gap,
-        settings.particle_friction,
-        settings.floor_friction,
-        settings.damping,
-        settings.gravity,
-    )
-
-
-def add_cloth(
-    scene: Scene,
-    rigid: Trajectory,
-    settings: ClothSettings | None = None,
-    *,
-    start: State | None = None,
-    until_contact: bool = False,
-) -> Trajectory:
-    """Return the trajectory of the scene's bodies with the motion of its cloths added.
-
-    Contacts of both are merged in the order of frames. The result is never ``completed``, because
-    cloth does not sleep. `BadInputError` if the bodies are not those of the scene.
-
-    Parameters
-    ----------
-    scene, rigid
-        The scene, and the trajectory of its bodies.
-    settings : ClothSettings, optional
-        By default those of the official trials.
-    start : State, optional
-        The state from which ``rigid`` started, if it was not the scene's.
-    until_contact : bool
-        End with the first frame in which cloth and patient touch, if nothing appears or vanishes:
-        the label is then known.
-    """
-    with_state = start is not None and len(start.cloth_vertices) > 0
-    motion = simulate_cloth(
-        scene,
-        rigid.positions,
-        rigid.rotations,
-        settings,
-        vertices=start.cloth_vertices if start is not None and with_state else None,
-        velocities=start.cloth_velocities if start is not None and with_state else None,
-        until_gap=CLOTH_CONTACT_GAP if until_contact and not scene.events else None,
-    )
-    frames = len(motion.vertices)
-    both = (rigid.contacts, motion.contacts)
-    frame = np.concatenate([c.frame for c in both])
-    order = np.argsort(frame, kind="stable")
-    order = order[frame[order] < frames]
-    return replace(
-        rigid,
-        positions=rigid.positions[:frames],
-        rotations=rigid.rotations[:frames],
-        velocities=rigid.velocities[:frames],
-        angular_velocities=rigid.angular_velocities[:frames],
-        cloth_vertices=motion.vertices,
-        cloth_distance=motion.distance,
-        contacts=Contacts(
-            *(
-                np.concatenate([getattr(c, name) for c in both])[order]
-                for name in ("frame", "bodies", "point", "normal", "impulse")
-            )
-        ),
-        completed=False,
-    )
-
-
-def _start(given: NDArray[np.floating] | None, default: list[Points], what: str) -> list[Points]:
-    """Return a given state (V, 3) split by cloth, or the default; always as new arrays."""
-    count = sum(len(sheet) for sheet in default)
-    if given is None:
-        return [sheet.copy() for sheet in default]
-    if np.shape(given) != (count, 3):
-        raise BadInputError(f"cloth: {what} have the shape {np.shape(given)}, not {(count, 3)}")
-    ends = np.cumsum([len(sheet) for sheet in default])[:-1]
-    return [part.astype(np.float64).copy() for part in np.split(np.asarray(given), ends)]
-
-
-def _run(
-    scene: Scene,
-    number: int,
-    points: Points,
-    velocities: Points,
-    solids: Solids,
-    positions: Points,
-    rotations: Points,
-    settings: ClothSettings,
-    until_gap: float | None,
-) -> ClothRecord:
-    """Simulate one cloth of the scene, to the end or until its gap is below ``until_gap``."""
-    cloth, frames, bodies = scene.cloths[number], len(positions), len(scene.bodies)
-    watched = _other_body(scene, cloth.name)
-    record = ClothRecord(
-        np.zeros((frames, len(points), 3)),
-        np.full(frames, np.nan),
-        np.full((frames, bodies + 1), np.inf),
-        np.zeros((frames, bodies + 1, 2, 3)),
-        np.zeros((frames, bodies + 1)),
-    )
-    particles = (
-        surface_particles(scene.bodies[watched], settings.particle_spacing)
-        if watched >= 0
-        else np.zeros((0, 3))
-    )
-    scenery = MovingSolids(solids, positions, rotations, watched, particles)
-    stop_below = -np.inf
-    if until_gap is not None and len(scene.cloths) == 1:
-        stop_below = until_gap + settings.rest_distance
-    frames = run_cloth(
-        np.ascontiguousarray(points.T),
-        np.ascontiguousarray(velocities.T),
-        sheet_springs(cloth),
-        scenery,
-        _options(scene, settings),
-        stop_below,
-        record,
-    )
-    record.distance[:] -= settings.rest_distance
-    return ClothRecord(*(part[:frames] for part in record))
-
-
-def _other_body(scene: Scene, cloth: str) -> int:
-    """Return the body that is agent or patient where ``cloth`` is the other one; -1 if none is."""
-    roles = (scene.roles.agent, scene.roles.patient)
-    if cloth not in roles:
-        return -1
-    other = scene.index(roles[1] if roles[0] == cloth else roles[0])
-    return other if other < len(scene.bodies) else -1
-
-
-def _contacts(scene: Scene, records: list[ClothRecord], settings: ClothSettings) -> Contacts:
-    """Return the contacts of all cloths, sorted by frame, then by pair."""
-    rows = []
-    for number, (cloth, record) in enumerate(zip(scene.cloths, records, strict=True)):
-        # A correction by d metres within one step is a change of velocity by d / step.
-        mass = cloth.mass / cloth.resolution**2
-        impulse = record.normal_correction * mass * settings.substeps / FRAME_TIME
-        touching = (record.gap <= 0) | (record.normal_correction > 0)
-        for frame, body in np.argwhere(touching & np.isfinite(record.gap)):
-            floor = body == len(scene.bodies)
-            point, normal = record.contact[frame, body]
-            pair = (ENVIRONMENT if floor else body, len(scene.bodies) + number)
-            rows.append((frame, pair, point, normal, impulse[frame, body]))
-    rows.sort(key=lambda row: (row[0], row[1]))
-    if not rows:
-        return Contacts.empty()
-    frame, pair, point, normal, push = zip(*rows, strict=True)
-    return Contacts(
-        np.array(frame, np.int32),
-        np.array(pair, np.int32),
-        np.array(point, np.float32),
-        np.array(normal, np.float32),
-        np.array(push, np.float32),
     )

@@ -1,4 +1,8 @@
-"""Fill rigid bodies with cubic lattices of particles, as NVIDIA Flex does."""
+"""Rigid bodies filled with cubic lattices of particles, as in NVIDIA Flex.
+
+`fill_shape` makes the lattice of a shape. While bodies settle before a cloth falls, they move as
+solids of particles: `correct_solids` parts those that come too close.
+"""
 
 from __future__ import annotations
 
@@ -24,12 +28,13 @@ from physion.physics.cloth.contacts import (
 from physion.scenes.scene import Body, Quat, Vec3
 from physion.scenes.shapes.primitives import ConvexPiece, shape
 
-Points = NDArray[np.float64]
+F64 = NDArray[np.float64]
 Filled = NDArray[np.bool_]
+I64 = NDArray[np.int64]
 
 
 @lru_cache(maxsize=256)
-def fill_shape(name: str, scale: Vec3, spacing: float) -> tuple[Points, Filled]:
+def fill_shape(name: str, scale: Vec3, spacing: float) -> tuple[F64, Filled]:
     """Fill a shape at ``scale`` with a lattice of particles ``spacing`` metres apart.
 
     The lattice is centred in the bounds and holds as many whole spacings as fit, at least one point
@@ -62,7 +67,7 @@ def fill_shape(name: str, scale: Vec3, spacing: float) -> tuple[Points, Filled]:
 
 
 @lru_cache(maxsize=1024)
-def _planes(name: str, number: int) -> Points:
+def _planes(name: str, number: int) -> F64:
     """Return the faces (K, 4) of a convex piece of a shape: unit normal out, and offset."""
     # Imported late: what only reads scenes and trials starts faster.
     from scipy.spatial import ConvexHull
@@ -71,7 +76,7 @@ def _planes(name: str, number: int) -> Points:
 
 
 @kernel
-def _fill_convex(points: Points, planes: Points, filled: Filled) -> None:
+def _fill_convex(points: F64, planes: F64, filled: Filled) -> None:
     """Set ``filled`` (P,) for the ``points`` (P, 3) that lie on the inner side of all planes."""
     for p in range(len(points)):
         inside = not filled[p]
@@ -84,7 +89,7 @@ def _fill_convex(points: Points, planes: Points, filled: Filled) -> None:
             filled[p] = True
 
 
-def _inside(piece: ConvexPiece, points: Points) -> Filled:
+def _inside(piece: ConvexPiece, points: F64) -> Filled:
     """Return which ``points`` (P, 3), in the shape's frame at unit scale, lie in a piece.
 
     The piece is a box, a sphere or a cylinder.
@@ -98,13 +103,13 @@ def _inside(piece: ConvexPiece, points: Points) -> Filled:
     return np.asarray(in_circle & (np.abs(local[:, 2]) <= 1 + 1e-9))
 
 
-def particles_of(body: Body, spacing: float) -> Points:
+def particles_of(body: Body, spacing: float) -> F64:
     """Return the particles (P, 3) of a body in its own frame, metres; its pose is not applied."""
     origin, filled = fill_shape(body.shape, body.scale, spacing)
     return np.asarray(origin + spacing * np.argwhere(filled))
 
 
-def surface_particles(body: Body, spacing: float) -> Points:
+def surface_particles(body: Body, spacing: float) -> F64:
     """Return the particles (P, 3) of a body that lack one of their six neighbours.
 
     They are enough to find the smallest distance to something outside.
@@ -146,9 +151,6 @@ def fill_lattices(shapes: Sequence[tuple[str, Vec3] | None], spacing: float) -> 
 
 
 # Solids filled with particles that move as a whole: records, particles, poses and rotations.
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 
 class SolidBody(NamedTuple):

@@ -1,4 +1,8 @@
-"""Springs of a sheet of particles, in families that join each particle to one at a fixed offset."""
+"""A cloth as a sheet of particles: its vertices and triangles, its springs and their correction.
+
+Springs are kept in families: all springs of one family join a particle to the one at the same
+offset of indices.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +20,21 @@ from physion.scenes.scene import Cloth
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
+Indices = NDArray[np.int32]
 
 MIN_LENGTH = 1e-12
 """Metres below which a spring or a slip has no direction."""
+EDGES = ((1, 0), (0, 1), (1, 1))
+"""Steps along x and y between the ends of the edges of `sheet_triangles`."""
+ACROSS = ((1, -1), (1, 2), (2, 1))
+"""Steps between the two corners opposite an inner edge: the diagonal, and the sides of squares."""
+_CORNERS = (
+    (slice(None, -1), slice(None, -1)),
+    (slice(1, None), slice(None, -1)),
+    (slice(None, -1), slice(1, None)),
+    (slice(1, None), slice(1, None)),
+)
+"""Corners of a square of the sheet, as slices along x and y."""
 
 
 class SheetSprings(NamedTuple):
@@ -97,11 +113,8 @@ def _add_difference(factor: F64, b: F64, a: F64, total: F64) -> None:
 
 # Vertices, triangles and springs of an undeformed cloth.
 
-Points = NDArray[np.float64]
-Indices = NDArray[np.int32]
 
-
-def sheet_vertices(cloth: Cloth) -> Points:
+def sheet_vertices(cloth: Cloth) -> F64:
     """Return the vertices (V, 3) of an undeformed cloth in metres, world.
 
     They come row by row along x, then y: the first ``resolution`` vertices have the lowest x.
@@ -124,14 +137,6 @@ def sheet_triangles(resolution: int) -> Indices:
     return np.stack([np.stack([a, b, d], 1), np.stack([a, d, c], 1)], 1).reshape(-1, 3)
 
 
-_CORNERS = (
-    (slice(None, -1), slice(None, -1)),
-    (slice(1, None), slice(None, -1)),
-    (slice(None, -1), slice(1, None)),
-    (slice(1, None), slice(1, None)),
-)
-
-
 def sheet_springs(cloth: Cloth) -> SheetSprings:
     """Return the springs of a cloth, as Flex makes them from its triangles.
 
@@ -152,9 +157,3 @@ def sheet_springs(cloth: Cloth) -> SheetSprings:
     return SheetSprings(
         offsets, norm(steps * sides), np.where(joined, stiffness[:, None] / 2, 0.0), degree
     )
-
-
-EDGES = ((1, 0), (0, 1), (1, 1))
-"""Steps along x and y between the ends of the edges of `sheet_triangles`."""
-ACROSS = ((1, -1), (1, 2), (2, 1))
-"""Steps between the two corners opposite an inner edge: the diagonal, and the sides of squares."""

@@ -1,7 +1,8 @@
-"""Actors of a scene: what moves as one, with its mass and its frame.
+"""Bodies as the rigid engine sees them: convex hulls, masses, actors, and the settings.
 
-An actor is a body, or several bodies joined together. Its frame has its origin at the centre of
-mass and the axes of its first body. Bodies that do not move belong to the world.
+An actor is what moves as one: a body, or several bodies joined together. Its frame has its origin
+at the centre of mass and the axes of its first body. Bodies that do not move belong to the world.
+`build_model` puts everything together that does not change while a scene moves.
 """
 
 from __future__ import annotations
@@ -37,18 +38,18 @@ from physion.numerics.rotations import (
 )
 from physion.physics.engine import settings_tag
 from physion.physics.rigid.collision.faces import Hulls
-from physion.physics.rigid.collision.fast_pairs import SweepScene, sweep_scene
 from physion.scenes.scene import FRAME_TIME, GRAVITY, Body, Scene, SurfaceMaterial, Vec3
 from physion.scenes.shapes.meshes import revolve, solid_moments
 from physion.scenes.shapes.primitives import ConvexPiece, ball_mesh, shape
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
 
 # Convex hulls that stand for a body in collisions.
 #
 # The official simulator uses hulls of meshes for all shapes, balls and cylinders included. A hull
 # rolls and slides unlike a smooth ball, so ours are hulls as well.
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 BALL_SEGMENTS = 16
 """Meridians of a ball's hull, with half as many bands. With 24, balls roll on for longer than in
@@ -74,32 +75,29 @@ class Hull:
     - ``corners`` (K, 3): metres. ``center`` (3,): their mean.
     - ``faces``: for each face its corner numbers, counterclockwise from outside.
     - ``inner_box`` (3,): half extents in metres of a box round ``center`` inside the hull.
-    - ``inradius``: metres: the least scale times the radius of a ball round ``center`` inside the
-      hull at unit scale, as PhysX 4 takes it.
     """
 
     corners: F64
     center: F64
     faces: tuple[I64, ...]
     inner_box: F64
-    inradius: float
 
 
 @lru_cache(maxsize=CACHED_HULLS)
 def collision_hulls(name: str, scale: Vec3) -> tuple[Hull, ...]:
     """Return the hulls of all convex pieces of the shape ``name``, scaled, in the body's frame."""
     hulls = []
-    for corners, faces, inradius in _unit_hulls(name):
+    for corners, faces in _unit_hulls(name):
         scaled = corners * np.asarray(scale)
         center = ordered_mean(scaled, axis=0)
         box = inner_box(scaled, faces, center)
-        hulls.append(Hull(scaled, center, faces, box, float(min(scale)) * inradius))
+        hulls.append(Hull(scaled, center, faces, box))
     return tuple(hulls)
 
 
 @cache
-def _unit_hulls(name: str) -> tuple[tuple[F64, tuple[I64, ...], float], ...]:
-    """Return corners, faces and the radius of an inscribed ball of the hulls at unit scale.
+def _unit_hulls(name: str) -> tuple[tuple[F64, tuple[I64, ...]], ...]:
+    """Return corners and faces of the hulls at unit scale.
 
     Points inside a face, such as the middle of a cylinder's ends, are no corners: a body would rest
     on them in place of its rim.
@@ -111,7 +109,7 @@ def _unit_hulls(name: str) -> tuple[tuple[F64, tuple[I64, ...], float], ...]:
         used = np.unique(np.concatenate(faces))
         corners = points[used]
         kept = tuple(np.searchsorted(used, face) for face in faces)
-        hulls.append((corners, kept, inscribed_radius(corners, kept)))
+        hulls.append((corners, kept))
     return tuple(hulls)
 
 
@@ -193,14 +191,6 @@ def face_planes(vertices: F64, loops: I64, first_loop: I64) -> F64:
         planes[f, 0], planes[f, 1], planes[f, 2] = x, y, z
         planes[f, 3] = x * vertices[a, 0] + y * vertices[a, 1] + z * vertices[a, 2]
     return planes
-
-
-def inscribed_radius(corners: F64, faces: tuple[I64, ...]) -> float:
-    """Return the radius in metres of the ball round the mean of the corners inside a hull."""
-    first_loop = np.cumsum([0, *(len(face) for face in faces)]).astype(np.int64)
-    planes = face_planes(corners, np.concatenate(faces), first_loop)
-    center = ordered_mean(corners, axis=0)
-    return float((planes[:, 3] - dot(planes[:, :3], center)).min())
 
 
 def inner_box(corners: F64, faces: tuple[I64, ...], center: F64) -> F64:
@@ -385,6 +375,9 @@ def hull_moments(corners: F64) -> tuple[float, F64, F64]:
     )
 
 
+# Actors: bodies that joints hold together, their common mass and frame.
+
+
 @dataclass(frozen=True)
 class Actors:
     """Bodies of a scene grouped into A actors; N bodies. Actor A stands for the world.
@@ -536,9 +529,6 @@ class RigidSettings:
     - ``friction_sweeps``: number of the last position sweeps that solve friction; 0 means all
       (PhysX: 3).
     - ``persistent_manifolds``: contact points are kept from step to step (Unity 2019).
-    - ``continuous``: bodies that could pass through each other in a step are swept, and stop where
-      they hit (`physion.physics.rigid.collision.impacts`; Unity's mode ``continuous_dynamic``).
-      Off, because the recorded scenes are not predicted better with it.
     - ``friction_doubling``: each of a patch's two anchors may bear the whole friction force, so
       that flat contacts have twice the friction of Coulomb's law. The official simulator behaves
       so (Unity's "improved patch friction" is off); with False the anchors divide the force.
@@ -563,7 +553,6 @@ class RigidSettings:
     velocity_iterations: int = 1
     friction_sweeps: int = 3
     persistent_manifolds: bool = True
-    continuous: bool = False
     friction_doubling: bool = True
     contact_offset: float = 0.01
     bias: float = 0.8
@@ -605,7 +594,6 @@ class RigidModel:
     - ``inertia`` (A + 1, 3, 3) in kg m^2, ``inv_mass`` (A + 1,), ``inv_inertia`` (A + 1, 3, 3): in
       actor frames; 0 for the world, which is the last.
     - ``hulls``: all geoms, in their actors' frames. ``first_geom`` (N + 1,): those of each body.
-    - ``swept``: thresholds of continuous collision detection.
     - ``material`` (N + 1, 3): static and dynamic friction, restitution; the last is the floor.
     """
 
@@ -615,7 +603,6 @@ class RigidModel:
     inv_inertia: F64
     hulls: Hulls
     first_geom: I64
-    swept: SweepScene
     material: F64
 
 
@@ -640,7 +627,6 @@ def build_model(
         for body, there in zip(scene.bodies, here, strict=False)
     ]
     first_geom = np.cumsum([0, *(len(pieces) for pieces in hulls)]).astype(np.int64)
-    inradius = np.array([hull.inradius for pieces in hulls for hull in pieces])
     materials = [b.contact for b in scene.bodies] + [settings.floor]
     return RigidModel(
         actors=actors,
@@ -649,7 +635,6 @@ def build_model(
         inv_inertia=inv_inertia,
         hulls=_gather(hulls, actors.pivot, actors.rotation),
         first_geom=first_geom,
-        swept=sweep_scene(inradius, first_geom, actors.pivot),
         material=np.array(
             [[m.static_friction, m.dynamic_friction, m.restitution] for m in materials]
         ),

@@ -24,9 +24,11 @@ from physion.physics.rigid.step import RigidRun
 from physion.physics.trajectory import Contacts, State, Trajectory
 from physion.scenes.scene import Scene
 
-# Simulation of the rigid bodies of a scene, with bodies that appear, vanish and move.
-
 F64 = NDArray[np.float64]
+
+
+# Simulation of a scene whose bodies may appear, vanish and be moved: one run for each stretch
+# between such events.
 
 
 def simulate_rigid(

@@ -40,13 +40,12 @@ from physion.numerics.kernel import in_place_kernel
 from physion.physics.rigid.collision.manifold import Manifolds
 from physion.physics.rigid.collision.search import ContactList
 
-# Arrays that the phases of a step pass to each other; see `solver` and `step`.
-#
-# All arrays are made once for a run and reused in every step.
-
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Flags = NDArray[np.bool_]
+
+
+# Arrays that the phases of a step pass to each other, made once for a run and reused in every step.
 
 DIRECTION, ANGULAR_A, ANGULAR_B, SPIN_A, SPIN_B = 0, 3, 6, 9, 12
 EFFECTIVE_MASS, BIAS, TARGET = 15, 16, 17

@@ -1,15 +1,14 @@
 """Steps of all rigid bodies in compiled code: contacts, impulses, poses, sleep, record.
 
 `run_steps` moves a scene by many steps in one call. It neither allocates nor touches Python
-objects, so that several runs can go on in threads. One step is one frame:
+objects, so that several runs can share the processor in threads; `RigidRun` holds its arrays and
+makes room for more. One step is one frame:
 
 1. boxes of the bodies, candidates, pushes, manifolds (`physion.physics.rigid.collision.search`);
 2. islands of touching bodies; what an awake body touches is woken;
-3. gravity, drag, cap of the angular velocity (`physion.physics.rigid.motion`);
-4. contact impulses (`physion.physics.rigid.solver`), poses, velocities;
-5. the contacts are recorded, and bodies at rest fall asleep (`physion.physics.rigid.sleeping`);
-6. what has hit something on a fast way is put where it did
-   (`physion.physics.rigid.collision.impacts`).
+3. gravity, drag, cap of the angular velocity (`move_freely`);
+4. contact impulses (`physion.physics.rigid.solver`), then the poses (`move_poses`);
+5. the contacts are recorded, and bodies at rest fall asleep (`physion.physics.rigid.sleeping`).
 """
 
 from __future__ import annotations
@@ -20,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from physion.numerics.elementary import cos_of, sin_of
 from physion.numerics.kernel import in_place_kernel
 from physion.numerics.linear_algebra import cross, unit
 from physion.numerics.rotations import (
@@ -30,8 +30,6 @@ from physion.numerics.rotations import (
 )
 from physion.physics.rigid.bodies import RigidSettings, build_model
 from physion.physics.rigid.collision.faces import Hulls
-from physion.physics.rigid.collision.fast_pairs import Sweeps, SweepScene, new_sweeps
-from physion.physics.rigid.collision.impacts import keep_start, stop_at_impacts
 from physion.physics.rigid.collision.manifold import Manifolds, grown, new_manifolds
 from physion.physics.rigid.collision.pairs import PairSpace, new_pair_space
 from physion.physics.rigid.collision.search import (
@@ -47,7 +45,6 @@ from physion.physics.rigid.collision.search import (
     update_boxes,
     update_candidates,
 )
-from physion.physics.rigid.motion import fill_rotations, move_freely, move_poses
 from physion.physics.rigid.sleeping import (
     SleepOptions,
     SleepState,
@@ -57,9 +54,7 @@ from physion.physics.rigid.sleeping import (
     update_sleep,
     wake_touched,
 )
-from physion.physics.rigid.solver import F64 as SolverF64
 from physion.physics.rigid.solver import (
-    I64,
     Bodies,
     Constraints,
     SolverOptions,
@@ -72,10 +67,19 @@ from physion.physics.rigid.solver import (
 from physion.physics.trajectory import State, Trajectory, summarise_contacts
 from physion.scenes.scene import Scene
 
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+MIN_SPIN = 1e-12
+"""Radians per second: keeps the cap of the angular velocity from dividing by zero."""
 DONE, NEEDS_PAIRS, NEEDS_ROWS = 0, 1, 2
 """Results of `run_steps`: as many frames as asked, or no room for further pairs or records."""
 RECORD_WIDTH = 8
 """Columns of a recorded contact: point (3), normal (3), impulse, gap."""
+
+
+# Records that the compiled steps read and change.
 
 
 class StepOptions(NamedTuple):
@@ -83,7 +87,7 @@ class StepOptions(NamedTuple):
 
     ``gravity`` in m/s^2 downwards, ``max_angular_velocity`` in rad/s, ``reach`` in metres: distance
     of surfaces below which points are contacts. ``floor``: its height in metres. ``persistent``:
-    manifolds are kept from step to step. ``continuous``: fast pairs are swept.
+    manifolds are kept from step to step.
     """
 
     solver: SolverOptions
@@ -93,7 +97,6 @@ class StepOptions(NamedTuple):
     reach: float
     floor: float
     persistent: bool
-    continuous: bool
 
 
 class EndRule(NamedTuple):
@@ -110,7 +113,7 @@ class EndRule(NamedTuple):
     floor: float
     until_touch: bool
     asked: I64
-    pivot: SolverF64
+    pivot: F64
 
 
 class Pushes(NamedTuple):
@@ -122,8 +125,8 @@ class Pushes(NamedTuple):
 
     frame: I64
     actor: I64
-    impulse: SolverF64
-    point: SolverF64
+    impulse: F64
+    point: F64
 
 
 class Work(NamedTuple):
@@ -136,10 +139,9 @@ class Work(NamedTuple):
     pair: PairSpace
     contacts: ContactList
     rows: Constraints
-    sweeps: Sweeps
     touching: I64
-    move_v: SolverF64
-    move_w: SolverF64
+    move_v: F64
+    move_w: F64
 
 
 class History(NamedTuple):
@@ -151,11 +153,115 @@ class History(NamedTuple):
     - ``counters`` (3,): frames, contacts, and 1 once the run has ended.
     """
 
-    state: SolverF64
+    state: F64
     frame: I64
     bodies: I64
-    contact: SolverF64
+    contact: F64
     counters: I64
+
+
+# Free motion and integration: semi-implicit Euler, velocities first, then poses with the velocities
+# at the end of the step. PhysX: `bodyCoreComputeUnconstrainedVelocity` and `integrateCore`.
+
+
+@in_place_kernel
+def move_freely(
+    v: F64,
+    w: F64,
+    asleep: Flags,
+    drag: F64,
+    gravity: float,
+    max_angular_velocity: float,
+    dt: float,
+) -> None:
+    """Change velocities by a step of gravity and drag, and cap the angular velocity.
+
+    Parameters
+    ----------
+    v, w : (B + 1, 3)
+        Velocities in m/s and rad/s, world axes; changed, but for the last row and sleepers.
+    asleep : (B,)
+        Bodies that are not simulated.
+    drag : (B, 2)
+        Linear and angular drag c, d per second.
+    gravity, max_angular_velocity, dt : float
+        g in m/s^2 downwards, rad/s, seconds.
+
+    Notes
+    -----
+    v <- (v - g dt z) max(1 - c dt, 0), w <- w max(1 - d dt, 0), then w <- w min(1, cap / |w|).
+    """
+    for i in range(len(asleep)):
+        if asleep[i]:
+            continue
+        v[i, 2] -= gravity * dt
+        keep_v, keep_w = max(1.0 - drag[i, 0] * dt, 0.0), max(1.0 - drag[i, 1] * dt, 0.0)
+        for j in range(3):
+            v[i, j] *= keep_v
+            w[i, j] *= keep_w
+        speed = np.sqrt(w[i, 0] * w[i, 0] + w[i, 1] * w[i, 1] + w[i, 2] * w[i, 2])
+        factor = min(1.0, max_angular_velocity / max(speed, MIN_SPIN))
+        for j in range(3):
+            w[i, j] *= factor
+
+
+@in_place_kernel
+def move_poses(x: F64, q: F64, v: F64, w: F64, asleep: Flags, dt: float) -> None:
+    """Move centres of mass ``x`` and orientations ``q`` by constant velocities over ``dt`` seconds.
+
+    Parameters
+    ----------
+    x, q : (B + 1, 3), (B + 1, 4)
+        Changed, but for the last row, which stands for the world.
+    v, w : (B + 1, 3)
+        Velocities in m/s and rad/s, world axes.
+    asleep : (B,)
+        Bodies that do not move.
+    dt : float
+        Seconds.
+
+    Notes
+    -----
+    x <- x + v dt; q <- (cos(|w| dt / 2), sin(|w| dt / 2) w / |w|) q, then q <- q / |q|.
+    """
+    for i in range(len(x) - 1):
+        if asleep[i]:
+            continue
+        for j in range(3):
+            x[i, j] += v[i, j] * dt
+        speed = np.sqrt(w[i, 0] ** 2 + w[i, 1] ** 2 + w[i, 2] ** 2)
+        if speed == 0.0:
+            continue
+        half = 0.5 * speed * dt
+        c, s = cos_of(half), sin_of(half) / speed
+        dx, dy, dz = w[i, 0] * s, w[i, 1] * s, w[i, 2] * s
+        qw, qx, qy, qz = q[i, 0], q[i, 1], q[i, 2], q[i, 3]
+        q[i, 0] = c * qw - dx * qx - dy * qy - dz * qz
+        q[i, 1] = c * qx + dx * qw + dy * qz - dz * qy
+        q[i, 2] = c * qy - dx * qz + dy * qw + dz * qx
+        q[i, 3] = c * qz + dx * qy - dy * qx + dz * qw
+        length = np.sqrt(q[i, 0] ** 2 + q[i, 1] ** 2 + q[i, 2] ** 2 + q[i, 3] ** 2)
+        for j in range(4):
+            q[i, j] /= length
+
+
+@in_place_kernel
+def fill_rotations(q: F64, rot: F64, start: int, stop: int) -> None:
+    """Fill rows ``start`` to ``stop`` of ``rot`` (B, 3, 3) with the matrices of ``q`` (B, 4)."""
+    for i in range(start, stop):
+        w, x, y, z = q[i, 0], q[i, 1], q[i, 2], q[i, 3]
+        rot[i, 0, 0] = 1 - 2 * (y * y + z * z)
+        rot[i, 0, 1] = 2 * (x * y - w * z)
+        rot[i, 0, 2] = 2 * (x * z + w * y)
+        rot[i, 1, 0] = 2 * (x * y + w * z)
+        rot[i, 1, 1] = 1 - 2 * (x * x + z * z)
+        rot[i, 1, 2] = 2 * (y * z - w * x)
+        rot[i, 2, 0] = 2 * (x * z - w * y)
+        rot[i, 2, 1] = 2 * (y * z + w * x)
+        rot[i, 2, 2] = 1 - 2 * (x * x + y * y)
+
+
+# Parts of a step, in the order of `run_steps`.
 
 
 @in_place_kernel
@@ -165,7 +271,7 @@ def _push(
     pushes: Pushes,
     frame: int,
     wake_time: float,
-    space: SolverF64,
+    space: F64,
 ) -> None:
     """Apply the pushes of ``frame``: v += J / m, w += R I^-1 R^T (r x J); wake what is pushed.
 
@@ -256,23 +362,6 @@ def _record(
 
 
 @in_place_kernel
-def _record_impacts(sweeps: Sweeps, count: int, frame: int, asked: I64, history: History) -> bool:
-    """Record ``count`` hits of a step; return whether one is of the asked bodies."""
-    found = False
-    for c in range(count):
-        used = history.counters[1] + c
-        i, j = sweeps.contact_bodies[c, 0], sweeps.contact_bodies[c, 1]
-        history.frame[used] = frame
-        history.bodies[used, 0], history.bodies[used, 1] = i, j
-        for k in range(RECORD_WIDTH):
-            history.contact[used, k] = sweeps.contact[c, k]
-        if (i == asked[0] and j == asked[1]) or (i == asked[1] and j == asked[0]):
-            found = True
-    history.counters[1] += count
-    return found
-
-
-@in_place_kernel
 def record_state(bodies: Bodies, history: History) -> None:
     """Add the present state of all actors as the next frame."""
     frame = history.counters[0]
@@ -305,10 +394,9 @@ def _at_rest(bodies: Bodies, sleep: SleepState, rule: EndRule) -> bool:
 def run_steps(
     hulls: Hulls,
     scene: SearchScene,
-    swept: SweepScene,
     bodies: Bodies,
     sleep: SleepState,
-    drag: SolverF64,
+    drag: F64,
     pushes: Pushes,
     manifolds: Manifolds,
     space: SearchSpace,
@@ -323,7 +411,7 @@ def run_steps(
 
     Parameters
     ----------
-    hulls, scene, swept, drag, pushes
+    hulls, scene, drag, pushes
         What does not change; ``drag`` (A, 2) is linear and angular drag per second.
     bodies, sleep, manifolds, space, history
         State of the run; all are changed.
@@ -367,7 +455,7 @@ def run_steps(
         )  # fmt: skip
         candidates = find_candidates(scene, manifolds, space, actors, options.floor, options.reach)
         room = len(history.frame) - history.counters[1]
-        if candidates == FULL or 4 * candidates + actors > room:
+        if candidates == FULL or 4 * candidates > room:
             space.counters[1] -= 1
             return NEEDS_PAIRS if candidates == FULL else NEEDS_ROWS
         _push(bodies, sleep, pushes, now, options.sleep.wake_time, rows.arm)
@@ -398,19 +486,11 @@ def run_steps(
                 work.move_w[a, i] = bodies.w[a, i]
         correct_velocities(rows, contacts, pairs, manifolds, bodies, options.solver)
         remember_anchors(contacts, pairs, rows.slipped, manifolds, bodies)
-        if options.continuous:
-            keep_start(bodies, work.sweeps)
         move_poses(bodies.x, bodies.q, work.move_v, work.move_w, sleep.asleep, dt)
         touched = _record(contacts, pairs, rows, frames, rule.asked, history)
         update_sleep(
             work.touching, touching, bodies, work.move_v, work.move_w, sleep, options.sleep
         )
-        if options.continuous:
-            hits = stop_at_impacts(
-                hulls, scene, swept, bodies, sleep, work.move_v, work.move_w, dt,
-                options.sleep.wake_time, work.sweeps, work.pair,
-            )  # fmt: skip
-            touched |= _record_impacts(work.sweeps, hits, frames, rule.asked, history)
         record_state(bodies, history)
         if touched and rule.until_touch:
             history.counters[2] = 1
@@ -418,8 +498,6 @@ def run_steps(
 
 
 # Simulations of rigid bodies: make room for arrays, call the compiled steps, collect results.
-
-F64 = NDArray[np.float64]
 
 PAIRS, ROWS, FRAMES = 64, 2048, 128
 """Room at the start for pairs of geoms, recorded contacts and frames; each is doubled when full."""
@@ -472,7 +550,6 @@ class RigidRun:
             2.0 * settings.contact_offset,
             scene.floor,
             settings.persistent_manifolds,
-            settings.continuous,
         )
         self.history = History(
             np.zeros((FRAMES, actors + 1, 13)),
@@ -512,7 +589,6 @@ class RigidRun:
             result = run_steps(
                 self.model.hulls,
                 self.search_scene,
-                self.model.swept,
                 self.bodies,
                 self.sleep,
                 self.model.actors.drag,
@@ -586,7 +662,6 @@ class RigidRun:
             new_pair_space(),
             new_contact_list(capacity),
             new_constraints(capacity, actors),
-            new_sweeps(len(self.model.hulls.margin), len(self.scene.bodies), actors),
             np.zeros((capacity, 2), np.int64),
             np.zeros((actors + 1, 3)),
             np.zeros((actors + 1, 3)),

@@ -26,6 +26,10 @@ from physion.rendering.textures.materials import (
     Painter,
 )
 
+I64 = NDArray[np.int64]
+U8 = NDArray[np.uint8]
+
+
 # Texture lookup: mip level of a pixel's footprint, and filtering within and between levels.
 #
 # A texture is stored as a pyramid of levels, each a square of texels with half the side of the one
@@ -35,9 +39,6 @@ from physion.rendering.textures.materials import (
 # References
 # ----------
 # Williams, L. (1983). Pyramidal parametrics. SIGGRAPH.
-
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
 
 ALBEDO_SCALE = 255.0
 """Stored value of a square root of albedo of 1."""

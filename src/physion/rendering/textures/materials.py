@@ -1,4 +1,7 @@
-"""Painters of the textures of metals, plastics, stones, fabrics, wicker and fur."""
+"""Painters of procedural textures: metals, plastics, stones, fabrics, fur, woods, floors and walls.
+
+A painter draws a square that repeats without a seam: albedo and height of every texel.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +13,10 @@ from numpy.typing import NDArray
 from physion.numerics.elementary import cos, exp, power, sin, standard_normal, tanh
 from physion.numerics.linear_algebra import inverse_real_transform, norm, ordered_mean, outer
 
-# Building blocks of procedural textures: seamless noise, Voronoi cells, coordinates, tints.
-
 F32 = NDArray[np.float32]
+
+
+# Building blocks of procedural textures: seamless noise, Voronoi cells, coordinates, tints.
 
 SIZE = 512
 """Texels along the side of a texture."""

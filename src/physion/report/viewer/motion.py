@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from physion.core.errors import BadInputError
 from physion.physics.labels import contact_frames
 from physion.physics.trajectory import Trajectory
-from physion.rendering.camera import solid
+from physion.rendering.triangles import solid
 from physion.scenes.scene import Scene
 from physion.scenes.shapes.primitives import shape
 

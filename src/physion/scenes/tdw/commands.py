@@ -246,7 +246,7 @@ class LoggedObject:
     ``position`` and ``rotation`` are those at its creation, in frame ``created``. ``gone``: it was
     destroyed in that frame and never was in the trial; ``destroyed``: the later frame in which it
     was. ``put``: the position and rotation that the log gave last, after which forces may have
-    moved it.
+    moved it. ``earlier``: number of objects with its id that it replaced.
     """
 
     id: int
@@ -268,10 +268,12 @@ class LoggedObject:
     created: int = 0
     destroyed: int | None = None
     put: tuple[Vec3, Quat] | None = None
+    earlier: int = 0
 
     @property
     def name(self) -> str:
-        return f"{self.model}_{self.id}"
+        """Name of the body: model and id, and a number if objects with the id came before."""
+        return f"{self.model}_{self.id}" + (f"_{self.earlier + 1}" if self.earlier else "")
 
     @property
     def free(self) -> bool:
@@ -284,14 +286,19 @@ class LoggedObject:
 
 
 class CommandReader:
-    """State of a trial while its commands are executed, in our axes."""
+    """State of a trial while its commands are executed, in our axes.
+
+    ``objects`` are the present ones by their ids; ``replaced`` those whose id was given again at a
+    later frame. Pushes, events and joints name the objects.
+    """
 
     def __init__(self, unknown: Counter[str]) -> None:
         self.unknown = unknown
         self.objects: dict[int, LoggedObject] = {}
-        self.pushes: list[tuple[int, Push]] = []
-        self.events: list[tuple[int, BodyEvent]] = []
-        self.joints: list[tuple[int, int]] = []
+        self.replaced: list[LoggedObject] = []
+        self.pushes: list[Push] = []
+        self.events: list[BodyEvent] = []
+        self.joints: list[tuple[str, str]] = []
         self.eye: Vec3 = (0.0, -3.0, 1.0)
         self.target: Vec3 = (0.0, 0.0, 0.5)
         self.fov = math.radians(55.0)
@@ -304,7 +311,7 @@ class CommandReader:
         """Execute the set-up commands, then those of every frame: (line number, commands)."""
         for command in setup:
             self._execute(command, "the set-up before the first trial")
-        for frame, (line, commands) in enumerate(frames[: _count_frames(frames)]):
+        for frame, (line, commands) in enumerate(frames[_start(frames) : _count_frames(frames)]):
             self.frame = frame
             for command in commands:
                 self._execute(command, f"line {line}")
@@ -360,12 +367,11 @@ class CommandReader:
         thing.put = pose
         if not thing.free:
             position, rotation = pose
-        index, event = self.events[-1] if self.events else (None, None)
-        if event and (index, event.frame, event.kind) == (thing.id, self.frame, "move"):
+        event = self.events[-1] if self.events else None
+        if event and (event.body, event.frame, event.kind) == (thing.name, self.frame, "move"):
             self.events.pop()
             position, rotation = position or event.position, rotation or event.rotation
-        event = BodyEvent(self.frame, thing.name, "move", position, rotation)
-        self.events.append((thing.id, event))
+        self.events.append(BodyEvent(self.frame, thing.name, "move", position, rotation))
 
     # One method per command.
 
@@ -386,12 +392,17 @@ class CommandReader:
 
     def do_add_object(self, command: Command) -> None:
         id_ = int(command["id"])
-        if len(self.objects) >= MAX_THINGS:
+        if len(self.objects) + len(self.replaced) >= MAX_THINGS:
             raise BadInputError(f"there are more than {MAX_THINGS} objects")
         if len(str(command["name"])) > MAX_NAME:
             raise BadInputError(f"a name of a model has more than {MAX_NAME} characters")
-        if self.frame and id_ in self.objects:
-            raise BadInputError(f"object {id_} was already created; use a new id at later frames")
+        old = self.objects.get(id_)
+        if old is not None and old.created == self.frame:
+            self.events = [event for event in self.events if event.body != old.name]
+        elif old is not None:
+            if not old.gone and old.destroyed is None:
+                self._vanish(old)
+            self.replaced.append(old)
         thing = LoggedObject(
             id_,
             str(command["name"]),
@@ -399,18 +410,22 @@ class CommandReader:
             vector(command["position"]),
             quaternion_from_euler(command["rotation"]),
             created=self.frame,
+            earlier=sum(other.id == id_ for other in self.replaced),
         )
         self.objects[id_] = thing
         if self.frame:
-            self.events.append((id_, BodyEvent(self.frame, thing.name, "appear")))
+            self.events.append(BodyEvent(self.frame, thing.name, "appear"))
 
     def do_destroy_object(self, command: Command) -> None:
         thing = self._object(command)
         if thing.created == self.frame:
             thing.gone = True
             return
+        self._vanish(thing)
+
+    def _vanish(self, thing: LoggedObject) -> None:
         thing.destroyed = self.frame
-        self.events.append((thing.id, BodyEvent(self.frame, thing.name, "vanish")))
+        self.events.append(BodyEvent(self.frame, thing.name, "vanish"))
 
     do_destroy_flex_object = do_destroy_object
 
@@ -469,7 +484,7 @@ class CommandReader:
     def _push(self, command: Command, point: Vec3 | None) -> None:
         thing, impulse = self._object(command), vector(command["force"])
         if any(impulse):
-            self.pushes.append((thing.id, Push(thing.name, impulse, point, self.frame)))
+            self.pushes.append(Push(thing.name, impulse, point, self.frame))
 
     def do_add_fixed_joint(self, command: Command) -> None:
         parent, child = self._object(command, "parent_id"), self._object(command)
@@ -478,7 +493,7 @@ class CommandReader:
                 f"joins {parent.name} and {child.name} at frame {self.frame}, but both were "
                 "created before; joints hold from then on"
             )
-        self.joints.append((parent.id, child.id))
+        self.joints.append((parent.name, child.name))
 
     def do_set_color(self, command: Command) -> None:
         c = command["color"]
@@ -505,6 +520,20 @@ class CommandReader:
 
     def do_set_flex_object_mass(self, command: Command) -> None:
         self._object(command).mass = float(command["mass"])
+
+
+def _start(frames: list[tuple[int, list[Command]]]) -> int:
+    """Return the list with which a trial starts: the last one that creates all its objects again.
+
+    The first list was written twice where the official program repeated the set-up of a trial.
+    """
+    start, known = 0, set[Any]()
+    for index, (_, commands) in enumerate(frames):
+        made = {c.get("id") for c in commands if c["$type"] == "add_object"}
+        if known and known <= made:
+            start = index
+        known |= made
+    return start
 
 
 def _count_frames(frames: list[tuple[int, list[Command]]]) -> int:

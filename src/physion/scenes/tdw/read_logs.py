@@ -196,17 +196,16 @@ class _SceneBuilder:
 
     def scene(self) -> Scene:
         kept: list[LoggedObject] = []
-        for thing in self.commands.objects.values():
+        for thing in (*self.commands.replaced, *self.commands.objects.values()):
             if thing.gone:
                 continue
             if thing.vanishing:
                 self.notes.append(f"{thing.name} has no size or no mass and is left out")
                 continue
             kept.append(thing)
-        ids = {thing.id for thing in kept}
+        by_name = {thing.name: thing for thing in kept}
         scenario = self._scenario()
-        pushes = tuple(push for id_, push in self.commands.pushes if id_ in ids)
-        names = {thing.id: thing.name for thing in kept}
+        pushes = tuple(push for push in self.commands.pushes if push.body in by_name)
         index = self.record.get("trial_num", self.record.get("stimulus_name"))
         return Scene(
             name=str(self.record.get("stimulus_name") or f"{self.folder.name}_{index}"),
@@ -215,7 +214,7 @@ class _SceneBuilder:
             cloths=tuple(self._cloth(thing) for thing in kept if thing.cloth is not None),
             pushes=pushes,
             joints=tuple(
-                Joint(names[a], names[b]) for a, b in self.commands.joints if a in ids and b in ids
+                Joint(a, b) for a, b in self.commands.joints if a in by_name and b in by_name
             ),
             roles=self._roles(kept, pushes),
             camera=Camera(self.commands.eye, self.commands.target, self.commands.fov),
@@ -224,9 +223,9 @@ class _SceneBuilder:
             ending=Ending(151, self._max_frames(scenario)),
             settle_frames=FLEX_SETTLE_FRAMES if self.commands.settles else 0,
             events=tuple(
-                self._event(event, self.commands.objects[id_])
-                for id_, event in self.commands.events
-                if id_ in ids
+                self._event(event, by_name[event.body])
+                for event in self.commands.events
+                if event.body in by_name
             ),
             parameters={
                 "source": "official command log",

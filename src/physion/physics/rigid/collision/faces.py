@@ -2,11 +2,11 @@
 
 `closest_points` and `penetration` give one pair of points and a direction. Where a face rests on
 another, up to four points are needed: the face of each hull that looks most along the direction is
-taken, one is clipped against the other (`clipping`), and the four points that span the overlap are
-kept (`reduction`).
+taken, one is clipped against the other (`clip_faces`), and the four points that span the overlap
+are kept (`physion.physics.rigid.collision.manifold.spread_points`).
 
-After PhysX 4 (``geomutils``, contact generation of convex meshes): `facing_face` follows
-``getWitnessPolygonIndex``.
+After PhysX 4 (``geomutils``, contact generation of convex meshes): `clip_faces` follows
+``generatedContacts``, `facing_face` ``getWitnessPolygonIndex``.
 """
 
 from __future__ import annotations
@@ -19,12 +19,10 @@ from numpy.typing import NDArray
 from physion.numerics.kernel import in_place_kernel
 from physion.physics.rigid.collision.manifold import MANIFOLD_SIZE
 
-# Clipping of one convex face against another, in the plane of the reference face.
-#
-# After PhysX 4 (``geomutils``, contact generation of convex meshes): ``generatedContacts``.
-
 F64 = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+I64 = NDArray[np.int64]
+
 
 MAX_POINTS = 64
 """Points of one clipping before they are reduced; further ones are dropped (PhysX)."""
@@ -186,8 +184,6 @@ def _clip_edges(
 
 
 # Convex hulls as arrays that the compiled collision functions read.
-
-I64 = NDArray[np.int64]
 
 
 class Hulls(NamedTuple):

@@ -10,8 +10,8 @@ their bodies, with the normal from B to A in the frame of B. In every step:
 4. if points were lost, or the new direction is more than 45 degrees from the old, all points are
    found anew from the faces.
 
-`physion.physics.rigid.collision.pairs` goes through these steps for two hulls,
-`floor_update` for a hull and the floor.
+`physion.physics.rigid.collision.pairs` goes through these steps, for two hulls and for a hull and
+the floor.
 
 So the contacts of a rolling or rocking body are partly older than the step, which delays and
 smooths the change from one facet to the next.
@@ -30,13 +30,14 @@ from numpy.typing import NDArray
 
 from physion.numerics.kernel import in_place_kernel
 
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
 # Choice of the four contact points that stand for all those of a pair of hulls.
 #
 # After PhysX 4 (``geomutils``): `spread_points` follows ``reduceBatchContacts``, `choose_of_five`
 # ``reduceContactsForPCM``.
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 MANIFOLD_SIZE = 4
 """Points kept of a pair of convex hulls (PhysX)."""

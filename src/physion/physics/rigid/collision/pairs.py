@@ -1,7 +1,7 @@
-"""Contact points of a pair of hulls in a step: moved along with the bodies, or found anew.
+"""Contact points of two hulls, or of a hull and the floor: moved with the bodies, or found anew.
 
 See `physion.physics.rigid.collision.manifold` for the method. After PhysX 4 (``geomutils``):
-``pcmContactConvexConvex``.
+``pcmContactConvexConvex`` and, for the floor, ``pcmContactPlaneConvex``.
 """
 
 from __future__ import annotations
@@ -33,10 +33,11 @@ from physion.physics.rigid.collision.manifold import (
 )
 from physion.physics.rigid.collision.penetration import Polytope, new_polytope, penetration
 
-# Closest points of a pair of hulls, and a bound on how far they still are apart.
-
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
+
+
+# Closest points of a pair of hulls, and a bound on how far they still are apart.
 
 
 class PairSpace(NamedTuple):
@@ -295,10 +296,7 @@ def _points_of_faces(
     manifolds.size[s] = count
 
 
-# Contact points of a hull and the floor in a step: moved along with the hull, or found anew.
-#
-# See `physion.physics.rigid.collision.manifold` for the method. After PhysX 4 (``geomutils``):
-# ``pcmContactPlaneConvex``.
+# Contact points of a hull and the floor.
 
 FLOOR_FRACTION = 0.2
 """Part of the hull's margin by which the halves of a point may slide apart, and the hull may move,
