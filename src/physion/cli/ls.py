@@ -15,6 +15,7 @@ from physion.core.errors import BadInputError
 from physion.core.registry import Registry
 from physion.models import models
 from physion.physics.engine import engines
+from physion.rendering.rooms import rooms
 from physion.scenes.looks import MATERIALS
 from physion.scenes.sampling.build import as_record, scenarios
 from physion.scenes.sampling.parameters import describe_limits
@@ -31,6 +32,7 @@ LISTS: Mapping[str, Callable[[], Names]] = {
     "materials": lambda: {family: list(names) for family, names in MATERIALS.items()},
     "models": models.names,
     "readers": lambda: _readers().names(),
+    "rooms": rooms.names,
     "engines": engines.names,
     "executors": executors.names,
 }
@@ -66,6 +68,7 @@ class Options:
             "materials",
             "models",
             "readers",
+            "rooms",
             "engines",
             "executors",
         ],

@@ -7,7 +7,7 @@ import importlib
 import importlib.util
 import inspect
 from collections.abc import Callable, Iterator
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoints, entry_points
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -83,7 +83,7 @@ class Registry(Generic[T]):
         if self._plugins_read:
             return
         self._plugins_read = True
-        for point in entry_points(group=f"physion.{self.kind}s"):
+        for point in _plugins(self.kind):
             self._lazy.setdefault(point.name, point.value)
 
     def __contains__(self, name: object) -> bool:
@@ -91,6 +91,15 @@ class Registry(Generic[T]):
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.names())
+
+
+def plugin_names(kind: str) -> list[str]:
+    """Return the names that other packages add to the registry of a kind, without loading them."""
+    return sorted(point.name for point in _plugins(kind))
+
+
+def _plugins(kind: str) -> EntryPoints:
+    return entry_points(group=f"physion.{kind}s")
 
 
 def _docstring(module: str, attribute: str) -> str:

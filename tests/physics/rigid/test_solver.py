@@ -15,7 +15,6 @@ from physion.numerics.rotations import axis_angle_quaternion, rotation_matrices
 from physion.physics.rigid.bodies import RigidSettings
 from physion.physics.rigid.collision.manifold import Manifolds, new_manifolds
 from physion.physics.rigid.collision.search import ContactList
-from physion.physics.rigid.step import fill_rotations, move_freely, move_poses
 from physion.physics.rigid.solver import (
     Bodies,
     Constraints,
@@ -29,6 +28,7 @@ from physion.physics.rigid.solver import (
     set_order,
     sweep,
 )
+from physion.physics.rigid.step import fill_rotations, move_freely, move_poses
 
 F64 = NDArray[np.float64]
 DEFAULTS = RigidSettings()

@@ -1,4 +1,8 @@
-"""Steps shared by all scenarios: colours, camera, scenery, and assembly of the scene."""
+"""What all scenarios share: registry, colours, assembly of a scene with camera and scenery.
+
+A scenario samples scenes from its parameters and a seed. It registers its sampling function with
+the decorator `scenario`.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +18,7 @@ from physion.core.registry import Registry
 from physion.core.seeds import child_generator, stable_hash
 from physion.scenes.looks import pick_material, random_color
 from physion.scenes.sampling.placement import CameraRule, SceneryRule, place_camera, place_scenery
-from physion.scenes.scene import Body, Cloth, Ending, Joint, Look, Push, Roles, Scene, Vec3
-
-# Registry of scenarios. A scenario samples scenes from its parameters and a seed.
+from physion.scenes.scene import FLOORS, Body, Cloth, Ending, Joint, Look, Push, Roles, Scene, Vec3
 
 P = TypeVar("P")
 
@@ -82,10 +84,6 @@ def as_record(params: Any) -> dict[str, Any]:
 
 AIM_HEIGHT = 0.5
 """Default height of the camera's target above the floor, metres."""
-FLOORS = {"box": 0.0, "bright": 0.0043, "empty": 0.0}
-"""Height of each room's floor, metres. In the official ``tdw_room`` (here ``bright``) bodies placed
-at 0 come to rest 4 to 5 mm higher than in ``box_room_2018`` (here ``box``)."""
-
 
 MovableT = TypeVar("MovableT", Body, Cloth)
 
@@ -95,7 +93,7 @@ class SceneParams(Protocol):
 
     @property
     def room(self) -> str:
-        """Name of a room of `FLOORS`."""
+        """Name of a room (``physion ls rooms``)."""
         ...
 
     @property
@@ -192,7 +190,7 @@ def build_scene(
         child_generator(seed, "distractors"),
         child_generator(seed, "occluders"),
     )
-    floor = FLOORS[params.room]
+    floor = FLOORS.get(params.room, 0.0)
     return Scene(
         name=scene_name(scenario, seed),
         scenario=scenario,

@@ -18,11 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.core.errors import BadInputError, BadSceneError, UnknownNameError
+from physion.core.registry import plugin_names
 from physion.core.settings import check_keys, field_types
 from physion.numerics.rotations import axis_angle_quaternion, multiply_quaternions
-from physion.scenes.scene import Ending, Quat, Vec3
-
-ROOMS = ("box", "bright", "empty")
+from physion.scenes.scene import FLOORS, Ending, Quat, Vec3
 
 Range: TypeAlias = tuple[float, float]
 """Smallest and largest value of a uniform random draw."""
@@ -293,7 +292,7 @@ def _known_names(kind: str) -> frozenset[str]:
             "shape": shapes.names(),
             "material": (*MATERIALS, *TEXTURES),
             "prop": (*PROPS, *PROP_CATEGORIES),
-            "room": ROOMS,
+            "room": (*FLOORS, *plugin_names("room")),
         }[kind]
     )
 

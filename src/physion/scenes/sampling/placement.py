@@ -1,7 +1,8 @@
-"""Placement of the camera and of scenery: distractors behind and occluders in front of the bodies.
+"""Placement of the camera, of scenery, and of the bodies, zones and pushes of all scenarios.
 
-The rules are those of the official generator (docs/official-system.md, sections 2.4 and 2.5), with
-one addition: a camera that does not see agent and patient is drawn again.
+Scenery are distractors behind and occluders in front of the bodies. The rules are those of the
+official generator (docs/official-system.md, sections 2.4 and 2.5), with one addition: a camera that
+does not see agent and patient is drawn again.
 """
 
 from __future__ import annotations

@@ -1,4 +1,17 @@
-"""Sampling of a scene from the name of its scenario, a seed, and a preset or parameters."""
+"""Sampling of a scene from the name of its scenario, a seed, and a preset or parameters.
+
+A preset names parameters of a scenario, among them the published configurations. Presets are kept
+in TOML files:
+
+- ``scenario``: the scenario of all presets in the file.
+- ``[shared]``: parameters that all presets of the file have.
+- ``[presets.NAME]``: a preset. ``params`` are its parameters, ``about`` a description, ``based_on``
+  the preset that it changes (an earlier one of the file, or one that comes with the scenario).
+  Published configurations also have ``official`` (name), ``seed`` and ``published`` (results).
+
+Keys and units of parameters are those of the scenario's parameters; ``physion ls presets SCENARIO
+PRESET`` prints them.
+"""
 
 from __future__ import annotations
 
@@ -18,20 +31,6 @@ from physion.core.settings import check_keys, shown
 from physion.scenes.sampling.build import scenarios
 from physion.scenes.sampling.parameters import Quantity, check_params, check_together, read_params
 from physion.scenes.scene import Scene
-
-# Presets: named parameters of a scenario, among them the published configurations.
-#
-# A preset file is TOML:
-#
-# - ``scenario``: the scenario of all presets in the file.
-# - ``[shared]``: parameters that all presets of the file have.
-# - ``[presets.NAME]``: a preset. ``params`` are its parameters, ``about`` a description,
-#   ``based_on``
-#   the preset that it changes (an earlier one of the file, or one that comes with the scenario).
-#   Published configurations also have ``official`` (name), ``seed`` and ``published`` (results).
-#
-# Keys and units of parameters are those of the scenario's parameters; ``physion ls presets
-# SCENARIO PRESET`` prints them.
 
 DEFAULT, FAMILIARIZATION, DEBUG = "default", "familiarization", "debug"
 """Names of presets that every scenario of this package has besides the published ones."""

@@ -1,4 +1,8 @@
-"""Stacks of bodies, the stands that carry them, and masses proportional to volume."""
+"""Stacks of bodies and the stands that carry them, as in support, contain and link.
+
+Bodies are raised until they overlap no other (`raise_above`); a shape is represented by its convex
+pieces, as in collisions. Masses are proportional to volumes.
+"""
 
 from __future__ import annotations
 
@@ -40,8 +44,6 @@ from physion.scenes.shapes.primitives import shape
 from physion.scenes.shapes.props import NATURAL_SIZES
 
 # Tests for overlap of bodies, and the height by which a body must be raised to avoid one.
-#
-# A shape is represented by its convex pieces, as in collisions.
 
 GAP = 0.001
 """Gap left below a body that had to be raised, metres."""

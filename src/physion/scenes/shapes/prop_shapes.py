@@ -1,4 +1,8 @@
-"""Solids from which props are built: boxes, limbs, surfaces of revolution, tubes and lofts."""
+"""Solids from which props are built: boxes, limbs, surfaces of revolution, tubes and lofts.
+
+A prop is modelled in metres at its natural size with its front towards +y, and then scaled to the
+box [-0.5, 0.5] x [-0.5, 0.5] x [0, 1], so that the scale of a body is its size in metres.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +22,6 @@ from physion.scenes.shapes.meshes import Mesh, Points, box, hull, merge, revolve
 from physion.scenes.shapes.primitives import CURVED, PREFIX, Shape, ball_mesh, convex, shapes
 
 # Parts of props with looks of their own; registration of a prop as a shape.
-#
-# A prop is modelled in metres at its natural size with its front towards +y, and then scaled to
-# the box [-0.5, 0.5] x [-0.5, 0.5] x [0, 1], so that the scale of a body is its size in metres.
 
 NATURAL_SIZES: dict[str, Vec3] = {}
 """Natural width, depth and height of each prop in metres, by name without prefix."""

@@ -1,9 +1,9 @@
 """Props that replace the library models of the official scenes: vases, chairs, dogs, lamps, ...
 
-The licence of the official models forbids shipping them, so each prop is built from a few solids,
-in the modules imported here. A prop fills the box [-0.5, 0.5] x [-0.5, 0.5] x [0, 1] exactly, so
-that the scale of a body is the size of the model it replaces. Its front is +y. Props are shapes
-like any other (``prop:vase``): mostly scenery, but they have collision pieces as well.
+The licence of the official models forbids shipping them, so each prop is built from a few solids. A
+prop fills the box [-0.5, 0.5] x [-0.5, 0.5] x [0, 1] exactly, so that the scale of a body is the
+size of the model it replaces. Its front is +y. Props are shapes like any other (``prop:vase``):
+mostly scenery, but they have collision pieces as well.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Execution of the official simulator's commands: one method of `CommandReader` per command.
+"""Command logs of the official simulator: reading of their lines, execution of their commands.
 
-`read_logs` builds a scene from the result. Vectors and rotations are converted to our axes here:
-(x, y, z) of Unity is (x, z, y) of ours.
+`CommandReader` has one method per command, and `physion.scenes.tdw.read_logs` builds a scene from
+the result. Vectors and rotations are converted to our axes here: (x, y, z) of Unity is (x, z, y) of
+ours.
 """
 
 from __future__ import annotations

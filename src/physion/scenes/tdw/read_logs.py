@@ -20,6 +20,7 @@ from physion.core.seeds import generator
 from physion.numerics.rotations import rotate_vectors
 from physion.scenes.looks import prop_look
 from physion.scenes.scene import (
+    FLOORS,
     Body,
     BodyEvent,
     Camera,
@@ -49,10 +50,6 @@ Collide controller: a folder whose name contains ``rolling`` is Roll."""
 
 MAX_FRAMES = {"collide": 152, "contain": 452, "link": 452, "support": 602, "drape": 151}
 """Frames of the longest trial, frame 0 included; 302 for others (docs/official-system.md, 2.6)."""
-
-FLOORS = {"bright": 0.0043}
-"""Height of a room's floor if it is not 0, metres. In ``tdw_room`` bodies placed at 0 come to rest
-4 to 5 mm higher than in ``box_room_2018`` (recorded displacements of the targets)."""
 
 FLEX_SETTLE_FRAMES = 100
 
@@ -219,7 +216,7 @@ class _SceneBuilder:
             roles=self._roles(kept, pushes),
             camera=Camera(self.commands.eye, self.commands.target, self.commands.fov),
             room=self.commands.room,
-            floor=FLOORS.get(self.commands.room, 0.0),
+            floor=FLOORS[self.commands.room],
             ending=Ending(151, self._max_frames(scenario)),
             settle_frames=FLEX_SETTLE_FRAMES if self.commands.settles else 0,
             events=tuple(

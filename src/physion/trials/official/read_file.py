@@ -26,8 +26,8 @@ from physion.core.errors import BadInputError
 from physion.core.seeds import generator
 from physion.physics.trajectory import ENVIRONMENT, Contacts, Trajectory
 from physion.scenes.looks import RED, YELLOW, colors_are_similar, prop_look
-from physion.scenes.sampling.build import FLOORS
 from physion.scenes.scene import (
+    FLOORS,
     Body,
     Camera,
     Cloth,
