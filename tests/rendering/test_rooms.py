@@ -29,10 +29,10 @@ RED = replace(empty, panels=tuple(replace(p, color=(1.0, 0.0, 0.0)) for p in emp
 SHOW = """
 import numpy as np, sys
 from physion.physics.engine import simulate
-from physion.rendering.renderer import Renderer
+from physion.rendering.renderer import PASSES, Renderer
 from physion.scenes.sampling.sample import sample_scene
 scene = sample_scene("collide", 3, preset=f"{sys.argv[1]}:mine")
-frame = Renderer(scene, simulate(scene, frames=2), 32, 32).render(0)
+frame = Renderer(scene, simulate(scene, frames=2), 32, 32).render(0, PASSES)
 room = frame.color[frame.ids == 0].astype(float)
 print(scene.room, scene.floor, room[:, 0].mean() > 3 * room[:, 1].mean())
 """
