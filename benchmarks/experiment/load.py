@@ -46,7 +46,7 @@ import uvloop
 
 from light_http import Connection, request
 from physion.compute.tasks import processor
-from physion.experiment.simulated.server_process import HOST, ServerProcess
+from physion.experiment.server_process import HOST, ServerProcess
 from physion.experiment.store.database import ANSWERS, SESSIONS, open_database, sqlite_url
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import make_pass

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from physion.experiment.protocol.messages import Answer, Enter, PageDone, Phase
+from physion.experiment.protocol import Answer, Enter, PageDone, Phase
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import make_pass

@@ -16,8 +16,8 @@ from starlette.responses import Response
 
 from physion.core.errors import BadInputError
 from physion.experiment.experimenter.routes import build_router
-from physion.experiment.protocol.refused import Refused
-from physion.experiment.study.media_links import read_media
+from physion.experiment.protocol import Refused
+from physion.experiment.study.media import read_media
 from physion.experiment.study.texts import TEXTS_FOLDER, read_consent_file
 from physion.experiment.web.api import BadBodyError, build_api
 from physion.experiment.web.files import PACKAGE, MediaFiles, read_page_file, read_page_files

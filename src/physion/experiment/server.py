@@ -22,7 +22,7 @@ from physion.core.errors import BadInputError
 from physion.experiment.app import build_app
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.media_checks import check_media
+from physion.experiment.study.media import check_media
 from physion.experiment.study.recruitment import missing_settings
 from physion.experiment.study.study import load_study
 from physion.experiment.web.connections import LimitedHeadProtocol

@@ -9,8 +9,8 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from physion.experiment.simulated.server_process import ServerProcess
-from physion.experiment.study.courses.blocks import block_scenarios
+from physion.experiment.server_process import ServerProcess
+from physion.experiment.study.orders import block_scenarios
 from physion.experiment.study.study import Blocks, Recruitment
 from physion.experiment.study.texts import TEXTS_FOLDER
 from support.experiment.browser import FAST, SHORT, Visit, chromium, rows_of

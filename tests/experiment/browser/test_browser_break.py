@@ -12,7 +12,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 import sqlalchemy as sa
 
-from physion.experiment.simulated.server_process import ServerProcess
+from physion.experiment.server_process import ServerProcess
 from physion.experiment.store.database import ANSWERS, open_database, sqlite_url
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import make_pass

@@ -10,10 +10,10 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from physion.experiment.simulated.server_process import ServerProcess
-from physion.experiment.study.conditions import Condition
+from physion.experiment.server_process import ServerProcess
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import make_pass
+from physion.experiment.study.settings import Condition
 from physion.experiment.study.study import write_settings
 from physion.experiment.study.texts import TEXTS_FOLDER
 from support.experiment.browser import FAST, SHORT, Visit, chromium, rows_of

@@ -11,7 +11,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 import httpx2
 
-from physion.experiment.simulated.server_process import ServerProcess
+from physion.experiment.server_process import ServerProcess
 from physion.experiment.study.study import load_study
 from physion.experiment.study.texts import TEXTS_FOLDER
 from support.experiment.browser import SHORT, Visit, chromium

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from physion.experiment.simulated.server_process import ServerProcess
+from physion.experiment.server_process import ServerProcess
 from physion.experiment.study.texts import TEXTS_FOLDER
 from support.experiment.browser import SHORT, Visit, chromium, rows_of, served
 from support.experiment.tiny_study import make_tiny_study

@@ -10,8 +10,8 @@ import pytest
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.questions import Question
 from physion.experiment.study.recruitment import make_pass
+from physion.experiment.study.settings import Question
 from support.experiment.browser import Visit, chromium, rows_of, served
 from support.experiment.own_questions import OWN_ANSWERS, OWN_QUESTIONS, OWN_TEXTS
 

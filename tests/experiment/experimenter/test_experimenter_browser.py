@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from physion.experiment.simulated.server_process import ServerProcess
+from physion.experiment.server_process import ServerProcess
 from physion.experiment.store.database import open_database, sqlite_url
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Study

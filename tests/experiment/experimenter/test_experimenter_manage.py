@@ -12,7 +12,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 import sqlalchemy as sa
 
 from physion.experiment.export.answer_tables import read_tables
-from physion.experiment.protocol.messages import Enter
+from physion.experiment.protocol import Enter
 from physion.experiment.store.database import ANSWERS, EVENTS, PAUSES, RAW_IDS, SESSIONS
 from support.experiment.experimenter_client import Lab, Visitor, lab
 from support.experiment.store_walk import enter, give, refusal, rows, run, walk

@@ -25,7 +25,7 @@ from physion.experiment.experimenter.statistics.summaries import (
 )
 from physion.experiment.experimenter.statistics.worker import StatisticsWorker
 from physion.experiment.experimenter.templating import minutes
-from physion.experiment.protocol.stages import Stage
+from physion.experiment.protocol import Stage
 from physion.experiment.store.database import ANSWERS, SESSIONS, open_database, upgrade
 from physion.experiment.study.identity import Secrets
 from support.experiment.experimenter_rows import BROWSERS, insert_sessions

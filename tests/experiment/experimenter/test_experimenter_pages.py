@@ -27,9 +27,9 @@ from physion.analysis.people.exclusions import PREREGISTERED, RULES, flag_sessio
 from physion.analysis.people.responses import clean
 from physion.experiment.export.answer_tables import read_tables
 from physion.experiment.export.export_study import export_study
-from physion.experiment.simulated.server_process import ServerProcess
+from physion.experiment.server_process import ServerProcess
 from physion.experiment.store.database import ANSWERS, EVENTS, RAW_IDS, SESSIONS
-from physion.experiment.study.conditions import Condition
+from physion.experiment.study.settings import Condition
 from support.experiment.experimenter_client import BASE, TWO, Lab, Visitor, lab
 from support.experiment.experimenter_rows import insert_sessions
 from support.experiment.tiny_study import PASSWORD, make_tiny_study

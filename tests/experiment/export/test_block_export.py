@@ -20,8 +20,8 @@ from physion.experiment.experimenter.statistics.summaries import SummaryCache
 from physion.experiment.export.export_study import export_study
 from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.store import Store
-from physion.experiment.study.courses.blocks import block_scenarios
 from physion.experiment.study.identity import Secrets
+from physion.experiment.study.orders import block_scenarios
 from physion.experiment.study.settings import Attention
 from physion.experiment.study.study import ALL_SCENARIOS, Blocks
 from support.experiment.store_walk import enter, rows, run, walk

@@ -22,8 +22,8 @@ from physion.experiment.experimenter.statistics.summaries import SummaryCache
 from physion.experiment.export.export_study import export_study
 from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.store import Store
-from physion.experiment.study.conditions import Condition
 from physion.experiment.study.identity import Secrets
+from physion.experiment.study.settings import Condition
 from support.experiment.store_walk import enter, page, rows, walk
 from support.experiment.tiny_study import make_tiny_study
 

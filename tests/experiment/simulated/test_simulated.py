@@ -14,9 +14,8 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.cli.main import main
 from physion.core.errors import UnknownNameError
-from physion.experiment.simulated.participants import SimulationPlan, Visit, simulate
-from physion.experiment.simulated.person import SimulatedPerson
-from physion.experiment.simulated.server_process import ServerProcess
+from physion.experiment.server_process import ServerProcess
+from physion.experiment.simulated import SimulatedPerson, SimulationPlan, Visit, simulate
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.stimuli import Stimulus
 from physion.experiment.study.study import Plausibility, Study
@@ -172,7 +171,7 @@ def test_the_verb_serves_by_itself_and_prints(
 def test_without_leave_of_the_study_they_take_their_time(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from physion.experiment.simulated.participants import minutes_each
+    from physion.experiment.simulated import minutes_each
 
     real = make_tiny_study(tmp_path / "real", plausibility=Plausibility())
     # 16 trials of 1 s cross, 2 s cue, 1.5 s movie and some 0.8 s to answer, 10 s of reading,

@@ -10,8 +10,8 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from physion.experiment.simulated.participants import SimulationPlan, simulate
-from physion.experiment.simulated.server_process import ServerProcess
+from physion.experiment.server_process import ServerProcess
+from physion.experiment.simulated import SimulationPlan, simulate
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Attention, Practice
 from support.experiment.experimenter_client import BASE

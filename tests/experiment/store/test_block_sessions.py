@@ -11,13 +11,12 @@ from alembic import command
 from sqlalchemy import text
 
 from physion.core.errors import BadInputError
-from physion.experiment.protocol.messages import Jump, PageDone
+from physion.experiment.protocol import Jump, PageDone
 from physion.experiment.store.database import SESSIONS, _load_migrations, open_database
 from physion.experiment.store.store import Store
-from physion.experiment.study.courses.blocks import block_scenarios, order_number
 from physion.experiment.study.identity import Secrets, hash_token
-from physion.experiment.study.media_links import read_media_path
-from physion.experiment.study.orders import trial_order
+from physion.experiment.study.media import read_media_path
+from physion.experiment.study.orders import block_scenarios, order_number, trial_order
 from physion.experiment.study.recruitment import links, make_pass
 from physion.experiment.study.study import ALL_SCENARIOS, Blocks, Study, load_study, write_settings
 from support.experiment.store_walk import (

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from physion.experiment.export.export_study import export_study
-from physion.experiment.protocol.messages import Completion, Jump, PageDone
+from physion.experiment.protocol import Completion, Jump, PageDone
 from physion.experiment.store.answering import ATTEMPT
 from physion.experiment.store.database import EVENTS, SESSIONS
 from physion.experiment.store.store import Store

@@ -13,16 +13,15 @@ from sqlalchemy import update
 
 from physion.cli.main import main
 from physion.core.errors import BadInputError
-from physion.experiment.protocol.messages import Enter
+from physion.experiment.protocol import Enter
 from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.lab import set_voided
 from physion.experiment.store.store import Store
-from physion.experiment.study.conditions import Condition
-from physion.experiment.study.courses.variants import under
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.media_links import read_media_path
+from physion.experiment.study.media import read_media_path
 from physion.experiment.study.recruitment import links, make_pass
-from physion.experiment.study.study import Blocks, Study, Timing, load_study, write_settings
+from physion.experiment.study.settings import Condition
+from physion.experiment.study.study import Blocks, Study, Timing, load_study, under, write_settings
 from physion.experiment.study.texts import TEXTS_FOLDER
 from support.experiment.store_walk import enter, give, page, refusal, request, rows, run, walk
 from support.experiment.tiny_study import make_tiny_study

@@ -22,7 +22,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 import sqlalchemy as sa
 from sqlalchemy.engine import make_url
 
-from physion.experiment.simulated.participants import SimulationPlan, Visit, simulate
+from physion.experiment.simulated import SimulationPlan, Visit, simulate
 from physion.experiment.store.database import open_database, sqlite_url
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Limits, Study

@@ -11,7 +11,7 @@ import pytest
 
 from physion.cli.main import main
 from physion.core.errors import BadInputError, PhysionError
-from physion.experiment.protocol.messages import Device, Enter, Event, Events
+from physion.experiment.protocol import Device, Enter, Event, Events
 from physion.experiment.store.database import ANSWERS, EVENTS, RAW_IDS, SESSIONS, TOKENS
 from physion.experiment.store.lab import forget, forget_raw_ids, forget_sessions
 from physion.experiment.store.store import Store

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from physion.experiment.protocol.messages import Jump
+from physion.experiment.protocol import Jump
 from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.sessions import stages_of
 from physion.experiment.store.store import Store

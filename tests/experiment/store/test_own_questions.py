@@ -14,12 +14,12 @@ from sqlalchemy import inspect
 from physion.core.errors import BadInputError
 from physion.experiment.export.export_study import export_study
 from physion.experiment.export.spreadsheet import restore_cell
-from physion.experiment.protocol.messages import PageDone
+from physion.experiment.protocol import PageDone
 from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.lab import forget_sessions
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.questions import Question
+from physion.experiment.study.settings import Question
 from physion.experiment.study.study import Study, load_study, write_settings
 from physion.experiment.study.texts import shipped_file
 from support.experiment.own_questions import OWN_ANSWERS, OWN_QUESTIONS, OWN_TEXTS

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from physion.experiment.protocol.messages import Showing, TrialMedia
+from physion.experiment.protocol import Showing, TrialMedia
 from physion.experiment.store.database import SESSIONS, SHOWINGS
 from physion.experiment.store.judging import TOLERANCE_S
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.media_links import read_media
+from physion.experiment.study.media import read_media
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Plausibility, Recruitment, Study
 from support.experiment.store_walk import (

@@ -12,7 +12,7 @@ import pytest
 
 from physion.analysis.people.responses import read_responses
 from physion.experiment.export.export_study import export_study
-from physion.experiment.protocol.messages import Completion, Jump, SessionState
+from physion.experiment.protocol import Completion, Jump, SessionState
 from physion.experiment.store.database import ANSWERS, PRACTICE_REPEATS, SESSIONS, SHOWINGS
 from physion.experiment.store.lab import forget_sessions
 from physion.experiment.store.store import Store

@@ -16,11 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sqlalchemy import delete
 
-from physion.experiment.protocol.messages import Answer, PageDone
+from physion.experiment.protocol import Answer, PageDone
 from physion.experiment.store.database import ANSWERS, METADATA, SESSIONS, STUDIES
 from physion.experiment.store.store import Refused, Store
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.media_links import read_media_path
+from physion.experiment.study.media import read_media_path
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.study import Study
 from support.experiment.store_walk import (

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from physion.experiment.protocol.messages import Completion, Device, Enter, SessionEnd
+from physion.experiment.protocol import Completion, Device, Enter, SessionEnd
 from physion.experiment.store.database import EVENTS, RAW_IDS, SESSIONS
 from physion.experiment.store.lab import forget_sessions
 from physion.experiment.store.store import Refused, Store

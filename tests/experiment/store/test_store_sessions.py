@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from sqlalchemy import update
 
 from physion.core.errors import BadInputError, PhysionError
-from physion.experiment.protocol.messages import REFUSALS, Device, Enter, Event, Events, PageDone
+from physion.experiment.protocol import REFUSALS, Device, Enter, Event, Events, PageDone
 from physion.experiment.store.database import (
     EVENTS,
     PARTICIPANTS,
@@ -526,7 +526,7 @@ def test_trials_come_after_the_consent_in_the_sessions_order(store: Store) -> No
         assert word not in listed.model_dump_json().lower()
     walk(store, token, "demographics")
     given = [row.stimulus for row in rows(store) if row.phase == "test"]
-    from physion.experiment.study.media_links import read_media_path
+    from physion.experiment.study.media import read_media_path
 
     files = {
         str(read_media_path(store.study, store.secrets, each.movie)): trial

@@ -16,7 +16,7 @@ import pytest
 from sqlalchemy import Connection, Engine, create_engine, event, text
 from sqlalchemy.engine import make_url
 
-from physion.experiment.protocol.messages import Enter, PageDone
+from physion.experiment.protocol import Enter, PageDone
 from physion.experiment.store.database import EVENTS, Writer, connect_writer, open_database
 from physion.experiment.store.store import Refused, Store
 from physion.experiment.study.identity import Secrets

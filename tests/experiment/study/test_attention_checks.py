@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from physion.core.errors import BadInputError
-from physion.experiment.study.courses.attention import instructed_response
-from physion.experiment.study.orders import session_trials, trial_order
+from physion.experiment.study.orders import instructed_response, session_trials, trial_order
 from physion.experiment.study.stimuli import ATTENTION, STIMULI_FILE
 from physion.experiment.study.study import Attention, Blocks, Study, load_study, write_settings
 from support.experiment.tiny_study import make_tiny_study

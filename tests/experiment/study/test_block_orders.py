@@ -10,20 +10,15 @@ from pathlib import Path
 import pytest
 
 from physion.core.errors import BadInputError
-from physion.experiment.study.courses.blocks import (
+from physion.experiment.study.orders import (
     block_orders,
     block_scenarios,
     seed_with_order,
+    session_trials,
+    trial_order,
 )
-from physion.experiment.study.orders import session_trials, trial_order
 from physion.experiment.study.stimuli import STIMULI_FILE, write_stimuli
-from physion.experiment.study.study import (
-    ALL_SCENARIOS,
-    Blocks,
-    Study,
-    load_study,
-    write_settings,
-)
+from physion.experiment.study.study import ALL_SCENARIOS, Blocks, Study, load_study, write_settings
 from support.experiment.tiny_study import make_tiny_study
 
 THREE = ("collide", "drop", "roll")

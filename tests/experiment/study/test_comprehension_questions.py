@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from physion.core.errors import BadInputError
-from physion.experiment.study.comprehension import check_attempt
+from physion.experiment.study.settings import check_attempt
 from physion.experiment.study.study import format_settings, load_study, parse_settings
 from support.experiment.own_questions import COMPREHENSION, COMPREHENSION_TEXTS, RIGHT, WRONG
 from support.experiment.tiny_study import make_tiny_study

@@ -14,7 +14,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.cli.experiment.experiment import SUBVERBS
 from physion.experiment.store.database import METADATA
-from physion.experiment.study.study_checks import KEYS
+from physion.experiment.study.settings import KEYS
 
 PAGE = (Path(__file__).parents[3] / "docs" / "experiment.md").read_text()
 

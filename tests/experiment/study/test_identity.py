@@ -27,7 +27,7 @@ from physion.experiment.study.identity import (
     set_password,
     sign,
 )
-from physion.experiment.study.media_links import read_media_path, sign_media
+from physion.experiment.study.media import read_media_path, sign_media
 from physion.experiment.study.orders import (
     draw_buttons,
     fixations,

@@ -10,7 +10,7 @@ import pytest
 
 from physion.cli.main import main
 from physion.core.errors import BadInputError
-from physion.experiment.study.media_checks import check_media
+from physion.experiment.study.media import check_media
 from physion.experiment.study.study import Study, load_study
 from physion.trials.video import encode_movie
 from support.experiment.tiny_study import FULL, OBSERVED, draw, draw_map, make_tiny_study

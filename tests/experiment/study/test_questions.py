@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from physion.core.errors import BadInputError
-from physion.experiment.study.questions import Question, check_answers, columns_of
+from physion.experiment.study.settings import Question, check_answers, columns_of
 from physion.experiment.study.study import format_settings, load_study, parse_settings
 from support.experiment.own_questions import OWN_ANSWERS, OWN_QUESTIONS, OWN_TEXTS
 from support.experiment.tiny_study import make_tiny_study

@@ -12,12 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from physion.core.errors import BadInputError
-from physion.experiment.study.stimuli import (
-    COLUMNS,
-    Stimulus,
-    read_stimuli,
-    write_stimuli,
-)
+from physion.experiment.study.stimuli import COLUMNS, Stimulus, read_stimuli, write_stimuli
 
 NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,30}", fullmatch=True)
 FILES = st.from_regex(r"media/[A-Za-z0-9][A-Za-z0-9_-]{0,20}", fullmatch=True)

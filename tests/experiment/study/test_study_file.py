@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from physion.core.errors import BadInputError
+from physion.experiment.study.settings import KEYS, TABLES
 from physion.experiment.study.study import (
     Attention,
     Bonus,
@@ -30,7 +31,6 @@ from physion.experiment.study.study import (
     parse_settings,
     write_settings,
 )
-from physion.experiment.study.study_checks import KEYS, TABLES
 from support.experiment.own_questions import COMPREHENSION, OWN_QUESTIONS
 from support.experiment.tiny_study import make_tiny_study
 

@@ -12,8 +12,8 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 import sqlalchemy as sa
 from sqlalchemy.exc import OperationalError
 
-from physion.experiment.protocol import messages as wire
-from physion.experiment.protocol.public_study import PublicStudy
+from physion.experiment import protocol as wire
+from physion.experiment.protocol import PublicStudy
 from physion.experiment.store.database import ANSWERS, RAW_IDS, SESSIONS
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Recruitment

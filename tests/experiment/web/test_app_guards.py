@@ -22,7 +22,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.testclient import TestClient
 
-from physion.experiment.protocol.messages import MAX_BODY
+from physion.experiment.protocol import MAX_BODY
 from physion.experiment.study.study import Limits, Study
 from physion.experiment.web import connections, guards
 from physion.experiment.web.guards import Guards, content_policy

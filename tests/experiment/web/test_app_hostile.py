@@ -18,10 +18,10 @@ import sqlalchemy as sa
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from physion.experiment.protocol import messages as wire
+from physion.experiment import protocol as wire
 from physion.experiment.store.database import ANSWERS, EVENTS, RAW_IDS, SESSIONS
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.media_links import sign_media
+from physion.experiment.study.media import sign_media
 from physion.experiment.web.api import BadBodyError, parse_message
 from support.experiment.app_walk import Person, Served, answer_body, served
 from support.experiment.live_app import exchange, running

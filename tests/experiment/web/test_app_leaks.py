@@ -18,7 +18,7 @@ from sqlalchemy import select
 
 from physion.experiment.store.database import SESSIONS
 from physion.experiment.study.identity import sign
-from physion.experiment.study.media_links import NO_TAG, sign_media
+from physion.experiment.study.media import NO_TAG, sign_media
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.stimuli import Stimulus
 from physion.experiment.web.files import MEDIA_TYPES, PACKAGE

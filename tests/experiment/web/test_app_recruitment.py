@@ -15,7 +15,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.cli.main import main
 from physion.core.errors import BadInputError
-from physion.experiment.protocol.messages import Enter
+from physion.experiment.protocol import Enter
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import (
     MTURK_HOSTS,

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 import physion.experiment
-from physion.experiment.protocol import messages, public_study
-from physion.experiment.protocol.messages import REFUSALS
+from physion.experiment import protocol
+from physion.experiment.protocol import REFUSALS
 from physion.experiment.study import texts
 
 PACKAGE = Path(physion.experiment.__file__).parent
@@ -66,7 +66,7 @@ def test_types_of_messages_are_those_of_the_server() -> None:
     interfaces = re.findall(r"export interface (\w+) \{\n(.*?)\n\}", declared, re.DOTALL)
     assert len(interfaces) > 10
     for name, body in interfaces:
-        model = getattr(messages, name, None) or getattr(public_study, name)
+        model = getattr(protocol, name)
         fields = model.model_fields
         expected = [field.alias or key for key, field in fields.items()]
         assert re.findall(r"^  (\w+)\??:", body, re.MULTILINE) == expected, name

@@ -13,8 +13,8 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 import httpx2
 
 from physion.analysis.people.exclusions import RULE_SETS
-from physion.experiment.simulated.server_process import ServerProcess
-from physion.experiment.study.study_checks import EXCLUSIONS
+from physion.experiment.server_process import ServerProcess
+from physion.experiment.study.settings import EXCLUSIONS
 from support.experiment.tiny_study import make_tiny_study
 
 SLOW_TO_IMPORT = (

@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 import pytest
 import sqlalchemy as sa
 
-from physion.experiment.simulated.server_process import ServerProcess
+from physion.experiment.server_process import ServerProcess
 from physion.experiment.store.database import ANSWERS, EVENTS, SESSIONS, open_database, sqlite_url
 from physion.experiment.study.identity import Secrets, participant_hash
 from physion.experiment.study.recruitment import make_pass

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from physion.experiment.study.comprehension import ComprehensionQuestion
-from physion.experiment.study.questions import Question
+from physion.experiment.study.settings import ComprehensionQuestion, Question
 
 OWN_QUESTIONS = (
     Question("strategy", "text"),

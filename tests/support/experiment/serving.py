@@ -11,7 +11,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from physion.experiment.simulated.server_process import ServerProcess
+from physion.experiment.server_process import ServerProcess
 from physion.experiment.store.database import ANSWERS, SESSIONS, open_database, sqlite_url
 from physion.experiment.study.study import Study
 

@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 import pytest
 from sqlalchemy import select
 
-from physion.experiment.protocol import stages
-from physion.experiment.protocol.messages import Answer, AnswerStored, Enter, PageDone, SessionState
+from physion.experiment import protocol as stages
+from physion.experiment.protocol import Answer, AnswerStored, Enter, PageDone, SessionState
 from physion.experiment.store.database import ANSWERS
 from physion.experiment.store.store import Refused, Store
 from physion.experiment.study.identity import Secrets

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from physion.core.errors import BadInputError
-from physion.experiment.study.study_checks import NO_CONTACT
+from physion.experiment.study.settings import NO_CONTACT
 
 if TYPE_CHECKING:
-    from physion.experiment.study.init.generated_trials import StimulusSelection
+    from physion.experiment.study.choose import StimulusSelection
     from physion.experiment.study.study import Study
 
 
@@ -82,7 +82,7 @@ def main(options: Options) -> int:
 
     require_extra()
     from physion.cli.output import Stages
-    from physion.experiment.study.init.study_folder import make_study
+    from physion.experiment.study.make import make_study
 
     password, chosen = _password(options.password_file), _choose(options)
     with Stages() as stages:
@@ -114,7 +114,7 @@ def _choose(options: Options) -> StimulusSelection:
 
 def _choose_made(options: Options, trials: Path, scenario: tuple[str, ...]) -> StimulusSelection:
     """Select the stimuli from a dataset."""
-    from physion.experiment.study.init.generated_trials import TEST, choose_trials
+    from physion.experiment.study.choose import TEST, choose_trials
 
     return choose_trials(
         trials,
@@ -132,8 +132,7 @@ def _choose_official(options: Options) -> StimulusSelection:
     from physion.cli.official.read import official_data, read_trials
     from physion.cli.output import Stages
     from physion.compute.local import LocalExecutor
-    from physion.experiment.study.init.generated_trials import TEST
-    from physion.experiment.study.init.official_scenes import SIZE, choose_official
+    from physion.experiment.study.choose import SIZE, TEST, choose_official
     from physion.trials.making.generate import make_trials
     from physion.trials.making.plan import GenerateSettings
 
@@ -160,8 +159,7 @@ def _choose_official(options: Options) -> StimulusSelection:
 
 def _choose_listed(options: Options) -> StimulusSelection:
     """Select the stimuli from official lists."""
-    from physion.experiment.study.init.generated_trials import choose_familiarization
-    from physion.experiment.study.init.official_lists import choose_listed
+    from physion.experiment.study.choose import choose_familiarization, choose_listed
 
     if options.movies is None:
         raise BadInputError("--stimuli needs --movies DIR, the folder with STIM_ID.mp4")

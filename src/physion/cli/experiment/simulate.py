@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 if TYPE_CHECKING:
-    from physion.experiment.simulated.participants import SimulationPlan, Visit
+    from physion.experiment.simulated import SimulationPlan, Visit
     from physion.experiment.study.study import Study
 
 
@@ -57,7 +57,7 @@ def main(options: Options) -> int:
     from physion.cli.experiment.experiment import require_extra
 
     require_extra()
-    from physion.experiment.simulated.participants import SimulationPlan, simulate
+    from physion.experiment.simulated import SimulationPlan, simulate
     from physion.experiment.study.identity import Secrets
     from physion.experiment.study.study import load_study
 
@@ -83,7 +83,7 @@ def main(options: Options) -> int:
 def _tell_duration(study: Study, options: Options) -> None:
     """Print how long a participant takes, if that is more than a minute."""
     from physion.cli.output import console
-    from physion.experiment.simulated.participants import minutes_each
+    from physion.experiment.simulated import minutes_each
 
     minutes = max(minutes_each(study, scenario) for scenario in study.offered)
     if minutes > 1 and not options.json:
@@ -130,7 +130,7 @@ def _server(options: Options) -> Iterator[str]:
     if options.url is not None:
         yield options.url.rstrip("/")
         return
-    from physion.experiment.simulated.server_process import ServerProcess
+    from physion.experiment.server_process import ServerProcess
 
     with ServerProcess(options.study, options.database) as server:
         yield server.url

@@ -17,10 +17,9 @@ from physion.experiment.experimenter.statistics.summaries import (
     SessionSummary,
     stages_shown,
 )
-from physion.experiment.protocol.stages import label
-from physion.experiment.study.courses.variants import variants
+from physion.experiment.protocol import label
 from physion.experiment.study.orders import session_trials
-from physion.experiment.study.study import Study
+from physion.experiment.study.study import Study, variants
 
 RATE_SESSIONS = 20
 """The current rate is estimated from at most this many of the last finished sessions, ..."""

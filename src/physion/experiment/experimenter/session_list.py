@@ -9,7 +9,7 @@ from urllib.parse import urlencode
 
 from physion.experiment.experimenter.statistics.flagging import Flags
 from physion.experiment.experimenter.statistics.summaries import STATES, SessionSummary
-from physion.experiment.protocol.stages import label
+from physion.experiment.protocol import label
 from physion.experiment.study.study import Study
 
 PAGE = 50

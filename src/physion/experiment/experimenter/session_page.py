@@ -13,8 +13,7 @@ from physion.experiment.experimenter.session_list import flags_shown
 from physion.experiment.experimenter.statistics.flagging import Flags
 from physion.experiment.experimenter.statistics.summaries import SessionSummary
 from physion.experiment.store.database import ANSWERS, EVENTS, SESSIONS, STUDIES
-from physion.experiment.study.courses.attention import instructed_response
-from physion.experiment.study.courses.blocks import stimuli_by_session
+from physion.experiment.study.orders import instructed_response, stimuli_by_session
 from physion.experiment.study.study import Study
 
 EVENTS_SHOWN = 500

@@ -9,10 +9,9 @@ from sqlalchemy import Connection, select
 from physion.core.names import canonical_name
 from physion.experiment.export.session_rows import SessionTable
 from physion.experiment.store.database import SESSIONS
-from physion.experiment.study.courses.variants import under
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.stimuli import Stimulus
-from physion.experiment.study.study import ALL_SCENARIOS, Study
+from physion.experiment.study.study import ALL_SCENARIOS, Study, under
 
 
 def expected_stimuli(

@@ -17,8 +17,7 @@ from physion.analysis.people.responses import TRIAL_COLUMNS, Column
 from physion.experiment.export.arrow_types import ARROW_TYPES, arrow_schema
 from physion.experiment.export.iso_times import iso_times
 from physion.experiment.store.database import ANSWERS, PRACTICE_REPEATS
-from physion.experiment.study.courses.attention import instructed_response
-from physion.experiment.study.courses.blocks import stimuli_by_session
+from physion.experiment.study.orders import instructed_response, stimuli_by_session
 from physion.experiment.study.stimuli import ATTENTION
 from physion.experiment.study.study import ALL_SCENARIOS, Study
 

@@ -16,7 +16,7 @@ from sqlalchemy import Connection, select
 from physion.analysis.people.responses import Column
 from physion.experiment.export.arrow_types import ARROW_TYPES, arrow_schema
 from physion.experiment.store.database import SESSIONS, STUDIES
-from physion.experiment.study.questions import Question, columns_of
+from physion.experiment.study.settings import Question, columns_of
 from physion.experiment.study.study import Study
 
 KEYS: tuple[Column, ...] = (

@@ -16,9 +16,8 @@ from physion.core.errors import UnknownNameError
 from physion.experiment.export.arrow_types import ARROW_TYPES, arrow_schema
 from physion.experiment.export.iso_times import iso_times
 from physion.experiment.store.database import SESSIONS, STUDIES
-from physion.experiment.study.courses.blocks import block_scenarios
-from physion.experiment.study.courses.variants import under
-from physion.experiment.study.study import Study
+from physion.experiment.study.orders import block_scenarios
+from physion.experiment.study.study import Study, under
 
 EXPORTED_KINDS = ("person", "simulated")
 """Kinds of sessions that can be exported; previews cannot."""

@@ -11,18 +11,21 @@ from typing import Any
 
 from sqlalchemy import Connection, bindparam, delete, func, insert, select, update
 
-from physion.experiment.protocol.messages import (
+from physion.experiment.protocol import (
+    ENDED,
+    PAGES,
+    STAGES,
     Answer,
     AnswerStored,
+    Course,
     Feedback,
     Jump,
     PageDone,
+    Refused,
     SessionState,
     Showing,
     Shown,
 )
-from physion.experiment.protocol.refused import Refused
-from physion.experiment.protocol.stages import ENDED, PAGES, STAGES, Course
 from physion.experiment.store.database import (
     ANSWERS,
     EVENTS,
@@ -52,11 +55,10 @@ from physion.experiment.store.sessions import (
     storable,
     with_check,
 )
-from physion.experiment.study.comprehension import check_attempt
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.media_links import MediaKind, session_tag, sign_media
+from physion.experiment.study.media import MediaKind, session_tag, sign_media
 from physion.experiment.study.orders import trial_order
-from physion.experiment.study.questions import check_answers
+from physion.experiment.study.settings import check_answers, check_attempt
 from physion.experiment.study.stimuli import ATTENTION, PHASES, Stimulus
 from physion.experiment.study.study import Study
 

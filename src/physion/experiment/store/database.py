@@ -46,7 +46,7 @@ from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
 from physion.core.errors import BadInputError, PhysionError
 from physion.core.files import folder_lock
 from physion.core.seeds import stable_hash
-from physion.experiment.protocol.refused import Refused
+from physion.experiment.protocol import Refused
 
 METADATA = MetaData(
     naming_convention={

@@ -12,8 +12,7 @@ from typing import NamedTuple
 from sqlalchemy import ColumnElement, Connection, and_, case, func, insert, or_, select
 
 from physion.core.seeds import stable_hash
-from physion.experiment.protocol.messages import Enter, Entered, Kind
-from physion.experiment.protocol.refused import Refused
+from physion.experiment.protocol import Enter, Entered, Kind, Refused
 from physion.experiment.store.database import EVENTS, PARTICIPANTS, RAW_IDS, SESSIONS, TOKENS
 from physion.experiment.store.lab import is_paused
 from physion.experiment.store.sessions import (
@@ -31,8 +30,6 @@ from physion.experiment.store.sessions import (
     storable,
     storable_values,
 )
-from physion.experiment.study.courses.blocks import block_orders
-from physion.experiment.study.courses.variants import under, variants
 from physion.experiment.study.identity import (
     Secrets,
     hash_token,
@@ -41,14 +38,19 @@ from physion.experiment.study.identity import (
     new_token,
     participant_hash,
 )
-from physion.experiment.study.orders import draw_buttons, individual_order_seed, prepared_order_seed
+from physion.experiment.study.orders import (
+    block_orders,
+    draw_buttons,
+    individual_order_seed,
+    prepared_order_seed,
+)
 from physion.experiment.study.recruitment import (
     ending_completion,
     is_id_allowed,
     is_unfilled,
     read_pass,
 )
-from physion.experiment.study.study import ALL_SCENARIOS, Study
+from physion.experiment.study.study import ALL_SCENARIOS, Study, under, variants
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,10 @@ from typing import Any
 
 from sqlalchemy import Connection, bindparam, delete, func, insert, literal, or_, select
 
-from physion.experiment.protocol.messages import Answer
-from physion.experiment.protocol.stages import Course
+from physion.experiment.protocol import Answer, Course
 from physion.experiment.store.database import ANSWERS, PRACTICE_REPEATS, SESSIONS, SHOWINGS, STUDIES
 from physion.experiment.store.sessions import Session, block_of, change_session, with_check
-from physion.experiment.study.courses.blocks import stimuli_by_session
-from physion.experiment.study.orders import fixation, trial_order
+from physion.experiment.study.orders import fixation, stimuli_by_session, trial_order
 from physion.experiment.study.stimuli import PHASES, Stimulus
 from physion.experiment.study.study import Study
 

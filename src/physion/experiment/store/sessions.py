@@ -10,14 +10,22 @@ from typing import Any, cast
 from sqlalchemy import Connection, Table, bindparam, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 
-from physion.experiment.protocol.messages import BlockTrials, SessionSettings, SessionState
-from physion.experiment.protocol.refused import Refused
-from physion.experiment.protocol.stages import ENDED, PAGES, STAGES, Block, Course, Stage
+from physion.experiment.protocol import (
+    ENDED,
+    PAGES,
+    STAGES,
+    Block,
+    BlockTrials,
+    Course,
+    Refused,
+    SessionSettings,
+    SessionState,
+    Stage,
+)
 from physion.experiment.store.database import SESSIONS, TOKENS
-from physion.experiment.study.courses.variants import under
 from physion.experiment.study.orders import session_trials
 from physion.experiment.study.stimuli import PHASES
-from physion.experiment.study.study import Study
+from physion.experiment.study.study import Study, under
 
 ACTIVE_WITHIN = 15 * 60.0
 """A session counts as active for this many seconds after its last request."""

@@ -14,7 +14,8 @@ from sqlalchemy import ColumnElement, Connection, Engine, func, insert, select, 
 from sqlalchemy.exc import OperationalError
 
 from physion.core.errors import BadInputError
-from physion.experiment.protocol.messages import (
+from physion.experiment.protocol import (
+    ENDED,
     Answer,
     AnswerStored,
     Completion,
@@ -23,6 +24,8 @@ from physion.experiment.protocol.messages import (
     Events,
     Jump,
     PageDone,
+    Phase,
+    Refused,
     Result,
     SessionEnd,
     SessionState,
@@ -32,8 +35,6 @@ from physion.experiment.protocol.messages import (
     TrialList,
     TrialMedia,
 )
-from physion.experiment.protocol.refused import Refused
-from physion.experiment.protocol.stages import ENDED, Phase
 from physion.experiment.store.answering import (
     FetchedMedia,
     check_page,
@@ -69,15 +70,13 @@ from physion.experiment.store.sessions import (
     state_of,
     storable_values,
 )
-from physion.experiment.study.courses.attention import instructed_response
-from physion.experiment.study.courses.variants import under
 from physion.experiment.study.identity import Secrets, hash_token
-from physion.experiment.study.media_links import MediaKind, session_tag, sign_media
-from physion.experiment.study.orders import fixations, trial_order
-from physion.experiment.study.questions import Question, columns_of
+from physion.experiment.study.media import MediaKind, session_tag, sign_media
+from physion.experiment.study.orders import fixations, instructed_response, trial_order
 from physion.experiment.study.recruitment import completion, ending_completion
+from physion.experiment.study.settings import Question, columns_of
 from physion.experiment.study.stimuli import ATTENTION, Stimulus
-from physion.experiment.study.study import STUDY_FILE, Study
+from physion.experiment.study.study import STUDY_FILE, Study, under
 
 # Registration of each served version of the study folder in the database.
 

@@ -15,12 +15,10 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl, quote, unquote, urlencode, urlsplit, urlunsplit
 
 from physion.core.errors import BadInputError
-from physion.experiment.protocol.messages import Completion, Enter, Source
-from physion.experiment.protocol.public_study import Recruiter
-from physion.experiment.study.courses.variants import under
+from physion.experiment.protocol import Completion, Enter, Recruiter, Source
 from physion.experiment.study.identity import REFERENCE_LETTERS, check_signature, sign
-from physion.experiment.study.settings import ALL_SCENARIOS
-from physion.experiment.study.study_checks import NO_CONTACT
+from physion.experiment.study.settings import ALL_SCENARIOS, NO_CONTACT
+from physion.experiment.study.study import under
 
 if TYPE_CHECKING:
     from physion.experiment.study.identity import Secrets

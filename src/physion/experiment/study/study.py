@@ -19,40 +19,48 @@ import os
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from physion.core.errors import BadInputError
 from physion.core.files import check_plain, read_ids, read_plain, write_atomic
 from physion.core.names import canonical_name
-from physion.experiment.study import comprehension, conditions, questions
-from physion.experiment.study.comprehension import ComprehensionQuestion, parse_comprehension
-from physion.experiment.study.conditions import Condition, parse_conditions
-from physion.experiment.study.questions import Question, parse_questions
 from physion.experiment.study.settings import (
+    ABOUT,
     ALL_SCENARIOS,
+    COMPREHENSION_ABOUT,
+    COMPREHENSION_KEYS,
+    CONDITIONS_ABOUT,
+    CONDITIONS_KEYS,
     EARLY_ENDS,
+    QUESTIONS_KEYS,
     Attention,
     Blocks,
     Bonus,
     Comprehension,
+    ComprehensionQuestion,
+    Condition,
     EarlyEnd,
     Limits,
     Plausibility,
     Practice,
+    Question,
     Recruitment,
     Screen,
     Timing,
+    check_list,
+    check_tables,
+    condition_text_keys,
+    format_list,
+    format_tables,
+    parse_comprehension,
+    parse_conditions,
+    parse_questions,
+    parse_toml,
 )
 from physion.experiment.study.stimuli import MAX_BYTES as MAX_STIMULI_BYTES
 from physion.experiment.study.stimuli import PHASES, STIMULI_FILE, Stimulus, parse_stimuli
-from physion.experiment.study.study_file import (
-    check_list,
-    check_tables,
-    format_list,
-    format_tables,
-    parse_toml,
-)
 from physion.experiment.study.texts import TEXTS_FOLDER, read_consent_file, read_texts
 
 __all__ = [
@@ -275,10 +283,10 @@ def parse_settings(table: Mapping[str, Any], path: Path) -> Study:
     """
     values = check_tables(table, path, ("questions", "comprehension_questions", "conditions"))
     parts = {name: part(**values[name]) for name, part in _PARTS.items()}
-    asked = parse_questions(check_list(table, path, "questions", questions.KEYS), path)
-    entries = check_list(table, path, "comprehension_questions", comprehension.KEYS)
+    asked = parse_questions(check_list(table, path, "questions", QUESTIONS_KEYS), path)
+    entries = check_list(table, path, "comprehension_questions", COMPREHENSION_KEYS)
     checked = parse_comprehension(entries, path)
-    listed = check_list(table, path, "conditions", conditions.KEYS)
+    listed = check_list(table, path, "conditions", CONDITIONS_KEYS)
     groups = parse_conditions(listed, values[""]["scenarios"], path)
     return Study(
         folder=path.parent,
@@ -298,13 +306,13 @@ def format_settings(study: Study) -> str:
     values = {name: vars(getattr(study, name)) for name in _PARTS}
     path = study.folder / STUDY_FILE
     text = format_tables({"": vars(study), **values}, path)
-    for name, kind in (
-        ("comprehension_questions", comprehension),
-        ("questions", questions),
-        ("conditions", conditions),
+    for name, keys, about in (
+        ("comprehension_questions", COMPREHENSION_KEYS, COMPREHENSION_ABOUT),
+        ("questions", QUESTIONS_KEYS, ABOUT),
+        ("conditions", CONDITIONS_KEYS, CONDITIONS_ABOUT),
     ):
         entries = [vars(entry) for entry in getattr(study, name)]
-        text += format_list(name, kind.KEYS, kind.ABOUT, entries, path)
+        text += format_list(name, keys, about, entries, path)
     return text
 
 
@@ -313,7 +321,7 @@ def own_text_keys(study: Study) -> tuple[str, ...]:
     asked: tuple[ComprehensionQuestion | Question, ...]
     asked = (*study.comprehension_questions, *study.questions)
     several = study.blocks.all_scenarios
-    of_conditions = conditions.own_text_keys(study.conditions, blocks=several)
+    of_conditions = condition_text_keys(study.conditions, blocks=several)
     return (*(key for question in asked for key in question.text_keys), *of_conditions)
 
 
@@ -385,3 +393,56 @@ def _digest(*parts: bytes) -> str:
     for part in parts:
         hashed.update(len(part).to_bytes(8, "big") + part)
     return hashed.hexdigest()
+
+
+# The settings of a study in one of its conditions.
+
+_OF_TIMING = ("cue_ms", "flash_hz", "break_every")
+
+
+class StudyKey:
+    """Cache key of a study, compared by object identity, since studies are not hashable."""
+
+    __slots__ = ("study",)
+
+    def __init__(self, study: Study) -> None:
+        self.study = study
+
+    def __hash__(self) -> int:
+        return id(self.study)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, StudyKey) and self.study is other.study
+
+
+def under(study: Study, condition: str | None) -> Study:
+    """Return a study with the settings of a condition; the study itself for None.
+
+    A preview may have a condition that the study no longer has: it keeps the study's settings.
+    """
+    return _under(StudyKey(study), condition) if condition else study
+
+
+def variants(study: Study) -> tuple[Study, ...]:
+    """Return the study under each of its conditions; the study itself if it has none."""
+    return tuple(under(study, each.name) for each in study.conditions) or (study,)
+
+
+# Cached because every request needs the settings of its session, whose object is a cache key too.
+@lru_cache(maxsize=1024)
+def _under(key: StudyKey, name: str) -> Study:
+    study = key.study
+    for condition in study.conditions:
+        if condition.name == name:
+            break
+    else:
+        return study
+    own = {k: getattr(condition, k) for k in _OF_TIMING if getattr(condition, k) is not None}
+    feedback = condition.familiarization_feedback
+    return replace(
+        study,
+        condition=name,
+        timing=replace(study.timing, **own),
+        scenarios=condition.scenarios or study.scenarios,
+        familiarization_feedback=study.familiarization_feedback if feedback is None else feedback,
+    )

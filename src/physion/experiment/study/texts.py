@@ -24,7 +24,7 @@ from typing import Any
 
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import read_plain
-from physion.experiment.study.study_file import parse_toml
+from physion.experiment.study.settings import parse_toml
 
 TEXTS_FOLDER = "texts"
 MAX_BYTES = 1_000_000

@@ -13,19 +13,21 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from physion.core.errors import BadInputError
-from physion.experiment.protocol.messages import (
+from physion.experiment.protocol import (
     Answer,
+    AskedQuestion,
+    CheckedQuestion,
     Enter,
     Events,
     Health,
     Jump,
     Message,
     PageDone,
+    PublicStudy,
     Showing,
     TrialMedia,
 )
-from physion.experiment.protocol.public_study import AskedQuestion, CheckedQuestion, PublicStudy
-from physion.experiment.study.media_links import sign_media
+from physion.experiment.study.media import sign_media
 from physion.experiment.study.recruitment import RECRUITERS, ending_completion, is_mturk_preview
 from physion.experiment.study.stimuli import PHASES
 from physion.experiment.web.guards import (
@@ -39,11 +41,11 @@ from physion.experiment.web.guards import (
 if TYPE_CHECKING:
     from physion.experiment.store.store import Store
     from physion.experiment.study.identity import Secrets
-    from physion.experiment.study.questions import Question
+    from physion.experiment.study.settings import Question
     from physion.experiment.study.study import Study
 
 
-# Parse untrusted request bodies into messages of `physion.experiment.protocol.messages`.
+# Parse untrusted request bodies into messages of `physion.experiment.protocol`.
 #
 # Apart from the types of the message, a body must be plain JSON: unique keys, no NaN or infinity,
 # no integer beyond 2**53, no NUL and no unpaired surrogate (databases cannot store them), and at

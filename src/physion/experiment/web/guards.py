@@ -16,13 +16,7 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from physion.experiment.protocol.messages import (
-    MAX_BODY,
-    REFUSALS,
-    Completion,
-    Refusal,
-    SessionState,
-)
+from physion.experiment.protocol import MAX_BODY, REFUSALS, Completion, Refusal, SessionState
 from physion.experiment.study.recruitment import MTURK_HOSTS
 from physion.experiment.web.rate_limits import RateLimits
 
@@ -59,7 +53,7 @@ def read_token(headers: Iterable[tuple[bytes, bytes]]) -> str:
 
 
 class Reply(Response):
-    """JSON response whose body is a message of `physion.experiment.protocol.messages`."""
+    """JSON response whose body is a message of `physion.experiment.protocol`."""
 
     media_type = "application/json"
 

@@ -20,11 +20,10 @@ import pytest
 from physion.cli.experiment.experiment import SUBVERBS
 from physion.cli.main import main
 from physion.core.errors import BadInputError, UnknownNameError
+from physion.experiment.study import make as study_folder
+from physion.experiment.study.choose import choose_familiarization, choose_trials
 from physion.experiment.study.identity import Secrets, check_password
-from physion.experiment.study.init import study_folder
-from physion.experiment.study.init.generated_trials import choose_familiarization, choose_trials
-from physion.experiment.study.init.media import StimulusSource, import_stimulus
-from physion.experiment.study.init.study_folder import JOURNAL, make_study
+from physion.experiment.study.make import JOURNAL, StimulusSource, import_stimulus, make_study
 from physion.experiment.study.study import Study, load_study
 from physion.trials.index import read_index, write_index
 from physion.trials.video import read_frames

@@ -13,7 +13,7 @@ import pytest
 from physion.cli.main import main
 from physion.core.errors import BadInputError
 from physion.core.names import OFFICIAL_SCENARIOS, canonical_name
-from physion.experiment.study.init.official_lists import choose_listed, list_scenario, read_list
+from physion.experiment.study.choose import choose_listed, list_scenario, read_list
 from physion.experiment.study.study import load_study
 from physion.trials.video import encode_movie, read_frames
 from support.experiment.tiny_dataset import make_tiny_dataset

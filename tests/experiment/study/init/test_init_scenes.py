@@ -13,12 +13,7 @@ from physion.compute.local import SerialExecutor
 from physion.core.errors import BadInputError
 from physion.core.names import canonical_name
 from physion.data import official
-from physion.experiment.study.init.official_scenes import (
-    HIDDEN,
-    OfficialSelection,
-    choose_official,
-    find_fault,
-)
+from physion.experiment.study.choose import HIDDEN, OfficialSelection, choose_official, find_fault
 from physion.experiment.study.study import load_study
 from physion.physics.replay import ReplayTask, replay_trial
 from physion.scenes.tdw.read_logs import ImportedTrial

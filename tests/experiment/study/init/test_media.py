@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from physion.core.errors import BadInputError
-from physion.experiment.study.init.media import StimulusSource, clean_map, import_stimulus
+from physion.experiment.study.make import StimulusSource, clean_map, import_stimulus
 from physion.trials.video import encode_movie, read_frames
 from support.experiment.tiny_study import FULL, OBSERVED, draw, draw_map, read_number
 

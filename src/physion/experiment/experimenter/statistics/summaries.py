@@ -9,7 +9,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, Row, select
 
-from physion.experiment.protocol.stages import OF_BLOCK, Block, Course, SessionTrials
+from physion.experiment.protocol import OF_BLOCK, Block, Course, SessionTrials
 from physion.experiment.store.database import ANSWERS, SESSIONS
 from physion.experiment.store.sessions import (
     ACTIVE_WITHIN,
@@ -19,7 +19,7 @@ from physion.experiment.store.sessions import (
     stage_of,
     stages_of,
 )
-from physion.experiment.study.courses.blocks import stimuli_by_session
+from physion.experiment.study.orders import stimuli_by_session
 from physion.experiment.study.stimuli import ATTENTION
 from physion.experiment.study.study import Study
 

@@ -34,11 +34,141 @@ A refused request is answered with a `Refusal`; codes and HTTP statuses are in `
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-from physion.experiment.protocol.stages import Phase, Stage
+from physion.core.errors import PhysionError
+
+# Stages of a session: the one list of pages and phases, from which all others are derived.
+#
+# To add a page: add its stage to `Stage` and its row to `PAGES`, in the order of a session; its
+# column to `store.tables` with a migration, and to `store.sessions.Session`; its fields to
+# `store.sent_pages.FIELDS`; its rendering to ``PAGES`` in ``static/session.js``; and its label to
+# the table ``preview`` of the texts. `store.sessions.stages_of` says which studies have it.
+
+Phase = Literal["familiarization", "test"]
+Stage = Literal[
+    "consent",
+    "instructions",
+    "comprehension",
+    "familiarization",
+    "ready",
+    "test",
+    "block",
+    "demographics",
+    "questions",
+    "feedback",
+    "done",
+    "declined",
+    "withdrawn",
+    "screened_out",
+]
+"""Stages of a session, in this order; the `ENDED` ones can follow any other but ``done``. After
+``block``, the page between blocks, the next block begins with ``familiarization`` or ``test``."""
+STAGES: tuple[Stage, ...] = get_args(Stage)
+ENDED: tuple[Stage, ...] = ("declined", "withdrawn", "screened_out")
+"""Stages of sessions that ended before they were complete: no consent, stopped, or ended by the
+study since the participant failed the comprehension check."""
+
+
+OF_BLOCK: tuple[Stage, ...] = ("familiarization", "ready", "test", "block")
+"""Stages that each block of a session has."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page that is submitted: the column of SESSIONS with the time of it, and a label."""
+
+    column: str
+    label: str
+
+
+PAGES: Mapping[Stage, Page] = {
+    "consent": Page("consented_at", "Consent"),
+    "instructions": Page("instructed_at", "Instructions"),
+    "comprehension": Page("comprehended_at", "Comprehension check"),
+    "ready": Page("ready_at", "Start page"),
+    "block": Page("block_at", "Page between blocks"),
+    "demographics": Page("demographics_at", "Demographics"),
+    "questions": Page("questions_at", "Own questions"),
+    "feedback": Page("finished_at", "Feedback"),
+}
+"""The pages by stage; the last one finishes the session."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block of a session.
+
+    Attributes
+    ----------
+    scenario
+        The scenario of its trials.
+    familiarization, test
+        Indices of its trials in each phase, counted over the whole session.
+    """
+
+    scenario: str
+    familiarization: range
+    test: range
+
+    def of(self, phase: str) -> range:
+        """Return the indices of the trials of a phase."""
+        return self.test if phase == "test" else self.familiarization
+
+
+@dataclass(frozen=True)
+class SessionTrials(Mapping[str, int]):
+    """Numbers of trials of a session by phase, and its blocks."""
+
+    blocks: tuple[Block, ...]
+
+    def __getitem__(self, phase: str) -> int:
+        if phase not in get_args(Phase):
+            raise KeyError(phase)
+        return self.blocks[-1].of(phase).stop
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(get_args(Phase))
+
+    def __len__(self) -> int:
+        return len(get_args(Phase))
+
+
+@dataclass(frozen=True)
+class Course:
+    """What a session consists of.
+
+    Attributes
+    ----------
+    stages
+        Its pages and phases in order, ``done`` last.
+    trials
+        Number of trials in each phase, and blocks.
+    settings
+        Settings of the study that may differ between sessions: the fields of
+        `SessionSettings`.
+    """
+
+    stages: tuple[Stage, ...]
+    trials: SessionTrials
+    settings: Mapping[str, float] = field(default_factory=dict)
+
+
+def label(stage: str) -> str:
+    """Return the name of a stage on the experimenter's pages.
+
+    The stage may be followed by the number of a block: ``test 2``.
+    """
+    name, _, number = stage.partition(" ")
+    known: dict[str, str] = {page: about.label for page, about in PAGES.items()}
+    known["done"] = "Finished"
+    words = known.get(name, name.capitalize())
+    return f"{words}, block {number}" if number else words
+
 
 Kind = Literal["person", "simulated", "preview"]
 Source = Literal["link", "prolific", "sona", "mturk"]
@@ -386,3 +516,113 @@ class Refusal(Message):
     message: str
     state: SessionState | None = None
     completion: Completion | None = None
+
+
+# What anyone who opens the page may know of a study, sent before a session begins.
+
+
+class Recruiter(Message):
+    """Names of the URL parameters by which one recruiter identifies participants.
+
+    A URL belongs to the first recruiter whose ``id`` parameter or one of whose ``preview``
+    parameters it has, else it is a plain link. Parameters named in ``others`` go into
+    ``Enter.recruiter`` if present. ``preview``: a URL with one of these values only shows
+    information, and no session may begin (MTurk). Any URL may have ``scenario``, ``language`` and
+    ``pass``, which are copied into `Enter`.
+    """
+
+    source: Source
+    id: str
+    others: list[str]
+    preview: dict[str, str] = Field(default_factory=dict)
+
+
+class AskedQuestion(Message):
+    """A question of the lab; its text has the key ``question.NAME.text``."""
+
+    name: str
+    kind: Literal["text", "choice", "choices", "scale"]
+    required: bool
+    options: list[str]
+    steps: int
+
+
+class CheckedQuestion(Message):
+    """A question of the comprehension check, without its right answer; its text has the key
+    ``comprehension_question.NAME.text``."""
+
+    name: str
+    options: list[str]
+
+
+class PublicStudy(Message):
+    """Settings of the study that anyone who opens the page may see."""
+
+    title: str
+    contact: str
+    languages: list[str]
+    consent_version: str
+    consent_files: list[str]
+    """Languages in which the consent form can be read as a file, ``/consent/LANGUAGE.pdf``."""
+    scenarios: list[str]
+    id_needed: bool
+    min_width: int
+    min_height: int
+    fullscreen: bool
+    cue_ms: int
+    flash_hz: float
+    break_every: int
+    """Number of test trials between two breaks; 0: no breaks."""
+    familiarization_feedback: bool
+    preload: int
+    """Number of trials whose media are loaded ahead."""
+    interrupted: Literal["repeat", "void"]  # see `Plausibility`
+    comprehension_questions: list[CheckedQuestion]
+    comprehension_limit: int
+    """How often the comprehension check can be answered."""
+    practice_min_correct: int
+    """Right answers needed in the practice; 0: no criterion."""
+    questions: list[AskedQuestion]
+    """The lab's own questions at the end."""
+    example: dict[str, TrialMedia]
+    """Media of the animated example in the instructions, by scenario."""
+    recruiters: list[Recruiter]
+    """In the order in which they are matched against the URL."""
+    device_refused: dict[Source, Completion]
+    """Completion of participants whose device or browser cannot show the movies."""
+
+
+# Exception by which the store refuses a participant's request.
+
+
+class Refused(PhysionError):
+    """Refusal of a request, which then has changed nothing.
+
+    Parameters
+    ----------
+    code
+        A key of `REFUSALS`.
+    message
+        A sentence for people.
+    state
+        Current state of the session, for the codes after which a client can continue.
+    completion
+        How the refused participant reports back to the recruiter, if the study says it.
+    wait_s
+        Seconds after which the same request will be accepted, for ``too_early``.
+    """
+
+    def __init__(
+        self,
+        code: str,
+        message: str,
+        state: SessionState | None = None,
+        completion: Completion | None = None,
+        *,
+        wait_s: float = 0.0,
+    ) -> None:
+        assert code in REFUSALS
+        super().__init__(message)
+        self.wait_s = wait_s
+        self.code, self.message, self.state = code, message, state
+        self.completion = completion

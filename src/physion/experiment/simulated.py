@@ -1,35 +1,225 @@
-"""Simulated participants who complete a served study over HTTP, as a browser would.
+"""Simple response model of a simulated participant: accuracy, response bias and response time.
 
-They enter with the signed key of the pilot link, which marks their sessions as simulated for good.
-Each uses a `SimulatedBrowser` to load the pages' data and media, answer every trial (with a key
-that stays the same over retries) and submit the pages. The answers come from `SimulatedPerson`,
-which reads the outcomes from the study folder, never from the server. They announce each trial and
-wait for cross, cue, movie, response time and feedback as a browser does; a study may let their time
-pass faster (``plausibility.simulated_speed``). The reported times are the nominal ones.
+An answer is correct with probability logistic(``ability`` + ``easiness`` of the stimulus), as in
+the Rasch model; ``bias`` towards "yes" is added on the same scale. Response times are log-normal
+and longer for hard stimuli. The model does not look at movies: it is given the outcome of each
+stimulus. All draws follow from the seed, the person's number and the stimulus, so a participant who
+comes back gives the same answer again.
 """
 
 from __future__ import annotations
 
 import asyncio
+import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import httpx2
+import numpy as np
 
 from physion.core.errors import PhysionError, UnknownNameError
-from physion.experiment.protocol import messages as wire
-from physion.experiment.protocol.public_study import PublicStudy
-from physion.experiment.protocol.stages import ENDED, Phase
-from physion.experiment.simulated.browser import RefusedError, SimulatedBrowser, state_after
-from physion.experiment.simulated.person import TYPICAL_RT_MS, SimulatedPerson
+from physion.core.seeds import generator
+from physion.experiment import protocol as wire
+from physion.experiment.protocol import ENDED, Phase, PublicStudy
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.media_links import read_media_path
+from physion.experiment.study.media import read_media_path
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.recruitment import make_pass
+from physion.experiment.study.settings import Answer, Question
 from physion.experiment.study.stimuli import ATTENTION, PHASES, STIMULUS_PHASES, Stimulus
 from physion.experiment.study.study import ALL_SCENARIOS, Study
+
+ABILITY = (1.2, 0.35)
+"""Mean and standard deviation over people, in log odds of a correct answer."""
+EASINESS_SD = 1.3
+"""Standard deviation over stimuli, in log odds; the same for all people and simulations."""
+BIAS_SD = 0.2
+"""Standard deviation over people of the bias towards yes, in log odds."""
+LOG_RT = 6.6
+"""Mean logarithm of the response time in milliseconds when a correct answer is certain."""
+LOG_RT_HARD = 0.4
+"""Added to the mean logarithm, times the probability of a wrong answer."""
+TYPICAL_RT_MS = 800.0
+"""Typical response time in milliseconds, for estimates of durations."""
+LOG_RT_SD = (0.2, 0.35)
+"""Standard deviations over people, and over the trials of one person."""
+GENDERS = ("female", "male", "")
+EDUCATIONS = ("secondary", "bachelor", "")
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A simulated answer. ``rt_ms`` counts from the moment the buttons are enabled."""
+
+    response: Literal["yes", "no"]
+    rt_ms: float
+
+
+@dataclass(frozen=True)
+class SimulatedPerson:
+    """Person ``number`` of the simulation with this ``seed``."""
+
+    seed: int
+    number: int
+
+    def _rng(self, *names: str | int) -> np.random.Generator:
+        """Return the generator of one named draw of this person."""
+        return generator("simulated", self.seed, self.number, *names)
+
+    def probability_correct(self, stimulus: Stimulus) -> float:
+        """Return the probability of a correct answer, without response bias."""
+        ability = self._rng("ability").normal(*ABILITY)
+        easiness = generator("easiness", stimulus.stimulus).normal(0, EASINESS_SD)
+        return float(_logistic(ability + easiness))
+
+    def predict(self, stimulus: Stimulus) -> Prediction:
+        """Return the answer to a stimulus; the same one on every call."""
+        correct = self.probability_correct(stimulus)
+        log_odds = np.log(correct / (1 - correct)) * (1 if stimulus.label else -1)
+        rng = self._rng("answer", stimulus.phase, stimulus.stimulus)
+        bias = self._rng("lean").normal(0, BIAS_SD)
+        yes = rng.random() < _logistic(log_odds + bias)
+        slowness = self._rng("slow").normal(0, LOG_RT_SD[0])
+        log_rt = LOG_RT + LOG_RT_HARD * (1 - correct) + slowness + rng.normal(0, LOG_RT_SD[1])
+        return Prediction("yes" if yes else "no", round(float(np.exp(log_rt)), 1))
+
+    def dropout_trial(self, trials: int, dropouts: float) -> int | None:
+        """Return the test trial before which the person leaves for good, or None if never."""
+        rng = self._rng("leaves")
+        leaves = rng.random() < dropouts
+        return int(rng.integers(trials)) if leaves and trials else None
+
+    def demographics(self) -> dict[str, bool | int | float | str | None]:
+        """Return the fields of the demographics page."""
+        rng = self._rng("demographics")
+        return {
+            "age": int(rng.integers(18, 70)),
+            "gender": GENDERS[rng.integers(len(GENDERS))],
+            "education": EDUCATIONS[rng.integers(len(EDUCATIONS))],
+        }
+
+    def own_answers(self, questions: Sequence[Question]) -> dict[str, Answer]:
+        """Return answers to the lab's own questions, drawn at random; texts are marked."""
+        answers: dict[str, Answer] = {}
+        for question in questions:
+            rng = self._rng("question", question.name)
+            match question.kind:
+                case "text":
+                    answers[question.name] = "simulated"
+                case "scale":
+                    answers[question.name] = int(rng.integers(1, question.steps + 1))
+                case "choice":
+                    answers[question.name] = question.options[rng.integers(len(question.options))]
+                case _:
+                    chosen = [option for option in question.options if rng.random() < 0.5]
+                    answers[question.name] = chosen or [question.options[0]]
+        return answers
+
+    def feedback(self) -> dict[str, bool | int | float | str | None]:
+        """Return the fields of the feedback page, whose text is marked as simulated."""
+        difficulty = int(self._rng("difficulty").integers(1, 6))
+        return {"difficulty": difficulty, "technical_problems": False, "text": "simulated"}
+
+
+def _logistic(log_odds: float) -> float:
+    """Return the probability of log odds."""
+    return float(1 / (1 + np.exp(-log_odds)))
+
+
+# HTTP client of a simulated participant, with the same retries as the browser pages.
+
+GO_ON = ("out_of_order", "already_answered", "wrong_stage", "not_shown")
+"""Refusals that carry the session's state, with which the participant continues."""
+
+
+class RefusedError(PhysionError):
+    """Refusal by the server: a ``code`` of `wire.REFUSALS` and the session's state, if sent."""
+
+    def __init__(self, refusal: wire.Refusal) -> None:
+        super().__init__(refusal.message)
+        self.code, self.state = refusal.error, refusal.state
+
+
+class SimulatedBrowser:
+    """Client of one visitor that retries each request until the server answers.
+
+    Parameters
+    ----------
+    client
+        The shared HTTP client.
+    waits_s
+        First and longest pause between retries in seconds; the pause doubles in between.
+    patience_s
+        Seconds after which a request is given up.
+    """
+
+    def __init__(
+        self, client: httpx2.AsyncClient, waits_s: tuple[float, float], patience_s: float
+    ) -> None:
+        self._client, self._waits_s, self._patience_s = client, waits_s, patience_s
+        self.token = ""
+        self.retries = 0
+
+    async def ask(self, method: str, path: str, body: wire.Message | None = None) -> bytes:
+        """Send a request and return the body of the response.
+
+        Raises
+        ------
+        RefusedError
+            The server refused the request.
+        PhysionError
+            The server did not answer within ``patience_s``.
+        """
+        content = None if body is None else body.model_dump_json(by_alias=True, exclude_none=True)
+        headers = {"Authorization": f"Bearer {self.token}"} if self.token else {}
+        if content is not None:
+            headers["Content-Type"] = "application/json"
+        (wait, longest), until = self._waits_s, time.monotonic() + self._patience_s
+        while True:
+            trouble = "the server does not answer"
+            try:
+                answer = await self._client.request(method, path, content=content, headers=headers)
+            except httpx2.TransportError as error:
+                trouble = f"the server does not answer ({type(error).__name__})"
+            else:
+                if answer.is_success:
+                    return answer.content
+                if answer.status_code not in (425, 429) and answer.status_code < 500:
+                    raise RefusedError(_refusal(answer))
+                trouble = f"the server answers {answer.status_code}"
+            if time.monotonic() > until:
+                raise PhysionError(f"{method} {path}: {trouble} for {self._patience_s:g} s")
+            self.retries += 1
+            await asyncio.sleep(wait)
+            wait = min(2 * wait, longest)
+
+
+def _refusal(answer: httpx2.Response) -> wire.Refusal:
+    """Return the refusal in a response; a generic one if the body is not a `Refusal`."""
+    try:
+        return wire.Refusal.model_validate_json(answer.content)
+    except ValueError:
+        return wire.Refusal(error="bad_request", message=f"status {answer.status_code}")
+
+
+def state_after(refused: RefusedError) -> wire.SessionState:
+    """Return the state with which to continue after a refusal; raise the refusal if it has none."""
+    if refused.code in GO_ON and refused.state is not None:
+        return refused.state
+    raise refused
+
+
+# Simulated participants who complete a served study over HTTP, as a browser would.
+#
+# They enter with the signed key of the pilot link, which marks their sessions as simulated for
+# good. Each uses a `SimulatedBrowser` to load the pages' data and media, answer every trial (with
+# a key that stays the same over retries) and submit the pages. The answers come from
+# `SimulatedPerson`, which reads the outcomes from the study folder, never from the server. They
+# announce each trial and wait for cross, cue, movie, response time and feedback as a browser does;
+# a study may let their time pass faster (``plausibility.simulated_speed``). The reported times are
+# the nominal ones.
 
 DEVICE = wire.Device(
     user_agent="physion simulate",

@@ -1,1 +1,0 @@
-"""Protocol between browser and server: message types and refusal codes."""

@@ -1,1 +1,0 @@
-"""Simulated participants, for testing a served study before people take part."""

@@ -1,0 +1,671 @@
+"""Selection of a study's stimuli from a generated dataset.
+
+For each scenario, testing and familiarization trials are drawn, half of them with contact. The
+order of the familiarization trials is fixed here and the same for all participants.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+
+from physion.compute.tasks import Executor, Progress
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.files import read_plain
+from physion.core.names import (
+    FOLDERS,
+    OFFICIAL_SCENARIOS,
+    SCENARIOS,
+    canonical_name,
+    plain_name,
+    scenario_of,
+)
+from physion.core.seeds import generator, stable_hash
+from physion.experiment.study.make import StimulusSource
+from physion.experiment.study.stimuli import MAX_FRAMES, csv_rows, is_name
+from physion.physics.engine import simulate
+from physion.physics.labels import label_contact
+from physion.rendering.renderer import Renderer
+from physion.scenes.scene import OBSERVED_FRAMES
+from physion.scenes.tdw.read_logs import ImportedTrial
+from physion.trials.dataset import Dataset
+from physion.trials.index import TrialPaths
+from physion.trials.making.plan import TrialTask, check_names, plan_scenes
+
+Look = Literal["free", "redyellow"]
+SPLITS = {"familiarization": "familiarization", "test": "testing"}
+"""Split of the dataset from which the trials of each phase are drawn."""
+TEST, PRACTICE = 150, 10
+"""Test and familiarization trials per session, as in the official study."""
+
+
+@dataclass(frozen=True)
+class StimulusSelection:
+    """Selected stimuli; ``notes`` report where fewer were available than requested."""
+
+    sources: tuple[StimulusSource, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def scenarios(self) -> tuple[str, ...]:
+        """Scenarios of the stimuli, in the order of the paper, then any others by name."""
+        names = {source.scenario for source in self.sources}
+        return tuple(in_paper_order(names))
+
+
+def choose_trials(
+    dataset: Path,
+    *,
+    scenarios: Sequence[str] = (),
+    test: int = TEST,
+    practice: int = PRACTICE,
+    look: Look = "free",
+    seed: int = 0,
+) -> StimulusSelection:
+    """Select testing and familiarization trials of a dataset.
+
+    Parameters
+    ----------
+    dataset
+        Folder of the dataset.
+    scenarios
+        Scenarios to use; by default all that have testing trials.
+    test, practice
+        Number of test and familiarization trials per scenario; even, half of them with contact.
+    look
+        Colours of the movies.
+    seed
+        Seed of the draw. The same dataset and seed give the same selection.
+
+    Raises
+    ------
+    BadInputError
+        A scenario has no trial with (or without) contact, or trials have no movies in this look.
+    """
+    opened = Dataset(dataset)
+    tested = set(opened.index["scenario"][opened.index["split"] == SPLITS["test"]])
+    if not tested:
+        raise BadInputError(f"{dataset} has no testing trials; physion generate makes them")
+    for name in scenarios:
+        if name not in tested:
+            raise UnknownNameError(f"scenario of the testing trials of {dataset}:", name, tested)
+    counts = {"familiarization": practice, "test": test}
+    sources, notes = [], []
+    for name in scenarios or in_paper_order(tested):
+        for phase, count in counts.items():
+            rows, note = _draw(opened, name, phase, count, seed)
+            sources += [_source(opened, row, phase, i, look) for i, row in enumerate(rows)]
+            notes += [note] if note else []
+    return StimulusSelection(tuple(sources), tuple(notes))
+
+
+def choose_familiarization(
+    dataset: Path, scenario: str, *, count: int = PRACTICE, look: Look = "free", seed: int = 0
+) -> StimulusSelection:
+    """Select the familiarization trials of one scenario only, as `choose_trials` does."""
+    opened = Dataset(dataset)
+    rows, note = _draw(opened, scenario, "familiarization", count, seed)
+    sources = [_source(opened, row, "familiarization", i, look) for i, row in enumerate(rows)]
+    return StimulusSelection(tuple(sources), (note,) if note else ())
+
+
+def in_paper_order(scenarios: set[str]) -> Iterator[str]:
+    """Known scenarios in the order of the paper, then others in alphabetical order."""
+    yield from (name for name in SCENARIOS if name in scenarios)
+    yield from sorted(scenarios - set(SCENARIOS))
+
+
+def check_even(count: int, option: str) -> None:
+    """Check that ``count`` is even and positive, so that half of the trials can have contact."""
+    if count < 2 or count % 2:
+        raise BadInputError(
+            f"{option} must be even and 2 or more, half with contact and half without, not {count}"
+        )
+
+
+def _draw(
+    dataset: Dataset, scenario: str, phase: str, count: int, seed: int
+) -> tuple[list[dict[str, Any]], str]:
+    """Draw ``count`` rows of the index, half of them with contact, in random order.
+
+    Returns the rows, and a note (else an empty text) if fewer trials were available.
+    """
+    check_even(count, "--test" if phase == "test" else "--practice")
+    split = SPLITS[phase]
+    table = dataset.index
+    table = table[(table["split"] == split) & (table["scenario"] == scenario)]
+    by_label = [table[table["contact"] == contact] for contact in (True, False)]
+    half = min(count // 2, *map(len, by_label))
+    if half == 0:
+        lacking = "with" if len(by_label[0]) == 0 else "without"
+        imported = dataset.index["recorded_contact"].notna().any()
+        advice = (
+            "for official scenes give --scenes official in place of --trials"
+            if imported
+            else f"to make some: physion generate {dataset.folder} --scenario {scenario} "
+            f"--split {split} --count {count}"
+        )
+        raise BadInputError(
+            f"{dataset.folder} has no {split} trial of {scenario} {lacking} contact; {advice}"
+        )
+    # Separate random streams for trials with and without contact: adding trials with one label
+    # does not change which trials with the other label are drawn.
+    chosen = pd.concat([_sample(group, half, scenario, phase, seed) for group in by_label])
+    rng = generator("study places", seed, scenario, phase)
+    rows = chosen.iloc[rng.permutation(len(chosen))].to_dict("records")
+    note = ""
+    if 2 * half < count:
+        note = (
+            f"{scenario}: {2 * half} {split} trials instead of {count}, since half must have "
+            "contact and no more are available"
+        )
+    return rows, note
+
+
+def _sample(group: pd.DataFrame, half: int, scenario: str, phase: str, seed: int) -> pd.DataFrame:
+    """Draw ``half`` rows of a table whose rows all have the same contact label."""
+    contact = str(bool(group["contact"].iloc[0]))
+    rng = generator("study trials", seed, scenario, phase, contact)
+    return group.iloc[rng.permutation(len(group))[:half]]
+
+
+def _source(
+    dataset: Dataset, row: dict[str, Any], phase: str, place: int, look: Look
+) -> StimulusSource:
+    """Return the source files of one row of the index, with movies in the given look."""
+    paths = TrialPaths(dataset.folder, row["split"], row["scenario"], row["trial"])
+    free = row["look"] != look
+    columns = {"movie": "movie", "observed": "observed_movie", "map": "map"}
+    files = {"movie": paths.movie, "observed": paths.observed_movie, "map": paths.map}
+    if free:
+        if look != "free" or pd.isna(row["free_movie"]):
+            raise BadInputError(
+                f"trial {row['trial']} of {dataset.folder} has no movie in the look {look!r}, only "
+                f"{row['look']!r}; choose --look {row['look']}, or generate with --look {look}"
+            )
+        columns |= {"movie": "free_movie", "observed": "free_observed_movie"}
+        files |= {"movie": paths.free_movie, "observed": paths.free_observed_movie}
+    digests = {name: row[f"{column}_sha256"] for name, column in columns.items()}
+    lacking = [name for name, digest in digests.items() if pd.isna(digest)]
+    if lacking:
+        raise BadInputError(
+            f"trial {row['trial']} of {dataset.folder} has no {lacking[0]} file; generate trials "
+            "with movies"
+        )
+    return StimulusSource(
+        stimulus=str(row["trial"]),
+        scenario=str(row["scenario"]),
+        phase=phase,
+        place=place,
+        label=bool(row["contact"]),
+        look=look,
+        movie=files["movie"],
+        observed=files["observed"],
+        map=files["map"],
+        frames=int(row["observed_frames"]),
+        digests=digests,
+    )
+
+
+# Selection of a study's stimuli from stimulus lists in the official format, with their movies.
+#
+# A list is a JSON file as published by the official study (one object per column, keyed by row) or
+# a CSV file. Its columns are ``stim_ID``, ``target_hit_zone_label`` (whether the agent touches the
+# patient) and optionally ``map_url`` (name of the map, if it does not follow from the stimulus),
+# ``scenario`` (any name, the same in all rows) and ``observed_frames`` (number of frames before
+# the answer, 45 in the official study). Movies are called ``STIM_ID.mp4`` and contain all frames;
+# they are cut to the observed frames later.
+
+MAX_LIST_BYTES = 50_000_000
+ID, LABEL, MAP = "stim_ID", "target_hit_zone_label", "map_url"
+SCENARIO, FRAMES = "scenario", "observed_frames"
+OPTIONAL = (MAP, SCENARIO, FRAMES)
+_REDYELLOW = "-redyellow"
+_LABELS = {"true": True, "false": False, "1": True, "0": False}
+
+
+@dataclass(frozen=True)
+class ListedStimulus:
+    """One row of a stimulus list: name, contact label, file name of the map and scenario (either
+    may be empty), and number of observed frames.
+    """
+
+    stim_id: str
+    contact: bool
+    map_name: str
+    scenario: str = ""
+    frames: int = OBSERVED_FRAMES
+
+    @property
+    def stimulus(self) -> str:
+        """Stimulus name as the analysis uses it, without the endings of the movie file."""
+        return self.stim_id.removesuffix(".mp4").removesuffix("_img")
+
+    @property
+    def look(self) -> str:
+        """Colours of the movie (``free`` or ``redyellow``), derived from its name."""
+        return "redyellow" if _REDYELLOW in self.stim_id else "free"
+
+
+def choose_listed(
+    lists: Sequence[Path],
+    familiarization: Sequence[Path],
+    movies: Path,
+    maps: Path | None = None,
+    *,
+    test: int | None = None,
+    seed: int = 0,
+) -> StimulusSelection:
+    """Select the stimuli of a study from official lists, one list per scenario and phase.
+
+    Parameters
+    ----------
+    lists
+        Lists of test stimuli. The scenario of a list follows from its stimuli or its file name.
+    familiarization
+        Lists of familiarization stimuli, which are shown in the order of the list.
+    movies
+        Folder with the movies, flat or laid out as PhysionTest-Core.
+    maps
+        Folder with the maps; by default they are searched for next to the movies.
+    test
+        Number of test stimuli to draw from each list, half of them with contact. None: all.
+    seed
+        Seed of the draw.
+
+    Raises
+    ------
+    BadInputError
+        A list is invalid; the message names the list and the row.
+    """
+    sources: list[StimulusSource] = []
+    for phase, paths in (("familiarization", familiarization), ("test", lists)):
+        seen: dict[str, Path] = {}
+        for path in paths:
+            rows = read_list(path)
+            scenario = list_scenario(path, rows)
+            if scenario in seen:
+                raise BadInputError(f"{path} and {seen[scenario]} are both lists of {scenario}")
+            seen[scenario] = path
+            if phase == "test":
+                rows = _select(path, rows, scenario, test, seed)
+            files = _MediaFinder(movies, maps, scenario)
+            sources += [
+                _official_lists_source(row, scenario, phase, i, files) for i, row in enumerate(rows)
+            ]
+    return StimulusSelection(tuple(sources))
+
+
+def read_list(path: Path) -> list[ListedStimulus]:
+    """Read and check the rows of a list; `BadInputError` names an invalid row and column.
+
+    Rows of JSON files count from 1, rows of CSV files as a spreadsheet shows them.
+    """
+    content = read_plain(path, MAX_LIST_BYTES)
+    rows: Iterable[tuple[int, dict[str, Any]]]
+    if path.suffix.lower() == ".csv":
+        rows = csv_rows(path, content, (ID, LABEL))
+    else:
+        rows = enumerate(_json_rows(path, content), start=1)
+    by_name: dict[str, ListedStimulus] = {}
+    for number, row in rows:
+        name = str(row[ID]).strip()
+        label = _LABELS.get(str(row[LABEL]).strip().lower())
+        if not is_name(name):
+            raise BadInputError(
+                f"{path}, row {number}: {ID} must be letters, digits and ._+- alone, not "
+                f"{name[:100]!r}"
+            )
+        if label is None:
+            raise BadInputError(
+                f"{path}, row {number}: {LABEL} must be true or false, not {row[LABEL]!r}"
+            )
+        # URLs are never opened; only their last part is used, as a name in a local folder.
+        map_name = str(row.get(MAP) or "").strip().rpartition("/")[2]
+        listed = ListedStimulus(
+            name,
+            label,
+            map_name if is_name(map_name) else "",
+            _scenario(path, number, row),
+            _frames(path, number, row),
+        )
+        if listed.stimulus in by_name:
+            raise BadInputError(f"{path}, row {number}: {name} is there already")
+        by_name[listed.stimulus] = listed
+    if not by_name:
+        raise BadInputError(f"{path} lists no stimulus")
+    return list(by_name.values())
+
+
+def _scenario(path: Path, number: int, row: Mapping[str, Any]) -> str:
+    """Return the scenario of a row, or an empty text if the list does not name it."""
+    given = str(row.get(SCENARIO) or "").strip()
+    if given and not is_name(given):
+        raise BadInputError(
+            f"{path}, row {number}: {SCENARIO} must be letters, digits and ._+- alone, not "
+            f"{given[:100]!r}"
+        )
+    return given
+
+
+def _frames(path: Path, number: int, row: Mapping[str, Any]) -> int:
+    """Return the number of observed frames of a row; that of the official study if not given."""
+    given = str(row.get(FRAMES) or "").strip()
+    if not given:
+        return OBSERVED_FRAMES
+    if not re.fullmatch(r"[0-9]{1,6}(\.0)?", given) or not 1 <= float(given) <= MAX_FRAMES:
+        raise BadInputError(
+            f"{path}, row {number}: {FRAMES} must be from 1 to {MAX_FRAMES}, not {given[:100]!r}"
+        )
+    return int(float(given))
+
+
+def list_scenario(path: Path, rows: Iterable[ListedStimulus]) -> str:
+    """Return the scenario of a list: that of its rows, else of its stimulus names or file name."""
+    rows = list(rows)
+    named = {row.scenario for row in rows}
+    if len(named) > 1:
+        raise BadInputError(
+            f"{path}: a list is of one scenario, not of {' and '.join(sorted(named)[:5])}"
+        )
+    if named != {""}:
+        return named.pop()
+    from_stimuli = {scenario_of(canonical_name(row.stim_id)) for row in rows}
+    if len(from_stimuli) == 1 and None not in from_stimuli:
+        return str(from_stimuli.pop())
+    parts = path.stem.lower().replace("_", "-").split("-")
+    from_name = {OFFICIAL_SCENARIOS.get(part, part) for part in parts}
+    from_name &= set(SCENARIOS)
+    if len(from_name) != 1:
+        raise BadInputError(
+            f"{path}: which scenario is it? Give a column {SCENARIO}, or put one of "
+            f"{', '.join(SCENARIOS)} into the file's name"
+        )
+    return from_name.pop()
+
+
+def _json_rows(path: Path, content: bytes) -> list[dict[str, Any]]:
+    """Return the rows of a JSON list, with the columns that are used here."""
+    try:
+        columns = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise BadInputError(f"{path} is not JSON: {error}") from error
+    if not isinstance(columns, dict) or not all(isinstance(c, dict) for c in columns.values()):
+        raise BadInputError(f'{path} is not one object per column, {{"{ID}": {{"0": ...}}, ...}}')
+    for name in (ID, LABEL):
+        if name not in columns:
+            raise BadInputError(
+                f"{path} lacks the column {name}; it has {', '.join(columns)[:200]}"
+            )
+    keys = list(columns[ID])
+    optional = [name for name in OPTIONAL if name in columns]
+    for name in (LABEL, *optional):
+        if list(columns[name]) != keys:
+            raise BadInputError(f"{path}: the columns {ID} and {name} have different rows")
+    return [{name: columns[name][key] for name in (ID, LABEL, *optional)} for key in keys]
+
+
+def _select(
+    path: Path, rows: list[ListedStimulus], scenario: str, count: int | None, seed: int
+) -> list[ListedStimulus]:
+    """Return all rows, or ``count`` random ones, half with contact, in the order of the list."""
+    if count is None or count == len(rows):
+        return rows
+    check_even(count, "--test")
+    by_label = [[row for row in rows if row.contact == contact] for contact in (True, False)]
+    if count // 2 > min(map(len, by_label)):
+        raise BadInputError(
+            f"{path} has {len(by_label[0])} stimuli with and {len(by_label[1])} without contact, "
+            f"not {count // 2} of each"
+        )
+    rng = generator("study list", seed, scenario)
+    kept = {row for group in by_label for row in _official_lists_sample(group, count // 2, rng)}
+    return [row for row in rows if row in kept]
+
+
+def _official_lists_sample(
+    rows: list[ListedStimulus], count: int, rng: np.random.Generator
+) -> list[ListedStimulus]:
+    return [rows[i] for i in rng.permutation(len(rows))[:count]]
+
+
+class _MediaFinder:
+    """Search paths for the movies and maps of one scenario."""
+
+    def __init__(self, movies: Path, maps: Path | None, scenario: str) -> None:
+        for folder in filter(None, (movies, maps)):
+            if not folder.is_dir():
+                raise BadInputError(f"there is no folder {folder}")
+        title = FOLDERS.get(scenario, scenario)
+        roots = [movies, movies / title, movies / title.lower()]
+        self.movies = [root / sub for root in roots for sub in ("", "mp4s", "mp4s-redyellow")]
+        map_folders = [root / "maps" for root in (*roots, movies.parent)]
+        self.maps = [maps, maps / title, maps / "maps"] if maps else [*self.movies, *map_folders]
+
+    def movie(self, row: ListedStimulus) -> Path:
+        """Return the path of the movie of a stimulus; if there is none, its expected path."""
+        return _first_existing(self.movies, [f"{row.stim_id.removesuffix('.mp4')}.mp4"])
+
+    def map(self, row: ListedStimulus) -> Path:
+        """Return the path of the map of a stimulus, which both looks may share."""
+        names = [row.map_name] if row.map_name else []
+        names += [f"{row.stimulus}_map.png", f"{plain_name(row.stim_id)}_map.png"]
+        return _first_existing(self.maps, names)
+
+
+def _first_existing(folders: Sequence[Path], names: Sequence[str]) -> Path:
+    """Return the first existing file with one of these names; if none exists, the first path."""
+    paths = [folder / name for folder in folders for name in names]
+    return next((path for path in paths if path.is_file()), paths[0])
+
+
+def _official_lists_source(
+    row: ListedStimulus, scenario: str, phase: str, place: int, files: _MediaFinder
+) -> StimulusSource:
+    """Return the source files of one row of a list."""
+    return StimulusSource(
+        stimulus=row.stimulus,
+        scenario=scenario,
+        phase=phase,
+        place=place,
+        label=row.contact,
+        look=row.look,
+        movie=files.movie(row),
+        map=files.map(row),
+        frames=row.frames,
+    )
+
+
+# Selection of official scenes for a study with people, before their trials are rendered.
+#
+# Test trials are scenes that people of the original study saw. Familiarization trials are those of
+# the study where the data hold any, else scenes that nobody saw and whose physics no test trial
+# has. Only scenes are taken whose simulation has the recorded outcome: the movie that participants
+# see ends as the original one did, and their answers can be compared with those of the study.
+# Agent and patient must be visible in the first frame, where the map marks them.
+
+Group = tuple[str, str, bool]
+"""Scenario, phase and recorded outcome."""
+SIZE = 256
+"""Pixels per side of the movies."""
+OTHER_OUTCOME = "their simulation does not have the recorded outcome"
+HIDDEN = "agent or patient is not visible in the first frame"
+
+
+@dataclass(frozen=True)
+class OfficialSelection:
+    """Trials to render, and notes on scenes that were left out."""
+
+    tasks: list[TrialTask]
+    notes: tuple[str, ...]
+
+
+def choose_official(
+    trials: Sequence[ImportedTrial],
+    seen: Collection[str] | None,
+    *,
+    scenarios: Sequence[str] = (),
+    test: int,
+    practice: int,
+    executor: Executor,
+    progress: Progress | None = None,
+) -> OfficialSelection:
+    """Select official scenes for test and familiarization, half of each with contact.
+
+    Parameters
+    ----------
+    trials
+        Official scenes with recorded outcomes.
+    seen
+        Canonical names of the stimuli that people saw; None if all are to be tested that are not
+        called familiarization.
+    scenarios
+        Scenarios to use; by default all that have scenes for both phases.
+    test, practice
+        Largest number of test and familiarization trials per scenario, even.
+    executor
+        Where scenes are simulated to compare their outcomes.
+    progress
+        Shows the progress.
+
+    Raises
+    ------
+    BadInputError
+        A count is odd, or a scenario has no scene of a phase with (or without) contact.
+    """
+    counts = {"test": test, "familiarization": practice}
+    for phase, count in counts.items():
+        check_even(count, "--test" if phase == "test" else "--practice")
+    groups = _groups(trials, seen)
+    names = scenarios or list(in_paper_order({scenario for scenario, _, _ in groups}))
+    for name in names:
+        _check_scenario(name, groups)
+    wanted = {
+        (name, phase, contact): count // 2
+        for name in names
+        for phase, count in counts.items()
+        for contact in (True, False)
+    }
+    chosen, lost = _usable(groups, wanted, executor, progress)
+    notes = [
+        f"{name}: official scenes left out because {why}: {lost[name, why]}"
+        for name in names
+        for why in (OTHER_OUTCOME, HIDDEN)
+        if lost[name, why]
+    ]
+    return OfficialSelection(_tasks(chosen), tuple(notes))
+
+
+def _groups(
+    trials: Iterable[ImportedTrial], seen: Collection[str] | None
+) -> dict[Group, list[ImportedTrial]]:
+    """Return the candidates of each group, sorted by the hash of their names.
+
+    Scenes that nobody saw come after those that are called familiarization.
+    """
+    tested, others = [], []
+    for trial in trials:
+        name = trial.scene.name
+        practice = "familiarization" in name
+        if not practice and (seen is None or canonical_name(name) in seen):
+            tested.append(trial)
+        else:
+            others.append((not practice, stable_hash("practice", name), trial))
+    known = {trial.scene.physics_digest() for trial in tested}
+    tested.sort(key=lambda trial: stable_hash("limit", trial.scene.name))
+    practiced = [trial for _, _, trial in sorted(others, key=lambda row: row[:2])]
+    parts = {
+        "test": tested,
+        "familiarization": [t for t in practiced if t.scene.physics_digest() not in known],
+    }
+    groups: dict[Group, list[ImportedTrial]] = defaultdict(list)
+    for phase, part in parts.items():
+        for trial in part:
+            groups[trial.scene.scenario, phase, trial.outcome.contact].append(trial)
+    return groups
+
+
+def _check_scenario(name: str, groups: dict[Group, list[ImportedTrial]]) -> None:
+    """Check that a scenario has scenes of both phases, with and without contact."""
+    known = {scenario for scenario, _, _ in groups}
+    if name not in known:
+        raise UnknownNameError("scenario of the official scenes:", name, known)
+    for phase in SPLITS:
+        for contact in (True, False):
+            if not groups.get((name, phase, contact)):
+                raise BadInputError(
+                    f"there is no official scene of {name} {'with' if contact else 'without'} "
+                    f"contact for {phase} trials; leave {name} out with --scenario, or import the "
+                    "whole study (physion import-official CHECKOUT DIR) and give --scenes DIR"
+                )
+
+
+def find_fault(trial: ImportedTrial) -> str:
+    """Return why a scene cannot be shown to participants; an empty text if it can."""
+    scene = trial.scene
+    motion = simulate(scene)
+    if label_contact(scene, motion).contact != trial.outcome.contact:
+        return OTHER_OUTCOME
+    ids = np.asarray(Renderer(scene, motion, SIZE, SIZE).render(0, ("ids",)).ids)
+    roles = (scene.roles.agent, scene.roles.patient)
+    return "" if np.isin([scene.index(role) + 1 for role in roles], ids).all() else HIDDEN
+
+
+def _usable(
+    groups: dict[Group, list[ImportedTrial]],
+    wanted: dict[Group, int],
+    executor: Executor,
+    progress: Progress | None,
+) -> tuple[dict[Group, list[ImportedTrial]], Counter[tuple[str, str]]]:
+    """Return the first scenes of each group that can be shown.
+
+    Also returns how many others were met, by scenario and reason. Scenes are simulated in rounds,
+    as many as are still wanted, so that a small study simulates few.
+    """
+    left = {group: list(groups[group]) for group in wanted}
+    chosen: dict[Group, list[ImportedTrial]] = {group: [] for group in wanted}
+    lost: Counter[tuple[str, str]] = Counter()
+    done, total = 0, sum(min(count, len(left[group])) for group, count in wanted.items())
+    while True:
+        batch: dict[str, tuple[Group, ImportedTrial]] = {}
+        for group, count in wanted.items():
+            number = count - len(chosen[group])
+            batch |= {trial.scene.name: (group, trial) for trial in left[group][:number]}
+            del left[group][:number]
+        if not batch:
+            return chosen, lost
+        faults: dict[str, str] = {}
+        for outcome in executor.map(find_fault, {name: t for name, (_, t) in batch.items()}):
+            faults[outcome.key] = outcome.value
+            done += 1
+            if progress is not None:
+                progress("outcomes", done, max(total, done))
+        for name, (group, trial) in batch.items():
+            if faults[name]:
+                lost[group[0], faults[name]] += 1
+            else:
+                chosen[group].append(trial)
+
+
+def _tasks(chosen: dict[Group, list[ImportedTrial]]) -> list[TrialTask]:
+    """Return the trials to render; as many with as without contact."""
+    tasks: list[TrialTask] = []
+    for phase, split in SPLITS.items():
+        trials = []
+        for name, part, contact in chosen:
+            if part == phase and contact:
+                pair = chosen[name, part, True], chosen[name, part, False]
+                half = min(map(len, pair))
+                trials += [trial for kind in pair for trial in kind[:half]]
+        recorded = {trial.scene.name: trial.outcome.contact for trial in trials}
+        tasks += plan_scenes("official", [trial.scene for trial in trials], split, recorded)
+    check_names(tasks)
+    return tasks

@@ -1,1 +1,0 @@
-"""What sessions consist of: the blocks of several scenarios, and the settings of conditions."""

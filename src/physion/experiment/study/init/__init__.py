@@ -1,1 +1,0 @@
-"""Creation of a study folder: selection of stimuli, their movies and maps."""
