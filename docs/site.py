@@ -1,7 +1,7 @@
 """Pages of the site that are made of other files, and links that lead out of the folder ``docs``.
 
-mkdocs calls the functions ``on_...`` (``hooks`` in mkdocs.yml). Overview and performance come from
-the README, the verbs from their help texts, the metrics from their registry, the model cards from
+mkdocs calls the functions ``on_...`` (``hooks`` in mkdocs.yml). The overview comes from the README,
+the verbs from their help texts, the metrics from their registry, the model cards from
 the shipped weights, so that each fact stands in one place.
 """
 
@@ -18,7 +18,7 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[1]
-CARDS = ROOT / "src" / "physion" / "models" / "checkpoints" / "shipped"
+CARDS = ROOT / "src" / "physion" / "data" / "weights"
 OTHERS = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
@@ -27,8 +27,6 @@ OTHERS = {
 }
 """Files of the repository by their path, and where the site has them."""
 COPIED = (*(ROOT / "benchmarks" / "results").glob("*"), *(ROOT / "examples").rglob("*"))
-RESULTS = "## Results"
-"""Heading of the part of the README that becomes a page of its own."""
 
 
 def on_files(files: Files, *, config: Any) -> Files:
@@ -80,26 +78,15 @@ def place(path: str) -> str:
 
 def pages() -> dict[str, str]:
     """Return the text of every page that is made of other files, by its path in the site."""
-    overview, performance = split_readme((ROOT / "README.md").read_text(encoding="utf-8"))
     made = {
-        "index.md": relink(overview, PurePosixPath(), PurePosixPath()),
-        "performance.md": relink(performance, PurePosixPath(), PurePosixPath()),
         "verbs.md": verbs_page(),
         "metrics.md": metrics_page(),
         "model-cards.md": cards_page(),
     }
-    for name in ("CONTRIBUTING.md", "CHANGELOG.md"):
+    for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"):
         text = (ROOT / name).read_text(encoding="utf-8")
         made[OTHERS[name]] = relink(text, PurePosixPath(), PurePosixPath())
     return made
-
-
-def split_readme(text: str) -> tuple[str, str]:
-    """Return the README without its results, and the results."""
-    before, _, after = text.partition(f"\n{RESULTS}\n")
-    results, heading, rest = after.partition("\n## ")
-    overview = f"{before}\n## Results\nSee [performance](docs/performance.md).\n{heading}{rest}"
-    return overview, f"# Performance\n{results}"
 
 
 def verbs_page() -> str:
@@ -155,7 +142,7 @@ def metrics_page() -> str:
     head = (
         "# Meaning of the metrics\nEvery metric is computed for each model and readout, on the "
         "stimuli of one scenario and on all together. An undefined value is left empty, with its "
-        "reason. [Comparing models with people](docs/analysis.md) describes averages and "
+        "reason. [What the analysis computes](docs/reference/analysis.md) describes averages and "
         "intervals, [adding a metric](docs/how-to/add-a-metric.md) how to extend this list.\n\n"
         "| column | definition | needs | better |\n|---|---|---|---|\n"
     )

@@ -194,7 +194,9 @@ def test_the_python_of_the_documentation_runs(
     own.responses.rename(data / own.responses.name)
     own.expected.rename(data / "expected.csv")
     (tmp_path / "dataset").rename(tmp_path / "trials")
-    page = (Path(__file__).parents[2] / "docs" / "analysis.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "compare.md").read_text(
+        encoding="utf-8"
+    )
     code = page.split("```python\n")[1].split("```")[0]
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "analysis.md", "exec"), {})

@@ -58,7 +58,13 @@ def test_every_page_is_built_and_loads_nothing_from_elsewhere(site: Path) -> Non
     names = {path.relative_to(site).as_posix() for path in pages}
     sources = {path.relative_to(ROOT / "docs") for path in (ROOT / "docs").rglob("*.md")}
     assert {path.with_suffix(".html").as_posix() for path in sources} <= names
-    assert {"index.html", "verbs.html", "metrics.html", "performance.html"} <= names
+    assert {
+        "index.html",
+        "verbs.html",
+        "metrics.html",
+        "results/models.html",
+        "reference/api.html",
+    } <= names
     for path in pages:
         page = Loaded()
         page.feed(path.read_text(encoding="utf-8"))
@@ -76,7 +82,7 @@ def test_generated_pages_say_what_the_package_says(site: Path) -> None:
     metrics = (site / "metrics.html").read_text(encoding="utf-8")
     assert "partial" in metrics and "official outcome" in metrics
     assert "gns-small" in (site / "model-cards.html").read_text(encoding="utf-8")
-    assert "Generation of trials" in (site / "performance.html").read_text(encoding="utf-8")
+    assert "Generation of trials" in (site / "results/trials.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow

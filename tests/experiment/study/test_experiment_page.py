@@ -1,4 +1,4 @@
-"""The page docs/experiment.md names all verbs, valid options and settings, and all tables."""
+"""The pages on studies name all verbs, valid options and settings, and all tables."""
 
 from __future__ import annotations
 
@@ -16,7 +16,11 @@ from physion.cli.experiment.experiment import SUBVERBS
 from physion.experiment.store.database import METADATA
 from physion.experiment.study.settings import KEYS
 
-PAGE = (Path(__file__).parents[3] / "docs" / "experiment.md").read_text()
+DOCS = Path(__file__).parents[3] / "docs"
+PAGE = "".join(
+    (DOCS / name).read_text()
+    for name in ("tutorials/study.md", "how-to/run-a-study.md", "reference/study.md")
+)
 
 
 def _commands() -> list[list[str]]:
