@@ -69,7 +69,7 @@ def everywhere() -> Callable[[], object]:
             p = generator.random(STIMULI)
             stimuli = [f"{scenario}-{name}" for name in made.stimuli]
             predictions.append(
-                pd.DataFrame({"agent": f"m{model}", "stimulus": stimuli, "p_contact": p,
+                pd.DataFrame({"model": f"m{model}", "stimulus": stimuli, "p_contact": p,
                               "predicted": p > 0.5})
             )  # fmt: skip
     test, rows_of_models = pd.concat(tests), pd.concat(predictions)

@@ -136,13 +136,13 @@ def rollout_errors(coverage: Coverage, size: Size, repeats: int) -> None:
     names = np.arange(len(scenario)).astype(str)
     for _ in range(repeats):
         errors = pd.DataFrame(
-            {"agent": "model", "scenario": scenario, "stimulus": names, "seconds": 0.03,
+            {"model": "model", "scenario": scenario, "stimulus": names, "seconds": 0.03,
              "error": rng.lognormal(0, 1, len(names)),
              "baseline": rng.exponential(1, len(names))}
         )  # fmt: skip
-        table = rollout_error_table(errors).set_index(["panel", "agent"])
-        for agent, shape in shapes.items():
-            for panel, row in table.xs(agent, level="agent").iterrows():
+        table = rollout_error_table(errors).set_index(["panel", "model"])
+        for model, shape in shapes.items():
+            for panel, row in table.xs(model, level="model").iterrows():
                 prefix = "mean of 8: " if panel == MEAN else ""
                 coverage.add(f"{prefix}rollout error, {shape}", "stimuli", size, row["value"],
                              row["low"], row["high"])  # fmt: skip
@@ -177,7 +177,7 @@ def _good(scenario: str, study: Study, people: int) -> pd.DataFrame:
     p_contact, label = study.p_contact[1], study.label.astype(bool)
     return pd.DataFrame(
         {
-            "agent": "good", "model": "good", "readout": "", "scenario": scenario,
+            "model": "good", "base_model": "good", "readout": "", "scenario": scenario,
             "stimulus": [f"{scenario} {k:03d}" for k in range(len(label))],
             "p_contact": p_contact, "predicted": p_contact > 0.5, "label": label,
             "simulated": label, "count": people, "p_yes": study.p_yes,

@@ -1,4 +1,4 @@
-"""The page's tables of scores: anchors below the models, beyond the outcome, later contacts."""
+"""The page's tables of scores: baselines below the models, beyond the outcome, later contacts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from physion.analysis.metrics import score_metrics
 from physion.analysis.scores import COMPUTED, MAJORITY, OUTCOME, TWO_PEOPLE
 from physion.analysis.tables import MEAN, POOLED
 from physion.report import ReportInputs, build_report, scores
-from physion.report.html import ANCHORS
+from physion.report.html import BASELINES
 
 Maker = Callable[..., Comparison]
 
@@ -36,47 +36,47 @@ def groups(table: str) -> list[list[list[str]]]:
 
 
 @pytest.fixture
-def with_anchor(make_comparison: Maker) -> Comparison:
-    """A comparison whose first model is an anchor of the package."""
+def with_baseline(make_comparison: Maker) -> Comparison:
+    """A comparison whose first model is a baseline of the package."""
     return make_comparison(model="constant-motion")
 
 
-def test_anchors_are_a_group_of_their_own(with_anchor: Comparison) -> None:
-    plain = scores.shown_metrics(with_anchor, beyond=False)
-    models, anchors = groups(scores.scores_table(with_anchor.all_scores, MEAN, plain))
+def test_baselines_are_a_group_of_their_own(with_baseline: Comparison) -> None:
+    plain = scores.shown_metrics(with_baseline, beyond=False)
+    models, baselines = groups(scores.scores_table(with_baseline.all_scores, MEAN, plain))
     assert [line[0] for line in models] == ["encoder"]
-    assert [line[0] for line in anchors] == [ANCHORS, "constant-motion", *COMPUTED]
+    assert [line[0] for line in baselines] == [BASELINES, "constant-motion", *COMPUTED]
     for key in ("accuracy", "r", "kappa_within_outcomes"):
-        models, anchors = groups(scores.matrix(with_anchor, key))
+        models, baselines = groups(scores.matrix(with_baseline, key))
         assert models[-1][0] == "encoder · observed+simulated"
-        assert [line[0] for line in anchors][:4] == [
-            ANCHORS, "constant-motion · observed", OUTCOME, MAJORITY,
+        assert [line[0] for line in baselines][:4] == [
+            BASELINES, "constant-motion · observed", OUTCOME, MAJORITY,
         ]  # fmt: skip
 
 
 def test_the_cells_are_the_scores_and_empty_where_two_people_have_none(
-    with_anchor: Comparison,
+    with_baseline: Comparison,
 ) -> None:
     metrics = score_metrics()
-    _, anchors = groups(scores.scores_table(with_anchor.all_scores, POOLED, metrics))
+    _, baselines = groups(scores.scores_table(with_baseline.all_scores, POOLED, metrics))
     names = ["", "readout", "stimuli"]
     for metric in metrics:
         names += [metric.name, "ceiling"] if metric.name == "r" else [metric.name]
-    two = dict(zip(names, anchors[-1], strict=True))
-    table = with_anchor.anchors.set_index(["agent", "scenario"])
+    two = dict(zip(names, baselines[-1], strict=True))
+    table = with_baseline.baselines.set_index(["model", "scenario"])
     row = table.loc[(TWO_PEOPLE, POOLED)]
     assert two["kappa_from_averages"].split()[0] == f"{row['kappa_from_averages']:.2f}"
     assert two["accuracy"].split()[0] == f"{row['accuracy']:.2f}"
     assert two["r"].split()[0] == f"{row['r']:.2f}"
     assert two["rmsd"] == two["r_beyond_outcome"] == two["difference"] == ""
-    outcome = dict(zip(names, anchors[-3], strict=True))
+    outcome = dict(zip(names, baselines[-3], strict=True))
     assert outcome["r_beyond_outcome"] == "NaN" and outcome["r"] != "NaN"
 
 
-def test_reasons_stand_below_the_table_that_they_are_about(with_anchor: Comparison) -> None:
+def test_reasons_stand_below_the_table_that_they_are_about(with_baseline: Comparison) -> None:
     text = {
         beyond: scores.scores_table(
-            with_anchor.all_scores, MEAN, scores.shown_metrics(with_anchor, beyond=beyond)
+            with_baseline.all_scores, MEAN, scores.shown_metrics(with_baseline, beyond=beyond)
         )
         for beyond in (False, True)
     }
@@ -85,13 +85,13 @@ def test_reasons_stand_below_the_table_that_they_are_about(with_anchor: Comparis
 
 
 def test_the_page_has_both_tables_and_says_why_one_is_missing(
-    with_anchor: Comparison, make_comparison: Maker
+    with_baseline: Comparison, make_comparison: Maker
 ) -> None:
-    text = scores.scores(with_anchor)
+    text = scores.scores(with_baseline)
     assert "Beyond the outcome" in text
     assert "Not known: the predictions have no column Observed Contact" in text
     alone = scores.scores(make_comparison(with_people=False))
-    assert "Beyond the outcome" not in alone and ANCHORS not in alone
+    assert "Beyond the outcome" not in alone and BASELINES not in alone
     assert OUTCOME not in alone.lower()
 
 
@@ -112,6 +112,6 @@ def test_later_contacts_have_a_table_and_a_file(tmp_path: Path) -> None:
     assert "Left out: 3 of 12 stimuli (drop 3 of 12)" in text
     build_report(ReportInputs(comparison), tmp_path)
     later = pd.read_csv(tmp_path / "tables" / "comparison_later.csv")
-    assert set(later["stimuli"]) == {9} and set(later["kind"]) == {"model", "anchor"}
+    assert set(later["stimuli"]) == {9} and set(later["kind"]) == {"model", "baseline"}
     without = dataclasses.replace(comparison, later=comparison.later.iloc[:0])
     assert "comparison_later" not in ReportInputs(without).tables()

@@ -60,11 +60,11 @@ def test_dots_stand_at_the_accuracies(make_comparison: Maker) -> None:
     assert titles == ["collide", "drop", "mean over scenarios"]
 
 
-def test_anchors_stand_below_the_models_lighter_and_hollow(make_comparison: Maker) -> None:
+def test_baselines_stand_below_the_models_lighter_and_hollow(make_comparison: Maker) -> None:
     comparison = make_comparison(model="constant-motion")
     given, model = "constant-motion · observed", "encoder · observed+simulated"
     table = figure_tables.accuracy_table(comparison)
-    assert set(table.loc[table["kind"] != figure_tables.ANCHOR, "agent"]) == {model}
+    assert set(table.loc[table["kind"] != figure_tables.BASELINE, "model"]) == {model}
     figure = measure_figure(table, "accuracy")
     names = [text.get_text() for text in figure.axes[0].get_yticklabels()]
     assert names == [protocol_names(name) for name in (model, given, *COMPUTED)]
@@ -73,18 +73,18 @@ def test_anchors_stand_below_the_models_lighter_and_hollow(make_comparison: Make
     marks = [line for line in figure.axes[0].lines if line.get_marker() not in ("None", None)]
     hollow = [line.get_markerfacecolor() == theme.LIGHT.paper for line in marks]
     assert hollow == [False, True, True, True, True]
-    assert [text.get_text() for text in figure.legends[0].get_texts()].count("anchor") == 1
+    assert [text.get_text() for text in figure.legends[0].get_texts()].count("baseline") == 1
     # One person has an r too, with the average of the others.
-    assert list(figure_tables.r_table(comparison)["agent"].unique()) == [model, given, *COMPUTED]
+    assert list(figure_tables.r_table(comparison)["model"].unique()) == [model, given, *COMPUTED]
     thirds = figure_tables.thirds_table(comparison)
-    assert next(iter(thirds["agent"].unique())) == model
+    assert next(iter(thirds["model"].unique())) == model
 
 
 def test_figures_of_single_answers_show_models_alone(make_comparison: Maker) -> None:
     comparison = make_comparison(model="constant-motion")
     model = ["encoder · observed+simulated"]
-    assert list(figure_tables.calibration_table(comparison)["agent"].unique()) == model
-    assert ReportInputs(comparison).scatter_agents() == model
+    assert list(figure_tables.calibration_table(comparison)["model"].unique()) == model
+    assert ReportInputs(comparison).scatter_models() == model
 
 
 def test_zones_of_participants_and_of_scenarios_look_different(make_comparison: Maker) -> None:
@@ -100,7 +100,7 @@ def test_zones_of_participants_and_of_scenarios_look_different(make_comparison: 
 
 def test_undefined_values_are_called_nan_in_the_figure(make_comparison: Maker) -> None:
     table = figure_tables.r_table(make_comparison(constant=True))
-    table = table[table["kind"] != figure_tables.ANCHOR]
+    table = table[table["kind"] != figure_tables.BASELINE]
     assert table["value"].isna().all() and table["reason"].str.contains("undefined|constant").all()
     words = [text.get_text() for text in measure_figure(table, "r").axes[0].texts]
     assert words == ["NaN", "NaN"]
@@ -108,9 +108,9 @@ def test_undefined_values_are_called_nan_in_the_figure(make_comparison: Maker) -
 
 def test_points_are_the_stimuli_in_the_square_of_their_scenario(make_comparison: Maker) -> None:
     comparison = make_comparison()
-    table = figure_tables.scatter_table(comparison, comparison.agents)
+    table = figure_tables.scatter_table(comparison, comparison.names)
     figure = scatter_figure(table)
-    own = table[table["agent"] == comparison.agents[1]]
+    own = table[table["model"] == comparison.names[1]]
     changed = own["label"] != own["simulated"]
     assert changed.sum() == 1
     filled, hollow = figure.axes[1].lines[1:]
@@ -138,8 +138,8 @@ def test_bars_hold_every_stimulus_and_mark_the_tail() -> None:
 def test_calibration_is_the_share_of_contact_in_each_bin(make_comparison: Maker) -> None:
     comparison = make_comparison()
     table = figure_tables.calibration_table(comparison)
-    own = comparison.stimuli[comparison.stimuli["agent"] == comparison.agents[0]]
-    first = table[(table["agent"] == comparison.agents[0]) & (table["from"] == 0.5)].iloc[0]
+    own = comparison.stimuli[comparison.stimuli["model"] == comparison.names[0]]
+    first = table[(table["model"] == comparison.names[0]) & (table["from"] == 0.5)].iloc[0]
     inside = own[(own["p_contact"] >= 0.5) & (own["p_contact"] < 0.6)]
     assert first["stimuli"] == len(inside) and first["share"] == inside["label"].mean()
     assert first["brier"] == pytest.approx(((own["p_contact"] - own["label"]) ** 2).mean())
@@ -148,9 +148,9 @@ def test_calibration_is_the_share_of_contact_in_each_bin(make_comparison: Maker)
 def test_thirds_are_of_the_stimuli_that_bear_their_name(make_comparison: Maker) -> None:
     comparison = make_comparison()
     table = figure_tables.thirds_table(comparison)
-    own = comparison.stimuli[comparison.stimuli["agent"] == comparison.agents[1]]
+    own = comparison.stimuli[comparison.stimuli["model"] == comparison.names[1]]
     easy = own[own["human_accuracy"] >= 2 / 3]
-    row = table[(table["agent"] == comparison.agents[1]) & table["panel"].str.startswith("easy")]
+    row = table[(table["model"] == comparison.names[1]) & table["panel"].str.startswith("easy")]
     assert row["stimuli"].item() == len(easy)
     expected = np.corrcoef(easy["p_contact"], easy["p_yes"])[0, 1]
     assert row["value"].item() == pytest.approx(expected)
@@ -190,11 +190,11 @@ def test_thirds_show_what_halves_of_people_reach(make_comparison: Maker) -> None
 def trained(make_comparison: Maker, trainings: list[str]) -> tuple[Comparison, pd.DataFrame]:
     """The comparison with both models as one, trained in as many ways."""
     comparison = make_comparison()
-    stimuli = comparison.stimuli.assign(model="one", readout="observed")
+    stimuli = comparison.stimuli.assign(base_model="one", readout="observed")
     comparison = dataclasses.replace(comparison, stimuli=stimuli)
-    column = dict(zip(comparison.agents, trainings, strict=True))
-    rows = stimuli[["agent", "stimulus"]]
-    return comparison, rows.assign(**{"Dynamics Training Dataset": rows["agent"].map(column)})
+    column = dict(zip(comparison.names, trainings, strict=True))
+    rows = stimuli[["model", "stimulus"]]
+    return comparison, rows.assign(**{"Dynamics Training Dataset": rows["model"].map(column)})
 
 
 def test_effects_hold_the_accuracy_of_each_training(make_comparison: Maker) -> None:
@@ -234,7 +234,7 @@ def test_generalization_is_relative_to_people(make_comparison: Maker) -> None:
     table = figure_tables.generalization_table(comparison, predictions)
     cell = table[(table["trained"] == "collide") & (table["tested"] == "drop")].iloc[0]
     own = comparison.stimuli[
-        (comparison.stimuli["agent"] == comparison.agents[1])
+        (comparison.stimuli["model"] == comparison.names[1])
         & (comparison.stimuli["scenario"] == "drop")
     ]
     right = (own["predicted"] == own["label"]).mean()
@@ -251,9 +251,9 @@ def numbered(axis: Axes, which: str) -> tuple[bool, bool]:
 
 
 def test_an_odd_number_of_models_leaves_no_column_without_scenarios() -> None:
-    pairs = [(agent, trained, tested) for agent in "abc" for trained in ("all", "drop")
+    pairs = [(model, trained, tested) for model in "abc" for trained in ("all", "drop")
              for tested in SCENARIOS]  # fmt: skip
-    table = pd.DataFrame(pairs, columns=["agent", "trained", "tested"])
+    table = pd.DataFrame(pairs, columns=["model", "trained", "tested"])
     figure = generalization_figure(table.assign(difference=0.1, people=0.7))
     figure.draw_without_rendering()
     first, right, lower = figure.axes[:3]
@@ -285,8 +285,8 @@ def pictures(inputs: ReportInputs) -> list[Picture]:
 def test_page_and_figures_call_a_model_by_one_name(make_comparison: Maker) -> None:
     long = "m · observed · dynamics training dataset same"
     comparison = make_comparison()
-    renamed = {comparison.agents[0]: long}
-    tables = [t.replace({"agent": renamed}) for t in (comparison.scores, comparison.stimuli)]
+    renamed = {comparison.names[0]: long}
+    tables = [t.replace({"model": renamed}) for t in (comparison.scores, comparison.stimuli)]
     comparison = dataclasses.replace(comparison, scores=tables[0], stimuli=tables[1])
     inputs = ReportInputs(comparison, scatter_limit=0)
     page = render_page(inputs, pictures(inputs))
@@ -307,7 +307,7 @@ def test_columns_of_simulated_outcomes_stand_only_where_these_differ(
         text = scores.scores_table(own.all_scores, MEAN, plain) + scores.definitions(own)
         assert ("against simulated outcome" in text) is there
         assert ("same outcome" in text) is there
-        assert text.count('<th scope="row">') == len(own.agents) + len(COMPUTED)
+        assert text.count('<th scope="row">') == len(own.names) + len(COMPUTED)
         cells = text.count("<td>") / text.count('<th scope="row">')
         assert text.count('scope="col"') - 1 == cells
 
@@ -321,14 +321,14 @@ def test_counts_and_gaps_are_written_in_one_way(make_comparison: Maker) -> None:
 
 def test_models_are_held_against_the_first_in_the_files(make_comparison: Maker) -> None:
     comparison = make_comparison()
-    assert comparison.agents != sorted(comparison.agents)
+    assert comparison.names != sorted(comparison.names)
     spread = comparison.scores.assign(accuracy=np.linspace(0.4, 0.9, len(comparison.scores)) ** 2)
     comparison = dataclasses.replace(comparison, scores=spread)
     models = fits_of_models(comparison)[0]
     assert models.fit is not None
     terms = models.fit.table["term"].tolist()
-    assert len(terms) == 2 and comparison.agents[1] in terms[1]
-    assert comparison.agents[0] in models.about
+    assert len(terms) == 2 and comparison.names[1] in terms[1]
+    assert comparison.names[0] in models.about
 
 
 # --- one file each ------------------------------------------------------------------------------

@@ -115,7 +115,7 @@ def test_with_and_without_flagged_sessions(report: Path) -> None:
 
 
 def test_kappa_of_the_figure_is_the_mean_over_people(report: Path) -> None:
-    table = pd.read_csv(report.parent / "figures" / "kappa.csv").set_index(["panel", "agent"])
+    table = pd.read_csv(report.parent / "figures" / "kappa.csv").set_index(["panel", "model"])
     answers = responses()
     model = predictions().iloc[STIMULI : 2 * STIMULI]["Predicted Outcome"].to_numpy(float)
     people = answers[answers["scenario"] == "drop"].groupby("session")["response"]
@@ -140,7 +140,7 @@ def test_tests_and_mixed_models_are_told(report: Path) -> None:
     assert "test of McNemar" in text and "Holm" in text
     assert "correct ~ scenario + (1|participant) + (1|stimulus)" in text
     assert "log_rt ~ accuracy + scenario" in text
-    assert "accuracy ~ agent + (1|scenario)" in text
+    assert "accuracy ~ model + (1|scenario)" in text
     values = json.loads((report.parent / "report.json").read_text())
     assert len(values["paired_tests"]) == 3
     fitted = {row["term"] for row in values["mixed_flagged"]}

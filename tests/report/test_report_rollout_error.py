@@ -25,10 +25,10 @@ SECONDS = (0.03, 0.06)
 
 def table() -> pd.DataFrame:
     rows = [
-        (panel, agent, kind, seconds, 5, slope * seconds, slope * seconds - 0.01,
+        (panel, model, kind, seconds, 5, slope * seconds, slope * seconds - 0.01,
          slope * seconds + 0.02)
         for panel in ("drop", "mean")
-        for agent, kind, slope in (
+        for model, kind, slope in (
             ("one", "model", 1.0), ("two", "model", 2.0), (CONSTANT_VELOCITY, "baseline", 50.0)
         )
         for seconds in SECONDS

@@ -59,7 +59,7 @@ def some_rows(**columns: object) -> pd.DataFrame:
     """Return rows of ``comparison.stimuli``: one model on a stimulus each, but for ``columns``."""
     count = max(len(value) for value in columns.values() if isinstance(value, list))
     rows: dict[str, object] = {
-        "agent": "m · observed", "model": "m", "readout": "observed", "scenario": "drop",
+        "model": "m · observed", "base_model": "m", "readout": "observed", "scenario": "drop",
         "stimulus": [f"s{k}" for k in range(count)], "p_contact": 0.9, "predicted": True,
         "label": True, "human_accuracy": 0.9, "count": 20.0,
     } | columns  # fmt: skip
@@ -99,8 +99,8 @@ def test_the_opening_prefers_trials_with_a_movie_and_all_models(make_comparison:
     comparison = make_comparison()
     named = set(comparison.stimuli["stimulus"].iloc[[3, 20]])
     assert set(opening_trials(comparison, named)) == named
-    rows = some_rows(human_accuracy=[0.99, 0.8], agent=["a", "a"])
-    more = pd.concat([rows, rows.iloc[1:].assign(agent="b")])
+    rows = some_rows(human_accuracy=[0.99, 0.8], model=["a", "a"])
+    more = pd.concat([rows, rows.iloc[1:].assign(model="b")])
     assert opening_trials(with_stimuli(comparison, more)) == ["s1"]
 
 
@@ -113,11 +113,11 @@ def test_the_order_of_the_rows_does_not_matter(make_comparison: Maker) -> None:
 def test_widest_gaps_take_turns_and_pass_over_changed_trials(make_comparison: Maker) -> None:
     comparison = make_comparison()
     chosen = widest_gaps(comparison, 4)
-    assert list(chosen["agent"]) == comparison.agents * 2
+    assert list(chosen["model"]) == comparison.names * 2
     assert chosen["stimulus"].is_unique
     assert not set(chosen["stimulus"]) & set(comparison.changed["stimulus"])
     same = comparison.stimuli[comparison.stimuli["label"] == comparison.stimuli["simulated"]]
-    own = same[same["agent"] == comparison.agents[0]]
+    own = same[same["model"] == comparison.names[0]]
     assert chosen["size"].iloc[0] == own["gap"].abs().max()
     wide = same[same["gap"].abs() >= WIDE]["stimulus"].nunique()
     assert 4 < wide < 23 and len(widest_gaps(comparison, 1000)) == wide
@@ -128,8 +128,8 @@ def test_a_model_has_one_turn_and_none_without_an_opinion(make_comparison: Maker
     p = [0.0, 0.0, 0.1, 0.3, 0.0, 0.05, 0.0, 0.0]
     rows = some_rows(
         stimulus=["a", "b", "a", "b", "a", "b", "a", "b"],
-        agent=["m1", "m1", "m2", "m2", "told", "told", "flat", "flat"],
-        model=["m", "m", "m", "m", "told", "told", "flat", "flat"],
+        model=["m1", "m1", "m2", "m2", "told", "told", "flat", "flat"],
+        base_model=["m", "m", "m", "m", "told", "told", "flat", "flat"],
         readout=[
             name for name in ("observed", "observed+simulated", "full", "observed") for _ in "ab"
         ],
@@ -137,7 +137,7 @@ def test_a_model_has_one_turn_and_none_without_an_opinion(make_comparison: Maker
     )
     rows.loc[1, "p_contact"] = 0.01
     chosen = widest_gaps(with_stimuli(make_comparison(), rows), 8)
-    assert list(chosen["agent"]) == ["m1", "m1"] and list(chosen["stimulus"]) == ["a", "b"]
+    assert list(chosen["model"]) == ["m1", "m1"] and list(chosen["stimulus"]) == ["a", "b"]
 
 
 def test_counts_of_who_was_right(make_comparison: Maker) -> None:
@@ -147,8 +147,8 @@ def test_counts_of_who_was_right(make_comparison: Maker) -> None:
     )
     table = who_was_right(with_stimuli(make_comparison(), rows))
     assert table.iloc[0].to_dict() == {
-        "agent": "m · observed", "stimuli": 6, "both": 1, "people": 1, "model": 1, "neither": 1,
-        "divided": 2,
+        "model": "m · observed", "stimuli": 6, "both": 1, "only_people": 1,
+        "only_model": 1, "neither": 1, "divided": 2,
     }  # fmt: skip
 
 
@@ -156,7 +156,7 @@ def test_counts_of_who_was_right(make_comparison: Maker) -> None:
 
 
 def test_a_card_says_what_happened_and_what_all_said() -> None:
-    rows = some_rows(stimulus=["s", "s"], agent=["a", "b"], model=["a", "b"],
+    rows = some_rows(stimulus=["s", "s"], model=["a", "b"], base_model=["a", "b"],
                      p_contact=[0.25, 0.75], predicted=[False, True])  # fmt: skip
     html = card(rows, "", {"s": "trials/s.html"}, named="a")
     assert '<span class="outcome contact">contact</span>' in html
@@ -178,14 +178,14 @@ def test_a_label_tells_when_the_movie_shows_something_else() -> None:
 
 def test_cards_show_one_readout_of_a_model_and_open_the_rest() -> None:
     rows = some_rows(
-        stimulus=["s"] * 4, agent=["a1", "a2", "a3", "told"], model=["a", "a", "a", "told"],
+        stimulus=["s"] * 4, model=["a1", "a2", "a3", "told"], base_model=["a", "a", "a", "told"],
         readout=["full", "observed", "observed+simulated", "full"],
     )  # fmt: skip
-    assert list(pick_readouts(rows)["agent"]) == ["a3"]
-    assert list(pick_readouts(rows, named="a2")["agent"]) == ["a2"]
-    assert list(pick_readouts(rows.iloc[[3]])["agent"]) == ["told"]
+    assert list(pick_readouts(rows)["model"]) == ["a3"]
+    assert list(pick_readouts(rows, named="a2")["model"]) == ["a2"]
+    assert list(pick_readouts(rows.iloc[[3]])["model"]) == ["told"]
     names = [f"m{k}" for k in range(MOST_ANSWERS + 2)]
-    html = answers(some_rows(stimulus=["s"] * len(names), agent=names, model=names))
+    html = answers(some_rows(stimulus=["s"] * len(names), model=names, base_model=names))
     before, after = html.split("<details>")
     assert before.count("<li") == MOST_ANSWERS + 1 and after.count("<li") == 2
     assert "2 further models" in after
@@ -273,9 +273,9 @@ def test_one_sentence_says_which_weights_each_model_started_from(
     sentence = "Weights that each network started from: encoder: imagenet."
     assert weights_sentence(inputs) == sentence and sentence in render_page(inputs, [])
     assert weights_sentence(ReportInputs(make_comparison())) == ""
-    table = inputs.tables()["comparison"].set_index("model")["init"]
+    table = inputs.tables()["comparison"].set_index("base_model")["init"]
     assert set(table["encoder"]) == {"imagenet"} and set(table["simulation"]) == {"none"}
-    assert set(table.drop(["encoder", "simulation"])) == {""}, "anchors that were computed"
+    assert set(table.drop(["encoder", "simulation"])) == {""}, "baselines that were computed"
 
 
 # --- a page for each stimulus ---------------------------------------------------------------------

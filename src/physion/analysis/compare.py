@@ -25,7 +25,7 @@ from physion.analysis.people.measures import HALVES, accuracy_by_stimulus, all_a
 from physion.analysis.people.results import PeopleResults
 from physion.analysis.scores import (
     TWO_PEOPLE,
-    add_anchors,
+    add_baselines,
     human_zones,
     mean_measures,
     measure_models,
@@ -46,16 +46,16 @@ class PeopleComparison:
     """Tables that compare models with single participants.
 
     - ``scores``: `measures.measure_table` of every scenario, then of their mean with equal
-      weights (NaN if one of them is undefined), with ``kind`` (model or anchor; the computed
-      anchors come last in each scenario), ``zone_low``, ``zone_high`` (of single participants) and
-      ``in_zone`` (yes, no, or empty if either is undefined).
+      weights (NaN if one of them is undefined), with ``kind`` (model or baseline; the computed
+      baselines come last in each scenario), ``zone_low``, ``zone_high`` (of single participants)
+      and ``in_zone`` (yes, no, or empty if either is undefined).
     - ``zones``: `zones.human_zones` of every scenario, and for several scenarios also the paper's
       band of r (`zones.released_r_zone`), whose scenario is the mean.
     - ``pairs``: `model_people.model_pairs` of every scenario.
     - ``tests``: `paired.compare_models` on the stimuli of all scenarios together;
       ``measure_tests``: `paired_measures.paired_measures`.
     - ``calibration``: `calibration.calibration_table`, likewise.
-    - ``dropped``: ``agent``, ``scenario``, ``reason``, ``stimuli``.
+    - ``dropped``: ``model``, ``scenario``, ``reason``, ``stimuli``.
     """
 
     scores: pd.DataFrame
@@ -80,7 +80,7 @@ def compare_everywhere(
     Parameters
     ----------
     predictions
-        One row a model and stimulus with ``agent``, ``stimulus`` (canonical name), ``p_contact``,
+        One row a model and stimulus with ``model``, ``stimulus`` (canonical name), ``p_contact``,
         ``predicted``. Predictions of stimuli that nobody saw are counted as dropped.
     test
         Test rows of `participants.Responses`.
@@ -91,21 +91,21 @@ def compare_everywhere(
     permutations
         Permutations of the test of differences in r.
     """
-    columns = ["agent", "stimulus", "p_contact", "predicted"]
+    columns = ["model", "stimulus", "p_contact", "predicted"]
     require_columns(predictions, columns, "the predictions")
     draws = bootstrap or Bootstrap()
     scenario_by_stimulus = test.drop_duplicates("stimulus").set_index("stimulus")["scenario"]
     rows = predictions[columns].assign(scenario=predictions["stimulus"].map(scenario_by_stimulus))
-    agents = list(rows["agent"].unique())
+    names = list(rows["model"].unique())
     dropped = [_unseen(rows)]
     measured, scored, zones, pairs = [], [], [], []
     for answers in all_answers(test):
         subset = rows[rows["scenario"] == answers.scenario]
-        models, unmatched = models_of(subset, answers, agents)
+        models, unmatched = models_of(subset, answers, names)
         dropped.append(unmatched.assign(scenario=answers.scenario))
         scored.append((models, answers))
         measured.append(
-            measure_models(add_anchors(models, answers), answers, two_people=TWO_PEOPLE)
+            measure_models(add_baselines(models, answers), answers, two_people=TWO_PEOPLE)
         )
         zones.append(human_zones(answers, split_halves(answers.yes, halves, draws.seed)))
         pairs.append(model_pairs(models, answers).assign(scenario=answers.scenario))
@@ -123,13 +123,13 @@ def compare_everywhere(
         tests=paired_tests(pooled, draws, permutations),
         measure_tests=paired_measures(pooled, draws.level, permutations, draws.seed),
         calibration=calibration_scores(pooled),
-        dropped=pd.concat(dropped, ignore_index=True)[["agent", "scenario", "reason", "stimuli"]],
+        dropped=pd.concat(dropped, ignore_index=True)[["model", "scenario", "reason", "stimuli"]],
     )
 
 
 def _unseen(rows: pd.DataFrame) -> pd.DataFrame:
-    counts = rows[rows["scenario"].isna()].groupby("agent", sort=False).size()
-    table = pd.DataFrame({"agent": counts.index, "stimuli": counts.to_numpy()})
+    counts = rows[rows["scenario"].isna()].groupby("model", sort=False).size()
+    table = pd.DataFrame({"model": counts.index, "stimuli": counts.to_numpy()})
     return table.assign(scenario="unknown", reason="people did not see it")
 
 
@@ -235,7 +235,7 @@ def _with_averages(
 ) -> ComparisonResults:
     """Complete a comparison with people's averages, or without people, by tests and fits."""
     pooled = pool_comparison(comparison)
-    several = len(comparison.agents) > 1
+    several = len(comparison.names) > 1
     return ComparisonResults(
         comparison,
         predictions=predictions,
@@ -270,8 +270,8 @@ def _with_participants(
     )
     everybody = accuracy_by_stimulus(people.whole.test, draws)
     whole = compare_scores(predictions, everybody, people.labels(), **settings)
-    agents = len(main.agents)
-    permutations = permutations_of(agents * (agents - 1) // 2)
+    count = len(main.names)
+    permutations = permutations_of(count * (count - 1) // 2)
     beside = compare_everywhere(main.stimuli, people.kept.test, draws, permutations=permutations)
     return ComparisonResults(
         main,
@@ -279,8 +279,8 @@ def _with_participants(
         people=people,
         comparison_all=whole,
         beside=beside,
-        paired=beside.tests if agents > 1 else None,
-        paired_measures=beside.measure_tests if agents > 1 else None,
+        paired=beside.tests if count > 1 else None,
+        paired_measures=beside.measure_tests if count > 1 else None,
         calibration=beside.calibration,
         mixed=(*fits_of_people(people), *fits_of_models(main)),
         warnings=(*people.warnings, *main.warnings),

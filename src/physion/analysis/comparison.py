@@ -11,7 +11,7 @@ from scipy import stats
 
 from physion.analysis.intervals import Bootstrap
 from physion.analysis.people.responses import EXCLUDED, LEDGE
-from physion.analysis.scores import anchor_scores, kind_of, people_table, score_table, with_kind
+from physion.analysis.scores import baseline_scores, kind_of, people_table, score_table, with_kind
 from physion.analysis.tables import check_predictions, in_order, name_models, with_labels
 from physion.core.errors import BadInputError
 from physion.core.names import canonical_name, is_ledge, scenario_of
@@ -38,7 +38,7 @@ def check_probabilities(predictions: pd.DataFrame) -> list[str]:
     than 0.5 is only warned of.
     """
     found = []
-    for agent, rows in predictions.groupby("agent", sort=False):
+    for model, rows in predictions.groupby("model", sort=False):
         p = rows["p_contact"]
         against = (p != 0.5) & ((p > 0.5) != rows["predicted"])
         count = int(against.sum())
@@ -46,7 +46,7 @@ def check_probabilities(predictions: pd.DataFrame) -> list[str]:
             continue
         first = rows[against].iloc[0]
         what = (
-            f"{agent}: Predicted Outcome contradicts Predicted Prob_true in {count} of "
+            f"{model}: Predicted Outcome contradicts Predicted Prob_true in {count} of "
             f"{len(rows)} rows, the first is {first['stimulus']!r} ({first['predicted']}, "
             f"{first['p_contact']:g})"
         )
@@ -96,14 +96,14 @@ def check_accuracy(stimuli: pd.DataFrame) -> list[str]:
     z = (a - e) / sqrt(e (1 - e) / n) below `BELOW_CHANCE`.
     """
     found = []
-    for agent, rows in stimuli.groupby("agent", sort=False):
+    for model, rows in stimuli.groupby("model", sort=False):
         contact, yes = rows["label"].mean(), rows["predicted"].mean()
         by_chance = contact * yes + (1 - contact) * (1 - yes)
         accuracy = float((rows["label"] == rows["predicted"]).mean())
         spread = np.sqrt(by_chance * (1 - by_chance) / len(rows))
         if spread > 0 and (accuracy - by_chance) / spread < BELOW_CHANCE:
             found.append(
-                f"{agent} is right in {accuracy:.0%} of {len(rows)} stimuli, far less than by "
+                f"{model} is right in {accuracy:.0%} of {len(rows)} stimuli, far less than by "
                 "guessing: its answers, or the outcomes, may be opposite"
             )
     return found
@@ -167,7 +167,7 @@ def observed_contacts(predictions: pd.DataFrame) -> pd.Series:
 
 
 def later_scores(stimuli: pd.DataFrame, level: float = 0.95) -> tuple[pd.DataFrame, str]:
-    """Return the scores of models and anchors on trials without observed contact, and a sentence.
+    """Return the scores of models and baselines on trials without observed contact, and a sentence.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def later_scores(stimuli: pd.DataFrame, level: float = 0.95) -> tuple[pd.DataFra
 
     Returns
     -------
-    The rows of models, then of computed anchors, with the columns of `anchors.with_kind`; empty if
+    The rows of models, then of computed baselines, with the columns of `with_kind`; empty if
     nothing is known or left. The sentence says what was left out, or why the table is empty.
     """
     each = stimuli.drop_duplicates("stimulus")
@@ -200,7 +200,7 @@ def later_scores(stimuli: pd.DataFrame, level: float = 0.95) -> tuple[pd.DataFra
     kept = stimuli[stimuli["stimulus"].isin(each.loc[later, "stimulus"])]
     if kept.empty:
         return pd.DataFrame(), f"{words}; none is left, so there are no scores without them"
-    parts = [with_kind(score_table(kept, level)), anchor_scores(kept, level)]
+    parts = [with_kind(score_table(kept, level)), baseline_scores(kept, level)]
     return pd.concat([part for part in parts if len(part)], ignore_index=True), words
 
 
@@ -214,27 +214,27 @@ NO_SCENARIO = "its scenario is not known"
 class Comparison:
     """Tables that compare models with people.
 
-    - ``scores``: `score_tables.score_table` of what was predicted, with ``kind``: model, or anchor
-      for models named in `anchors.ANCHOR_MODELS`.
-    - ``anchors``: the same of the anchors that need no predictions (`anchors.COMPUTED`), on the
-      stimuli that any model predicts; empty without people.
+    - ``scores``: `scores.score_table` of what was predicted, with ``kind``: model, or baseline for
+      models named in `scores.BASELINE_MODELS`.
+    - ``baselines``: the same of the baselines that need no predictions (`scores.COMPUTED`), on
+      the stimuli that any model predicts; empty without people.
     - ``later``: the rows of both without the trials whose contact was observed, see
       `observed_contact.later_scores`; empty if that is not known.
     - ``people``: see `score_tables.people_table`, for the stimuli that any model predicts; empty
       without people.
-    - ``stimuli``: one row a model and stimulus that both answered: ``agent``, ``model``,
+    - ``stimuli``: one row a model and stimulus that both answered: ``model``, ``base_model``,
       ``readout``, ``scenario``, ``stimulus``, ``p_contact``, ``predicted``, ``label`` (official),
       ``simulated``, ``human_accuracy``, ``count``, ``p_yes``, ``gap`` (p_contact - p_yes),
       ``observed_contact`` (True, False, or None if it is not known).
     - ``changed``: the stimuli whose simulated outcome is not the official one, one row each.
-    - ``dropped``: excluded stimuli: ``agent`` (empty: excluded for all), ``scenario``, ``reason``,
+    - ``dropped``: excluded stimuli: ``model`` (empty: excluded for all), ``scenario``, ``reason``,
       ``stimuli`` (count).
     - ``settings``: the settings as text for the report, by name.
     - ``warnings``: what may make the scores wrong, one sentence each (`contradictions`).
     """
 
     scores: pd.DataFrame
-    anchors: pd.DataFrame
+    baselines: pd.DataFrame
     later: pd.DataFrame
     people: pd.DataFrame
     stimuli: pd.DataFrame
@@ -244,20 +244,20 @@ class Comparison:
     warnings: tuple[str, ...] = ()
 
     @property
-    def agents(self) -> list[str]:
+    def names(self) -> list[str]:
         """Names of the models in the order of the predictions."""
-        return [str(name) for name in self.stimuli["agent"].unique()]
+        return [str(name) for name in self.stimuli["model"].unique()]
 
     @property
     def models(self) -> list[str]:
-        """Names of the models that are no anchors; if all are, of all."""
-        return [name for name in self.agents if kind_of(name) == "model"] or self.agents
+        """Names of the models that are no baselines; if all are, of all."""
+        return [name for name in self.names if kind_of(name) == "model"] or self.names
 
     @property
     def all_scores(self) -> pd.DataFrame:
-        """The rows of ``scores`` and ``anchors``: models, anchors by models, computed anchors."""
-        parts = [self.scores[self.scores["kind"] == kind] for kind in ("model", "anchor")]
-        parts += [self.anchors]
+        """Scores of models, of models that are baselines, and of computed baselines."""
+        parts = [self.scores[self.scores["kind"] == kind] for kind in ("model", "baseline")]
+        parts += [self.baselines]
         return pd.concat([part for part in parts if len(part)], ignore_index=True)
 
     @property
@@ -314,7 +314,9 @@ def compare_scores(
         If no stimulus is left, or a model or the tables contradict themselves.
     """
     draws = bootstrap or Bootstrap()
-    rows = predictions if "agent" in predictions else name_models(check_predictions(predictions))
+    rows = (
+        predictions if "base_model" in predictions else name_models(check_predictions(predictions))
+    )
     unwanted = {canonical_name(name) for name in exclude}
     known = _recorded(rows)
     known |= {canonical_name(name): bool(value) for name, value in (labels or {}).items()}
@@ -340,7 +342,7 @@ def compare_scores(
     later, observed = later_scores(stimuli, draws.level)
     return Comparison(
         scores=scores,
-        anchors=anchor_scores(stimuli, draws.level).reindex(columns=scores.columns),
+        baselines=baseline_scores(stimuli, draws.level).reindex(columns=scores.columns),
         later=later.reindex(columns=scores.columns),
         people=people.iloc[:0]
         if humans is None
@@ -386,7 +388,7 @@ def _drop(
     purpose = _purpose(people["stimulus"], unwanted, exclude_ledge)
     reason = reason.mask(purpose != "", purpose)
     kept = reason == ""
-    left_out = people[~kept].assign(reason=reason[~kept], agent="")
+    left_out = people[~kept].assign(reason=reason[~kept], model="")
     return people[kept].reset_index(drop=True), _count(left_out)
 
 
@@ -398,14 +400,14 @@ def _purpose(stimulus: pd.Series, unwanted: set[str], exclude_ledge: bool) -> pd
 
 
 def _join(rows: pd.DataFrame, people: pd.DataFrame) -> pd.DataFrame:
-    left = rows[["agent", "model", "readout", "stimulus", "p_contact", "predicted", "actual"]]
+    left = rows[["model", "base_model", "readout", "stimulus", "p_contact", "predicted", "actual"]]
     joined = left.merge(people, on="stimulus", how="inner", validate="many_to_one")
     joined = joined.rename(columns={"actual": "simulated", "accuracy": "human_accuracy"})
     joined["label"] = joined["label"].astype(bool)
     joined["gap"] = joined["p_contact"] - joined["p_yes"]
     observed = joined["stimulus"].map(observed_contacts(rows)).astype(object)
     joined["observed_contact"] = observed.where(observed.notna(), None)
-    columns = ["agent", "model", "readout", "scenario", "stimulus", "p_contact", "predicted"]
+    columns = ["model", "base_model", "readout", "scenario", "stimulus", "p_contact", "predicted"]
     columns += ["label", "simulated", "human_accuracy", "count", "p_yes", "gap"]
     return joined[[*columns, "observed_contact"]]
 
@@ -417,14 +419,14 @@ def _unmatched(
     extra = rows[~rows["stimulus"].isin(people["stimulus"])]
     reason = _purpose(extra["stimulus"], unwanted, exclude_ledge)
     parts = [_count(extra.assign(reason=reason.mask(reason == "", NOT_SEEN)))]
-    for agent, subset in rows.groupby("agent", sort=False):
+    for model, subset in rows.groupby("model", sort=False):
         missing = people[~people["stimulus"].isin(subset["stimulus"])]
-        parts.append(_count(missing.assign(reason=NOT_PREDICTED, agent=agent)))
+        parts.append(_count(missing.assign(reason=NOT_PREDICTED, model=model)))
     return parts
 
 
 def _count(rows: pd.DataFrame) -> pd.DataFrame:
-    keys = ["agent", "scenario", "reason"]
+    keys = ["model", "scenario", "reason"]
     if rows.empty:
         return pd.DataFrame(columns=[*keys, "stimuli"])
     filled = rows.assign(scenario=rows["scenario"].fillna("unknown"))

@@ -1,6 +1,6 @@
 """Tables of the figures: each figure draws exactly its table.
 
-Tables of scores (`MEASURE_COLUMNS`) have models, then anchors; the others have models alone.
+Tables of scores (`MEASURE_COLUMNS`) have models, then baselines; the others have models alone.
 Each function returns one table, plain rows and columns, that is written next to the figure as CSV.
 """
 
@@ -16,7 +16,7 @@ from physion.analysis.compare import PeopleComparison
 from physion.analysis.comparison import Comparison
 from physion.analysis.intervals import jackknife, mean_of, variance_of_mean
 from physion.analysis.people.effects import THIRDS, below_chance_level, difficulty_third, r_by_third
-from physion.analysis.scores import COMPUTED, anchor_stimuli, kind_of, released_zone
+from physion.analysis.scores import COMPUTED, baseline_stimuli, kind_of, released_zone
 from physion.analysis.statistics.agreement import correlate_resampled, correlate_rows
 from physion.analysis.statistics.regression import brier, reliability_curve
 from physion.analysis.tables import DATASETS, MEAN, POOLED, PROTOCOLS, READOUTS, in_order
@@ -30,19 +30,19 @@ SCENARIO_ZONE = "paper's band: bootstrap of scenario means"
 HALVES_ZONE = "paper's band: r of halves, mean over scenarios"
 """What the zone of a row is, in words of the figure's key."""
 
-ANCHOR = "anchor"
-"""``kind`` of anchors in the tables of scores."""
+BASELINE = "baseline"
+"""``kind`` of baselines in the tables of scores."""
 
 MEASURE_COLUMNS = (
-    "panel", "agent", "kind", "value", "low", "high", "people", "people_is", "zone_low",
+    "panel", "model", "kind", "value", "low", "high", "people", "people_is", "zone_low",
     "zone_high", "zone", "reason",
 )  # fmt: skip
-"""``panel``: scenario or `MEAN`; ``kind``: what the mark says: the readout, or `ANCHOR`; ``people``
-and ``people_is``: the dashed line and its name; ``zone``: what the band is."""
+"""``panel``: scenario or `MEAN`; ``kind``: what the mark says: the readout, or `BASELINE`;
+``people`` and ``people_is``: the dashed line and its name; ``zone``: what the band is."""
 
-GROUPED_COLUMNS = ("panel", "agent", "group", "value", "low", "high", "people", "stimuli", "reason")
+GROUPED_COLUMNS = ("panel", "model", "group", "value", "low", "high", "people", "stimuli", "reason")
 
-GENERALIZATION_COLUMNS = ("agent", "trained", "tested", "stimuli", "accuracy", "people",
+GENERALIZATION_COLUMNS = ("model", "trained", "tested", "stimuli", "accuracy", "people",
                           "difference")  # fmt: skip
 
 ALL_BUT, ONLY, ANOTHER = PROTOCOLS["all but this"], PROTOCOLS["same"], "another scenario"
@@ -75,11 +75,11 @@ def kappa_table(comparison: Comparison, with_people: PeopleComparison) -> pd.Dat
     Columns: `MEASURE_COLUMNS`. Intervals draw people and stimuli.
     """
     rows = with_people.scores[with_people.scores["measure"] == "kappa"].rename(
-        columns={"model": "agent", "scenario": "panel", "low_both": "low", "high_both": "high"}
-    )[["panel", "agent", "value", "low", "high", "reason"]]
-    readouts = comparison.scores.drop_duplicates("agent").set_index("agent")["readout"]
-    rows = rows[rows["agent"].isin([*comparison.agents, *COMPUTED])]
-    rows = rows.assign(kind=rows["agent"].map(readouts).fillna(""))
+        columns={"model": "model", "scenario": "panel", "low_both": "low", "high_both": "high"}
+    )[["panel", "model", "value", "low", "high", "reason"]]
+    readouts = comparison.scores.drop_duplicates("model").set_index("model")["readout"]
+    rows = rows[rows["model"].isin([*comparison.names, *COMPUTED])]
+    rows = rows.assign(kind=rows["model"].map(readouts).fillna(""))
     zones = with_people.zones
     subset = zones[(zones["measure"] == "kappa") & (zones["of"] == "participants")]
     people = subset.set_index("scenario")[["mean"]].set_axis(["people"], axis=1)
@@ -94,15 +94,15 @@ def _scores(comparison: Comparison, key: str) -> pd.DataFrame:
     rows = table[table["scenario"] != POOLED].drop(columns="kind")
     names = {"scenario": "panel", "readout": "kind", key: "value", f"{key}_low": "low",
              f"{key}_high": "high"}  # fmt: skip
-    return rows[["agent", *names, "reason"]].rename(columns=names)
+    return rows[["model", *names, "reason"]].rename(columns=names)
 
 
-def _anchors_last(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of models, then of anchors, which are marked; undefined ones are left out."""
-    anchor = rows["agent"].map(kind_of) == "anchor"
-    defined = rows["agent"].isin(rows.loc[rows["value"].notna(), "agent"])
-    marked = rows.assign(kind=rows["kind"].mask(anchor, ANCHOR))
-    return pd.concat([marked[~anchor], marked[anchor & defined]], ignore_index=True)
+def _baselines_last(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of models, then of the defined baselines, which are marked."""
+    baseline = rows["model"].map(kind_of) == "baseline"
+    defined = rows["model"].isin(rows.loc[rows["value"].notna(), "model"])
+    marked = rows.assign(kind=rows["kind"].mask(baseline, BASELINE))
+    return pd.concat([marked[~baseline], marked[baseline & defined]], ignore_index=True)
 
 
 def _accuracy_of_people(comparison: Comparison) -> pd.DataFrame:
@@ -139,7 +139,7 @@ def _with_zone(
 
 
 def _measure(rows: pd.DataFrame, people: pd.DataFrame, people_is: str) -> pd.DataFrame:
-    table = _anchors_last(rows).join(people, on="panel")
+    table = _baselines_last(rows).join(people, on="panel")
     table = table.assign(people_is=people_is, zone=table["zone"].fillna(""))
     names = [*in_order(table.loc[table["panel"] != MEAN, "panel"]), MEAN]
     if len(names) == 2:
@@ -153,12 +153,12 @@ def _measure(rows: pd.DataFrame, people: pd.DataFrame, people_is: str) -> pd.Dat
 # --- by stimulus --------------------------------------------------------------------------------
 
 
-def scatter_table(comparison: Comparison, agents: Sequence[str]) -> pd.DataFrame:
+def scatter_table(comparison: Comparison, models: Sequence[str]) -> pd.DataFrame:
     """Return P(contact) and the fraction of yes, a row a model and stimulus, in the order of
-    ``agents``.
+    ``models``.
     """
-    columns = ["agent", "scenario", "stimulus", "p_yes", "p_contact", "label", "simulated"]
-    rows = comparison.stimuli[comparison.stimuli["agent"].isin(agents)]
+    columns = ["model", "scenario", "stimulus", "p_yes", "p_contact", "label", "simulated"]
+    rows = comparison.stimuli[comparison.stimuli["model"].isin(models)]
     return rows[columns].reset_index(drop=True)
 
 
@@ -185,11 +185,11 @@ def calibration_table(comparison: Comparison) -> pd.DataFrame:
     The outcome is the official one.
     """
     parts = []
-    chosen = comparison.stimuli[comparison.stimuli["agent"].isin(comparison.models)]
-    for agent, rows in chosen.groupby("agent", sort=False):
+    chosen = comparison.stimuli[comparison.stimuli["model"].isin(comparison.models)]
+    for model, rows in chosen.groupby("model", sort=False):
         truth = rows["label"].to_numpy(dtype=np.float64)
         curve = reliability_curve(rows["p_contact"], truth)
-        curve.insert(0, "agent", agent)
+        curve.insert(0, "model", model)
         parts.append(curve.assign(brier=brier(rows["p_contact"], truth)))
     return pd.concat(parts, ignore_index=True)
 
@@ -205,15 +205,15 @@ def thirds_table(
     `participants.Responses`) the dashed line is the r of halves of them with each other.
     """
     people = _halves_by_third(comparison, answers)
-    stimuli = pd.concat([comparison.stimuli, anchor_stimuli(comparison.stimuli)])
+    stimuli = pd.concat([comparison.stimuli, baseline_stimuli(comparison.stimuli)])
     parts = []
     for name, words in THIRD_WORDS.items():
         rows = [
-            {"agent": agent, "kind": subset["readout"].iloc[0]} | _third(subset, name, level)
-            for agent, subset in stimuli.groupby("agent", sort=False)
+            {"model": model, "kind": subset["readout"].iloc[0]} | _third(subset, name, level)
+            for model, subset in stimuli.groupby("model", sort=False)
         ]
         parts.append(pd.DataFrame(rows).assign(panel=words, **people[name]))
-    table = _anchors_last(pd.concat(parts, ignore_index=True))
+    table = _baselines_last(pd.concat(parts, ignore_index=True))
     order = table["panel"].map({words: at for at, words in enumerate(THIRD_WORDS.values())})
     table = table.assign(order=order).sort_values("order", kind="stable", ignore_index=True)
     return table[[*MEASURE_COLUMNS, "stimuli"]]
@@ -306,9 +306,9 @@ def _with_training(comparison: Comparison, predictions: pd.DataFrame) -> pd.Data
     for column in reversed(DATASETS[1:3]):
         if column in predictions:
             result = result.where(result != "", predictions[column])
-    subset = predictions[["agent", "stimulus"]].assign(trained=result)
-    chosen = comparison.stimuli[comparison.stimuli["agent"].isin(comparison.models)]
-    rows = chosen.merge(subset, on=["agent", "stimulus"], how="left")
+    subset = predictions[["model", "stimulus"]].assign(trained=result)
+    chosen = comparison.stimuli[comparison.stimuli["model"].isin(comparison.models)]
+    rows = chosen.merge(subset, on=["model", "stimulus"], how="left")
     ours = rows["trained"].map(lambda name: OFFICIAL_SCENARIOS.get(str(name).lower(), name))
     rows["trained"] = ours.where(ours != "same", rows["scenario"]).replace("all but this", ALL_BUT)
     rows["training"] = rows["trained"].where(~rows["trained"].isin(SCENARIOS), ANOTHER)
@@ -323,11 +323,11 @@ def _most_common(values: pd.Series) -> str:
 def _effect(
     rows: pd.DataFrame, column: str, groups: Sequence[str], panel: str, level: float
 ) -> pd.DataFrame:
-    if rows.groupby("model")[column].nunique().max() < 2:
+    if rows.groupby("base_model")[column].nunique().max() < 2:
         return pd.DataFrame(columns=list(GROUPED_COLUMNS))
     right = rows.assign(right=(rows["predicted"] == rows["label"]).astype(np.float64))
     records = []
-    for (model, group), subset in right.groupby(["model", column], sort=False):
+    for (model, group), subset in right.groupby(["base_model", column], sort=False):
         values, variances = [], []
         for _, part in subset.groupby("scenario"):
             mean = part.groupby("stimulus")["right"].mean().sort_index().to_numpy(np.float64)
@@ -339,10 +339,10 @@ def _effect(
                         subset["stimulus"].nunique(), ""))  # fmt: skip
     table = pd.DataFrame(records, columns=list(GROUPED_COLUMNS))
     rank = {name: at for at, name in enumerate(groups)}
-    models = {name: at for at, name in enumerate(rows["model"].unique())}
-    keys = {"group": rank, "agent": models}
+    models = {name: at for at, name in enumerate(rows["base_model"].unique())}
+    keys = {"group": rank, "model": models}
     return table.sort_values(
-        ["group", "agent"], key=lambda values: values.map(keys[str(values.name)]), kind="stable"
+        ["group", "model"], key=lambda values: values.map(keys[str(values.name)]), kind="stable"
     )
 
 
@@ -355,16 +355,16 @@ def generalization_table(comparison: Comparison, predictions: pd.DataFrame) -> p
     """
     rows = _with_training(comparison, predictions)
     parts = {*SCENARIOS, ALL_BUT}
-    several = rows.groupby(["model", "readout"])["training"].nunique().max() > 1
+    several = rows.groupby(["base_model", "readout"])["training"].nunique().max() > 1
     if not set(rows["trained"]) & parts or not several:
         return pd.DataFrame(columns=list(GENERALIZATION_COLUMNS))
     if not (rows["training"] == ANOTHER).any():
         rows["trained"] = rows["training"]  # nothing off the diagonal: one row is enough
     rows = rows.assign(
-        right=rows["predicted"] == rows["label"], agent=rows["model"] + " · " + rows["readout"]
+        right=rows["predicted"] == rows["label"], model=rows["base_model"] + " · " + rows["readout"]
     )
-    rows = rows[rows.groupby("agent")["trained"].transform("nunique") > 1]
-    keys = ["agent", "trained", "scenario"]
+    rows = rows[rows.groupby("model")["trained"].transform("nunique") > 1]
+    keys = ["model", "trained", "scenario"]
     table = rows.groupby(keys, sort=False).agg(
         stimuli=("stimulus", "nunique"), accuracy=("right", "mean"),
         people=("human_accuracy", "mean"),
@@ -374,12 +374,12 @@ def generalization_table(comparison: Comparison, predictions: pd.DataFrame) -> p
     first = ["all", ALL_BUT, ONLY, *SCENARIOS]
     order = {name: at for at, name in enumerate(first)}
     rank = {
-        "agent": {name: at for at, name in enumerate(table["agent"].unique())},
+        "model": {name: at for at, name in enumerate(table["model"].unique())},
         "trained": order,
         "tested": order,
     }
     ordered = table.sort_values(
-        ["agent", "trained", "tested"],
+        ["model", "trained", "tested"],
         key=lambda values: values.map(rank[str(values.name)]).fillna(len(first)),
         kind="stable",
     )

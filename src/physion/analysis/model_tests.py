@@ -78,12 +78,12 @@ def pool_comparison(comparison: Comparison) -> PooledStimuli:
     )
 
     def by_model(column: str) -> Array:
-        wide = rows.pivot(index="agent", columns="stimulus", values=column)
-        return np.asarray(wide.loc[comparison.agents], dtype=np.float64)
+        wide = rows.pivot(index="model", columns="stimulus", values=column)
+        return np.asarray(wide.loc[comparison.names], dtype=np.float64)
 
     by_stimulus = rows.drop_duplicates("stimulus").set_index("stimulus").sort_index()
     return PooledStimuli(
-        names=tuple(comparison.agents),
+        names=tuple(comparison.names),
         p_contact=by_model("p_contact"),
         correct=by_model("correct"),
         label=by_stimulus["label"].to_numpy(dtype=np.float64),
@@ -371,26 +371,26 @@ def fits_of_models(comparison: Comparison) -> list[MixedTable]:
     """
     scores = comparison.scores
     rows = scores[~scores["scenario"].isin([MEAN, POOLED])]
-    if len(comparison.agents) < 2 or rows["scenario"].nunique() < 2:
+    if len(comparison.names) < 2 or rows["scenario"].nunique() < 2:
         return []
-    rows = rows[["agent", "model", "readout", "scenario", "accuracy"]]
+    rows = rows[["model", "base_model", "readout", "scenario", "accuracy"]]
     # The first in the files, not in the alphabet, is the base level.
     rows = rows.assign(
-        agent=pd.Categorical(rows["agent"], categories=comparison.agents),
+        model=pd.Categorical(rows["model"], categories=comparison.names),
         readout=pd.Categorical(rows["readout"], categories=rows["readout"].unique()),
     )
     fits = [
         _fitted(
             "models",
-            f"Do models differ in accuracy? Linear, each against {comparison.agents[0]}, "
+            f"Do models differ in accuracy? Linear, each against {comparison.names[0]}, "
             "the first in the files",
-            "accuracy ~ agent + (1|scenario)",
+            "accuracy ~ model + (1|scenario)",
             fit_linear,
             rows,
-            "agent",
+            "model",
         )
     ]
-    if rows["readout"].nunique() > 1 and rows["model"].nunique() > 1:
+    if rows["readout"].nunique() > 1 and rows["base_model"].nunique() > 1:
         first = rows["readout"].cat.categories[0]
         fits.append(
             _fitted(

@@ -21,7 +21,7 @@ CONSTANT_VELOCITY = "constant velocity"
 """Name of the baseline: objects go on as they moved in the last observed step."""
 REQUIRED = ("Model", "Scenario", "Stimulus Name", "Frames", "Error", "Constant Velocity Error")
 """Columns of a file of errors, which ``physion evaluate --rollout-error`` writes."""
-COLUMNS = ("panel", "agent", "kind", "seconds", "trials", "value", "low", "high")
+COLUMNS = ("panel", "model", "kind", "seconds", "trials", "value", "low", "high")
 """``panel``: scenario or `MEAN`; ``kind``: model or baseline; ``seconds`` of physics after the last
 observed frame; ``value``: mean error in metres, with its interval."""
 _FRAME = 0.01
@@ -31,7 +31,7 @@ Array = npt.NDArray[np.float64]
 
 
 def read_rollout_errors(paths: Sequence[Path]) -> pd.DataFrame:
-    """Read files of errors: columns ``agent``, ``scenario``, ``stimulus``, ``seconds``, ``error``,
+    """Read files of errors: columns ``model``, ``scenario``, ``stimulus``, ``seconds``, ``error``,
     ``baseline``.
 
     A model that is in several files is named with each file. Raises `BadInputError` for a file that
@@ -41,7 +41,7 @@ def read_rollout_errors(paths: Sequence[Path]) -> pd.DataFrame:
     count = Counter(name for table in tables.values() for name in set(table["Model"]))
     parts = []
     for path, table in tables.items():
-        agent = [f"{m}, {path.stem}" if count[m] > 1 else m for m in table["Model"]]
+        model = [f"{m}, {path.stem}" if count[m] > 1 else m for m in table["Model"]]
         numbers = {
             name: as_numbers(table[column], 0, _FARTHEST, str(path))
             for name, column in (
@@ -51,9 +51,9 @@ def read_rollout_errors(paths: Sequence[Path]) -> pd.DataFrame:
             )
         }
         names = {"scenario": table["Scenario"], "stimulus": table["Stimulus Name"]}
-        part = pd.DataFrame({"agent": agent, **names, **numbers})
+        part = pd.DataFrame({"model": model, **names, **numbers})
         part["seconds"] *= _FRAME
-        repeated = part.duplicated(["agent", "stimulus", "seconds"])
+        repeated = part.duplicated(["model", "stimulus", "seconds"])
         if repeated.any():
             row = int(np.flatnonzero(repeated)[0])
             raise BadInputError(
@@ -78,13 +78,13 @@ def rollout_error_table(errors: pd.DataFrame, level: float = 0.95) -> pd.DataFra
         Level of the intervals, which are symmetric in the logarithm of the mean error. Errors are
         skewed, which `jackknife.degrees_of_freedom` takes into account.
     """
-    agents = list(dict.fromkeys(errors["agent"]))
+    models = list(dict.fromkeys(errors["model"]))
     scenarios = in_order(set(errors["scenario"]))
-    curves = [(agent, "model", "error", agent) for agent in agents]
-    curves.append((CONSTANT_VELOCITY, "baseline", "baseline", agents[0]))
+    curves = [(model, "model", "error", model) for model in models]
+    curves.append((CONSTANT_VELOCITY, "baseline", "baseline", models[0]))
     rows: list[pd.DataFrame] = []
-    for name, kind, column, agent in curves:
-        own = errors[errors["agent"] == agent]
+    for name, kind, column, model in curves:
+        own = errors[errors["model"] == model]
         means = {
             scenario: _means(own[own["scenario"] == scenario], column)
             for scenario in scenarios
@@ -93,7 +93,7 @@ def rollout_error_table(errors: pd.DataFrame, level: float = 0.95) -> pd.DataFra
         if len(means) > 1:
             means[MEAN] = _mean_over_scenarios(list(means.values()))
         rows += [
-            _rows(values, level).assign(panel=panel, agent=name, kind=kind)
+            _rows(values, level).assign(panel=panel, model=name, kind=kind)
             for panel, values in means.items()
         ]
     table = pd.concat(rows, ignore_index=True)[list(COLUMNS)]

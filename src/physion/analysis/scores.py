@@ -53,7 +53,7 @@ def score_table(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
 
     Returns
     -------
-    For each ``agent`` its scenarios, then `MEAN` and `POOLED`. Columns: ``agent``, ``model``,
+    For each ``model`` its scenarios, then `MEAN` and `POOLED`. Columns: ``model``, ``base_model``,
     ``readout``, ``scenario``; counts of ``stimuli`` and of ``changed`` ones, whose simulated
     outcome is not the official one; every metric of `metrics.score_metrics` with ``_low`` and
     ``_high``; ``ceiling`` of r and ``floor`` of the RMSD; ``reason``: why a score or an interval is
@@ -63,11 +63,11 @@ def score_table(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
     ordered = stimuli.sort_values("stimulus", kind="stable")
     parts = [
         _agent_rows(rows, level, _of_models, _why_undefined)
-        for _, rows in ordered.groupby("agent", sort=False)
+        for _, rows in ordered.groupby("model", sort=False)
     ]
     table = pd.concat(parts, ignore_index=True)
-    rank = {agent: position for position, agent in enumerate(stimuli["agent"].unique())}
-    return table.sort_values("agent", key=lambda a: a.map(rank), kind="stable").reset_index(
+    rank = {model: position for position, model in enumerate(stimuli["model"].unique())}
+    return table.sort_values("model", key=lambda a: a.map(rank), kind="stable").reset_index(
         drop=True
     )
 
@@ -108,7 +108,7 @@ def _agent_rows(rows: pd.DataFrame, level: float, scores: Compute, why: Explain)
     pooled = scores(pool(samples))
     records.append(_record(POOLED, rows, pooled, strata, level, [*why(rows).values()]))
     table = pd.DataFrame(records)
-    for position, column in enumerate(("agent", "model", "readout")):
+    for position, column in enumerate(("model", "base_model", "readout")):
         table.insert(position, column, rows[column].iloc[0])
     return table
 
@@ -257,43 +257,43 @@ class Models:
 
 
 def models_of(
-    rows: pd.DataFrame, answers: ScenarioAnswers, agents: Sequence[str] | None = None
+    rows: pd.DataFrame, answers: ScenarioAnswers, names: Sequence[str] | None = None
 ) -> tuple[Models, pd.DataFrame]:
     """Return the models of a table, and a table of what has no counterpart.
 
     Parameters
     ----------
     rows
-        Table with ``agent``, ``stimulus``, ``p_contact``, ``predicted``.
+        Table with ``model``, ``stimulus``, ``p_contact``, ``predicted``.
     answers
         Answers of people to the scenario, whose stimuli are used.
-    agents
+    names
         Names of the models in the order to use, whether they occur in ``rows`` or not; None: those
         that occur.
 
     Returns
     -------
-    The models, and the table ``agent``, ``reason``, ``stimuli``. Raises `BadInputError` if a model
+    The models, and the table ``model``, ``reason``, ``stimuli``. Raises `BadInputError` if a model
     predicts a stimulus twice.
     """
-    twice = rows[rows.duplicated(["agent", "stimulus"])]
+    twice = rows[rows.duplicated(["model", "stimulus"])]
     if len(twice):
         raise BadInputError(
-            f"{twice['agent'].iloc[0]!r} answers {twice['stimulus'].iloc[0]!r} twice"
+            f"{twice['model'].iloc[0]!r} answers {twice['stimulus'].iloc[0]!r} twice"
         )
-    names = tuple(map(str, rows["agent"].unique() if agents is None else agents))
+    names = tuple(map(str, rows["model"].unique() if names is None else names))
     grids = [
-        rows.pivot(index="agent", columns="stimulus", values=column)
+        rows.pivot(index="model", columns="stimulus", values=column)
         .reindex(index=list(names), columns=list(answers.stimuli))
         .to_numpy(dtype=np.float64)
         for column in ("p_contact", "predicted")
     ]
-    unseen = rows[~rows["stimulus"].isin(answers.stimuli)].groupby("agent", sort=False).size()
-    unmatched = [(agent, "people did not see it", int(n)) for agent, n in unseen.items()]
+    unseen = rows[~rows["stimulus"].isin(answers.stimuli)].groupby("model", sort=False).size()
+    unmatched = [(model, "people did not see it", int(n)) for model, n in unseen.items()]
     gaps = np.isnan(grids[0]).sum(axis=1)
     unmatched += [(name, "the model does not predict it", int(n))
              for name, n in zip(names, gaps, strict=True) if n]  # fmt: skip
-    dropped = pd.DataFrame(unmatched, columns=["agent", "reason", "stimuli"])
+    dropped = pd.DataFrame(unmatched, columns=["model", "reason", "stimuli"])
     return Models(names, grids[0], grids[1]), dropped
 
 
@@ -483,7 +483,7 @@ def _undefined(models: Models, answers: ScenarioAnswers, computes: Computes) -> 
     return {name: Variance(values, values) for name, values in nothing.items()}
 
 
-# Anchors of the tables of results: what a model's score is worth.
+# Baselines of the tables of results: what a model's score is worth.
 #
 # Three are computed from the answers of people and the official outcomes, without a model:
 #
@@ -493,16 +493,17 @@ def _undefined(models: Models, answers: ScenarioAnswers, computes: Computes) -> 
 #   agrees with single people more often, so its kappa is the ceiling of models;
 # - `TWO_PEOPLE`: one person in place of the model, compared with another one.
 #
-# Others come as predictions of models whose names are in `ANCHOR_MODELS`. Predictions of `outcome`
-# or `majority-of-people` take the place of the computed anchor, which then stands in no table.
+# Others come as predictions of models whose names are in `BASELINE_MODELS`. Predictions of
+# `outcome` or `majority-of-people` take the place of the computed baseline, which then stands in
+# no table.
 
 OUTCOME = "recorded outcome"
 MAJORITY = "majority of people"
 TWO_PEOPLE = "one person with another"
 COMPUTED = (OUTCOME, MAJORITY, TWO_PEOPLE)
-"""Names of the anchors that need no predictions."""
+"""Names of the baselines that need no predictions."""
 
-ANCHOR_MODELS = frozenset(
+BASELINE_MODELS = frozenset(
     {
         "outcome",
         "majority-of-people",
@@ -514,26 +515,26 @@ ANCHOR_MODELS = frozenset(
         "chance",
     }
 )
-"""Names of models whose predictions are anchors."""
+"""Names of models whose predictions are baselines."""
 
 GIVEN_AS = {OUTCOME: "outcome", MAJORITY: "majority-of-people"}
-"""Names of the models whose predictions take the place of a computed anchor."""
+"""Names of the models whose predictions take the place of a computed baseline."""
 
-Kind = Literal["model", "anchor"]
-
-
-def kind_of(agent: str) -> Kind:
-    """Return whether an agent is a model or an anchor, by the name of the model alone."""
-    model = agent.partition(" · ")[0]
-    return "anchor" if model in ANCHOR_MODELS or agent in COMPUTED else "model"
+Kind = Literal["model", "baseline"]
 
 
-def not_given(agents: Iterable[str]) -> list[str]:
+def kind_of(name: str) -> Kind:
+    """Return whether a row of a table is about a model or a baseline, by its name only."""
+    model = name.partition(" · ")[0]
+    return "baseline" if model in BASELINE_MODELS or name in COMPUTED else "model"
+
+
+def not_given(names: Iterable[str]) -> list[str]:
     """Return those of `OUTCOME` and `MAJORITY` of which no predictions were given.
 
-    ``agents``: names of everything of which there are predictions.
+    ``names``: names of everything of which there are predictions.
     """
-    models = {agent.partition(" · ")[0] for agent in agents}
+    models = {name.partition(" · ")[0] for name in names}
     return [name for name, model in GIVEN_AS.items() if model not in models]
 
 
@@ -547,34 +548,34 @@ def seen_stimuli(stimuli: pd.DataFrame) -> pd.DataFrame:
     return _answering(seen, TWO_PEOPLE, seen["label"].astype(bool))
 
 
-def anchor_stimuli(stimuli: pd.DataFrame) -> pd.DataFrame:
+def baseline_stimuli(stimuli: pd.DataFrame) -> pd.DataFrame:
     """Return the answers of `OUTCOME` and `MAJORITY` to the stimuli that people answered.
 
     ``stimuli`` and the result have the columns of `comparison.Comparison.stimuli`; the result is
-    about each stimulus once, and P(contact) is 0 or 1. Without people, and for anchors whose
+    about each stimulus once, and P(contact) is 0 or 1. Without people, and for baselines whose
     predictions were given (`GIVEN_AS`), it has no rows.
     """
     seen = seen_stimuli(stimuli)
     answers = {OUTCOME: seen["label"].astype(bool), MAJORITY: seen["p_yes"] > 0.5}
-    names = not_given(str(agent) for agent in stimuli["agent"].unique())
+    names = not_given(str(model) for model in stimuli["model"].unique())
     parts = [_answering(seen, name, answers[name]) for name in names]
     return pd.concat(parts, ignore_index=True) if parts else seen.iloc[:0]
 
 
 def _answering(seen: pd.DataFrame, name: str, yes: pd.Series) -> pd.DataFrame:
-    """Return the rows of ``seen`` with the answers ``yes`` of an anchor."""
+    """Return the rows of ``seen`` with the answers ``yes`` of a baseline."""
     table = seen.assign(
-        agent=name, model=name, readout="", predicted=yes, p_contact=yes.astype(float)
+        model=name, base_model=name, readout="", predicted=yes, p_contact=yes.astype(float)
     )
     return table.assign(gap=table["p_contact"] - table["p_yes"]).reset_index(drop=True)
 
 
-def anchor_scores(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
-    """Return `with_kind` of the scores of the computed anchors; empty without people.
+def baseline_scores(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
+    """Return `with_kind` of the scores of the computed baselines; empty without people.
 
-    ``stimuli``: as for `anchor_stimuli`.
+    ``stimuli``: as for `baseline_stimuli`.
     """
-    seen, answers = seen_stimuli(stimuli), anchor_stimuli(stimuli)
+    seen, answers = seen_stimuli(stimuli), baseline_stimuli(stimuli)
     if seen.empty:
         return pd.DataFrame()
     parts = [score_table(answers, level)] if len(answers) else []
@@ -582,7 +583,7 @@ def anchor_scores(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
     return with_kind(pd.concat(parts, ignore_index=True))
 
 
-def with_kind(scores: pd.DataFrame, names: str = "agent") -> pd.DataFrame:
+def with_kind(scores: pd.DataFrame, names: str = "model") -> pd.DataFrame:
     """Return a table with the column ``kind`` after that of the names of models."""
     table = scores.copy()
     kinds = [kind_of(str(name)) for name in scores[names]]
@@ -590,7 +591,7 @@ def with_kind(scores: pd.DataFrame, names: str = "agent") -> pd.DataFrame:
     return table
 
 
-def add_anchors(models: Models, answers: ScenarioAnswers) -> Models:
+def add_baselines(models: Models, answers: ScenarioAnswers) -> Models:
     """Return the models with `OUTCOME` and `MAJORITY` as the last two, unless they were given."""
     rows = {OUTCOME: answers.label, MAJORITY: answers.p_yes() > 0.5}
     names = not_given(models.names)

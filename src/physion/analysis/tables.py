@@ -256,13 +256,16 @@ def check_predictions(table: pd.DataFrame, where: str = "predictions") -> pd.Dat
 
 
 def name_models(predictions: pd.DataFrame) -> pd.DataFrame:
-    """Return ``predictions`` with ``agent``, a unique name for each model.
+    """Return ``predictions`` with a unique ``model`` for each row of results, and ``base_model``.
 
-    It is model and readout and, if several models share these, also what distinguishes them
-    (training set, seed, ...). Raises `BadInputError` if one model predicts a stimulus twice, or if
-    two models were shown trials of one name but of different scenario, outcome or observed contact.
+    The unique name is model and readout and, if several models share these, also what
+    distinguishes them (training set, seed, ...). Raises `BadInputError` if one model predicts a
+    stimulus twice, or if two models were shown trials of one name but of different scenario,
+    outcome or observed contact.
     """
-    agent = predictions["model"] + " · " + predictions["readout"]
+    model = predictions["model"].where(
+        predictions["readout"] == "", predictions["model"] + " · " + predictions["readout"]
+    )
     for column in DISTINGUISHING:
         if column not in predictions:
             continue
@@ -270,12 +273,12 @@ def name_models(predictions: pd.DataFrame) -> pd.DataFrame:
         several = values.groupby([predictions["model"], predictions["readout"]]).transform(
             "nunique"
         )
-        agent = agent.where(several < 2, agent + f" · {column.lower()} " + values)
-    named = predictions.assign(agent=agent)
-    twice = named[named.duplicated(["agent", "stimulus"])]
+        model = model.where(several < 2, model + f" · {column.lower()} " + values)
+    named = predictions.assign(base_model=predictions["model"], model=model)
+    twice = named[named.duplicated(["model", "stimulus"])]
     if len(twice):
         row = twice.iloc[0]
-        raise BadInputError(f"{row['agent']!r} predicts {row['stimulus']!r} twice; keep one row")
+        raise BadInputError(f"{row['model']!r} predicts {row['stimulus']!r} twice; keep one row")
     _refuse_two_scenarios(named)
     for column, what in (("actual", "outcomes"), ("observed_contact", "observed contacts")):
         if column not in named:

@@ -163,8 +163,8 @@ def data_uri(mime: str, data: bytes) -> str:
 
 # Building blocks of the report page: tables, lists and cards; every text is escaped.
 
-ANCHORS = "Anchors: what a score is worth"
-"""Heading of the rows of anchors in a table."""
+BASELINES = "Baselines: what a score is worth"
+"""Heading of the rows of baselines in a table."""
 
 
 def details(title: str, content: str) -> str:
@@ -229,16 +229,16 @@ def rows_table(rows: pd.DataFrame, columns: Sequence[PageColumn], caption: str =
     """Return a table of some columns of ``rows``, with reasons of undefined numbers listed below
     it.
 
-    Rows whose ``kind`` is anchor, if there is such a column, follow the others as a group.
+    Rows whose ``kind`` is baseline, if there is such a column, follow the others as a group.
     """
     cells = [[column.cell(row) for column in columns] for _, row in rows.iterrows()]
-    is_anchor = [kind == "anchor" for kind in rows.get("kind", [""] * len(rows))]
-    first, anchors = (
-        [line for line, anchor in zip(cells, is_anchor, strict=True) if anchor is which]
+    is_baseline = [kind == "baseline" for kind in rows.get("kind", [""] * len(rows))]
+    first, baselines = (
+        [line for line, baseline in zip(cells, is_baseline, strict=True) if baseline is which]
         for which in (False, True)
     )
     headings = [column.heading for column in columns]
-    return table(headings, first, caption, (ANCHORS, anchors)) + notes(rows, columns)
+    return table(headings, first, caption, (BASELINES, baselines)) + notes(rows, columns)
 
 
 def notes(rows: pd.DataFrame, columns: Sequence[PageColumn]) -> str:
@@ -379,10 +379,10 @@ def dropped(comparison: Comparison) -> str:
     rows = comparison.dropped
     if rows.empty:
         return "<p>Nothing.</p>"
-    keys = ["agent", "reason"]
+    keys = ["model", "reason"]
     totals = rows.groupby(keys, sort=False)["stimuli"].sum().reset_index()
     cells = [
-        [escape(row["agent"] or "people"), escape(row["reason"]), str(row["stimuli"])]
+        [escape(row["model"] or "people"), escape(row["reason"]), str(row["stimuli"])]
         for _, row in totals.iterrows()
     ]
     return table(["whose", "reason", "stimuli"], cells)

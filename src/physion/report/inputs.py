@@ -55,7 +55,7 @@ class ReportInputs(ComparisonResults):
         """What stands at the top of every page, see `PeopleResults.mark`."""
         return "" if self.people is None else self.people.mark
 
-    def scatter_agents(self) -> list[str]:
+    def scatter_models(self) -> list[str]:
         """The models of the scatter figure: the first ones, in the order of the predictions."""
         return self.comparison.models[: self.scatter_limit]
 
@@ -93,7 +93,7 @@ class ReportInputs(ComparisonResults):
 
     def _with_init(self, scores: pd.DataFrame) -> pd.DataFrame:
         """Return scores with the column ``init``, the weights of each model, after the readout."""
-        init = [self.model_weights.get(str(model), "") for model in scores["model"]]
+        init = [self.model_weights.get(str(model), "") for model in scores["base_model"]]
         table = scores.copy()
         table.insert(list(table.columns).index("readout") + 1, "init", init)
         return table

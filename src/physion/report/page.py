@@ -91,7 +91,7 @@ def _summary(inputs: ReportInputs) -> str:
     comparison = inputs.comparison
     stimuli = comparison.stimuli["stimulus"].nunique()
     scenarios = in_order(comparison.stimuli["scenario"])
-    models, rows = comparison.stimuli["model"].nunique(), len(comparison.agents)
+    models, rows = comparison.stimuli["base_model"].nunique(), len(comparison.names)
     each = f" (with their readouts and trainings {rows} rows)" if rows > models else ""
     words = [
         f"{plural(models, 'model')}{each} on {plural(stimuli, 'stimulus')} "
@@ -188,7 +188,7 @@ def _unanswered(inputs: ReportInputs) -> list[str]:
         )
     elif inputs.people.tables["by_stimulus"]["mean_log_rt"].isna().all():
         words.append("Response times: no answer has one above 0.")
-    counts = inputs.comparison.stimuli[["agent", "stimulus"]].groupby("agent").size()
+    counts = inputs.comparison.stimuli[["model", "stimulus"]].groupby("model").size()
     if counts.nunique() > 1:
         words.append(
             f"Models answered between {counts.min()} and {counts.max()} stimuli: their scores are "

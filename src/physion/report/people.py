@@ -24,7 +24,7 @@ from physion.analysis.people.results import (
 from physion.analysis.scores import TWO_PEOPLE
 from physion.analysis.tables import MEAN, in_order, read_csv
 from physion.report.html import (
-    ANCHORS,
+    BASELINES,
     PageColumn,
     details,
     number,
@@ -547,12 +547,12 @@ def _models_with_and_without(inputs: ReportInputs) -> str:
     if inputs.comparison_all is None:
         return ""
     with_all = inputs.comparison_all.all_scores
-    grouped: dict[str, list[list[str]]] = {"model": [], "anchor": []}
+    grouped: dict[str, list[list[str]]] = {"model": [], "baseline": []}
     for _, row in inputs.comparison.all_scores.iterrows():
-        if row["scenario"] != MEAN or row["agent"] == TWO_PEOPLE:
+        if row["scenario"] != MEAN or row["model"] == TWO_PEOPLE:
             continue
-        other = with_all[(with_all["agent"] == row["agent"]) & (with_all["scenario"] == MEAN)]
-        line = [escape(str(row["agent"]))]
+        other = with_all[(with_all["model"] == row["model"]) & (with_all["scenario"] == MEAN)]
+        line = [escape(str(row["model"]))]
         for key in ("difference", "r"):
             column = PageColumn("", key, "interval")
             line += [column.cell(subset) for subset in (row, other.iloc[0])]
@@ -568,7 +568,7 @@ def _models_with_and_without(inputs: ReportInputs) -> str:
         header,
         grouped["model"],
         "Models, mean over scenarios: accuracy less people's, and r",
-        (ANCHORS, grouped["anchor"]),
+        (BASELINES, grouped["baseline"]),
     )
 
 

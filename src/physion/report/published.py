@@ -140,7 +140,7 @@ _KAPPA = _SHOWN.format(
 
 
 def _measure(panel: pd.DataFrame, measure: str, zone: str) -> pd.DataFrame:
-    rows = panel.rename(columns={"model": "agent", "scenario": "panel", measure: "value"})
+    rows = panel.rename(columns={"scenario": "panel", measure: "value"})
     is_mean = rows["panel"] == MEAN
     rows = rows.assign(kind="", people_is="people", reason="", zone=zone)
     rows["zone"] = rows["zone"].mask(is_mean, SCENARIO_ZONE)
@@ -150,7 +150,7 @@ def _measure(panel: pd.DataFrame, measure: str, zone: str) -> pd.DataFrame:
 
 
 def _grouped(panel: pd.DataFrame, column: str, name: str, people: float) -> pd.DataFrame:
-    rows = panel.rename(columns={"model": "agent", column: "group", "accuracy": "value"})
+    rows = panel.rename(columns={column: "group", "accuracy": "value"})
     rows = rows.assign(panel=name, people=people, stimuli=float("nan"), reason="")
     return rows[list(GROUPED_COLUMNS)].reset_index(drop=True)
 

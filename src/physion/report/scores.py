@@ -15,7 +15,7 @@ from physion.analysis.model_tests import MixedTable, permutations_of
 from physion.analysis.scores import TWO_PEOPLE
 from physion.analysis.tables import MEAN, POOLED, in_order
 from physion.report.html import (
-    ANCHORS,
+    BASELINES,
     PageColumn,
     definition_list,
     details,
@@ -48,7 +48,7 @@ INPUT_WORDS = {
 def inputs_sentence(inputs: ReportInputs) -> str:
     """Return what each model was given, the models of equal inputs together; "" if none says so."""
     groups: dict[str, list[str]] = {}
-    for model in dict.fromkeys(inputs.comparison.stimuli["model"].astype(str)):
+    for model in dict.fromkeys(inputs.comparison.stimuli["base_model"].astype(str)):
         groups.setdefault(inputs.model_inputs.get(model, ""), []).append(model)
     unknown = groups.pop("", [])
     if not groups:
@@ -63,7 +63,7 @@ def inputs_sentence(inputs: ReportInputs) -> str:
 def weights_sentence(inputs: ReportInputs) -> str:
     """Return the initial weights of each model that has any; "" if there is none."""
     groups: dict[str, list[str]] = {}
-    for model in dict.fromkeys(inputs.comparison.stimuli["model"].astype(str)):
+    for model in dict.fromkeys(inputs.comparison.stimuli["base_model"].astype(str)):
         groups.setdefault(inputs.model_weights.get(model, WITHOUT), []).append(model)
     groups.pop(WITHOUT, None)
     if not groups:
@@ -77,7 +77,7 @@ def _describe(given: str) -> str:
     return listed([INPUT_WORDS.get(name, name) for name in names])
 
 
-# Tables of scores, anchors below the models: scores, beyond the outcome, by scenario.
+# Tables of scores, baselines below the models: scores, beyond the outcome, by scenario.
 
 _SAME_EVENT = ("accuracy_simulated", "r_same")
 """Metrics that say something only where a simulated outcome is not the official one."""
@@ -85,7 +85,7 @@ _SAME_EVENT = ("accuracy_simulated", "r_same")
 _LIKENESS = ("r", "kappa_from_averages")
 """Metrics of likeness to people, which those beyond the outcome are read next to."""
 
-_ANCHORS = (
+_BASELINES = (
     "The recorded outcome answers as a perfect simulator would. The majority of people answers "
     "what most of them did: no yes or no agrees with them more often, so its kappa is the ceiling. "
     "One person with another: what a person reaches."
@@ -103,7 +103,7 @@ def scores(comparison: Comparison) -> str:
     """Return all tables of scores: mean over scenarios and pooled, beyond the outcome, later."""
     plain = shown_metrics(comparison, beyond=False)
     parts = [
-        paragraph(_ANCHORS) if comparison.has_people else "",
+        paragraph(_BASELINES) if comparison.has_people else "",
         scores_table(comparison.all_scores, MEAN, plain, "Mean over scenarios"),
         details("All stimuli pooled", scores_table(comparison.all_scores, POOLED, plain)),
     ]
@@ -168,7 +168,7 @@ def scores_table(
     Parameters
     ----------
     scores
-        As `Comparison.all_scores`; anchors follow the models as a group.
+        As `Comparison.all_scores`; baselines follow the models as a group.
     which
         A scenario, `MEAN` or `POOLED`.
     metrics
@@ -180,7 +180,7 @@ def scores_table(
     header = ["model", "readout", "stimuli"]
     for metric in metrics:
         header += [metric.heading, "ceiling of r"] if metric.name == "r" else [metric.heading]
-    lines: dict[str, list[list[str]]] = {"model": [], "anchor": []}
+    lines: dict[str, list[list[str]]] = {"model": [], "baseline": []}
     for _, row in rows.iterrows():
         line = [escape(_describe_model(row)), escape(row["readout"]), str(row["stimuli"])]
         for metric in metrics:
@@ -188,13 +188,13 @@ def scores_table(
             if metric.name == "r":
                 line.append(number(row["ceiling"]))
         lines[row["kind"]].append(line)
-    listing = table(header, lines["model"], caption, (ANCHORS, lines["anchor"]))
+    listing = table(header, lines["model"], caption, (BASELINES, lines["baseline"]))
     return listing + _reasons(rows, metrics)
 
 
 def _cell(row: pd.Series, metric: Metric) -> str:
     """Return a score with its interval; empty where it has no meaning for two people."""
-    if row["agent"] == TWO_PEOPLE and metric.two_people is None:
+    if row["model"] == TWO_PEOPLE and metric.two_people is None:
         return ""
     return interval(row, metric.name)
 
@@ -207,33 +207,33 @@ def _reasons(rows: pd.DataFrame, metrics: Sequence[Metric]) -> str:
         parts = [part for part in str(row["reason"]).split("; ") if part]
         about = [part for part in parts if part.partition(":")[0] not in others]
         if about:
-            items.append(f"<li>{escape(row['agent'])}: {escape('; '.join(about))}</li>")
+            items.append(f"<li>{escape(row['model'])}: {escape('; '.join(about))}</li>")
     return f'<ul class="notes">{"".join(items)}</ul>' if items else ""
 
 
 def _describe_model(row: pd.Series) -> str:
     """Return the model's name with what distinguishes it from others, but without the readout."""
-    head = " · ".join(name for name in (row["model"], row["readout"]) if name)
-    return str(row["model"]) + str(row["agent"]).removeprefix(head)
+    head = " · ".join(name for name in (row["base_model"], row["readout"]) if name)
+    return str(row["base_model"]) + str(row["model"]).removeprefix(head)
 
 
 def matrix(comparison: Comparison, key: str) -> str:
-    """Return a score by model (rows) and scenario (columns), people on top, anchors below."""
+    """Return a score by model (rows) and scenario (columns), people on top, baselines below."""
     columns = [*in_order(comparison.stimuli["scenario"]), MEAN, POOLED]
     first = []
     if comparison.has_people and key in _PEOPLE:
         first.append([f"<em>{_PEOPLE[key]}</em>", *_people_cells(comparison, key, columns)])
-    lines: dict[str, list[list[str]]] = {"model": first, "anchor": []}
-    for agent, rows in comparison.all_scores.groupby("agent", sort=False):
+    lines: dict[str, list[list[str]]] = {"model": first, "baseline": []}
+    for model, rows in comparison.all_scores.groupby("model", sort=False):
         subset = rows.set_index("scenario")
-        if agent == TWO_PEOPLE and (key in _PEOPLE or subset[key].isna().all()):
+        if model == TWO_PEOPLE and (key in _PEOPLE or subset[key].isna().all()):
             continue
         cells = [
             interval(subset.loc[name], key) if name in subset.index else undefined("no predictions")
             for name in columns
         ]
-        lines[subset["kind"].iloc[0]].append([escape(str(agent)), *cells])
-    return table(["", *columns], lines["model"], below=(ANCHORS, lines["anchor"]))
+        lines[subset["kind"].iloc[0]].append([escape(str(model)), *cells])
+    return table(["", *columns], lines["model"], below=(BASELINES, lines["baseline"]))
 
 
 _PEOPLE = {"accuracy": "people", "r": "ceiling"}

@@ -65,7 +65,7 @@ def opening_trials(comparison: Comparison, movies: Container[str] = ()) -> list[
 def _best(rows: pd.DataFrame, movies: Container[str], contact: bool) -> str:
     rows = rows.assign(miss=(rows["p_contact"] - rows["label"].astype(float)).abs())
     table = rows.groupby("stimulus", as_index=False).agg(
-        models=("agent", "size"),
+        models=("model", "size"),
         label=("label", "first"),
         simulated=("simulated", "first"),
         accuracy=("human_accuracy", "first"),
@@ -93,9 +93,9 @@ def opinions(comparison: Comparison) -> pd.DataFrame:
     stimuli of every scenario the same P(contact); if none is left, all rows are returned.
     """
     rows = comparison.stimuli
-    values = rows.groupby(["agent", "scenario"])["p_contact"].nunique()
-    varied = values[values > 1].reset_index()["agent"].unique()
-    kept = rows[rows["agent"].isin(varied) & (rows["readout"] != "full")]
+    values = rows.groupby(["model", "scenario"])["p_contact"].nunique()
+    varied = values[values > 1].reset_index()["model"].unique()
+    kept = rows[rows["model"].isin(varied) & (rows["readout"] != "full")]
     return rows if kept.empty else kept
 
 
@@ -112,8 +112,8 @@ def widest_gaps(comparison: Comparison, count: int) -> pd.DataFrame:
     rows = rows[(rows["label"] == rows["simulated"]) & (rows["gap"].abs() >= WIDE)]
     rows = rows.assign(size=rows["gap"].abs())
     ranked = rows.sort_values(["size", "stimulus"], ascending=[False, True], kind="stable")
-    names = list(dict.fromkeys(rows["model"]))
-    queues = [list(ranked.index[ranked["model"] == name]) for name in names]
+    names = list(dict.fromkeys(rows["base_model"]))
+    queues = [list(ranked.index[ranked["base_model"] == name]) for name in names]
     chosen: list[int] = []
     seen: set[str] = set()
     while len(chosen) < count and any(queues):
@@ -129,23 +129,24 @@ def widest_gaps(comparison: Comparison, count: int) -> pd.DataFrame:
 def who_was_right(comparison: Comparison) -> pd.DataFrame:
     """Return how often the majority of people and each model were right on the same stimuli.
 
-    A row a model (``agent``) with counts: ``stimuli``, ``both``, ``people``, ``model``, ``neither``
-    right, ``divided``: exactly half of the people were right. The outcome is the official one.
+    One row per model with counts: ``stimuli``, ``both``, ``only_people``, ``only_model``,
+    ``neither`` right, ``divided``: exactly half of the people were right. The outcome is the
+    official one.
     """
     rows = comparison.stimuli
     people, divided = rows["human_accuracy"] > 0.5, rows["human_accuracy"] == 0.5
     model = rows["predicted"].astype(bool) == rows["label"].astype(bool)
     counted = rows.assign(
         both=people & model,
-        people=people & ~model,
-        model_alone=~people & ~divided & model,
+        only_people=people & ~model,
+        only_model=~people & ~divided & model,
         neither=~people & ~divided & ~model,
         divided=divided,
     )
-    keys = ["both", "people", "model_alone", "neither", "divided"]
-    sums = counted.groupby("agent", sort=False)[keys].sum().astype(int)
-    sums.insert(0, "stimuli", counted.groupby("agent", sort=False).size())
-    return sums.reset_index().rename(columns={"model_alone": "model"})
+    keys = ["both", "only_people", "only_model", "neither", "divided"]
+    sums = counted.groupby("model", sort=False)[keys].sum().astype(int)
+    sums.insert(0, "stimuli", counted.groupby("model", sort=False).size())
+    return sums.reset_index()
 
 
 # Cards of a page: a stimulus with its movie, its outcome, and the answers of people and models.
@@ -173,7 +174,7 @@ def card(rows: pd.DataFrame, movie: str, links: Mapping[str, str], named: str = 
     links
         Addresses by stimulus; the name links there.
     named
-        Name of a model (``agent``) that is shown in bold and with this readout.
+        Name of a model (``model``) that is shown in bold and with this readout.
     """
     first = rows.iloc[0]
     return (
@@ -188,12 +189,12 @@ def pick_readouts(rows: pd.DataFrame, named: str = "") -> pd.DataFrame:
 
     Readouts that were shown the outcome (*full*) are left out where another one is there.
     """
-    seen = rows[(rows["readout"] != "full") | (rows["agent"] == named)]
+    seen = rows[(rows["readout"] != "full") | (rows["model"] == named)]
     rows = rows if seen.empty else seen
     parts = []
-    for _, own in rows.groupby("model", sort=False):
-        if (own["agent"] == named).any():
-            parts.append(own[own["agent"] == named])
+    for _, own in rows.groupby("base_model", sort=False):
+        if (own["model"] == named).any():
+            parts.append(own[own["model"] == named])
             continue
         known = [name for name in READOUT_ORDER if (own["readout"] == name).any()]
         parts.append(own[own["readout"] == known[0]] if known else own)
@@ -225,12 +226,12 @@ def answers(rows: pd.DataFrame, named: str = "") -> str:
         right = None if first["human_accuracy"] == 0.5 else first["human_accuracy"] > 0.5
         items.append(_answer("people say yes", "", value, first["p_yes"], right, "human"))
     for _, row in rows.iterrows():
-        alone = (rows["model"] == row["model"]).sum() == 1
+        alone = (rows["base_model"] == row["base_model"]).sum() == 1
         right = bool(row["predicted"]) == bool(row["label"])
-        kind = "model named" if row["agent"] == named else "model"
-        label = row["model"] if alone else row["agent"]
+        kind = "model named" if row["model"] == named else "model"
+        label = row["base_model"] if alone else row["model"]
         value = number(row["p_contact"])
-        items.append(_answer(str(label), str(row["agent"]), value, row["p_contact"], right, kind))
+        items.append(_answer(str(label), str(row["model"]), value, row["p_contact"], right, kind))
     # People come first and count as one.
     most = MOST_ANSWERS + len(items) - len(rows)
     shown = f'<ul class="answers">{"".join(items[:most])}</ul>'
@@ -313,7 +314,7 @@ def gaps(inputs: ReportInputs, movies: PageMovies, links: Mapping[str, str]) -> 
     for _, row in chosen.iterrows():
         rows = stimuli[stimuli["stimulus"] == row["stimulus"]]
         movie = movies.show(row["stimulus"], describe(rows))
-        cards.append(card(rows, movie, links, named=row["agent"]))
+        cards.append(card(rows, movie, links, named=row["model"]))
     words = (
         "The stimuli whose P(contact) is farthest from the fraction of people who say yes, at "
         "least by one half; the models, in bold, take turns. Only stimuli whose simulated outcome "
@@ -324,8 +325,8 @@ def gaps(inputs: ReportInputs, movies: PageMovies, links: Mapping[str, str]) -> 
 
 def _silent(inputs: ReportInputs) -> str:
     """Return which models add no stimulus, and why."""
-    speaking = set(opinions(inputs.comparison)["model"])
-    models = dict.fromkeys(inputs.comparison.stimuli["model"])
+    speaking = set(opinions(inputs.comparison)["base_model"])
+    models = dict.fromkeys(inputs.comparison.stimuli["base_model"])
     silent = [str(name) for name in models if name not in speaking]
     if not silent:
         return ""
@@ -340,14 +341,14 @@ def _counts(inputs: ReportInputs) -> str:
     heads = {
         "stimuli": "stimuli",
         "both": "both right",
-        "people": "only people right",
-        "model": "only the model right",
+        "only_people": "only people right",
+        "only_model": "only the model right",
         "neither": "both wrong",
     }
     if rows["divided"].any():
         heads["divided"] = "people divided"
     cells = [
-        [escape(str(row["agent"])), *(str(row[key]) for key in heads)] for _, row in rows.iterrows()
+        [escape(str(row["model"])), *(str(row[key]) for key in heads)] for _, row in rows.iterrows()
     ]
     return table(["model", *heads.values()], cells, "The majority of people and each model")
 
@@ -435,7 +436,11 @@ def _answers(rows: pd.DataFrame) -> str:
     people = rows["p_yes"].notna().all()
     cells = []
     for _, row in rows.iterrows():
-        line = [escape(str(row["model"])), escape(str(row["readout"])), number(row["p_contact"], 3)]
+        line = [
+            escape(str(row["base_model"])),
+            escape(str(row["readout"])),
+            number(row["p_contact"], 3),
+        ]
         line.append("contact" if row["predicted"] else "no contact")
         line.append("yes" if bool(row["predicted"]) == bool(row["label"]) else "no")
         cells.append([*line, number(row["gap"])] if people else line)

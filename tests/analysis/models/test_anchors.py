@@ -1,4 +1,4 @@
-"""Anchors: closed forms, the official people, and that models and anchors stay apart."""
+"""Baselines: closed forms, the official people, and that models and baselines stay apart."""
 
 from __future__ import annotations
 
@@ -16,7 +16,14 @@ from physion.analysis.compare import compare_everywhere
 from physion.analysis.comparison import SETTING
 from physion.analysis.metrics import metrics
 from physion.analysis.sample import sample_of_rows
-from physion.analysis.scores import ANCHOR_MODELS, COMPUTED, MAJORITY, OUTCOME, TWO_PEOPLE, kind_of
+from physion.analysis.scores import (
+    BASELINE_MODELS,
+    COMPUTED,
+    MAJORITY,
+    OUTCOME,
+    TWO_PEOPLE,
+    kind_of,
+)
 from physion.analysis.tables import MEAN, POOLED, read_humans, read_labels
 from physion.core.errors import BadInputError
 from support.simulated_people import study
@@ -54,8 +61,8 @@ def compared(given: pd.DataFrame | None = None, people: pd.DataFrame | None = No
     return compare_scores(given, humans() if people is None else people, LABELS, bootstrap=QUICK)
 
 
-def row_of(table: pd.DataFrame, agent: str, scenario: str = MEAN) -> pd.Series:
-    (row,) = table[(table["agent"] == agent) & (table["scenario"] == scenario)].iloc
+def row_of(table: pd.DataFrame, model: str, scenario: str = MEAN) -> pd.Series:
+    (row,) = table[(table["model"] == model) & (table["scenario"] == scenario)].iloc
     return row
 
 
@@ -64,7 +71,7 @@ def row_of(table: pd.DataFrame, agent: str, scenario: str = MEAN) -> pd.Series:
 
 def test_the_outcome_is_right_and_its_kappa_that_of_the_table_of_answers() -> None:
     people, truth = humans(), np.array(list(LABELS.values()), dtype=float)
-    row = row_of(compared().anchors, OUTCOME, POOLED)
+    row = row_of(compared().baselines, OUTCOME, POOLED)
     right = people["accuracy"].to_numpy()
     p_yes = np.where(truth == 1, right, 1 - right)
     assert row["accuracy"] == 1 and row["human_accuracy"] == pytest.approx(right.mean())
@@ -76,7 +83,7 @@ def test_the_outcome_is_right_and_its_kappa_that_of_the_table_of_answers() -> No
 
 
 def test_the_outcome_has_no_r_beyond_itself_and_says_why() -> None:
-    table = compared().anchors
+    table = compared().baselines
     row = row_of(table, OUTCOME, "collide")
     assert np.isnan(row["r_beyond_outcome"]) and np.isnan(row["r_beyond_outcome_low"])
     assert "P(contact) is constant given the outcome" in row["reason"]
@@ -87,7 +94,7 @@ def test_the_outcome_has_no_r_beyond_itself_and_says_why() -> None:
 def test_no_other_yes_or_no_agrees_more_often_than_the_majority() -> None:
     people, truth = humans(), np.array(list(LABELS.values()))
     p_yes = np.where(truth, people["accuracy"], 1 - people["accuracy"])
-    row = row_of(compared().anchors, MAJORITY, POOLED)
+    row = row_of(compared().baselines, MAJORITY, POOLED)
     assert row["accuracy"] == pytest.approx(np.mean((p_yes > 0.5) == truth))
 
     def agreement(said: npt.NDArray[np.bool_]) -> float:
@@ -104,7 +111,7 @@ def test_no_other_yes_or_no_agrees_more_often_than_the_majority() -> None:
 def test_two_people_agree_as_all_pairs_of_them_do() -> None:
     people, truth = humans(count=20), np.array(list(LABELS.values()))
     p_yes = np.where(truth, people["accuracy"], 1 - people["accuracy"])
-    row = row_of(compared().anchors, TWO_PEOPLE, POOLED)
+    row = row_of(compared().baselines, TWO_PEOPLE, POOLED)
     agreeing = []
     for p in p_yes:
         answers = np.arange(20) < round(20 * p)
@@ -137,19 +144,19 @@ def test_r_of_one_person_is_that_with_the_average_of_the_others() -> None:
     # An average that contains the person would count the noise of their answers twice.
     included = [np.corrcoef(one, p_yes)[0, 1] for one in yes]
     assert np.mean(included) > found + 0.03
-    row = row_of(compared().anchors, TWO_PEOPLE, POOLED)
+    row = row_of(compared().baselines, TWO_PEOPLE, POOLED)
     assert row["r_low"] < row["r"] < row["r_high"]
     assert row["r_same"] == row["r"] and "same outcome" not in row["reason"]
 
 
 def test_people_who_all_agree_have_an_r_of_one() -> None:
-    row = row_of(compared(people=humans(np.ones(24))).anchors, TWO_PEOPLE, POOLED)
+    row = row_of(compared(people=humans(np.ones(24))).baselines, TWO_PEOPLE, POOLED)
     assert row["r"] == pytest.approx(1)
 
 
 def test_one_person_alone_makes_no_pair() -> None:
     people = humans(np.arange(24) % 3 / 2, count=1)
-    row = row_of(compared(people=people).anchors, TWO_PEOPLE)
+    row = row_of(compared(people=people).baselines, TWO_PEOPLE)
     assert row[["kappa_from_averages", "r"]].isna().all() and np.isfinite(row["accuracy"])
     assert "kappa: undefined in collide, drop" in row["reason"]
 
@@ -213,49 +220,49 @@ def test_of_one_outcome_alone_partial_r_is_r() -> None:
     assert row["r_beyond_outcome"] == pytest.approx(row["r"])
 
 
-# --- models and anchors --------------------------------------------------------------------------
+# --- models and baselines ------------------------------------------------------------------------
 
 
-def test_anchors_that_come_as_predictions_are_marked_and_follow_the_models() -> None:
+def test_baselines_that_come_as_predictions_are_marked_and_follow_the_models() -> None:
     given = pd.concat([predictions("state-classifier", 2), predictions("m"), predictions("z", 3)])
     found = compared(given)
-    assert found.agents[0] == "state-classifier · observed"
+    assert found.names[0] == "state-classifier · observed"
     assert found.models == ["m · observed", "z · observed"]
-    order = list(dict.fromkeys(found.all_scores["agent"]))
+    order = list(dict.fromkeys(found.all_scores["model"]))
     assert order == [*found.models, "state-classifier · observed", *COMPUTED]
-    kinds = found.all_scores.drop_duplicates("agent").set_index("agent")["kind"]
+    kinds = found.all_scores.drop_duplicates("model").set_index("model")["kind"]
     assert set(kinds[found.models]) == {"model"}
-    assert set(kinds[["state-classifier · observed", *COMPUTED]]) == {"anchor"}
-    assert kind_of("my outcome · observed") == "model" and kind_of("outcome · full") == "anchor"
+    assert set(kinds[["state-classifier · observed", *COMPUTED]]) == {"baseline"}
+    assert kind_of("my outcome · observed") == "model" and kind_of("outcome · full") == "baseline"
 
 
 @pytest.mark.parametrize(
     ("name", "computed"), [("outcome", OUTCOME), ("majority-of-people", MAJORITY)]
 )
-def test_predictions_of_an_anchor_take_the_place_of_the_computed_one(
+def test_predictions_of_a_baseline_take_the_place_of_the_computed_one(
     name: str, computed: str
 ) -> None:
     given = compared(pd.concat([predictions("m"), predictions(name, 2)]))
     others = [other for other in COMPUTED if other != computed]
-    assert list(given.anchors["agent"].unique()) == others
-    assert list(given.all_scores["agent"].unique()) == [
+    assert list(given.baselines["model"].unique()) == others
+    assert list(given.all_scores["model"].unique()) == [
         "m · observed",
         f"{name} · observed",
         *others,
     ]
-    before = compared(predictions("m")).anchors
+    before = compared(predictions("m")).baselines
     for other in others:
-        assert row_of(given.anchors, other)["accuracy"] == row_of(before, other)["accuracy"]
+        assert row_of(given.baselines, other)["accuracy"] == row_of(before, other)["accuracy"]
 
 
-def test_predictions_of_both_anchors_leave_one_person_with_another() -> None:
+def test_predictions_of_both_baselines_leave_one_person_with_another() -> None:
     names = ("m", "outcome", "majority-of-people")
     parts = [predictions(name, k) for k, name in enumerate(names)]
-    assert list(compared(pd.concat(parts)).anchors["agent"].unique()) == [TWO_PEOPLE]
+    assert list(compared(pd.concat(parts)).baselines["model"].unique()) == [TWO_PEOPLE]
     test = study(people=8, stimuli=16, scenarios=("collide",), seed=2).test
     stimuli = test.drop_duplicates("stimulus")["stimulus"]
     rows = [
-        pd.DataFrame({"agent": f"{name} · full", "stimulus": stimuli, "p_contact": 1.0,
+        pd.DataFrame({"model": f"{name} · full", "stimulus": stimuli, "p_contact": 1.0,
                       "predicted": True})
         for name in names
     ]  # fmt: skip
@@ -263,37 +270,37 @@ def test_predictions_of_both_anchors_leave_one_person_with_another() -> None:
     assert list(found.scores["model"].unique()) == [*(f"{n} · full" for n in names), TWO_PEOPLE]
 
 
-def test_every_anchor_of_the_package_is_known_by_name() -> None:
+def test_every_baseline_of_the_package_is_known_by_name() -> None:
     """The analysis may not import the models, so it has their names a second time."""
     source = Path(__file__).parents[3] / "src" / "physion" / "models" / "build.py"
     found = re.findall(r'"([\w-]+)": "physion\.models\.baselines\.', source.read_text())
     packaged = set(found)
-    assert {"outcome", "constant-motion"} <= packaged <= ANCHOR_MODELS
+    assert {"outcome", "constant-motion"} <= packaged <= BASELINE_MODELS
 
 
-def test_anchors_are_about_the_stimuli_that_any_model_predicts() -> None:
+def test_baselines_are_about_the_stimuli_that_any_model_predicts() -> None:
     half = predictions().iloc[:12]
     other = predictions("other", 2).iloc[6:18]
     found = compared(pd.concat([half, other]))
-    assert row_of(found.anchors, OUTCOME, POOLED)["stimuli"] == 18
+    assert row_of(found.baselines, OUTCOME, POOLED)["stimuli"] == 18
     alone = compared(half)
-    assert row_of(alone.anchors, OUTCOME, POOLED)["stimuli"] == 12
+    assert row_of(alone.baselines, OUTCOME, POOLED)["stimuli"] == 12
 
 
-def test_without_people_there_is_no_anchor() -> None:
+def test_without_people_there_is_no_baseline() -> None:
     found = compare_scores(predictions(), None, LABELS, bootstrap=QUICK)
-    assert found.anchors.empty and list(found.anchors.columns) == list(found.scores.columns)
-    assert list(found.all_scores["agent"].unique()) == ["m · observed"]
+    assert found.baselines.empty and list(found.baselines.columns) == list(found.scores.columns)
+    assert list(found.all_scores["model"].unique()) == ["m · observed"]
 
 
-def test_the_order_of_rows_changes_no_anchor() -> None:
+def test_the_order_of_rows_changes_no_baseline() -> None:
     given = pd.concat([predictions(), predictions("other", 2)])
     plain = compared(given)
     mixed = compare_scores(
         given.sample(frac=1, random_state=3), humans().sample(frac=1, random_state=4), LABELS,
         bootstrap=QUICK,
     )  # fmt: skip
-    pd.testing.assert_frame_equal(plain.anchors, mixed.anchors)
+    pd.testing.assert_frame_equal(plain.baselines, mixed.baselines)
 
 
 # --- contacts in the observed part ---------------------------------------------------------------
@@ -309,7 +316,7 @@ def test_scores_without_observed_contacts_are_those_of_the_other_stimuli() -> No
     rest = compare_scores(
         predictions()[~observed()], humans()[~observed()], LABELS, bootstrap=QUICK
     )
-    expected = pd.concat([rest.scores, rest.anchors], ignore_index=True)
+    expected = pd.concat([rest.scores, rest.baselines], ignore_index=True)
     pd.testing.assert_frame_equal(found.later, expected)
     assert found.settings[SETTING] == "4 of 24 stimuli (collide 2 of 12, drop 2 of 12)"
 
@@ -317,7 +324,7 @@ def test_scores_without_observed_contacts_are_those_of_the_other_stimuli() -> No
 def test_one_model_that_knows_the_observed_contacts_suffices() -> None:
     knows = predictions(**{"Observed Contact": observed()})
     found = compared(pd.concat([predictions("other", 2), knows]))
-    assert set(found.later["agent"]) == {"m · observed", "other · observed", *COMPUTED}
+    assert set(found.later["model"]) == {"m · observed", "other · observed", *COMPUTED}
     odd = predictions("other", 2, **{"Observed Contact": ~observed()})
     with pytest.raises(BadInputError, match="different observed contacts"):
         compared(pd.concat([knows, odd]))
@@ -341,16 +348,16 @@ def test_where_observed_contacts_are_not_known_the_settings_say_so() -> None:
 # --- single participants -----------------------------------------------------
 
 
-def test_with_participants_anchors_stand_next_to_models() -> None:
+def test_with_participants_baselines_stand_next_to_models() -> None:
     test = study(people=8, stimuli=16, scenarios=("collide", "roll"), seed=2).test
     stimuli = test.drop_duplicates("stimulus")["stimulus"]
     p = np.random.default_rng(0).random(len(stimuli))
-    given = pd.DataFrame({"agent": "m", "stimulus": stimuli, "p_contact": p, "predicted": p > 0.5})
+    given = pd.DataFrame({"model": "m", "stimulus": stimuli, "p_contact": p, "predicted": p > 0.5})
     found = compare_everywhere(given, test, QUICK, halves=10, permutations=20)
     scores = found.scores.set_index(["scenario", "model", "measure"])
     assert list(found.scores["model"].unique()) == ["m", *COMPUTED]
     kinds = found.scores.drop_duplicates("model").set_index("model")["kind"]
-    assert kinds.to_dict() == {"m": "model"} | dict.fromkeys(COMPUTED, "anchor")
+    assert kinds.to_dict() == {"m": "model"} | dict.fromkeys(COMPUTED, "baseline")
     zones = found.zones.set_index(["scenario", "measure", "of"])
     row = scores.loc[("collide", TWO_PEOPLE, "kappa")]
     assert row["value"] == pytest.approx(zones.loc[("collide", "kappa", "pairs"), "mean"])
@@ -368,7 +375,7 @@ def test_with_participants_anchors_stand_next_to_models() -> None:
 # --- official data -------------------------------------------------------------------------------
 
 
-def test_anchors_of_the_official_people(official: Path) -> None:
+def test_baselines_of_the_official_people(official: Path) -> None:
     people = read_humans(official / "humans")
     labels = read_labels(official / "stimuli" / "stimulus_names_and_labels.csv")
     truth = people["stimulus"].map(labels).astype(bool)
@@ -376,14 +383,14 @@ def test_anchors_of_the_official_people(official: Path) -> None:
         {"Model": "m", "Readout Type": "C", "Predicted Prob_true": 0.5, "Predicted Outcome": False,
          "Actual Outcome": truth, "Stimulus Name": people["stimulus"]}
     )  # fmt: skip
-    anchors = compare_scores(given, people, labels, bootstrap=QUICK).anchors
-    two = row_of(anchors, TWO_PEOPLE)
+    baselines = compare_scores(given, people, labels, bootstrap=QUICK).baselines
+    two = row_of(baselines, TWO_PEOPLE)
     assert two["accuracy"] == pytest.approx(0.745, abs=0.0005)
     assert two["r"] == pytest.approx(0.69, abs=0.03)
-    outcome = row_of(anchors, OUTCOME)
+    outcome = row_of(baselines, OUTCOME)
     assert outcome["kappa_from_averages"] == pytest.approx(0.49, abs=0.005)
-    assert row_of(anchors, OUTCOME, POOLED)["r"] == pytest.approx(0.683, abs=0.0005)
-    majority = row_of(anchors, MAJORITY)
+    assert row_of(baselines, OUTCOME, POOLED)["r"] == pytest.approx(0.683, abs=0.0005)
+    majority = row_of(baselines, MAJORITY)
     # .808 where the two stimuli with as many yes as no count as yes; here they count as no.
     assert majority["accuracy"] == pytest.approx(0.808, abs=0.002)
     assert majority["kappa_from_averages"] == pytest.approx(0.64, abs=0.006)
@@ -396,9 +403,9 @@ def test_anchors_of_the_official_people(official: Path) -> None:
              "linking": "link", "rollingsliding": "roll", "towers": "support"}  # fmt: skip
     medians = released.set_index(released["scenario"].replace(names))["corr_med"]
     for scenario, median in medians.items():
-        row = row_of(anchors, TWO_PEOPLE, str(scenario))
+        row = row_of(baselines, TWO_PEOPLE, str(scenario))
         assert row["kappa_from_averages"] == pytest.approx(median, abs=0.03)
     accuracy = pd.read_csv(official / "results" / "human_accuracy_by_scenario.csv")
     for name, mean in zip(accuracy["scenario"], accuracy["obs_mean"], strict=True):
-        row = row_of(anchors, TWO_PEOPLE, names.get(name, name))
+        row = row_of(baselines, TWO_PEOPLE, names.get(name, name))
         assert row["accuracy"] == pytest.approx(mean, abs=0.005)

@@ -68,8 +68,8 @@ def predictions(
     )
 
 
-def score(table: pd.DataFrame, agent: str, scenario: str) -> pd.Series:
-    rows = table[(table["agent"] == agent) & (table["scenario"] == scenario)]
+def score(table: pd.DataFrame, model: str, scenario: str) -> pd.Series:
+    rows = table[(table["model"] == model) & (table["scenario"] == scenario)]
     assert len(rows) == 1
     return rows.iloc[0]
 
@@ -165,7 +165,7 @@ def test_the_order_of_rows_changes_nothing_but_their_order() -> None:
         labels(people),
         bootstrap=QUICK,
     )
-    keys = ["agent", "scenario"]
+    keys = ["model", "scenario"]
     one, two = (c.scores.sort_values(keys).reset_index(drop=True) for c in (plain, mixed))
     pd.testing.assert_frame_equal(one, two)
     pd.testing.assert_frame_equal(plain.people, mixed.people)
@@ -176,7 +176,7 @@ def test_a_model_scores_the_same_alone_and_beside_others() -> None:
     both = pd.concat([predictions(people), predictions(people.iloc[::2], "half", seed=2)])
     together = compare_scores(both, people, labels(people), bootstrap=QUICK).scores
     alone = compare_scores(predictions(people), people, labels(people), bootstrap=QUICK).scores
-    pd.testing.assert_frame_equal(together[together["model"] == "m"], alone)
+    pd.testing.assert_frame_equal(together[together["base_model"] == "m"], alone)
 
 
 def test_either_look_of_a_stimulus_joins() -> None:
@@ -235,7 +235,7 @@ def test_one_stimulus_has_no_interval() -> None:
 def counts(dropped: pd.DataFrame) -> dict[tuple[str, str], int]:
     return {
         (a, r): int(n)
-        for a, r, n in dropped.groupby(["agent", "reason"])["stimuli"]
+        for a, r, n in dropped.groupby(["model", "reason"])["stimuli"]
         .sum()
         .reset_index()
         .to_numpy()
@@ -258,15 +258,15 @@ def test_everything_left_out_is_counted() -> None:
         exclude=[people["stimulus"].iloc[4] + "_img"],
         bootstrap=QUICK,
     )
-    agent = "m · observed"
+    model = "m · observed"
     assert counts(found.dropped) == {
         ("", LEDGE): 1,
         ("", NO_LABEL): 1,
         ("", EXCLUDED): 1,
-        (agent, LEDGE): 1,
-        (agent, EXCLUDED): 1,
-        (agent, NOT_SEEN): 2,  # the new one, and the one without a label
-        (agent, NOT_PREDICTED): 2,
+        (model, LEDGE): 1,
+        (model, EXCLUDED): 1,
+        (model, NOT_SEEN): 2,  # the new one, and the one without a label
+        (model, NOT_PREDICTED): 2,
     }
     assert len(found.stimuli) == 24 - 4
     assert found.people.set_index("scenario").loc[MEAN, "stimuli"] == 20
@@ -326,16 +326,16 @@ def test_labels_of_one_class_are_said() -> None:
     people = humans()
     known = {name: value or "drop" in name for name, value in labels(people).items()}
     scores = compare_scores(predictions(people), people, known, bootstrap=QUICK).scores
-    agent = "m · observed"
-    assert "labels: all contact" in score(scores, agent, "drop")["reason"]
-    assert "labels: of one class in drop" in score(scores, agent, MEAN)["reason"]
+    model = "m · observed"
+    assert "labels: all contact" in score(scores, model, "drop")["reason"]
+    assert "labels: of one class in drop" in score(scores, model, MEAN)["reason"]
     for scenario in ("collide", POOLED):
-        assert "labels" not in score(scores, agent, scenario)["reason"]
+        assert "labels" not in score(scores, model, scenario)["reason"]
     never = compare_scores(
         predictions(people), people, dict.fromkeys(known, False), bootstrap=QUICK
     )
     for scenario in ("collide", POOLED):
-        assert "labels: all no contact" in score(never.scores, agent, scenario)["reason"]
+        assert "labels: all no contact" in score(never.scores, model, scenario)["reason"]
 
 
 def test_the_settings_say_where_the_zone_comes_from_and_what_is_drawn() -> None:
@@ -382,7 +382,7 @@ def test_readout_letters_get_their_names_and_seeds_tell_models_apart() -> None:
     two = predictions(people, readout="B", seed=2, **{"Dynamics Training Seed": 1.0})
     alone = predictions(people, readout="A", **{"Dynamics Training Seed": 1.0})
     named = name_models(check_predictions(pd.concat([one, two, alone])))
-    assert list(named["agent"].unique()) == [
+    assert list(named["model"].unique()) == [
         "m · observed+simulated · dynamics training seed 0",
         "m · observed+simulated · dynamics training seed 1",
         "m · full",
@@ -400,7 +400,7 @@ def test_training_on_each_scenario_in_turn_is_one_model(spelling: str) -> None:
     found = compare_scores(
         pd.concat([same, others, everything]), people, labels(people), bootstrap=QUICK
     )
-    suffixes = [agent.rsplit("dataset ")[1] for agent in found.agents]
+    suffixes = [model.rsplit("dataset ")[1] for model in found.names]
     assert suffixes == ["same", "all but this", "all"]
 
 
@@ -409,7 +409,7 @@ def test_a_stray_stimulus_does_not_split_a_model() -> None:
     given = predictions(people)
     stray = given.iloc[:1].assign(**{"Stimulus Name": "of_no_known_scenario_0001"})
     found = compare_scores(pd.concat([given, stray]), people, labels(people), bootstrap=QUICK)
-    assert found.agents == ["m · observed"]
+    assert found.names == ["m · observed"]
     assert counts(found.dropped) == {("m · observed", NOT_SEEN): 1}
 
 

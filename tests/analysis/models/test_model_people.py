@@ -271,8 +271,8 @@ def test_tables_become_models_and_what_has_no_counterpart_is_counted(
     answers: ScenarioAnswers,
 ) -> None:
     rows = pd.DataFrame(
-        [(agent, stimulus, 0.7, True) for agent in ("b", "a") for stimulus in answers.stimuli],
-        columns=["agent", "stimulus", "p_contact", "predicted"],
+        [(model, stimulus, 0.7, True) for model in ("b", "a") for stimulus in answers.stimuli],
+        columns=["model", "stimulus", "p_contact", "predicted"],
     )
     rows.loc[0, "stimulus"] = "somewhere else"
     models, dropped = models_of(rows, answers)
@@ -325,9 +325,9 @@ def everywhere(**changes: object) -> tuple[PeopleComparison, pd.DataFrame, pd.Da
     shares = test.groupby(["scenario", "stimulus"])["yes"].mean().reset_index()
     generator = np.random.default_rng(0)
     parts = [
-        pd.DataFrame({"agent": agent, "stimulus": shares["stimulus"], "p_contact": p,
+        pd.DataFrame({"model": model, "stimulus": shares["stimulus"], "p_contact": p,
                       "predicted": p > 0.5})
-        for agent, p in (("people", shares["yes"]), ("chance", generator.random(len(shares))))
+        for model, p in (("people", shares["yes"]), ("chance", generator.random(len(shares))))
     ]  # fmt: skip
     predictions = pd.concat(parts, ignore_index=True).assign(**changes)
     return compare_everywhere(predictions, test, FEW, halves=20, permutations=50), predictions, test
@@ -385,7 +385,7 @@ def test_what_is_missing_somewhere_is_counted_and_undefined_there() -> None:
         ["people", "collide", "the model does not predict it", 1],
     ]
     no_roll = compare_everywhere(predictions[~constant], test, FEW, halves=20, permutations=50)
-    gone = no_roll.dropped.set_index(["agent", "scenario"])["stimuli"]
+    gone = no_roll.dropped.set_index(["model", "scenario"])["stimuli"]
     assert gone.to_dict() == {("people", "roll"): 20, ("chance", "roll"): 20}
 
 

@@ -42,7 +42,7 @@ def test_curves_are_means_over_trials_with_intervals(tmp_path: Path) -> None:
     curves = rollout_error_table(read_rollout_errors([table]))
     assert tuple(curves.columns) == COLUMNS
     assert list(curves["panel"].unique()) == ["collide", "drop", "mean"]
-    drop = curves[(curves["panel"] == "drop") & (curves["agent"] == "sim")]
+    drop = curves[(curves["panel"] == "drop") & (curves["model"] == "sim")]
     assert drop["seconds"].tolist() == pytest.approx([0.03, 0.06, 0.09])
     assert drop["value"].tolist() == pytest.approx([0.75, 1.5, 2.25])
     assert (drop["trials"] == 4).all()
@@ -51,9 +51,9 @@ def test_curves_are_means_over_trials_with_intervals(tmp_path: Path) -> None:
     reach = 3.1824 * np.std([0.1, 0.2, 0.3, 0.4], ddof=1) / 2 / 0.25
     assert last["low"] == pytest.approx(2.25 * np.exp(-reach), rel=1e-4)
     assert last["high"] == pytest.approx(2.25 * np.exp(reach), rel=1e-4)
-    still = curves[(curves["panel"] == "collide") & (curves["agent"] == "sim")]
+    still = curves[(curves["panel"] == "collide") & (curves["model"] == "sim")]
     assert still["low"].tolist() == pytest.approx(still["high"].tolist())
-    mean = curves[(curves["panel"] == "mean") & (curves["agent"] == "sim")]
+    mean = curves[(curves["panel"] == "mean") & (curves["model"] == "sim")]
     assert mean["value"].tolist() == pytest.approx([1.125, 2.25, 3.375])
     assert mean["trials"].tolist() == [8, 8, 8]
     reaches = [row["value"] * np.log(row["high"] / row["low"]) for row in (last, mean.iloc[-1])]
@@ -64,7 +64,7 @@ def test_the_baseline_is_constant_velocity_of_the_first_model(tmp_path: Path) ->
     first = write(tmp_path / "a.csv", errors_of("one", {"drop": [0.1, 0.2]}, baseline=0.05))
     second = write(tmp_path / "b.csv", errors_of("two", {"drop": [0.3, 0.4]}, baseline=0.06))
     curves = rollout_error_table(read_rollout_errors([first, second]))
-    assert list(curves["agent"].unique()) == ["one", "two", CONSTANT_VELOCITY]
+    assert list(curves["model"].unique()) == ["one", "two", CONSTANT_VELOCITY]
     assert list(curves["panel"].unique()) == ["drop"], "one scenario has no mean over scenarios"
     base = curves[curves["kind"] == "baseline"]
     assert base["value"].tolist() == pytest.approx([0.15, 0.3, 0.45])
@@ -74,7 +74,7 @@ def test_trials_that_end_earlier_are_left_out_from_there(tmp_path: Path) -> None
     table = errors_of("sim", {"drop": [0.1, 0.2, 0.9]})
     table = table.drop(table.index[-1])
     curves = rollout_error_table(read_rollout_errors([write(tmp_path / "a.csv", table)]))
-    own = curves[curves["agent"] == "sim"]
+    own = curves[curves["model"] == "sim"]
     assert own["trials"].tolist() == [3, 3, 2]
     assert own["value"].tolist() == pytest.approx([1.2, 2.4, 1.35])
     assert own["value"].between(own["low"], own["high"], inclusive="neither").all()
@@ -84,7 +84,7 @@ def test_one_model_in_several_files_is_named_with_each(tmp_path: Path) -> None:
     paths = [
         write(tmp_path / f"dpi-{name}.csv", errors_of("dpi", {"drop": [0.1]})) for name in "ab"
     ]
-    assert set(read_rollout_errors(paths)["agent"]) == {"dpi, dpi-a", "dpi, dpi-b"}
+    assert set(read_rollout_errors(paths)["model"]) == {"dpi, dpi-a", "dpi, dpi-b"}
 
 
 def test_other_tables_are_refused(tmp_path: Path) -> None:

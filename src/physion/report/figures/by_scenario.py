@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from physion.analysis import figure_tables as tables
-from physion.analysis.figure_tables import ANCHOR, HALVES_ZONE, SCENARIO_ZONE
+from physion.analysis.figure_tables import BASELINE, HALVES_ZONE, SCENARIO_ZONE
 from physion.analysis.rollout_errors import CONSTANT_VELOCITY
 from physion.analysis.tables import MEAN
 from physion.report.figures.theme import (
@@ -45,8 +45,8 @@ LABELS = {
 }
 """Names on the axis, by measure."""
 
-ANCHOR_MARKER = "d"
-"""Mark of anchors; no readout has it."""
+BASELINE_MARKER = "d"
+"""Mark of baselines; no readout has it."""
 
 RELEASED_ZONES = (SCENARIO_ZONE, HALVES_ZONE)
 """Names of zones; those of the paper are hatched, as they say nothing about participants."""
@@ -63,36 +63,36 @@ def measure_figure(table: pd.DataFrame, measure: str, theme: Theme = LIGHT) -> F
     band.
 
     ``table``: see `figure_tables.MEASURE_COLUMNS`. One panel a scenario and one for the mean; the
-    dotted line is chance. Anchors stand below the models, lighter and hollow.
+    dotted line is chance. Baselines stand below the models, lighter and hollow.
     """
     names = list(table["panel"].unique())
-    agents = list(table["agent"].unique())
-    readouts = [kind for kind in table["kind"].unique() if kind != ANCHOR]
+    models = list(table["model"].unique())
+    readouts = [kind for kind in table["kind"].unique() if kind != BASELINE]
     kinds = {kind: theme.mark(place) for place, kind in enumerate(readouts)}
-    anchors = set(table.loc[table["kind"] == ANCHOR, "agent"])
-    kinds |= {ANCHOR: (theme.faint, ANCHOR_MARKER)} if anchors else {}
-    row_height = 0.3 if len(agents) <= 8 else 0.2
+    baselines = set(table.loc[table["kind"] == BASELINE, "model"])
+    kinds |= {BASELINE: (theme.faint, BASELINE_MARKER)} if baselines else {}
+    row_height = 0.3 if len(models) <= 8 else 0.2
     low, high = _limits(table, CHANCE[measure])
     with matplotlib.rc_context(style(theme)):
-        size = (11 / min(3, len(names)), row_height * len(agents) + 0.75)
+        size = (11 / min(3, len(names)), row_height * len(models) + 0.75)
         figure, axes = panels(len(names), min(3, len(names)), size, sharex=True)
         for place, (axis, name) in enumerate(zip(axes, names, strict=True)):
-            rows = table[table["panel"] == name].set_index("agent")
+            rows = table[table["panel"] == name].set_index("model")
             _human_marks(axis, rows, theme)
-            _dots(axis, rows, agents, kinds, theme, high)
+            _dots(axis, rows, models, kinds, theme, high)
             axis.axvline(CHANCE[measure], color=theme.faint, linestyle=":", linewidth=1, zorder=1)
             title(axis, "mean over scenarios" if name == MEAN else str(name))
-            labels = [label(agent, 48) for agent in agents]
+            labels = [label(model, 48) for model in models]
             small = 9 if row_height == 0.3 else 8
-            axis.set_yticks(range(len(agents)), labels if place % 3 == 0 else [], fontsize=small)
-            for text, agent in zip(axis.get_yticklabels(), agents, strict=False):
-                text.set_color(theme.faint if agent in anchors else theme.ink)
-            if 0 < len(anchors) < len(agents):
-                first = len(agents) - len(anchors)
+            axis.set_yticks(range(len(models)), labels if place % 3 == 0 else [], fontsize=small)
+            for text, model in zip(axis.get_yticklabels(), models, strict=False):
+                text.set_color(theme.faint if model in baselines else theme.ink)
+            if 0 < len(baselines) < len(models):
+                first = len(models) - len(baselines)
                 axis.axhline(first - 0.5, color=theme.zone, linewidth=0.8, zorder=0)
             # No ticks here: they would look like labels of the values in the panel to the left.
             axis.tick_params(axis="y", left=place % 3 == 0)
-            axis.set_ylim(len(agents) - 0.4, -0.6)
+            axis.set_ylim(len(models) - 0.4, -0.6)
             # Space on the right for the column of values.
             axis.set_xlim(low, high + 0.16 * (high - low))
         figure.supxlabel(LABELS[measure], fontsize=10)
@@ -112,32 +112,32 @@ def _limits(table: pd.DataFrame, chance_level: float) -> tuple[float, float]:
 def _dots(
     axis: Axes,
     rows: pd.DataFrame,
-    agents: Sequence[str],
+    models: Sequence[str],
     kinds: dict[str, tuple[str, str]],
     theme: Theme,
     high: float,
 ) -> None:
-    for place, agent in enumerate(agents):
-        if agent not in rows.index:
+    for place, model in enumerate(models):
+        if model not in rows.index:
             axis.text(0.5, place, "no predictions", va="center", ha="center", fontsize=7,
                       color=theme.faint, transform=axis.get_yaxis_transform())  # fmt: skip
             continue
-        row = rows.loc[agent]
+        row = rows.loc[model]
         if np.isfinite(row["low"]):
             axis.plot([row["low"], row["high"]], [place, place], color=kinds[row["kind"]][0],
                       linewidth=1.4)  # fmt: skip
         axis.plot(row["value"], place, linestyle="", **_mark(row["kind"], kinds, theme))
-        words, anchor = number(row["value"]), row["kind"] == ANCHOR
+        words, baseline = number(row["value"]), row["kind"] == BASELINE
         axis.text(0.995, place, words, va="center", ha="right", fontsize=7.5,
-                  color=theme.faint if anchor else theme.ink,
+                  color=theme.faint if baseline else theme.ink,
                   transform=axis.get_yaxis_transform())  # fmt: skip
 
 
 def _mark(kind: str, kinds: dict[str, tuple[str, str]], theme: Theme) -> dict[str, Any]:
-    """Return the properties of a mark; those of anchors are hollow."""
+    """Return the properties of a mark; those of baselines are hollow."""
     colour, marker = kinds[kind]
     properties = {"marker": marker, "color": colour, "markersize": 5.5, "markeredgewidth": 0.6}
-    if kind == ANCHOR:
+    if kind == BASELINE:
         return {**properties, "markerfacecolor": theme.paper, "markeredgewidth": 1.0}
     return {**properties, "markeredgecolor": theme.ink}
 
@@ -270,18 +270,18 @@ def rollout_error(inputs: ReportInputs) -> Plot | None:
 def draw_rollout_error(table: pd.DataFrame, theme: Theme) -> Figure:
     """Draw curves with bands, one panel a scenario; ``table``: see `rollout_errors.COLUMNS`."""
     names = list(table["panel"].unique())
-    models = list(table.loc[table["kind"] == "model", "agent"].unique())
+    models = list(table.loc[table["kind"] == "model", "model"].unique())
     lines: dict[str, dict[str, Any]] = {
-        agent: {"color": theme.mark(place)[0], "linestyle": _DASHES[place % len(_DASHES)]}
-        for place, agent in enumerate(models)
+        model: {"color": theme.mark(place)[0], "linestyle": _DASHES[place % len(_DASHES)]}
+        for place, model in enumerate(models)
     }
     lines[CONSTANT_VELOCITY] = {"color": theme.ink, "linestyle": ":"}
     with matplotlib.rc_context(style(theme)):
         figure, axes = panels(len(names), min(3, len(names)), (3.6, 2.2), sharex=True)
         for axis, name in zip(axes, names, strict=True):
             rows = table[table["panel"] == name]
-            for agent, line in lines.items():
-                own = rows[rows["agent"] == agent].sort_values("seconds")
+            for model, line in lines.items():
+                own = rows[rows["model"] == model].sort_values("seconds")
                 axis.plot(own["seconds"], own["value"], linewidth=1.5, **line)
                 axis.fill_between(
                     own["seconds"], own["low"], own["high"], color=line["color"], alpha=0.18,
@@ -294,7 +294,7 @@ def draw_rollout_error(table: pd.DataFrame, theme: Theme) -> Figure:
             title(axis, "mean over scenarios" if name == MEAN else str(name))
         figure.supxlabel("seconds of physics after the last observed frame", fontsize=10)
         figure.supylabel("error (m)", fontsize=10)
-        handles = [Line2D([], [], label=label(agent), **line) for agent, line in lines.items()]
+        handles = [Line2D([], [], label=label(model), **line) for model, line in lines.items()]
         legend(figure, handles, 3)
     return figure
 

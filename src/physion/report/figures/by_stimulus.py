@@ -40,7 +40,7 @@ SQUARE = 1.16
 @register_figure("scatter", section=BY_STIMULUS, heading="Models against people", order=60)
 def scatter(inputs: ReportInputs) -> Plot | None:
     """Return P(contact) against the fraction of people who say yes."""
-    comparison, shown = inputs.comparison, inputs.scatter_agents()
+    comparison, shown = inputs.comparison, inputs.scatter_models()
     if not comparison.has_people:
         return None
     caption = (
@@ -62,17 +62,17 @@ def scatter_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
     that no colour is needed; hollow points are stimuli whose simulated outcome is not the official
     one.
     """
-    agents = list(table["agent"].unique())
+    models = list(table["model"].unique())
     scenarios = in_order(table["scenario"])
     columns = max(1, min(4, 8 // len(scenarios)))
     width = 11 / columns
     height = (width - 0.4) / (SQUARE * len(scenarios))
     with matplotlib.rc_context(style(theme)):
         figure, axes = panels(
-            len(agents), columns, (width, height + 0.52), above=0.4, sharex=True, sharey=True
+            len(models), columns, (width, height + 0.52), above=0.4, sharex=True, sharey=True
         )
-        for axis, agent in zip(axes, agents, strict=True):
-            _squares(axis, table[table["agent"] == agent], scenarios, theme)
+        for axis, model in zip(axes, models, strict=True):
+            _squares(axis, table[table["model"] == model], scenarios, theme)
         figure.supxlabel("share of people who say yes", fontsize=10)
         figure.supylabel("P(contact) of the model", fontsize=10)
         if (table["label"] != table["simulated"]).any():
@@ -99,7 +99,7 @@ def _squares(axis: Axes, rows: pd.DataFrame, scenarios: Sequence[str], theme: Th
         axis.text(index, 1.05, words, fontsize=7.5, va="bottom")
     pooled = f"{_describe_r(rows['p_contact'], rows['p_yes'])} pooled, {len(rows)} stimuli"
     join = ", " if len(scenarios) > 3 else "\n"
-    axis.set_title(f"{label(rows['agent'].iloc[0], 90)}{join}{pooled}", fontsize=8.5, loc="left",
+    axis.set_title(f"{label(rows['model'].iloc[0], 90)}{join}{pooled}", fontsize=8.5, loc="left",
                    pad=15)  # fmt: skip
     axis.set_xlim(-0.04, left[-1] + 1.04)
     axis.set_ylim(-0.04, 1.04)
@@ -182,14 +182,14 @@ def calibration_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
     ``table``: see `figure_tables.calibration_table`. The area of a point is proportional to its
     stimuli.
     """
-    agents = list(table["agent"].unique())
-    columns = 3 if len(agents) <= 6 else 5
+    models = list(table["model"].unique())
+    columns = 3 if len(models) <= 6 else 5
     with matplotlib.rc_context(style(theme)):
         width = 11 / columns
-        figure, axes = panels(len(agents), columns, (width, width + 0.2), above=0.5,
+        figure, axes = panels(len(models), columns, (width, width + 0.2), above=0.5,
                               sharex=True, sharey=True)  # fmt: skip
-        for axis, agent in zip(axes, agents, strict=True):
-            rows = table[(table["agent"] == agent) & (table["stimuli"] > 0)]
+        for axis, model in zip(axes, models, strict=True):
+            rows = table[(table["model"] == model) & (table["stimuli"] > 0)]
             axis.plot([0, 1], [0, 1], color=theme.faint, linewidth=1, linestyle=":")
             axis.vlines(rows["mean_p"], rows["low"], rows["high"], color=theme.palette[0],
                         linewidth=1.1)  # fmt: skip
@@ -197,8 +197,8 @@ def calibration_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
             fraction = rows["stimuli"] / rows["stimuli"].sum()
             axis.scatter(rows["mean_p"], rows["share"], s=8 + 160 * fraction, zorder=3,
                          color=theme.palette[0], edgecolors=theme.ink, linewidths=0.6)  # fmt: skip
-            words = label(agent, 30 if columns == 5 else 44)
-            brier = table.loc[table["agent"] == agent, "brier"].iloc[0]
+            words = label(model, 30 if columns == 5 else 44)
+            brier = table.loc[table["model"] == model, "brier"].iloc[0]
             axis.set_title(f"{words}\nBrier {brier:.3f}", fontsize=8, loc="left")
             axis.set_xlim(-0.03, 1.03)
             axis.set_ylim(-0.03, 1.03)

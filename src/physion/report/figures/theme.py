@@ -101,9 +101,9 @@ def legend(figure: Figure, handles: Sequence[Any], columns: int) -> None:
     )
 
 
-def label(agent: str, width: int = 48) -> str:
+def label(model: str, width: int = 48) -> str:
     """Return the name of a model for an axis, as on the page, broken into lines."""
-    return textwrap.fill(protocol_names(str(agent)), width)
+    return textwrap.fill(protocol_names(str(model)), width)
 
 
 def title(axis: Axes, text: str) -> None:

@@ -46,16 +46,16 @@ def grouped_figure(
     ``table``: see `figure_tables.GROUPED_COLUMNS`; one panel for each of its ``panel``.
     """
     names = list(table["panel"].unique())
-    agents = list(table["agent"].unique())
+    models = list(table["model"].unique())
     with matplotlib.rc_context(style(theme)):
-        size = (11 / len(names), (0.34 if len(agents) <= 8 else 0.27) * len(agents) + 0.9)
+        size = (11 / len(names), (0.34 if len(models) <= 8 else 0.27) * len(models) + 0.9)
         figure, axes = panels(len(names), len(names), size, above=0.3, sharex=True, sharey=True)
         for axis, name in zip(axes, names, strict=True):
             rows = table[table["panel"] == name]
             groups = list(rows["group"].unique())
             for place, group in enumerate(groups):
                 subset = rows[rows["group"] == group]
-                at = subset["agent"].map(agents.index) + (place - (len(groups) - 1) / 2) * 0.24
+                at = subset["model"].map(models.index) + (place - (len(groups) - 1) / 2) * 0.24
                 _group_marks(axis, subset, at.to_numpy(dtype=np.float64), theme.mark(place), theme)
             axis.axvline(chance_level, color=theme.faint, linestyle=":", linewidth=1, zorder=0)
             people = rows["people"].iloc[0]
@@ -63,12 +63,12 @@ def grouped_figure(
                 axis.axvline(people, color=theme.ink, linestyle="--", linewidth=1.3, zorder=0)
             title(axis, str(name))
             axis.set_xlabel(measure)
-            axis.set_yticks(range(len(agents)), [label(agent) for agent in agents])
-            axis.set_ylim(len(agents) - 0.5, -0.5)
+            axis.set_yticks(range(len(models)), [label(model) for model in models])
+            axis.set_ylim(len(models) - 0.5, -0.5)
             axis.grid(axis="y", color=theme.zone, linewidth=0.5)
             axis.set_axisbelow(True)
             axis.legend(handles=_group_handles(groups, people, theme), loc="lower center",
-                        bbox_to_anchor=(0.5, 1.02 + 0.18 / len(agents)), ncols=5, fontsize=8,
+                        bbox_to_anchor=(0.5, 1.02 + 0.18 / len(models)), ncols=5, fontsize=8,
                         handletextpad=0.4, columnspacing=1.2)  # fmt: skip
     return figure
 
@@ -143,23 +143,23 @@ def generalization_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
     ``table``: see `figure_tables.GENERALIZATION_COLUMNS`. Each cell contains its number, so that
     the colours, purple below people and orange above, are not needed in print.
     """
-    agents = list(table["agent"].unique())
+    models = list(table["model"].unique())
     trained, tested = (list(table[name].unique()) for name in ("trained", "tested"))
     widest = max(float(table["difference"].abs().max()), 0.01)
     with matplotlib.rc_context(style(theme)):
         size = (0.46 * len(tested) + 1.2, 0.3 * len(trained) + 0.6)
-        columns = max(1, min(int(12 / size[0]), 3, len(agents)))
-        figure, axes = panels(len(agents), columns, size, above=0.8, sharex=True, sharey=True)
+        columns = max(1, min(int(12 / size[0]), 3, len(models)))
+        figure, axes = panels(len(models), columns, size, above=0.8, sharex=True, sharey=True)
         image = None
-        for axis, agent in zip(axes, agents, strict=True):
-            grid = table[table["agent"] == agent].pivot(
+        for axis, model in zip(axes, models, strict=True):
+            grid = table[table["model"] == model].pivot(
                 index="trained", columns="tested", values="difference"
             )
             values = grid.reindex(index=trained, columns=tested).to_numpy(dtype=np.float64)
             image = axis.imshow(values, cmap="PuOr_r", norm=TwoSlopeNorm(0, -widest, widest),
                                 aspect="auto")  # fmt: skip
             _cells(axis, values, widest)
-            title(axis, label(agent, 40))
+            title(axis, label(model, 40))
             axis.set_xticks(range(len(tested)), tested, rotation=45, ha="right")
             axis.set_yticks(range(len(trained)), trained)
         figure.supxlabel("tested on", fontsize=10)
