@@ -52,8 +52,8 @@ from physion.compute.tasks import processor
 from physion.core.names import canonical_name
 from physion.data import official
 from physion.models.interface import can
-from physion.models.particles.bodies import poses_of, scene_particles
-from physion.models.particles.graph import (
+from physion.models.particles.bodies import poses_of, rotation_from_vector, scene_particles
+from physion.models.particles.networks import (
     ObjectState,
     SceneLayout,
     drift_of,
@@ -62,7 +62,6 @@ from physion.models.particles.graph import (
     make_graph,
     rotate_scenes,
 )
-from physion.models.particles.rigid_motion import rotation_from_vector
 from physion.models.particles.simulator import ParticleSimulator
 from physion.physics.labels import label_contact
 from physion.readout.rollout_error import motion_error

@@ -26,7 +26,7 @@ from physion.models import Provenance, Rollout, Spec
 
 
 class Standstill:
-    spec = Spec(inputs=("state",), stride=3, context=15, future=0, anchor="end")
+    spec = Spec(inputs=("state",), stride=3, context=15, future=0, context_at="end")
     reader, samples, seed, knobs = "touch", 4, 0, {}
     dtype = np.float32
 

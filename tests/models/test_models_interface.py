@@ -43,7 +43,7 @@ def test_spec_shows_the_frames_of_the_released_models() -> None:
 
 
 def test_spec_anchored_at_the_end_shows_the_last_observed_frame() -> None:
-    spec = Spec(anchor="end", stride=5, context=4, future=2)
+    spec = Spec(context_at="end", stride=5, context=4, future=2)
     assert spec.context_frames() == (29, 34, 39, 44)
     assert spec.future_frames() == (49, 54)
 
@@ -58,7 +58,7 @@ def test_spec_anchored_at_the_end_shows_the_last_observed_frame() -> None:
         {"context": 0},
         {"inputs": ("sound",)},
         {"inputs": ()},
-        {"anchor": "middle"},
+        {"context_at": "middle"},
         {"objects": 0},
     ],
 )

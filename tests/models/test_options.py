@@ -16,7 +16,7 @@ from physion.models.build import build_model, make_config
 from physion.models.encoders.encoder import EncoderConfig
 from physion.models.encoders.video import VideoConfig
 from physion.models.noisy_simulation import NoisySimulationConfig
-from physion.models.particles.config import ParticleOptions
+from physion.models.particles.simulator import ParticleOptions
 from physion.models.vision import VisionOptions
 
 CONFIGS: list[Any] = [

@@ -224,7 +224,7 @@ def test_without_readout_trials_the_tested_ones_are_cross_fitted(tmp_path: Path)
 class Oracle:
     """State model of another package that reports the contacts it receives."""
 
-    spec = Spec(inputs=("state",), anchor="end", stride=1, context=1, future=0)
+    spec = Spec(inputs=("state",), context_at="end", stride=1, context=1, future=0)
     answers = "observed"
 
     def __init__(self, answer: float | None = None) -> None:

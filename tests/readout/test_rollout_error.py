@@ -56,7 +56,7 @@ def standing_still(poses: Poses, rows: int) -> Poses:
 class Standstill:
     """Model in which everything stays where it is."""
 
-    spec = Spec(inputs=("state",), stride=STRIDE, context=NOW + 1, future=0, anchor="end")
+    spec = Spec(inputs=("state",), stride=STRIDE, context=NOW + 1, future=0, context_at="end")
     rows = 80
 
     def __init__(self) -> None:

@@ -41,7 +41,8 @@ class Spec:
     - ``stride``: frames between two frames of a clip (6 of a movie at 30 frames/s: 5 a second).
     - ``context``: frames of a clip that are observed. ``future``: those that follow, 0 for a model
       that neither imagines nor reads later frames.
-    - ``anchor``: where the context lies: ``start`` (0, s, 2 s, ...) or ``end`` (..., 44 - s, 44).
+    - ``context_at``: where the context lies: ``start`` (0, s, 2 s, ...) or ``end`` (..., 44 - s,
+      44).
     - ``objects``: rows of ``Batch.boxes``.
     - ``framewise``: whether the features of a frame depend on that frame alone, so that a clip can
       be encoded in parts.
@@ -57,7 +58,7 @@ class Spec:
     stride: int = 6
     context: int = 7
     future: int = 18
-    anchor: Literal["start", "end"] = "start"
+    context_at: Literal["start", "end"] = "start"
     objects: int = 10
     framewise: bool = True
 
@@ -73,8 +74,8 @@ class Spec:
                 f"and objects {self.objects} must be at least 1, and future {self.future} at least "
                 "0"
             )
-        if self.anchor not in ("start", "end"):
-            raise BadInputError(f"spec: anchor must be start or end, not {self.anchor!r}")
+        if self.context_at not in ("start", "end"):
+            raise BadInputError(f"spec: context_at must be start or end, not {self.context_at!r}")
         if (self.context - 1) * self.stride > LAST_OBSERVED:
             raise BadInputError(
                 f"spec: {self.context} context frames at stride {self.stride} span "
@@ -85,7 +86,7 @@ class Spec:
     @property
     def first(self) -> int:
         """Frame at which a clip starts."""
-        return 0 if self.anchor == "start" else LAST_OBSERVED - (self.context - 1) * self.stride
+        return 0 if self.context_at == "start" else LAST_OBSERVED - (self.context - 1) * self.stride
 
     @property
     def total(self) -> int:

@@ -147,7 +147,7 @@ class Clips(Sequence[dict[str, Any]]):
         context: int = 7,
         future: int = 18,
         stride: int = 6,
-        anchor: Literal["start", "end"] = "start",
+        context_at: Literal["start", "end"] = "start",
         size: int = 224,
         passes: Sequence[str] = ("rgb",),
         look: str | None = None,
@@ -167,7 +167,7 @@ class Clips(Sequence[dict[str, Any]]):
             stride=stride,
             context=context,
             future=future,
-            anchor=anchor,
+            context_at=context_at,
             objects=objects,
         )
         index = dataset.index.set_index("trial")

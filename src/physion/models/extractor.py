@@ -58,7 +58,7 @@ class ExtractorModel(TorchModel):
             stride=stride,
             context=LAST_OBSERVED // stride + 1,
             future=0,
-            anchor="end",
+            context_at="end",
             framewise=False,
         )
         weights = extractor.state_dict()

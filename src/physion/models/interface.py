@@ -16,9 +16,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,6 +91,84 @@ class TrainingSettings:
                     f"training: {name} must be one of {', '.join(known)}, "
                     f"not {getattr(self, name)!r}"
                 )
+
+
+# Settings of a model: all that a user can set.
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelSettings:
+    """Base of the settings of the models of this package; their fields are the options.
+
+    A model of one's own may have any dataclass as its settings, or plain arguments
+    (`physion.models.build`).
+
+    - ``model``: name under which the model is built; no option.
+    """
+
+    model: str = ""
+
+    @classmethod
+    def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the defaults of the model of this name that differ from those of the fields.
+
+        ``options`` are those that the user gave, such as the size.
+        """
+        return {}
+
+
+RANDOM, SHIPPED = "random", "shipped"
+"""Weights that are no path of a file: those to be trained, and those of the package."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SizedSettings(ModelSettings):
+    """Settings of a model that exists in several sizes, and whose weights may be shipped.
+
+    - ``size``: sets the defaults of the other options: ``small`` (for a CPU), ``paper``, or for
+      some models ``released``, with the settings of the published code where they differ.
+    - ``weights``: ``shipped``, those that come with the package, the default where there are some;
+      ``random``, to be trained; or the path of a ``model.safetensors`` that ``physion train``
+      wrote, or of its folder.
+    - ``seed``: of the initial weights, and of imagined futures.
+    """
+
+    size: str = "small"
+    weights: str = SHIPPED
+    seed: int = 0
+
+    sizes: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType({"small": {}})
+    """Settings of each size that differ from the defaults of the fields."""
+    any_weights: ClassVar[frozenset[str]] = frozenset({"model", "weights", "seed", "samples"})
+    """Settings that do not change what weights are for."""
+
+    @classmethod
+    def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the settings of a size; weights are shipped for the small one."""
+        size = options.get("size", "small")
+        if size not in cls.sizes:
+            raise BadInputError(f"{model} has the sizes {', '.join(cls.sizes)}, not {size!r}")
+        return {"weights": SHIPPED if size == "small" else RANDOM, **cls.sizes[size]}
+
+    def check_shipped(self) -> None:
+        """Raise `BadInputError` if shipped weights are wanted that are for other settings."""
+        if self.weights != SHIPPED or self.size != "small":
+            return
+        own = type(self)(**{"model": self.model, **self.defaults(self.model, {})})
+        for part in fields(self):
+            value, expected = getattr(self, part.name), getattr(own, part.name)
+            if part.name not in self.any_weights and value != expected:
+                raise BadInputError(
+                    f"the shipped weights of {self.model} are for {part.name}={expected}, not "
+                    f"{value}; leave it out, or give weights=random and train the model"
+                )
+
+    def at_least(self, least: int, *names: str) -> None:
+        """Raise `BadInputError` for a setting that is below ``least``."""
+        for name in names:
+            if getattr(self, name) < least:
+                value = getattr(self, name)
+                raise BadInputError(f"{self.model}: {name} must be at least {least}, not {value}")
 
 
 Diet = Literal["clips", "features", "states"]

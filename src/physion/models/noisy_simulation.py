@@ -139,7 +139,7 @@ class NoisySimulation(Model):
 
     def __init__(self, config: NoisySimulationConfig, engine: Engine | None = None) -> None:
         self.config = self.settings = config
-        self.spec = Spec(inputs=("state",), anchor="end", stride=1, context=1, future=0)
+        self.spec = Spec(inputs=("state",), context_at="end", stride=1, context=1, future=0)
         self.samples, self.seed = config.samples, config.seed
         self.knobs = {"scale": config.scales}
         self._given = engine

@@ -171,7 +171,7 @@ class Dataset:
         context: int = 7,
         future: int = 18,
         stride: int = 6,
-        anchor: Literal["start", "end"] = "start",
+        context_at: Literal["start", "end"] = "start",
         size: int = 224,
         passes: Sequence[str] = ("rgb",),
         look: str | None = None,
@@ -193,7 +193,7 @@ class Dataset:
             follows the observed part is opened.
         stride
             Frames of 0.01 s from one frame of a clip to the next.
-        anchor
+        context_at
             ``start``: frame 0 comes first; ``end``: the last frame of the context is the last
             observed one.
         size
@@ -240,7 +240,7 @@ class Dataset:
             context=context,
             future=future,
             stride=stride,
-            anchor=anchor,
+            context_at=context_at,
             size=size,
             passes=passes,
             look=look,

@@ -16,13 +16,13 @@ from physion.models.particles.bodies import (
     CLOTH,
     KINEMATIC,
     RIGID,
-    ParticleSettings,
+    Sampling,
     particle_positions,
     poses_of,
     scene_particles,
     surface_points,
 )
-from physion.physics.particles import particles_over_time
+from physion.numerics.rotations import rotate_vectors
 from physion.scenes.scene import Cloth, Roles
 from physion.scenes.shapes.meshes import Mesh
 from physion.scenes.shapes.primitives import Shape, shapes
@@ -66,7 +66,7 @@ def test_bad_spacings_and_limits_are_named(spacing: float, limit: int) -> None:
     with pytest.raises(BadInputError, match="spacing above 0 m and a limit of at least 1"):
         surface_points("cube", (1.0, 1.0, 1.0), spacing, limit)
     with pytest.raises(BadInputError, match="particles: the spacing"):
-        ParticleSettings(spacing=spacing, limit=limit)
+        Sampling(spacing=spacing, limit=limit)
 
 
 def test_a_shape_without_faces_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,13 +76,12 @@ def test_a_shape_without_faces_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
         surface_points("test:bare", (1.0, 1.0, 1.0), 0.1, 10)
 
 
-@pytest.mark.parametrize("fill", ["surface", "volume"])
-def test_a_kinematic_body_has_a_limit_of_its_own(fill: str) -> None:
+def test_a_kinematic_body_has_a_limit_of_its_own() -> None:
     scene = scene_of(body("a"), body("b", kinematic=True), body("c", kinematic=True, scenery=True))
-    settings = ParticleSettings(0.1, 20, 70, fill)  # type: ignore[arg-type]
-    own = scene_particles(scene, settings)
+    sampling = Sampling(0.1, 20, 70)
+    own = scene_particles(scene, sampling)
     assert own.kinds.tolist() == [RIGID, KINEMATIC] and np.bincount(own.owners).tolist() == [20, 70]
-    swapped = scene_particles(scene, dataclasses.replace(settings, limit=70, still_limit=20))
+    swapped = scene_particles(scene, dataclasses.replace(sampling, limit=70, still_limit=20))
     assert np.bincount(swapped.owners).tolist() == [70, 20]
 
 
@@ -90,34 +89,33 @@ def test_a_scene_with_too_many_particles_is_refused(monkeypatch: pytest.MonkeyPa
     """All objects of a scene count, up to the number itself."""
     monkeypatch.setattr(bodies, "MAX_PARTICLES", 10)
     scene = scene_of(body("a"), body("b", kinematic=True))
-    assert len(scene_particles(scene, ParticleSettings(limit=4, still_limit=6)).owners) == 10
+    assert len(scene_particles(scene, Sampling(limit=4, still_limit=6)).owners) == 10
     with pytest.raises(BadInputError, match="'test' has 11 particles, at most 10: use a larger"):
-        scene_particles(scene, ParticleSettings(limit=5, still_limit=6))
+        scene_particles(scene, Sampling(limit=5, still_limit=6))
 
 
 def test_kinds_scenery_and_absent_bodies() -> None:
     scene = scene_of(body("a"), body("b", kinematic=True), body("c", scenery=True), body("d"))
-    own = scene_particles(scene, ParticleSettings())
+    own = scene_particles(scene, Sampling())
     assert own.things.tolist() == [0, 1, 3] and own.kinds.tolist() == [RIGID, KINEMATIC, RIGID]
     assert own.agent == 0
-    without = scene_particles(scene, ParticleSettings(), (False, True, True, True))
+    without = scene_particles(scene, Sampling(), (False, True, True, True))
     assert without.things.tolist() == [1, 3] and without.agent == -1
     with pytest.raises(BadInputError, match="no object"):
-        scene_particles(scene, ParticleSettings(), (False,) * 4)
+        scene_particles(scene, Sampling(), (False,) * 4)
 
 
-@pytest.mark.parametrize("fill", ["surface", "volume"])
-def test_particles_move_with_their_bodies(fill: str) -> None:
+def test_particles_move_with_their_bodies() -> None:
     scene, trajectory = tumbling()
-    settings = ParticleSettings(0.1, 500, 500, fill, cloth_step=1)  # type: ignore[arg-type]
-    own = scene_particles(scene, settings)
+    sampling = Sampling(0.1, 500, 500, cloth_step=1)
+    own = scene_particles(scene, sampling)
     frames = range(len(trajectory))
     positions = particle_positions(own, poses_of(own, Motion(scene, trajectory), frames))
-    if fill == "volume":
-        expected = particles_over_time(scene, trajectory, 0.1, limit=500)
-        assert np.allclose(positions, expected.positions, atol=1e-5)
     for row in np.flatnonzero(own.kinds != CLOTH):
-        mine = positions[:, own.owners == row]
+        mine, thing = positions[:, own.owners == row], own.things[row]
+        at_rest = own.shape[own.owners == row] + own.pivots[row]
+        turned = rotate_vectors(trajectory.rotations[:, thing, None].astype(np.float64), at_rest)
+        assert np.allclose(mine, trajectory.positions[:, thing, None] + turned, atol=1e-5)
         apart = np.linalg.norm(mine[:, :1] - mine, axis=-1)
         assert np.allclose(apart, apart[:1], atol=1e-6), "a body stays rigid"
 
@@ -125,7 +123,7 @@ def test_particles_move_with_their_bodies(fill: str) -> None:
 def test_a_cloth_is_a_grid_of_its_vertices() -> None:
     cloth = Cloth("sheet", (0.0, 0.0, 1.0), resolution=7)
     scene = dataclasses.replace(scene_of(body("a")), cloths=(cloth,))
-    own = scene_particles(scene, ParticleSettings(cloth_step=3))
+    own = scene_particles(scene, Sampling(cloth_step=3))
     rows = own.owners == 1
     assert own.kinds[1] == CLOTH and rows.sum() == 9
     assert own.vertices.tolist() == [0, 3, 6, 21, 24, 27, 42, 45, 48]
@@ -137,12 +135,12 @@ def test_a_cloth_is_a_grid_of_its_vertices() -> None:
 def test_a_motion_that_is_not_known_is_refused() -> None:
     scene, trajectory = tumbling()
     unknown = dataclasses.replace(trajectory, positions=np.full_like(trajectory.positions, np.nan))
-    own = scene_particles(scene, ParticleSettings())
+    own = scene_particles(scene, Sampling())
     with pytest.raises(BadInputError, match="has no motion"):
         poses_of(own, Motion(scene, unknown), [0])
 
 
 def test_roles_are_found_among_the_objects() -> None:
     scene = dataclasses.replace(scene_of(body("a"), body("b"), body("c")), roles=Roles("c", "b"))
-    own = scene_particles(scene, ParticleSettings())
+    own = scene_particles(scene, Sampling())
     assert (own.agent, own.patient) == (2, 1)

@@ -10,13 +10,14 @@ from torch import Tensor
 from physion.core import seeds
 from physion.core.errors import BadInputError
 from physion.models.particles import neighbours as cell_list
-from physion.models.particles.neighbours import (
-    radius_edges,
-    radius_edges_on_device,
-    swept_edges_on_device,
-)
+from physion.models.particles.neighbours import swept_edges_on_device
 
 RADIUS = 0.08
+
+
+def radius_edges(points: Tensor, scene: Tensor, radius: float) -> tuple[Tensor, Tensor]:
+    """Return the pairs of particles that do not move."""
+    return swept_edges_on_device(points, torch.zeros_like(points), scene, radius)
 
 
 def random_points(seed: str, count: int, size: float, scenes: int = 3) -> tuple[Tensor, Tensor]:
@@ -49,10 +50,8 @@ def listed(edges: tuple[Tensor, Tensor]) -> list[list[int]]:
 @pytest.mark.parametrize(("count", "size"), [(2, 0.1), (60, 0.2), (400, 0.6), (400, 50.0)])
 def test_radius_pairs_are_those_of_all_pairs(count: int, size: float) -> None:
     points, scene = random_points(f"{count} {size}", count, size)
-    edges = listed(radius_edges_on_device(points, scene, RADIUS))
+    edges = listed(radius_edges(points, scene, RADIUS))
     assert edges == all_swept(points, torch.zeros_like(points), scene, RADIUS)
-    by_tree = radius_edges(points.numpy(), scene.numpy(), RADIUS)
-    assert edges == [part.tolist() for part in by_tree]
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.1, 1.0, 4.0, 30.0, 3000.0])
@@ -66,17 +65,17 @@ def test_swept_pairs_are_those_of_all_pairs(speed: float, fast: float) -> None:
     moves[0] = moves[20]
     edges = listed(swept_edges_on_device(points, moves, scene, RADIUS))
     assert edges == all_swept(points, moves, scene, RADIUS)
-    plain = listed(radius_edges_on_device(points, scene, RADIUS))
+    plain = listed(radius_edges(points, scene, RADIUS))
     assert set(zip(*plain, strict=True)) <= set(zip(*edges, strict=True))
 
 
 def test_blocks_of_pairs_give_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     points, scene = random_points("blocks", 300, 0.4)
     moves = points.flip(0) / 5
-    whole = listed(radius_edges_on_device(points, scene, RADIUS))
+    whole = listed(radius_edges(points, scene, RADIUS))
     swept = listed(swept_edges_on_device(points, moves, scene, RADIUS))
     monkeypatch.setattr(cell_list, "CANDIDATES_AT_ONCE", 50)
-    assert listed(radius_edges_on_device(points, scene, RADIUS)) == whole
+    assert listed(radius_edges(points, scene, RADIUS)) == whole
     assert listed(swept_edges_on_device(points, moves, scene, RADIUS)) == swept
 
 
@@ -84,14 +83,14 @@ def test_pairs_at_exactly_the_radius_count() -> None:
     """On a grid whose step is the radius, where rounding decides in which cube a point lies."""
     grid = np.stack(np.meshgrid(*[np.arange(7) * 0.25 - 1e3] * 3), -1).reshape(-1, 3)
     points, scene = torch.tensor(grid), torch.zeros(len(grid), dtype=torch.int64)
-    receivers, _ = radius_edges_on_device(points, scene, 0.25)
+    receivers, _ = radius_edges(points, scene, 0.25)
     assert len(receivers) == 2 * 3 * 7 * 7 * 6
 
 
 def test_all_particles_in_one_point_are_neighbours() -> None:
     points, scene = torch.zeros(40, 3), torch.zeros(40, dtype=torch.int64)
     for edges in (
-        radius_edges_on_device(points, scene, RADIUS),
+        radius_edges(points, scene, RADIUS),
         swept_edges_on_device(points, points + 9, scene, RADIUS),
     ):
         assert len(edges[0]) == 40 * 39
@@ -100,14 +99,14 @@ def test_all_particles_in_one_point_are_neighbours() -> None:
 @pytest.mark.parametrize("count", [0, 1])
 def test_fewer_than_two_particles_have_no_neighbours(count: int) -> None:
     points, scene = torch.zeros(count, 3), torch.zeros(count, dtype=torch.int64)
-    assert listed(radius_edges_on_device(points, scene, RADIUS)) == [[], []]
+    assert listed(radius_edges(points, scene, RADIUS)) == [[], []]
     assert listed(swept_edges_on_device(points, points + 1, scene, RADIUS)) == [[], []]
 
 
 def test_far_particles_do_not_overflow() -> None:
     """The number of cubes between particles at opposite ends of space does not fit in 64 bits."""
     points = torch.tensor([[-9e8] * 3, [9e8] * 3, [9e8] * 3], dtype=torch.float64)
-    edges = radius_edges_on_device(points, torch.tensor([0, 0, 0]), 1e-3)
+    edges = radius_edges(points, torch.tensor([0, 0, 0]), 1e-3)
     assert listed(edges) == [[1, 2], [2, 1]]
 
 
@@ -123,6 +122,6 @@ def test_far_particles_do_not_overflow() -> None:
 def test_bad_input_is_refused(points: Tensor, radius: float, message: str) -> None:
     scene = torch.zeros(1, dtype=torch.int64)
     with pytest.raises(BadInputError, match=message):
-        radius_edges_on_device(points, scene, radius)
+        radius_edges(points, scene, radius)
     with pytest.raises(BadInputError, match=message):
         swept_edges_on_device(torch.zeros(1, 3), points, scene, radius)

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from physion.models.particles.bodies import ParticleSettings, Poses, SceneParticles, scene_particles
-from physion.models.particles.gap import FAR, TOLERANCE, smallest_distance
+from physion.models.particles.bodies import Poses, Sampling, SceneParticles, scene_particles
+from physion.models.particles.rollout import FAR, TOLERANCE, smallest_distance
 from physion.scenes.scene import Cloth, Scene
 from support.rendered_scenes import body, scene_of
 
@@ -23,7 +23,7 @@ def poses(*centers: tuple[float, float, float], rows: int = 1) -> Poses:
 
 def two_cubes() -> tuple[Scene, SceneParticles]:
     scene = scene_of(body("a", scale=(1.0, 1.0, 1.0)), body("b", scale=(1.0, 1.0, 1.0)))
-    own = scene_particles(scene, ParticleSettings())
+    own = scene_particles(scene, Sampling())
     # Centres are those of the particles; here they are to be those of the cubes.
     middle = np.array([0.0, 0.0, 0.5])
     return scene, dataclasses.replace(own, pivots=np.stack([middle, middle]))
@@ -56,14 +56,14 @@ def test_a_corner_that_comes_closest_between_two_frames() -> None:
 
 def test_an_absent_object_is_far() -> None:
     scene, _ = two_cubes()
-    own = scene_particles(scene, ParticleSettings(), (True, False))
+    own = scene_particles(scene, Sampling(), (True, False))
     assert smallest_distance(scene, own, poses((0, 0, 0)), 0.1, 100) == FAR
 
 
 def test_a_cloth_above_a_cube() -> None:
     cloth = Cloth("sheet", (0.0, 0.0, 1.0), size=(1.0, 1.0, 0.0), resolution=11)
     scene = scene_of(body("a", scale=(1.0, 1.0, 1.0)), cloths=[cloth])
-    own = scene_particles(scene, ParticleSettings(cloth_step=2))
+    own = scene_particles(scene, Sampling(cloth_step=2))
     top = own.shape[own.owners == 0, 2].max()
     grid = np.linspace(-0.5, 0.5, 6)
     x, y = np.meshgrid(grid, grid, indexing="ij")

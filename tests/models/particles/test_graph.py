@@ -8,7 +8,7 @@ import torch
 from physion import sample_scene
 from physion.clips.batch import Motion
 from physion.models.particles.bodies import ParticleSettings, poses_of, scene_particles
-from physion.models.particles.graph import (
+from physion.models.particles.networks import (
     drift_of,
     join_poses,
     join_scenes,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from physion.models.particles.neighbours import gap_over_time, radius_edges, swept_edges
+from physion.models.particles.neighbours import gap_over_time, swept_edges
 
 F64 = NDArray[np.float64]
 
@@ -54,24 +54,6 @@ def test_a_fast_body_meets_what_it_passes() -> None:
     assert swept[0].tolist() == [0, 1] and swept[1].tolist() == [1, 0] and not len(plain[0])
     moving = np.stack([points, points + steps])
     assert gap_over_time(moving[:, :1], moving[:, 1:]) == pytest.approx(0.05)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_radius_edges_equal_all_pairs(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(size=(60, 3))
-    points[10] = points[11]  # coincident particles
-    scene = rng.integers(0, 3, 60)
-    receivers, senders = radius_edges(points, scene, 0.3)
-    apart = np.linalg.norm(points[:, None] - points[None], axis=-1)
-    near = (apart <= 0.3) & (scene[:, None] == scene[None]) & ~np.eye(60, dtype=bool)
-    assert np.array_equal(np.stack([receivers, senders]), np.stack(np.nonzero(near)))
-
-
-def test_nothing_and_one_particle_have_no_neighbours() -> None:
-    none = np.zeros((0, 3)), np.zeros(0, np.int64)
-    one = np.zeros((1, 3)), np.zeros(1, np.int64)
-    assert len(radius_edges(*none, 0.1)[0]) == len(radius_edges(*one, 0.1)[0]) == 0
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from physion.models.particles.rigid_motion import (
+from physion.models.particles.bodies import (
     fit_rigid,
     fit_robust,
     mean_by,

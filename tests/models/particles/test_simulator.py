@@ -15,9 +15,15 @@ from physion.clips.batch import Batch, Motion, cut_to_observed
 from physion.core.errors import BadInputError
 from physion.models.build import build_model
 from physion.models.checkpoint import DamagedFileError
-from physion.models.particles.bodies import KINEMATIC, RIGID, poses_of, scene_particles
-from physion.models.particles.gap import smallest_distance
-from physion.models.particles.graph import (
+from physion.models.particles.bodies import (
+    KINEMATIC,
+    RIGID,
+    poses_of,
+    rotation_from_vector,
+    scene_particles,
+)
+from physion.models.particles.networks import (
+    JoinedInputs,
     ObjectState,
     drift_of,
     join_poses,
@@ -25,9 +31,7 @@ from physion.models.particles.graph import (
     make_graph,
     rotate_scenes,
 )
-from physion.models.particles.networks import JoinedInputs
-from physion.models.particles.rigid_motion import rotation_from_vector
-from physion.models.particles.rollout import Window, read_window
+from physion.models.particles.rollout import Window, read_window, smallest_distance
 from physion.models.particles.simulator import ParticleSimulator
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
@@ -537,7 +541,7 @@ def test_weights_of_a_file_are_loaded_and_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"size": "huge"}, "sizes small, paper and released"),
+        ({"size": "huge"}, "sizes small and paper"),
         ({"samples": 1.5}, "samples of model dpi must be a whole number"),
         ({"samples": 0}, "samples must be a whole number"),
         ({"stride": 2}, "stride must be 1 or 3"),

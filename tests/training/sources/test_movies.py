@@ -40,7 +40,7 @@ def test_context_shows_the_observed_movie(made: Dataset) -> None:
 
 
 def test_the_end_anchor_ends_with_the_last_observed_frame(made: Dataset) -> None:
-    spec = replace(SPEC, anchor="end", context=4, stride=5)
+    spec = replace(SPEC, context_at="end", context=4, stride=5)
     batch = observed_source(made, spec).context([RIGID])
     assert batch.frames.tolist() == [[29, 34, 39, 44]]
     movie = read_frames(made.paths(RIGID).observed_movie, size=(16, 16))
@@ -200,7 +200,7 @@ def test_keys_follow_the_movie_and_what_the_spec_reads(made: Dataset, copy: Data
         replace(SPEC, image_size=32),
         replace(SPEC, context=6),
         replace(SPEC, stride=5),
-        replace(SPEC, anchor="end"),
+        replace(SPEC, context_at="end"),
         replace(SPEC, inputs=("rgb", "ids")),
     )
     keys = [observed_source(made, spec).key(RIGID, "context") for spec in equal]

@@ -30,7 +30,7 @@ SPECS = {
     "rgb": dataclasses.replace(SPEC, inputs=("rgb",)),
     "state": dataclasses.replace(SPEC, inputs=("state",)),
     "all": SPEC,
-    "end": dataclasses.replace(SPEC, anchor="end"),
+    "end": dataclasses.replace(SPEC, context_at="end"),
     "every frame": dataclasses.replace(SPEC, stride=1, context=45),
 }
 

@@ -42,7 +42,7 @@ class BaseRate(Model):
 
     def __init__(self, config: BaseRateConfig) -> None:
         self.config = self.settings = config
-        self.spec = Spec(inputs=("state",), stride=1, context=1, future=0, anchor="end")
+        self.spec = Spec(inputs=("state",), stride=1, context=1, future=0, context_at="end")
 
     def fit(self, batch: Batch, labels: NDArray[np.bool_], seed: int) -> FittedBaseRate:
         """Return the model with the base rate of the outcomes (B,); trials and seed are unused."""

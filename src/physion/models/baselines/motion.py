@@ -451,7 +451,7 @@ class AlreadyTouched(Model):
 
     def __init__(self, config: AlreadyTouchedConfig) -> None:
         self.config = self.settings = config
-        self.spec = Spec(inputs=("state",), stride=1, context=1, future=0, anchor="end")
+        self.spec = Spec(inputs=("state",), stride=1, context=1, future=0, context_at="end")
 
     def fit(self, batch: Batch, labels: NDArray[np.bool_], seed: int) -> TouchedOrBaseRate:
         """Return the model with the base rate of some trials and outcomes (B,); no seed is used."""
@@ -542,7 +542,9 @@ class ConstantMotion(Model):
 
     def __init__(self, config: ConstantMotionConfig) -> None:
         self.config = self.settings = config
-        self.spec = Spec(inputs=("state",), stride=1, context=1, future=config.frames, anchor="end")
+        self.spec = Spec(
+            inputs=("state",), stride=1, context=1, future=config.frames, context_at="end"
+        )
 
     def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
         """Return gaps and contacts (B, samples); nothing is random and there are no knobs."""
@@ -615,7 +617,7 @@ class StateClassifier(Model):
 
     def __init__(self, config: StateClassifierConfig) -> None:
         self.config = self.settings = config
-        self.spec = Spec(inputs=("state",), stride=1, context=1, future=0, anchor="end")
+        self.spec = Spec(inputs=("state",), stride=1, context=1, future=0, context_at="end")
 
     def fit(self, batch: Batch, labels: NDArray[np.bool_], seed: int) -> FittedTrees:
         """Return trees fitted on trials and their outcomes (B,); ``seed`` is that of the trees.

@@ -253,7 +253,7 @@ class VideoEncoder(TorchModel):
             stride=config.stride,
             context=config.frames,
             future=config.later * config.frames,
-            anchor="end",
+            context_at="end",
             framewise=False,
         )
         self.network, self.init = create_video_encoder(family, config)

@@ -10,19 +10,19 @@ import math
 import threading
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from physion.clips.batch import Motion
 from physion.core.errors import BadInputError
 from physion.numerics.linear_algebra import cross, norm
 from physion.numerics.rotations import rotation_matrices
-from physion.physics.particles import sample_particles
 from physion.scenes.scene import Body, Scene, Vec3
 from physion.scenes.shapes.primitives import shape
 
@@ -135,44 +135,35 @@ def _candidates(
 
 I64 = NDArray[np.int64]
 
-RIGID, KINEMATIC, CLOTH, FREE = 0, 1, 2, 3
-"""Kinds of objects. Those from `CLOTH` on consist of particles that move on their own; `FREE` are
-bodies that nothing keeps rigid, in the published form alone."""
-Fill = Literal["surface", "volume"]
+RIGID, KINEMATIC, CLOTH = 0, 1, 2
+"""Kinds of objects. Cloths consist of particles that move on their own."""
 
 MAX_PARTICLES = 200_000
 """Largest number of particles of one scene."""
 
 
 @dataclass(frozen=True)
-class ParticleSettings:
+class Sampling:
     """How objects become particles.
 
     - ``spacing``: metres between particles. ``limit``: largest number for one body,
       ``still_limit``: for a kinematic one, which may be large.
-    - ``fill``: ``volume``, as the original study, or ``surface``.
     - ``inner``: how many of the nearest particles of its own rigid body a particle is linked to.
     - ``cloth_step``: every how many vertices of a cloth, along both sides, is a particle.
-    - ``cloth_spacing``: metres between particles of bodies in scenes with cloth; by default as in
-      the others.
     """
 
     spacing: float = 0.10
     limit: int = 100
     still_limit: int = 600
-    fill: Fill = "surface"
     cloth_step: int = 3
     inner: int = 0
-    cloth_spacing: float | None = None
 
     def __post_init__(self) -> None:
         counts = min(self.limit, self.still_limit, self.cloth_step)
-        spacing = min(self.spacing, self.cloth_spacing or self.spacing)
-        if not spacing > 0 or counts < 1 or self.fill not in ("surface", "volume"):
+        if not self.spacing > 0 or counts < 1:
             raise BadInputError(
-                "particles: the spacing must be above 0 m, limits and cloth_step at least 1, and "
-                f"fill surface or volume, not {self.spacing}, {self.limit}, {self.still_limit}, "
-                f"{self.cloth_step} and {self.fill!r}"
+                "particles: the spacing must be above 0 m, limits and cloth_step at least 1, not "
+                f"{self.spacing}, {self.limit}, {self.still_limit} and {self.cloth_step}"
             )
 
 
@@ -181,10 +172,10 @@ class SceneParticles:
     """Particles of one scene: K objects, P particles in blocks by object.
 
     - ``things`` (K,): index of each object in `Scene.names`.
-    - ``kinds`` (K,): `RIGID`, `KINEMATIC`, `CLOTH` or `FREE`.
+    - ``kinds`` (K,): `RIGID`, `KINEMATIC` or `CLOTH`.
     - ``owners`` (P,): row of the object of each particle.
     - ``normals`` (P, 3): outward unit normals in the body's frame; 0 where there is none, as in
-      cloths and volumes.
+      cloths.
     - ``shape`` (P, 3): metres, offset of each particle from the mean of its object's particles, in
       the body's frame; 0 for cloth.
     - ``pivots`` (K, 3): the mean of the particles in the body's frame; 0 for cloth.
@@ -217,8 +208,8 @@ class SceneParticles:
 
     @property
     def loose(self) -> NDArray[np.bool_]:
-        """Which particles (P,) move on their own: those of cloths and free bodies."""
-        return np.asarray(self.kinds[self.owners] >= CLOTH)
+        """Which particles (P,) move on their own: those of cloths."""
+        return np.asarray(self.kinds[self.owners] == CLOTH)
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +217,7 @@ class Poses:
     """Motion of the objects of one scene over T frames.
 
     - ``centers`` (T, K, 3): metres, mean of the particles of each object.
-    - ``rotations`` (T, K, 3, 3): of bodies; the identity for cloths and free bodies.
+    - ``rotations`` (T, K, 3, 3): of bodies; the identity for cloths.
     - ``loose`` (T, C, 3): positions of the particles that move on their own.
     """
 
@@ -235,7 +226,7 @@ class Poses:
     loose: F64
 
 
-_Key = tuple[int, ParticleSettings, tuple[bool, ...]]
+_Key = tuple[int, Sampling, tuple[bool, ...]]
 _kept: OrderedDict[_Key, tuple[Scene, SceneParticles]] = OrderedDict()
 """Particles of the scenes that were asked for last, and the scenes, so that their ids stay."""
 _BODIES_KEPT = 4_000_000
@@ -244,7 +235,7 @@ _lock = threading.Lock()
 
 
 def scene_particles(
-    scene: Scene, settings: ParticleSettings, present: Sequence[bool] | None = None
+    scene: Scene, sampling: Sampling, present: Sequence[bool] | None = None
 ) -> SceneParticles:
     """Return the particles of the objects of a scene.
 
@@ -252,8 +243,8 @@ def scene_particles(
     ----------
     scene
         The scene.
-    settings
-        Spacing, limit and fill.
+    sampling
+        Distances and numbers of particles.
     present
         Which bodies and cloths are there, in the order of `Scene.names`; by default all.
 
@@ -263,13 +254,13 @@ def scene_particles(
         If no object is left, or there are more than `MAX_PARTICLES`.
     """
     there = tuple(present) if present is not None else (True,) * len(scene.names())
-    key = (id(scene), settings, there)
+    key = (id(scene), sampling, there)
     with _lock:
         found = _kept.get(key)
         if found is not None:
             _kept.move_to_end(key)
             return found[1]
-    particles = _sample(scene, settings, there)
+    particles = _sample(scene, sampling, there)
     with _lock:
         _kept[key] = scene, particles
         while len(_kept) > 1 and sum(len(p.owners) for _, p in _kept.values()) > _BODIES_KEPT:
@@ -278,7 +269,7 @@ def scene_particles(
 
 
 def poses_of(particles: SceneParticles, motion: Motion, frames: Sequence[int]) -> Poses:
-    """Return the motion of the objects of a scene in the given frames; of free bodies the poses.
+    """Return the motion of the objects of a scene in the given frames.
 
     Raises `BadInputError` for a motion that is not known, as of a trial imported from a movie.
     """
@@ -340,29 +331,27 @@ def particle_positions(particles: SceneParticles, poses: Poses) -> F64:
     return positions
 
 
-def _sample(scene: Scene, settings: ParticleSettings, present: tuple[bool, ...]) -> SceneParticles:
-    if scene.cloths and settings.cloth_spacing is not None:
-        settings = replace(settings, spacing=settings.cloth_spacing)
+def _sample(scene: Scene, sampling: Sampling, present: tuple[bool, ...]) -> SceneParticles:
     things, kinds, normals, pivots = [], [], [], []
     shapes: list[F64] = []
     vertices, links = [np.zeros(0, np.int64)], [np.zeros((2, 0), np.int64)]
     for index, body in enumerate(scene.bodies):
         if body.scenery or not present[index]:
             continue
-        points, outward = _points(body, settings)
+        points, outward = _points(body, sampling)
         normals.append(outward)
         pivot = points.mean(axis=0)
         things.append(index)
         kinds.append(KINEMATIC if body.kinematic else RIGID)
-        if not body.kinematic and settings.inner:
-            links.append(_nearest(points, settings.inner) + sum(len(part) for part in shapes))
+        if not body.kinematic and sampling.inner:
+            links.append(_nearest(points, sampling.inner) + sum(len(part) for part in shapes))
         pivots.append(pivot)
         shapes.append(points - pivot)
     for number, cloth in enumerate(scene.cloths):
         things.append(len(scene.bodies) + number)
         kinds.append(CLOTH)
         pivots.append(np.zeros(3))
-        rows, grid = _grid(cloth.resolution, settings.cloth_step)
+        rows, grid = _grid(cloth.resolution, sampling.cloth_step)
         before = sum(sheet.resolution**2 for sheet in scene.cloths[:number])
         links.append(grid + sum(len(points) for points in shapes))
         vertices.append(rows + before)
@@ -423,10 +412,195 @@ def _grid(resolution: int, step: int) -> tuple[I64, I64]:
     return rows.astype(np.int64), links.astype(np.int64)
 
 
-def _points(body: Body, settings: ParticleSettings) -> tuple[F64, F64]:
+def _points(body: Body, sampling: Sampling) -> tuple[F64, F64]:
     """Return particles of a body and their normals."""
-    limit = settings.still_limit if body.kinematic else settings.limit
-    if settings.fill == "surface":
-        return surface_points(body.shape, body.scale, settings.spacing, limit)
-    points = sample_particles(body.shape, body.scale, settings.spacing, limit).astype(np.float64)
-    return points, np.zeros_like(points)
+    limit = sampling.still_limit if body.kinematic else sampling.limit
+    return surface_points(body.shape, body.scale, sampling.spacing, limit)
+
+
+# Rigid motions of objects from the motions of their particles.
+#
+# Rotations are written as rotation vectors (axis times angle in radians) where they are learned.
+# The fit of a rotation R and translation t to n pairs of points x -> y with weights w is the least
+# squares problem
+#
+#     min sum_i w_i |R x_i + t - y_i|^2
+#
+# Its solution (Kabsch 1976): with the weighted means x', y' and H = sum_i w_i (x_i - x') (y_i -
+# y')^T = U S V^T is R = V diag(1, 1, det(V U^T)) U^T, t = y' - R x'.
+#
+# References
+# ----------
+# W. Kabsch, A solution for the best rotation to relate two sets of vectors, Acta Crystallographica
+# A 32, 1976.
+# M. A. Fischler and R. C. Bolles, Random sample consensus, Communications of the ACM 24, 1981.
+
+_SMALL = 1e-12
+
+
+def rotation_from_vector(vector: Tensor) -> Tensor:
+    """Return rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians.
+
+    Rodrigues: R = I + a K + b K^2 with K the cross product matrix of the vector, angle t,
+    a = sin(t) / t and b = (1 - cos(t)) / t^2.
+    """
+    squared = vector.pow(2).sum(-1)
+    angle = squared.clamp_min(_SMALL).sqrt()
+    small = squared < 1e-8
+    a = torch.where(small, 1 - squared / 6, angle.sin() / angle)[..., None, None]
+    b = torch.where(small, 0.5 - squared / 24, (1 - angle.cos()) / angle.pow(2))[..., None, None]
+    cross = cross_matrix(vector)
+    eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
+    rotation: Tensor = eye + a * cross + b * (cross @ cross)
+    return rotation
+
+
+def cross_matrix(vector: Tensor) -> Tensor:
+    """Return the matrices K (..., 3, 3) with K x = vector x x."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = [zero, -z, y, z, zero, -x, -y, x, zero]
+    return torch.stack(rows, -1).reshape(*vector.shape[:-1], 3, 3)
+
+
+def vector_from_rotation(rotation: Tensor) -> Tensor:
+    """Return rotation vectors (..., 3) of rotation matrices (..., 3, 3), angles in 0..pi.
+
+    The angle t is atan2(|s|, (trace - 1) / 2) with s the axial vector of (R - R^T) / 2, whose
+    length is sin(t) and whose direction is the axis. Where sin(t) vanishes with t near pi, the axis
+    is the longest column of (R + I) / 2, which is the projection on it.
+    """
+    axial = torch.stack(
+        [
+            rotation[..., 2, 1] - rotation[..., 1, 2],
+            rotation[..., 0, 2] - rotation[..., 2, 0],
+            rotation[..., 1, 0] - rotation[..., 0, 1],
+        ],
+        -1,
+    )
+    sine = axial / 2
+    length = sine.pow(2).sum(-1).clamp_min(_SMALL).sqrt()
+    cosine = (rotation.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
+    angle = torch.atan2(length, cosine)
+    factor = torch.where(length < 1e-5, torch.ones_like(length), angle / length)
+    vector = sine * factor[..., None]
+    halfway = (length < 1e-4) & (cosine < 0)
+    if bool(halfway.any()):
+        eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
+        columns = ((rotation[halfway] + eye) / 2).transpose(-1, -2)
+        rows = columns.pow(2).sum(-1).argmax(-1)
+        axis = columns[torch.arange(len(rows), device=rows.device), rows]
+        axis = axis / axis.norm(dim=-1, keepdim=True)
+        sign = torch.where((axis * sine[halfway]).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+        vector = vector.clone()
+        vector[halfway] = sign * axis * angle[halfway][..., None]
+    return vector
+
+
+def sum_by(values: Tensor, group: Tensor, count: int) -> Tensor:
+    """Return the sums (count, ...) of the rows of ``values`` (n, ...) with each group (n,)."""
+    return values.new_zeros(count, *values.shape[1:]).index_add(0, group, values)
+
+
+def mean_by(values: Tensor, group: Tensor, count: int) -> Tensor:
+    """Return the means (count, ...) of the rows of each group; 0 for a group without rows."""
+    rows = torch.bincount(group, minlength=count).clamp_min(1).to(values.dtype)
+    return sum_by(values, group, count) / rows.reshape(-1, *[1] * (values.ndim - 1))
+
+
+def fit_rigid(
+    shape: Tensor, points: Tensor, owners: Tensor, count: int, weights: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return the rotations (K, 3, 3) and translations (K, 3) that fit shapes to points best.
+
+    Parameters
+    ----------
+    shape, points : (P, 3)
+        Points of the objects at rest, and where they are, metres.
+    owners : (P,)
+        Object of each point, 0..K-1.
+    count : int
+        K.
+    weights : (P,), optional
+        Not negative; by default 1.
+
+    Notes
+    -----
+    An object of one or two points, or of points on a line, has more than one best rotation; one of
+    them is returned.
+    """
+    weight = torch.ones_like(points[:, 0]) if weights is None else weights
+    total = sum_by(weight, owners, count).clamp_min(_SMALL)[:, None]
+    start = sum_by(weight[:, None] * shape, owners, count) / total
+    goal = sum_by(weight[:, None] * points, owners, count) / total
+    a, b = shape - start[owners], points - goal[owners]
+    spread = sum_by(weight[:, None, None] * a[:, :, None] * b[:, None, :], owners, count)
+    rotation = _best_rotation(spread)
+    return rotation, goal - (rotation @ start[..., None])[..., 0]
+
+
+def _best_rotation(spread: Tensor) -> Tensor:
+    """Return the rotation of Kabsch for matrices H (..., 3, 3)."""
+    u, _, vh = torch.linalg.svd(spread)
+    v, ut = vh.transpose(-1, -2), u.transpose(-1, -2)
+    sign = torch.det(v @ ut)
+    scale = torch.ones_like(spread[..., 0])
+    scale[..., 2] = torch.where(sign < 0, -1.0, 1.0).to(spread.dtype)
+    rotation: Tensor = (v * scale[..., None, :]) @ ut
+    return rotation
+
+
+def fit_robust(
+    shape: Tensor,
+    points: Tensor,
+    owners: Tensor,
+    count: int,
+    tolerance: float,
+    draws: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Fit a rigid motion to the particles of each object that agree with one another (RANSAC).
+
+    Every hypothesis is fitted to four particles of each object; its inliers are the particles that
+    it puts within ``tolerance`` of where they are. The one with most inliers, among them the fit to
+    all particles, is fitted again to its inliers.
+
+    Parameters
+    ----------
+    shape, points, owners, count
+        As `fit_rigid`.
+    tolerance : float
+        Metres.
+    draws : (hypotheses, 4)
+        Random numbers in 0..1 that choose the particles. They are the same for every object, so
+        that the fit of one does not depend on the others.
+
+    Returns
+    -------
+    rotation, translation, inliers
+        (K, 3, 3), (K, 3), and which particles (P,) are inliers.
+    """
+    numbers = torch.bincount(owners, minlength=count)
+    starts = torch.cumsum(numbers, 0) - numbers
+    rotation, shift = fit_rigid(shape, points, owners, count)
+
+    def agree(rotation: Tensor, shift: Tensor) -> Tensor:
+        put = (rotation[owners] @ shape[..., None])[..., 0] + shift[owners]
+        return (put - points).pow(2).sum(-1) <= tolerance**2
+
+    inliers = agree(rotation, shift)
+    votes = sum_by(inliers.to(points.dtype), owners, count)
+    for draw in draws:
+        rows = starts[:, None] + (draw * numbers[:, None]).long().clamp_max(
+            (numbers - 1).clamp_min(0)[:, None]
+        )
+        own = torch.arange(count, device=points.device).repeat_interleave(4)
+        tried, moved = fit_rigid(shape[rows].flatten(0, 1), points[rows].flatten(0, 1), own, count)
+        found = agree(tried, moved)
+        number = sum_by(found.to(points.dtype), owners, count)
+        better = number > votes
+        votes = torch.where(better, number, votes)
+        inliers = torch.where(better[owners], found, inliers)
+    # An object without inliers keeps all its particles.
+    inliers = inliers | (votes < 3)[owners]
+    rotation, shift = fit_rigid(shape, points, owners, count, inliers.to(points.dtype))
+    return rotation, shift, inliers

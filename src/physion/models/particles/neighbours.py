@@ -1,4 +1,4 @@
-"""Pairs of particles that are close, or will be within a step. On the CPU; see also `cell_list`.
+"""Pairs of particles that are close, or will be within a step: on a CPU, and on any device.
 
 Two particles at x and y that move by u and v during a step are at the time s in 0..1 of the step
 at the distance |d + s w| with d = y - x and w = v - u. It is smallest at
@@ -6,6 +6,9 @@ at the distance |d + s w| with d = y - x and w = v - u. It is smallest at
     s* = min(max(-(d . w) / (w . w), 0), 1)
 
 A pair is *swept* if that smallest distance is at most the radius.
+
+`swept_edges` compares boxes of objects, then particles, on the CPU. `swept_edges_on_device` is a
+cell list in torch for a GPU: it finds the same pairs, but on a CPU it is slower.
 """
 
 from __future__ import annotations
@@ -17,7 +20,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from physion.core.errors import BadInputError
@@ -27,32 +29,6 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Edges = tuple[I64, I64]
 """Receivers and senders (E,)."""
-
-
-def radius_edges(points: F64, scene: I64, radius: float) -> Edges:
-    """Return all pairs of different particles of one scene at most ``radius`` apart.
-
-    Both directions of a pair are returned, sorted by receiver, then sender.
-
-    Parameters
-    ----------
-    points : (P, 3)
-        Metres.
-    scene : (P,)
-        Number of the scene of each particle; particles of different scenes are no neighbours.
-    radius : float
-        Metres.
-    """
-    if len(points) == 0:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    # Scenes are moved apart, so that one tree serves all.
-    span = float(np.ptp(points[:, 0])) + 2 * radius + 1.0
-    apart = points.copy()
-    apart[:, 0] += span * scene
-    # A tree that is quick to build is searched once.
-    tree = cKDTree(apart, balanced_tree=False, compact_nodes=False)
-    pairs = tree.query_pairs(radius, output_type="ndarray")
-    return _both_ways(pairs[:, 0], pairs[:, 1])
 
 
 def swept_edges(
@@ -208,14 +184,14 @@ def _reaches(point: F64, step: F64, low: F64, high: F64, radius: float) -> bool:
     return True
 
 
-# Pairs of particles that are close, or will be within a step, by a cell list in torch.
+# The same pairs by a cell list in torch.
 #
-# For a GPU, and for the CPU too; `neighbours` is faster there. Space is cut into cubes with edges
+# Space is cut into cubes with edges
 # of at least the reach of the search. The number of a cube is ``((scene * nx + x) * ny + y) * nz +
 # z``; particles are sorted by it. What is within reach lies in the 27 cubes around a particle: the
 # three along z have consecutive numbers, so that 9 ranges of sorted particles hold them all.
 #
-# Swept pairs, see `neighbours` for their definition, are searched at moments of the step. Between
+# Swept pairs are searched at moments of the step. Between
 # two moments that are 1/K of a step apart, each particle is at most |u| / 2K from where it is in
 # the middle, so a pair that comes within the radius r is then at most r + (|u| + |v|) / 2K apart.
 # Slow particles need one moment, and most are slow; for pairs with a fast one, K grows with the
@@ -247,34 +223,6 @@ class _Cells(NamedTuple):
     columns: Tensor
 
 
-def radius_edges_on_device(points: Tensor, scene: Tensor, radius: float) -> tuple[Tensor, Tensor]:
-    """Return all pairs of different particles of one scene at most ``radius`` apart.
-
-    Parameters
-    ----------
-    points : (P, 3)
-        Metres, on any device.
-    scene : (P,)
-        Number of the scene of each particle, int64.
-    radius : float
-        Metres.
-
-    Returns
-    -------
-    receivers, senders : (E,)
-        Both directions of each pair, int64, sorted by receiver, then sender.
-
-    Raises
-    ------
-    BadInputError
-        If the radius is not above 0, arrays do not fit each other, or a point is not finite.
-    """
-    _check(points, scene, radius)
-    if len(points) == 0:
-        return scene.new_zeros(0), scene.new_zeros(0)
-    return _sorted(list(_close_pairs(points.double(), scene, radius, None)), len(points))
-
-
 def swept_edges_on_device(
     points: Tensor, displacements: Tensor, scene: Tensor, radius: float
 ) -> tuple[Tensor, Tensor]:
@@ -297,7 +245,7 @@ def swept_edges_on_device(
     Raises
     ------
     BadInputError
-        As `radius_edges_on_device`.
+        If the radius is not above 0, arrays do not fit each other, or a point is not finite.
     """
     _check(points, scene, radius)
     _check(displacements, scene, radius)

@@ -22,8 +22,8 @@ that lie on surfaces, where contacts happen.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from typing import Any, cast
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -42,41 +42,41 @@ from physion.clips.batch import (
 from physion.core.errors import BadInputError
 from physion.core.seeds import generator
 from physion.models.baselines.motion import FAR
-from physion.models.interface import Diet
+from physion.models.build import make_config
+from physion.models.checkpoint import SHIPPED as CheckpointSHIPPED
+from physion.models.checkpoint import load_named
+from physion.models.interface import Diet, TrainingSettings
 from physion.models.noisy_simulation import best_threshold
 from physion.models.particles.bodies import (
     CLOTH,
     KINEMATIC,
     RIGID,
-    ParticleSettings,
     Poses,
+    Sampling,
     SceneParticles,
+    fit_rigid,
+    fit_robust,
     join_poses_in_time,
     later_poses,
+    mean_by,
     particle_positions,
     poses_of,
     put_by_events,
+    rotation_from_vector,
     scene_particles,
+    vector_from_rotation,
 )
-from physion.models.particles.config import ParticleConfig, ParticleOptions
-from physion.models.particles.gap import smallest_distance
-from physion.models.particles.graph import (
+from physion.models.particles.networks import (
     Drift,
     Graph,
+    MessageNetwork,
+    ObjectNetwork,
     ObjectState,
     SceneLayout,
     drift_of,
     make_graph,
     move,
     move_loose,
-)
-from physion.models.particles.networks import MessageNetwork, ObjectNetwork
-from physion.models.particles.rigid_motion import (
-    fit_rigid,
-    fit_robust,
-    mean_by,
-    rotation_from_vector,
-    vector_from_rotation,
 )
 from physion.models.particles.rollout import (
     Start,
@@ -86,11 +86,145 @@ from physion.models.particles.rollout import (
     read_window,
     roll_out,
     rotated,
+    smallest_distance,
     start_probabilities,
 )
 from physion.models.torch_model import TorchModel, digest_of, initial_weights
 from physion.physics.labels import label_contact
 from physion.scenes.scene import FRAME_TIME
+
+# Settings of the particle models, and their sizes.
+
+Size = Literal["small", "paper"]
+RANDOM, SHIPPED = "random", "shipped"
+
+
+@dataclass(frozen=True, slots=True)
+class ParticleOptions:
+    """What a user chooses of a particle model.
+
+    - ``size``: ``small`` or ``paper``.
+    - ``weights``: ``random``, to be trained; ``shipped``, those that come with the package,
+      trained on all scenarios; or the path of a ``model.safetensors`` that ``physion train`` wrote,
+      or of its folder.
+    - ``swept``: whether particles that come close during a step are neighbours.
+    - ``samples``: futures of a trial, and ``spread``: standard deviation of the noise on their
+      initial velocities, m/s. One future has no noise.
+    - ``stride``: frames of 0.01 s in one step.
+    - ``seed``: of initial weights, and of the noise of futures.
+    """
+
+    size: Size = "small"
+    weights: str = RANDOM
+    swept: bool = True
+    samples: int = 1
+    spread: float = 0.05
+    stride: int = 3
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.size not in ("small", "paper"):
+            raise BadInputError(
+                f"a particle model has the sizes small and paper, not {self.size!r}"
+            )
+        if isinstance(self.samples, bool) or not isinstance(self.samples, int) or self.samples < 1:
+            raise BadInputError(f"samples must be a whole number from 1 on, not {self.samples!r}")
+        if self.stride not in (1, 3):
+            raise BadInputError(f"stride must be 1 or 3 frames, not {self.stride!r}")
+        if not self.spread >= 0:
+            raise BadInputError(f"spread must not be negative, not {self.spread!r}")
+
+
+@dataclass(frozen=True, slots=True)
+class ParticleConfig:
+    """All settings of a particle model of this package's own form.
+
+    - ``network``: ``messages`` (GNS) or ``objects`` (DPI-Net), with ``width`` and ``rounds``.
+    - ``particles``: how objects become particles.
+    - ``radius``: metres within which particles of different objects are neighbours; with ``swept``
+      also those that come so close during a step.
+    - ``rigid``: how GNS keeps bodies rigid: ``fit`` to all particles, or ``robust`` (RANSAC).
+    - ``velocity_noise``, ``relative_noise``: metres a step, and fraction of the speed; standard
+      deviations of the noise in training, drawn for every rigid body and for every particle of a
+      cloth. Noise that is large beside a slow motion teaches that it stops.
+    - ``pushforward``: steps that follow the first one in training. They start from what the network
+      predicted, without gradient, so that it learns to correct its own errors (Brandstetter et al.
+      2022, section 3.1).
+    - ``abrupt``: fraction of the training windows that are drawn from moments at which bodies
+      change their velocity abruptly, as at contacts (`windows.start_probabilities`); the others
+      are drawn from all moments.
+    - ``rest``: metres a step; in a rollout a body whose centre and rim would move less together
+      stays where it is, as bodies sleep in physics engines. Otherwise small errors, which add up as
+      a velocity, tip what stands.
+    - ``knee``: errors of an object count squared up to this many units (``simulator.CHANGE``), and
+      linearly beyond.
+    - ``gap_spacing``, ``gap_limit``: of the particles by which distances are measured.
+    - ``training``: optimiser and schedule.
+    """
+
+    network: Literal["messages", "objects"]
+    width: int = 64
+    rounds: int = 3
+    particles: Sampling = field(default_factory=Sampling)
+    radius: float = 0.12
+    swept: bool = True
+    rigid: Literal["fit", "robust"] = "fit"
+    velocity_noise: float = 3e-4
+    relative_noise: float = 0.02
+    pushforward: int = 1
+    abrupt: float = 0.5
+    rest: float = 3e-4
+    knee: float = 1.0
+    gap_spacing: float = 0.04
+    gap_limit: int = 300
+    training: TrainingSettings = field(default_factory=TrainingSettings)
+
+
+_SMALL = TrainingSettings(
+    steps=3000,
+    batch=24,
+    learning_rate=2e-3,
+    schedule="cosine",
+    warmup=100,
+    clip=0.0,
+    validate_every=500,
+    log_every=50,
+    checkpoint_every=500,
+)
+_PAPER = replace(_SMALL, steps=500_000, learning_rate=5e-4, warmup=2000, validate_every=5000)
+_FINE = Sampling(spacing=0.05, limit=1000, cloth_step=1)
+
+
+def own_config(network: Literal["messages", "objects"], options: ParticleOptions) -> ParticleConfig:
+    """Return the settings of the sizes ``small`` and ``paper``."""
+    inner = network == "messages"
+    if options.size == "small":
+        config = ParticleConfig(
+            network,
+            rounds=5 if inner else 3,
+            particles=Sampling(limit=50, inner=6) if inner else Sampling(),
+            training=_SMALL,
+        )
+    else:
+        config = ParticleConfig(
+            network,
+            width=128,
+            rounds=10 if inner else 4,
+            particles=replace(_FINE, inner=10 if inner else 0),
+            radius=0.08,
+            gap_spacing=0.03,
+            gap_limit=1000,
+            training=_PAPER,
+        )
+    # A step of fewer frames is shorter, and so is what is counted in metres a step.
+    part = options.stride / 3
+    return replace(
+        config,
+        swept=options.swept,
+        velocity_noise=config.velocity_noise * part,
+        rest=config.rest * part,
+    )
+
 
 # Imagined motions of trials: their start, how near agent and patient come, and what is shown.
 
@@ -99,7 +233,7 @@ Futures = list[tuple[SceneParticles, Poses]]
 """Particles and motion of every sample of a trial."""
 
 
-def observed_start(motion: Motion, frames: range, settings: ParticleSettings) -> Start:
+def observed_start(motion: Motion, frames: range, settings: Sampling) -> Start:
     """Return the observed motion of a scene in these frames, and the steps to its end."""
     scene = motion.scene
     own = scene_particles(scene, settings, scene.present(LAST_OBSERVED))
@@ -261,7 +395,7 @@ class ParticleSimulator(TorchModel):
             stride=stride,
             context=LAST_OBSERVED // stride + 1,
             future=0,
-            anchor="end",
+            context_at="end",
         )
         with initial_weights("particle model", options.seed):
             self.network = self._make_network()
@@ -561,3 +695,48 @@ def _made_again(
 def _softened(squares: Tensor, knee: float) -> Tensor:
     """Return 2 k^2 (sqrt(1 + s / k^2) - 1): about s for s << k^2, about 2 k sqrt(s) beyond."""
     return 2 * knee**2 * ((1 + squares / knee**2).sqrt() - 1)
+
+
+# Building of the particle models by name, with random, shipped or given weights.
+
+
+def gns(**options: Any) -> ParticleSimulator:
+    """Build a graph network simulator (GNS); ``options`` are those of `ParticleOptions`."""
+    return _build("gns", "messages", options)
+
+
+def gns_ransac(**options: Any) -> ParticleSimulator:
+    """Build a GNS that keeps bodies rigid by a robust fit; ``options`` as `gns`."""
+    return _build("gns-ransac", "messages", options, robust=True)
+
+
+def dpi(**options: Any) -> ParticleSimulator:
+    """Build a DPI-Net; ``options`` are those of `ParticleOptions`."""
+    return _build("dpi", "objects", options)
+
+
+def _build(
+    name: str,
+    network: Literal["messages", "objects"],
+    options: Mapping[str, Any],
+    *,
+    robust: bool = False,
+) -> ParticleSimulator:
+    chosen = make_config(ParticleOptions, name, options)
+    config = own_config(network, chosen)
+    if robust:
+        config = replace(config, rigid="robust")
+    return _weighted(ParticleSimulator(name, config, chosen))
+
+
+def _weighted(model: ParticleSimulator) -> ParticleSimulator:
+    """Return a model with the weights that its options name."""
+    options = model.options
+    own = options.size == "small" and options.swept and options.stride == 3
+    if options.weights == CheckpointSHIPPED and not own:
+        raise BadInputError(
+            "weights of particle models are shipped for size=small, swept=true and stride=3; "
+            "train others with physion train"
+        )
+    load_named(model, options.weights)
+    return model
