@@ -15,8 +15,8 @@ from physion.cli.main import main
 from physion.clips.batch import Motion, Provenance, Spec
 from physion.core.errors import BadInputError
 from physion.models.particles.bodies import (
-    ParticleSettings,
     Poses,
+    Sampling,
     SceneParticles,
     poses_of,
     scene_particles,
@@ -43,7 +43,7 @@ def true_motion(plan: int = 0, **changes: Any) -> Motion:
 
 
 def start_of(motion: Motion, frames: Sequence[int]) -> tuple[SceneParticles, Poses]:
-    particles = scene_particles(motion.scene, ParticleSettings())
+    particles = scene_particles(motion.scene, Sampling())
     return particles, poses_of(particles, motion, frames)
 
 
@@ -132,7 +132,7 @@ def test_objects_count_while_they_are_there_and_can_move() -> None:
     assert gone["Frames"].tolist() == [3, 6, 9]
     bodies = tuple(dataclasses.replace(body, kinematic=True) for body in motion.scene.bodies)
     fixed = dataclasses.replace(motion.scene, bodies=bodies)
-    particles = scene_particles(fixed, ParticleSettings())
+    particles = scene_particles(fixed, Sampling())
     assert motion_error(Motion(fixed, motion.trajectory), particles, still, STRIDE, 105).empty
 
 

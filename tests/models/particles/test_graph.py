@@ -7,7 +7,7 @@ import torch
 
 from physion import sample_scene
 from physion.clips.batch import Motion
-from physion.models.particles.bodies import ParticleSettings, poses_of, scene_particles
+from physion.models.particles.bodies import Sampling, poses_of, scene_particles
 from physion.models.particles.networks import (
     drift_of,
     join_poses,
@@ -27,7 +27,7 @@ def test_a_device_gets_the_edges_of_the_cpu(swept: bool) -> None:
     for scenario, seed in (("collide", 3), ("drape", 1)):
         scene = sample_scene(scenario, seed)
         motions.append(Motion(scene, simulate(scene)))
-    particles = [scene_particles(m.scene, ParticleSettings()) for m in motions]
+    particles = [scene_particles(m.scene, Sampling()) for m in motions]
     poses = [poses_of(p, m, [41, 44]) for p, m in zip(particles, motions, strict=True)]
     layout = join_scenes(particles, CPU)
     drift = drift_of(layout, join_poses(poses, 0, CPU), join_poses(poses, 1, CPU))
