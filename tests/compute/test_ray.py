@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from physion.compute.ray import RayExecutor
-from physion.compute.tasks import log_path
+from physion.compute.tasks import TaskSettings, log_path
 from support.paths import FIND_TESTS, ROOT
 from support.tasks import die_on_two, die_once, fail_on_three, square
 
@@ -37,6 +37,7 @@ STAYS = """
 import time
 import ray
 from physion.compute.ray import RayExecutor
+from physion.compute.tasks import TaskSettings
 from support.tasks import process_of
 
 def node():
@@ -68,7 +69,7 @@ class Elsewhere(RayExecutor):
         raise PhysionError("it looks for the cluster")
 
 try:
-    list(Elsewhere("127.0.0.1:1").map(process_of, {"a": 1}))
+    list(Elsewhere(TaskSettings(address="127.0.0.1:1")).map(process_of, {"a": 1}))
 except PhysionError as error:
     assert "looks for the cluster" in str(error)
 else:
@@ -78,7 +79,7 @@ else:
 
 def test_ray_started_here_stays_for_the_next_call_until_one_is_ended_early() -> None:
     # In a process of its own, since Ray of this one was started by the fixture.
-    # A cluster that the environment names is not used without --ray-address; nobody answers there.
+    # A cluster that the environment names is not used without an address; nobody answers there.
     environment = os.environ | {"RAY_ADDRESS": "127.0.0.1:1"}
     command = [sys.executable, "-c", STAYS]
     run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
@@ -90,7 +91,7 @@ def numbers(*values: int) -> dict[str, int]:
 
 
 def test_every_task_has_one_outcome_and_a_log(tmp_path: Path) -> None:
-    outcomes = list(RayExecutor(logs=tmp_path).map(square, numbers(*range(20))))
+    outcomes = list(RayExecutor(TaskSettings(logs=tmp_path)).map(square, numbers(*range(20))))
     assert {o.key: o.value for o in outcomes} == {f"task {n}": n * n for n in range(20)}
     assert len(outcomes) == 20
     assert log_path(tmp_path, "task 4").read_text().startswith("squaring 4\n")
@@ -105,7 +106,9 @@ def test_an_exception_fails_its_task_alone_and_is_not_tried_again() -> None:
 
 
 def test_a_poison_task_is_put_aside_and_a_lost_one_runs_again(tmp_path: Path) -> None:
-    outcomes = {o.key: o for o in RayExecutor(tries=2).map(die_on_two, numbers(*range(4)))}
+    outcomes = {
+        o.key: o for o in RayExecutor(TaskSettings(tries=2)).map(die_on_two, numbers(*range(4)))
+    }
     bad = outcomes.pop("task 2")
     assert bad.tries == 2 and "worker ended" in str(bad.error)
     assert sorted(o.value for o in outcomes.values()) == [0, 1, 3]
@@ -117,7 +120,9 @@ def test_a_task_without_end_is_stopped() -> None:
     list(RayExecutor().map(square, numbers(1, 2)))  # starts the workers, which may take long
     outcomes = {
         o.key: o
-        for o in RayExecutor(tries=1, timeout=60.0).map(time.sleep, {"long": 600, "short": 0})
+        for o in RayExecutor(TaskSettings(tries=1, minutes=1)).map(
+            time.sleep, {"long": 600, "short": 0}
+        )
     }
     assert "still running after 60 s" in str(outcomes["long"].error)
     assert outcomes["short"].error is None

@@ -15,7 +15,9 @@ from support.tasks import fail_on_three, square
 
 
 def test_local_has_its_limits_and_logs(tmp_path: Path) -> None:
-    executor = ExecutorSettings(workers=1, tries=2, task_minutes=0.5, task_logs=tmp_path).open()
+    executor = ExecutorSettings(
+        workers=1, task=("tries=2", "minutes=0.5", f"logs={tmp_path}")
+    ).open()
     assert isinstance(executor, LocalExecutor)
     assert (executor.workers, executor.tries, executor.timeout) == (1, 2, 30.0)
     assert [o.value for o in executor.map(square, {"a b": 3})] == [9]
@@ -34,11 +36,9 @@ def test_slurm_gets_minutes_of_all_tasks_of_a_job(
 ) -> None:
     pytest.importorskip("submitit", reason="the extra 'slurm' is not installed")
     slurm.install(tmp_path, monkeypatch)
-    settings = ExecutorSettings(
-        "slurm", task_minutes=3, tasks_per_job=5, task_gpus=2, task_memory_gb=1.5,
-        partition="fast", slurm=("account=physics",), task_logs=tmp_path / "logs",
-    )  # fmt: skip
-    asked = settings.open().settings.parameters()  # type: ignore[attr-defined]
+    task = ("minutes=3", "per_job=5", "gpus=2", "memory_gb=1.5", "partition=fast")
+    task += ("sbatch.account=physics", f"logs={tmp_path / 'logs'}")
+    asked = ExecutorSettings("slurm", task=task).open().parameters()  # type: ignore[attr-defined]
     assert (asked["time"], asked["gpus_per_node"], asked["mem"]) == (15, 2, "1536MB")
     assert (asked["partition"], asked["additional_parameters"]) == ("fast", {"account": "physics"})
 
@@ -46,9 +46,12 @@ def test_slurm_gets_minutes_of_all_tasks_of_a_job(
 @pytest.mark.parametrize(
     ("settings", "word"),
     [
-        (ExecutorSettings("slurm", task_gpus=0.5), "whole"),
-        (ExecutorSettings("slurm", slurm=("account",)), "NAME=VALUE"),
-        (ExecutorSettings(task_minutes=0), "--task-minutes"),
+        (ExecutorSettings("slurm", task=("gpus=0.5",)), "whole"),
+        (ExecutorSettings("slurm", task=("account",)), "NAME=VALUE"),
+        (ExecutorSettings("slurm", task=("sbatch.a=1", "sbatch.a=2")), "given twice"),
+        (ExecutorSettings(task=("minutes=0",)), "minutes"),
+        (ExecutorSettings(task=("tries=many",)), "whole number"),
+        (ExecutorSettings(task=("minuts=3",)), "did you mean 'minutes'"),
     ],
 )
 def test_what_an_executor_cannot_take_is_refused(settings: ExecutorSettings, word: str) -> None:

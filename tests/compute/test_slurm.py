@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from physion.compute.slurm import SlurmExecutor, SlurmJobSettings
-from physion.compute.tasks import log_path
+from physion.compute.slurm import SlurmExecutor
+from physion.compute.tasks import TaskSettings, log_path
 from physion.core.errors import BadInputError, PhysionError
 from support import slurm
 from support.tasks import die_on_two, die_once, fail_on_three, square
@@ -22,14 +22,9 @@ def states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return slurm.install(tmp_path / "slurm", monkeypatch)
 
 
-def make(folder: Path, tries: int = 3, **settings: int) -> SlurmExecutor:
-    return SlurmExecutor(
-        folder / "jobs-of-slurm",
-        SlurmJobSettings(**settings),  # type: ignore[arg-type]
-        tries=tries,
-        check_seconds=0.2,
-        grace_seconds=0.1,
-    )
+def make(folder: Path, **settings: int) -> SlurmExecutor:
+    limits = TaskSettings(logs=folder / "jobs-of-slurm", **settings)  # type: ignore[arg-type]
+    return SlurmExecutor(limits, check_seconds=0.2, grace_seconds=0.1)
 
 
 def numbers(*values: int) -> dict[str, int]:
@@ -38,20 +33,20 @@ def numbers(*values: int) -> dict[str, int]:
 
 @pytest.mark.slow
 def test_every_task_has_one_outcome_and_a_log(tmp_path: Path, states: Path) -> None:
-    executor = make(tmp_path, tasks_per_job=3, minutes=7, cpus=2, jobs=1)
+    executor = make(tmp_path, per_job=3, minutes=7, cpus=2, jobs=1)
     outcomes = list(executor.map(square, numbers(*range(5))))
     assert {o.key: o.value for o in outcomes} == {f"task {n}": n * n for n in range(5)}
     logs = executor.folder / "logs"
     assert log_path(logs, "task 4").read_text().startswith("squaring 4\n")
-    # Five tasks, three a job: one array of two jobs, with the limits that were asked for.
+    # Five tasks, three to a job: one array of two jobs, with the limits that were asked for.
     (script,) = states.glob("*.script")
-    for line in ("--array=0-1%1", "--time=7", "--cpus-per-task=2"):
+    for line in ("--array=0-1%1", "--time=21", "--cpus-per-task=2"):
         assert f"#SBATCH {line}\n" in script.read_text()
 
 
 @pytest.mark.slow
 def test_an_exception_fails_its_task_alone(tmp_path: Path, states: Path) -> None:
-    executor = make(tmp_path, tasks_per_job=2)
+    executor = make(tmp_path, per_job=2)
     outcomes = {o.key: o for o in executor.map(fail_on_three, numbers(1, 2, 3, 4))}
     bad = outcomes.pop("task 3")
     assert bad.error == "three is not liked" and bad.tries == 1
@@ -65,7 +60,7 @@ def test_an_exception_fails_its_task_alone(tmp_path: Path, states: Path) -> None
 def test_a_poison_task_is_put_aside_and_the_others_of_its_job_are_done(
     tmp_path: Path, states: Path
 ) -> None:
-    executor = make(tmp_path, tries=2, tasks_per_job=2)
+    executor = make(tmp_path, tries=2, per_job=2)
     outcomes = {o.key: o for o in executor.map(die_on_two, numbers(1, 2))}
     assert outcomes["task 1"].value == 1
     assert outcomes["task 2"].tries == 2 and "FAILED" in str(outcomes["task 2"].error)
@@ -103,13 +98,13 @@ def test_a_refused_submission_is_one_line(tmp_path: Path, states: Path) -> None:
 def test_without_slurm_the_message_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(BadInputError, match="sbatch was not found"):
-        SlurmExecutor(tmp_path)
+        SlurmExecutor()
 
 
-@pytest.mark.parametrize("name", ["minutes", "cpus", "jobs", "tasks_per_job"])
+@pytest.mark.parametrize("name", ["minutes", "cpus", "jobs", "per_job", "tries"])
 def test_numbers_below_one_are_refused(name: str) -> None:
     with pytest.raises(BadInputError, match=name):
-        SlurmJobSettings(**{name: 0})
+        TaskSettings(**{name: 0})  # type: ignore[arg-type]
 
 
 def test_logs_of_similar_names_are_apart(tmp_path: Path) -> None:

@@ -17,15 +17,12 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from physion.compute.tasks import TaskOutcome, run_task
+from physion.compute.tasks import ONE_THREAD, TRIES, TaskOutcome, run_task
 from physion.core.errors import PhysionError
 
 T = TypeVar("T")
 R = TypeVar("R")
 
-TRIES = 3
-"""How often a task is started before it counts as failed because its worker process died."""
-_THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _READY = "ready"
 _EXIT_SECONDS = 5.0
 """Seconds to wait for a process to end by itself before it is killed."""
@@ -318,8 +315,8 @@ def _interrupts_blocked() -> Iterator[None]:
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
     """Limit child processes to one thread of linear algebra each: there is one process per core."""
-    missing = [name for name in _THREAD_LIMITS if name not in os.environ]
-    os.environ.update(dict.fromkeys(missing, "1"))
+    missing = {name: value for name, value in ONE_THREAD.items() if name not in os.environ}
+    os.environ.update(missing)
     try:
         yield
     finally:

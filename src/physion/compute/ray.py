@@ -9,19 +9,17 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, TypeVar
 
-from physion.compute.local import TRIES, available_cores
-from physion.compute.tasks import TaskOutcome, run_task
-from physion.core.errors import BadInputError, MissingExtraError, PhysionError
+from physion.compute.local import available_cores
+from physion.compute.tasks import ONE_THREAD, TaskOutcome, TaskSettings, run_task
+from physion.core.errors import MissingExtraError, PhysionError
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 _WAITING_PER_CORE = 2
 """Tasks given to Ray for each core of the cluster; the others wait in this process."""
-_THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 @dataclass
@@ -48,42 +46,23 @@ class RayExecutor:
 
     Parameters
     ----------
-    address
-        Of a cluster, or ``auto``; empty: Ray is started on this machine by the first call of
-        `map`. It stops when this process ends, when a call of `map` is ended early, or when
-        another executor wants another address or number of workers.
+    settings
+        What a task takes, its limits, and the address of the cluster. Without an address Ray is
+        started on this machine by the first call of `map`. It stops when this process ends, when a
+        call of `map` is ended early, or when another executor wants another address or number of
+        workers. The time of a task includes the start of its worker.
     workers
         Cores of a Ray that is started here; by default all.
-    cpus, gpus, memory_gb
-        What a task takes; fractions of a graphics card let tasks share it.
-    tries
-        How often a task is started before it counts as failed because its worker ended.
-    timeout
-        Seconds, with the start of its worker, after which a task is stopped.
-    logs
-        Folder for a log of each task, which all nodes see.
     """
 
-    def __init__(
-        self,
-        address: str = "",
-        *,
-        workers: int | None = None,
-        cpus: float = 1,
-        gpus: float = 0,
-        memory_gb: float | None = None,
-        tries: int = TRIES,
-        timeout: float | None = None,
-        logs: Path | None = None,
-    ) -> None:
-        if tries < 1 or cpus < 0 or gpus < 0:
-            raise BadInputError("Ray needs at least one try, and no negative number of cores")
-        self.address, self.tries, self.timeout = address, tries, timeout
+    def __init__(self, settings: TaskSettings | None = None, workers: int | None = None) -> None:
+        settings = settings or TaskSettings()
+        self.address, self.tries, self.timeout = settings.address, settings.tries, settings.seconds
         self.workers = workers if workers is not None else available_cores()
-        self.logs = None if logs is None else logs.absolute()
-        self._shares: dict[str, Any] = {"num_cpus": cpus, "num_gpus": gpus}
-        if memory_gb is not None:
-            self._shares["memory"] = int(memory_gb * 2**30)
+        self.logs = None if settings.logs is None else settings.logs.absolute()
+        self._takes: dict[str, Any] = {"num_cpus": settings.cpus, "num_gpus": settings.gpus}
+        if settings.memory_gb is not None:
+            self._takes["memory"] = int(settings.memory_gb * 2**30)
         try:
             import ray
         except ImportError as error:
@@ -99,7 +78,7 @@ class RayExecutor:
         running: dict[Any, _Started] = {}
         _connection.calls += 1
         try:
-            remote = ray.remote(max_retries=0, **self._shares)(run_task)
+            remote = ray.remote(max_retries=0, **self._takes)(run_task)
             stored = ray.put(function)
             waiting = deque(_Queued(key) for key in tasks)
             window = self._window()
@@ -131,7 +110,7 @@ class RayExecutor:
         if self.timeout is None:
             return max(1, int(cores) * _WAITING_PER_CORE)
         # No more than can run, so that the time of a task does not count its waiting.
-        return max(1, int(cores / max(self._shares["num_cpus"], 1)))
+        return max(1, int(cores / max(self._takes["num_cpus"], 1)))
 
     def _connect(self) -> None:
         """Connect to the cluster or start Ray on this machine, unless that was done before.
@@ -158,7 +137,7 @@ class RayExecutor:
     def _start(self) -> None:
         """Connect to the cluster, or start Ray on this machine."""
         options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
-        options["runtime_env"] = {"env_vars": _THREADS}
+        options["runtime_env"] = {"env_vars": ONE_THREAD}
         if self.address:
             options["address"] = self.address
         else:

@@ -11,66 +11,20 @@ import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from physion.compute.local import TRIES
-from physion.compute.tasks import TaskOutcome, log_path, run_task
+from physion.compute.tasks import ONE_THREAD, TaskOutcome, TaskSettings, log_path, run_task
 from physion.core.errors import BadInputError, MissingExtraError, PhysionError
 
 T = TypeVar("T")
 R = TypeVar("R")
 
-_SETUP = tuple(
-    f"export {name}=1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-)
+_MINUTES = 60
+"""Limit of a task that has none of its own."""
 _ARRAY_JOBS = 1000
 """Jobs of one array; Slurm refuses more than 1001 unless it is configured otherwise."""
-
-
-@dataclass(frozen=True)
-class SlurmJobSettings:
-    """What a job asks for.
-
-    ``minutes``: limit of a job; ``jobs``: jobs of an array that run at a time; ``tasks_per_job``:
-    tasks that a job runs one after the other, since short jobs cost the cluster more than they do;
-    ``more``: further options of sbatch by name, such as ``account``.
-    """
-
-    minutes: int = 60
-    cpus: int = 1
-    gpus: int = 0
-    memory_gb: float | None = None
-    partition: str = ""
-    jobs: int = 100
-    tasks_per_job: int = 1
-    more: Mapping[str, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        """Raise `BadInputError` for numbers below 1."""
-        for name in ("minutes", "cpus", "jobs", "tasks_per_job"):
-            if getattr(self, name) < 1:
-                raise BadInputError(f"{name} of a Slurm job must be 1 or more")
-
-    def parameters(self) -> dict[str, Any]:
-        """Return the settings under the names of submitit."""
-        values: dict[str, Any] = {
-            "job_name": "physion",
-            "time": self.minutes,
-            "cpus_per_task": self.cpus,
-            "array_parallelism": self.jobs,
-            "additional_parameters": dict(self.more),
-        }
-        if self.cpus == 1:
-            values["setup"] = list(_SETUP)
-        if self.gpus:
-            values["gpus_per_node"] = self.gpus
-        if self.memory_gb is not None:
-            values["mem"] = f"{max(1, round(self.memory_gb * 1024))}MB"
-        if self.partition:
-            values["partition"] = self.partition
-        return values
 
 
 class SlurmExecutor:
@@ -81,13 +35,10 @@ class SlurmExecutor:
 
     Parameters
     ----------
-    folder
-        Folder that all nodes see: for jobs (``jobs/``) and a log of each task (``logs/``). Only the
-        user may be able to write there, since Python objects are read from it.
     settings
-        What a job asks for.
-    tries
-        How often a task is started before it counts as failed because its job ended.
+        What a task takes and its limits. The folder of logs is one that all nodes see: it holds
+        jobs (``jobs/``) and a log of each task (``logs/``). Only the user may be able to write
+        there, since Python objects are read from it.
     check_seconds
         Seconds between questions to Slurm about the state of jobs.
     grace_seconds
@@ -96,17 +47,16 @@ class SlurmExecutor:
 
     def __init__(
         self,
-        folder: Path,
-        settings: SlurmJobSettings | None = None,
+        settings: TaskSettings | None = None,
         *,
-        tries: int = TRIES,
         check_seconds: float = 30.0,
         grace_seconds: float = 15.0,
     ) -> None:
-        if tries < 1:
-            raise BadInputError(f"a task must be tried at least once, not {tries} times")
-        self.folder, self.settings = folder.absolute(), settings or SlurmJobSettings()
-        self.tries, self._check, self._grace = tries, check_seconds, grace_seconds
+        self.settings = settings or TaskSettings()
+        if self.settings.gpus != int(self.settings.gpus):
+            raise BadInputError(f"Slurm gives whole graphics cards, not {self.settings.gpus}")
+        self.folder = (self.settings.logs or Path("runs/slurm")).absolute()
+        self.tries, self._check, self._grace = self.settings.tries, check_seconds, grace_seconds
         if shutil.which("sbatch") is None:
             raise BadInputError(
                 "sbatch was not found; start the command where jobs of Slurm are submitted, or "
@@ -120,7 +70,7 @@ class SlurmExecutor:
 
     def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[TaskOutcome[R]]:
         """Yield outcomes as they come; see `physion.compute.tasks.Executor`."""
-        size = self.settings.tasks_per_job
+        size = self.settings.per_job
         keys = list(tasks)
         groups = [_Group(tuple(keys[i : i + size])) for i in range(0, len(keys), size)]
         running: dict[Any, _Group] = {}
@@ -151,12 +101,33 @@ class SlurmExecutor:
         finally:
             _cancel(running)
 
+    def parameters(self) -> dict[str, Any]:
+        """Return what a job asks for, under the names of submitit."""
+        task = self.settings
+        minutes = _MINUTES if task.minutes is None else max(1, round(task.minutes))
+        values: dict[str, Any] = {
+            "job_name": "physion",
+            "time": minutes * task.per_job,
+            "cpus_per_task": task.cpus,
+            "array_parallelism": task.jobs,
+            "additional_parameters": dict(task.sbatch),
+        }
+        if task.cpus == 1:
+            values["setup"] = [f"export {name}={value}" for name, value in ONE_THREAD.items()]
+        if task.gpus:
+            values["gpus_per_node"] = int(task.gpus)
+        if task.memory_gb is not None:
+            values["mem"] = f"{max(1, round(task.memory_gb * 1024))}MB"
+        if task.partition:
+            values["partition"] = task.partition
+        return values
+
     def _submit(
         self, function: Callable[[T], R], tasks: Mapping[str, T], groups: Sequence[_Group]
     ) -> dict[Any, _Group]:
         """Submit a job for each group, as job arrays, and return the jobs."""
         executor = self._submitit.SlurmExecutor(folder=self.folder / "jobs")
-        executor.update_parameters(**self.settings.parameters())
+        executor.update_parameters(**self.parameters())
         submitted: dict[Any, _Group] = {}
         for start in range(0, len(groups), _ARRAY_JOBS):
             part = groups[start : start + _ARRAY_JOBS]

@@ -1,4 +1,10 @@
-"""One task in a worker: its result or its exception as an outcome, and its log."""
+"""Tasks and executors: their interface, the outcome of a task, its limits, its log.
+
+An executor runs one function on many tasks. A task is a pure function of its description and writes
+its files atomically, so an interrupted task can simply be run again. An executor therefore stores
+nothing; it guarantees that every task ends in exactly one outcome. `physion.compute.run_tasks` is
+how the package runs tasks that write files.
+"""
 
 from __future__ import annotations
 
@@ -11,21 +17,22 @@ import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar, cast
 
-from physion.core.errors import PhysionError
+from physion.core.errors import BadInputError, PhysionError
 from physion.core.registry import Registry
-
-# Interface of executors, which run one function on many tasks, and the outcome of a task.
-#
-# A task is a pure function of its description and writes its files atomically, so an interrupted
-# task can simply be run again. An executor therefore stores nothing; it guarantees that every task
-# ends in exactly one outcome.
 
 T = TypeVar("T")
 R = TypeVar("R")
+
+TRIES = 3
+"""How often a task is started before it counts as failed because its process or job ended."""
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+"""Environment of a task with one core: libraries of linear algebra use one thread."""
+_NAME_BYTES = 80
+"""Longest readable part of the name of a log."""
 
 
 @dataclass(frozen=True)
@@ -95,8 +102,46 @@ executors: Registry[type] = Registry(
 )
 
 
-_NAME_BYTES = 80
-"""Longest readable part of the name of a log."""
+@dataclass(frozen=True)
+class TaskSettings:
+    """Limits of a task and what it takes; on the command line ``--task NAME=VALUE``.
+
+    - ``tries``: how often a task is started, if its process or job ends without a result.
+    - ``minutes``: limit of a task; on Slurm 60 if it is not given.
+    - ``cpus``, ``gpus``, ``memory_gb``: what a task takes, on Slurm and Ray. On Ray, fractions of a
+      graphics card let tasks share it.
+    - ``logs``: folder for a log of each task, on clusters one that all nodes see; on Slurm by
+      default ``runs/slurm``, else there are no logs.
+    - ``jobs``: jobs of Slurm at a time. ``per_job``: tasks that a job runs one after the other,
+      since short jobs cost the cluster more than they do. ``partition``: of Slurm. ``sbatch``:
+      further options of sbatch by name, as in ``--task sbatch.account=physics``.
+    - ``address``: of a Ray cluster, or ``auto``; if empty, Ray is started on this machine.
+    """
+
+    tries: int = TRIES
+    minutes: float | None = None
+    cpus: int = 1
+    gpus: float = 0
+    memory_gb: float | None = None
+    logs: Path | None = None
+    jobs: int = 100
+    per_job: int = 1
+    partition: str = ""
+    sbatch: Mapping[str, str] = field(default_factory=dict)
+    address: str = ""
+
+    def __post_init__(self) -> None:
+        """Raise `BadInputError` for numbers below what they must be."""
+        for name in ("tries", "cpus", "jobs", "per_job"):
+            if getattr(self, name) < 1:
+                raise BadInputError(f"{name} of a task must be 1 or more")
+        if self.gpus < 0 or (self.minutes is not None and self.minutes <= 0):
+            raise BadInputError("minutes of a task must be above 0, and gpus not below")
+
+    @property
+    def seconds(self) -> float | None:
+        """Limit of a task in seconds, or None."""
+        return None if self.minutes is None else 60 * self.minutes
 
 
 def run_task(
@@ -157,7 +202,7 @@ def _printing_into(path: Path) -> Iterator[None]:
             os.close(descriptor)
 
 
-# Callback through which long-running functions report how far they are.
+# Progress: a callback through which long-running functions report how far they are.
 
 
 class Progress(Protocol):

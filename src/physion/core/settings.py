@@ -152,6 +152,33 @@ def read_settings(
     return typing.cast(T, value)
 
 
+def read_pairs(kind: type[T], pairs: Iterable[str], where: str) -> T:
+    """Build ``kind`` from texts NAME=VALUE of the command line, as `read_settings` does.
+
+    A value that is not JSON is a text. A name with a dot, as in ``sbatch.account=physics``, sets an
+    entry of a mapping, whose values are texts.
+    """
+    values: dict[str, Any] = {}
+    for pair in pairs:
+        name, sign, text = pair.partition("=")
+        if not (name and sign):
+            raise BadInputError(f"{where} takes NAME=VALUE, not {pair!r}")
+        name, dot, entry = name.partition(".")
+        if dot:
+            holder = values.setdefault(name, {})
+            if not isinstance(holder, dict) or entry in holder:
+                raise BadInputError(f"{where}: {name}.{entry} is given twice")
+            holder[entry] = text
+            continue
+        if name in values:
+            raise BadInputError(f"{where}: {name} is given twice")
+        try:
+            values[name] = json.loads(text)
+        except (ValueError, RecursionError):
+            values[name] = text
+    return read_settings(kind, values, where)
+
+
 def check_keys(
     data: Iterable[str],
     known: Iterable[str],
