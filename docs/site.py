@@ -91,7 +91,7 @@ def pages() -> dict[str, str]:
 
 def verbs_page() -> str:
     """Return the help texts of all verbs and sub-verbs."""
-    from physion.cli.help.verbs import VERBS, module_of
+    from physion.cli.help import VERBS, module_of
 
     parts = ["# Verbs\nThe texts that `physion VERB --help` prints.\n"]
     for verb, summary in VERBS.items():

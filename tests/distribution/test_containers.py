@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import tyro
 
-from physion.cli.help.verbs import find_module
+from physion.cli.help import find_module
 from support.paths import ROOT
 
 DOCKERFILES = [ROOT / "Dockerfile", ROOT / "examples" / "server" / "Dockerfile"]

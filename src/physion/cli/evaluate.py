@@ -15,10 +15,9 @@ from typing import Annotated, Any
 
 import tyro
 
-from physion.cli.output import Stages, console, write_text
+from physion.cli.output import Stages, console, text_table, write_text
 from physion.cli.plans.choose_models import choose_models
 from physion.cli.plans.tables import evaluations_table, print_estimates
-from physion.cli.text_table import text_table
 from physion.compute.run_tasks import ExecutorSettings
 from physion.readout.plans.evaluation_plan import EvaluationPlan, EvaluationResults
 from physion.readout.plans.keys import key_of

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import sys
 
-from physion.cli.help.verbs import VERBS, find_module
+from physion.cli.help import VERBS, describe, find_module
 
 OUTPUT_CLOSED = 141
 """Exit code that shells show for programs that write to a closed pipe: 128 + SIGPIPE."""
@@ -28,7 +28,7 @@ def _usage() -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Run one verb and return the exit code."""
-    from physion.core.errors import MEMORY_SETTINGS, PhysionError
+    from physion.core.errors import MEMORY_SETTINGS, PhysionError, one_line
 
     try:
         try:
@@ -38,8 +38,7 @@ def main(argv: list[str] | None = None) -> int:
             if sys.stdout is not None:
                 sys.stdout.flush()
     except PhysionError as error:
-        message = " ".join(str(error).split())
-        print(f"physion: {message}", file=sys.stderr)
+        print(f"physion: {one_line(error)}", file=sys.stderr)
         return error.exit_code
     except MemoryError:
         text = f"memory is used up; {MEMORY_SETTINGS}, where the verb has them"
@@ -49,9 +48,7 @@ def main(argv: list[str] | None = None) -> int:
         _discard_output()
         return OUTPUT_CLOSED
     except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        reason = " ".join((error.strerror or str(error)).split())
-        print(f"physion: {where}{reason}", file=sys.stderr)
+        print(f"physion: {one_line(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("physion: interrupted; run the same command again to resume", file=sys.stderr)
@@ -73,8 +70,6 @@ def _run_verb(args: list[str]) -> int:
 
         raise UnknownNameError("verb", args[0], VERBS)
     import tyro
-
-    from physion.cli.help.examples import describe
 
     module, taken = find_module(args)
     options = tyro.cli(

@@ -1,4 +1,7 @@
-"""Output of the verbs: results, progress bars, and files that are written atomically."""
+"""Output of the verbs: results, text tables, progress bars, files that are written atomically.
+
+Text tables are not cut to the width of the terminal, so that they can be searched and piped.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import sys
 import time
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import (
@@ -20,6 +24,9 @@ from rich.progress import (
 )
 
 from physion.core.files import write_atomic
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 class OutputConsole(Console):
@@ -52,14 +59,14 @@ _KNOWN_AFTER = 5
 
 
 class Stages:
-    """Progress bars, one a stage, of work that reports to a `compute.progress.Progress`.
+    """Progress bars, one per stage, of work that reports to a `physion.compute.tasks.Progress`.
 
-    Where standard error is no terminal, work that takes long is told in lines instead.
+    If standard error is not a terminal, print progress lines instead of bars.
     """
 
     def __enter__(self) -> Stages:
         self._begun: dict[str, tuple[float, int]] = {}
-        self._told = time.monotonic()
+        self._printed = time.monotonic()
         self._progress = Progress(*_columns(), console=Console(file=sys.stderr), transient=True)
         self._tasks: dict[str, TaskID] = {}
         return self
@@ -75,7 +82,7 @@ class Stages:
     def __call__(self, what: str, done: int, total: int) -> None:
         """Show that ``done`` of ``total`` items of a stage are finished."""
         if not self._progress.console.is_terminal:
-            self._tell(what, done, total)
+            self._print_line(what, done, total)
             return
         # Not started earlier: bars without a stage would still print an empty line when they stop.
         self._progress.start()
@@ -83,13 +90,13 @@ class Stages:
             self._tasks[what] = self._progress.add_task(what, total=total)
         self._progress.update(self._tasks[what], completed=done, total=total)
 
-    def _tell(self, what: str, done: int, total: int) -> None:
+    def _print_line(self, what: str, done: int, total: int) -> None:
         """Print how far a stage is, and how long the rest takes at the speed so far."""
         now = time.monotonic()
         since, first = self._begun.setdefault(what, (now, done))
-        if now - self._told < _LINE_EVERY:
+        if now - self._printed < _LINE_EVERY:
             return
-        self._told = now
+        self._printed = now
         made = done - first
         # The first items take longer: code is compiled, workers start.
         known = made >= _KNOWN_AFTER
@@ -107,3 +114,40 @@ def write_text(path: Path, text: str) -> None:
     """Write a text file atomically and create its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, text.encode())
+
+
+def counted(number: int, singular: str, plural: str = "") -> str:
+    """Return a number with its noun: ``1 fault``, ``2 faults``."""
+    return f"{number} {singular if number == 1 else plural or singular + 's'}"
+
+
+def text_table(table: pd.DataFrame, title: str = "") -> str:
+    """Return a table as text: a header and one line per row, columns separated by two spaces.
+
+    Numbers have three decimals and are aligned to the right; NaN is an empty cell.
+    """
+    import pandas as pd
+
+    columns = [[str(name), *map(_cell, table[name])] for name in table.columns]
+    widths = [max(map(len, cells)) for cells in columns]
+    right = [pd.api.types.is_numeric_dtype(table[name]) for name in table.columns]
+    lines = [
+        "  ".join(
+            cell.rjust(width) if number else cell.ljust(width)
+            for cell, width, number in zip(cells, widths, right, strict=True)
+        ).rstrip()
+        for cells in zip(*columns, strict=True)
+    ]
+    return "\n".join([*([title] if title else []), *lines])
+
+
+def _cell(value: object) -> str:
+    import pandas as pd
+
+    if value is None or value is pd.NA:
+        return ""
+    if not isinstance(value, float):
+        return str(value)
+    if pd.isna(value):
+        return ""
+    return f"{value:.0f}" if value.is_integer() and abs(value) > 1 else f"{value:.3f}"

@@ -20,8 +20,7 @@ import pandas as pd
 import tyro
 
 from physion.cli.official.read import read_trials
-from physion.cli.output import Stages, console, write_text
-from physion.cli.text_table import text_table
+from physion.cli.output import Stages, console, text_table, write_text
 from physion.compute.run_tasks import ExecutorSettings
 from physion.compute.tasks import Executor, tracked
 from physion.core.errors import BadInputError

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar, cast
 
-from physion.core.errors import BadInputError, PhysionError
+from physion.core.errors import BadInputError, PhysionError, one_line
 from physion.core.registry import Registry
 
 T = TypeVar("T")
@@ -173,9 +173,9 @@ def _run(key: str, function: Callable[[T], R], task: T) -> TaskOutcome[R]:
         return TaskOutcome(key, function(task))
     except Exception as error:
         number = error.errno if isinstance(error, OSError) else None
-        text = " ".join(str(error).split()) or "no message"
-        line = text if isinstance(error, PhysionError) else f"{type(error).__name__}: {text}"
-        return TaskOutcome(key, error=line, traceback=traceback.format_exc(), errno=number)
+        return TaskOutcome(
+            key, error=one_line(error), traceback=traceback.format_exc(), errno=number
+        )
 
 
 @contextlib.contextmanager

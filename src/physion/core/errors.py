@@ -82,3 +82,15 @@ class MissingExtraError(PhysionError):
             f"or in a clone: pip install -e '.[{extra}]' -c requirements.lock"
         )
         self.extra = extra
+
+
+def one_line(error: BaseException) -> str:
+    """Return an error as one line: the file and the reason of the system, or the message.
+
+    Errors of other kinds than these and `PhysionError` begin with their type.
+    """
+    if isinstance(error, OSError) and error.strerror:
+        where = f"{error.filename}: " if error.filename else ""
+        return where + " ".join(error.strerror.split())
+    text = " ".join(str(error).split()) or "no message"
+    return text if isinstance(error, PhysionError) else f"{type(error).__name__}: {text}"

@@ -15,6 +15,7 @@ from physion.analysis.people.exclusions import flag_sessions, read_expected
 from physion.analysis.people.responses import check_table, read_responses
 from physion.analysis.tables import read_table
 from physion.cli.experiment import export as experiment_export
+from physion.cli.help import EXAMPLES
 from physion.cli.main import main
 from physion.core.errors import BadInputError, PhysionError
 from physion.experiment.export import export_study as export
@@ -270,6 +271,10 @@ def test_a_study_without_data_is_exported_all_the_same(study: Study, tmp_path: P
     assert report.rows == {"trials": 0, "sessions": 0, "events": 0, "trial_details": 0}
     assert report.until is None and report.sessions == {}
     assert len((tmp_path / "out" / "trials.csv").read_text().splitlines()) == 1
+    # The examples of the help name files that are written.
+    words = [word for lines in EXAMPLES.values() for line in lines for word in line.split()]
+    named = {Path(word).name for word in words if word.startswith("study/export/")}
+    assert named and named <= {path.name for path in (tmp_path / "out").iterdir()}
 
 
 # --- whole or not at all ------------------------------------------------------------------------

@@ -126,7 +126,7 @@ def _estimate(row: dict[str, object], fit: str) -> str:
 
 
 def _show(title: str, table: pd.DataFrame) -> None:
-    from physion.cli.text_table import text_table
+    from physion.cli.output import text_table
 
     _say(text_table(table, title))
 

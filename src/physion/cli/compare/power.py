@@ -54,8 +54,7 @@ class Options:
 def main(options: Options) -> int:
     """Print the power of every size."""
     from physion.analysis.people.power import PlannedEffect, power_table
-    from physion.cli.output import console
-    from physion.cli.text_table import text_table
+    from physion.cli.output import console, text_table
 
     planned = PlannedEffect(
         options.question, options.effect, options.base, options.alike, options.person_sd

@@ -6,8 +6,7 @@ import json as json_module
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from physion.cli.output import console
-from physion.cli.text_table import text_table
+from physion.cli.output import console, text_table
 from physion.readout.plans.estimates import DONE, MEASURED, duration
 
 if TYPE_CHECKING:

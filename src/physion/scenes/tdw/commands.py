@@ -411,7 +411,7 @@ class CommandReader:
             vector(command["position"]),
             quaternion_from_euler(command["rotation"]),
             created=self.frame,
-            earlier=sum(other.id == id_ for other in self.replaced),
+            earlier=[other.id for other in self.replaced].count(id_),
         )
         self.objects[id_] = thing
         if self.frame:

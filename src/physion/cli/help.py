@@ -1,8 +1,40 @@
-"""Examples that ``physion VERB --help`` prints below the description."""
+"""The verbs of the command line: what they do, their modules, and the examples of their help.
+
+Modules are imported when a verb is used, so that ``physion --help`` answers at once.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib import import_module
+from types import ModuleType
+
+VERBS = {
+    "run": "run the whole pipeline: scenes, trials, models, readout, comparison, report",
+    "generate": "sample scenes and write trials",
+    "replay": "simulate official command logs and compare with the recorded outcomes",
+    "train": "train models on trials, without labels",
+    "evaluate": "train models and readouts on trials and write their predictions",
+    "compare": "compare predictions with people",
+    "experiment": "run the experiment with people: init, serve, export",
+    "view": "write a page that shows a dataset: movies, passes, motion in 3D",
+    "export": "write the official layout, webdataset shards, or a dataset card",
+    "import": "convert official HDF5 files and movies to trials",
+    "import-official": "convert a checkout of the original study: scenes, outcomes, people",
+    "verify": "check every byte, label and motion of a dataset",
+    "ls": "list scenarios, presets, shapes, props, materials, models, decisions, rooms, engines",
+    "doctor": "check this machine and print what to install",
+    "bench": "measure this machine: simulation, rendering, trials",
+}
+
+MODULES = {
+    "import": "import_trials",
+    "import-official": "official.import_official",
+    "run": "run.run",
+    "compare": "compare.compare",
+    "experiment": "experiment.experiment",
+}
+"""Modules of verbs that are Python keywords, have sub-verbs or stand in a folder."""
 
 EXAMPLES: dict[str, tuple[str, ...]] = {
     "run": (
@@ -62,9 +94,21 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "ls": ("physion ls models", "physion ls presets"),
     "doctor": ("physion doctor --reproduce",),
     "bench": ("physion bench", "physion bench --scenario drop --count 10 --json"),
-    "completion": ("physion completion bash > ~/.local/share/bash-completion/completions/physion",),
 }
-"""Command lines by verb, or verb and sub-verb; tests parse each."""
+"""Command lines that ``--help`` prints, by verb, or verb and sub-verb; tests parse each."""
+
+
+def module_of(verb: str) -> ModuleType:
+    """Return the module of a verb; it has ``Options`` and ``main(options)``."""
+    return import_module(f"physion.cli.{MODULES.get(verb, verb)}")
+
+
+def find_module(args: Sequence[str]) -> tuple[ModuleType, int]:
+    """Return the module of the verb that ``args`` start with, and 1, or 2 for a sub-verb."""
+    module = module_of(args[0])
+    if args[1:2] and args[1] in getattr(module, "SUBVERBS", {}):
+        return import_module(module.SUBVERBS[args[1]]), 2
+    return module, 1
 
 
 def describe(text: str | None, names: Sequence[str]) -> str:

@@ -7,8 +7,7 @@ import shlex
 import pytest
 import tyro
 
-from physion.cli.help.examples import EXAMPLES
-from physion.cli.help.verbs import VERBS, find_module, module_of
+from physion.cli.help import EXAMPLES, VERBS, find_module, module_of
 from physion.cli.main import main
 
 

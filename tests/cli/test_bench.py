@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from physion.cli.bench.bench import COLUMNS
+from physion.cli.bench import COLUMNS
 from physion.cli.main import main
 from physion.core.version import MADE_WITH
 

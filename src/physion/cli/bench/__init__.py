@@ -1,1 +1,0 @@
-"""Benchmarks on the machine of the user: the verb, and what it measures."""
