@@ -32,9 +32,8 @@ from physion.report.figures.by_scenario import measure_figure
 from physion.report.figures.by_stimulus import SQUARE, difficulty_figure, scatter_figure
 from physion.report.figures.theme import make_plots
 from physion.report.figures.training import generalization_figure
-from physion.report.html import Picture, number, protocol_names
+from physion.report.html import Picture, number
 from physion.report.inputs import ReportInputs
-from physion.report.page import render_page
 from support.paths import ROOT
 
 Maker = Callable[..., Comparison]
@@ -67,7 +66,7 @@ def test_baselines_stand_below_the_models_lighter_and_hollow(make_comparison: Ma
     assert set(table.loc[table["kind"] != figure_tables.BASELINE, "model"]) == {model}
     figure = measure_figure(table, "accuracy")
     names = [text.get_text() for text in figure.axes[0].get_yticklabels()]
-    assert names == [protocol_names(name) for name in (model, given, *COMPUTED)]
+    assert names == [model, given, *COMPUTED]
     inks = [text.get_color() for text in figure.axes[0].get_yticklabels()]
     assert inks == [theme.LIGHT.ink, *[theme.LIGHT.faint] * 4]
     marks = [line for line in figure.axes[0].lines if line.get_marker() not in ("None", None)]
@@ -194,11 +193,11 @@ def trained(make_comparison: Maker, trainings: list[str]) -> tuple[Comparison, p
     comparison = dataclasses.replace(comparison, stimuli=stimuli)
     column = dict(zip(comparison.names, trainings, strict=True))
     rows = stimuli[["model", "stimulus"]]
-    return comparison, rows.assign(**{"Dynamics Training Dataset": rows["model"].map(column)})
+    return comparison, rows.assign(protocol=rows["model"].map(column))
 
 
 def test_effects_hold_the_accuracy_of_each_training(make_comparison: Maker) -> None:
-    comparison, predictions = trained(make_comparison, ["all", "same"])
+    comparison, predictions = trained(make_comparison, ["all", "only"])
     table = figure_tables.effects_table(comparison, predictions)
     assert table["group"].tolist() == ["all", figure_tables.ONLY]
     scores = comparison.scores[comparison.scores["scenario"] == "mean"]
@@ -280,20 +279,6 @@ def test_panels_inside_have_neither_ticks_nor_numbers(make_comparison: Maker) ->
 def pictures(inputs: ReportInputs) -> list[Picture]:
     blank = {"svg": b"<svg/>", "png": b""}
     return [Picture(plot.name, blank, blank, plot.words) for plot in make_plots(inputs)]
-
-
-def test_page_and_figures_call_a_model_by_one_name(make_comparison: Maker) -> None:
-    long = "m · observed · dynamics training dataset same"
-    comparison = make_comparison()
-    renamed = {comparison.names[0]: long}
-    tables = [t.replace({"model": renamed}) for t in (comparison.scores, comparison.stimuli)]
-    comparison = dataclasses.replace(comparison, scores=tables[0], stimuli=tables[1])
-    inputs = ReportInputs(comparison, scatter_limit=0)
-    page = render_page(inputs, pictures(inputs))
-    assert "dynamics training" not in page
-    assert page.count(theme.label(long)) > 4  # tables, cards, caption of the scatter figure
-    assert protocol_names("m · readout train data all but this") == "m · readout train data all-but"
-    assert protocol_names("the same dynamics") == "the same dynamics"
 
 
 def test_columns_of_simulated_outcomes_stand_only_where_these_differ(

@@ -11,7 +11,7 @@ import pytest
 from matplotlib.collections import PolyCollection
 
 from physion.analysis import Comparison
-from physion.analysis.rollout_errors import COLUMNS, CONSTANT_VELOCITY, REQUIRED
+from physion.analysis.rollout_errors import COLUMNS, CONSTANT_VELOCITY, ERRORS
 from physion.cli.main import main
 from physion.report.figures.by_scenario import draw_rollout_error as draw
 from physion.report.figures.by_scenario import rollout_error
@@ -81,7 +81,7 @@ def test_compare_draws_the_errors_that_it_is_given(tmp_path: Path) -> None:
     predictions.to_csv(tmp_path / "p.csv", index=False)
     errors = pd.DataFrame(
         [("sim", "drop", f"drop_testing_{i:04d}", 3, 0.1 * i, 0.4) for i in range(4)],
-        columns=list(REQUIRED),
+        columns=[column.name for column in ERRORS],
     )
     errors.to_csv(tmp_path / "e.csv", index=False)
     arguments = ["compare", str(tmp_path / "p.csv"), "--resamples", "20"]

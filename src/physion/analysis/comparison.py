@@ -46,15 +46,15 @@ def check_probabilities(predictions: pd.DataFrame) -> list[str]:
             continue
         first = rows[against].iloc[0]
         what = (
-            f"{model}: Predicted Outcome contradicts Predicted Prob_true in {count} of "
+            f"{model}: predicted contradicts p_contact in {count} of "
             f"{len(rows)} rows, the first is {first['stimulus']!r} ({first['predicted']}, "
             f"{first['p_contact']:g})"
         )
         opposite = p[rows["predicted"]].mean() < p[~rows["predicted"]].mean()
         if opposite and stats.binom.sf(count - 1, len(rows), 0.5) < SURE:
             raise BadInputError(
-                f"{what}; Predicted Prob_true must be the probability of a contact, and True in "
-                "Predicted Outcome must mean a contact"
+                f"{what}; p_contact must be the probability of a contact, and True in predicted "
+                "must mean a contact"
             )
         found.append(
             f"{what}: accuracy and kappa are those of the outcome, r and RMSD of the probability"
@@ -77,7 +77,7 @@ def check_outcomes(stimuli: pd.DataFrame) -> list[str]:
             continue
         what = (
             f"{scenario}: the official outcome is not that of the trial shown to the models "
-            f"(Actual Outcome) in {differ} of {len(rows)} stimuli"
+            f"(outcome) in {differ} of {len(rows)} stimuli"
         )
         if stats.binom.sf(differ - 1, len(rows), 0.5) < SURE:
             raise BadInputError(
@@ -160,10 +160,11 @@ SETTING = "Contact in the observed part"
 def observed_contacts(predictions: pd.DataFrame) -> pd.Series:
     """Return by stimulus whether the contact was observed, for the stimuli for which it is known.
 
-    ``predictions``: from `predictions.name_models`; a model that knows suffices for all.
+    ``predictions``: from `predictions.name_models`; a model that knows suffices for all,
+    and a contact that one simulation shows in the observed part counts for all.
     """
-    known = predictions[predictions["observed_contact"].notna()].drop_duplicates("stimulus")
-    return known.set_index("stimulus")["observed_contact"].astype(bool)
+    known = predictions[predictions["observed_contact"].notna()]
+    return known["observed_contact"].astype(bool).groupby(known["stimulus"]).any()
 
 
 def later_scores(stimuli: pd.DataFrame, level: float = 0.95) -> tuple[pd.DataFrame, str]:
@@ -185,7 +186,7 @@ def later_scores(stimuli: pd.DataFrame, level: float = 0.95) -> tuple[pd.DataFra
     each = stimuli.drop_duplicates("stimulus")
     if each["observed_contact"].isna().all():
         return pd.DataFrame(), (
-            "not known: the predictions have no column Observed Contact, so there are no scores "
+            "not known: the predictions have no column observed_contact, so there are no scores "
             "without such trials"
         )
     observed, later = each["observed_contact"] == True, each["observed_contact"] == False  # noqa: E712
@@ -226,7 +227,8 @@ class Comparison:
       ``readout``, ``scenario``, ``stimulus``, ``p_contact``, ``predicted``, ``label`` (official),
       ``simulated``, ``human_accuracy``, ``count``, ``p_yes``, ``gap`` (p_contact - p_yes),
       ``observed_contact`` (True, False, or None if it is not known).
-    - ``changed``: the stimuli whose simulated outcome is not the official one, one row each.
+    - ``changed``: the stimuli whose simulated outcome is not the official one, one row each, with
+      the ``models`` that were shown them.
     - ``dropped``: excluded stimuli: ``model`` (empty: excluded for all), ``scenario``, ``reason``,
       ``stimuli`` (count).
     - ``settings``: the settings as text for the report, by name.
@@ -283,13 +285,12 @@ def compare_scores(
     Parameters
     ----------
     predictions
-        Official column names (`predictions.check_predictions`); *Actual Outcome* is the outcome of
-        the trial that the model was shown.
+        Columns of `tables.PREDICTIONS`; ``outcome`` is that of the trial as the model was shown it.
     humans
         Table from `responses.read_humans`, or None for the accuracies of the models alone.
     labels
-        Official outcome by stimulus. For a stimulus without one the column *Recorded Outcome* of
-        the predictions is used and, without people, the simulated outcome.
+        Official outcome by stimulus. For a stimulus without one ``recorded_outcome`` of the
+        predictions counts and, without people, the simulated outcome.
     zone
         Table from `responses.read_human_zone` or from the accuracies of single participants, with
         ``scenario``, ``low`` and ``high``.
@@ -320,6 +321,7 @@ def compare_scores(
     unwanted = {canonical_name(name) for name in exclude}
     known = _recorded(rows)
     known |= {canonical_name(name): bool(value) for name, value in (labels or {}).items()}
+    _refuse_two_outcomes(rows, known)
     if humans is None:
         people = _nobody(rows, known)
     elif known:
@@ -358,24 +360,35 @@ def compare_scores(
     )
 
 
+def _refuse_two_outcomes(rows: pd.DataFrame, known: Mapping[str, bool]) -> None:
+    """Raise `BadInputError` if models were shown different outcomes and none is official."""
+    unknown = rows[~rows["stimulus"].isin(set(known))]
+    several = unknown.groupby("stimulus")["outcome"].nunique()
+    if (several > 1).any():
+        raise BadInputError(
+            f"two models were shown {several[several > 1].index[0]!r} with different outcomes, and "
+            "no official outcome is known; give the labels, or compare models on one set of trials"
+        )
+
+
 def _recorded(rows: pd.DataFrame) -> dict[str, bool]:
     """Return the official outcomes that the predictions contain."""
-    given = rows[rows["recorded"].notna()].drop_duplicates("stimulus")
-    pairs = zip(given["stimulus"], given["recorded"], strict=True)
+    given = rows[rows["recorded_outcome"].notna()].drop_duplicates("stimulus")
+    pairs = zip(given["stimulus"], given["recorded_outcome"], strict=True)
     return {str(stimulus): bool(value) for stimulus, value in pairs}
 
 
 def _nobody(rows: pd.DataFrame, known: Mapping[str, bool]) -> pd.DataFrame:
     """Return the stimuli of the predictions as a table of people whose answers are NaN."""
-    people = rows.drop_duplicates("stimulus")[["stimulus", "scenario", "actual"]]
+    people = rows.drop_duplicates("stimulus")[["stimulus", "scenario", "outcome"]]
     label = people["stimulus"].map(known).astype(object)
     people = people.assign(
-        label=label.where(label.notna(), people["actual"]),
+        label=label.where(label.notna(), people["outcome"]),
         accuracy=np.nan,
         count=np.nan,
         p_yes=np.nan,
     )
-    return people.drop(columns="actual")
+    return people.drop(columns="outcome")
 
 
 def _drop(
@@ -400,10 +413,12 @@ def _purpose(stimulus: pd.Series, unwanted: set[str], exclude_ledge: bool) -> pd
 
 
 def _join(rows: pd.DataFrame, people: pd.DataFrame) -> pd.DataFrame:
-    left = rows[["model", "base_model", "readout", "stimulus", "p_contact", "predicted", "actual"]]
+    left = rows[["model", "base_model", "readout", "stimulus", "p_contact", "predicted", "outcome"]]
     joined = left.merge(people, on="stimulus", how="inner", validate="many_to_one")
-    joined = joined.rename(columns={"actual": "simulated", "accuracy": "human_accuracy"})
+    joined = joined.rename(columns={"outcome": "simulated", "accuracy": "human_accuracy"})
     joined["label"] = joined["label"].astype(bool)
+    shown = joined["simulated"].where(joined["simulated"].notna(), joined["label"])
+    joined["simulated"] = shown.astype(bool)
     joined["gap"] = joined["p_contact"] - joined["p_yes"]
     observed = joined["stimulus"].map(observed_contacts(rows)).astype(object)
     joined["observed_contact"] = observed.where(observed.notna(), None)
@@ -442,8 +457,11 @@ def _whole(
 
 
 def _changed(stimuli: pd.DataFrame) -> pd.DataFrame:
-    rows = stimuli[stimuli["label"] != stimuli["simulated"]].drop_duplicates("stimulus")
-    columns = ["scenario", "stimulus", "label", "simulated", "human_accuracy", "p_yes"]
+    rows = stimuli[stimuli["label"] != stimuli["simulated"]]
+    shown = rows.groupby("stimulus")["model"].agg(", ".join)
+    rows = rows.drop_duplicates("stimulus")
+    rows = rows.assign(models=rows["stimulus"].map(shown).astype(str))
+    columns = ["scenario", "stimulus", "label", "simulated", "human_accuracy", "p_yes", "models"]
     return rows.sort_values(["scenario", "stimulus"])[columns].reset_index(drop=True)
 
 

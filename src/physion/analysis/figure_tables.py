@@ -19,7 +19,7 @@ from physion.analysis.people.effects import THIRDS, below_chance_level, difficul
 from physion.analysis.scores import COMPUTED, baseline_stimuli, kind_of, released_zone
 from physion.analysis.statistics.agreement import correlate_resampled, correlate_rows
 from physion.analysis.statistics.regression import brier, reliability_curve
-from physion.analysis.tables import DATASETS, MEAN, POOLED, PROTOCOLS, READOUTS, in_order
+from physion.analysis.tables import ALL_BUT, MEAN, ONLY, POOLED, READOUTS, in_order
 from physion.core.names import OFFICIAL_SCENARIOS, SCENARIOS
 
 Array = npt.NDArray[np.float64]
@@ -45,7 +45,7 @@ GROUPED_COLUMNS = ("panel", "model", "group", "value", "low", "high", "people", 
 GENERALIZATION_COLUMNS = ("model", "trained", "tested", "stimuli", "accuracy", "people",
                           "difference")  # fmt: skip
 
-ALL_BUT, ONLY, ANOTHER = PROTOCOLS["all but this"], PROTOCOLS["same"], "another scenario"
+ANOTHER = "another scenario"
 
 
 def accuracy_table(comparison: Comparison) -> pd.DataFrame:
@@ -303,14 +303,14 @@ def _with_training(comparison: Comparison, predictions: pd.DataFrame) -> pd.Data
     ``training``.
     """
     result = pd.Series("", index=predictions.index, dtype=object)
-    for column in reversed(DATASETS[1:3]):
+    for column in ("protocol", "encoder_training_dataset"):
         if column in predictions:
             result = result.where(result != "", predictions[column])
     subset = predictions[["model", "stimulus"]].assign(trained=result)
     chosen = comparison.stimuli[comparison.stimuli["model"].isin(comparison.models)]
     rows = chosen.merge(subset, on=["model", "stimulus"], how="left")
     ours = rows["trained"].map(lambda name: OFFICIAL_SCENARIOS.get(str(name).lower(), name))
-    rows["trained"] = ours.where(ours != "same", rows["scenario"]).replace("all but this", ALL_BUT)
+    rows["trained"] = ours.where(ours != ONLY, rows["scenario"])
     rows["training"] = rows["trained"].where(~rows["trained"].isin(SCENARIOS), ANOTHER)
     rows["training"] = rows["training"].mask(rows["trained"] == rows["scenario"], ONLY)
     return rows

@@ -14,18 +14,26 @@ import numpy.typing as npt
 import pandas as pd
 
 from physion.analysis.intervals import Variance, mean_of, variance_of_mean
-from physion.analysis.tables import MEAN, as_numbers, in_order, read_csv
+from physion.analysis.tables import MEAN, Column, check_table, in_order, must, read_csv
 from physion.core.errors import BadInputError
 
 CONSTANT_VELOCITY = "constant velocity"
 """Name of the baseline: objects go on as they moved in the last observed step."""
-REQUIRED = ("Model", "Scenario", "Stimulus Name", "Frames", "Error", "Constant Velocity Error")
-"""Columns of a file of errors, which ``physion evaluate --rollout-error`` writes."""
+ERRORS: tuple[Column, ...] = (
+    must("model", "text", "Name of the model", also=("Model",)),
+    must("scenario", "text", "Scenario of the trial", also=("Scenario",)),
+    must("stimulus", "text", "Name of the trial", also=("Stimulus Name",)),
+    must("frames", "integer", "Frames after the last observed one", low=0, also=("Frames",)),
+    must("error", "number", "Mean distance from the true positions", unit="m", low=0, high=1e6,
+         also=("Error",)),
+    must("constant_velocity_error", "number", "The same of objects that keep their last velocity",
+         unit="m", low=0, high=1e6, also=("Constant Velocity Error",)),
+)  # fmt: skip
+"""Columns of a file of errors, which ``physion evaluate --rollout-errors`` writes."""
 COLUMNS = ("panel", "model", "kind", "seconds", "trials", "value", "low", "high")
 """``panel``: scenario or `MEAN`; ``kind``: model or baseline; ``seconds`` of physics after the last
 observed frame; ``value``: mean error in metres, with its interval."""
 _FRAME = 0.01
-_FARTHEST = 1e6
 
 Array = npt.NDArray[np.float64]
 
@@ -37,21 +45,20 @@ def read_rollout_errors(paths: Sequence[Path]) -> pd.DataFrame:
     A model that is in several files is named with each file. Raises `BadInputError` for a file that
     is no such table.
     """
-    tables = {path: read_csv(path, REQUIRED) for path in paths}
-    count = Counter(name for table in tables.values() for name in set(table["Model"]))
+    tables = {path: check_table(read_csv(path), ERRORS, str(path)) for path in paths}
+    count = Counter(name for table in tables.values() for name in set(table["model"]))
     parts = []
     for path, table in tables.items():
-        model = [f"{m}, {path.stem}" if count[m] > 1 else m for m in table["Model"]]
-        numbers = {
-            name: as_numbers(table[column], 0, _FARTHEST, str(path))
-            for name, column in (
-                ("seconds", "Frames"),
-                ("error", "Error"),
-                ("baseline", "Constant Velocity Error"),
-            )
-        }
-        names = {"scenario": table["Scenario"], "stimulus": table["Stimulus Name"]}
-        part = pd.DataFrame({"model": model, **names, **numbers})
+        model = [f"{m}, {path.stem}" if count[m] > 1 else m for m in table["model"]]
+        names = {"model": model, "scenario": table["scenario"], "stimulus": table["stimulus"]}
+        part = pd.DataFrame(
+            {
+                **names,
+                "seconds": table["frames"].astype(float),
+                "error": table["error"],
+                "baseline": table["constant_velocity_error"],
+            }
+        )
         part["seconds"] *= _FRAME
         repeated = part.duplicated(["model", "stimulus", "seconds"])
         if repeated.any():

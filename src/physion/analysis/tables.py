@@ -1,10 +1,17 @@
-"""Readers of tables from outside: complete and checked, or refused with one clear message."""
+"""Tables from outside: predictions, answers of people, outcomes, attributes of stimuli.
+
+A table is described by its `Column` values: meaning, allowed values, and other headers under which
+the column may come, such as those of the official files. `check_table` reads any table by such a
+description and refuses the first cell that breaks it, with file, row and column. Inside the package
+all columns have the names of the description.
+"""
 
 from __future__ import annotations
 
 import io
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -19,7 +26,7 @@ from physion.core.names import OFFICIAL_SCENARIOS, SCENARIOS, canonical_name, sc
 Array = npt.NDArray[np.float64]
 
 
-def read_csv(path: Path, columns: Iterable[str]) -> pd.DataFrame:
+def read_csv(path: Path, columns: Iterable[str] = ()) -> pd.DataFrame:
     """Read the CSV file at ``path`` as text; it must have ``columns`` and at least one row.
 
     Raises `BadInputError` for a file that is absent, of another kind, empty, lacks a column, or
@@ -30,13 +37,17 @@ def read_csv(path: Path, columns: Iterable[str]) -> pd.DataFrame:
         table = pd.read_csv(io.BytesIO(content), dtype=str, keep_default_na=False, encoding="utf-8")
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
         raise BadInputError(f"{path} is not a CSV table: {error}") from error
+    if len(table.columns) == 1 and ";" in str(table.columns[0]):
+        raise BadInputError(
+            f"{path} separates its columns with semicolons; save it as CSV with commas"
+        )
     require_columns(table, columns, str(path))
     if table.empty:
         raise BadInputError(f"{path} has a header and no rows")
     return table
 
 
-def read_table(path: Path, columns: Iterable[str]) -> pd.DataFrame:
+def read_table(path: Path, columns: Iterable[str] = ()) -> pd.DataFrame:
     """Read a parquet table with its types, or a CSV file as text (`read_csv`).
 
     Raises `BadInputError` as `read_csv` does.
@@ -63,6 +74,163 @@ def _read_checked(path: Path) -> bytes:
     digest = digest_path(path).name
     check_digest(path, content, f"make it again, or delete {digest} to use the table as it is")
     return content
+
+
+# Descriptions of tables.
+
+Kind = Literal["text", "integer", "number", "flag", "choice", "time"]
+"""``text``; whole or any ``number``; ``flag``: True or False; ``choice``: one of ``choices``;
+``time``: a moment in ISO 8601 with its offset from UTC."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table: its meaning and its allowed values.
+
+    ``required``: the column must exist. ``may_be_empty``: a cell may be empty (unknown). The bounds
+    ``low`` and ``high`` are inclusive and in ``unit``. ``also``: other headers that it may have in
+    a file, of which the first that is there counts.
+    """
+
+    name: str
+    kind: Kind
+    about: str
+    unit: str = ""
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+    required: bool = False
+    may_be_empty: bool = True
+    also: tuple[str, ...] = ()
+
+
+def must(name: str, kind: Kind, about: str, **rest: Any) -> Column:
+    """Return a column that must exist and have a value in every row."""
+    return Column(name, kind, about, required=True, may_be_empty=False, **rest)
+
+
+FLAGS = {
+    **dict.fromkeys(("true", "1", "1.0", "yes"), True),
+    **dict.fromkeys(("false", "0", "0.0", "no"), False),
+}
+"""Words for True and False in a table, in any case."""
+
+
+def data_dictionary(columns: Sequence[Column]) -> list[dict[str, Any]]:
+    """Return the columns as plain values for JSON: name, kind, about, unit, bounds, choices, ..."""
+    found = []
+    for column in columns:
+        values = {**asdict(column), "choices": list(column.choices)}
+        del values["also"]
+        found.append(values)
+    return found
+
+
+@dataclass(frozen=True)
+class BadCell:
+    """A cell that its column does not allow: row from 1, header in the file, what it holds."""
+
+    row: int
+    header: str
+    value: str
+    expected: str
+
+    def __str__(self) -> str:
+        return (
+            f"row {self.row} of column {self.header!r} holds {self.value!r}; "
+            f"expected {self.expected}"
+        )
+
+
+def check_table(table: pd.DataFrame, columns: Sequence[Column], where: str) -> pd.DataFrame:
+    """Return ``table`` with the types of its ``columns``; columns not described are dropped.
+
+    Cells may be text, as from CSV, or typed, as from parquet. Resulting types: str for text, choice
+    and time (empty if unknown), Int64 for integer, float64 (NaN) for number, boolean for flag (bool
+    if no cell may be empty). An optional column that is absent stays absent. Raises `BadInputError`
+    for a missing column or the first cell that is not allowed.
+    """
+    typed, missing, bad = inspect_table(table, columns)
+    if missing:
+        names = ", ".join(" or ".join((column.name, *column.also)) for column in missing)
+        given = ", ".join(map(str, table.columns[:12]))
+        raise BadInputError(f"{where} lacks the column(s) {names}; it has: {given}")
+    if bad:
+        raise BadInputError(f"{where}: {bad[0]}")
+    for column in columns:
+        if column.kind == "flag" and not column.may_be_empty and column.name in typed:
+            typed[column.name] = typed[column.name].astype(bool)
+    return typed
+
+
+def inspect_table(
+    table: pd.DataFrame, columns: Sequence[Column]
+) -> tuple[pd.DataFrame, list[Column], list[BadCell]]:
+    """Return ``table`` as `check_table` does, with what is wrong with it.
+
+    Returns
+    -------
+    typed
+        The columns that are there; a cell that is not allowed is empty.
+    missing
+        Required columns that are not there.
+    bad
+        Every cell that is not allowed, column by column.
+    """
+    typed, bad = {}, []
+    missing = []
+    for column in columns:
+        header = next((name for name in (column.name, *column.also) if name in table), None)
+        if header is None:
+            missing += [column] if column.required else []
+            continue
+        values = table[header]
+        text = values.astype(object).where(values.notna(), "").astype(str).str.strip()
+        typed[column.name], faults = _typed(text, column)
+        bad += [
+            BadCell(int(row) + 1, header, text.iloc[row][:80], expected)
+            for wrong, expected in faults
+            for row in np.flatnonzero(wrong.to_numpy())
+        ]
+    return pd.DataFrame(typed, index=table.index).reset_index(drop=True), missing, bad
+
+
+def _typed(text: pd.Series, column: Column) -> tuple[pd.Series, list[tuple[pd.Series, str]]]:
+    """Return the values of a column, and which cells are not allowed, with what was expected."""
+    empty = text == ""
+    absent = [] if column.may_be_empty else [(empty, "a value")]
+    match column.kind:
+        case "integer" | "number":
+            values, wrong, expected = _numbers(text, empty, column)
+        case "flag":
+            flags = text.str.lower().map(FLAGS)
+            values, wrong = flags.astype("boolean"), ~empty & flags.isna()
+            expected = "True or False"
+        case "choice":
+            lower = text.str.lower()
+            wrong, expected = ~empty & ~lower.isin(column.choices), " or ".join(column.choices)
+            values = lower.where(~wrong, "")
+        case "time":
+            given = text.where(~empty)
+            moments = pd.to_datetime(given, errors="coerce", utc=True, format="ISO8601")
+            wrong, expected = ~empty & moments.isna(), "a time in ISO 8601"
+            values = text.where(~wrong, "")
+        case "text":
+            return text, absent
+    return values, [*absent, (wrong, expected)]
+
+
+def _numbers(text: pd.Series, empty: pd.Series, column: Column) -> tuple[pd.Series, pd.Series, str]:
+    numbers = pd.to_numeric(text.where(~empty), errors="coerce").astype(np.float64)
+    low = -np.inf if column.low is None else column.low
+    high = np.inf if column.high is None else column.high
+    good = np.isfinite(numbers) & (numbers >= low) & (numbers <= high)
+    whole = column.kind == "integer"
+    if whole:
+        good &= numbers == np.floor(numbers)
+    expected = f"a {'whole ' if whole else ''}number from {low:g} to {high:g}"
+    kept = numbers.where(good)
+    return kept.astype("Int64") if whole else kept, ~empty & ~good, expected
 
 
 def require_columns(table: pd.DataFrame, columns: Iterable[str], where: str) -> None:
@@ -92,9 +260,7 @@ def as_booleans(values: pd.Series, where: str) -> npt.NDArray[np.bool_]:
     """Return ``values`` as bool: True/False, 1/0 or yes/no in any case; else raise
     `BadInputError`.
     """
-    meaning = {"true": True, "1": True, "1.0": True, "yes": True}
-    meaning |= {"false": False, "0": False, "0.0": False, "no": False}
-    result = [meaning.get(str(value).strip().lower()) for value in values]
+    result = [FLAGS.get(str(value).strip().lower()) for value in values]
     for row, value in enumerate(result):
         if value is None:
             raise BadInputError(
@@ -165,182 +331,190 @@ def check_excluded_names(exclude: Iterable[str], known: Collection[str]) -> None
             raise UnknownNameError("stimulus to exclude", name, names)
 
 
-# Predictions of models: tables with the column names of the official result files.
-
-REQUIRED = (
-    "Model",
-    "Readout Type",
-    "Predicted Prob_true",
-    "Predicted Outcome",
-    "Actual Outcome",
-    "Stimulus Name",
-)
-"""Columns without which a table of predictions cannot be compared."""
+# Predictions of models.
 
 READOUTS = {"A": "full", "B": "observed+simulated", "C": "observed"}
-"""The letters of the official files and the protocols that they stand for."""
+"""The letters of the official files and the readouts that they stand for."""
 
-PROTOCOLS = {"same": "only", "all but this": "all-but"}
-"""Name of a training protocol by the value that the tables hold."""
-DATASETS = (
-    "Encoder Pre-training Dataset",
-    "Encoder Training Dataset",
-    "Dynamics Training Dataset",
-    "Readout Train Data",
-)
+ONLY, ALL_BUT = "only", "all-but"
+"""Training protocols: only on the tested scenario, or on all but that one."""
+
+PREDICTIONS: tuple[Column, ...] = (
+    must("stimulus", "text", "Name of the trial", also=("Stimulus Name",)),
+    must(
+        "p_contact",
+        "number",
+        "Probability that agent and patient touch",
+        low=0,
+        high=1,
+        also=("Predicted Prob_true", "probability", "p"),
+    ),
+    Column("model", "text", "Name of the model; absent: that of the file", may_be_empty=False,
+           also=("Model",)),
+    Column("readout", "text", "What the readout saw", also=("Readout Type",)),
+    Column("scenario", "text", "Scenario of the trial", also=("Readout Test Data",)),
+    Column("predicted", "flag", "The answer; absent: p_contact > 0.5", also=("Predicted Outcome",)),
+    Column("outcome", "flag", "Contact in the trial as the model was shown it; absent: the "
+           "official outcome", also=("Actual Outcome",)),
+    Column("recorded_outcome", "flag", "Contact in the official recording",
+           also=("Recorded Outcome",)),
+    Column("observed_contact", "flag", "Contact in the observed part", also=("Observed Contact",)),
+    Column("inputs", "text", "What the model was given of a trial", also=("Inputs",)),
+    Column("init", "text", "Weights that the model started from", also=("Init",)),
+    Column("protocol", "text", "Scenarios of the training: all, all-but, only",
+           also=("Dynamics Training Dataset",)),
+    Column("seed", "text", "Seed of the training", also=("Dynamics Training Seed",)),
+    Column("encoder_type", "text", "", also=("Encoder Type",)),
+    Column("dynamics_type", "text", "", also=("Dynamics Type",)),
+    Column("encoder_pretraining_task", "text", "", also=("Encoder Pre-training Task",)),
+    Column("encoder_pretraining_dataset", "text", "", also=("Encoder Pre-training Dataset",)),
+    Column("encoder_pretraining_seed", "text", "", also=("Encoder Pre-training Seed",)),
+    Column("encoder_training_task", "text", "", also=("Encoder Training Task",)),
+    Column("encoder_training_dataset", "text", "", also=("Encoder Training Dataset",)),
+    Column("encoder_training_seed", "text", "", also=("Encoder Training Seed",)),
+    Column("dynamics_training_task", "text", "", also=("Dynamics Training Task",)),
+    Column("readout_training_dataset", "text", "", also=("Readout Train Data",)),
+)  # fmt: skip
+"""One row per model and stimulus. Needed are ``stimulus`` and ``p_contact`` only; the other headers
+in ``also`` are those of the official files."""
+
+DATASETS = ("encoder_pretraining_dataset", "encoder_training_dataset", "protocol",
+            "readout_training_dataset")  # fmt: skip
 """Columns of the scenario(s) on which a part was trained. They distinguish models of one name only
 in relation to the tested scenario."""
 
 DISTINGUISHING = (
-    "Init",
-    "Encoder Type",
-    "Dynamics Type",
-    "Encoder Pre-training Task",
-    "Encoder Pre-training Seed",
-    "Encoder Training Task",
-    "Encoder Training Seed",
-    "Dynamics Training Task",
-    "Dynamics Training Seed",
-    *DATASETS,
+    *("protocol", "seed", "init", "encoder_type", "dynamics_type"),
+    *("encoder_pretraining_task", "encoder_pretraining_dataset", "encoder_pretraining_seed"),
+    *("encoder_training_task", "encoder_training_dataset", "encoder_training_seed"),
+    *("dynamics_training_task", "readout_training_dataset"),
 )
 """Further columns that distinguish models of one name; all of them may be absent."""
 
 
-def read_predictions(paths: list[Path]) -> pd.DataFrame:
+def read_predictions(paths: Sequence[Path]) -> pd.DataFrame:
     """Read and check the rows of several CSV files of predictions; see `check_predictions`."""
     if not paths:
         raise BadInputError("no file of predictions was given")
-    tables = []
-    for path in paths:
-        raw = read_csv(path, REQUIRED)
-        tables.append(check_predictions(raw, str(path)))
+    tables = [check_predictions(read_csv(path), str(path), path.stem) for path in paths]
     return name_models(pd.concat(tables, ignore_index=True))
 
 
-def check_predictions(table: pd.DataFrame, where: str = "predictions") -> pd.DataFrame:
-    """Return one row a model and stimulus with our column names, in the order of ``table``.
+def check_predictions(
+    table: pd.DataFrame, where: str = "predictions", name: str = "model"
+) -> pd.DataFrame:
+    """Return one row per model and stimulus with the columns of `PREDICTIONS`.
 
-    Columns: ``model`` (the name), ``readout`` (*observed*, *observed+simulated*, *full*, or another
-    name), ``stimulus`` (canonical), ``scenario`` (None if unknown), ``p_contact`` (0 to 1),
-    ``predicted`` and ``actual`` (bool), and those of `DISTINGUISHING` that are present, as text.
-    ``actual`` is the outcome of the trial that the model was shown, so for our own simulations the
-    simulated outcome; ``recorded`` is the official one if a column *Recorded Outcome* contains it
-    (bool), else None; ``observed_contact`` says likewise, from *Observed Contact*, whether the
-    contact happened in the observed part. Raises `BadInputError`.
+    Parameters
+    ----------
+    table
+        Table with the columns of `PREDICTIONS`, of which only two must be there.
+    where
+        What it is called in messages.
+    name
+        Name of the model if the table has no column ``model``.
+
+    Returns
+    -------
+    All columns of `PREDICTIONS`: ``stimulus`` by its canonical name; ``readout`` as a word; flags
+    as bool, or None where unknown; the text that is absent is empty; columns of `DATASETS` in
+    relation to the tested scenario (`ONLY`, `ALL_BUT`).
+
+    Raises
+    ------
+    BadInputError
+        For a missing column or the first cell that is not allowed.
     """
-    require_columns(table, REQUIRED, where)
-    table = table.reset_index(drop=True)
-    stimulus = table["Stimulus Name"].astype(str).map(canonical_name)
-    checked = pd.DataFrame(
-        {
-            "model": _text(table["Model"]),
-            "readout": _text(table["Readout Type"]).replace(READOUTS),
-            "stimulus": stimulus,
-            "scenario": _scenarios(table, stimulus),
-            "p_contact": as_numbers(table["Predicted Prob_true"], 0, 1, where),
-            "predicted": as_booleans(table["Predicted Outcome"], where),
-            "actual": as_booleans(table["Actual Outcome"], where),
-            "recorded": _optional(table, "Recorded Outcome", where),
-            "observed_contact": _optional(table, "Observed Contact", where),
-        }
-    )
-    blank = (checked["model"] == "") | (checked["stimulus"] == "")
-    if blank.any():
-        row = int(np.flatnonzero(blank.to_numpy())[0]) + 1
-        raise BadInputError(f"{where}: row {row} names no model or no stimulus")
-    for column in DISTINGUISHING:
-        checked[column] = _text(table[column]) if column in table.columns else ""
-    for column in DATASETS:
-        checked[column] = _relative(checked[column], checked["scenario"])
-    return checked
+    checked = check_table(table, PREDICTIONS, where)
+    rows = pd.DataFrame(index=checked.index)
+    for column in PREDICTIONS:
+        given = checked.get(column.name)
+        if column.kind == "number":
+            rows[column.name] = given
+        elif column.kind == "flag":
+            rows[column.name] = _known_flags(given, checked.index)
+        else:
+            rows[column.name] = "" if given is None else _without_decimals(given)
+    if "model" not in checked:
+        rows["model"] = name
+    rows["readout"] = rows["readout"].replace(READOUTS)
+    rows["stimulus"] = rows["stimulus"].map(canonical_name)
+    rows["scenario"] = _scenarios(rows["scenario"], rows["stimulus"])
+    rows["predicted"] = rows["predicted"].where(rows["predicted"].notna(), rows["p_contact"] > 0.5)
+    rows["predicted"] = rows["predicted"].astype(bool)
+    for dataset in DATASETS:
+        rows[dataset] = _relative(rows[dataset], rows["scenario"])
+    return rows
 
 
 def name_models(predictions: pd.DataFrame) -> pd.DataFrame:
     """Return ``predictions`` with a unique ``model`` for each row of results, and ``base_model``.
 
     The unique name is model and readout and, if several models share these, also what
-    distinguishes them (training set, seed, ...). Raises `BadInputError` if one model predicts a
-    stimulus twice, or if two models were shown trials of one name but of different scenario,
-    outcome or observed contact.
+    distinguishes them (protocol, seed, ...). Raises `BadInputError` if one model predicts a
+    stimulus twice, or if two models were shown trials of one name but of different scenarios.
     """
-    model = predictions["model"].where(
-        predictions["readout"] == "", predictions["model"] + " · " + predictions["readout"]
-    )
+    base, readout = predictions["model"], predictions["readout"]
+    model = base.where(readout == "", base + " · " + readout)
     for column in DISTINGUISHING:
         if column not in predictions:
             continue
         values = predictions[column].astype(str)
-        several = values.groupby([predictions["model"], predictions["readout"]]).transform(
-            "nunique"
-        )
-        model = model.where(several < 2, model + f" · {column.lower()} " + values)
-    named = predictions.assign(base_model=predictions["model"], model=model)
+        several = values.groupby([base, readout]).transform("nunique")
+        words = "" if column == "protocol" else column.replace("_", " ") + " "
+        added = f" · {words}" + values.where(values != "", "not stated")
+        model = model.where(several < 2, model + added)
+    named = predictions.assign(base_model=base, model=model)
     twice = named[named.duplicated(["model", "stimulus"])]
     if len(twice):
         row = twice.iloc[0]
         raise BadInputError(f"{row['model']!r} predicts {row['stimulus']!r} twice; keep one row")
-    _refuse_two_scenarios(named)
-    for column, what in (("actual", "outcomes"), ("observed_contact", "observed contacts")):
-        if column not in named:
-            continue
-        several = named.groupby("stimulus")[column].nunique()
-        if (several > 1).any():
-            raise BadInputError(
-                f"two models were shown {several[several > 1].index[0]!r} with different {what}; "
-                "compare models on one set of trials"
-            )
+    scenarios = named.groupby("stimulus")["scenario"].unique()
+    several_scenarios = scenarios[scenarios.map(len) > 1]
+    if len(several_scenarios):
+        both = " and ".join(map(str, several_scenarios.iloc[0]))
+        raise BadInputError(
+            f"{several_scenarios.index[0]!r} is predicted in two scenarios, {both}; compare models "
+            "on one set of trials"
+        )
     return named
 
 
-def _refuse_two_scenarios(named: pd.DataFrame) -> None:
-    scenarios = named.groupby("stimulus")["scenario"].unique()
-    several = scenarios[scenarios.map(len) > 1]
-    if len(several):
-        both = " and ".join(map(str, several.iloc[0]))
-        raise BadInputError(
-            f"{several.index[0]!r} is predicted in two scenarios, {both}; compare models on one "
-            "set of trials"
-        )
+def _without_decimals(values: pd.Series) -> pd.Series:
+    """Return text without the decimals that pandas adds to seeds, and empty for words for none."""
+    words = values.str.replace(r"^(\d+)\.0$", r"\1", regex=True)
+    return words.replace({"nan": "", "None": ""})
 
 
-def _text(values: pd.Series) -> pd.Series:
-    """Return values as text, empty if absent, and seeds without the decimals that pandas adds."""
-    words = values.astype(object).where(values.notna(), "").map(str).str.strip()
-    return words.str.replace(r"^(\d+)\.0$", r"\1", regex=True).replace({"nan": "", "None": ""})
-
-
-def _scenarios(table: pd.DataFrame, stimulus: pd.Series) -> pd.Series:
-    """Return the scenario of each row by its stimulus, else by *Readout Test Data*, else None."""
-    known = {*SCENARIOS, *OFFICIAL_SCENARIOS}
-    tested = table.get("Readout Test Data", pd.Series("", index=table.index)).astype(str)
-    result = [
-        scenario_of(name) or (scenario_name(test) if test.lower() in known else None)
-        for name, test in zip(stimulus, tested, strict=True)
-    ]
-    return pd.Series(result, index=table.index, dtype=object)
-
-
-def _optional(table: pd.DataFrame, column: str, where: str) -> pd.Series:
-    """Return a column of True and False as bool; None where it is empty or absent."""
-    result = pd.Series(None, index=table.index, dtype=object)
-    if column not in table.columns:
-        return result
-    words = _text(table[column])
-    given = words != ""
-    result[given] = as_booleans(words[given], where).tolist()
+def _known_flags(values: pd.Series | None, index: pd.Index) -> pd.Series:
+    """Return True, False, or None where nothing is known."""
+    result = pd.Series(None, index=index, dtype=object)
+    if values is not None:
+        known = values.notna()
+        result[known] = [bool(value) for value in values[known]]
     return result
 
 
+def _scenarios(given: pd.Series, stimulus: pd.Series) -> pd.Series:
+    """Return the scenario of each row by its stimulus, else as it was given, else None."""
+    known = {*SCENARIOS, *OFFICIAL_SCENARIOS}
+    result = [
+        scenario_of(name) or (scenario_name(said) if said.lower() in known else None)
+        for name, said in zip(stimulus, given, strict=True)
+    ]
+    return pd.Series(result, index=stimulus.index, dtype=object)
+
+
 def _relative(trained: pd.Series, scenario: pd.Series) -> pd.Series:
-    """Return ``same`` if the training scenario is the tested one; all else is unchanged.
+    """Return `ONLY` if the training scenario is the tested one, and `ALL_BUT` where it is left out.
 
     Otherwise a model trained on each scenario in turn would count as eight models. An absent
     training scenario stays absent, even for a stimulus of unknown scenario.
     """
     ours = trained.map(lambda name: OFFICIAL_SCENARIOS.get(name.lower(), name.lower()))
     left_out = trained.str.lower().str.startswith(("all_but", "no_"))
-    relative = trained.where((trained == "") | (ours != scenario.fillna("")), "same")
-    return relative.where(~left_out, "all but this")
+    relative = trained.where((trained == "") | (ours != scenario.fillna("")), ONLY)
+    return relative.where(~left_out, ALL_BUT)
 
 
 # Accuracy of people for each stimulus, from the official tables.
@@ -420,17 +594,24 @@ def _choose_look(table: pd.DataFrame, dominoes: DominoesLook, folder: Path) -> p
     return table[~in_dominoes | wanted].drop(columns="redyellow")
 
 
-def read_labels(path: Path) -> dict[str, bool]:
-    """Read the official outcome by canonical stimulus from ``stimulus_names_and_labels.csv``.
+LABELS: tuple[Column, ...] = (
+    must("stimulus", "text", "Name of the trial", also=("stim_ID",)),
+    must("contact", "flag", "Do agent and patient touch?", also=("label", "outcome")),
+)
+"""One row per stimulus; the other headers are those of the official file."""
 
-    Not from ``readout_labels.csv``, which is about the trials on which readouts are trained; some
-    of these have the names of test trials. Raises `BadInputError`.
+
+def read_labels(path: Path) -> dict[str, bool]:
+    """Read the outcome by canonical stimulus from a table of `LABELS`.
+
+    Such are the official ``stimulus_names_and_labels.csv`` and the package's ``labels.csv``, but
+    not ``readout_labels.csv``, which is about the trials on which readouts are trained; some of
+    these have the names of test trials. Raises `BadInputError`.
     """
-    raw = read_csv(path, ("stim_ID", "label"))
-    names = raw["stim_ID"].map(canonical_name)
+    rows = check_table(read_csv(path), LABELS, str(path))
+    names = rows["stimulus"].map(canonical_name)
     refuse_duplicates(names, str(path))
-    outcomes = as_booleans(raw["label"], str(path))
-    return {str(name): bool(value) for name, value in zip(names, outcomes, strict=True)}
+    return {str(name): bool(value) for name, value in zip(names, rows["contact"], strict=True)}
 
 
 def read_human_zone(path: Path) -> pd.DataFrame:

@@ -18,13 +18,11 @@ import pandas as pd
 from PIL import Image
 
 from physion.analysis.comparison import Comparison
-from physion.analysis.tables import DATASETS, PROTOCOLS, in_order
+from physion.analysis.tables import in_order
 from physion.core.errors import BadInputError
 from physion.core.names import canonical_name
 from physion.core.version import MADE_WITH
 from physion.scenes.scene import OBSERVED_FRAMES
-
-_RELATIVE = re.compile(rf"( · (?:{'|'.join(DATASETS)}) )(same|all but this)\b", re.IGNORECASE)
 
 
 def plural(count: int, noun: str) -> str:
@@ -50,13 +48,8 @@ def number(value: float, digits: int = 2) -> str:
 
 
 def protocol_names(text: str) -> str:
-    """Return ``text`` with training protocols called *all-but* and *only*.
-
-    Tables of the analysis hold the column and value of the predictions, such as *dynamics training
-    dataset same*. The column is removed only for the dynamics; for other parts it stays.
-    """
-    short = _RELATIVE.sub(lambda match: match[1] + PROTOCOLS[match[2]], text)
-    return short.replace(" · dynamics training dataset ", " · ")
+    """Return ``text``; names of training protocols need no replacement any more."""
+    return text
 
 
 # Frame of a page that needs no network, no script and no other file.

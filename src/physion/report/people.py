@@ -13,8 +13,7 @@ from physion.analysis.intervals import Bootstrap
 from physion.analysis.metrics import measure_metrics
 from physion.analysis.people.effects import HYPOTHESES, below_chance_level
 from physion.analysis.people.exclusions import RULES, ExclusionRules, Expected, streak_limit
-from physion.analysis.people.responses import ParticipantsKind as Kind
-from physion.analysis.people.responses import check_labels, keep_where
+from physion.analysis.people.responses import Participants, check_labels, keep_where
 from physion.analysis.people.results import (
     PeopleResults,
     analyse_people,
@@ -65,7 +64,7 @@ def people_from_files(
     *,
     expected: Expected | None = None,
     accept_rules: Collection[str] = (),
-    participants: Kind = "people",
+    participants: Participants = "people",
     attributes: pd.DataFrame | None = None,
     where: Sequence[str] = (),
 ) -> PeopleResults:

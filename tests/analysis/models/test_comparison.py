@@ -383,8 +383,8 @@ def test_readout_letters_get_their_names_and_seeds_tell_models_apart() -> None:
     alone = predictions(people, readout="A", **{"Dynamics Training Seed": 1.0})
     named = name_models(check_predictions(pd.concat([one, two, alone])))
     assert list(named["model"].unique()) == [
-        "m · observed+simulated · dynamics training seed 0",
-        "m · observed+simulated · dynamics training seed 1",
+        "m · observed+simulated · seed 0",
+        "m · observed+simulated · seed 1",
         "m · full",
     ]
 
@@ -400,8 +400,7 @@ def test_training_on_each_scenario_in_turn_is_one_model(spelling: str) -> None:
     found = compare_scores(
         pd.concat([same, others, everything]), people, labels(people), bootstrap=QUICK
     )
-    suffixes = [model.rsplit("dataset ")[1] for model in found.names]
-    assert suffixes == ["same", "all but this", "all"]
+    assert [name.rsplit(" · ")[-1] for name in found.names] == ["only", "all-but", "all"]
 
 
 def test_a_stray_stimulus_does_not_split_a_model() -> None:
@@ -419,8 +418,8 @@ def test_a_stray_stimulus_does_not_split_a_model() -> None:
         ("Predicted Prob_true", 1.5, "row 1 of column 'Predicted Prob_true'"),
         ("Predicted Prob_true", float("nan"), "row 1 of column 'Predicted Prob_true'"),
         ("Predicted Outcome", "perhaps", "expected True or False"),
-        ("Model", "", "names no model"),
-        ("Stimulus Name", " ", "no stimulus"),
+        ("Model", "", "row 1 of column 'Model'.*expected a value"),
+        ("Stimulus Name", " ", "row 1 of column 'Stimulus Name'.*expected a value"),
     ],
 )
 def test_bad_predictions_are_refused(column: str, value: object, message: str) -> None:
@@ -436,10 +435,38 @@ def test_contradictions_are_refused() -> None:
     with pytest.raises(BadInputError, match="twice"):
         compare_scores(pd.concat([given, given]), people, labels(people))
     other = predictions(people, "other", changed=(people["stimulus"].iloc[0],))
-    with pytest.raises(BadInputError, match="different outcomes"):
-        compare_scores(pd.concat([given, other]), people, labels(people))
-    with pytest.raises(BadInputError, match=r"lacks the column\(s\) Actual Outcome"):
-        compare_scores(given.drop(columns="Actual Outcome"), people, labels(people))
+    with pytest.raises(BadInputError, match="different outcomes, and no official outcome"):
+        compare_scores(pd.concat([given, other]), None)
+    with pytest.raises(BadInputError, match=r"lacks the column\(s\) p_contact or Predicted Prob"):
+        compare_scores(given.drop(columns="Predicted Prob_true"), people, labels(people))
+
+
+def test_the_official_outcome_decides_where_simulated_ones_differ() -> None:
+    people = humans()
+    name = people["stimulus"].iloc[0]
+    plain, other = predictions(people), predictions(people, "other", changed=(name,))
+    found = compare_scores(pd.concat([plain, other]), people, labels(people), bootstrap=QUICK)
+    assert list(found.changed["stimulus"]) == [name]
+    assert list(found.changed["models"]) == ["other · observed"]
+    stimuli = found.stimuli[found.stimuli["stimulus"] == name].set_index("base_model")
+    assert set(stimuli["label"]) == {labels(people)[name]}
+    assert stimuli.loc["m", "simulated"] != stimuli.loc["other", "simulated"]
+    alone = compare_scores(plain, people, labels(people), bootstrap=QUICK).scores
+    own = found.scores[found.scores["base_model"] == "m"]
+    pd.testing.assert_frame_equal(own, alone)
+
+
+def test_stimulus_and_probability_are_enough() -> None:
+    people = humans()
+    given = predictions(people)
+    short = given[["Stimulus Name", "Predicted Prob_true"]].set_axis(["stimulus", "p"], axis=1)
+    found = compare_scores(short, people, labels(people), bootstrap=QUICK)
+    assert found.names == ["model"] and len(found.stimuli) == len(people)
+    whole = compare_scores(given.assign(**{"Predicted Outcome": given["Predicted Prob_true"] > 0.5,
+        "Actual Outcome": given["Stimulus Name"].map(labels(people))}), people, labels(people),
+        bootstrap=QUICK)  # fmt: skip
+    columns = ["scenario", "accuracy", "r", "kappa_from_averages", "rmsd", "r_low"]
+    pd.testing.assert_frame_equal(found.scores[columns], whole.scores[columns])
 
 
 def test_predictions_survive_their_files(tmp_path: Path) -> None:
@@ -451,6 +478,9 @@ def test_predictions_survive_their_files(tmp_path: Path) -> None:
     direct = compare_scores(pd.concat(tables), people, labels(people), bootstrap=QUICK).scores
     read = compare_scores(read_predictions(paths), people, labels(people), bootstrap=QUICK).scores
     pd.testing.assert_frame_equal(direct, read)
+    tables[0][["Stimulus Name", "Predicted Prob_true"]].to_csv(paths[0], index=False, sep=";")
+    with pytest.raises(BadInputError, match=r"a\.csv separates its columns with semicolons"):
+        read_predictions(paths)
     with pytest.raises(BadInputError, match="no file"):
         read_predictions([])
     with pytest.raises(BadInputError, match="not a file"):

@@ -57,7 +57,7 @@ def test_an_outcome_against_its_probability_is_told() -> None:
     table.loc[[4, 9], "Predicted Prob_true"] = 1 - table.loc[[4, 9], "Predicted Prob_true"]
     (warning,) = warnings_of(table)
     assert "m · observed+simulated" in warning and f"{STEM}_0004" in warning
-    assert "contradicts Predicted Prob_true in 2 of 30 rows" in warning
+    assert "contradicts p_contact in 2 of 30 rows" in warning
     # Another threshold contradicts as well, but is no mistake.
     p = np.where(predictions()["Predicted Outcome"], 0.95, 0.7)
     (warning,) = warnings_of(predictions().assign(**{"Predicted Prob_true": p}))

@@ -11,7 +11,7 @@ import pytest
 from physion.analysis.rollout_errors import (
     COLUMNS,
     CONSTANT_VELOCITY,
-    REQUIRED,
+    ERRORS,
     read_rollout_errors,
     rollout_error_table,
 )
@@ -28,7 +28,7 @@ def errors_of(model: str, speeds: dict[str, list[float]], baseline: float = 0.02
         for trial, speed in enumerate(values)
         for frame in FRAMES
     ]
-    return pd.DataFrame(rows, columns=list(REQUIRED))
+    return pd.DataFrame(rows, columns=[column.name for column in ERRORS])
 
 
 def write(path: Path, table: pd.DataFrame) -> Path:
@@ -89,11 +89,11 @@ def test_one_model_in_several_files_is_named_with_each(tmp_path: Path) -> None:
 
 def test_other_tables_are_refused(tmp_path: Path) -> None:
     table = errors_of("sim", {"drop": [0.1]})
-    with pytest.raises(BadInputError, match=r"lacks the column\(s\) Error"):
-        read_rollout_errors([write(tmp_path / "a.csv", table.drop(columns="Error"))])
+    with pytest.raises(BadInputError, match=r"lacks the column\(s\) error"):
+        read_rollout_errors([write(tmp_path / "a.csv", table.drop(columns="error"))])
     twice = pd.concat([table, table.iloc[1:2]])
     with pytest.raises(BadInputError, match="row 4 repeats a model, stimulus and frame: 'drop_0'"):
         read_rollout_errors([write(tmp_path / "b.csv", twice)])
-    table["Error"] = ["0.1", "far", "0.2"]
-    with pytest.raises(BadInputError, match="row 2 of column 'Error' holds 'far'"):
+    table["error"] = ["0.1", "far", "0.2"]
+    with pytest.raises(BadInputError, match="row 2 of column 'error' holds 'far'"):
         read_rollout_errors([write(tmp_path / "c.csv", table)])

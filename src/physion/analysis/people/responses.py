@@ -9,20 +9,23 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from physion.analysis.tables import Column as Column
+from physion.analysis.tables import check_table as check_table
+from physion.analysis.tables import data_dictionary as data_dictionary
 from physion.analysis.tables import (
     in_order,
+    must,
     read_csv,
     read_table,
     refuse_duplicates,
-    require_columns,
 )
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.names import OFFICIAL_SCENARIOS, canonical_name, is_ledge, scenario_of
@@ -34,45 +37,17 @@ from physion.core.names import OFFICIAL_SCENARIOS, canonical_name, is_ledge, sce
 # dictionary with `data_dictionary`; the analysis refuses a file that violates them and names the
 # row.
 
-Kind = Literal["text", "integer", "number", "flag", "choice", "time"]
-"""``text``; whole or any ``number``; ``flag``: True or False; ``choice``: one of ``choices``;
-``time``: a moment in ISO 8601 with its offset from UTC."""
-
-
-@dataclass(frozen=True)
-class Column:
-    """A column of participant-level data: its meaning and its allowed values.
-
-    ``required``: the column must exist. ``may_be_empty``: a cell may be empty (unknown). The bounds
-    ``low`` and ``high`` are inclusive and in ``unit``.
-    """
-
-    name: str
-    kind: Kind
-    about: str
-    unit: str = ""
-    low: float | None = None
-    high: float | None = None
-    choices: tuple[str, ...] = ()
-    required: bool = False
-    may_be_empty: bool = True
-
-
 PHASES = ("familiarization", "test")
 DAY_MS = 86_400_000.0
 
 
-def _must(name: str, kind: Kind, about: str, **rest: Any) -> Column:
-    return Column(name, kind, about, required=True, may_be_empty=False, **rest)
-
-
 TRIAL_COLUMNS: tuple[Column, ...] = (
-    _must("participant", "text", "Keyed hash of the participant's id; never the id itself"),
-    _must("session", "text", "One run through the experiment by one participant, unique"),
-    _must("scenario", "text", "Scenario of the trial"),
-    _must("stimulus", "text", "Name of the trial that was shown"),
-    _must("phase", "choice", "With feedback (familiarization) or without (test)", choices=PHASES),
-    _must(
+    must("participant", "text", "Keyed hash of the participant's id; never the id itself"),
+    must("session", "text", "One run through the experiment by one participant, unique"),
+    must("scenario", "text", "Scenario of the trial"),
+    must("stimulus", "text", "Name of the trial that was shown"),
+    must("phase", "choice", "With feedback (familiarization) or without (test)", choices=PHASES),
+    must(
         "trial",
         "integer",
         "Place in the order of its phase in the session, from 0; attention "
@@ -86,8 +61,8 @@ TRIAL_COLUMNS: tuple[Column, ...] = (
         choices=("yes", "no"),
         required=True,
     ),
-    _must("label", "flag", "Does the agent touch the patient?"),
-    _must("simulated", "flag", "Made by a program for piloting: no person"),
+    must("label", "flag", "Does the agent touch the patient?"),
+    must("simulated", "flag", "Made by a program for piloting: no person"),
     Column(
         "rt_ms",
         "number",
@@ -146,11 +121,11 @@ TRIAL_COLUMNS: tuple[Column, ...] = (
 """One row a participant and trial."""
 
 SESSION_COLUMNS: tuple[Column, ...] = (
-    _must("participant", "text", "As in the trials"),
-    _must("session", "text", "As in the trials; unique here"),
-    _must("scenario", "text", "Scenario of the session; several, one block each, in the order "
+    must("participant", "text", "As in the trials"),
+    must("session", "text", "As in the trials; unique here"),
+    must("scenario", "text", "Scenario of the session; several, one block each, in the order "
           "shown and separated by spaces"),
-    _must("simulated", "flag", "As in the trials"),
+    must("simulated", "flag", "As in the trials"),
     Column("study", "text", "Name and version of the study"),
     Column("recruited_by", "text", "Where the participant came from"),
     Column("started_at", "time", "When the session began"),
@@ -196,83 +171,8 @@ SESSION_COLUMNS: tuple[Column, ...] = (
 """One row a session; demographics are asked at its end, so that they are empty in broken ones."""
 
 
-def data_dictionary(columns: Sequence[Column]) -> list[dict[str, Any]]:
-    """Return the columns as plain values for JSON: name, kind, about, unit, low, high, choices,
-    ...
-    """
-    return [{**asdict(column), "choices": list(column.choices)} for column in columns]
-
-
-def check_table(table: pd.DataFrame, columns: Sequence[Column], where: str) -> pd.DataFrame:
-    """Return ``table`` with the types of its ``columns``; columns not in the schema are dropped.
-
-    Cells may be text, as from CSV, or typed, as from parquet. Resulting types: str for text, choice
-    and time (empty if unknown), Int64 for integer, float64 (NaN) for number, boolean for flag (bool
-    if no cell may be empty). An optional column that is absent stays absent. Raises `BadInputError`
-    for a missing column or the first invalid cell.
-    """
-    require_columns(table, [column.name for column in columns if column.required], where)
-    present = [column for column in columns if column.name in table.columns]
-    typed = {column.name: _typed(table[column.name], column, where) for column in present}
-    return pd.DataFrame(typed, index=table.index).reset_index(drop=True)
-
-
-def _typed(values: pd.Series, column: Column, where: str) -> pd.Series:
-    text = values.astype(object).where(values.notna(), "").astype(str).str.strip()
-    empty = text == ""
-    if not column.may_be_empty:
-        _refuse(empty, text, column, where, "a value")
-    match column.kind:
-        case "integer" | "number":
-            return _numbers(text, empty, column, where)
-        case "flag":
-            return _flags(text, empty, column, where)
-        case "choice":
-            text = text.str.lower()
-            bad = ~empty & ~text.isin(column.choices)
-            _refuse(bad, text, column, where, " or ".join(column.choices))
-        case "time":
-            moments = pd.to_datetime(
-                text.where(~empty), errors="coerce", utc=True, format="ISO8601"
-            )
-            _refuse(~empty & moments.isna(), text, column, where, "a time in ISO 8601")
-        case "text":
-            pass
-    return text
-
-
-def _numbers(text: pd.Series, empty: pd.Series, column: Column, where: str) -> pd.Series:
-    numbers = pd.to_numeric(text.where(~empty), errors="coerce").astype(np.float64)
-    low = -np.inf if column.low is None else column.low
-    high = np.inf if column.high is None else column.high
-    good = np.isfinite(numbers) & (numbers >= low) & (numbers <= high)
-    whole = column.kind == "integer"
-    if whole:
-        good &= numbers == np.floor(numbers)
-    expected = f"a {'whole ' if whole else ''}number from {low:g} to {high:g}"
-    _refuse(~empty & ~good, text, column, where, expected)
-    return numbers.astype("Int64") if whole else numbers
-
-
-def _flags(text: pd.Series, empty: pd.Series, column: Column, where: str) -> pd.Series:
-    words = {"true": True, "1": True, "1.0": True, "yes": True}
-    words |= {"false": False, "0": False, "0.0": False, "no": False}
-    flags = text.str.lower().map(words)
-    _refuse(~empty & flags.isna(), text, column, where, "True or False")
-    return flags.astype("boolean") if column.may_be_empty else flags.astype(bool)
-
-
-def _refuse(bad: pd.Series, text: pd.Series, column: Column, where: str, expected: str) -> None:
-    if bad.any():
-        row = int(np.flatnonzero(bad)[0])
-        raise BadInputError(
-            f"{where}: row {row + 1} of column {column.name!r} holds {text.iloc[row][:80]!r}; "
-            f"expected {expected}"
-        )
-
-
 Refuse = Literal["refuse", "drop"]
-ParticipantsKind = Literal["people", "simulated", "all"]
+Participants = Literal["people", "simulated", "all"]
 """Whose sessions are kept: those of people, of simulated participants, or of both."""
 
 NO_ANSWER = "no answer was given"
@@ -362,7 +262,7 @@ def read_responses(
     known: Collection[str] | None = None,
     unknown: Refuse = "refuse",
     conflicts: Refuse = "refuse",
-    participants: ParticipantsKind = "people",
+    participants: Participants = "people",
 ) -> Responses:
     """Read the responses of our experiment's export.
 
@@ -394,7 +294,7 @@ def read_responses(
     return _of_kind(cleaned, participants, str(trials))
 
 
-def _of_kind(cleaned: Responses, kind: ParticipantsKind, where: str) -> Responses:
+def _of_kind(cleaned: Responses, kind: Participants, where: str) -> Responses:
     """Return the sessions of one kind of participants; `BadInputError` if there is none."""
     if kind == "all":
         return cleaned
@@ -736,7 +636,7 @@ def _buttons(choices: str) -> str:
 
 # Choose the sessions to analyse by the values of their columns, such as ``condition=fast``.
 
-SELECT_SESSIONS_COLUMNS = (
+CHOSEN_BY = (
     "condition",
     "language",
     "recruited_by",
@@ -764,7 +664,7 @@ def keep_where(responses: Responses, chosen: Sequence[str]) -> Responses:
     BadInputError
         A text has no ``=``, the responses lack the column, or no session has such a value.
     UnknownNameError
-        The column is not in `COLUMNS`.
+        The column is not in `CHOSEN_BY`.
     """
     wanted: dict[str, set[str]] = {}
     for text in chosen:
@@ -773,8 +673,8 @@ def keep_where(responses: Responses, chosen: Sequence[str]) -> Responses:
             raise BadInputError(
                 f"--where {text}: give a column and a value, such as condition=fast"
             )
-        if column not in SELECT_SESSIONS_COLUMNS:
-            raise UnknownNameError("column of sessions", column, SELECT_SESSIONS_COLUMNS)
+        if column not in CHOSEN_BY:
+            raise UnknownNameError("column of sessions", column, CHOSEN_BY)
         wanted.setdefault(column, set()).add(value)
     for column, values in wanted.items():
         found = _values(responses, column)

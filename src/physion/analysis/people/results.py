@@ -45,12 +45,12 @@ from physion.analysis.people.measures import (
 )
 from physion.analysis.people.responses import (
     REHEARSAL,
+    Participants,
     Responses,
     missing_times,
     read_official_responses,
     read_responses,
 )
-from physion.analysis.people.responses import ParticipantsKind as Kind
 from physion.analysis.tables import (
     ATTRIBUTES,
     attributes_from_names,
@@ -115,7 +115,7 @@ class PeopleResults:
 
 
 def read_any_responses(
-    files: Sequence[Path], sessions: Path | None = None, participants: Kind = "people"
+    files: Sequence[Path], sessions: Path | None = None, participants: Participants = "people"
 ) -> Responses:
     """Read the export of our experiment (one file), or raw files of the original study.
 

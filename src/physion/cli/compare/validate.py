@@ -45,7 +45,7 @@ class Options:
 
 def main(options: Options) -> int:
     """Print the faults; return 1 if one of them is an error."""
-    from physion.analysis.check import validate
+    from physion.analysis.check import check_predictions_file
     from physion.core.errors import BadInputError
 
     if not options.predictions and not options.responses:
@@ -57,7 +57,7 @@ def main(options: Options) -> int:
         found.append(checked)
         if reference.labels is None and outcomes:
             reference = replace(reference, labels=outcomes)
-    found += [validate(path, reference) for path in options.predictions]
+    found += [check_predictions_file(path, reference) for path in options.predictions]
     if options.json:
         print(json_module.dumps([{**asdict(each), "errors": each.errors} for each in found]))
     else:
