@@ -26,7 +26,7 @@ from physion.analysis.scores import COMPUTED
 from physion.analysis.tables import MEAN
 from physion.core.names import SCENARIOS
 from physion.report import html as blocks
-from physion.report import scores
+from physion.report import people, scores
 from physion.report.figures import theme
 from physion.report.figures.by_scenario import measure_figure
 from physion.report.figures.by_stimulus import SQUARE, difficulty_figure, scatter_figure
@@ -301,7 +301,7 @@ def test_counts_and_gaps_are_written_in_one_way(make_comparison: Maker) -> None:
     column = blocks.PageColumn("rows", "rows", "count")
     assert column.cell(pd.Series({"rows": 120000})) == "120000"
     comparison = make_comparison()
-    assert "–" not in blocks.people(comparison) + scores.matrix(comparison, "r")
+    assert "–" not in people.averages(comparison) + scores.matrix(comparison, "r")
 
 
 def test_models_are_held_against_the_first_in_the_files(make_comparison: Maker) -> None:

@@ -209,7 +209,7 @@ def test_movies_play_without_sound_and_with_controls(movie: Path) -> None:
     html = PageMovies({"s": movie}, 1_000_000).show("s", 'a "movie"')
     for word in ("autoplay", "controls", "loop", "muted", "playsinline", 'preload="none"'):
         assert word in html
-    assert 'aria-label="a &quot;movie&quot;"' in html and 'poster="data:image/jpeg' in html
+    assert 'aria-label="a &#34;movie&#34;"' in html and 'poster="data:image/jpeg' in html
     data = html.partition(PREFIX)[2].partition('"')[0]
     assert base64.b64decode(data) == movie.read_bytes()
 

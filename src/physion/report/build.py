@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from html import escape
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +29,6 @@ from physion.analysis.tables import (
 from physion.core.errors import BadInputError
 from physion.core.files import write_atomic
 from physion.core.version import MADE_WITH
-from physion.report import html as blocks
-from physion.report import people as people_blocks
-from physion.report import people as session_blocks
 from physion.report.figures import theme
 from physion.report.figures.by_stimulus import CAPTION as DIFFICULTY
 from physion.report.figures.by_stimulus import RESPONSE_TIME_CAPTION as RESPONSE_TIME
@@ -40,15 +36,11 @@ from physion.report.figures.by_stimulus import difficulty_figure, response_time_
 from physion.report.figures.theme import Plot, make_plots
 from physion.report.html import (
     Picture,
-    Section,
     check_movies,
-    figure,
     page_kind,
-    plural,
-    render_document,
 )
-from physion.report.inputs import ReportInputs
-from physion.report.page import render_page
+from physion.report.inputs import PeopleReport, ReportInputs
+from physion.report.page import people_methods, render_page, render_people_page
 from physion.report.people import (
     describe_attributes,
     describe_expected,
@@ -105,27 +97,6 @@ def mark_rehearsal(table: pd.DataFrame) -> pd.DataFrame:
     return table.assign(rehearsal="simulated participants")
 
 
-# Report about people alone, without predictions: page, tables and figures.
-
-TITLE = "People on physical prediction"
-
-
-@dataclass(frozen=True)
-class PeopleReport:
-    """Results about people with the settings of the page.
-
-    - ``people``: every analysis of them.
-    - ``methods``: settings made outside the analysis, as text.
-    - ``movies``: movie by stimulus, to which the page links.
-    - ``title``: the heading.
-    """
-
-    people: PeopleResults
-    methods: Mapping[str, str] = field(default_factory=dict)
-    movies: Mapping[str, Path] = field(default_factory=dict)
-    title: str = TITLE
-
-
 def build_people_report(report: PeopleReport, folder: Path) -> Path:
     """Write ``report.html``, ``report.json``, ``tables/*.csv`` and ``figures/*``; return the page.
 
@@ -143,7 +114,7 @@ def build_people_report(report: PeopleReport, folder: Path) -> Path:
     }
     shown = [write_plot(plot, pictures, rehearsal) for plot in people_plots(report.people)]
     warnings = list(report.people.warnings)
-    methods = _methods(report)
+    methods = people_methods(report)
     content = {"package": MADE_WITH, "methods": methods, "warnings": warnings, **numbers}
     text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
     write_atomic(folder / "report.json", f"{text}\n".encode())
@@ -163,45 +134,6 @@ def people_plots(people: PeopleResults) -> list[Plot]:
         plots.append(Plot("response_time", RESPONSE_TIME, times, response_time_figure))
     return plots
 
-
-def render_people_page(report: PeopleReport, pictures: Sequence[Picture], folder: Path) -> str:
-    """Return the page as text; ``folder``: its folder, for relative links to movies."""
-    people = report.people
-    shown = "\n".join(figure(picture) for picture in pictures)
-    links = blocks.relative_links(report.movies, folder)
-    sections = [
-        Section("People", people_blocks.people_alone(people)),
-        Section(
-            "Stimulus by stimulus",
-            shown + people_blocks.fooled_by(people.tables["by_stimulus"], links),
-        ),
-        Section("Sessions left out", session_blocks.sessions_alone(people)),
-        Section("How this was made", blocks.definition_list(_methods(report))),
-        Section("What was left out", session_blocks.dropped(people)),
-    ]
-    return render_document(report.title, _summary(people), sections, people.mark)
-
-
-def _summary(people: PeopleResults) -> str:
-    """Return the sentences at the top of the page."""
-    flags, test = people.tables["flags"], people.kept.test
-    scenarios = in_order(test["scenario"])
-    words = (
-        f"{plural(test['participant'].nunique(), 'participant')} on "
-        f"{plural(test['stimulus'].nunique(), 'stimulus')} of "
-        f"{plural(len(scenarios), 'scenario')} ({', '.join(scenarios)}). No predictions were "
-        f"given. Flagged and left out: {int(flags['flagged'].sum())} of "
-        f"{plural(len(flags), 'session')}; the main results are given with them too."
-    )
-    warned = blocks.warnings(people.warnings, people.mark)
-    return f'{warned}<p class="lead">{escape(words)}</p>'
-
-
-def _methods(report: PeopleReport) -> dict[str, str]:
-    return {**report.methods, **session_blocks.rules_text(report.people)}
-
-
-# Writers of a report, from a comparison or from files: a folder with page, tables and figures.
 
 ZONE_FILE = "human_accuracy_by_scenario.csv"
 

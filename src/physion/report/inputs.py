@@ -10,6 +10,7 @@ from typing import Any
 import pandas as pd
 
 from physion.analysis.compare import ComparisonResults
+from physion.analysis.people.results import PeopleResults
 
 EXPECTED_METHODS = ("Engine", "Renderer", "Readout", "Encoder weights", "Noise of the simulation")
 """Settings made outside the analysis; those that the caller omits are printed as not stated."""
@@ -97,3 +98,19 @@ class ReportInputs(ComparisonResults):
         table = scores.copy()
         table.insert(list(table.columns).index("readout") + 1, "init", init)
         return table
+
+
+@dataclass(frozen=True)
+class PeopleReport:
+    """Results about people with the settings of their page, which needs no predictions.
+
+    - ``people``: every analysis of them.
+    - ``methods``: settings made outside the analysis, as text.
+    - ``movies``: movie by stimulus, to which the page links.
+    - ``title``: the heading.
+    """
+
+    people: PeopleResults
+    methods: Mapping[str, str] = field(default_factory=dict)
+    movies: Mapping[str, Path] = field(default_factory=dict)
+    title: str = "People on physical prediction"

@@ -1,28 +1,28 @@
-"""Page of a comparison of models with people, with all settings, tests and counts."""
+"""The two pages of a report: a comparison of models with people, and people without models."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
 
+from physion.analysis.people.results import PeopleResults
 from physion.analysis.tables import MEAN, in_order
-from physion.report import html as blocks
-from physion.report import people as people_blocks
-from physion.report import people as session_blocks
-from physion.report import scores
-from physion.report import scores as tests_of_models
+from physion.core.html import Markup, joined
+from physion.report import html, scores
+from physion.report import people as people_parts
 from physion.report.figures.theme import BY_SCENARIO, BY_STIMULUS, TRAINING, all_figures
 from physion.report.html import (
     PageMovies,
     Picture,
     Section,
     figure,
+    heading,
+    notes,
+    paragraph,
     plural,
-    protocol_names,
     render_document,
 )
-from physion.report.inputs import EXPECTED_METHODS, ReportInputs
+from physion.report.inputs import EXPECTED_METHODS, PeopleReport, ReportInputs
 from physion.report.scores import inputs_sentence, weights_sentence
 from physion.report.trials import FOLDER, gaps, opening, page_name
 
@@ -43,11 +43,11 @@ def render_page(
         Section(BY_SCENARIO, _by_scenario(inputs, shown)),
         Section(TRAINING, _figures(TRAINING, shown, {})),
         Section(BY_STIMULUS, _stimuli(inputs, shown, links)),
-        Section(DISAGREE, ""),
-        Section("People", people_blocks.people(inputs, shown)),
-        Section("Sessions left out", session_blocks.sessions(inputs)),
-        Section("Tests", tests_of_models.tests(inputs)),
-        Section("Trials whose simulated outcome differs", blocks.changed(inputs.comparison, links)),
+        Section(DISAGREE, Markup()),
+        Section("People", people_parts.people(inputs, shown)),
+        Section("Sessions left out", people_parts.sessions(inputs)),
+        Section("Tests", scores.tests(inputs)),
+        Section("Trials whose simulated outcome differs", scores.changed(inputs.comparison, links)),
         Section("How this was made", _methods(inputs)),
         Section("What was left out", _left_out(inputs)),
     ]
@@ -60,8 +60,7 @@ def render_page(
     left = inputs.page_bytes - _FRAME_BYTES - sum(len(text.encode()) for text in texts)
     sections = _with_trials(inputs, sections, PageMovies(inputs.movies, left), links)
     filled = [one for one in sections if one.content]
-    page = render_document(inputs.title, lead, filled, inputs.mark)
-    return protocol_names(page)  # here, so that all tables and captions use the same names
+    return render_document(inputs.title, lead, filled, inputs.mark)
 
 
 OPENING = "One trial of each scenario"
@@ -84,10 +83,10 @@ def _links(inputs: ReportInputs, folder: Path | None) -> Mapping[str, str]:
     if inputs.trial_pages:
         names = inputs.comparison.stimuli["stimulus"].unique()
         return {name: f"{FOLDER}/{page_name(name)}" for name in names}
-    return {} if folder is None else blocks.relative_links(inputs.movies, folder)
+    return {} if folder is None else html.relative_links(inputs.movies, folder)
 
 
-def _summary(inputs: ReportInputs) -> str:
+def _summary(inputs: ReportInputs) -> Markup:
     comparison = inputs.comparison
     stimuli = comparison.stimuli["stimulus"].nunique()
     scenarios = in_order(comparison.stimuli["scenario"])
@@ -117,59 +116,55 @@ def _summary(inputs: ReportInputs) -> str:
             "official one; accuracy is given against both."
         )
     given = f"{inputs_sentence(inputs)} {weights_sentence(inputs)}".strip()
-    more = f'<p class="given">{escape(given)}</p>' if given else ""
-    warned = blocks.warnings(inputs.warnings, inputs.mark)
-    return f'{warned}<p class="lead">{escape(" ".join(words))}</p>{more}'
+    more = paragraph(given, "given") if given else Markup()
+    warned = html.warnings(inputs.warnings, inputs.mark)
+    return joined([warned, paragraph(" ".join(words), "lead"), more])
 
 
-def _figures(section: str, shown: Mapping[str, str], below: Mapping[str, str]) -> str:
-    """Return the figures of a section with their headings; ``below``: HTML below a figure."""
+def _figures(section: str, shown: Mapping[str, Markup], below: Mapping[str, Markup]) -> Markup:
+    """Return the figures of a section with headings; ``below``: what stands below them."""
     parts = []
     for entry in all_figures():
         if entry.section == section and entry.name in shown:
-            parts += [f"<h3>{escape(entry.heading)}</h3>"] if entry.heading else []
-            parts += [shown[entry.name], below.get(entry.name, "")]
-    return "\n".join(part for part in parts if part)
+            parts += [heading(entry.heading)] if entry.heading else []
+            parts += [shown[entry.name], below.get(entry.name, Markup())]
+    return joined(parts)
 
 
-def _by_scenario(inputs: ReportInputs, shown: Mapping[str, str]) -> str:
+def _by_scenario(inputs: ReportInputs, shown: Mapping[str, Markup]) -> Markup:
     comparison = inputs.comparison
     below = {
-        "accuracy": blocks.details("Accuracy as a table", scores.matrix(comparison, "accuracy")),
-        "kappa": people_blocks.measures(inputs),
+        "accuracy": html.details("Accuracy as a table", scores.matrix(comparison, "accuracy")),
+        "kappa": people_parts.measures(inputs),
     }
     if comparison.has_people:
-        below["r"] = blocks.details(
+        below["r"] = html.details(
             "Pearson r by scenario, as a table", scores.matrix(comparison, "r")
         )
     return _figures(BY_SCENARIO, shown, below)
 
 
-def _stimuli(inputs: ReportInputs, shown: Mapping[str, str], links: Mapping[str, str]) -> str:
-    below = {"calibration": tests_of_models.calibration(inputs)}
+def _stimuli(inputs: ReportInputs, shown: Mapping[str, Markup], links: Mapping[str, str]) -> Markup:
+    below = {"calibration": scores.calibration(inputs)}
     if inputs.comparison.has_people:
-        below["difficulty"] = people_blocks.fooled(inputs, links)
+        below["difficulty"] = people_parts.fooled(inputs, links)
     return _figures(BY_STIMULUS, shown, below)
 
 
-def _methods(inputs: ReportInputs) -> str:
+def _methods(inputs: ReportInputs) -> Markup:
     stated = dict.fromkeys(EXPECTED_METHODS, "not stated") | dict(inputs.methods)
-    choices = {**stated, **inputs.comparison.settings, **session_blocks.methods(inputs)}
-    return blocks.definition_list(choices) + scores.definitions(inputs.comparison)
+    choices = {**stated, **inputs.comparison.settings, **people_parts.methods(inputs)}
+    return html.definition_list(choices) + scores.definitions(inputs.comparison)
 
 
-def _left_out(inputs: ReportInputs) -> str:
-    parts = ["<h3>Stimuli</h3>", blocks.dropped(inputs.comparison)]
+def _left_out(inputs: ReportInputs) -> Markup:
+    parts = [heading("Stimuli"), scores.dropped(inputs.comparison)]
     if inputs.people is not None:
-        parts += ["<h3>Answers of people</h3>", session_blocks.dropped(inputs.people)]
+        parts += [heading("Answers of people"), people_parts.dropped(inputs.people)]
     missing = _unanswered(inputs)
     if missing:
-        items = "".join(f"<li>{escape(words)}</li>" for words in missing)
-        parts += [
-            "<h3>What cannot be said from these files</h3>",
-            f'<ul class="notes">{items}</ul>',
-        ]
-    return "\n".join(parts)
+        parts += [heading("What cannot be said from these files"), notes(missing)]
+    return joined(parts)
 
 
 def _unanswered(inputs: ReportInputs) -> list[str]:
@@ -195,3 +190,44 @@ def _unanswered(inputs: ReportInputs) -> list[str]:
             "of different stimuli; the paired tests use those that both answered."
         )
     return words
+
+
+# --- people without predictions ------------------------------------------------------------------
+
+
+def render_people_page(report: PeopleReport, pictures: Sequence[Picture], folder: Path) -> str:
+    """Return the page as text; ``folder``: its folder, for relative links to movies."""
+    people = report.people
+    shown = joined(figure(picture) for picture in pictures)
+    links = html.relative_links(report.movies, folder)
+    sections = [
+        Section("People", people_parts.people_alone(people)),
+        Section(
+            BY_STIMULUS,
+            shown + people_parts.fooled_by(people.tables["by_stimulus"], links),
+        ),
+        Section("Sessions left out", people_parts.sessions_alone(people)),
+        Section("How this was made", html.definition_list(people_methods(report))),
+        Section("What was left out", people_parts.dropped(people)),
+    ]
+    return render_document(report.title, _people_summary(people), sections, people.mark)
+
+
+def _people_summary(people: PeopleResults) -> Markup:
+    """Return the sentences at the top of the page."""
+    flags, test = people.tables["flags"], people.kept.test
+    scenarios = in_order(test["scenario"])
+    words = (
+        f"{plural(test['participant'].nunique(), 'participant')} on "
+        f"{plural(test['stimulus'].nunique(), 'stimulus')} of "
+        f"{plural(len(scenarios), 'scenario')} ({', '.join(scenarios)}). No predictions were "
+        f"given. Flagged and left out: {int(flags['flagged'].sum())} of "
+        f"{plural(len(flags), 'session')}; the main results are given with them too."
+    )
+    warned = html.warnings(people.warnings, people.mark)
+    return joined([warned, paragraph(words, "lead")])
+
+
+def people_methods(report: PeopleReport) -> dict[str, str]:
+    """Return the settings of the page, as text."""
+    return {**report.methods, **people_parts.rules_text(report.people)}

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from html import escape
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from physion.analysis.comparison import Comparison
 from physion.analysis.intervals import Bootstrap
 from physion.analysis.metrics import measure_metrics
 from physion.analysis.people.effects import HYPOTHESES, below_chance_level
@@ -22,19 +22,23 @@ from physion.analysis.people.results import (
 )
 from physion.analysis.scores import TWO_PEOPLE
 from physion.analysis.tables import MEAN, in_order, read_csv
+from physion.core.html import Markup, joined
 from physion.report.html import (
     BASELINES,
     PageColumn,
     details,
+    heading,
+    interval,
+    notes,
     number,
     paragraph,
     plural,
     rows_table,
+    spread,
     stimulus_link,
     table,
     undefined,
 )
-from physion.report.html import people as averages
 from physion.report.inputs import ReportInputs
 
 
@@ -132,44 +136,69 @@ def describe_attributes(people: PeopleResults) -> str:
 
 # Parts of the page about people: accuracy, agreement, biases, difficulty.
 
+_NO_ZONE = "known only of scenarios of which all stimuli that single participants saw are predicted"
+
+
+def averages(comparison: Comparison) -> Markup:
+    """Return the table of people by scenario."""
+    header = ["scenario", "stimuli", "people", "base rate", "say yes", "accuracy", "zone"]
+    rows = []
+    for _, row in comparison.people.assign(reason="").iterrows():
+        zone = f"{number(row['zone_low'])} to {number(row['zone_high'])}"
+        rows.append(
+            [
+                str(row["scenario"]),
+                str(row["stimuli"]),
+                number(row["people"], 0),
+                number(row["base_rate"]),
+                number(row["yes"]),
+                interval(row, "accuracy"),
+                zone if np.isfinite(row["zone_low"]) else undefined(_NO_ZONE),
+                number(row["reliability"], 3),
+                number(row["ceiling"], 3),
+            ]
+        )
+    return table([*header, "reliability", "ceiling of r"], rows, "People")
+
+
 MORE = "every scenario, and why an interval is missing, is in tables/measures.csv"
 
 
-def people(inputs: ReportInputs, shown: Mapping[str, str]) -> str:
+def people(inputs: ReportInputs, shown: Mapping[str, str]) -> Markup:
     """Return accuracy of and agreement among people."""
     if not inputs.comparison.has_people:
-        return ""
+        return Markup()
     parts = [averages(inputs.comparison)]
     if inputs.people is None:
-        return "".join(parts)
-    zones = "" if inputs.beside is None else _zones(inputs.beside.zones)
+        return joined(parts)
+    zones = Markup() if inputs.beside is None else _zones(inputs.beside.zones)
     on_predicted = averages(inputs.comparison)
-    return "\n".join([
+    return joined([
         people_alone(inputs.people, zones),
         details("People on the stimuli that any model predicts", on_predicted),
     ])  # fmt: skip
 
 
-def people_alone(people: PeopleResults, zones: str = "") -> str:
+def people_alone(people: PeopleResults, zones: str = "") -> Markup:
     """Return the parts that need no predictions; ``zones``: table of what single people reach."""
     tables = people.tables
-    return "\n".join([
+    return joined([
         _accuracy(tables),
         _conditions(tables),
         _agreement(tables),
         *([details("What single people reach", zones)] if zones else []),
-        "<h3>Inclinations, practice, background</h3>",
+        heading("Inclinations, practice, background"),
         _biases(tables),
-        "<h3>What makes a stimulus hard</h3>",
+        heading("What makes a stimulus hard"),
         _hypotheses(people),
         details("Stimuli as items of a test", _items(tables["items"])),
     ])  # fmt: skip
 
 
-def _conditions(tables: Mapping[str, pd.DataFrame]) -> str:
+def _conditions(tables: Mapping[str, pd.DataFrame]) -> Markup:
     """Return the table of between-subject conditions, or nothing without any."""
     if tables["by_condition"].empty:
-        return ""
+        return Markup()
     columns = [
         PageColumn("condition", "condition", "text"),
         PageColumn("scenario", "scenario", "text"),
@@ -181,7 +210,7 @@ def _conditions(tables: Mapping[str, pd.DataFrame]) -> str:
     return rows_table(tables["by_condition"], columns, words)
 
 
-def _accuracy(tables: Mapping[str, pd.DataFrame]) -> str:
+def _accuracy(tables: Mapping[str, pd.DataFrame]) -> Markup:
     columns = [
         PageColumn("scenario", "scenario", "text"),
         PageColumn("people", "people", "count"),
@@ -211,22 +240,21 @@ _ALIKE = {
 }
 
 
-def _agreement(tables: Mapping[str, pd.DataFrame]) -> str:
-    """Return a row a scenario: mean over pairs or halves, their middle 95 %, the interval of the
-    mean.
+def _agreement(tables: Mapping[str, pd.DataFrame]) -> Markup:
+    """Return one row per scenario: mean over pairs or halves, central 95 % range, confidence
+    interval.
     """
     rows = tables["agreement"]
     cells, reasons = [], []
     for name in in_order(rows["scenario"]):
-        line = [escape(name)]
+        line = [str(name)]
         for measure in _ALIKE:
             row = rows[(rows["scenario"] == name) & (rows["measure"] == measure)].iloc[0]
             line.append(PageColumn("", "mean", "interval", 3, "low", "high").cell(row))
             if measure in ("kappa", "correlation"):
-                line.append(PageColumn("", "mean", "interval", 3).cell(row).split(" ", 1)[-1])
+                line.append(spread(row["mean_low"], row["mean_high"], 3))
             if row["reason"]:
-                why = f"{name}, {_ALIKE[measure]}: {row['reason']}"
-                reasons.append(f"<li>{escape(why)}</li>")
+                reasons.append(f"{name}, {_ALIKE[measure]}: {row['reason']}")
         cells.append(line)
     header = [
         "scenario",
@@ -241,11 +269,10 @@ def _agreement(tables: Mapping[str, pd.DataFrame]) -> str:
         "How alike people answer: mean and middle 95 % over all pairs of participants and over "
         "1000 random halves of them; the interval of the mean draws people"
     )
-    notes = f'<ul class="notes">{"".join(reasons)}</ul>' if reasons else ""
-    return table(header, cells, words) + notes
+    return table(header, cells, words) + notes(reasons)
 
 
-def _items(rows: pd.DataFrame) -> str:
+def _items(rows: pd.DataFrame) -> Markup:
     """Return item statistics by scenario, and the stimuli with the lowest item-rest correlation."""
     groups = rows.assign(low=rows["item_rest"] < 0).groupby("scenario", sort=False)
     summary = groups.agg(
@@ -276,7 +303,7 @@ def _items(rows: pd.DataFrame) -> str:
     return rows_table(summary, columns, words) + (listing if len(lowest) else "")
 
 
-def _zones(rows: pd.DataFrame) -> str:
+def _zones(rows: pd.DataFrame) -> Markup:
     columns = [
         PageColumn("scenario", "scenario", "text"),
         PageColumn("measure", "measure", "text"),
@@ -290,7 +317,7 @@ def _zones(rows: pd.DataFrame) -> str:
     return rows_table(rows, columns)
 
 
-def _biases(tables: Mapping[str, pd.DataFrame]) -> str:
+def _biases(tables: Mapping[str, pd.DataFrame]) -> Markup:
     yes = [
         PageColumn("scenario", "scenario", "text"),
         PageColumn("people", "people", "count"),
@@ -343,7 +370,7 @@ def _biases(tables: Mapping[str, pd.DataFrame]) -> str:
     )
 
 
-def _hypotheses(results: PeopleResults) -> str:
+def _hypotheses(results: PeopleResults) -> Markup:
     tables = results.tables
     rows = tables["hypotheses"].assign(
         about=tables["hypotheses"]["hypothesis"].map({k: v.about for k, v in HYPOTHESES.items()})
@@ -372,10 +399,10 @@ def _hypotheses(results: PeopleResults) -> str:
     return paragraph(words) + rows_table(main, columns) + whole
 
 
-def measures(inputs: ReportInputs) -> str:
+def measures(inputs: ReportInputs) -> Markup:
     """Return every measure of every model with its three intervals, and kappa among models."""
     if inputs.beside is None:
-        return ""
+        return Markup()
     scores = inputs.beside.scores
     labels = {metric.name: metric.label for metric in measure_metrics()}
     rows = scores.assign(measure=scores["measure"].map(labels))
@@ -404,7 +431,7 @@ def measures(inputs: ReportInputs) -> str:
     )
 
 
-def _mean_pairs(pairs: pd.DataFrame) -> str:
+def _mean_pairs(pairs: pd.DataFrame) -> Markup:
     """Return kappa of every two models, mean over scenarios, as a matrix."""
     if pairs.empty:
         return paragraph("One model alone makes no pair.")
@@ -418,14 +445,14 @@ def _mean_pairs(pairs: pd.DataFrame) -> str:
             key = (name, other) if (name, other) in mean.index else (other, name)
             value = mean.get(key, np.nan)
             cells.append("" if name == other else number(value))
-        rows.append([f"{marks[at]} {escape(name)}", *cells])
+        rows.append([f"{marks[at]} {name}", *cells])
     return table(["", *marks], rows, "Mean over the scenarios in which it is defined")
 
 
 # --- stimuli that fool people -------------------------------------------------------------------
 
 
-def fooled(inputs: ReportInputs, links: Mapping[str, str]) -> str:
+def fooled(inputs: ReportInputs, links: Mapping[str, str]) -> Markup:
     """Return the stimuli that people get wrong more often than by guessing, with links to
     movies.
     """
@@ -435,12 +462,12 @@ def fooled(inputs: ReportInputs, links: Mapping[str, str]) -> str:
     return fooled_by(rows.rename(columns={"human_accuracy": "accuracy"}), links)
 
 
-def fooled_by(rows: pd.DataFrame, links: Mapping[str, str]) -> str:
+def fooled_by(rows: pd.DataFrame, links: Mapping[str, str]) -> Markup:
     """Return the stimuli among these that people get wrong more often than by guessing."""
     tail = below_chance_level(rows.reset_index(drop=True))
     counts = [
         [
-            escape(name),
+            str(name),
             str(len(subset)),
             str(int(subset["released"].sum())),
             str(int(subset["exact"].sum())),
@@ -458,7 +485,7 @@ def fooled_by(rows: pd.DataFrame, links: Mapping[str, str]) -> str:
         cells.append(
             [
                 stimulus_link(row["stimulus"], links),
-                escape(row["scenario"]),
+                str(row["scenario"]),
                 number(row["accuracy"]),
                 str(int(row["count"])),
                 "yes" if row["exact"] else "no",
@@ -472,14 +499,14 @@ def fooled_by(rows: pd.DataFrame, links: Mapping[str, str]) -> str:
 # Parts of the page about sessions: which were flagged, and the effect of excluding them.
 
 
-def sessions(inputs: ReportInputs) -> str:
+def sessions(inputs: ReportInputs) -> Markup:
     """Return which sessions were flagged, by which rule, and the effect of flagged sessions."""
     if inputs.people is None:
-        return ""
+        return Markup()
     return sessions_alone(inputs.people, _models_with_and_without(inputs))
 
 
-def sessions_alone(people: PeopleResults, models: str = "") -> str:
+def sessions_alone(people: PeopleResults, models: str = "") -> Markup:
     """Return the same without models; ``models``: their scores without and with these sessions."""
     result = people.tables
     parts = [paragraph(describe_rules(people.rules))]
@@ -503,23 +530,23 @@ def sessions_alone(people: PeopleResults, models: str = "") -> str:
             "construction"
         )
         parts.append(rows_table(result["flag_effects"], columns, words))
-    return "\n".join(parts)
+    return joined(parts)
 
 
-def _flag_counts(counts: pd.DataFrame) -> str:
+def _flag_counts(counts: pd.DataFrame) -> Markup:
     rules = list(dict.fromkeys(counts["rule"]))
     rules = [name for name in rules if name not in ("flagged", "kept", "all")]
     rules += ["flagged", "kept", "all"]
     wide = counts.pivot(index="scenario", columns="rule", values="sessions").fillna(0)
     names = in_order(counts["scenario"])
-    rows = [[escape(name), *(str(int(wide.loc[name, rule])) for rule in rules)] for name in names]
+    rows = [[str(name), *(str(int(wide.loc[name, rule])) for rule in rules)] for name in names]
     rows.append(["all", *(str(int(wide[rule].sum())) for rule in rules)])
     heads = [name.replace("_", " ") for name in rules]
     words = "Sessions that each rule flags; one session can be flagged by several rules"
     return table(["scenario", *heads], rows, words)
 
 
-def _with_and_without(people: PeopleResults) -> str:
+def _with_and_without(people: PeopleResults) -> Markup:
     """Return people's accuracy without and with the flagged sessions."""
     rows = people.tables["with_and_without"]
     columns = [
@@ -528,7 +555,7 @@ def _with_and_without(people: PeopleResults) -> str:
     ]
     cells = []
     for name in dict.fromkeys(rows["scenario"]):
-        line = [escape(str(name))]
+        line = [str(name)]
         for which in ("unflagged", "complete"):
             subset = rows[(rows["scenario"] == name) & (rows["sessions"] == which)]
             line += (
@@ -541,17 +568,17 @@ def _with_and_without(people: PeopleResults) -> str:
     return table(header, cells, "Accuracy of people without flagged sessions and with them")
 
 
-def _models_with_and_without(inputs: ReportInputs) -> str:
+def _models_with_and_without(inputs: ReportInputs) -> Markup:
     """Return the models' scores without and with the flagged sessions."""
     if inputs.comparison_all is None:
-        return ""
+        return Markup()
     with_all = inputs.comparison_all.all_scores
     grouped: dict[str, list[list[str]]] = {"model": [], "baseline": []}
     for _, row in inputs.comparison.all_scores.iterrows():
         if row["scenario"] != MEAN or row["model"] == TWO_PEOPLE:
             continue
         other = with_all[(with_all["model"] == row["model"]) & (with_all["scenario"] == MEAN)]
-        line = [escape(str(row["model"]))]
+        line = [str(row["model"])]
         for key in ("difference", "r"):
             column = PageColumn("", key, "interval")
             line += [column.cell(subset) for subset in (row, other.iloc[0])]
@@ -598,7 +625,7 @@ def describe_rules(rules: ExclusionRules) -> str:
     )
 
 
-def dropped(result: PeopleResults) -> str:
+def dropped(result: PeopleResults) -> Markup:
     """Return counts of excluded answers, by step and reason."""
     rows = result.tables["left_out"]
     if rows.empty:

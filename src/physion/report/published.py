@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from functools import partial
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from physion.analysis.published.claims import TITLES, PublishedResults
 from physion.analysis.published.tables import grid
 from physion.analysis.tables import MEAN
 from physion.core.files import write_atomic
+from physion.core.html import Markup, joined
 from physion.core.version import MADE_WITH
 from physion.report.build import prepare_folder, write_csv, write_plot
 from physion.report.figures.by_scenario import measure_figure, model_and_people_figure
@@ -27,6 +27,7 @@ from physion.report.figures.by_stimulus import difficulty_figure
 from physion.report.figures.theme import Plot, Theme
 from physion.report.figures.training import grouped_figure
 from physion.report.html import (
+    MACROS,
     PageColumn,
     Section,
     details,
@@ -166,13 +167,13 @@ def _draw_grouped(rows: pd.DataFrame, theme: Theme) -> Any:
 # --- page ---------------------------------------------------------------------------------------
 
 
-def _page(results: PublishedResults, shown: dict[str, str]) -> str:
+def _page(results: PublishedResults, shown: dict[str, Markup]) -> str:
     tables, words = results.tables, results.descriptions
     models = tables["accuracies"]["model"].nunique()
-    lead = (
-        f'<p class="lead">{models} models and people on '
-        f"{tables['accuracies']['scenario'].nunique()} scenarios: what was printed, "
-        "what it averages or compares, and beside it what a reader expects.</p>"
+    lead = paragraph(
+        f"{models} models and people on {tables['accuracies']['scenario'].nunique()} scenarios: "
+        "what was printed, what it averages or compares, and what a reader expects.",
+        "lead",
     )
     panels = [
         shown["panel_a"],
@@ -182,7 +183,7 @@ def _page(results: PublishedResults, shown: dict[str, str]) -> str:
     ]
     sections = [
         Section("Accuracies by scenario", _accuracies(results)),
-        Section("Panels A and C", "\n".join(panels)),
+        Section("Panels A and C", joined(panels)),
         Section("Panels D and E", shown["panel_d"] + shown["panel_e"]),
         Section("Accuracy and kappa", _accuracy_kappa(results)),
         Section("Supplementary figures", _supplement(results, shown)),
@@ -193,7 +194,7 @@ def _page(results: PublishedResults, shown: dict[str, str]) -> str:
     return render_document(TITLE, lead, sections)
 
 
-def _accuracies(results: PublishedResults) -> str:
+def _accuracies(results: PublishedResults) -> Markup:
     rows = results.tables["accuracies"]
     parts = [paragraph(results.descriptions["accuracies"])]
     for column, caption in (
@@ -204,7 +205,7 @@ def _accuracies(results: PublishedResults) -> str:
         wide = grid(rows, column)
         names = [name for name in wide.columns if name != "model"]
         cells = [
-            [escape(str(row["model"])), *(number(row[name], 3) for name in names)]
+            [str(row["model"]), *(number(row[name], 3) for name in names)]
             for _, row in wide.iterrows()
         ]
         parts.append(table(["model", *names], cells, caption))
@@ -223,10 +224,10 @@ def _accuracies(results: PublishedResults) -> str:
         PageColumn("difference", "difference", digits=3),
     ]
     parts.append(details("Every value with its interval", rows_table(rows, columns)))
-    return "\n".join(parts)
+    return joined(parts)
 
 
-def _panel(rows: pd.DataFrame, measure: str) -> str:
+def _panel(rows: pd.DataFrame, measure: str) -> Markup:
     columns = [
         PageColumn("model", "model", "text"),
         PageColumn("scenario", "scenario", "text"),
@@ -238,7 +239,7 @@ def _panel(rows: pd.DataFrame, measure: str) -> str:
     return details(f"{measure} as a table", rows_table(words, columns))
 
 
-def _accuracy_kappa(results: PublishedResults) -> str:
+def _accuracy_kappa(results: PublishedResults) -> Markup:
     columns = [
         PageColumn("over", "over", "text"),
         PageColumn("models", "models", "count"),
@@ -249,13 +250,13 @@ def _accuracy_kappa(results: PublishedResults) -> str:
     return paragraph(results.descriptions["accuracy_kappa"]) + rows
 
 
-def _supplement(results: PublishedResults, shown: dict[str, str]) -> str:
-    cells = [[escape(text) for text in row] for row in results.tables["not_made"].to_numpy()]
+def _supplement(results: PublishedResults, shown: dict[str, Markup]) -> Markup:
+    cells = [[str(text) for text in row] for row in results.tables["not_made"].to_numpy()]
     missing = table(["figure", "why it is missing"], cells, TITLES["not_made"])
     return shown["figure_s1"] + shown["figure_s3"] + missing
 
 
-def _regressions(results: PublishedResults) -> str:
+def _regressions(results: PublishedResults) -> Markup:
     cells = []
     for _, row in results.tables["regressions"].iterrows():
         printed = ", ".join(f"{k} {row[f'printed_{k}']}" for k in "btp" if row[f"printed_{k}"])
@@ -264,9 +265,9 @@ def _regressions(results: PublishedResults) -> str:
             f"{number(row[f'{fit}_t'], 1)}, p {p_value(row[f'{fit}_p'])}"
             for fit in ("run", "once", "asked")
         ]
-        about = f"{escape(row['claim'])}<small>{escape(row['sentence'])}</small>"
-        differs = escape(f"Compares {row['compared']} ({row['state']}): {row['differs']}")
-        cells.append([about, escape(printed), *fits, escape(row["met"]), differs])
+        about = MACROS.with_small(row["claim"], row["sentence"])
+        differs = str(f"Compares {row['compared']} ({row['state']}): {row['differs']}")
+        cells.append([about, str(printed), *fits, str(row["met"]), differs])
     header = [
         "claim",
         "printed",
@@ -279,7 +280,7 @@ def _regressions(results: PublishedResults) -> str:
     return paragraph(results.descriptions["regressions"]) + table(header, cells)
 
 
-def _people(rows: pd.DataFrame, claims: pd.DataFrame, description: str) -> str:
+def _people(rows: pd.DataFrame, claims: pd.DataFrame, description: str) -> Markup:
     columns = [
         PageColumn("scenario", "scenario", "text"),
         PageColumn("accuracy", "accuracy", "interval", 3, "zone_low", "zone_high"),
@@ -305,7 +306,7 @@ def _people(rows: pd.DataFrame, claims: pd.DataFrame, description: str) -> str:
     )
 
 
-def _left_out(rows: pd.DataFrame) -> str:
+def _left_out(rows: pd.DataFrame) -> Markup:
     if rows.empty:
         return paragraph("None.")
     columns = [PageColumn(name, name, "text") for name in rows.columns]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from html import escape
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -14,16 +13,23 @@ from physion.analysis.mixed.result import effect_name
 from physion.analysis.model_tests import MixedTable, permutations_of
 from physion.analysis.scores import TWO_PEOPLE
 from physion.analysis.tables import MEAN, POOLED, in_order
+from physion.core.html import Markup, joined
 from physion.report.html import (
     BASELINES,
+    MACROS,
     PageColumn,
     definition_list,
     details,
+    heading,
     interval,
     listed,
+    notes,
     number,
     paragraph,
+    percent,
+    plural,
     rows_table,
+    stimulus_link,
     table,
     undefined,
 )
@@ -99,21 +105,21 @@ _BEYOND = (
 )
 
 
-def scores(comparison: Comparison) -> str:
+def scores(comparison: Comparison) -> Markup:
     """Return all tables of scores: mean over scenarios and pooled, beyond the outcome, later."""
     plain = shown_metrics(comparison, beyond=False)
     parts = [
-        paragraph(_BASELINES) if comparison.has_people else "",
+        paragraph(_BASELINES) if comparison.has_people else Markup(),
         scores_table(comparison.all_scores, MEAN, plain, "Mean over scenarios"),
         details("All stimuli pooled", scores_table(comparison.all_scores, POOLED, plain)),
     ]
     if comparison.has_people:
-        parts += ["<h3>Beyond the outcome</h3>", paragraph(_BEYOND), *_beyond(comparison)]
-    parts += ["<h3>Without contacts in the observed part</h3>", _later(comparison)]
-    return "\n".join(part for part in parts if part)
+        parts += [heading("Beyond the outcome"), paragraph(_BEYOND), *_beyond(comparison)]
+    parts += [heading("Without contacts in the observed part"), _later(comparison)]
+    return joined(parts)
 
 
-def _beyond(comparison: Comparison) -> list[str]:
+def _beyond(comparison: Comparison) -> list[Markup]:
     beyond = shown_metrics(comparison, beyond=True)
     tables = [
         scores_table(comparison.all_scores, MEAN, beyond, "Mean over scenarios"),
@@ -126,7 +132,7 @@ def _beyond(comparison: Comparison) -> list[str]:
     return tables
 
 
-def _later(comparison: Comparison) -> str:
+def _later(comparison: Comparison) -> Markup:
     """Return the scores without observed contacts, or why there are none."""
     left_out = comparison.settings[SETTING]
     if comparison.later.empty:
@@ -162,7 +168,7 @@ def shown_metrics(comparison: Comparison, beyond: bool) -> list[Metric]:
 
 def scores_table(
     scores: pd.DataFrame, which: str, metrics: Sequence[Metric], caption: str = ""
-) -> str:
+) -> Markup:
     """Return a table of scores: a row a model, the metrics, and after r its noise ceiling.
 
     Parameters
@@ -182,7 +188,7 @@ def scores_table(
         header += [metric.heading, "ceiling of r"] if metric.name == "r" else [metric.heading]
     lines: dict[str, list[list[str]]] = {"model": [], "baseline": []}
     for _, row in rows.iterrows():
-        line = [escape(_describe_model(row)), escape(row["readout"]), str(row["stimuli"])]
+        line = [str(_describe_model(row)), str(row["readout"]), str(row["stimuli"])]
         for metric in metrics:
             line.append(_cell(row, metric))
             if metric.name == "r":
@@ -199,7 +205,7 @@ def _cell(row: pd.Series, metric: Metric) -> str:
     return interval(row, metric.name)
 
 
-def _reasons(rows: pd.DataFrame, metrics: Sequence[Metric]) -> str:
+def _reasons(rows: pd.DataFrame, metrics: Sequence[Metric]) -> Markup:
     """Return the reasons that are about columns of the table, as a list."""
     others = {metric.label for metric in score_metrics()} - {metric.label for metric in metrics}
     items = []
@@ -207,8 +213,8 @@ def _reasons(rows: pd.DataFrame, metrics: Sequence[Metric]) -> str:
         parts = [part for part in str(row["reason"]).split("; ") if part]
         about = [part for part in parts if part.partition(":")[0] not in others]
         if about:
-            items.append(f"<li>{escape(row['model'])}: {escape('; '.join(about))}</li>")
-    return f'<ul class="notes">{"".join(items)}</ul>' if items else ""
+            items.append(f"{row['model']}: {'; '.join(about)}")
+    return notes(items)
 
 
 def _describe_model(row: pd.Series) -> str:
@@ -217,12 +223,12 @@ def _describe_model(row: pd.Series) -> str:
     return str(row["base_model"]) + str(row["model"]).removeprefix(head)
 
 
-def matrix(comparison: Comparison, key: str) -> str:
+def matrix(comparison: Comparison, key: str) -> Markup:
     """Return a score by model (rows) and scenario (columns), people on top, baselines below."""
     columns = [*in_order(comparison.stimuli["scenario"]), MEAN, POOLED]
     first = []
     if comparison.has_people and key in _PEOPLE:
-        first.append([f"<em>{_PEOPLE[key]}</em>", *_people_cells(comparison, key, columns)])
+        first.append([_PEOPLE[key], *_people_cells(comparison, key, columns)])
     lines: dict[str, list[list[str]]] = {"model": first, "baseline": []}
     for model, rows in comparison.all_scores.groupby("model", sort=False):
         subset = rows.set_index("scenario")
@@ -232,7 +238,7 @@ def matrix(comparison: Comparison, key: str) -> str:
             interval(subset.loc[name], key) if name in subset.index else undefined("no predictions")
             for name in columns
         ]
-        lines[subset["kind"].iloc[0]].append([escape(str(model)), *cells])
+        lines[subset["kind"].iloc[0]].append([str(model), *cells])
     return table(["", *columns], lines["model"], below=(BASELINES, lines["baseline"]))
 
 
@@ -247,7 +253,7 @@ def _people_cells(comparison: Comparison, key: str, columns: Sequence[str]) -> l
     return [number(people.loc[name, "ceiling"]) if name in people.index else "" for name in columns]
 
 
-def definitions(comparison: Comparison) -> str:
+def definitions(comparison: Comparison) -> Markup:
     """Return the definitions of the columns of the tables of scores."""
     chosen = [*shown_metrics(comparison, beyond=False)]
     if comparison.has_people:
@@ -258,24 +264,24 @@ def definitions(comparison: Comparison) -> str:
         "all, all-but, only": "a model's training: on all scenarios, on all but the tested one, on "
         "the tested one alone; in the files the last two are “all but this” and “same”",
     }
-    return f"<h3>What the numbers mean</h3>{definition_list(meaning)}"
+    return joined([heading("What the numbers mean"), definition_list(meaning)])
 
 
 # Parts of the page with tests: models against each other, mixed models, calibration.
 
 
-def tests(inputs: ReportInputs) -> str:
+def tests(inputs: ReportInputs) -> Markup:
     """Return paired tests of models, then mixed models."""
     parts = []
     if inputs.paired is not None:
-        parts += ["<h3>Models against each other</h3>", _paired(inputs.paired)]
+        parts += [heading("Models against each other"), _paired(inputs.paired)]
     if inputs.paired_measures is not None and len(inputs.paired_measures):
         parts.append(_paired_measures(inputs.paired_measures))
     if inputs.mixed:
-        parts.append("<h3>Mixed models</h3>")
+        parts.append(heading("Mixed models"))
         parts.append(paragraph(_MIXED))
         parts += [_mixed(model) for model in inputs.mixed]
-    return "\n".join(parts)
+    return joined(parts)
 
 
 _MIXED = (
@@ -287,7 +293,7 @@ _MIXED = (
 )
 
 
-def _paired(rows: pd.DataFrame) -> str:
+def _paired(rows: pd.DataFrame) -> Markup:
     """Return a summary as text, and the table of all pairs."""
     counts = {
         key: (
@@ -330,7 +336,7 @@ def _paired(rows: pd.DataFrame) -> str:
     return paragraph(words) + listing
 
 
-def _paired_measures(rows: pd.DataFrame) -> str:
+def _paired_measures(rows: pd.DataFrame) -> Markup:
     """Return a summary by scenario and measure, and the table of all pairs over all scenarios."""
     counts = rows.assign(
         holm=rows["p_holm"] < 0.05, pairs=1, measure=rows["measure"].map(_MEASURES)
@@ -366,8 +372,8 @@ def _paired_measures(rows: pd.DataFrame) -> str:
 _MEASURES = {"rmsd": "RMSD", "kappa_from_averages": "kappa, from averages", "r": "r"}
 
 
-def _mixed(model: MixedTable) -> str:
-    formula = f"<p><code>{escape(model.formula)}</code></p>"
+def _mixed(model: MixedTable) -> Markup:
+    formula = paragraph(MACROS.code(model.formula))
     if model.fit is None:
         return details(f"{model.about}: not fitted", formula + paragraph(model.reason))
     fit = model.fit
@@ -394,7 +400,7 @@ def _mixed(model: MixedTable) -> str:
         note += f"; correlation of {row['first']} and {row['second']} by {row['group']}: "
         note += number(row["r"])
     note = ". ".join([note, *fit.warnings]) + "."
-    listing = rows_table(rows, known) + f'<p class="note">{escape(note)}</p>'
+    listing = rows_table(rows, known) + paragraph(note, "note")
     return details(f"{model.about}{_together(model)}", formula + listing)
 
 
@@ -409,11 +415,11 @@ def _together(model: MixedTable) -> str:
     return f". All together: F({test.df1}, {number(test.df2, 1)}) = {number(test.statistic)}, {p}"
 
 
-def calibration(inputs: ReportInputs) -> str:
+def calibration(inputs: ReportInputs) -> Markup:
     """Brier score and its parts, a row a model."""
     rows = inputs.calibration
     if rows is None:
-        return ""
+        return Markup()
     columns = [
         PageColumn("model", "model", "text"),
         PageColumn("stimuli", "stimuli", "count"),
@@ -431,3 +437,53 @@ def calibration(inputs: ReportInputs) -> str:
     )
     known = rows.replace([np.inf, -np.inf], np.nan)
     return details("Brier score and its parts", rows_table(known, columns, words))
+
+
+# --- outcomes that differ, and what was left out --------------------------------------------------
+
+
+def changed(comparison: Comparison, links: Mapping[str, str] | None = None) -> Markup:
+    """Return the trials whose simulated outcome is not the official one; ``links``: to their
+    movies.
+    """
+    rows = comparison.changed
+    if rows.empty:
+        return paragraph("None.")
+    counts = rows["scenario"].value_counts()
+    totals = comparison.stimuli.groupby("scenario")["stimulus"].nunique()
+    words = ", ".join(
+        f"{name} {counts.get(name, 0)} of {totals[name]}" for name in in_order(totals.index)
+    )
+    header = ["stimulus", "scenario", "official", "simulated"]
+    header += ["people say yes"] if comparison.has_people else []
+    cells = []
+    for _, row in rows.iterrows():
+        line = [stimulus_link(row["stimulus"], links or {}), str(row["scenario"])]
+        line += [_outcome(row["label"]), _outcome(row["simulated"])]
+        line += [percent(row["p_yes"])] if comparison.has_people else []
+        cells.append(line)
+    listing = details(f"{plural(len(rows), 'trial')}, one by one", table(header, cells))
+    total = comparison.stimuli["stimulus"].nunique()
+    text = (
+        f"{len(rows)} of {total} stimuli: {words}. There the models were shown another event than "
+        "people saw, so accuracy is given against both outcomes and r also without them."
+    )
+    return paragraph(text) + listing
+
+
+def dropped(comparison: Comparison) -> Markup:
+    """Return counts of what was excluded, and why."""
+    rows = comparison.dropped
+    if rows.empty:
+        return paragraph("Nothing.")
+    keys = ["model", "reason"]
+    totals = rows.groupby(keys, sort=False)["stimuli"].sum().reset_index()
+    cells = [
+        [str(row["model"] or "people"), str(row["reason"]), str(row["stimuli"])]
+        for _, row in totals.iterrows()
+    ]
+    return table(["whose", "reason", "stimuli"], cells)
+
+
+def _outcome(value: bool) -> str:
+    return "contact" if value else "no contact"

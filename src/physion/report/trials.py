@@ -5,22 +5,22 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Container, Iterator, Mapping
-from html import escape
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
 from physion.analysis.comparison import Comparison
 from physion.analysis.tables import in_order
+from physion.core.html import Markup, joined, macros_of
 from physion.report.html import (
+    MACROS,
     PageMovies,
-    details,
     listed,
     number,
     paragraph,
     percent,
     plural,
-    protocol_names,
     render_document,
     stimulus_link,
     table,
@@ -162,7 +162,10 @@ KEY = (
 READOUT_KEY = "Of a model with several readouts the cards show observed+simulated, else observed."
 
 
-def card(rows: pd.DataFrame, movie: str, links: Mapping[str, str], named: str = "") -> str:
+_MACROS = macros_of("physion.report", "trials.html")
+
+
+def card(rows: pd.DataFrame, movie: Markup, links: Mapping[str, str], named: str = "") -> Markup:
     """Return one stimulus as a card.
 
     Parameters
@@ -170,18 +173,16 @@ def card(rows: pd.DataFrame, movie: str, links: Mapping[str, str], named: str = 
     rows
         The rows of ``comparison.stimuli`` of this stimulus.
     movie
-        Its movie as HTML.
+        Its movie, see `PageMovies`.
     links
         Addresses by stimulus; the name links there.
     named
         Name of a model (``model``) that is shown in bold and with this readout.
     """
     first = rows.iloc[0]
-    return (
-        f"<article><header><h3>{escape(first['scenario'])}</h3>{outcome(first)}</header>"
-        f"{movie}{answers(pick_readouts(rows, named), named)}"
-        f'<p class="name">{stimulus_link(first["stimulus"], links)}</p></article>'
-    )
+    answered = answers(pick_readouts(rows, named), named)
+    name = stimulus_link(first["stimulus"], links)
+    return Markup(_MACROS.card(first["scenario"], outcome(first), movie, answered, name))
 
 
 def pick_readouts(rows: pd.DataFrame, named: str = "") -> pd.DataFrame:
@@ -201,13 +202,13 @@ def pick_readouts(rows: pd.DataFrame, named: str = "") -> pd.DataFrame:
     return pd.concat(parts)
 
 
-def outcome(row: pd.Series) -> str:
-    """Return what happened as a label, as HTML; with the simulated outcome if it differs."""
+def outcome(row: pd.Series) -> Markup:
+    """Return what happened as a label; with the simulated outcome if it differs."""
     kind = "contact" if row["label"] else "no contact"
     words = kind
     if bool(row["simulated"]) != bool(row["label"]):
         words += ", not in the movie" if row["label"] else ", but in the movie"
-    return f'<span class="outcome {kind.replace(" ", "-")}">{words}</span>'
+    return Markup(_MACROS.outcome(kind.replace(" ", "-"), words))
 
 
 def describe(rows: pd.DataFrame) -> str:
@@ -217,41 +218,55 @@ def describe(rows: pd.DataFrame) -> str:
     return f"Movie of {first['stimulus']} ({first['scenario']}): {happened}"
 
 
-def answers(rows: pd.DataFrame, named: str = "") -> str:
+@dataclass(frozen=True)
+class _Answer:
+    """Answer of people or of a model: a bar of ``fraction`` and whether it is right."""
+
+    name: str
+    title: str
+    value: str
+    fraction: float
+    right: bool | None
+    kind: str
+    small: str = ""
+
+    @property
+    def word(self) -> str:
+        return {True: "right", False: "wrong", None: "divided"}[self.right]
+
+    @property
+    def mark(self) -> str:
+        return {True: "✓", False: "✗", None: "–"}[self.right]
+
+
+def answers(rows: pd.DataFrame, named: str = "") -> Markup:
     """Return the answers of people, if there are any, and of the models as labelled bars."""
     first = rows.iloc[0]
     items = []
     if np.isfinite(first["p_yes"]):
-        value = f"{percent(first['p_yes'])} <small>of {first['count']:.0f}</small>"
         right = None if first["human_accuracy"] == 0.5 else first["human_accuracy"] > 0.5
-        items.append(_answer("people say yes", "", value, first["p_yes"], right, "human"))
+        value, count = percent(first["p_yes"]), f"of {first['count']:.0f}"
+        items.append(_Answer("people say yes", "", value, first["p_yes"], right, "human", count))
     for _, row in rows.iterrows():
-        alone = (rows["base_model"] == row["base_model"]).sum() == 1
+        only = (rows["base_model"] == row["base_model"]).sum() == 1
         right = bool(row["predicted"]) == bool(row["label"])
         kind = "model named" if row["model"] == named else "model"
-        label = row["base_model"] if alone else row["model"]
-        value = number(row["p_contact"])
-        items.append(_answer(str(label), str(row["model"]), value, row["p_contact"], right, kind))
+        name = str(row["base_model"] if only else row["model"])
+        value = probability(row["p_contact"])
+        items.append(_Answer(name, str(row["model"]), value, row["p_contact"], right, kind))
     # People come first and count as one.
     most = MOST_ANSWERS + len(items) - len(rows)
-    shown = f'<ul class="answers">{"".join(items[:most])}</ul>'
-    if len(items) > most:
-        rest = f'<ul class="answers">{"".join(items[most:])}</ul>'
-        shown += details(f"{plural(len(items) - most, 'further model')}", rest)
-    return shown
+    more = plural(len(items) - most, "further model")
+    return Markup(_MACROS.answers(items[:most], items[most:], more))
 
 
-def _answer(
-    name: str, title: str, value: str, fraction: float, right: bool | None, kind: str
-) -> str:
-    """Return one answer; a ``meter`` would be coloured as good or bad by browsers."""
-    mark, word = {True: ("✓", "right"), False: ("✗", "wrong"), None: ("–", "divided")}[right]
-    hover = f' title="{escape(title)}"' if title else ""
-    return (
-        f'<li class="{kind}"><span{hover}>{escape(name)}</span><b>{value}</b>'
-        f'<em class="{word}" role="img" aria-label="{word}">{mark}</em>'
-        f'<i aria-hidden="true"><s style="width:{100 * fraction:.0f}%"></s></i></li>'
-    )
+def probability(p: float) -> str:
+    """Return P(contact) with the decimals that show on which side of one half it lies."""
+    for digits in (2, 3, 4):
+        text = number(p, digits)
+        if p == 0.5 or float(text) != 0.5:
+            return text
+    return "> 0.5" if p > 0.5 else "< 0.5"
 
 
 # Parts of the page that show trials: one of each scenario, and the largest disagreements.
@@ -270,7 +285,7 @@ def shown_stimuli(inputs: ReportInputs) -> list[str]:
     return list(dict.fromkeys(found))
 
 
-def opening(inputs: ReportInputs, movies: PageMovies, links: Mapping[str, str]) -> str:
+def opening(inputs: ReportInputs, movies: PageMovies, links: Mapping[str, str]) -> Markup:
     """Return a card for one stimulus of each scenario, with its movie playing."""
     stimuli = inputs.comparison.stimuli
     cards = []
@@ -279,14 +294,13 @@ def opening(inputs: ReportInputs, movies: PageMovies, links: Mapping[str, str]) 
         cards.append(card(rows, movies.show(stimulus, describe(rows)), links))
     people = inputs.comparison.has_people
     note = [OPENING_RULE if people else OPENING_RULE_ALONE, KEY, READOUT_KEY]
-    if inputs.trial_pages:
-        listing = f'<p><a href="{INDEX}">A page for every stimulus</a></p>'
-    else:
-        listing = ""
-    return (
-        f"<p>{escape(_question(inputs))}</p>{_grid(cards)}"
-        f'<p class="note">{escape(" ".join(note))}</p>{listing}'
-    )
+    listing = MACROS.link(INDEX, "A page for every stimulus") if inputs.trial_pages else ""
+    return joined([
+        paragraph(_question(inputs)),
+        _grid(cards),
+        paragraph(" ".join(note), "note"),
+        *([paragraph(listing)] if listing else []),
+    ])  # fmt: skip
 
 
 def _question(inputs: ReportInputs) -> str:
@@ -298,10 +312,10 @@ def _question(inputs: ReportInputs) -> str:
     )
 
 
-def gaps(inputs: ReportInputs, movies: PageMovies, links: Mapping[str, str]) -> str:
+def gaps(inputs: ReportInputs, movies: PageMovies, links: Mapping[str, str]) -> Markup:
     """Return who was right how often, and a card for each of the largest differences."""
     if not inputs.comparison.has_people:
-        return ""
+        return Markup()
     chosen = widest_gaps(inputs.comparison, inputs.movie_count)
     counts = _counts(inputs)
     if chosen.empty:
@@ -320,7 +334,7 @@ def gaps(inputs: ReportInputs, movies: PageMovies, links: Mapping[str, str]) -> 
         "least by one half; the models, in bold, take turns. Only stimuli whose simulated outcome "
         "is the official one." + _silent(inputs)
     )
-    return f"{counts}{paragraph(words)}{_grid(cards)}"
+    return joined([counts, paragraph(words), _grid(cards)])
 
 
 def _silent(inputs: ReportInputs) -> str:
@@ -336,7 +350,7 @@ def _silent(inputs: ReportInputs) -> str:
     )
 
 
-def _counts(inputs: ReportInputs) -> str:
+def _counts(inputs: ReportInputs) -> Markup:
     rows = who_was_right(inputs.comparison)
     heads = {
         "stimuli": "stimuli",
@@ -347,14 +361,12 @@ def _counts(inputs: ReportInputs) -> str:
     }
     if rows["divided"].any():
         heads["divided"] = "people divided"
-    cells = [
-        [escape(str(row["model"])), *(str(row[key]) for key in heads)] for _, row in rows.iterrows()
-    ]
+    cells = [[str(row["model"]), *(str(row[key]) for key in heads)] for _, row in rows.iterrows()]
     return table(["model", *heads.values()], cells, "The majority of people and each model")
 
 
-def _grid(cards: list[str]) -> str:
-    return f'<div class="cards">{"".join(cards)}</div>'
+def _grid(cards: list[Markup]) -> Markup:
+    return Markup(_MACROS.cards(cards))
 
 
 # A page for each stimulus, and the list of them; written on demand next to the report.
@@ -386,8 +398,8 @@ def trial_pages(inputs: ReportInputs) -> Iterator[tuple[str, str]]:
         before = names[position - 1] if position else None
         after = names[position + 1] if position + 1 < len(names) else None
         page = _page(inputs, groups[stimulus], before, after)
-        yield page_name(stimulus), protocol_names(page)
-    yield "index.html", protocol_names(_index(inputs, [groups[name] for name in names]))
+        yield page_name(stimulus), page
+    yield "index.html", _index(inputs, [groups[name] for name in names])
 
 
 def _ordered(inputs: ReportInputs) -> list[str]:
@@ -407,14 +419,9 @@ def _page(inputs: ReportInputs, rows: pd.DataFrame, before: str | None, after: s
     links = [("the report", "../report.html"), ("all stimuli", "index.html")]
     links += [("previous", page_name(before))] if before is not None else []
     links += [("next", page_name(after))] if after is not None else []
-    ways = " · ".join(f'<a href="{escape(to)}">{words}</a>' for words, to in links)
-    body = (
-        f"{paragraph(_facts(first))}"
-        f'<div class="trial">{movie}<div><p>{escape(inputs.question)} {outcome(first)}</p>'
-        f"{answers(rows)}</div></div>"
-        f'<p class="note">{escape(KEY)}</p>{_answers(rows)}'
-    )
-    lead = f'<p class="ways">{ways}</p>{body}'
+    asked = outcome(first)
+    body = _MACROS.trial(_facts(first), movie, inputs.question, asked, answers(rows), KEY)
+    lead = joined([Markup(_MACROS.ways(links)), Markup(body), _answers(rows)])
     return render_document(first["stimulus"], lead, [], inputs.mark)
 
 
@@ -431,16 +438,12 @@ def _facts(first: pd.Series) -> str:
     )
 
 
-def _answers(rows: pd.DataFrame) -> str:
+def _answers(rows: pd.DataFrame) -> Markup:
     """Return the table of the models' answers."""
     people = rows["p_yes"].notna().all()
     cells = []
     for _, row in rows.iterrows():
-        line = [
-            escape(str(row["base_model"])),
-            escape(str(row["readout"])),
-            number(row["p_contact"], 3),
-        ]
+        line = [str(row["base_model"]), str(row["readout"]), number(row["p_contact"], 3)]
         line.append("contact" if row["predicted"] else "no contact")
         line.append("yes" if bool(row["predicted"]) == bool(row["label"]) else "no")
         cells.append([*line, number(row["gap"])] if people else line)
@@ -455,11 +458,11 @@ def _index(inputs: ReportInputs, groups: list[pd.DataFrame]) -> str:
         first = rows.iloc[0]
         right = (rows["predicted"].astype(bool) == rows["label"].astype(bool)).sum()
         name = str(first["stimulus"])
-        line = [f'<a href="{escape(page_name(name))}"><code>{escape(name)}</code></a>']
-        line += [escape(str(first["scenario"])), outcome(first)]
+        line: list[str] = [stimulus_link(name, {name: page_name(name)})]
+        line += [str(first["scenario"]), outcome(first)]
         line += [percent(first["human_accuracy"])] if people else []
         cells.append([*line, f"{right} of {len(rows)}"])
     header = ["stimulus", "scenario", "outcome", *(["people right"] if people else [])]
     body = table([*header, "models right"], cells)
-    lead = '<p class="ways"><a href="../report.html">the report</a></p>'
-    return render_document("Every stimulus", lead + body, [], inputs.mark)
+    lead = joined([Markup(_MACROS.ways([("the report", "../report.html")])), body])
+    return render_document("Every stimulus", lead, [], inputs.mark)

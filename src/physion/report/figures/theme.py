@@ -21,7 +21,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from physion.core.registry import Registry
-from physion.report.html import protocol_names
 from physion.report.inputs import ReportInputs
 
 
@@ -103,7 +102,7 @@ def legend(figure: Figure, handles: Sequence[Any], columns: int) -> None:
 
 def label(model: str, width: int = 48) -> str:
     """Return the name of a model for an axis, as on the page, broken into lines."""
-    return textwrap.fill(protocol_names(str(model)), width)
+    return textwrap.fill(str(model), width)
 
 
 def title(axis: Axes, text: str) -> None:

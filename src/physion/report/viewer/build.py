@@ -119,7 +119,7 @@ def _hash(text: str) -> str:
 
 def _style() -> str:
     """Return the style of the report, followed by that of the viewer."""
-    report = files("physion.report").joinpath("report.css").read_text(encoding="utf-8")
+    report = files("physion.report").joinpath("templates", "report.css").read_text(encoding="utf-8")
     return "\n" + report + _part("viewer.css")
 
 
