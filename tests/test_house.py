@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -50,7 +51,7 @@ def _module(path: Path) -> str:
 
 
 def _imports(path: Path, modules: set[str]) -> set[str]:
-    """Modules of the package that a module imports anywhere, inside functions too."""
+    """Modules of the package that a module imports, inside functions and by `import_module` too."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
@@ -58,7 +59,29 @@ def _imports(path: Path, modules: set[str]) -> set[str]:
         elif isinstance(node, ast.ImportFrom) and node.module:
             members = {f"{node.module}.{name.name}" for name in node.names}
             found |= members & modules or {node.module}
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            found |= {a.value for a in node.args if isinstance(a, ast.Constant)}
     return (found & modules) - {_module(path)}
+
+
+BY_NAME = {
+    "physion": "public names",
+    "physion.cli.help": "verbs",
+    "physion.core.registry": "registered objects",
+    "physion.report.figures.theme": "modules of figures",
+}
+"""Modules that import others by names that are not written at the call."""
+
+
+def _room_levels() -> dict[str, int]:
+    """Return the level of each room in the layers of the import arrows, from above."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    (layers,) = (
+        contract["layers"]
+        for contract in project["tool"]["importlinter"]["contracts"]
+        if contract["type"] == "layers"
+    )
+    return {room.strip(): level for level, rooms in enumerate(layers) for room in rooms.split(":")}
 
 
 def test_no_import_ring() -> None:
@@ -69,6 +92,34 @@ def test_no_import_ring() -> None:
     count, labels = connected_components(csr_array(graph), connection="strong")
     rings = [[m for m, of in zip(modules, labels, strict=True) if of == k] for k in range(count)]
     assert not [ring for ring in rings if len(ring) > 1]
+
+
+def test_every_import_by_name_is_known() -> None:
+    found = set()
+    for path in SOURCES:
+        for name, call in _calls(ast.parse(path.read_text())):
+            written = call.args and isinstance(call.args[0], ast.Constant)
+            if name.endswith(("import_module", "__import__")) and not written:
+                found.add(_module(path))
+    assert found == set(BY_NAME)
+
+
+def test_no_module_names_one_of_a_higher_room() -> None:
+    """As registries do, whose objects are imported when they are asked for."""
+    levels, modules = _room_levels(), {_module(path) for path in SOURCES}
+    upward = []
+    for path in SOURCES:
+        level = levels.get(".".join(_module(path).split(".")[:2]), -1)
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not (isinstance(node, ast.Constant) and isinstance(node.value, str)):
+                continue
+            named = node.value.partition(":")[0]
+            room = ".".join(named.split(".")[:2])
+            if named == "physion.cli.main":
+                continue  # the command line as a process of its own
+            if named in modules and room in levels and levels[room] < level:
+                upward.append(f"{_module(path)}, line {node.lineno}: {node.value}")
+    assert not upward
 
 
 def test_modules_have_names_that_say_something() -> None:
