@@ -16,12 +16,11 @@ from matplotlib import pyplot as plt
 from numpy.typing import NDArray
 from PIL import Image
 
+from physion.core.seeds import trial_seed
 from physion.physics.engine import simulate
 from physion.rendering.renderer import Frame, Renderer, role_map
 from physion.scenes.looks import with_role_colors
-from physion.scenes.sampling.sample import get_preset
-from physion.scenes.sampling.sample import sample_scene
-from physion.core.seeds import trial_seed
+from physion.scenes.sampling.sample import get_preset, sample_scene
 
 TRIALS = {
     "dominoes": ("2mid_J020R15_d3chairs_o1plants_tdwroom", 0, 60),

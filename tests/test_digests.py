@@ -18,8 +18,6 @@ from physion.core.files import (
     digest_path,
     has_digest,
     is_whole,
-    read_sealed,
-    write_sealed,
     write_with_digest,
 )
 
@@ -82,26 +80,3 @@ def test_a_fault_between_file_and_digest_leaves_no_wrong_digest(
     check_digest(path, content, "")
     assert is_whole(path) == (step == 2)
     assert digests.has_digest(path) == (step == 2)
-
-
-def test_sealed_files_are_bounded_and_nested_shallowly(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "s.json"
-    write_sealed(path, {"b": [1.5, None], "a": "ü"})
-    assert read_sealed(path) == {"a": "ü", "b": [1.5, None]}
-    path.write_text('{"a": ' + "[" * 100_000)
-    with pytest.raises(BadInputError, match=r"s\.json is nested deeper than 100 levels"):
-        read_sealed(path)
-    monkeypatch.setattr("physion.core.files.MAX_BYTES", 10)
-    with pytest.raises(BadInputError, match=r"s\.json has \d+ bytes, more than 10"):
-        read_sealed(path)
-    with pytest.raises(BadInputError, match="is missing"):
-        read_sealed(tmp_path / "none.json")
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names here")
-def test_a_pipe_in_the_place_of_a_sealed_file_does_not_hang(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "s.json")
-    with pytest.raises(BadInputError, match="is not a regular file"):
-        read_sealed(tmp_path / "s.json")

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from physion.analysis.tables import read_humans
 from physion.core.names import canonical_name
 from physion.core.seeds import stable_hash
-from physion.data import official
+from physion.data.official import official
 from physion.models.noisy_simulation import configuration_half, cut_trial
 from physion.models.state_noise import NoiseLevels, ObservedTrial, simulate_contacts
 from physion.physics.engine import make_engine, simulate

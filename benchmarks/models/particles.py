@@ -50,7 +50,7 @@ from physion.clips.batch import LAST_OBSERVED, Batch, Motion, cut_to_observed
 from physion.clips.clips import observed_source, whole_source
 from physion.compute.tasks import processor
 from physion.core.names import canonical_name
-from physion.data import official
+from physion.data.official import official
 from physion.models.interface import can
 from physion.models.particles.bodies import poses_of, rotation_from_vector, scene_particles
 from physion.models.particles.networks import (

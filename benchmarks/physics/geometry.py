@@ -14,7 +14,7 @@ from collections import defaultdict
 import h5py
 import numpy as np
 
-from physion.data import official
+from physion.data.official import official
 from physion.scenes.scene import Scene
 from physion.trials.trial_file import GEOMETRY, geometry_arrays, storage
 

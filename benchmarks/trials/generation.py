@@ -27,7 +27,7 @@ import numpy as np
 import physion
 from physion.compute.tasks import processor
 from physion.scenes.sampling.build import scenarios
-from physion.trials.making.choose import Slot, choose
+from physion.trials.making.choose import choose
 from physion.trials.making.make import make_trial
 from physion.trials.making.plan import FULL_COUNTS, GenerateJob, GenerateSettings, plan_dataset
 from physion.trials.trial_file import Trial
@@ -46,7 +46,7 @@ def measure(scenario: str, split: str, count: int, settings: GenerateSettings) -
     try:
         for task in plan_dataset("benchmark", [scenario], {split: count}):
             begin = time.process_time()
-            filled = choose(Slot(task, settings)).fill(task)
+            filled, _ = choose(GenerateJob(task, folder, settings))
             chosen = time.process_time()
             job = GenerateJob(filled, folder, settings)
             make_trial(job)

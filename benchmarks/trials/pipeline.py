@@ -36,7 +36,7 @@ from unittest import mock
 
 import physion
 from physion.compute.tasks import processor
-from physion.trials.making.choose import Slot, choose
+from physion.trials.making.choose import choose
 from physion.trials.making.make import make_trial
 from physion.trials.making.plan import GenerateJob, GenerateSettings, plan_dataset
 
@@ -150,7 +150,7 @@ def safe() -> dict[str, float]:
     seconds: dict[bool, list[float]] = {True: [], False: []}
     with folders() as folder:
         for number, task in enumerate(tasks):
-            filled = choose(Slot(task, settings)).fill(task)
+            filled, _ = choose(GenerateJob(task, folder(), settings))
             # The first trial loads the compiled code; the order of the two changes with each.
             for synced in (True, False) if number % 2 else (False, True):
                 job = GenerateJob(filled, folder(), settings)

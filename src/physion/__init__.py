@@ -4,7 +4,8 @@ The public names are imported when they are first used, so that ``import physion
 
 - `sample_scene`: sample a scene of a scenario. `simulate`: compute its motion. `label_contact`:
   find out whether agent and patient touch. `Renderer`: render any pass of any frame.
-- `generate`: make a dataset of trials. `Dataset`: read it; `Dataset.clips` gives clips to torch.
+- `generate`: make a dataset of trials. `Dataset`: read it. `clips`: its clips, as torch takes them.
+- `official`: the data of the original study: scenes, recorded outcomes, answers of people.
 - `build_model`: build a model. `train`: train it. `evaluate`: predict the trials of a dataset.
 - `compare`: compare predictions with people.
 """
@@ -17,6 +18,8 @@ from physion.core.version import __version__
 
 if TYPE_CHECKING:
     from physion.analysis.compare import compare
+    from physion.clips.clips import clips
+    from physion.data.official import official
     from physion.models.build import build_model
     from physion.physics.engine import simulate
     from physion.physics.labels import label_contact
@@ -32,10 +35,12 @@ __all__ = [
     "Renderer",
     "__version__",
     "build_model",
+    "clips",
     "compare",
     "evaluate",
     "generate",
     "label_contact",
+    "official",
     "sample_scene",
     "simulate",
     "train",
@@ -45,10 +50,12 @@ _MODULES = {
     "Dataset": "physion.trials.dataset",
     "Renderer": "physion.rendering.renderer",
     "build_model": "physion.models.build",
+    "clips": "physion.clips.clips",
     "compare": "physion.analysis.compare",
     "evaluate": "physion.readout.evaluate",
     "generate": "physion.trials.making.generate",
     "label_contact": "physion.physics.labels",
+    "official": "physion.data.official",
     "sample_scene": "physion.scenes.sampling.sample",
     "simulate": "physion.physics.engine",
     "train": "physion.readout.trainings",
@@ -62,8 +69,9 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    value = globals()[name] = getattr(import_module(_MODULES[name]), name)
-    return value
+    value = getattr(import_module(_MODULES[name]), name)
+    # The package `physion.clips`, which importing the function put there, is that function too.
+    return globals().setdefault(name, value)
 
 
 def __dir__() -> list[str]:

@@ -14,7 +14,8 @@ import pytest
 
 from physion.cli.compare.compare import SUBVERBS
 from physion.cli.main import main
-from physion.trials.index import COLUMNS, TrialPaths
+from physion.trials.files import TrialPaths
+from physion.trials.index import COLUMNS
 
 
 def predictions(official: Path, path: Path, model: str = "m", skill: float = 0.8) -> Path:

@@ -11,11 +11,18 @@ import pytest
 
 from physion.analysis.published.claims import published_results
 from physion.analysis.tables import read_humans
+from physion.cli.main import main as cli
 from physion.core.errors import BadInputError
 from physion.core.names import SCENARIOS, canonical_name
-from physion.data import OfficialData, official
 from physion.data.make import make_official
-from physion.data.official import SCENES, trial_line
+from physion.data.official import (
+    SCENES,
+    OfficialData,
+    humans_folder,
+    official,
+    read_official_trials,
+    trial_line,
+)
 from physion.scenes.tdw.read_logs import read_scenes
 from support.official import official_folder
 
@@ -63,24 +70,21 @@ def test_a_changed_file_is_one_clear_line(copy: Path, name: str) -> None:
     content = bytearray((copy / name).read_bytes())
     content[len(content) // 2] ^= 1
     (copy / name).write_bytes(content)
-    with pytest.raises(BadInputError, match=f"{name} was changed since it was made"):
+    with pytest.raises(BadInputError, match=f"{name} was changed since it was written"):
         OfficialData(copy).read(name)
 
 
 def test_a_changed_answer_of_people_is_found(copy: Path) -> None:
-    path = next((copy / "humans").iterdir())
+    path = next((copy / "humans").glob("*.csv"))
     path.write_text(path.read_text().replace("0.7", "0.9", 1))
     with pytest.raises(BadInputError, match="was changed"):
         _ = OfficialData(copy).humans
 
 
-def test_other_versions_and_folders_are_refused(copy: Path, tmp_path: Path) -> None:
-    manifest = json.loads((copy / "manifest.json").read_text())
-    (copy / "manifest.json").write_text(json.dumps({**manifest, "version": 99}))
-    with pytest.raises(BadInputError, match="version 99"):
-        _ = OfficialData(copy).trials
-    with pytest.raises(BadInputError, match="holds no official data"):
-        _ = OfficialData(tmp_path).manifest
+def test_other_folders_are_refused(copy: Path, tmp_path: Path) -> None:
+    (copy / "scenes.jsonl.gz").unlink()
+    with pytest.raises(BadInputError, match=r"holds no official data .*physion import CHECKOUT"):
+        official(copy)
     with pytest.raises(BadInputError, match="holds no human_accuracy"):
         make_official(tmp_path / "data" / "results", tmp_path / "out")
     with pytest.raises(BadInputError, match="not a folder"):
@@ -94,7 +98,10 @@ def test_the_package_is_what_the_official_files_give(tmp_path: Path) -> None:
     assert made.trials == 874 and made.answered == 1144
     assert any("have no scene" in note for note in made.notes)
     packaged = official()
-    for name in packaged.manifest["sha256"]:
+    names = {str(p.relative_to(made.folder)) for p in made.folder.rglob("*") if p.is_file()}
+    there = packaged.folder.rglob("*")
+    assert names == {str(p.relative_to(packaged.folder)) for p in there if p.is_file()}
+    for name in sorted(name for name in names if not name.endswith(".sha256")):
         content = (made.folder / name).read_bytes()
         if name == SCENES:
             # Other versions of zlib compress differently.
@@ -125,3 +132,37 @@ def test_a_configuration_given_twice_is_named_or_refused(tmp_path: Path) -> None
 def test_a_line_of_a_trial_comes_back_whole() -> None:
     trial = official().trials[0]
     assert json.loads(trial_line(trial))["scene"]["name"] == trial.scene.name
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not OFFICIAL.is_dir(), reason="the official data is not here")
+def test_a_checkout_is_converted_and_read_in_place_of_the_package(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli(["import", str(OFFICIAL), str(tmp_path / "made"), "--json"]) == 0
+    made = json.loads(capsys.readouterr().out)
+    assert made["trials"] == 874 and made["answered"] == 1144
+    assert read_official_trials(tmp_path / "made").trials == list(official().trials)
+    assert humans_folder(tmp_path / "made") == tmp_path / "made" / "humans"
+
+
+def test_official_means_the_package_unless_there_is_such_a_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert humans_folder(Path("official")) == official().humans
+    (tmp_path / "official").mkdir()
+    assert humans_folder(Path("official")) == Path("official")
+
+
+def test_trials_are_chosen_by_scenario_and_limit() -> None:
+    chosen = read_official_trials(Path("official"), "link", 3).trials
+    assert [trial.scene.scenario for trial in chosen] == ["link"] * 3
+
+
+def test_another_layout_is_one_clear_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli(["import", str(tmp_path), str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert "checkout of the original study" in error and error.count("\n") == 1

@@ -14,7 +14,8 @@ import pytest
 
 from physion.physics.labels import Labels
 from physion.trials import state
-from physion.trials.index import INDEX_COLUMNS, Metadata
+from physion.trials.files import Metadata
+from physion.trials.index import INDEX_COLUMNS
 from physion.trials.trial_file import FIELDS, GEOMETRY, PASSES, SCHEMA, Field, Trial
 from support.paths import ROOT
 

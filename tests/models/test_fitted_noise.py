@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.data import official
+from physion.data.official import official
 from physion.models import Batch, Motion, build_model
 from physion.models.noisy_simulation import FITTED, configuration_half, fitted_levels
 from physion.models.state_noise import NoiseLevels

@@ -16,7 +16,7 @@ from physion.core.errors import BadInputError
 from physion.physics.labels import Labels, label_contact
 from physion.physics.trajectory import Contacts, Trajectory
 from physion.scenes.scene import Body, Camera, Cloth, Roles, Scene
-from physion.trials.index import Metadata, encode_png, write_files
+from physion.trials.files import Metadata, encode_png, write_files
 from physion.trials.making.plan import GenerateJob
 from physion.trials.trial_file import TrialWriter
 from physion.trials.video import encode_movie

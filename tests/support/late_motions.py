@@ -19,14 +19,8 @@ from physion.physics.trajectory import ENVIRONMENT
 from physion.rendering.renderer import Renderer, role_map
 from physion.scenes.looks import in_look
 from physion.trials.dataset import Dataset
-from physion.trials.index import (
-    Metadata,
-    TrialPaths,
-    build_index,
-    encode_png,
-    write_files,
-    write_index,
-)
+from physion.trials.files import Metadata, TrialPaths, encode_png, write_files
+from physion.trials.index import build_index, write_index
 from physion.trials.trial_file import TrialWriter
 from physion.trials.video import encode_movie
 from support.crossing_bodies import crossing

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.trials.dataset import Dataset
-from physion.trials.index import COLUMNS, TrialPaths, as_table, write_index
+from physion.trials.files import TrialPaths
+from physion.trials.index import COLUMNS, as_table, write_index
 from physion.trials.video import encode_movie
 
 FRAMES, SIZE, OBSERVED = 151, 64, 45

@@ -12,7 +12,8 @@ from physion.physics.trajectory import ENVIRONMENT, Contacts, Trajectory
 from physion.rendering.renderer import Renderer, role_map
 from physion.scenes.looks import in_look
 from physion.scenes.scene import Body, Camera, Cloth, Look, Push, Roles, Scene, SurfaceMaterial
-from physion.trials.index import Metadata, TrialPaths, build_index, write_files, write_index
+from physion.trials.files import Metadata, TrialPaths, write_files
+from physion.trials.index import build_index, write_index
 from physion.trials.trial_file import TrialWriter
 from physion.trials.video import encode_movie
 from support.hand_made import encode_png

@@ -10,14 +10,8 @@ import numpy as np
 from physion.physics.labels import label_contact
 from physion.physics.trajectory import Contacts, Trajectory
 from physion.scenes.scene import Body, Camera, Cloth, Look, Push, Roles, Scene
-from physion.trials.index import (
-    Metadata,
-    TrialPaths,
-    build_index,
-    encode_png,
-    write_files,
-    write_index,
-)
+from physion.trials.files import Metadata, TrialPaths, encode_png, write_files
+from physion.trials.index import build_index, write_index
 from physion.trials.trial_file import TrialWriter
 from physion.trials.video import encode_movie
 

@@ -23,7 +23,7 @@ def plan_of(monkeypatch: pytest.MonkeyPatch, folder: Path, *arguments: Any, **mo
         return RunReport([], [], {}, folder / "index")
 
     monkeypatch.setattr(module, "make_trials", note)
-    monkeypatch.setattr(module, "Dataset", lambda folder: folder)
+    monkeypatch.setattr(module, "GeneratedDataset", lambda folder, report: folder)
     assert physion.generate(folder, *arguments, **more) == folder
     return seen[0]
 
@@ -38,6 +38,7 @@ def test_the_plan_is_that_of_the_command_line(
     counts = {"training": 2, "readout": 1}
     tasks = plan_of(monkeypatch, tmp_path, ("drop", "roll"), counts, name="mine")
     assert tasks == plan_dataset("mine", ["drop", "roll"], counts)
+    assert plan_of(monkeypatch, tmp_path, "drop,roll", counts, name="mine") == tasks
     tasks = plan_of(monkeypatch, tmp_path, "collide", 2, presets=["debug"])
     assert {task.presets for task in tasks} == {("debug",)}
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import physion
 from physion.core.errors import BadInputError
-from physion.trials.index import TrialPaths
+from physion.trials.files import TrialPaths
 from physion.trials.making.verify import _check_trial
 from physion.trials.state import world_vertices
 from physion.trials.trial_file import GEOMETRY, SEAL_BYTES, Trial, TrialWriter, seal

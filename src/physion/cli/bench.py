@@ -27,7 +27,7 @@ from physion.physics.replay import Replay, ReplayTask, replay_trial, summarise
 from physion.rendering.renderer import PASSES, Renderer
 from physion.scenes.sampling.build import scenarios
 from physion.scenes.sampling.sample import sample_scene
-from physion.trials.making.choose import Slot, choose
+from physion.trials.making.choose import choose
 from physion.trials.making.make import make_trial
 from physion.trials.making.plan import GenerateJob, GenerateSettings, plan_dataset
 from physion.trials.trial_file import Trial
@@ -154,7 +154,7 @@ def _trials(scenario: str, count: int) -> tuple[float, float, int, int]:
         # The first trial loads compiled code, and is not counted.
         for number, task in enumerate(plan_dataset("bench", [scenario], {"readout": count + 1})):
             begin = time.process_time()
-            filled = choose(Slot(task, settings)).fill(task)
+            filled, _ = choose(GenerateJob(task, Path(name), settings))
             chosen = time.process_time()
             job = GenerateJob(filled, Path(name), settings)
             make_trial(job)

@@ -11,8 +11,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from physion.cli.official.report import print_report
-from physion.cli.output import Stages, console
+from physion.cli.output import Stages, console, print_report
 from physion.compute.local import LocalExecutor
 from physion.core.errors import BadInputError
 

@@ -19,8 +19,7 @@ VERBS = {
     "experiment": "run the experiment with people: init, serve, export",
     "view": "write a page that shows a dataset: movies, passes, motion in 3D",
     "export": "write the official layout, webdataset shards, or a dataset card",
-    "import": "convert official HDF5 files and movies to trials",
-    "import-official": "convert a checkout of the original study: scenes, outcomes, people",
+    "import": "convert official HDF5 files, movies, or a checkout of the original study",
     "verify": "check every byte, label and motion of a dataset",
     "ls": "list scenarios, presets, shapes, props, materials, models, decisions, rooms, engines",
     "doctor": "check this machine and print what to install",
@@ -29,7 +28,6 @@ VERBS = {
 
 MODULES = {
     "import": "import_trials",
-    "import-official": "official.import_official",
     "run": "run.run",
     "compare": "compare.compare",
     "experiment": "experiment.experiment",
@@ -85,8 +83,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "physion export trials official-files --layout official",
         "physion export trials --layout card --creator 'A. Author' --license CC-BY-4.0",
     ),
-    "import": ("physion import official-files trials --split testing",),
-    "import-official": ("physion import-official CHECKOUT study",),
+    "import": (
+        "physion import official-files trials --split testing",
+        "physion import CHECKOUT study",
+    ),
     "verify": (
         "physion verify trials --again 20",
         "physion verify trials --against trials-of-another-machine",

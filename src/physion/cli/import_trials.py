@@ -1,7 +1,14 @@
-"""Convert official HDF5 files and movies to a dataset of this package."""
+"""Convert official HDF5 files and movies to a dataset, or a checkout of the study to its data.
+
+A checkout, which has human_accuracy-*.csv and command logs, becomes a folder with scenes, recorded
+outcomes, labels, answers of people and published tables. --scenes, --humans and replay take it in
+place of `official`.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import json as json_module
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,10 +16,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from physion.cli.official.report import print_report
-from physion.cli.output import Stages
-from physion.compute.local import LocalExecutor
-from physion.trials.official.import_folder import import_official
+from physion.cli.output import Stages, console, print_report
+from physion.core.errors import BadInputError
 
 
 @dataclass(frozen=True)
@@ -20,13 +25,13 @@ class Options:
     """Options of ``physion import``."""
 
     folder: Annotated[Path, tyro.conf.Positional]
-    """Folder with official files, at any depth."""
+    """Folder with official HDF5 files or movies at any depth, or a checkout of the study."""
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of the dataset: new, or one to resume."""
-    name: str | None = None
-    """Name of the dataset; default: the name in files of this package, else "imported"."""
+    name: str = "imported"
+    """Name of the dataset."""
     split: Literal["training", "readout", "testing", "familiarization"] | None = None
-    """Split of the trials; default: the split in files of this package, else testing."""
+    """Split of the trials; default: that of metadata.json beside the files, else testing."""
     scenario: str | None = None
     """Scenario of all files; default: inferred from their names."""
     workers: int = os.cpu_count() or 1
@@ -37,6 +42,13 @@ class Options:
 
 def main(options: Options) -> int:
     """Import what is missing; return 1 if a file failed."""
+    from physion.data.make import is_checkout
+
+    if is_checkout(options.folder):
+        return _checkout(options)
+    from physion.compute.local import LocalExecutor
+    from physion.trials.official.import_folder import import_official
+
     with Stages() as stages:
         report = import_official(
             options.folder,
@@ -48,3 +60,24 @@ def main(options: Options) -> int:
             progress=stages,
         )
     return print_report(report, options.json)
+
+
+def _checkout(options: Options) -> int:
+    from physion.data.make import make_official
+
+    for name in ("split", "scenario"):
+        if getattr(options, name) is not None:
+            raise BadInputError(f"--{name} does not apply to a checkout of the study: leave it out")
+    made = make_official(options.folder, options.out)
+    if options.json:
+        print(json_module.dumps(dataclasses.asdict(made), default=str))
+        return 0
+    for note in made.notes:
+        console.print(f"note: {note}", markup=False, soft_wrap=True)
+    console.print(
+        f"{made.trials} scenes, {made.stimuli} labels, {made.answered} stimuli with answers: "
+        f"{made.folder}",
+        markup=False,
+        soft_wrap=True,
+    )
+    return 0

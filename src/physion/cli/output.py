@@ -5,6 +5,7 @@ Text tables are not cut to the width of the terminal, so that they can be search
 
 from __future__ import annotations
 
+import json
 import sys
 import time
 from collections.abc import Iterable
@@ -27,6 +28,8 @@ from physion.core.files import write_atomic
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from physion.compute.run_tasks import RunReport
 
 
 class OutputConsole(Console):
@@ -151,3 +154,26 @@ def _cell(value: object) -> str:
     if pd.isna(value):
         return ""
     return f"{value:.0f}" if value.is_integer() and abs(value) > 1 else f"{value:.3f}"
+
+
+SHOWN_NOTES = 5
+
+
+def print_report(report: RunReport, as_json: bool) -> int:
+    """Print which trials were made, kept and failed, as text or JSON; return the exit code."""
+    if as_json:
+        values = {"made": report.made, "kept": report.kept, "failed": dict(report.failed)}
+        values |= {"notes": dict(report.notes), "index": str(report.index)}
+        print(json.dumps(values))
+        return report.exit_code
+    for name, reason in report.failed.items():
+        console.print(f"failed: {name}: {reason}", markup=False, soft_wrap=True)
+    notes = [f"{name}: {note}" for name, texts in report.notes.items() for note in texts]
+    for note in notes[:SHOWN_NOTES]:
+        console.print(f"note: {note}", markup=False, soft_wrap=True)
+    if len(notes) > SHOWN_NOTES:
+        more = len(notes) - SHOWN_NOTES
+        console.print(f"... and {more} more notes (--json lists all)", markup=False)
+    done = f"{len(report.made)} made, {len(report.kept)} kept, {len(report.failed)} failed"
+    console.print(f"{done}: {report.index}", markup=False, soft_wrap=True)
+    return report.exit_code

@@ -19,13 +19,12 @@ from typing import Annotated
 import pandas as pd
 import tyro
 
-from physion.cli.official.read import read_trials
 from physion.cli.output import Stages, console, text_table, write_text
 from physion.compute.run_tasks import ExecutorSettings
 from physion.compute.tasks import Executor, tracked
 from physion.core.errors import BadInputError
 from physion.core.version import MADE_WITH
-from physion.data import PACKAGED
+from physion.data.official import PACKAGED, read_official_trials
 from physion.physics.engine import DEFAULT_ENGINE, can_simulate, engines
 from physion.physics.replay import Replay, ReplayRow, ReplayTask, replay_trial, summarise
 from physion.scenes.tdw.read_logs import TrialSet
@@ -84,7 +83,7 @@ class Options:
     """Options of ``physion replay``."""
 
     folder: Annotated[Path, tyro.conf.Positional] = Path(PACKAGED)
-    """Folder with official command logs, at any depth, or made by import-official; official stands
+    """Folder with official command logs, at any depth, or made by physion import; official stands
     for the scenes of the package."""
     json: Path | None = None
     """Write the table, all trials and all failures to this file."""
@@ -111,7 +110,7 @@ def main(options: Options) -> int:
         raise BadInputError("--repeats and --jitter must not be negative")
     if options.json is not None and options.json.is_dir():
         raise BadInputError(f"--json {options.json} is a folder; give a file")
-    logs = read_trials(options.folder, options.scenario, options.limit)
+    logs = read_official_trials(options.folder, options.scenario, options.limit)
     logs.require_trials()
     trials, copies = logs.unique()
     names = _engine_names(options.engines)

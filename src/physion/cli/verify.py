@@ -12,7 +12,7 @@ from typing import Annotated
 
 import tyro
 
-from physion.cli.output import Stages, console
+from physion.cli.output import Stages, console, counted
 from physion.trials.making.verify import SAMPLE, DatasetComparison, compare_datasets, verify_dataset
 
 
@@ -24,6 +24,9 @@ class Options:
     """Folder of a dataset."""
     again: int = SAMPLE
     """Number of trials to simulate and render again for a bitwise comparison; -1: all."""
+    repair: bool = False
+    """Delete the trial files of damaged trials: the command that made the dataset then makes these
+    trials again."""
     against: Path | None = None
     """Folder of another dataset, for example of another machine or version: trials that only one of
     both has, or that differ in scene, motion, label or bytes of files, are named."""
@@ -36,7 +39,9 @@ def main(options: Options) -> int:
     """Print faults, notes and differences; return 1 if there is a fault or a difference."""
     other = None
     with Stages() as stages:
-        result = verify_dataset(options.folder, again=options.again, progress=stages)
+        result = verify_dataset(
+            options.folder, again=options.again, repair=options.repair, progress=stages
+        )
         if options.against is not None:
             other = compare_datasets(options.folder, options.against, progress=stages)
     failed = bool(result.faults) or (other is not None and not other.equal)
@@ -47,9 +52,17 @@ def main(options: Options) -> int:
     for line in (*result.notes, *result.other_versions, *result.faults):
         console.print(line, markup=False, soft_wrap=True)
     others = result.other_versions
-    differ = f", {len(others)} differences from another version" if others else ""
-    noted = f", {len(result.notes)} notes" if result.notes else ""
-    line = f"{options.folder}: {len(result.faults)} faults{differ}{noted}"
+    differ = f", {counted(len(others), 'difference')} from another version" if others else ""
+    noted = f", {counted(len(result.notes), 'note')}" if result.notes else ""
+    line = f"{options.folder}: {counted(len(result.faults), 'fault')}{differ}{noted}"
+    if result.damaged:
+        trials = counted(len(result.damaged), "damaged trial")
+        again = "the command that made the dataset makes them again"
+        line += (
+            f"; {trials} deleted: {again}"
+            if options.repair
+            else (f"; --repair deletes the {trials}, and {again}")
+        )
     console.print(line, markup=False, soft_wrap=True)
     if other is not None and options.against is not None:
         _print_comparison(other, options.folder, options.against)
@@ -65,7 +78,7 @@ def _print_comparison(compared: DatasetComparison, folder: Path, against: Path) 
     alone = len(compared.only_first) + len(compared.only_second)
     lines.append(
         f"{folder} against {against}: {compared.same} trials are the same, "
-        f"{len(compared.differences)} differ, {alone} are in one of them alone"
+        f"{len(compared.differences)} differ, {alone} are only in one of them"
     )
     for line in lines:
         console.print(line, markup=False, soft_wrap=True)

@@ -1,43 +1,33 @@
-"""Clips of a dataset one by one, as torch's ``DataLoader`` takes them. This module needs no torch.
+"""Clips of a dataset one by one, as torch's ``DataLoader`` takes them; torch is not needed.
 
-`physion.trials.dataset.Dataset.clips` makes them.
+`clips` makes them; `observed_source` and `whole_source` open the sources that models are given.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
 from physion.clips.batch import PIXELS, Spec
+from physion.clips.movies import MovieReader, movie_files
+from physion.clips.rendered import MotionRenderer
 from physion.clips.source import (
     ClipReader,
-    ObservedBatches,
     ObservedSource,
     TrialReaders,
-    WholeBatches,
     WholeSource,
 )
+from physion.clips.states import TrialMotions
 from physion.core.errors import BadInputError
 from physion.scenes.looks import LOOKS
-
-if TYPE_CHECKING:
-    from physion.trials.dataset import Dataset
-
-
-# Sources of the batches of a dataset.
-#
-# Modules that need av or hdf5plugin are imported when they are used, so that clips can be rendered
-# and models trained without them.
+from physion.trials.dataset import Dataset
 
 
 def observed_source(
-    dataset: Dataset,
-    spec: Spec,
-    *,
-    look: str | None = None,
-    rendered: bool = False,
+    dataset: Dataset, spec: Spec, *, look: str | None = None, rendered: bool = False
 ) -> ObservedSource:
     """Return the source of the observed part of the trials of a dataset.
 
@@ -61,24 +51,15 @@ def observed_source(
         If the look is unknown. Batches raise it for a file that is missing, damaged, or changed
         since it was made.
     """
-    return _observed(dataset, spec, look, rendered)
+    return ObservedSource(spec, _readers(dataset, spec, look, rendered, observed=True))
 
 
 def whole_source(
-    dataset: Dataset,
-    spec: Spec,
-    *,
-    look: str | None = None,
-    rendered: bool = False,
+    dataset: Dataset, spec: Spec, *, look: str | None = None, rendered: bool = False
 ) -> WholeSource:
     """Return the source of whole trials of a dataset; parameters as of `observed_source`."""
-    context = _observed(dataset, spec, look, rendered)
-    return WholeBatches(context, _readers(dataset, spec, look, rendered, observed=False))
-
-
-def _observed(dataset: Dataset, spec: Spec, look: str | None, rendered: bool) -> ObservedBatches:
-    readers = _readers(dataset, spec, look, rendered, observed=True)
-    return ObservedBatches(spec, readers)
+    context = observed_source(dataset, spec, look=look, rendered=rendered)
+    return WholeSource(context, _readers(dataset, spec, look, rendered, observed=False))
 
 
 def _readers(
@@ -101,18 +82,12 @@ def _readers(
     from_movies = ("rgb",) if "rgb" in spec.inputs and not rendered else ()
     from_motion = [name for name in spec.inputs if name in PIXELS and name not in from_movies]
     if from_movies:
-        from physion.clips.movies import MovieReader, movie_files
-
         files = movie_files(dataset, observed=observed, look=look)
         readers.append(MovieReader(files, spec.image_size))
     if not from_motion and "state" not in spec.inputs:
         return TrialReaders(lengths, readers)
-    from physion.clips.states import TrialMotions
-
     motions = TrialMotions(dataset.files("trial_file"), observed=observed)
     if from_motion:
-        from physion.clips.rendered import MotionRenderer
-
         if from_movies:
             _check_square(dataset)
         looks = {str(row.trial): look or str(row.look) for row in index.itertuples()}
@@ -131,8 +106,113 @@ def _check_square(dataset: Dataset) -> None:
         )
 
 
+def clips(
+    dataset: Dataset | Path | str,
+    *,
+    split: str | None = None,
+    scenario: str | None = None,
+    context: int = 7,
+    future: int = 18,
+    stride: int = 6,
+    context_at: Literal["start", "end"] = "start",
+    size: int = 224,
+    passes: Sequence[str] = ("rgb",),
+    look: str | None = None,
+    objects: int = 10,
+    padding: bool = True,
+    labels: bool = True,
+    rendered: bool = False,
+) -> Clips:
+    """Return clips, one for each trial, which torch's ``DataLoader`` takes as they are.
+
+    The words are those of `physion.clips.batch.Spec`; its defaults are those of the study.
+
+    Parameters
+    ----------
+    dataset
+        The dataset, or its folder.
+    split, scenario
+        Which trials; by default all.
+    context, future
+        Frames of a clip in the observed part, and after them. With ``future=0`` nothing that
+        follows the observed part is opened.
+    stride
+        Frames of 0.01 s from one frame of a clip to the next.
+    context_at
+        ``start``: frame 0 comes first; ``end``: the last frame of the context is the last
+        observed one.
+    size
+        Pixels per side.
+    passes
+        Any of rgb, ids, depth, boxes, camera. All but ``rgb`` are rendered.
+    look
+        Colours: ``redyellow`` or ``free``; by default each trial's own.
+    objects
+        Rows of ``boxes``.
+    padding
+        Repeat the last frame in clips that are longer than their trial; otherwise such trials
+        are left out.
+    labels
+        Give the outcome, too.
+    rendered
+        Render ``rgb`` from the motion instead of reading movies.
+
+    Returns
+    -------
+    clips
+        A sequence of dictionaries: ``trial`` (name), ``label`` (bool: agent and patient touch),
+        ``frames`` (T) int64, ``valid`` (T) bool: whether the trial has that frame, ``rgb``
+        (T, H, W, 3) uint8, ``ids`` (T, H, W) uint8: 0 scenery, 1 agent, 2 patient, 3 and more
+        the others, ``depth`` (T, H, W) float32 in metres, ``boxes`` (T, objects, 4) float32 in
+        0..1 with NaN for the unseen, ``camera`` (2, 4, 4) float64: view and projection.
+
+    Raises
+    ------
+    BadInputError
+        For an unknown pass or look, a context that is not observed, or no trial. Items raise it
+        for a file that is missing, damaged or changed.
+
+    Examples
+    --------
+    >>> clips = physion.clips("trials", split="training", size=64)  # doctest: +SKIP
+    >>> loader = torch.utils.data.DataLoader(clips, 32, shuffle=True)  # doctest: +SKIP
+    """
+    unknown = [name for name in passes if name not in PIXELS]
+    if unknown or not passes:
+        raise BadInputError(
+            f"clips: passes must be some of {', '.join(PIXELS)}, not {list(passes)}"
+        )
+    spec = Spec(
+        inputs=tuple(passes),
+        image_size=size,
+        stride=stride,
+        context=context,
+        future=future,
+        context_at=context_at,
+        objects=objects,
+    )
+    if not isinstance(dataset, Dataset):
+        dataset = Dataset(dataset)
+    trials = dataset.trials(split, scenario)
+    if not padding:
+        column = "frames" if future else "observed_frames"
+        length = dict(zip(dataset.index["trial"], dataset.index[column], strict=True))
+        trials = [trial for trial in trials if length[trial] > spec.all_frames()[-1]]
+    if not trials:
+        if padding:
+            raise BadInputError(
+                f"{dataset.folder} has no trial of split {split or 'any'} and scenario "
+                f"{scenario or 'any'}"
+            )
+        raise BadInputError(
+            f"no trial of {dataset.folder} is long enough for a clip (split {split or 'any'}, "
+            f"scenario {scenario or 'any'})"
+        )
+    return Clips(dataset, trials, spec, look=look, labels=labels, rendered=rendered)
+
+
 class Clips(Sequence[dict[str, Any]]):
-    """Clips with labels, one for each trial; see `Dataset.clips` for parameters and items.
+    """Clips with labels, one for each trial, which `clips` makes.
 
     Clips without a future are read from the observed movies, and motions that are cut when they
     are read. Files are opened when a clip is asked for, in the process that asks.
@@ -141,47 +221,16 @@ class Clips(Sequence[dict[str, Any]]):
     def __init__(
         self,
         dataset: Dataset,
+        trials: Sequence[str],
+        spec: Spec,
         *,
-        split: str | None = None,
-        scenario: str | None = None,
-        context: int = 7,
-        future: int = 18,
-        stride: int = 6,
-        context_at: Literal["start", "end"] = "start",
-        size: int = 224,
-        passes: Sequence[str] = ("rgb",),
-        look: str | None = None,
-        objects: int = 10,
-        padding: bool = True,
-        labels: bool = True,
-        rendered: bool = False,
+        look: str | None,
+        labels: bool,
+        rendered: bool,
     ) -> None:
-        unknown = [name for name in passes if name not in PIXELS]
-        if unknown or not passes:
-            raise BadInputError(
-                f"clips: passes must be some of {', '.join(PIXELS)}, not {list(passes)}"
-            )
-        self.spec = Spec(
-            inputs=tuple(passes),
-            image_size=size,
-            stride=stride,
-            context=context,
-            future=future,
-            context_at=context_at,
-            objects=objects,
-        )
-        index = dataset.index.set_index("trial")
-        self.trials = tuple(dataset.trials(split, scenario))
-        if not padding:
-            column = "frames" if future else "observed_frames"
-            long = index[column] > self.spec.all_frames()[-1]
-            self.trials = tuple(trial for trial in self.trials if long[trial])
-        if not self.trials:
-            raise BadInputError(
-                f"{dataset.folder} has no trial of split {split or 'any'} and scenario "
-                f"{scenario or 'any'}" + ("" if padding else " that is as long as a clip")
-            )
-        self._labels = index["contact"].astype(bool).to_dict() if labels else None
+        self.spec, self.trials = spec, tuple(trials)
+        outcomes = dataset.index.set_index("trial")["contact"].astype(bool)
+        self._labels = outcomes.to_dict() if labels else None
         self._dataset, self._look, self._rendered = dataset, look, rendered
         self._source = self._open()
 

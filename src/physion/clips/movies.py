@@ -1,11 +1,10 @@
-"""Pictures of clips from the movies of a dataset. This module needs av."""
+"""Pictures of clips from the movies of a dataset, and reading ahead."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -13,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.compute.local import available_cores
-from physion.compute.tasks import Executor, TaskOutcome
-from physion.core.errors import BadInputError, PhysionError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.trials.dataset import Dataset, indexed_file
-from physion.trials.index import IndexedFile
+from physion.trials.files import IndexedFile
 from physion.trials.video import MovieProperties, read_chosen
 
 
@@ -91,11 +89,10 @@ def _properties(row: Mapping[Any, Any], observed: bool) -> MovieProperties:
     )
 
 
-# Reading of batches ahead, in threads or processes.
+# Reading of batches ahead, in threads.
 #
 # Decoding of movies and the kernels of the renderer release Python's global lock, so that threads
-# read while a model trains. The renderer is partly Python itself: on more than a few cores,
-# processes render faster than threads.
+# read while a model trains.
 
 Request = TypeVar("Request")
 Read = TypeVar("Read")
@@ -107,12 +104,11 @@ def background(
     *,
     ahead: int = 2,
     threads: int | None = None,
-    executor: Executor | None = None,
 ) -> Iterator[Read]:
     """Yield ``read(request)`` of every request, in order, read ahead in threads.
 
     An error of ``read`` or of ``requests`` is raised where its result would come. When the iterator
-    ends, fails or is closed, all its threads and processes have ended.
+    ends, fails or is closed, all its threads have ended.
 
     Parameters
     ----------
@@ -124,15 +120,9 @@ def background(
         Results that are read or being read before they are asked for; they are held in memory.
     threads
         Number of threads; by default one for each core, at most ``ahead``.
-    executor
-        Executor that reads in place of threads, such as
-        `physion.compute.local.LocalExecutor`. Its workers decide how much is read ahead; all
-        requests are taken at once; errors become `PhysionError`, and ``read`` must be picklable.
     """
     if ahead < 1 or (threads is not None and threads < 1):
         raise BadInputError(f"reading ahead needs 1 result and 1 thread, not {ahead} and {threads}")
-    if executor is not None:
-        return _read_by_executor(requests, read, executor)
     return _read_ahead(iter(requests), read, ahead, min(threads or available_cores(), ahead))
 
 
@@ -161,21 +151,3 @@ def _read_ahead(
             raise failure
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _read_by_executor(
-    requests: Iterable[Request], read: Callable[[Request], Read], executor: Executor
-) -> Iterator[Read]:
-    """Yield the results of an executor, which come in any order, in the order of the requests."""
-    tasks = {str(position): request for position, request in enumerate(requests)}
-    early: dict[str, TaskOutcome[Read]] = {}
-    outcomes: Any = executor.map(read, tasks)
-    with closing(outcomes):
-        for position in tasks:
-            while position not in early:
-                outcome = next(outcomes)
-                early[outcome.key] = outcome
-            outcome = early.pop(position)
-            if outcome.error is not None:
-                raise PhysionError(outcome.error)
-            yield outcome.value

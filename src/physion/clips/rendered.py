@@ -1,16 +1,14 @@
 """Clips rendered on demand from motions: no file is read or written, and no movie encoded.
 
-Boxes are small, but ids of pixels have to be rendered for them. They are kept by trial and frame.
+Boxes are small (13 MB for 100,000 frames of 8 objects), but ids of pixels have to be rendered for
+them. They are kept by trial and frame.
 Most of the time goes into the preparation of a scene, so that a trial that is read a second time is
 rendered as a whole: later windows of it need no rendering for their boxes.
 """
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,7 +25,7 @@ from physion.clips.batch import (
     Motion,
     Spec,
 )
-from physion.clips.source import FutureFrameError, ObservedBatches, TrialReaders, WholeBatches
+from physion.clips.source import FutureFrameError, ObservedSource, TrialReaders, WholeSource
 from physion.clips.states import CutMotions, cut_motion, motion_digest
 from physion.core.errors import BadInputError
 from physion.core.version import version_digest
@@ -35,92 +33,6 @@ from physion.rendering.camera import projection_matrix, view_matrix
 from physion.rendering.renderer import PASSES, VERSION, Renderer
 from physion.scenes.looks import in_look
 from physion.scenes.scene import Scene
-
-# Boxes of objects that were rendered before, kept in memory by trial and frame.
-
-MOST_BYTES = 2**28
-"""Bytes that the boxes of one reader take at most: those of 100,000 frames are 13 MB at 8 objects
-of 16 bytes."""
-
-
-@dataclass(frozen=True, eq=False)
-class BoxesOfTrial:
-    """Boxes (F, K, 4) of the frames of a trial, and which of them are known (F,)."""
-
-    boxes: NDArray[np.float32]
-    known: NDArray[np.bool_]
-
-    @classmethod
-    def unknown(cls, frames: int, objects: int) -> BoxesOfTrial:
-        """Return those of a trial of which nothing is known yet."""
-        shape = (frames, objects, 4)
-        return cls(np.full(shape, np.nan, np.float32), np.zeros(frames, np.bool_))
-
-    @property
-    def bytes(self) -> int:
-        """Size in memory."""
-        return self.boxes.nbytes + self.known.nbytes
-
-
-class KeptBoxes:
-    """Boxes of trials; the trials that were used longest ago are forgotten first.
-
-    Threads may share it. Another process that receives it starts with an empty one.
-
-    Parameters
-    ----------
-    objects
-        Rows K of the boxes of a frame.
-    most_bytes
-        Largest size in memory; 0 keeps nothing.
-    """
-
-    def __init__(self, objects: int, most_bytes: int = MOST_BYTES) -> None:
-        self._objects, self._most_bytes = objects, most_bytes
-        self._trials: OrderedDict[str, BoxesOfTrial] = OrderedDict()
-        self._bytes, self._lock = 0, threading.Lock()
-
-    @property
-    def bytes(self) -> int:
-        """Size in memory of what is kept."""
-        return self._bytes
-
-    def get(
-        self, trial: str, frames: NDArray[np.int64]
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Return the boxes (T, K, 4) of frames (T,), and which are known (T,); copies."""
-        with self._lock:
-            kept = self._trials.get(trial)
-            if kept is None:
-                kept = BoxesOfTrial.unknown(len(frames), self._objects)
-                return kept.boxes, kept.known
-            self._trials.move_to_end(trial)
-            return kept.boxes[frames], kept.known[frames]
-
-    def missing(self, trial: str) -> NDArray[np.int64]:
-        """Return the frames of a trial whose boxes are not known; none if it is not kept at all."""
-        with self._lock:
-            kept = self._trials.get(trial)
-            return np.zeros(0, np.int64) if kept is None else np.flatnonzero(~kept.known)
-
-    def add(
-        self, trial: str, length: int, frames: NDArray[np.int64], boxes: NDArray[np.float32]
-    ) -> None:
-        """Keep the boxes (T, K, 4) of frames (T,) of a trial with ``length`` frames."""
-        with self._lock:
-            kept = self._trials.get(trial)
-            if kept is None:
-                kept = BoxesOfTrial.unknown(length, self._objects)
-                self._trials[trial] = kept
-                self._bytes += kept.bytes
-            kept.boxes[frames], kept.known[frames] = boxes, True
-            while self._bytes > self._most_bytes:
-                self._bytes -= self._trials.popitem(last=False)[1].bytes
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        # A lock cannot be sent to another process.
-        return KeptBoxes, (self._objects, self._most_bytes)
-
 
 _PASS = {"rgb": "color", "ids": "ids", "depth": "depth"}
 """Pass of the renderer by input of a `Spec`; boxes are those of the ids."""
@@ -143,8 +55,6 @@ class MotionRenderer:
         Rows of ``boxes``.
     looks
         Colours by trial, ``redyellow`` or ``free``.
-    kept_bytes
-        Memory for boxes that were read before, at most; 0 keeps none.
     """
 
     def __init__(
@@ -154,12 +64,11 @@ class MotionRenderer:
         size: int,
         objects: int,
         looks: Mapping[str, str],
-        kept_bytes: int = MOST_BYTES,
     ) -> None:
         self._motions, self._inputs = motions, tuple(inputs)
         self._size, self._objects, self._looks = size, objects, looks
         self._passes = tuple(_PASS[name] for name in inputs if name in _PASS)
-        self._kept_boxes = KeptBoxes(objects, kept_bytes)
+        self._kept: dict[str, tuple[NDArray[np.float32], NDArray[np.bool_]]] = {}
         self._digests: dict[str, str] = {}
 
     def read(self, trial: str, frames: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
@@ -204,15 +113,27 @@ class MotionRenderer:
         return drawn
 
     def _boxes(self, trial: str, motion: Motion, frames: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Return boxes (T, K, 4) of frames (T,), which increase; those not kept are rendered."""
-        found, known = self._kept_boxes.get(trial, frames)
-        if known.all():
-            return found
-        wanted = np.union1d(frames[~known], self._kept_boxes.missing(trial))
-        new = boxes(self._draw(trial, motion, wanted, ("ids",))["ids"], self._objects)
-        self._kept_boxes.add(trial, len(motion.trajectory), wanted, new)
-        found[~known] = new[np.searchsorted(wanted, frames[~known])]
-        return found
+        """Return boxes (T, K, 4) of frames (T,), which increase; those not kept are rendered.
+
+        Threads may render the same frames at once, with the same result.
+        """
+        boxes_of, known = self._kept.get(trial, (None, None))
+        if boxes_of is None or known is None:
+            wanted = frames
+            boxes_of = np.full((len(motion.trajectory), self._objects, 4), np.nan, np.float32)
+            known = np.zeros(len(boxes_of), np.bool_)
+        else:
+            wanted = np.zeros(0, np.int64) if known[frames].all() else np.flatnonzero(~known)
+        if len(wanted):
+            drawn = self._draw(trial, motion, wanted, ("ids",))["ids"]
+            boxes_of[wanted] = boxes(drawn, self._objects)
+            known[wanted] = True
+            self._kept.setdefault(trial, (boxes_of, known))
+        return boxes_of[frames]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the boxes: another process renders its own."""
+        return {**vars(self), "_kept": {}}
 
     def identity(self, trial: str) -> str:
         """Return look, version of the renderer, and digest of scene and motion."""
@@ -222,7 +143,7 @@ class MotionRenderer:
         return f"rendered {self._looks[trial]} {version} {self._digests[trial]}"
 
 
-class RenderedSource(WholeBatches):
+class RenderedSource(WholeSource):
     """Source over motions in memory.
 
     Parameters
@@ -247,7 +168,7 @@ class RenderedSource(WholeBatches):
         observed: bool,
     ) -> None:
         kept = {name: cut_motion(motion) for name, motion in motions.items()} if observed else None
-        context = ObservedBatches(spec, _readers(kept or CutMotions(motions), spec, look))
+        context = ObservedSource(spec, _readers(kept or CutMotions(motions), spec, look))
         super().__init__(context, _readers(kept or motions, spec, look))
         self._last = LAST_OBSERVED if observed else None
 

@@ -1,7 +1,8 @@
-"""What a source of batches offers.
+"""Sources of batches: what is read of trials, put together from readers of single clips.
 
 Code under a predicting protocol gets an `ObservedSource`, which cannot reach a frame after the
 observed part: it opens the observed movies, and motions that were cut when they were read.
+`WholeSource` reads whole trials, for training and for the protocol *full*.
 """
 
 from __future__ import annotations
@@ -25,56 +26,6 @@ Part = Literal["context", "later", "whole"]
 class FutureFrameError(BadInputError):
     """Error for a request of a frame after the observed part from an `ObservedSource`."""
 
-
-class ObservedSource(Protocol):
-    """Source of the observed part of trials."""
-
-    @property
-    def spec(self) -> Spec:
-        """What the batches hold."""
-        ...
-
-    @property
-    def trials(self) -> tuple[str, ...]:
-        """Names of all trials."""
-        ...
-
-    def context(self, trials: Sequence[str]) -> Batch:
-        """Return the context of clips; motions end with the last observed frame.
-
-        Raises `UnknownNameError` for an unknown trial.
-        """
-        ...
-
-    def key(self, trial: str, part: Part) -> str:
-        """Return the hexadecimal SHA-256 of all that determines the part of a trial's clip."""
-        ...
-
-
-class WholeSource(ObservedSource, Protocol):
-    """Source of whole trials, for training and for the protocol *full*; motions are whole."""
-
-    def length(self, trial: str) -> int:
-        """Return the number of frames of a trial's motion."""
-        ...
-
-    def later(self, trials: Sequence[str]) -> Batch:
-        """Return the frames of clips that follow the context."""
-        ...
-
-    def whole(self, trials: Sequence[str]) -> Batch:
-        """Return whole clips."""
-        ...
-
-    def window(self, trials: Sequence[str], starts: Sequence[int], length: int) -> Batch:
-        """Return ``length`` frames of every trial, ``spec.stride`` apart, from its start frame."""
-        ...
-
-
-# Batches of a dataset's clips, put together from readers of single clips.
-#
-# `ObservedBatches` reads the observed part; all that it refers to ends with the last observed
-# frame. `WholeBatches` reads whole trials.
 
 _VERSION = 1
 """To be increased with every change that can alter what a source gives for equal files."""
@@ -159,7 +110,7 @@ class TrialReaders:
         return texts
 
 
-class ObservedBatches:
+class ObservedSource:
     """Source of the observed part of trials, which are read by ``readers``."""
 
     def __init__(self, spec: Spec, readers: TrialReaders) -> None:
@@ -194,25 +145,16 @@ class ObservedBatches:
         return clip_key(self._spec, part, self._readers.identity(trial))
 
 
-class WholeBatches:
+class WholeSource(ObservedSource):
     """Source of whole trials, which are read by ``readers``; the context is that of ``observed``.
 
     Movies of the observed part and of the whole trial are encoded apart, so the first frames of
     `whole` differ from those of `context` by the rounding of the encoder.
     """
 
-    def __init__(self, observed: ObservedBatches, readers: TrialReaders) -> None:
-        self._observed, self._readers = observed, readers
-
-    @property
-    def spec(self) -> Spec:
-        """What the batches hold."""
-        return self._observed.spec
-
-    @property
-    def trials(self) -> tuple[str, ...]:
-        """Names of all trials."""
-        return self._readers.trials
+    def __init__(self, observed: ObservedSource, readers: TrialReaders) -> None:
+        super().__init__(observed.spec, readers)
+        self._observed = observed
 
     def length(self, trial: str) -> int:
         """Return the number of frames of a trial's motion."""

@@ -1,4 +1,4 @@
-"""Motions of trials, from trial files. This module needs h5py and hdf5plugin."""
+"""Motions of trials, from trial files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from physion.clips.batch import Motion, cut_to_observed
 from physion.core.errors import UnknownNameError
-from physion.trials.index import IndexedFile
+from physion.trials.files import IndexedFile
 from physion.trials.trial_file import Trial
 
 # Motions cut at the last observed frame, such that nothing leads to what was cut off.

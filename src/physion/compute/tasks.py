@@ -67,7 +67,7 @@ class TaskOutcome(Generic[R]):
         """Return value of the function; `PhysionError` if the task failed."""
         if self.error is not None:
             raise PhysionError(f"{self.key}: {self.error}")
-        return cast(R, self.result)
+        return cast("R", self.result)
 
 
 class Executor(Protocol):

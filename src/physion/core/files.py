@@ -304,9 +304,10 @@ def read_sealed(path: Path) -> dict[str, Any]:
         text = content.decode()
     except UnicodeDecodeError as error:
         raise BadInputError(f"{path} cannot be read: {error}") from error
-    from physion.core.settings import parse_json
-
-    values = parse_json(text, str(path))
+    try:
+        values = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise BadInputError(f"{path} is not JSON: {error}") from error
     if not isinstance(values, dict) or _SEAL not in values:
         raise BadInputError(f"{path} is damaged: field 'sha256' is missing")
     del values[_SEAL]

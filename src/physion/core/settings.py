@@ -21,13 +21,13 @@ import typing
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from physion.core.errors import BadInputError
 from physion.core.files import read_plain
 
 if TYPE_CHECKING:  # pydantic is imported when something is read, since it takes 0.1 s
-    from pydantic import TypeAdapter, ValidationError
+    from pydantic import ConfigDict, TypeAdapter, ValidationError
     from pydantic_core import ErrorDetails
 
 T = TypeVar("T")
@@ -38,16 +38,8 @@ MAX_BYTES = 1 << 28
 """Largest file that is read."""
 
 
-class Strict(TypedDict):
-    """Type of `STRICT`."""
-
-    strict: bool
-    extra: typing.Literal["forbid"]
-    allow_inf_nan: bool
-
-
-STRICT: Strict = {"strict": True, "extra": "forbid", "allow_inf_nan": False}
-"""Configuration of all that is read; pydantic models take it as ``ConfigDict(**STRICT)``."""
+STRICT: ConfigDict = {"strict": True, "extra": "forbid", "allow_inf_nan": False}
+"""Configuration of all that is read; pydantic models take it as their ``model_config``."""
 
 _REPR = reprlib.Repr()
 _REPR.maxlevel, _REPR.maxlist, _REPR.maxdict, _REPR.maxstring, _REPR.maxlong = 3, 4, 4, 60, 40
@@ -143,13 +135,15 @@ def read_settings(
 
     try:
         # As JSON, since pydantic takes lists for tuples, and objects for dataclasses, only there.
-        (value,) = _adapter(kind).validate_json(json.dumps([data], default=_plain))
+        (value,) = _adapter(typing.cast("Any", kind)).validate_json(
+            json.dumps([data], default=_plain)
+        )
     except ValidationError as problem:
         raise error(_describe(problem, kind, data, where)) from None
     except (TypeError, ValueError) as problem:
         raise error(f"{where}: {problem}") from problem
     _check_finite(data, where, error)
-    return typing.cast(T, value)
+    return typing.cast("T", value)
 
 
 def read_pairs(kind: type[T], pairs: Iterable[str], where: str) -> T:
@@ -192,9 +186,13 @@ def check_keys(
             raise error(f"{where}: {_unknown(key, names)}")
 
 
-@functools.cache
 def field_types(kind: Any) -> Mapping[str, Any]:
     """Return the declared type of each field of a dataclass, with annotations, by field name."""
+    return _cached_field_types(kind)
+
+
+@functools.cache
+def _cached_field_types(kind: Any) -> Mapping[str, Any]:
     hints = typing.get_type_hints(kind, include_extras=True)
     names = (field.name for field in dataclasses.fields(kind))
     return types.MappingProxyType({name: hints[name] for name in names})
@@ -208,9 +206,9 @@ def shown(value: Any) -> str:
 @functools.cache
 def _adapter(kind: Any) -> TypeAdapter[Any]:
     """Return what checks a list of one ``kind``; within a list, dataclasses take `STRICT`."""
-    from pydantic import ConfigDict, TypeAdapter
+    from pydantic import TypeAdapter
 
-    return TypeAdapter(tuple[kind], config=ConfigDict(**STRICT))
+    return TypeAdapter(tuple[kind], config=STRICT)
 
 
 def _plain(value: Any) -> Any:

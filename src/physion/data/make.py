@@ -7,9 +7,7 @@ the archive of command logs beside it, and folders arranged by hand are all read
 from __future__ import annotations
 
 import gzip
-import hashlib
 import io
-import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,16 +15,14 @@ from pathlib import Path
 from typing import Any
 
 from physion.core.errors import BadInputError
-from physion.core.files import write_atomic
+from physion.core.files import folder_for_writing, write_with_digest
 from physion.core.names import canonical_name
 from physion.core.settings import parse_json
 from physion.data.official import (
     HUMANS,
     LABELS,
-    MANIFEST,
     RESULTS,
     SCENES,
-    VERSION,
     label_rows,
     official,
     trial_line,
@@ -40,7 +36,7 @@ RESULT_FILES = (
     "model_human_CohensK.csv",
     "model_human_accuracies.csv",
 )
-"""Published tables that `physion compare official` reads."""
+"""Published tables that `physion compare --published` reads."""
 _LISTS = "*experimental_stims.json"
 _PEOPLE = "human_accuracy-*_testing.csv"
 _BOUNDS = "model_bounds.json"
@@ -49,7 +45,7 @@ _LICENSE = "LICENSE.official.txt"
 _SOURCE = """# Source
 Facts of the study *Physion: Evaluating Physical Prediction from Vision in Humans and Machines*
 (Bear, Wang, Mrowca, Binder, Tung, Pramod, Holdaway, Tao, Smith, Sun, Li, Fei-Fei, Kanwisher,
-Tenenbaum, Yamins, Fan; 2021), converted by `physion import-official`.
+Tenenbaum, Yamins, Fan; 2021), converted by `physion import`.
 
 - `scenes.jsonl.gz`: scenes of the command logs of the stimuli, with the outcome, first frame of
   contact, length and final position that the original simulator recorded.
@@ -72,8 +68,13 @@ class MadeData:
     notes: tuple[str, ...]
 
 
+def is_checkout(folder: Path) -> bool:
+    """Return whether a folder holds answers of people as a checkout of the original study does."""
+    return next(folder.rglob(_PEOPLE), None) is not None
+
+
 def make_official(checkout: Path, folder: Path) -> MadeData:
-    """Write the official data found in ``checkout`` to ``folder``; the manifest is written last.
+    """Write the official data found in ``checkout`` to ``folder``.
 
     Raises `BadInputError` if ``checkout`` holds no command logs or no answers of people, if a
     configuration or a stimulus occurs twice with other content, or if a file is damaged.
@@ -169,7 +170,7 @@ def _labels(paths: Sequence[Path]) -> dict[str, bool]:
             pairs = {canonical_name(names[key]): bool(values[key]) for key in names}
         except (KeyError, TypeError, AttributeError) as error:
             raise BadInputError(
-                f"{path} is no list of stimuli: it needs stim_ID and target_hit_zone_label"
+                f"{path} is not a stimulus list: it needs stim_ID and target_hit_zone_label"
             ) from error
         for name, contact in pairs.items():
             if labels.setdefault(name, contact) != contact:
@@ -193,10 +194,9 @@ def _compress(text: str) -> bytes:
 
 
 def _write(folder: Path, contents: Mapping[str, bytes]) -> None:
-    for name, content in contents.items():
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, content)
-    checksums = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
-    manifest = {"version": VERSION, "sha256": dict(sorted(checksums.items()))}
-    write_atomic(folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
+    """Write the files with their digests; the scenes, by which the folder is known, come last."""
+    with folder_for_writing(folder):
+        for name in sorted(contents, key=lambda name: name == SCENES):
+            path = folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_with_digest(path, contents[name])

@@ -7,7 +7,9 @@ A folder of official data has these files. `physion.data.make` writes it; one is
 - ``humans/``: fraction of correct answers and number of people for every stimulus.
 - ``results/``: published tables of models and people.
 - ``model_bounds.json``: bounds of the models of the simulator's library.
-- ``SOURCE.md``, ``LICENSE.official.txt``, and ``manifest.json`` with version and checksums.
+- ``SOURCE.md``, ``LICENSE.official.txt``.
+
+Beside each is its digest file (`physion.core.files`).
 """
 
 from __future__ import annotations
@@ -15,7 +17,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import gzip
-import hashlib
 import io
 import json
 import zlib
@@ -23,50 +24,26 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
-from physion.core.errors import BadInputError
-from physion.core.names import canonical_name
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.files import check_digest, read_plain
+from physion.core.names import SCENARIOS, canonical_name
 from physion.core.settings import parse_json, read_settings
 from physion.scenes.scene import Scene
-from physion.scenes.tdw.read_logs import ImportedTrial, RecordedOutcome, TrialSet
+from physion.scenes.tdw.read_logs import ImportedTrial, RecordedOutcome, TrialSet, read_scenes
 
 PACKAGED = "official"
 """What the command line takes in place of a folder for the data of the package."""
-VERSION = 1
-"""Version of the format; to be raised with every change of the files."""
-SCENES, LABELS, HUMANS, RESULTS, MANIFEST = (
-    "scenes.jsonl.gz", "labels.csv", "humans", "results", "manifest.json",
-)  # fmt: skip
+SCENES, LABELS, HUMANS, RESULTS = "scenes.jsonl.gz", "labels.csv", "humans", "results"
 _MAX_BYTES = 2**28
 """Largest size of the scenes, uncompressed; all configurations of the study take a tenth of it."""
 
 
 @dataclass(frozen=True)
 class OfficialData:
-    """Official data in a folder; files are read, and their checksums tested, on first use."""
+    """Official data in a folder; files are read, and compared with their digests, on first use."""
 
     folder: Path
-
-    @cached_property
-    def manifest(self) -> dict[str, Any]:
-        """Version, source and checksums. `BadInputError` if the folder is none of this kind."""
-        path = self.folder / MANIFEST
-        try:
-            content = parse_json(path.read_text(encoding="utf-8"), str(path))
-        except (OSError, UnicodeDecodeError) as error:
-            raise BadInputError(
-                f"{self.folder} holds no official data (there is no {MANIFEST}); make it with: "
-                "physion import-official CHECKOUT DIR"
-            ) from error
-        if not isinstance(content, dict) or not isinstance(content.get("sha256"), dict):
-            raise BadInputError(f"{path} holds no checksums; make the folder again")
-        if content.get("version") != VERSION:
-            raise BadInputError(
-                f"{path} has version {content.get('version')!r}, this package reads {VERSION}; "
-                "make the folder again with: physion import-official CHECKOUT DIR"
-            )
-        return content
 
     @cached_property
     def trials(self) -> tuple[ImportedTrial, ...]:
@@ -99,43 +76,88 @@ class OfficialData:
 
     @property
     def humans(self) -> Path:
-        """Folder with the answers of people, after its checksums were tested."""
+        """Folder with the answers of people."""
         return self._checked_folder(HUMANS)
 
     @property
     def results(self) -> Path:
-        """Folder with the published tables, after its checksums were tested."""
+        """Folder with the published tables."""
         return self._checked_folder(RESULTS)
 
     def read(self, name: str) -> bytes:
         """Return the content of a file; raise `BadInputError` if it is missing or was changed."""
         path = self.folder / name
-        try:
-            content = path.read_bytes()
-        except OSError as error:
-            raise BadInputError(f"{path} cannot be read: {error.strerror}") from error
-        if hashlib.sha256(content).hexdigest() != self.manifest["sha256"].get(name):
-            raise BadInputError(
-                f"{path} was changed since it was made (its checksum differs); "
-                "install the package again, or make the folder again"
-            )
+        content = read_plain(path, _MAX_BYTES, follow_links=True)
+        check_digest(path, content, "install the package again, or make the folder again")
         return content
 
     def _checked_folder(self, name: str) -> Path:
-        members = [key for key in self.manifest["sha256"] if key.startswith(f"{name}/")]
+        members = sorted((self.folder / name).glob("*.csv"))
         if not members:
             raise BadInputError(f"{self.folder} has no {name}/")
         for member in members:
-            self.read(member)
+            self.read(f"{name}/{member.name}")
         return self.folder / name
 
 
+def official(folder: Path | str | None = None) -> OfficialData:
+    """Return the official data of the package, or of a folder that `physion import` made.
+
+    Parameters
+    ----------
+    folder
+        By default, and for ``official`` where there is no such folder, that of the package.
+
+    Returns
+    -------
+    data
+        Scenes with recorded outcomes (``trials``), labels, and folders of people and results.
+
+    Raises
+    ------
+    BadInputError
+        If the folder holds no official data.
+    """
+    data = find_official(PACKAGED if folder is None else folder)
+    if data is None:
+        raise BadInputError(
+            f"{folder} holds no official data (there is no {SCENES}); make it from a checkout of "
+            "the original study with: physion import CHECKOUT FOLDER"
+        )
+    return data
+
+
+def find_official(folder: Path | str) -> OfficialData | None:
+    """Return the official data of a folder or, for ``official``, of the package; else None."""
+    path = Path(folder)
+    if (path / SCENES).is_file():
+        return _opened(path)
+    if path == Path(PACKAGED) and not path.exists():
+        return _opened(Path(str(files("physion.data") / "official_study")))
+    return None
+
+
 @lru_cache(maxsize=4)
-def official(folder: Path | None = None) -> OfficialData:
-    """Return the official data of a folder, by default that of the package."""
-    if folder is None:
-        return OfficialData(Path(str(files("physion.data") / "official_study")))
+def _opened(folder: Path) -> OfficialData:
     return OfficialData(folder)
+
+
+def read_official_trials(
+    folder: Path, scenario: str | None = None, limit: int | None = None
+) -> TrialSet:
+    """Return the trials of official data (see `find_official`), or of a folder of command logs."""
+    data = find_official(folder)
+    if data is None:
+        return read_scenes(folder, scenario, limit)
+    if scenario is not None and scenario not in SCENARIOS:
+        raise UnknownNameError("scenario", scenario, SCENARIOS)
+    return data.trial_set(scenario, limit)
+
+
+def humans_folder(folder: Path) -> Path:
+    """Return the folder with ``human_accuracy-*.csv`` of official data, or ``folder`` itself."""
+    data = find_official(folder)
+    return folder if data is None else data.humans
 
 
 def trial_line(trial: ImportedTrial) -> str:

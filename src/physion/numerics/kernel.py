@@ -54,7 +54,7 @@ def _compiled(function: Function, options: dict[str, Any]) -> Function:
         return function  # NUMBA_DISABLE_JIT is set: nothing is compiled
     compiled: Any = dispatcher
     compiled._cache = _KernelCache(function)
-    return cast(Function, dispatcher)
+    return cast("Function", dispatcher)
 
 
 class _KernelCache(FunctionCache):
@@ -96,7 +96,7 @@ class _StampedFiles(IndexDataCacheFile):
     def _load_index(self) -> dict[Any, str]:
         # An index refers to the classes of arguments; one that was renamed since cannot be read.
         try:
-            return cast(dict[Any, str], super()._load_index())
+            return cast("dict[Any, str]", super()._load_index())
         except (AttributeError, ImportError, EOFError, pickle.UnpicklingError):
             return {}
 

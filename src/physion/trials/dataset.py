@@ -5,18 +5,18 @@ What reads trial files and movies is imported when it is used: an index is known
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.trials.index import IndexedFile, TrialPaths, read_index
+from physion.trials.files import IndexedFile, TrialPaths
+from physion.trials.index import read_index
 
 if TYPE_CHECKING:
     from physion.trials.trial_file import Trial
@@ -162,95 +162,6 @@ class Dataset:
     ) -> NDArray[np.uint8]:
         """Return frames of the observed movie (T, H, W, 3) in sRGB; see `video.read_frames`."""
         return self.observed.frames(trial, count=count, stride=stride, size=size)
-
-    def clips(
-        self,
-        *,
-        split: str | None = None,
-        scenario: str | None = None,
-        context: int = 7,
-        future: int = 18,
-        stride: int = 6,
-        context_at: Literal["start", "end"] = "start",
-        size: int = 224,
-        passes: Sequence[str] = ("rgb",),
-        look: str | None = None,
-        objects: int = 10,
-        padding: bool = True,
-        labels: bool = True,
-        rendered: bool = False,
-    ) -> Sequence[dict[str, Any]]:
-        """Return clips, one for each trial, which torch's ``DataLoader`` takes as they are.
-
-        The words are those of `physion.clips.batch.Spec`; its defaults are those of the study.
-
-        Parameters
-        ----------
-        split, scenario
-            Which trials; by default all.
-        context, future
-            Frames of a clip in the observed part, and after them. With ``future=0`` nothing that
-            follows the observed part is opened.
-        stride
-            Frames of 0.01 s from one frame of a clip to the next.
-        context_at
-            ``start``: frame 0 comes first; ``end``: the last frame of the context is the last
-            observed one.
-        size
-            Pixels per side.
-        passes
-            Any of rgb, ids, depth, boxes, camera. All but ``rgb`` are rendered.
-        look
-            Colours: ``redyellow`` or ``free``; by default each trial's own.
-        objects
-            Rows of ``boxes``.
-        padding
-            Repeat the last frame in clips that are longer than their trial; otherwise such trials
-            are left out.
-        labels
-            Give the outcome, too.
-        rendered
-            Render ``rgb`` from the motion instead of reading movies.
-
-        Returns
-        -------
-        clips
-            A sequence of dictionaries: ``trial`` (name), ``label`` (bool: agent and patient touch),
-            ``frames`` (T) int64, ``valid`` (T) bool: whether the trial has that frame, ``rgb``
-            (T, H, W, 3) uint8, ``ids`` (T, H, W) uint8: 0 scenery, 1 agent, 2 patient, 3 and more
-            the others, ``depth`` (T, H, W) float32 in metres, ``boxes`` (T, objects, 4) float32 in
-            0..1 with NaN for the unseen, ``camera`` (2, 4, 4) float64: view and projection.
-
-        Raises
-        ------
-        BadInputError
-            For an unknown pass or look, a context that is not observed, or no trial. Items raise it
-            for a file that is missing, damaged or changed.
-
-        Examples
-        --------
-        >>> clips = Dataset("trials").clips(split="training", size=64)  # doctest: +SKIP
-        >>> loader = torch.utils.data.DataLoader(clips, 32, shuffle=True)  # doctest: +SKIP
-        """
-        # By name: training imports this module, and what only reads trials does not need it.
-        made: Any = import_module("physion.clips.clips").Clips(
-            self,
-            split=split,
-            scenario=scenario,
-            context=context,
-            future=future,
-            stride=stride,
-            context_at=context_at,
-            size=size,
-            passes=passes,
-            look=look,
-            objects=objects,
-            padding=padding,
-            labels=labels,
-            rendered=rendered,
-        )
-        clips: Sequence[dict[str, Any]] = made
-        return clips
 
     @cached_property
     def _rows(self) -> dict[str, int]:

@@ -33,7 +33,7 @@ from physion.rendering.camera import intrinsics, view_matrix
 from physion.scenes.looks import in_look
 from physion.scenes.scene import Body, Cloth, Scene
 from physion.scenes.shapes.primitives import shape
-from physion.trials.index import MAX_FILE_BYTES, Metadata
+from physion.trials.files import MAX_FILE_BYTES, Metadata
 
 if TYPE_CHECKING:
     from physion.rendering.renderer import Frame, Renderer
@@ -212,7 +212,7 @@ FIELDS: Mapping[str, Field] = {
     "contacts/normal": Field("<f4", ("contact", 3), "unit, from the first to the second body"),
     "contacts/impulse": Field("<f4", ("contact",), "N s along the normal"),
     "first_frame/ids": Field("<i2", ("row", "column"), "0 the room, i + 1 the i-th of Scene.names"),
-    "first_frame/shares": Field("<f4", ("thing",), "share of the picture by Scene.names"),
+    "first_frame/fractions": Field("<f4", ("thing",), "fraction of the picture by Scene.names"),
 }
 """Fields that every trial file has, by their path."""
 
@@ -679,7 +679,7 @@ class Trial:
     @cached_property
     def pixel_fractions(self) -> NDArray[np.float32]:
         """Fraction of the pixels of frame 0 that show each object of `Scene.names`: (N,), 0..1."""
-        return self._reader.array("first_frame/shares")
+        return self._reader.array("first_frame/fractions")
 
     @cached_property
     def geometry(self) -> dict[str, NDArray[Any]] | None:
@@ -727,7 +727,7 @@ def _arrays(trajectory: Trajectory, ids: NDArray[Any], things: int) -> dict[str,
     if ids.ndim != 2 or not ids.size or ids.min() < 0 or ids.max() > things:
         raise BadInputError(f"ids of shape {ids.shape} are not pixels in 0..{things}")
     counts = np.bincount(ids.ravel(), minlength=things + 1)[1:]
-    arrays = {"first_frame/ids": ids, "first_frame/shares": counts / ids.size}
+    arrays = {"first_frame/ids": ids, "first_frame/fractions": counts / ids.size}
     for name in (*_STATE, "cloth_vertices", "cloth_distance"):
         arrays[f"trajectory/{name}"] = getattr(trajectory, name)
     for name in _CONTACTS:

@@ -14,7 +14,7 @@ import pytest
 from physion.cli import output
 from physion.cli.main import main
 from physion.cli.run.plan import balanced_trials
-from physion.data import official
+from physion.data.official import official
 
 SMALL = ["--limit", "2", "--size", "64", "--steps", "10", "--samples", "4", "--workers", "2"]
 

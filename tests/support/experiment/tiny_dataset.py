@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from physion.trials.dataset import Dataset
-from physion.trials.index import COLUMNS, TrialPaths, as_table, write_index
+from physion.trials.files import TrialPaths
+from physion.trials.index import COLUMNS, as_table, write_index
 from physion.trials.video import encode_movie
 from support.experiment.tiny_study import FULL, OBSERVED, draw, draw_map
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 
 import pytest
@@ -17,11 +16,7 @@ from physion.scenes.sampling.sample import sample_scene
 from physion.trials.dataset import Dataset
 from physion.trials.making import choose as choosing
 from physion.trials.making.choose import (
-    ChoiceRecord,
-    ChosenScene,
-    Slot,
     choose,
-    choose_all,
     judge,
     robustness,
     split_of,
@@ -29,7 +24,14 @@ from physion.trials.making.choose import (
 )
 from physion.trials.making.generate import make_trials
 from physion.trials.making.make import scene_of
-from physion.trials.making.plan import SPLITS, GenerateSettings, TrialTask, plan_dataset
+from physion.trials.making.plan import (
+    SPLITS,
+    GenerateJob,
+    GenerateSettings,
+    TrialTask,
+    plan_dataset,
+)
+from support.hand_made import tree_digest
 
 QUICK = GenerateSettings(width=64, height=64, jitters=0, min_visible=0.0, movies=False)
 
@@ -59,12 +61,10 @@ def test_every_physics_belongs_to_one_split() -> None:
 
 @pytest.mark.parametrize("split", ["testing", "training"])
 def test_chosen_draws_are_what_their_split_takes(split: str, tmp_path: Path) -> None:
-    tasks = slots(split, 8)
-    choices, failed = choose_all({tmp_path / "c.json": tasks}, QUICK, SerialExecutor())
-    assert not failed
     contacts = []
-    for task in tasks:
-        scene = scene_of(choices[task.trial].fill(task))
+    for task in slots(split, 8):
+        filled, scene = choose(GenerateJob(task, tmp_path, QUICK))
+        assert scene == scene_of(filled) and scene.name == task.trial
         assert split_of(scene.physics_digest()) == split
         labels = label_contact(scene, simulate(scene))
         contacts.append(labels.contact)
@@ -73,17 +73,6 @@ def test_chosen_draws_are_what_their_split_takes(split: str, tmp_path: Path) -> 
             assert not labels.observed
     if split == "testing":
         assert sum(contacts) == 4
-
-
-def test_choices_do_not_depend_on_order_or_on_what_else_is_asked(tmp_path: Path) -> None:
-    tasks = slots("testing", 6)
-    whole, _ = choose_all({tmp_path / "a.json": tasks}, QUICK, SerialExecutor())
-    part, _ = choose_all({tmp_path / "b.json": tasks[:2]}, QUICK, SerialExecutor())
-    rest, _ = choose_all({tmp_path / "b.json": tasks[::-1]}, QUICK, SerialExecutor())
-    assert {**rest, **part} == whole
-    assert json.loads((tmp_path / "a.json").read_text()) == json.loads(
-        (tmp_path / "b.json").read_text()
-    )
 
 
 def few_scenes(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
@@ -101,14 +90,27 @@ def test_copies_are_refused_and_scarce_physics_is_said(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     few_scenes(monkeypatch, 12)
-    monkeypatch.setattr(choosing, "MAX_TRIES", 60)
-    tasks = slots("training", 12)
-    choices, failed = choose_all({tmp_path / "c.json": tasks}, QUICK, SerialExecutor())
-    digests = [choice.digest for choice in choices.values()]
-    assert len(set(digests)) == len(digests) > 2
-    assert failed, "twelve scenes, of which some belong to other splits, cannot fill twelve slots"
-    for outcome in failed.values():
-        assert "another trial has the same physics: 60" in str(outcome.error)
+    monkeypatch.setattr(choosing, "MAX_TRIES", 20)
+    monkeypatch.setattr(choosing, "MAX_ELSEWHERE", 100)
+    settings = dataclasses.replace(QUICK, width=32, height=32)
+    report = make_trials(tmp_path, slots("training", 12), settings, executor=SerialExecutor())
+    digests = Dataset(tmp_path).index["scene_digest"]
+    assert digests.is_unique and len(digests) == len(report.made) > 2
+    assert report.failed, "twelve scenes, of which some belong to other splits, cannot fill twelve"
+    for reason in report.failed.values():
+        assert "another trial has the same physics: 20" in reason
+
+
+def test_scenes_do_not_depend_on_order_or_on_what_else_is_asked(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    few_scenes(monkeypatch, 40)  # so that some find the same physics at first
+    tasks, folders = slots("training", 6), [tmp_path / name for name in "abc"]
+    make_trials(folders[0], tasks, QUICK, executor=SerialExecutor())
+    make_trials(folders[1], tasks[::-1], QUICK, executor=SerialExecutor())
+    make_trials(folders[2], tasks[:2], QUICK, executor=SerialExecutor())
+    make_trials(folders[2], tasks, QUICK, executor=SerialExecutor())
+    assert len({tree_digest(folder) for folder in folders}) == 1
 
 
 def test_reasons_are_counted_and_settings_are_heeded() -> None:
@@ -148,27 +150,13 @@ def test_robustness_counts_the_runs_that_agree() -> None:
     assert share >= 0.5
 
 
-def test_a_damaged_record_of_choices_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "c.json"
-    for text in ("{", "[1]", '{"0": {"presets": 1}}', '{"a": {}}'):
-        path.write_text(text)
-        with pytest.raises(BadInputError, match=r"c\.json is not a record of chosen scenes"):
-            ChoiceRecord(path)
-    record = ChoiceRecord(tmp_path / "d.json")
-    record.by_index = {0: ChosenScene("default", 3, "a" * 64, 0.5)}
-    record.save()
-    (tmp_path / "d.json").write_text((tmp_path / "d.json").read_text().replace("3", "4"))
-    with pytest.raises(BadInputError, match="was changed"):
-        ChoiceRecord(tmp_path / "d.json")
-
-
 def test_a_preset_that_hardly_varies_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     few_scenes(monkeypatch, 1)
     monkeypatch.setattr(choosing, "MAX_ELSEWHERE", 40)
     digest = sample_scene("collide", trial_seed("few", "collide", "x", 0)).physics_digest()
     other = next(split for split in SPLITS if split != split_of(digest))
     with pytest.raises(PhysionError, match="default hardly varies"):
-        choose(Slot(slots(other, 1)[0], QUICK))
+        choose(GenerateJob(slots(other, 1)[0], Path(), QUICK))
 
 
 def test_a_preset_that_cannot_be_placed_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -177,38 +165,17 @@ def test_a_preset_that_cannot_be_placed_is_given_up(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(choosing, "sample_scene", refuse)
     with pytest.raises(PhysionError, match=r"none of 20 scenes .*it meets the wall \(100\): 20"):
-        choose(Slot(slots("testing", 1)[0], QUICK))
-
-
-def test_a_draw_that_comes_out_differently_is_refused(tmp_path: Path) -> None:
-    task = slots("testing", 1)[0]
-    choice = choose(Slot(task, QUICK))
-    wrong = dataclasses.replace(choice, attempt=choice.attempt + 1)
-    with pytest.raises(PhysionError, match="sampling gives another scene"):
-        scene_of(wrong.fill(task))
-
-
-def test_a_killed_search_goes_on(tmp_path: Path) -> None:
-    path = tmp_path / "c.json"
-    before = ChoiceRecord(path)
-    before.by_index = {
-        0: ChosenScene("default", 3, "a" * 64, 0.5),
-        1: ChosenScene("debug", 0, "a" * 64, 1),
-    }
-    before.save()
-    after = ChoiceRecord(path)
-    assert [task.index for task in after.missing(slots("testing", 3))] == [1, 2], "1 repeats 0"
-    assert after.by_index == {0: before.by_index[0]}
+        choose(GenerateJob(slots("testing", 1)[0], Path(), QUICK))
 
 
 def test_no_draw_says_why() -> None:
-    slot = Slot(slots("testing", 1)[0], dataclasses.replace(QUICK, min_visible=0.99))
+    job = GenerateJob(slots("testing", 1)[0], Path(), dataclasses.replace(QUICK, min_visible=0.99))
     original, choosing.MAX_TRIES = choosing.MAX_TRIES, 4
     try:
         with pytest.raises(
             PhysionError, match=r"none of 4 scenes sampled from default is accepted \("
         ):
-            choose(slot)
+            choose(job)
     finally:
         choosing.MAX_TRIES = original
 

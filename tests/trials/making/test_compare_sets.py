@@ -116,7 +116,7 @@ def test_missing_trials_and_other_movies_are_named_on_the_terminal(
     printed = capsys.readouterr().out.splitlines()
     assert f"c: only in {one}" in printed and f"d: only in {other}" in printed
     assert "a: other bytes of movie" in printed
-    assert printed[-1].endswith("1 trials are the same, 1 differ, 2 are in one of them alone")
+    assert printed[-1].endswith("1 trials are the same, 1 differ, 2 are only in one of them")
     assert cli(["verify", str(one), "--again", "0", "--against", str(one)]) == 0
 
 

@@ -17,13 +17,14 @@ from typing import Any
 
 import pytest
 
-from physion.cli.generate import _print
+from physion.cli.output import print_report
 from physion.compute.local import LocalExecutor, SerialExecutor
 from physion.compute.run_tasks import RunReport
 from physion.core.errors import BadInputError, PhysionError, UnknownNameError
 from physion.core.files import folder_lock, write_atomic
 from physion.trials.dataset import Dataset
-from physion.trials.index import TrialPaths, build_index, find_trials, index_row
+from physion.trials.files import TrialPaths, find_trials
+from physion.trials.index import build_index, index_row
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, TrialTask, plan_dataset, plan_scenes
 from physion.trials.making.verify import verify_dataset
@@ -64,7 +65,7 @@ def test_index_equals_the_files(finished: Path) -> None:
         trial = dataset.trial(paths.trial)
         assert stored["contact"] == trial.labels.contact == (paths.trial in "bd")
         assert stored["digest"] == trial.trajectory.digest()
-        assert stored["agent_share"] == 64 / 1024 and stored["patient_share"] == 512 / 1024
+        assert stored["agent_fraction"] == 64 / 1024 and stored["patient_fraction"] == 512 / 1024
     assert dataset.index["first_frame"].isna().tolist() == [True, False, True, False]
 
 
@@ -406,7 +407,7 @@ def test_trials_of_several_versions_are_marked(
     (note,) = report.notes[str(folder)]
     assert report.made == ["b"] and "several versions: 1 by 0, 1 by physion 9" in note
     assert any("several versions" in line for line in verify_dataset(folder, again=0).notes)
-    _print(report, json=False)
+    print_report(report, as_json=False)
     assert "note: " in capsys.readouterr().out
 
 

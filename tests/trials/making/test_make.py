@@ -163,7 +163,7 @@ def test_dataset_of_every_scenario_with_real_workers(tmp_path: Path) -> None:
     assert report.exit_code == 0 and len(report.made) == len(tasks)
     dataset = Dataset(tmp_path / "two")
     assert sorted(dataset.trials()) == sorted(task.trial for task in tasks)
-    assert (dataset.index[["agent_share", "patient_share"]] > 0).to_numpy().all()
+    assert (dataset.index[["agent_fraction", "patient_fraction"]] > 0).to_numpy().all()
     serial = make_trials(
         tmp_path / "one",
         tasks[::-1],

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
 from physion.compute.local import SerialExecutor
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.core.files import read_sealed
 from physion.physics.engine import make_engine
 from physion.trials.dataset import Dataset
 from physion.trials.making.generate import make_trials
@@ -34,7 +34,7 @@ def test_the_engine_is_stored_by_its_whole_name_alone(tmp_path: Path) -> None:
     assert GenerateSettings(engine="mujoco").stored() == GenerateSettings().stored()
     tasks = plan_dataset("tests", ["collide"], {"testing": 1})
     make_trials(tmp_path, tasks, MUJOCO, executor=SerialExecutor(), make=lambda job: "")
-    stored = read_sealed(tmp_path / "dataset.json")
+    stored = json.loads((tmp_path / "dataset.json").read_text())
     assert stored["made_by"]["engine"] == make_engine("mujoco").name
     with pytest.raises(BadInputError, match="made_by"):
         make_trials(

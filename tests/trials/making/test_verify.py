@@ -16,14 +16,8 @@ from physion.cli.main import main as cli
 from physion.compute.local import SerialExecutor
 from physion.core.errors import BadInputError
 from physion.trials.dataset import Dataset
-from physion.trials.index import (
-    TrialPaths,
-    build_index,
-    encode_png,
-    read_index,
-    same_picture,
-    write_index,
-)
+from physion.trials.files import TrialPaths, encode_png, same_picture
+from physion.trials.index import build_index, read_index, write_index
 from physion.trials.making.generate import make_trials
 from physion.trials.making.make import make_trial
 from physion.trials.making.plan import (
@@ -35,7 +29,7 @@ from physion.trials.making.plan import (
 )
 from physion.trials.making.verify import verify_dataset
 from physion.trials.video import encode_movie, read_frames
-from support.hand_made import make_by_hand, make_parts, make_scene
+from support.hand_made import make_by_hand, make_parts, make_scene, tree_digest
 
 
 @pytest.fixture
@@ -59,6 +53,25 @@ def test_one_changed_byte_in_any_file_is_found(name: str, folder: Path) -> None:
     assert faults and all("b" in fault for fault in faults)
     if name != "trial_file":
         assert any(f"b: {name}_sha256 is" in fault for fault in faults)
+
+
+def test_damaged_trials_are_deleted_and_made_again(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paths = Dataset(folder).paths("b")
+    whole = tree_digest(folder)
+    for path in (paths.movie, paths.trial_file):
+        data = bytearray(path.read_bytes())
+        data[-20] ^= 1
+        path.write_bytes(data)
+        tasks = plan_scenes("tests", [make_scene("a"), make_scene("b")])
+        report = make_trials(folder, tasks, make=make_by_hand, executor=SerialExecutor())
+        assert report.made == [], "a file of the right size is not read"
+        assert cli(["verify", str(folder), "--again", "0"]) == 1
+        assert "--repair deletes the 1 damaged trial" in capsys.readouterr().out
+        assert cli(["verify", str(folder), "--again", "0", "--repair"]) == 1
+        report = make_trials(folder, tasks, make=make_by_hand, executor=SerialExecutor())
+        assert report.made == ["b"] and tree_digest(folder) == whole
 
 
 def test_missing_unlisted_and_relabelled_trials_are_found(folder: Path) -> None:
@@ -127,29 +140,15 @@ def test_a_sampled_dataset_comes_out_the_same_again(sampled: Path) -> None:
     assert verify_dataset(sampled, again=-1).faults == []
 
 
-@pytest.mark.parametrize(
-    ("name", "says"),
-    [
-        ("dataset.json", "sha256"),
-        ("choices/testing_collide.json", "sha256"),
-        ("index.parquet", "index.parquet"),
-    ],
-)
-def test_one_changed_byte_beside_the_trials_is_found(
-    sampled: Path, tmp_path: Path, name: str, says: str
-) -> None:
-    content = (sampled / name).read_bytes()
+def test_one_changed_byte_of_the_index_is_found(sampled: Path, tmp_path: Path) -> None:
+    content = (sampled / "index.parquet").read_bytes()
+    shutil.copytree(sampled, tmp_path / "d")
     for place in np.linspace(1, len(content) - 2, 12).astype(int):
-        folder = tmp_path / str(place)
-        shutil.copytree(sampled, folder)
         changed = bytearray(content)
         changed[place] ^= 1
-        (folder / name).write_bytes(changed)
-        try:
-            faults = verify_dataset(folder, again=0).faults
-        except BadInputError as error:
-            faults = [str(error)]
-        assert any(says in fault or name in fault for fault in faults), place
+        (tmp_path / "d" / "index.parquet").write_bytes(changed)
+        with pytest.raises(BadInputError, match=r"index\.parquet"):
+            verify_dataset(tmp_path / "d", again=0)
 
 
 def test_strangers_and_trials_of_other_splits_are_named(sampled: Path, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from physion.core.errors import BadInputError
 from physion.core.names import CONTROLLERS, guess_scenario, plain_name
 from physion.rendering.camera import axes
 from physion.scenes.scene import Camera
-from physion.trials.index import encode_png
+from physion.trials.files import encode_png
 from physion.trials.official.names import (
     decode_depth,
     decode_picture,

@@ -19,18 +19,8 @@ import pytest
 
 from physion.cli.main import main as cli
 from physion.core.errors import BadInputError
-from physion.core.files import write_sealed
-from physion.trials.index import (
-    COLUMNS,
-    INDEX_COLUMNS,
-    TrialPaths,
-    build_index,
-    encode_png,
-    find_trials,
-    read_index,
-    write_files,
-    write_index,
-)
+from physion.trials.files import TrialPaths, encode_png, find_trials, write_files
+from physion.trials.index import COLUMNS, INDEX_COLUMNS, build_index, read_index, write_index
 from physion.trials.share.card import write_card
 from support.hand_made import SIZE, make_parts
 from support.programs import find_program
@@ -84,7 +74,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert not problems
     write_index(folder, table)
     chosen = {"min_visible": 0.0005, "robust": 0.5, "observed_contact": False}
-    write_sealed(folder / "dataset.json", {"dataset": "mine", "settings": chosen})
+    (folder / "dataset.json").write_text(json.dumps({"dataset": "mine", "settings": chosen}))
     return folder
 
 

@@ -17,7 +17,8 @@ import physion.trials.share.shards as shards_module
 from physion.cli.main import main as cli
 from physion.compute.local import LocalExecutor, SerialExecutor
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.trials.index import TrialPaths, build_index, encode_png, write_files, write_index
+from physion.trials.files import TrialPaths, encode_png, write_files
+from physion.trials.index import build_index, write_index
 from physion.trials.share.shards import SEEN_PARTS, SHARD_BYTES
 from physion.trials.trial_file import Trial
 from physion.trials.video import encode_movie

@@ -38,7 +38,7 @@ class Options:
     """Prediction files with the official column names; none with --responses: people alone."""
     humans: Path | None = None
     """Answers of people by stimulus: official (those of the package), a folder made by
-    import-official, or one with human_accuracy-*.csv."""
+    physion import, or one with human_accuracy-*.csv."""
     labels: Path | None = None
     """Official outcomes (stim_ID, label); if not given, looked for next to the folder of people."""
     responses: tuple[Path, ...] = ()
@@ -87,8 +87,8 @@ class Options:
 
 def main(options: Options) -> int:
     """Write the report and print its path."""
-    from physion.cli.official.read import humans_folder
     from physion.cli.output import console, print_warnings
+    from physion.data.official import humans_folder
     from physion.report.build import compare_files
 
     page = compare_files(

@@ -37,11 +37,12 @@ class Options:
 def main(options: Options) -> int:
     """Print the tables, and write the page if asked."""
     from physion.analysis.published.claims import published_results
-    from physion.cli.official.read import study_folder
     from physion.cli.output import console
+    from physion.data.official import find_official
     from physion.report.published import build_published_report, published_numbers
 
-    results = published_results(study_folder(options.folder))
+    data = find_official(options.folder)
+    results = published_results(options.folder if data is None else data.results.parent)
     page = None if options.out is None else build_published_report(results, options.out)
     if options.json:
         print(json_module.dumps(published_numbers(results), indent=1))

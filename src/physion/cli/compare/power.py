@@ -89,8 +89,8 @@ def _fractions(options: Options) -> pd.DataFrame:
         read_labels,
         with_labels,
     )
-    from physion.cli.official.read import official_data
     from physion.core.errors import BadInputError
+    from physion.data.official import find_official
 
     if options.responses:
         from physion.analysis.people.measures import accuracy_by_stimulus
@@ -99,7 +99,7 @@ def _fractions(options: Options) -> pd.DataFrame:
         test = read_any_responses(options.responses, options.sessions).test
         rows = accuracy_by_stimulus(test)
     else:
-        data = official_data(options.humans)
+        data = find_official(options.humans)
         folder = options.humans if data is None else data.humans
         file = options.labels or find_next_to(folder, "stimuli", LABELS_FILE)
         if file is not None:

@@ -33,7 +33,7 @@ class Options:
     """Dataset from which testing and familiarization trials are drawn."""
     scenes: Path | None = None
     """Instead of --trials: official scenes, which are rendered first: those of the package
-    (official), a folder made by import-official, or one with command logs."""
+    (official), a folder made by physion import, or one with command logs."""
     rendered: Path | None = None
     """Folder of the trials that --scenes makes; existing ones are kept. Default: next to the study,
     with -trials after its name."""
@@ -129,15 +129,15 @@ def _choose_made(options: Options, trials: Path, scenario: tuple[str, ...]) -> S
 def _choose_official(options: Options) -> StimulusSelection:
     """Select official scenes, render the trials that are missing, and take the stimuli of them."""
     from physion.analysis.tables import read_humans
-    from physion.cli.official.read import official_data, read_trials
     from physion.cli.output import Stages
     from physion.compute.local import LocalExecutor
+    from physion.data.official import find_official, read_official_trials
     from physion.experiment.study.choose import SIZE, TEST, choose_official
     from physion.trials.making.generate import make_trials
     from physion.trials.making.plan import GenerateSettings
 
     assert options.scenes is not None
-    data, logs = official_data(options.scenes), read_trials(options.scenes)
+    data, logs = find_official(options.scenes), read_official_trials(options.scenes)
     logs.require_trials()
     folder = options.rendered or options.folder.with_name(f"{options.folder.name}-trials")
     with LocalExecutor(workers=options.workers) as executor, Stages() as stages:

@@ -45,13 +45,13 @@ def plan_official(scenes: Path, humans: Path | None, limit: int | None) -> RunPl
     others are fitted. 0 takes all.
     """
     from physion.analysis.tables import read_humans
-    from physion.cli.official.read import read_trials
     from physion.core.names import canonical_name
+    from physion.data.official import read_official_trials
     from physion.trials.making.plan import check_names, plan_scenes
 
     limit = LIMIT if limit is None else limit or None
     seen = set(read_humans(humans)["stimulus"]) if humans is not None else None
-    logs = read_trials(scenes)
+    logs = read_official_trials(scenes)
     logs.require_trials()
     recorded = {trial.scene.name: trial.outcome.contact for trial in logs.trials}
     parts: dict[str, list[ImportedTrial]] = {"testing": [], "readout": []}

@@ -17,7 +17,7 @@ from physion.cli.output import Stages, console
 from physion.cli.run.finished import finished, record_finished
 from physion.cli.run.options import Options
 from physion.core.errors import BadInputError
-from physion.trials.index import INDEX
+from physion.trials.files import INDEX
 
 __all__ = ["Options", "main"]
 
@@ -72,7 +72,7 @@ def _run(options: Options, folder: Path) -> dict[str, Any]:
 
 def _complete(options: Options) -> Options:
     """Return the options with what follows from others; raise `BadInputError` if they disagree."""
-    from physion.cli.official.read import humans_folder, official_data
+    from physion.data.official import find_official, humans_folder
 
     if options.sampled and options.humans is not None:
         raise BadInputError("--sampled scenes were seen by nobody: leave out --humans")
@@ -81,7 +81,7 @@ def _complete(options: Options) -> Options:
         raise BadInputError(f"--limit must be at least {least}, not {options.limit}")
     out = options.out or Path("runs") / ("sampled" if options.sampled else "official")
     humans = options.humans
-    if not options.sampled and humans is None and official_data(options.scenes) is not None:
+    if not options.sampled and humans is None and find_official(options.scenes) is not None:
         humans = options.scenes
     humans = None if humans is None else humans_folder(humans)
     return replace(options, out=out, humans=humans)

@@ -208,7 +208,7 @@ def state_of(session: Session, course: Course) -> SessionState:
         ended=stage in ENDED,
         places=list(course.stages) if session.kind == "preview" else [],
         trial=answered(session, stage) if stage in PHASES else None,
-        trials=cast(Any, dict(course.trials)),
+        trials=cast("Any", dict(course.trials)),
         comprehension_attempts=session.comprehension_attempts,
         practice_repeats=session.practice_repeats,
         answered=any(answered(session, phase) for phase in PHASES),
@@ -225,8 +225,8 @@ def state_of(session: Session, course: Course) -> SessionState:
         settings=SessionSettings.model_validate(course.settings),
         scenario=block.scenario,
         language=session.language,
-        kind=cast(Any, session.kind),
-        buttons=cast(Any, session.buttons),
+        kind=cast("Any", session.kind),
+        buttons=cast("Any", session.buttons),
         reference=session.reference,
     )
 

@@ -37,7 +37,7 @@ from physion.rendering.renderer import Renderer
 from physion.scenes.scene import OBSERVED_FRAMES
 from physion.scenes.tdw.read_logs import ImportedTrial
 from physion.trials.dataset import Dataset
-from physion.trials.index import TrialPaths
+from physion.trials.files import TrialPaths
 from physion.trials.making.plan import TrialTask, check_names, plan_scenes
 
 Look = Literal["free", "redyellow"]
@@ -604,7 +604,7 @@ def _check_scenario(name: str, groups: dict[Group, list[ImportedTrial]]) -> None
                 raise BadInputError(
                     f"there is no official scene of {name} {'with' if contact else 'without'} "
                     f"contact for {phase} trials; leave {name} out with --scenario, or import the "
-                    "whole study (physion import-official CHECKOUT DIR) and give --scenes DIR"
+                    "whole study (physion import CHECKOUT DIR) and give --scenes DIR"
                 )
 
 

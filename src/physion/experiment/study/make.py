@@ -42,7 +42,7 @@ from physion.experiment.study.study import (
 )
 from physion.experiment.study.texts import TEXTS_FOLDER, shipped_file
 from physion.scenes.scene import OBSERVED_FRAMES
-from physion.trials.index import encode_png
+from physion.trials.files import encode_png
 from physion.trials.official.movies import SourceMovie
 from physion.trials.video import MovieEncoder, read_frames
 

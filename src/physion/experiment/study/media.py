@@ -109,7 +109,7 @@ def read_media(study: Study, secrets: Secrets, path: str) -> SignedMedia:
     if not name:
         raise BadInputError("no such movie or picture")
     file = study.folder / name
-    return SignedMedia(file, tag, _PHASES[letter], int(trial), cast(MediaKind, kind))
+    return SignedMedia(file, tag, _PHASES[letter], int(trial), cast("MediaKind", kind))
 
 
 def _courses(study: Study) -> Iterator[tuple[Study, str]]:

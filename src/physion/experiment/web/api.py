@@ -155,7 +155,7 @@ def public_study(study: Study, secrets: Secrets) -> PublicStudy:
         break_every=study.timing.break_every,
         familiarization_feedback=study.familiarization_feedback,
         preload=study.preload,
-        interrupted=cast(Literal["repeat", "void"], study.plausibility.interrupted),
+        interrupted=cast("Literal['repeat', 'void']", study.plausibility.interrupted),
         comprehension_questions=[
             CheckedQuestion(name=each.name, options=list(each.options))
             for each in study.comprehension_questions

@@ -447,7 +447,7 @@ class JoinedInputs(nn.Sequential):
         self, *inputs: Tensor, shared: Tensor | None = None, rows: Tensor | None = None
     ) -> Tensor:
         """Return outputs (n, width) for inputs (n, ...), the last of which is ``shared[rows]``."""
-        first = cast(nn.Linear, self[0])
+        first = cast("nn.Linear", self[0])
         parts = inputs if shared is None else (*inputs, shared)
         weights = torch.split(first.weight, [part.shape[1] for part in parts], dim=1)
         hidden = nn.functional.linear(inputs[0], weights[0], first.bias)

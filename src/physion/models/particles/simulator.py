@@ -637,7 +637,7 @@ class ParticleSimulator(TorchModel):
 
     def _changes(self, graph: Graph) -> Tensor:
         """Return the changes of displacements (P, 3) that GNS predicts, metres."""
-        return self._of_particles(graph, cast(Tensor, self.network(graph)))
+        return self._of_particles(graph, cast("Tensor", self.network(graph)))
 
     def _of_particles(self, graph: Graph, values: Tensor) -> Tensor:
         """Return values of nodes (N, 3), in units of changes, as metres of particles (P, 3)."""

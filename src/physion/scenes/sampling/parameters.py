@@ -119,9 +119,9 @@ def pick(rng: np.random.Generator, names: Sequence[str]) -> str:
 def draw_axes(rng: np.random.Generator, axes: Axes) -> Vec3:
     """Draw three values: one draw used for all axes, or one for each axis."""
     if is_range(axes):
-        value = uniform(rng, typing.cast(Range, axes))
+        value = uniform(rng, typing.cast("Range", axes))
         return (value, value, value)
-    x, y, z = (uniform(rng, interval) for interval in typing.cast(tuple[Range, ...], axes))
+    x, y, z = (uniform(rng, interval) for interval in typing.cast("tuple[Range, ...]", axes))
     return (x, y, z)
 
 
@@ -133,7 +133,7 @@ def is_range(axes: Axes) -> bool:
 def draw_rotation(rng: np.random.Generator, angles_deg: Axes) -> Quat:
     """Draw a rotation about z, or one about three axes (see `euler_rotation`); in degrees."""
     if is_range(angles_deg):
-        return yaw(math.radians(uniform(rng, typing.cast(Range, angles_deg))))
+        return yaw(math.radians(uniform(rng, typing.cast("Range", angles_deg))))
     return euler_rotation(*draw_axes(rng, angles_deg))
 
 
@@ -201,7 +201,7 @@ def _check_each(params: Any, where: str) -> None:
         value = getattr(params, key)
         if not dataclasses.is_dataclass(hint):
             _read(hint, value, f"{where}: {key}", value)
-        elif isinstance(value, kind := typing.cast(type[Any], hint)):
+        elif isinstance(value, kind := typing.cast("type[Any]", hint)):
             _check_each(value, f"{where}: {key}")
         else:
             given = type(value).__name__

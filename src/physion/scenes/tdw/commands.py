@@ -67,7 +67,7 @@ def find_logs(root: Path) -> list[Path]:
     if not root.exists():
         raise BadInputError(
             f"{root} does not exist; give official (the packaged scenes), a folder that "
-            "physion import-official made, or one with official command logs"
+            "physion import made from a checkout, or one with official command logs"
         )
     if not root.is_dir():
         raise BadInputError(f"{root} is a file; give the folder that holds the command logs")

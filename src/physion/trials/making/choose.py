@@ -14,21 +14,17 @@ in order, so a slot gets the same scene in any process and any order. A scene is
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
-from physion.compute.tasks import Executor, Progress, TaskOutcome, tracked
-from physion.core.errors import BadInputError, BadSceneError, PhysionError
-from physion.core.files import read_sealed, write_sealed
+from physion.core.errors import BadSceneError, PhysionError
 from physion.core.seeds import child_generator, stable_hash, trial_seed
 from physion.physics.engine import Engine, make_engine, simulate_many
 from physion.physics.labels import jitter_scene, label_contact
 from physion.physics.trajectory import Trajectory
 from physion.scenes.sampling.sample import get_preset, sample_scene
 from physion.scenes.scene import Scene
-from physion.trials.making.plan import GenerateSettings, TrialTask
+from physion.trials.making.plan import GenerateJob, GenerateSettings, TrialTask
 
 BALANCED = ("readout", "testing", "familiarization")
 """Splits in which half of the trials have contact, and none of them in the observed part."""
@@ -43,52 +39,8 @@ MAX_ELSEWHERE = 600
 preset with variation, the probability is at most 10^-16."""
 MAX_UNPLACED = 20
 """Consecutive failures to place the objects of a scene after which a preset is abandoned."""
-SAVE_EVERY = 100
-"""Outcomes after which the chosen scenes are saved; an interrupted run loses at most so many."""
 JITTER = 0.001
 """Standard deviation in metres of the position noise with which robustness is measured."""
-
-
-@dataclass(frozen=True)
-class ChosenScene:
-    """Scene that was chosen for a slot.
-
-    Parameters
-    ----------
-    preset, attempt
-        Parameter set and number of the attempt, which determine the scene.
-    digest
-        Physics digest of the scene.
-    robust
-        Fraction of jittered simulations with the same outcome; None if not measured.
-    refused
-        Number of scenes rejected before, by reason.
-    """
-
-    preset: str
-    attempt: int
-    digest: str
-    robust: float | None
-    refused: Mapping[str, int] = field(default_factory=dict)
-
-    def fill(self, task: TrialTask) -> TrialTask:
-        """Return ``task`` with this scene filled in."""
-        return replace(
-            task,
-            preset=self.preset,
-            attempt=self.attempt,
-            robust=self.robust,
-            scene_digest=self.digest,
-        )
-
-
-@dataclass(frozen=True)
-class Slot:
-    """Task whose scene is to be chosen; ``taken`` are `short` digests of physics already in use."""
-
-    task: TrialTask
-    settings: GenerateSettings
-    taken: frozenset[int] = frozenset()
 
 
 def split_of(digest: str) -> str:
@@ -111,9 +63,13 @@ def wanted_contact(task: TrialTask) -> bool | None:
     return first != bool(second)
 
 
-def choose(slot: Slot) -> ChosenScene:
-    """Return the scene of a slot, a pure function of it; `PhysionError` if none is accepted."""
-    task, refused = slot.task, Counter[str]()
+def choose(job: GenerateJob) -> tuple[TrialTask, Scene]:
+    """Return the scene chosen for a trial, and its task with preset, attempt and robustness of it.
+
+    A pure function of the job. Scenes are simulated only until agent and patient touch; the chosen
+    one is simulated as a whole when its trial is made. Raises `PhysionError` if none is accepted.
+    """
+    task, refused = job.task, Counter[str]()
     params = {name: get_preset(task.scenario, name).params for name in task.presets}
     unplaced, elsewhere = Counter[str](), Counter[str]()
     attempt = -1
@@ -139,12 +95,13 @@ def choose(slot: Slot) -> ChosenScene:
                 del params[name]
             continue
         elsewhere[name] = 0
-        if short(digest) in slot.taken:
+        if short(digest) in job.taken:
             refused["another trial has the same physics"] += 1
             continue
-        reason, robust = judge(scene, seed, task, slot.settings)
+        reason, robust = judge(scene, seed, task, job.settings)
         if reason is None:
-            return ChosenScene(name, attempt, digest, robust, dict(refused))
+            chosen = replace(task, presets=(), preset=name, attempt=attempt, robust=robust)
+            return chosen, replace(scene, name=task.trial)
         refused[reason] += 1
     counts = "; ".join(f"{reason}: {count}" for reason, count in refused.most_common(4))
     raise PhysionError(
@@ -204,114 +161,3 @@ def _visible(scene: Scene, trajectory: Trajectory, settings: GenerateSettings) -
     assert ids is not None, "ids were asked for"
     roles = (scene.roles.agent, scene.roles.patient)
     return all((ids == scene.index(name) + 1).mean() >= settings.min_visible for name in roles)
-
-
-class ChoiceRecord:
-    """Chosen scenes of one split of one scenario, saved so that interrupted runs can continue."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.by_index: dict[int, ChosenScene] = {}
-        if path.is_file():
-            try:
-                rows = read_sealed(path)
-                self.by_index = {int(index): ChosenScene(**row) for index, row in rows.items()}
-            except (BadInputError, ValueError, TypeError) as error:
-                raise BadInputError(
-                    f"{path} is not a record of chosen scenes ({error}); delete it to make it again"
-                ) from error
-
-    def save(self) -> None:
-        """Write the file atomically."""
-        rows = {str(index): asdict(self.by_index[index]) for index in sorted(self.by_index)}
-        self.path.parent.mkdir(exist_ok=True)
-        write_sealed(self.path, rows)
-
-    def missing(self, tasks: Collection[TrialTask]) -> list[TrialTask]:
-        """Return the tasks without a scene; drop scenes whose physics a lower index has too."""
-        wanted = {task.index: task for task in tasks}
-        first: dict[str, int] = {}
-        for index in sorted(self.by_index):
-            holder = first.setdefault(self.by_index[index].digest, index)
-            if holder != index:
-                del self.by_index[index]
-        return [task for index, task in sorted(wanted.items()) if index not in self.by_index]
-
-    def taken(self, below: int) -> frozenset[int]:
-        """Return the `short` digests of the scenes of all lower indices."""
-        return frozenset(
-            short(choice.digest) for index, choice in self.by_index.items() if index < below
-        )
-
-
-def choose_all(
-    groups: Mapping[Path, Collection[TrialTask]],
-    settings: GenerateSettings,
-    executor: Executor,
-    progress: Progress | None = None,
-) -> tuple[dict[str, ChosenScene], dict[str, TaskOutcome[ChosenScene]]]:
-    """Choose the scenes of all tasks that have none yet.
-
-    Slots are searched in parallel. If two slots find the same physics, the one with the higher
-    index searches again, so that the result does not depend on the order of the work.
-
-    Parameters
-    ----------
-    groups
-        Tasks of one split of one scenario, by the file in which their scenes are recorded.
-    settings
-        Conditions for accepting a scene.
-    executor
-        Where to run.
-    progress
-        Shows the progress.
-
-    Returns
-    -------
-    chosen, failed
-        Scenes and failed outcomes by name of the trial.
-    """
-    records = {path: ChoiceRecord(path) for path in groups}
-    failed: dict[str, TaskOutcome[ChosenScene]] = {}
-    while todo := _slots(groups, records, settings, failed.keys()):
-        outcomes = executor.map(choose, {name: slot for name, (_, slot) in todo.items()})
-        unsaved: set[Path] = set()
-        for done, outcome in enumerate(tracked(outcomes, "choosing", len(todo), progress), start=1):
-            if outcome.error is not None:
-                failed[outcome.key] = outcome
-                continue
-            path, slot = todo[outcome.key]
-            records[path].by_index[slot.task.index] = outcome.value
-            unsaved.add(path)
-            if done % SAVE_EVERY == 0:
-                _save(records, unsaved)
-        _save(records, unsaved)
-    chosen = {
-        task.trial: records[path].by_index[task.index]
-        for path, tasks in groups.items()
-        for task in tasks
-        if task.trial not in failed
-    }
-    return chosen, failed
-
-
-def _slots(
-    groups: Mapping[Path, Collection[TrialTask]],
-    records: Mapping[Path, ChoiceRecord],
-    settings: GenerateSettings,
-    failed: Collection[str],
-) -> dict[str, tuple[Path, Slot]]:
-    """Return the open slots, with the files of their records, by name of the trial."""
-    todo = {}
-    for path, tasks in groups.items():
-        for task in records[path].missing(tasks):
-            if task.trial not in failed:
-                taken = records[path].taken(task.index)
-                todo[task.trial] = (path, Slot(task, settings, taken))
-    return todo
-
-
-def _save(records: Mapping[Path, ChoiceRecord], unsaved: set[Path]) -> None:
-    for path in sorted(unsaved):
-        records[path].save()
-    unsaved.clear()

@@ -1,4 +1,4 @@
-"""Generation of a dataset: choose scenes, then simulate, label, render and write every trial.
+"""Generation of a dataset: choose the scene of every trial, simulate, label, render and write it.
 
 A trial is a pure function of its task and of the settings, and its files are written atomically.
 Therefore no state is kept between runs: a run makes whatever is missing, in any order and with any
@@ -13,35 +13,33 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from physion.compute.run_tasks import FATAL_ERRNOS, RunReport, run_tasks
+import pandas as pd
+
+from physion.compute.run_tasks import RunReport, run_tasks
 from physion.compute.tasks import Executor, Progress, TaskOutcome, workers_kept
 from physion.core.errors import BadInputError, PhysionError
 from physion.core.files import (
     folder_for_writing,
     has_digest,
-    read_sealed,
     remove_leftovers,
     write_atomic,
-    write_sealed,
 )
 from physion.core.seeds import stable_hash
+from physion.core.settings import read_json
 from physion.physics.engine import make_engine
 from physion.scenes.sampling.build import as_record, scenarios
 from physion.scenes.sampling.sample import get_preset
 from physion.trials.dataset import Dataset
+from physion.trials.files import FAILURES, INDEX, SETTINGS, find_trials
 from physion.trials.index import (
-    CHOICES,
-    FAILURES,
-    FILES,
-    INDEX,
-    SETTINGS,
+    as_table,
     build_index,
     describe_mixed_versions,
-    find_trials,
     has_sizes,
     read_index,
     write_index,
 )
+from physion.trials.making.choose import short
 from physion.trials.making.plan import (
     GenerateJob,
     GenerateSettings,
@@ -107,32 +105,64 @@ def make_trials(
     with folder_for_writing(folder), workers_kept(executor):
         _fix_settings(folder, datasets.pop(), settings, tasks)
         remove_leftovers(folder)
-        listed = _listed_files(folder)
-        missing = {n: job for n, job in jobs.items() if not _is_made(job, listed.get(n))}
-        chosen, unchosen = _choose(folder, jobs, missing, settings, executor, progress)
-        made, failed = run_tasks(
-            make,
-            chosen,
-            folder=folder,
-            what="generating",
-            executor=executor,
-            progress=progress,
-            on_outcome=lambda outcome: _note_outcome(folder, outcome, chosen[outcome.key]),
-        )
-        problems = _update_index(folder, set(made))
-        notes = _mixed_versions(folder)
+        index = _known_index(folder)
+        listed = {str(row["trial"]): row for row in index.to_dict("records")}
+        missing = [n for n, job in jobs.items() if not _is_made(job, listed.get(n))]
+        todo, made, failed = missing, dict[str, str](), dict[str, str]()
+        while True:
+            new, refused = run_tasks(
+                make,
+                {name: _without_taken(jobs[name], index) for name in todo},
+                folder=folder,
+                what="generating",
+                executor=executor,
+                progress=progress,
+                on_outcome=lambda outcome: _note_outcome(folder, outcome, jobs[outcome.key]),
+            )
+            made, failed = {**made, **new}, {**failed, **refused}
+            index, problems = _update_index(folder, set(made))
+            todo = _repeated(index, jobs)
+            if not todo:
+                break
+            for name in todo:
+                jobs[name].paths.trial_file.unlink()
+                made.pop(name, None)
+        note = describe_mixed_versions(index)
     kept = [name for name in jobs if name not in missing and name not in problems]
-    return RunReport(list(made), kept, {**unchosen, **failed, **problems}, folder / INDEX, notes)
+    notes = {str(folder): (note,)} if note else {}
+    return RunReport(list(made), kept, {**failed, **problems}, folder / INDEX, notes)
 
 
-def _listed_files(folder: Path) -> dict[str, dict[Any, Any]]:
-    """Return paths and sizes of all files by trial according to the index; none without one."""
+def _known_index(folder: Path) -> pd.DataFrame:
+    """Return the index of the folder, or one without trials if it has none."""
     try:
-        index = read_index(folder)
+        return read_index(folder)
     except BadInputError:
-        return {}
-    columns = ["trial", "split", "scenario", *FILES, *(f"{name}_bytes" for name in FILES)]
-    return {str(row["trial"]): row for row in index[columns].to_dict("records")}
+        return as_table([])
+
+
+def _without_taken(job: GenerateJob, index: pd.DataFrame) -> GenerateJob:
+    """Return the job of a trial with the physics that its scene must not have.
+
+    Trials of the same split and scenario with lower numbers have it.
+    """
+    if not job.task.presets:
+        return job
+    task = job.task
+    same = (index["split"] == task.split) & (index["scenario"] == task.scenario)
+    lower = index[same & (index["index"] < task.index)]["scene_digest"]
+    return dataclasses.replace(job, taken=frozenset(short(digest) for digest in lower))
+
+
+def _repeated(index: pd.DataFrame, jobs: Mapping[str, GenerateJob]) -> list[str]:
+    """Return the chosen trials that have the physics of one with a lower number.
+
+    Scenes are chosen at the same time, so that two trials may find the same one. The result does
+    not depend on the order of the work, since it is always the higher number that searches again.
+    """
+    ordered = index.sort_values("index", kind="stable")
+    again = ordered[ordered.duplicated(["split", "scenario", "scene_digest"])]["trial"]
+    return [str(name) for name in again if name in jobs and jobs[str(name)].task.presets]
 
 
 def _is_made(job: GenerateJob, row: Mapping[Any, Any] | None) -> bool:
@@ -151,49 +181,6 @@ def _is_made(job: GenerateJob, row: Mapping[Any, Any] | None) -> bool:
     return True
 
 
-def _mixed_versions(folder: Path) -> dict[str, tuple[str, ...]]:
-    """Return a note if trials of several versions of the package are in the folder."""
-    note = describe_mixed_versions(read_index(folder))
-    return {str(folder): (note,)} if note else {}
-
-
-def _choose(
-    folder: Path,
-    jobs: Mapping[str, GenerateJob],
-    missing: Mapping[str, GenerateJob],
-    settings: GenerateSettings,
-    executor: Executor,
-    progress: Progress | None,
-) -> tuple[dict[str, GenerateJob], dict[str, str]]:
-    """Return the missing jobs with their scenes chosen, and the reasons of failures by name."""
-    groups: dict[Path, list[TrialTask]] = {}
-    for job in jobs.values():
-        if job.task.presets:
-            path = folder / CHOICES / f"{job.task.split}_{job.task.scenario}.json"
-            groups.setdefault(path, []).append(job.task)
-    wanted = {
-        path: tasks
-        for path, tasks in groups.items()
-        if any(task.trial in missing for task in tasks)
-    }
-    chosen, failed = dict(missing), dict[str, str]()
-    if not wanted:
-        return chosen, failed
-    from physion.trials.making.choose import choose_all
-
-    choices, outcomes = choose_all(wanted, settings, executor, progress)
-    for name, outcome in outcomes.items():
-        if outcome.errno in FATAL_ERRNOS:
-            raise PhysionError(f"cannot write into {folder}: {outcome.error}")
-        if name in chosen:
-            failed[name] = str(outcome.error)
-            _note_outcome(folder, outcome, chosen.pop(name))
-    for name in choices.keys() & chosen.keys():
-        job = chosen[name]
-        chosen[name] = dataclasses.replace(job, task=choices[name].fill(job.task))
-    return chosen, failed
-
-
 def _note_outcome(folder: Path, outcome: TaskOutcome[Any], job: GenerateJob) -> None:
     """Write the traceback of a failed trial and its scene, if imported, into ``failures/``.
 
@@ -210,28 +197,20 @@ def _note_outcome(folder: Path, outcome: TaskOutcome[Any], job: GenerateJob) -> 
     write_atomic(path, text.encode())
 
 
-def _update_index(folder: Path, made: set[str]) -> dict[str, str]:
-    """Write the index unless it is up to date; return problems by name of the trial.
+def _update_index(folder: Path, made: set[str]) -> tuple[pd.DataFrame, dict[str, str]]:
+    """Write the index unless it is up to date; return it, and problems by name of the trial.
 
-    It is up to date if it has a SHA-256, lists exactly the trials of the folder, and none of them
-    is in ``made``.
+    It is up to date if it has a digest file, lists exactly the trials of the folder, and none of
+    them is in ``made``.
     """
     there = {(paths.split, paths.trial) for paths in find_trials(folder)}
-    try:
-        index = read_index(folder)
-    except BadInputError:
-        index = None
-    if (
-        index is not None
-        and not made
-        and has_digest(folder / INDEX)
-        and set(zip(index["split"], index["trial"], strict=True)) == there
-    ):
-        return {}
-    known = None if index is None else index[~index["trial"].isin(made)]
-    table, problems = build_index(folder, known)
+    index = _known_index(folder)
+    listed = set(zip(index["split"], index["trial"], strict=True))
+    if not made and has_digest(folder / INDEX) and listed == there:
+        return index, {}
+    table, problems = build_index(folder, index[~index["trial"].isin(made)])
     write_index(folder, table)
-    return problems
+    return table, problems
 
 
 def _fix_settings(
@@ -250,7 +229,7 @@ def _fix_settings(
     wanted = json.loads(json.dumps(plain))
     presets = _presets_in_use(tasks)
     if path.is_file():
-        known = read_sealed(path)
+        known = read_json(path, dict[str, Any])
         before = known.pop("presets", {})
         differs = [name for name in wanted if known.get(name) != wanted[name]]
         differs += [name for name in presets if before.get(name, presets[name]) != presets[name]]
@@ -262,16 +241,13 @@ def _fix_settings(
         presets = {**before, **presets}
         if presets == before:
             return
-    if path.is_file():
-        write_sealed(path, {**wanted, "presets": presets})
-        return
-    others = [item.name for item in folder.iterdir() if not item.name.startswith(".")]
-    if others:
+    elif others := sorted(item.name for item in folder.iterdir() if item.name[0] != "."):
         raise BadInputError(
-            f"{folder} is not empty and not a dataset (it contains {sorted(others)[0]!r}); "
+            f"{folder} is not empty and not a dataset (it contains {others[0]!r}); "
             "choose an empty or new folder"
         )
-    write_sealed(path, {**wanted, "presets": presets})
+    text = json.dumps({**wanted, "presets": presets}, indent=1, sort_keys=True) + "\n"
+    write_atomic(path, text.encode())
 
 
 def _presets_in_use(tasks: Sequence[TrialTask]) -> dict[str, dict[str, str]]:
@@ -288,6 +264,28 @@ def _presets_in_use(tasks: Sequence[TrialTask]) -> dict[str, dict[str, str]]:
 # Generation of a dataset in one call.
 
 
+class GeneratedDataset(Dataset):
+    """Dataset that `generate` made; ``report`` has the names of the trials made and kept."""
+
+    def __init__(self, folder: Path, report: RunReport) -> None:
+        super().__init__(folder)
+        self.report = report
+
+
+class FailedTrialsError(PhysionError):
+    """Error for trials that could not be made; ``report`` names them and those that were made."""
+
+    exit_code = 1
+
+    def __init__(self, report: RunReport, asked: int, folder: Path) -> None:
+        trial, reason = next(iter(report.failed.items()))
+        super().__init__(
+            f"{len(report.failed)} of {asked} trials could not be made, such as {trial!r}: "
+            f"{reason}; the others are in {folder}, and the same call tries again"
+        )
+        self.report = report
+
+
 def generate(
     folder: Path | str,
     scenario: str | Sequence[str] = "all",
@@ -298,7 +296,7 @@ def generate(
     settings: GenerateSettings | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
-) -> Dataset:
+) -> GeneratedDataset:
     """Sample scenes, simulate and render them, and write trials; existing trials are kept.
 
     An interrupted call is resumed by the same call. Equal arguments give equal bytes.
@@ -308,7 +306,7 @@ def generate(
     folder
         Folder of the dataset: new, empty, or one to resume or extend.
     scenario
-        Name of a scenario, names of several, or ``all``.
+        Name of a scenario, names of several (a list, or joined by commas), or ``all``.
     counts
         Trials per scenario by split (training, readout, testing, familiarization), or a number of
         testing trials.
@@ -328,7 +326,8 @@ def generate(
     Returns
     -------
     dataset
-        All trials of the folder, including those of earlier calls.
+        All trials of the folder, including those of earlier calls. Its ``report`` says which were
+        made and kept.
 
     Raises
     ------
@@ -337,11 +336,11 @@ def generate(
     BadInputError
         If the folder was made with other settings or is not a dataset, or for presets of more than
         one scenario.
-    PhysionError
+    FailedTrialsError
         If some trials could not be made. The others are in the folder, and the same call tries
         those that are missing again.
     """
-    names = [scenario] if isinstance(scenario, str) else list(scenario)
+    names = scenario.split(",") if isinstance(scenario, str) else list(scenario)
     if names == ["all"]:
         names = scenarios.names()
     if presets and len(names) != 1:
@@ -353,9 +352,5 @@ def generate(
     tasks = plan_dataset(name, names, planned, chosen)
     report = make_trials(Path(folder), tasks, settings, executor=executor, progress=progress)
     if report.failed:
-        trial, reason = next(iter(report.failed.items()))
-        raise PhysionError(
-            f"{len(report.failed)} of {len(tasks)} trials could not be made, such as {trial!r}: "
-            f"{reason}; the others are in {folder}, and the same call tries again"
-        )
-    return Dataset(folder)
+        raise FailedTrialsError(report, len(tasks), Path(folder))
+    return GeneratedDataset(Path(folder), report)

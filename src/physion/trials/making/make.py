@@ -1,4 +1,4 @@
-"""Making of one trial: sample, simulate, label, render and write it."""
+"""Making of one trial: choose a scene, simulate, label, render and write it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.core.errors import BadInputError, PhysionError
+from physion.core.errors import BadInputError
 from physion.core.version import __version__, version_digest
 from physion.physics.engine import make_engine
 from physion.physics.labels import Labels, label_contact
@@ -21,7 +21,8 @@ from physion.rendering.renderer import VERSION as RENDERER_VERSION
 from physion.scenes.looks import in_look
 from physion.scenes.sampling.sample import get_preset, sample_scene
 from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, Scene
-from physion.trials.index import Metadata, TrialPaths, encode_png, write_files
+from physion.trials.files import Metadata, TrialPaths, encode_png, write_files
+from physion.trials.making.choose import choose
 from physion.trials.making.plan import GenerateJob, TrialTask
 from physion.trials.trial_file import Trial, TrialWriter
 from physion.trials.video import MovieEncoder, read_chosen
@@ -35,12 +36,12 @@ movies and maps; stored with every trial."""
 
 
 def make_trial(job: GenerateJob) -> str:
-    """Make one trial and write its files; return its name. A pure function of the job.
+    """Choose the scene of a trial, make its files, and return its name. A pure function of the job.
 
     The trial file is written last, so a trial with a trial file is complete.
     """
-    task = job.task
-    scene = scene_of(task)
+    task, scene = choose(job) if job.task.presets else (job.task, scene_of(job.task))
+    job = dataclasses.replace(job, task=task)
     trajectory = make_engine(job.settings.engine).simulate(scene)
     if len(trajectory) <= OBSERVED_FRAMES:
         raise BadInputError(
@@ -59,12 +60,6 @@ def scene_of(task: TrialTask) -> Scene:
         return task.scene
     params = None if task.preset is None else get_preset(task.scenario, task.preset).params
     scene = sample_scene(task.scenario, task.seed(), params)
-    if task.scene_digest not in (None, scene.physics_digest()):
-        raise PhysionError(
-            f"trial {task.trial!r}: sampling gives another scene than the one chosen for it; "
-            "package or preset have changed since: choose another folder, or delete choices/ and "
-            "the trials made from it"
-        )
     return dataclasses.replace(scene, name=task.trial)
 
 

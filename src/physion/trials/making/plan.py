@@ -17,7 +17,7 @@ from physion.physics.engine import DEFAULT_ENGINE, engines
 from physion.scenes.sampling.build import scenarios as known_scenarios
 from physion.scenes.sampling.sample import default_presets, get_preset
 from physion.scenes.scene import FRAME_TIME, PLAYBACK_RATE, Scene
-from physion.trials.index import MAX_SIDE, SAFE_NAME, TrialPaths
+from physion.trials.files import MAX_SIDE, SAFE_NAME, TrialPaths
 from physion.trials.trial_file import PASSES
 
 SPLITS = ("training", "readout", "testing", "familiarization")
@@ -52,14 +52,12 @@ class TrialTask:
     recorded_contact
         Outcome recorded with an imported scene, if known.
     presets
-        Parameter sets to choose from. `physion.trials.making.choose` then fills in ``preset``,
-        ``attempt``, ``robust`` and ``scene_digest``.
+        Parameter sets to choose from. `physion.trials.making.choose` fills in ``preset``,
+        ``attempt`` and ``robust`` in their place.
     attempt
         Number of scenes sampled for this trial and rejected before.
     robust
         Fraction of jittered simulations with the same outcome, if measured.
-    scene_digest
-        Physics digest that the sampled scene must have, if known.
     """
 
     dataset: str
@@ -72,7 +70,6 @@ class TrialTask:
     presets: tuple[str, ...] = ()
     attempt: int = 0
     robust: float | None = None
-    scene_digest: str | None = None
 
     def __post_init__(self) -> None:
         if self.split not in SPLITS:
@@ -177,11 +174,15 @@ class GenerateSettings:
 
 @dataclass(frozen=True)
 class GenerateJob:
-    """A task with folder and settings: everything that a worker needs."""
+    """A task with folder and settings: everything that a worker needs.
+
+    ``taken`` are `physion.trials.making.choose.short` digests of physics that other trials have.
+    """
 
     task: TrialTask
     folder: Path
     settings: GenerateSettings
+    taken: frozenset[int] = frozenset()
 
     @property
     def paths(self) -> TrialPaths:

@@ -15,19 +15,14 @@ import pyarrow.parquet as pq
 
 from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError
-from physion.core.files import read_sealed
 from physion.core.seeds import stable_hash
+from physion.core.settings import read_json
 from physion.physics.labels import label_contact
 from physion.scenes.sampling.sample import load_presets
+from physion.trials.files import FILES, INDEX, SETTINGS, TrialPaths, find_trials
 from physion.trials.index import (
-    CHOICES,
     COLUMNS,
-    FILES,
-    INDEX,
-    SETTINGS,
-    TrialPaths,
     describe_mixed_versions,
-    find_trials,
     index_bytes,
     index_row,
     read_index,
@@ -50,10 +45,11 @@ class Verification:
     because another version of engine, renderer or encoder made it, which is not a fault.
     ``notes`` lists what is no fault either: trials of several versions of the package, pictures
     that are only compressed differently, and trials whose scene was not drawn again because their
-    preset is unknown.
+    preset is unknown. ``damaged`` names the trials with faults.
     """
 
     faults: list[str] = field(default_factory=list)
+    damaged: list[str] = field(default_factory=list)
     other_versions: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -67,7 +63,7 @@ class Verification:
 
 
 def verify_dataset(
-    folder: Path, *, again: int = SAMPLE, progress: Progress | None = None
+    folder: Path, *, again: int = SAMPLE, repair: bool = False, progress: Progress | None = None
 ) -> Verification:
     """Check a dataset against its index and for consistency, and make some trials again.
 
@@ -84,6 +80,9 @@ def verify_dataset(
         Number of trials (-1: all) that are also sampled, simulated and rendered again. Scene,
         motion, map and movies must be identical under the same versions of engine and renderer.
         Which trials depends on their names alone.
+    repair
+        Delete the trial files of trials with faults, so that the command that made the dataset
+        makes these trials again.
     progress
         Shows the progress.
 
@@ -94,13 +93,10 @@ def verify_dataset(
     """
     table = read_index(folder)
     listed = set(table["trial"])
-    result = Verification(
-        [
-            f"{paths.trial_file} is not in the index"
-            for paths in find_trials(folder)
-            if paths.trial not in listed
-        ]
-    )
+    result = Verification()
+    for paths in find_trials(folder):
+        if paths.trial not in listed:
+            result.faults.append(f"{paths.trial_file} is not in the index")
     result.faults += _check_folder(folder, table)
     result.faults += _duplicates(table)
     mixed = describe_mixed_versions(table)
@@ -110,6 +106,7 @@ def verify_dataset(
     rows = table.to_dict("records")
     for row in tracked(rows, "verifying", len(rows), progress):
         paths = TrialPaths(folder, row["split"], row["scenario"], row["trial"])
+        before = len(result.faults)
         try:
             trial = Trial.open(paths.trial_file)
             result.faults += _compare(row, paths, trial)
@@ -120,13 +117,17 @@ def verify_dataset(
                 _make_again(paths, trial, settings, result)
         except BadInputError as error:
             result.faults.append(str(error))
+        if len(result.faults) > before:
+            result.damaged.append(paths.trial)
+            if repair:
+                paths.trial_file.unlink(missing_ok=True)
     return result
 
 
 def _settings(folder: Path) -> Mapping[str, Any]:
     """Return the settings of `generate`; empty for imported datasets, which have none."""
     try:
-        return dict(read_sealed(folder / SETTINGS)["settings"])
+        return dict(read_json(folder / SETTINGS, dict[str, Any])["settings"])
     except (BadInputError, KeyError, TypeError, ValueError):
         return {}
 
@@ -134,17 +135,10 @@ def _settings(folder: Path) -> Mapping[str, Any]:
 def _check_folder(folder: Path, table: pd.DataFrame) -> list[str]:
     """Return faults of the files that are not part of a trial, and files that should not exist."""
     faults = []
-    records = [path for path in (folder / SETTINGS,) if path.is_file()]
-    for path in (*records, *sorted((folder / CHOICES).glob("*.json"))):
-        try:
-            read_sealed(path)
-        except BadInputError as error:
-            faults.append(str(error))
     path = folder / INDEX
-    # Bytes are comparable only if the same version of the parquet library wrote them. An index of
-    # an earlier version of this package has no checksums.
-    content, forms = path.read_bytes(), [index_bytes(table, checksums=c) for c in (True, False)]
-    if content not in forms and _writer(content) == _writer(forms[0]):
+    # Bytes are comparable only if the same version of the parquet library wrote them.
+    content, expected = path.read_bytes(), index_bytes(table)
+    if content != expected and _writer(content) == _writer(expected):
         faults.append(f"{path}: its bytes are not those of the table that it contains")
     listed = {folder / str(name) for file in FILES for name in table[file].dropna()}
     unknown = {path for path in folder.glob("*/*/*") if path.is_file()} - listed
@@ -278,7 +272,7 @@ def _render_again(paths: TrialPaths, trial: Trial, notes: list[str]) -> list[str
     A map with the same pixels in another compression is added to ``notes``.
     """
     from physion.rendering.renderer import role_map
-    from physion.trials.index import encode_png, same_picture
+    from physion.trials.files import encode_png, same_picture
     from physion.trials.making.make import make_movies
 
     meta, faults = trial.metadata, []
@@ -288,7 +282,7 @@ def _render_again(paths: TrialPaths, trial: Trial, notes: list[str]) -> list[str
         faults.append(f"{paths.trial_file}: field 'first_frame/ids' is rendered differently")
     counts = np.bincount(ids.ravel(), minlength=len(trial.scene.names()) + 1)[1:]
     if not np.array_equal((counts / ids.size).astype(np.float32), trial.pixel_fractions):
-        faults.append(f"{paths.trial_file}: field 'first_frame/shares' does not match the ids")
+        faults.append(f"{paths.trial_file}: field 'first_frame/fractions' does not match the ids")
     for name in trial.pass_names:
         for frame in (0, meta.frames // 2, meta.frames - 1):
             stored = trial.passes(frame)[name]

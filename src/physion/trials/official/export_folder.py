@@ -21,8 +21,8 @@ from physion.core.files import folder_for_writing, remove_leftovers, write_atomi
 from physion.core.names import FOLDERS, NAMES, canonical_name, scenario_of
 from physion.core.seeds import stable_hash
 from physion.trials.dataset import Dataset
-from physion.trials.index import IndexedFile, Metadata, TrialPaths, encode_png
-from physion.trials.official.names import TRIAL_FILE, redyellow_name, split_name
+from physion.trials.files import IndexedFile, Metadata, TrialPaths, encode_png
+from physion.trials.official.names import redyellow_name, split_name
 from physion.trials.official.read_file import OfficialFile
 from physion.trials.official.write_file import trial_stats
 from physion.trials.trial_file import Trial
@@ -483,6 +483,6 @@ def _is_done(job: ExportJob) -> bool:
 def _stored(path: Path, job: ExportJob) -> Any:
     """Return the metadata in an exported HDF5 file; None if it lacks wanted pictures."""
     with OfficialFile.open(path) as file:
-        if not file.has(TRIAL_FILE) or (job.images and not file.has(_IMAGE)):
+        if job.images and not file.has(_IMAGE):
             return None
         return json.loads(file.text("physion/metadata"))

@@ -20,22 +20,21 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from PIL import Image
 
 from physion.compute.run_tasks import RunReport, run_tasks
 from physion.compute.tasks import Executor, Progress
-from physion.core.errors import BadInputError, PhysionError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import folder_for_writing, remove_leftovers
 from physion.core.names import FOLDERS, guess_scenario, plain_name
 from physion.core.version import __version__
-from physion.physics.labels import Labels, contact_frames, label_contact
-from physion.physics.trajectory import ENVIRONMENT, Contacts, Trajectory
+from physion.physics.labels import Labels, label_contact
+from physion.physics.trajectory import Contacts, Trajectory
 from physion.rendering.renderer import Renderer, role_map
 from physion.scenes.scene import (
     FRAME_TIME,
@@ -43,50 +42,38 @@ from physion.scenes.scene import (
     PLAYBACK_RATE,
     Body,
     Camera,
-    Cloth,
     Roles,
     Scene,
 )
-from physion.trials.index import (
+from physion.trials.files import (
     INDEX,
     SAFE_NAME,
     SETTINGS,
     Metadata,
     TrialPaths,
-    build_index,
     encode_png,
     write_files,
-    write_index,
 )
+from physion.trials.index import build_index, write_index
 from physion.trials.making.plan import SPLITS
 from physion.trials.official.movies import (
     PICTURES,
     EncodedMovies,
-    SourceMovie,
     make_movies,
     neighbouring_file,
     read_movie,
     stored_frames,
 )
 from physion.trials.official.names import (
-    TRIAL_FILE,
     decode_picture,
     redyellow_name,
     split_name,
-    to_official_camera,
 )
 from physion.trials.official.read_file import MotionReader, OfficialFile, SceneReader
-from physion.trials.official.write_objects import OfficialObjects
-from physion.trials.trial_file import Trial, TrialWriter
-from physion.trials.video import MovieEncoder, count_frames
-
-# Description of one import job, and the metadata that every imported trial shares.
-#
-# These definitions are used both by the module that plans imports and by the modules that carry
-# them out; they stand here so that those need not import each other.
+from physion.trials.trial_file import TrialWriter
 
 IMPORTED = "imported"
-"""Default name of a dataset that is imported from files of other authors."""
+"""Default name of an imported dataset."""
 
 
 @dataclass(frozen=True)
@@ -102,8 +89,7 @@ class ImportJob:
     index
         Position of the trial in its split and scenario, from 0.
     dataset
-        Name of the dataset. None: keep the name stored in files that this package exported, and
-        use `IMPORTED` for all others.
+        Name of the dataset.
     contact
         Recorded outcome from the lists next to the source; None if they do not hold it.
     first_frame
@@ -113,7 +99,7 @@ class ImportJob:
     source: Path
     paths: TrialPaths
     index: int
-    dataset: str | None
+    dataset: str
     contact: bool | None = None
     first_frame: int | None = None
 
@@ -149,7 +135,7 @@ def imported_metadata(
     """
     return Metadata(
         trial=job.paths.trial,
-        dataset=job.dataset or IMPORTED,
+        dataset=job.dataset,
         scenario=job.paths.scenario,
         split=job.paths.split,
         index=job.index,
@@ -182,7 +168,7 @@ def import_official(
     folder: Path,
     out: Path,
     *,
-    name: str | None = None,
+    name: str = IMPORTED,
     split: str | None = None,
     scenario: str | None = None,
     executor: Executor | None = None,
@@ -190,17 +176,15 @@ def import_official(
 ) -> RunReport:
     """Import every official trial under ``folder`` into the dataset ``out``, and index it.
 
-    Files that this package exported become the trials that they were made from (see
-    `physion.trials.official.import_folder`). Trials that exist are kept. A damaged file is
-    reported and does not stop the others.
+    Trials that exist are kept. A damaged file is reported and does not stop the others.
 
     Parameters
     ----------
     folder, out
         Folder to read, and folder of the dataset to write into.
     name, split
-        Dataset and split of the trials; by default those stored in files that this package
-        exported, and otherwise ``imported`` and ``testing``.
+        Dataset and split of the trials; by default ``imported``, and the split in metadata.json
+        beside the files, otherwise ``testing``.
     scenario
         Scenario of trials whose scenario cannot be found from their names.
     executor
@@ -219,7 +203,7 @@ def import_official(
         raise UnknownNameError("split", split, SPLITS)
     if scenario is not None and scenario not in FOLDERS:
         raise UnknownNameError("scenario", scenario, FOLDERS)
-    if name is not None and not re.fullmatch(SAFE_NAME, name):
+    if not re.fullmatch(SAFE_NAME, name):
         raise BadInputError(f"dataset name {name!r} cannot be a file name")
     if not folder.is_dir():
         raise BadInputError(f"folder {folder} does not exist")
@@ -257,12 +241,15 @@ def import_trial(job: ImportJob) -> tuple[str, ...]:
 
 
 def _plan(
-    folder: Path, out: Path, dataset: str | None, split: str | None, scenario: str | None
+    folder: Path, out: Path, dataset: str, split: str | None, scenario: str | None
 ) -> tuple[dict[str, ImportJob], dict[str, str]]:
     """Return the jobs by name of the trial, and why other files cannot be imported."""
     sources = list(_sources(folder))
     if not sources:
-        raise BadInputError(f"{folder} has no official HDF5 file and no official movie")
+        raise BadInputError(
+            f"{folder} has no official HDF5 file and no official movie, and is no checkout of the "
+            "original study (with human_accuracy-*.csv)"
+        )
     lists = _FolderLists()
     jobs: dict[str, ImportJob] = {}
     failed: dict[str, str] = {}
@@ -486,203 +473,6 @@ def _unknown_motion(frames: int) -> Trajectory:
     )
 
 
-# Restoring of original trials from official files that this package exported.
-#
-# The official layout cannot store impulses, presets, seeds or the robustness of a label, so an
-# export embeds the trial file itself, without image passes, under ``physion/trial_file``. On
-# import it is checked like every trial file, and used only if the official arrays of the same file
-# agree with it: otherwise these were changed after the export, and only they are read.
-
-_CLOSE = 1e-5
-"""Tolerance of comparisons, in metres and other units: rounding to single precision."""
-_BROKEN = (PhysionError, ArithmeticError, LookupError, ValueError)
-"""Exceptions that a damaged or inconsistent trial file can raise."""
-
-Pictures = Iterator[NDArray[np.uint8]]
-
-
-def stored_trial(motion: MotionReader, trajectory: Trajectory) -> Trial | None:
-    """Return the original trial embedded in an official file.
-
-    None if it is absent, damaged, or contradicts the official arrays, whose motion is
-    ``trajectory``; the reason is added to the notes.
-    """
-    file, notes = motion.reader.file, motion.reader.notes
-    if not file.has(TRIAL_FILE):
-        return None
-    try:
-        trial = Trial(file.data(TRIAL_FILE), f"{file.where}: field {TRIAL_FILE!r}")
-        checks = _checks(trial, motion, trajectory)
-        differs = next((name for name, same in checks if not same), None)
-    except _BROKEN as error:
-        notes.append(f"the embedded trial is damaged and was ignored: {error}")
-        return None
-    if differs is not None:
-        notes.append(f"{differs} differs from the embedded trial, which was ignored")
-        return None
-    return trial
-
-
-def _checks(
-    trial: Trial, motion: MotionReader, trajectory: Trajectory
-) -> Iterator[tuple[str, bool]]:
-    """Yield names of fields and whether they agree with the trial; later checks rely on earlier."""
-    reader, meta, scene, stored = motion.reader, trial.metadata, trial.scene, trial.trajectory
-    objects = OfficialObjects(trial.shown(), stored)
-    ids, roles, file = objects.ids, scene.roles, reader.file
-    times = (OBSERVED_FRAMES, FRAME_TIME, reader.scenario)
-    yield "the scenario", (meta.observed_frames, meta.frame_time, meta.scenario) == times
-    origin = {value is None for value in (meta.seed, meta.preset, meta.attempt)}
-    yield "the origin", len(origin) == 1
-    yield (
-        "the digest",
-        (stored.digest(), scene.physics_digest()) == (meta.digest, meta.scene_digest),
-    )
-    yield "the picture's size", trial.ids.shape == (meta.height, meta.width)
-    yield "static/object_ids", reader.ids == list(ids.values())
-    yield "static/model_names", reader.models == objects.models
-    yield (
-        "static/mass",
-        _close(file.table("static/mass", 1)[:, 0], [thing.mass for thing in objects.things]),
-    )
-    yield "static/scale", _close(reader.scales, objects.scales)
-    colors = [thing.look.color for thing in objects.things]
-    yield "static/color", _close(file.table("static/color", 3), colors)
-    asked = {"zone_id": roles.patient, "target_id": roles.agent}
-    for key, name in asked.items():
-        yield f"static/{key}", file.number(f"static/{key}") == ids[name]
-    yield "frames", len(reader.frames) == meta.frames
-    poses = (reader.motion.positions, reader.motion.rotations)
-    moves = (reader.motion.velocities, reader.motion.angular_velocities)
-    for values, expected in zip((*poses, *moves), (*objects.poses, *objects.motions), strict=True):
-        yield "the motion", _close(values, expected)
-    camera = f"{reader.frames[0]}/camera_matrices/"
-    wanted = to_official_camera(scene.camera, meta.width, meta.height)
-    for name, matrix in zip(("camera_matrix", "projection_matrix"), wanted, strict=True):
-        yield "the camera", _close(file.numbers(camera + name, (16,)), matrix.ravel())
-    yield from _contact_checks(trial, motion, trajectory, objects)
-
-
-def _contact_checks(
-    trial: Trial, motion: MotionReader, trajectory: Trajectory, objects: OfficialObjects
-) -> Iterator[tuple[str, bool]]:
-    reader, scene, stored = motion.reader, trial.scene, trial.trajectory
-    sheets = sum(cloth.resolution**2 for cloth in scene.cloths)
-    yield "the cloth", stored.cloth_vertices.shape[1] == sheets
-    for index, thing in enumerate(objects.things):
-        if isinstance(thing, Cloth):
-            seen = [motion.particles(index, frame) for frame in range(len(stored))]
-            expected = objects.cloth_vertices(objects.order[index])
-            yield "the cloth", all(_close(a, b) for a, b in zip(seen, expected, strict=True))
-    yield "the cloth's distance", _close(trajectory.cloth_distance, stored.cloth_distance)
-    names = motion.scene.names()
-    read_indices = np.full(len(names) + 1, ENVIRONMENT)
-    for index in reader.kept:
-        read_indices[names.index(reader.label(index)) + 1] = index
-    stored_indices = np.full(len(objects) + 1, ENVIRONMENT)
-    stored_indices[np.array(objects.order) + 1] = np.arange(len(objects))
-    rows = _rows(trajectory.contacts, read_indices), _rows(stored.contacts, stored_indices)
-    yield "the list of contacts", _close(*rows)
-    yield "labels/trial_complete", trajectory.completed == stored.completed
-    if motion.labelled_contact is not None:
-        labelled = np.flatnonzero(motion.labelled_contact)
-        yield (
-            "labels/target_contacting_zone",
-            np.array_equal(labelled, contact_frames(scene, stored)),
-        )
-        first = int(labelled[0]) if len(labelled) else None
-        yield (
-            "the label",
-            (trial.labels.contact, trial.labels.first_frame) == (bool(len(labelled)), first),
-        )
-
-
-def _rows(contacts: Contacts, indices: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return contacts as sorted rows (C, 9): frame, indices of both objects, point, normal.
-
-    ``indices`` maps the objects of ``contacts`` to common indices, from the environment (-1) on.
-    """
-    pairs = indices[contacts.bodies + 1]
-    sign = np.where(pairs[:, :1] > pairs[:, 1:], -1.0, 1.0)
-    pairs = np.sort(pairs, axis=1)
-    rows = np.hstack([contacts.frame[:, None], pairs, contacts.point, sign * contacts.normal])
-    return np.asarray(rows[np.lexsort((pairs[:, 1], pairs[:, 0], contacts.frame))], np.float64)
-
-
-def _close(one: ArrayLike, other: ArrayLike) -> bool:
-    a, b = np.asarray(one, np.float64), np.asarray(other, np.float64)
-    return a.shape == b.shape and np.allclose(a, b, rtol=1e-6, atol=_CLOSE, equal_nan=True)
-
-
-def restored_files(
-    job: ImportJob, file: OfficialFile, frames: list[str], trial: Trial
-) -> dict[str, bytes]:
-    """Return the files of an embedded trial, with name, split and dataset of the job.
-
-    If split or dataset differ from the original ones, a sampled scene becomes an imported one.
-    """
-    original = trial.metadata
-    dataset, split = job.dataset or original.dataset, job.paths.split
-    meta = replace(original, trial=job.paths.trial, split=split, dataset=dataset)
-    if (meta.split, meta.dataset) != (original.split, original.dataset):
-        # Seeds are derived from these names; with others, the seed would give another scene.
-        meta = replace(meta, seed=None, preset=None, attempt=None)
-    files: dict[str, bytes] = {}
-    if meta.movies:
-        path: Path | None = job.source.with_name(f"{job.source.stem}_img.mp4")
-        drawn = file.has(f"{frames[0]}/{PICTURES}")
-        pictures = stored_frames(file, frames) if drawn else _rendered(trial, meta.look)
-        files["movie"], files["observed_movie"] = _movies(meta, path, pictures)
-        files["map"] = encode_png(role_map(trial.ids, trial.scene))
-    if meta.movies and meta.free_movies:
-        name = f"{plain_name(job.paths.trial)}_img.mp4"
-        path = neighbouring_file(job.source, "mp4s", name)
-        pictures = _rendered(trial, "free")
-        files["free_movie"], files["free_observed_movie"] = _movies(meta, path, pictures)
-    writer = TrialWriter(meta, trial.scene, trial.trajectory, trial.labels, trial.ids)
-    files["trial_file"] = writer.finish()
-    return files
-
-
-def _rendered(trial: Trial, look: str) -> Iterator[NDArray[np.uint8]]:
-    for frame in range(trial.metadata.frames):
-        color = trial.render(frame, look=look).color
-        assert color is not None, "the renderer left out colour"
-        yield color
-
-
-def _movies(meta: Metadata, path: Path | None, pictures: Pictures) -> tuple[bytes, bytes]:
-    """Return the full and the observed movie.
-
-    The full movie is that at ``path`` if it matches the trial, else it is encoded from
-    ``pictures``. The observed movie is always encoded from pictures, which gives better quality
-    than encoding a decoded movie again.
-    """
-    size = (meta.height, meta.width, 3)
-    if path is None or not _matches(meta, path):
-        made = make_movies(pictures, meta.frames, meta.playback_rate)
-        if made.size != (meta.width, meta.height):
-            raise BadInputError(f"pictures of {made.size} pixels are not those of {meta.trial!r}")
-        return made.full, made.observed
-    encoder = MovieEncoder(meta.width, meta.height, OBSERVED_FRAMES, rate=meta.playback_rate)
-    for picture in islice(pictures, OBSERVED_FRAMES):
-        if picture.shape != size:
-            raise BadInputError(f"a picture of shape {picture.shape} is not one of {meta.trial!r}")
-        encoder.add(picture)
-    return path.read_bytes(), encoder.finish()
-
-
-def _matches(meta: Metadata, path: Path) -> bool:
-    """Return whether a movie has the coding, size, rate and length of the trial's movie."""
-    try:
-        movie = SourceMovie(path)
-        size = (movie.width, movie.height, movie.rate)
-        wanted = (meta.width, meta.height, meta.playback_rate)
-        return movie.copied and size == wanted and count_frames(path) == meta.frames
-    except BadInputError:
-        return False
-
-
 # Import of one official HDF5 file: scene, motion, contacts, labels and movies.
 
 UNSEEN_SIZE = (256, 256)
@@ -702,10 +492,6 @@ def import_state(job: ImportJob) -> tuple[str, ...]:
             raise file.bad(
                 "frames", f"holds {frames}; nothing is left to predict after {OBSERVED_FRAMES}"
             )
-        stored = stored_trial(motion, trajectory)
-        if stored is not None:
-            write_files(job.paths, restored_files(job, file, reader.frames, stored))
-            return ()
         movies = _import_hdf5_movies(job, file, reader, frames)
         ids = _import_hdf5_ids(
             file, reader, scene, trajectory, movies.size if movies else UNSEEN_SIZE

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from physion.core.errors import BadInputError
 from physion.scenes.scene import OBSERVED_FRAMES
-from physion.trials.index import MAX_FRAMES, MAX_SIDE
+from physion.trials.files import MAX_FRAMES, MAX_SIDE
 from physion.trials.official.read_file import OfficialFile
 from physion.trials.video import MovieEncoder
 

@@ -18,7 +18,7 @@ from physion.core.errors import BadInputError
 from physion.physics.cloth.solver import CLOTH_CONTACT_GAP
 from physion.rendering.camera import projection_matrix, view_matrix
 from physion.scenes.scene import Camera
-from physion.trials.index import MAX_SIDE
+from physion.trials.files import MAX_SIDE
 
 Bytes = NDArray[np.uint8]
 
@@ -32,8 +32,6 @@ CLOTH_THRESHOLD = 0.1222
 CLOTH_DISTANCE = CLOTH_THRESHOLD - CLOTH_CONTACT_GAP
 """Metres by which ``minimum_distance_target_to_zone`` (between particle centres) exceeds the gap
 between surfaces of this package; it makes each threshold valid for the other's data."""
-TRIAL_FILE = "physion/trial_file"
-"""Path of the embedded trial file in official files that this package exports."""
 FLOW_FULL = 0.02
 """Motion per frame with full brightness in ``_flow``, as a fraction of the picture's width."""
 

@@ -43,7 +43,7 @@ from physion.scenes.scene import (
 from physion.scenes.shapes.primitives import FALLBACK, prop_for, shape, shapes
 from physion.scenes.tdw.commands import ROOMS as SCENE_ROOMS
 from physion.scenes.tdw.commands import UNSET_MATERIAL, VANISHING_SCALE
-from physion.trials.index import MAX_FRAMES
+from physion.trials.files import MAX_FRAMES
 from physion.trials.official.names import (
     CLOTH_DISTANCE,
     CLOTH_MODEL,

@@ -4,9 +4,8 @@ Names, shapes and encodings are those of docs/official-system.md, section 4, wit
 All static arrays have one entry per object (in the originals, masses and frictions lack scenery
 and so do not align with the other arrays). Ids and counts are int64, measures float32. What the
 official layout does not provide is stored under ``physion/``: the scene, labels and metadata as
-JSON, the record for ``metadata.json``, the flow in pixels (``flow``: (frames, rows, columns, 2),
-right and down, half precision), and the bytes of the trial file without passes (``trial_file``),
-from which an import restores the same trial.
+JSON, the record for ``metadata.json``, and the flow in pixels (``flow``: (frames, rows, columns,
+2), right and down, half precision).
 """
 
 from __future__ import annotations
@@ -33,7 +32,6 @@ from physion.trials.official.names import (
     CLOTH_DISTANCE,
     RAMPS,
     ROOMS,
-    TRIAL_FILE,
     encode_depth,
     encode_flow,
     encode_normals,
@@ -60,7 +58,7 @@ from physion.trials.official.write_objects import (
     put_bytes,
     put_picture,
 )
-from physion.trials.trial_file import Trial, TrialWriter
+from physion.trials.trial_file import Trial
 
 # Pictures of one frame, encoded as in the official files.
 
@@ -110,7 +108,7 @@ def encode_rgb(picture: NDArray[np.uint8]) -> bytes:
     """Return the bytes of a PNG file of ``picture`` (H, W, 3), made fast.
 
     One filter for all rows takes half the time of the choice of a filter for each row that
-    `physion.trials.index.encode_png` makes, for 10 % more bytes.
+    `physion.trials.files.encode_png` makes, for 10 % more bytes.
     """
     height, width, channels = picture.shape
     rows = np.ascontiguousarray(picture).reshape(height, width * channels)
@@ -436,9 +434,6 @@ def official_file(
         texts |= {"metadata": json.dumps(dataclasses.asdict(meta) | {"look": look or meta.look})}
         for name, text in texts.items():
             put(extra.id, name, np.array(text.encode()))
-        whole = TrialWriter(meta, trial.scene, trial.trajectory, trial.labels, trial.ids).finish()
-        # Without compression: its arrays are compressed already.
-        put_bytes(file.id, TRIAL_FILE, whole)
         file.flush()
         return bytes(file.id.get_file_image()), record
 

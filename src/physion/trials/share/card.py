@@ -13,11 +13,13 @@ from typing import Any
 import pandas as pd
 
 from physion.core.errors import BadInputError
-from physion.core.files import read_sealed, write_atomic
-from physion.trials.index import FILES, INDEX, INDEX_COLUMNS, SETTINGS, IndexColumn, read_index
+from physion.core.files import write_atomic
+from physion.core.settings import read_json
+from physion.trials.files import FILES, INDEX, SETTINGS
+from physion.trials.index import INDEX_COLUMNS, IndexColumn, read_index
 from physion.trials.share.tables import FOLDER, table_configs, write_split_tables
 
-# DatasetFacts about a dataset, for its card and its metadata.
+# Facts about a dataset, for its card and its metadata.
 #
 # Every statement is computed from the index, read from the settings of the dataset, or true of all
 # datasets that this package makes.
@@ -158,7 +160,7 @@ def read_facts(folder: Path) -> DatasetFacts:
     path, settings = folder / SETTINGS, {}
     if path.is_file():
         try:
-            settings = dict(read_sealed(path)["settings"])
+            settings = dict(read_json(path, dict[str, Any])["settings"])
         except (KeyError, TypeError, ValueError) as error:
             raise BadInputError(f"{path} is damaged: field 'settings' is missing") from error
     return DatasetFacts(index, len(data), hashlib.sha256(data).hexdigest(), settings)

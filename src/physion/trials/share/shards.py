@@ -32,7 +32,8 @@ from physion.compute.run_tasks import run_tasks
 from physion.compute.tasks import Executor, Progress, TaskOutcome
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import folder_for_writing, remove_leftovers, write_atomic
-from physion.trials.index import COLUMNS, TrialPaths, read_index
+from physion.trials.files import TrialPaths
+from physion.trials.index import COLUMNS, read_index
 
 MANIFEST = "shards.json"
 """File that lists the shards of a folder; rewritten with every shard, ``complete`` at the end."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from physion.cli.main import main
 from physion.experiment.study.study import load_study
 from physion.trials.dataset import Dataset
-from physion.trials.index import TrialPaths
+from physion.trials.files import TrialPaths
 from physion.trials.video import read_frames
 
 pytestmark = pytest.mark.slow

@@ -12,7 +12,7 @@ from physion.cli.main import main
 from physion.compute.local import SerialExecutor
 from physion.core.errors import BadInputError
 from physion.core.names import canonical_name
-from physion.data import official
+from physion.data.official import official
 from physion.experiment.study.choose import HIDDEN, OfficialSelection, choose_official, find_fault
 from physion.experiment.study.study import load_study
 from physion.physics.replay import ReplayTask, replay_trial

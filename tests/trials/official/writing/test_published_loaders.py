@@ -35,7 +35,7 @@ from physion.cli import export as export_verb
 from physion.compute.local import SerialExecutor
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.trials.dataset import Dataset
-from physion.trials.index import TrialPaths
+from physion.trials.files import TrialPaths
 from physion.trials.official.export_folder import LAYOUTS, evaluator_name, export_official
 from physion.trials.video import count_frames, read_frames
 from support.official_hand_made import CLOTH, FRAMES, RIGID, TOUCH, make_dataset

@@ -14,7 +14,7 @@ import pytest
 from physion.clips.batch import Batch, Motion, Spec, cut_to_observed
 from physion.clips.clips import observed_source, whole_source
 from physion.clips.rendered import RenderedSource
-from physion.clips.source import FutureFrameError, ObservedSource, WholeBatches
+from physion.clips.source import FutureFrameError, ObservedSource, WholeSource
 from physion.clips.states import cut_motion
 from physion.core.errors import BadInputError
 from physion.physics.trajectory import Contacts, Trajectory
@@ -174,7 +174,7 @@ def test_no_attribute_leads_to_later_frames(made: Dataset, name: str, rendered: 
     things = [*reachable(source), *reachable(batch)]
     assert len(things) > 20
     for thing in things:
-        assert not isinstance(thing, Dataset | Trial | WholeBatches)
+        assert not isinstance(thing, Dataset | Trial | WholeSource)
         if isinstance(thing, np.ndarray) and thing.ndim:
             assert thing.shape[0] != FRAMES and thing.nbytes != FRAMES
         if isinstance(thing, Trajectory):

@@ -14,7 +14,7 @@ import pytest
 from physion.clips.batch import Spec
 from physion.clips.clips import observed_source, whole_source
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.trials import index as indexed_file
+from physion.trials import files as indexed_file
 from physion.trials.dataset import Dataset
 from physion.trials.video import encode_movie, read_frames
 from support.official_hand_made import CLOTH, FRAMES, RIGID, SIZE

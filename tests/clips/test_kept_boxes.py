@@ -1,11 +1,10 @@
-"""Boxes that were read before are not rendered again, in bounded memory."""
+"""Boxes that were read before are not rendered again."""
 
 from __future__ import annotations
 
 import pickle
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ import pytest
 from physion.clips import rendered
 from physion.clips.batch import Motion
 from physion.clips.movies import background
-from physion.clips.rendered import BoxesOfTrial, KeptBoxes, MotionRenderer
+from physion.clips.rendered import MotionRenderer
 from physion.rendering.renderer import Frame, Renderer
 from support.official_hand_made import CLOTH, FRAMES, RIGID, make_scene, make_trajectory
 
@@ -41,16 +40,16 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, tuple[str, ...]]]:
     return calls
 
 
-def reader_of(motions: dict[str, Motion], *inputs: str, **more: Any) -> MotionRenderer:
-    return MotionRenderer(motions, inputs, SIZE, OBJECTS, LOOKS, **more)
+def reader_of(motions: dict[str, Motion], *inputs: str) -> MotionRenderer:
+    return MotionRenderer(motions, inputs, SIZE, OBJECTS, LOOKS)
 
 
 def test_a_trial_that_is_read_again_is_rendered_as_a_whole_and_then_never(
     motions: dict[str, Motion], drawn: list[tuple[int, tuple[str, ...]]]
 ) -> None:
-    reader, plain = reader_of(motions, "boxes"), reader_of(motions, "boxes", kept_bytes=0)
+    reader = reader_of(motions, "boxes")
     windows = [np.array(frames) for frames in ([0, 6, 12], [12, 6, 0], [6, 18, 18], [40, 44, 49])]
-    expected = [plain.read(RIGID, window)["boxes"] for window in windows]
+    expected = [reader_of(motions, "boxes").read(RIGID, window)["boxes"] for window in windows]
     assert len(drawn) == 3 + 3 + 2 + 3
     drawn.clear()
     found = [reader.read(RIGID, window)["boxes"] for window in windows[:2]]
@@ -84,26 +83,6 @@ def test_what_a_caller_changes_does_not_change_what_is_kept(motions: dict[str, M
     np.testing.assert_array_equal(reader.read(RIGID, frames)["boxes"], known)
 
 
-def test_memory_is_bounded_and_the_trial_used_longest_ago_is_forgotten() -> None:
-    frames, boxes = np.array([0, 2]), np.arange(16, dtype=np.float32).reshape(2, 2, 4)
-    size = BoxesOfTrial.unknown(5, 2).bytes
-    kept = KeptBoxes(2, 2 * size + 1)
-    for trial in ("one", "two"):
-        kept.add(trial, 5, frames, boxes)
-    kept.get("one", frames)
-    kept.add("three", 5, frames, boxes)
-    known = {trial: kept.get(trial, frames)[1].tolist() for trial in ("one", "two", "three")}
-    assert known == {"one": [True, True], "two": [False, False], "three": [True, True]}
-    assert kept.bytes == 2 * size
-    assert kept.missing("three").tolist() == [1, 3, 4] and not len(kept.missing("two"))
-    found, which = kept.get("three", np.array([2, 1]))
-    assert which.tolist() == [True, False] and np.isnan(found[1]).all()
-    np.testing.assert_array_equal(found[0], boxes[1])
-    none = KeptBoxes(2, 0)
-    none.add("one", 5, frames, boxes)
-    assert none.bytes == 0 and not none.get("one", frames)[1].any()
-
-
 def test_a_copy_in_another_process_starts_empty_and_reads_the_same(
     motions: dict[str, Motion], drawn: list[tuple[int, tuple[str, ...]]]
 ) -> None:
@@ -115,8 +94,9 @@ def test_a_copy_in_another_process_starts_empty_and_reads_the_same(
 
 
 def test_threads_may_share_a_reader(motions: dict[str, Motion]) -> None:
-    reader, plain = reader_of(motions, "boxes"), reader_of(motions, "boxes", kept_bytes=0)
+    reader = reader_of(motions, "boxes")
     requests = [np.arange(start, FRAMES, 9) for start in range(6)] * 3
     found = background(requests, partial(reader.read, CLOTH), ahead=6, threads=6)
     for window, values in zip(requests, found, strict=True):
-        np.testing.assert_array_equal(values["boxes"], plain.read(CLOTH, window)["boxes"])
+        alone = reader_of(motions, "boxes").read(CLOTH, window)
+        np.testing.assert_array_equal(values["boxes"], alone["boxes"])

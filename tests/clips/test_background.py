@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from functools import partial
 
 import numpy as np
 import pytest
@@ -13,9 +12,7 @@ import pytest
 from physion.clips.batch import Spec
 from physion.clips.clips import whole_source
 from physion.clips.movies import background
-from physion.compute.local import LocalExecutor, SerialExecutor
-from physion.compute.tasks import Executor
-from physion.core.errors import BadInputError, PhysionError
+from physion.core.errors import BadInputError
 from physion.trials.dataset import Dataset
 from support.official_hand_made import CLOTH, RIGID
 
@@ -107,38 +104,19 @@ def test_a_forgotten_iterator_ends_its_threads() -> None:
     assert not running()
 
 
-@pytest.mark.parametrize(
-    "executor", [None, SerialExecutor(), pytest.param(LocalExecutor(2), marks=pytest.mark.slow)]
-)
-def test_batches_of_a_source_are_the_same_read_ahead(
-    made: Dataset, executor: Executor | None
-) -> None:
+def test_batches_of_a_source_are_the_same_read_ahead(made: Dataset) -> None:
     """Movies, rendering and motions, with more threads than trials."""
     spec = Spec(inputs=("rgb", "ids", "boxes", "state"), image_size=16, stride=3)
     source = whole_source(made, spec)
     requests = [((RIGID, CLOTH), (start, 2 * start)) for start in range(8)]
     expected = [source.window(*request, 4) for request in requests]
-    read = partial(window, source)
-    ahead = background(requests, read, ahead=6, threads=6, executor=executor)
+    ahead = background(requests, lambda request: source.window(*request, 4), ahead=6, threads=6)
     for batch, known in zip(ahead, expected, strict=True):
         for name, values in known.arrays().items():
             np.testing.assert_array_equal(batch.arrays()[name], values, name)
         assert [motion.trajectory.digest() for motion in batch.state or ()] == [
             motion.trajectory.digest() for motion in known.state or ()
         ]
-
-
-def window(source, request):  # type: ignore[no-untyped-def]
-    """Read a window; a function of a module, so that processes can receive it."""
-    return source.window(*request, 4)
-
-
-@pytest.mark.slow
-def test_processes_give_results_in_order_and_errors_at_their_place() -> None:
-    found: list[int] = []
-    with pytest.raises(PhysionError, match="seven is bad"):
-        found.extend(background(range(20), slow_square, executor=LocalExecutor(2)))
-    assert found == [number**2 for number in range(7)]
 
 
 def test_settings_that_make_no_sense_are_refused_at_once() -> None:

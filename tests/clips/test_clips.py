@@ -29,7 +29,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 def test_a_clip_holds_the_frames_of_the_movie_and_the_outcome(made: Dataset) -> None:
-    clips = made.clips(**SHORT)
+    clips = physion.clips(made, **SHORT)
     assert len(clips) == len(made)
     for trial, clip in zip(made.trials(), clips, strict=True):
         assert set(clip) == {"trial", "label", "frames", "valid", "rgb"}
@@ -40,13 +40,16 @@ def test_a_clip_holds_the_frames_of_the_movie_and_the_outcome(made: Dataset) -> 
         assert bool(clip["label"]) == made.trial(trial).labels.contact
     changed = Dataset(made.folder)
     changed.index["contact"] = ~changed.index["contact"]
-    assert all(a["label"] != b["label"] for a, b in zip(clips, changed.clips(**SHORT), strict=True))
+    assert all(
+        a["label"] != b["label"]
+        for a, b in zip(clips, physion.clips(changed, **SHORT), strict=True)
+    )
     assert [clip["trial"] for clip in clips[1:]] == made.trials()[1:]
 
 
 def test_every_pass_has_its_shape_and_ids_name_the_roles(made: Dataset) -> None:
     passes = ("rgb", "ids", "depth", "boxes", "camera")
-    clip = made.clips(**SHORT, passes=passes, objects=2, labels=False, rendered=True)[0]
+    clip = physion.clips(made, **SHORT, passes=passes, objects=2, labels=False, rendered=True)[0]
     assert "label" not in clip
     assert clip["ids"].shape == clip["depth"].shape == (5, 16, 16)
     assert clip["boxes"].shape == (5, 2, 4) and clip["camera"].shape == (2, 4, 4)
@@ -55,20 +58,20 @@ def test_every_pass_has_its_shape_and_ids_name_the_roles(made: Dataset) -> None:
 
 def test_splits_and_scenarios_choose_the_trials(made: Dataset) -> None:
     row = made.index.iloc[1]
-    clips = made.clips(**SHORT, split=row["split"], scenario=row["scenario"])
+    clips = physion.clips(made, **SHORT, split=row["split"], scenario=row["scenario"])
     assert [clip["trial"] for clip in clips] == made.trials(row["split"], row["scenario"])
     with pytest.raises(BadInputError, match="no trial of split any and scenario none"):
-        made.clips(scenario="none")
+        physion.clips(made, scenario="none")
 
 
 def test_clips_longer_than_a_trial_repeat_its_last_frame_or_are_left_out(made: Dataset) -> None:
     long = {**SHORT, "future": 12}
-    clip = made.clips(**long)[0]
+    clip = physion.clips(made, **long)[0]
     assert clip["frames"].max() == 49 and clip["valid"].tolist() == [True] * 13 + [False] * 2
     assert np.array_equal(clip["rgb"][-1], clip["rgb"][-2])
-    with pytest.raises(BadInputError, match="as long as a clip"):
-        made.clips(**long, padding=False)
-    assert len(made.clips(**SHORT, padding=False)) == len(made)
+    with pytest.raises(BadInputError, match="is long enough for a clip"):
+        physion.clips(made, **long, padding=False)
+    assert len(physion.clips(made, **SHORT, padding=False)) == len(made)
 
 
 def test_without_a_future_only_the_observed_movies_are_opened(
@@ -79,27 +82,27 @@ def test_without_a_future_only_the_observed_movies_are_opened(
     for trial in copy.trials():
         copy.paths(trial).movie.unlink()
         copy.paths(trial).trial_file.unlink()
-    clips = copy.clips(**{**SHORT, "future": 0, "anchor": "end"})
+    clips = physion.clips(copy, **{**SHORT, "future": 0, "context_at": "end"})
     assert [clip["frames"].tolist() for clip in clips] == [[36, 40, 44]] * len(copy)
     with pytest.raises(BadInputError, match="missing"):
-        copy.clips(**SHORT)[0]
+        physion.clips(copy, **SHORT)[0]
     with pytest.raises(BadInputError, match="observed"):
-        copy.clips(context=20, future=0)
+        physion.clips(copy, context=20, future=0)
 
 
 def test_wrong_passes_and_looks_are_refused_at_once(made: Dataset) -> None:
     with pytest.raises(BadInputError, match=r"passes must be some of rgb.*\['state'\]"):
-        made.clips(passes=("state",))
+        physion.clips(made, passes=("state",))
     with pytest.raises(BadInputError, match="passes"):
-        made.clips(passes=())
+        physion.clips(made, passes=())
     with pytest.raises(BadInputError, match="redyellow, free"):
-        made.clips(look="blue")
+        physion.clips(made, look="blue")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_workers_of_a_loader_give_the_same_clips(method: str, made: Dataset) -> None:
-    clips = made.clips(**SHORT, passes=("rgb", "depth"))
+    clips = physion.clips(made, **SHORT, passes=("rgb", "depth"))
     here = list(DataLoader(clips, batch_size=2))  # type: ignore[arg-type, var-annotated]
     there = list(
         DataLoader(
@@ -116,8 +119,20 @@ def test_workers_of_a_loader_give_the_same_clips(method: str, made: Dataset) -> 
         assert torch.equal(here[0][name], there[0][name]), name
 
 
+def test_the_package_of_this_name_is_the_function_too(made: Dataset) -> None:
+    """Whichever of both is imported first."""
+    calls = f"physion.clips({str(made.folder)!r}, size=16)[0]"
+    for first in (
+        "import physion",
+        "import physion.clips.batch",
+        "from physion.clips import clips",
+    ):
+        code = f"{first}; import physion; {calls}; import physion.clips.states; {calls}"
+        subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_clips_are_small_when_they_are_sent(made: Dataset) -> None:
-    clips = made.clips(**SHORT, passes=("rgb", "ids"))
+    clips = physion.clips(made, **SHORT, passes=("rgb", "ids"))
     fresh = len(pickle.dumps(clips))
     first = clips[0]
     copy = pickle.loads(pickle.dumps(clips))
@@ -129,7 +144,7 @@ def test_clips_need_no_torch(made: Dataset) -> None:
     code = f"""
 import sys
 import physion
-clips = physion.Dataset({str(made.folder)!r}).clips(size=16, future=1)
+clips = physion.clips({str(made.folder)!r}, size=16, future=1)
 assert clips[0]["rgb"].shape == (8, 16, 16, 3)
 assert "torch" not in sys.modules
 """

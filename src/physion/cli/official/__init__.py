@@ -1,1 +1,0 @@
-"""Official data and files for the verbs, and the verb ``import-official``."""
