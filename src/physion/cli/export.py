@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from physion.cli.output import Stages, console, print_report
+from physion.cli.output import Stages, console, counted, print_report
 from physion.compute.local import LocalExecutor
 from physion.core.errors import BadInputError
 
@@ -38,9 +38,9 @@ class Options:
     card: README with Croissant metadata and a table for each split; result-tables: predictions with
     the names of scenarios that the notebooks of the study use."""
     split: Literal["training", "readout", "testing", "familiarization"] | None = None
-    """Export this split alone."""
+    """Export only this split."""
     scenario: str | None = None
-    """Export this scenario alone."""
+    """Export only this scenario."""
     images: bool = True
     """Write pictures into HDF5 files; without, the export is 20 times as fast."""
     verify: bool = True
@@ -64,7 +64,7 @@ class Options:
 
 
 CARD_TERMS = ("license", "creator", "version", "url", "published")
-"""Options that apply to a card alone."""
+"""Options that apply only to a card."""
 HDF5_LAYOUTS = ("official", "physion-particles", "physopt")
 """Layouts with official HDF5 files."""
 
@@ -73,9 +73,9 @@ def main(options: Options) -> int:
     """Export what is missing; return 1 if a trial failed."""
     terms = [name for name in CARD_TERMS if getattr(options, name) is not None]
     if terms and options.layout != "card":
-        raise BadInputError(f"--{terms[0]} applies to a card alone: use it with --layout card")
+        raise BadInputError(f"--{terms[0]} applies only to a card: use it with --layout card")
     if options.parts != "all" and options.layout != "webdataset":
-        raise BadInputError("--parts applies to shards alone: use it with --layout webdataset")
+        raise BadInputError("--parts applies only to shards: use it with --layout webdataset")
     if not options.images and options.layout not in HDF5_LAYOUTS:
         raise BadInputError(
             f"--no-images applies to HDF5 files: use it with --layout {', '.join(HDF5_LAYOUTS)}"
@@ -105,7 +105,7 @@ def _card(options: Options) -> int:
 
 
 def _result_tables(options: Options, out: Path) -> int:
-    from physion.trials.share.tables import export_result_tables
+    from physion.trials.share.result_tables import export_result_tables
 
     if options.split or options.scenario:
         raise BadInputError(
@@ -137,11 +137,11 @@ def _webdataset(options: Options, out: Path) -> int:
             progress=stages,
         )
     if options.json:
-        values = {"made": report.made, "samples": report.samples, "bytes": report.bytes}
-        print(json_module.dumps(values | {"index": str(report.manifest)}, default=list))
+        made = [shard.name for shard in report.shards]
+        values = {"made": made, "samples": report.samples, "bytes": report.bytes}
+        print(json_module.dumps(values | {"index": str(report.manifest)}))
         return 0
-    kept = len(report.shards) - len(report.made)
-    done = f"{report.samples} trials in {len(report.made)} new shards and {kept} kept"
+    done = f"{report.samples} trials in {counted(len(report.shards), 'shard')}"
     console.print(f"{done}: {report.manifest}", markup=False, soft_wrap=True)
     return 0
 

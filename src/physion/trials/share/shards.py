@@ -12,7 +12,7 @@ use and information about the outcome are in separate files:
   file; webdataset takes an extension ``h5`` for a picture (``IMAGE_EXTENSIONS`` in its
   ``autodecode.py``) and fails at it with ``decode("pil")``.
 
-Equal datasets and options give equal bytes.
+Equal datasets and options give equal bytes. Beside each shard is its digest file.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import re
 import tarfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -29,17 +30,22 @@ from typing import Any
 import pandas as pd
 
 from physion.compute.run_tasks import run_tasks
-from physion.compute.tasks import Executor, Progress, TaskOutcome
+from physion.compute.tasks import Executor, Progress
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.core.files import folder_for_writing, remove_leftovers, write_atomic
+from physion.core.files import (
+    digest_path,
+    folder_for_writing,
+    remove_leftovers,
+    write_atomic,
+    write_with_digest,
+)
+from physion.core.settings import read_json
 from physion.trials.files import TrialPaths
 from physion.trials.index import COLUMNS, read_index
 
 MANIFEST = "shards.json"
-"""File that lists the shards of a folder; rewritten with every shard, ``complete`` at the end."""
+"""File that lists the shards of a folder, written last."""
 SHARD_BYTES = 2**28
-LAYOUT = 2
-"""Version of names and contents of the files in a sample."""
 
 FILE_PARTS: Mapping[str, str] = {
     "full.mp4": "movie",
@@ -63,25 +69,19 @@ _BLOCK = tarfile.BLOCKSIZE
 
 @dataclass(frozen=True)
 class Shard:
-    """One tar file: its ``split``, number of ``samples``, size in ``bytes`` and ``sha256``.
-
-    ``contents`` is a digest of the content, which is known before the file is made.
-    """
+    """One tar file: its ``split``, number of ``samples``, and size in ``bytes``."""
 
     name: str
     split: str
     samples: int
-    contents: str
     bytes: int
-    sha256: str
 
 
 @dataclass(frozen=True)
 class ShardReport:
-    """All ``shards`` of a folder, names of those ``made`` now, and path of the ``manifest``."""
+    """All ``shards`` of a folder, and the path of its ``manifest``."""
 
     shards: tuple[Shard, ...]
-    made: tuple[str, ...]
     manifest: Path
 
     @property
@@ -108,20 +108,13 @@ class _Sample:
         """Return the sizes in bytes of the files of the sample."""
         return [len(text) for text in self.texts.values()] + [f[1] for f in self.files.values()]
 
-    def digest(self) -> str:
-        """Return a digest of the content of the sample."""
-        known = {ending: hashlib.sha256(text).hexdigest() for ending, text in self.texts.items()}
-        known |= {ending: sha for ending, (_, _, sha) in self.files.items()}
-        return hashlib.sha256(json.dumps([self.key, known], sort_keys=True).encode()).hexdigest()
-
 
 @dataclass(frozen=True)
 class _ShardTask:
-    """One shard to write: its path, its samples, and the digest of their content."""
+    """One shard to write: its path and its samples."""
 
     path: Path
     samples: tuple[_Sample, ...]
-    contents: str
 
 
 def export_shards(
@@ -138,8 +131,7 @@ def export_shards(
     """Write trials of the dataset in ``folder`` as tar shards into ``out``.
 
     Shards are called ``physion-<split>-000000.tar`` and contain trials in the order of the index.
-    Every file is compared with its SHA-256 in the index. An interrupted export is continued by the
-    same call; shards whose trials have changed are made again.
+    Every file is compared with its SHA-256 in the index. Shards of an earlier export are replaced.
 
     Parameters
     ----------
@@ -161,7 +153,7 @@ def export_shards(
     ------
     BadInputError
         If a file is not the one in the index (the shards without such files are written), or
-        ``out`` contains other files or shards of other options.
+        ``out`` contains other files, or shards of other options.
     PhysionError
         If nothing more can be written into ``out``.
     UnknownNameError
@@ -176,11 +168,46 @@ def export_shards(
         )
     table = _select(read_index(folder), split, scenario)
     plan = _plan(_samples(folder, table, sorted(set(parts))), shard_bytes)
-    options = {"layout": LAYOUT, "dataset": sorted(set(table["dataset"])), "split": split}
-    options |= {"scenario": scenario, "parts": sorted(set(parts)), "shard_bytes": shard_bytes}
+    options: dict[str, Any] = {
+        "dataset": sorted(set(table["dataset"])),
+        "split": split,
+        "scenario": scenario,
+    }
+    options |= {"parts": sorted(set(parts)), "shard_bytes": shard_bytes}
     with folder_for_writing(out):
         remove_leftovers(out)
-        return _write_all(out, plan, options, executor, progress)
+        _check_folder(out, options)
+        (out / MANIFEST).unlink(missing_ok=True)
+        made, failed = run_tasks(
+            _write_shard,
+            {name: _ShardTask(out / name, tuple(samples)) for name, samples in plan.items()},
+            folder=out,
+            what="shards",
+            executor=executor,
+            progress=progress,
+        )
+        if failed:
+            more = f" (and {len(failed) - 1} more shards failed)" if len(failed) > 1 else ""
+            raise BadInputError(f"{next(iter(failed.values()))}{more}")
+        for path in out.glob("physion-*.tar"):
+            if path.name not in plan:
+                path.unlink()
+                digest_path(path).unlink(missing_ok=True)
+        _write_manifest(out / MANIFEST, options, list(made.values()))
+    return ShardReport(tuple(made.values()), out / MANIFEST)
+
+
+def _check_folder(out: Path, options: Mapping[str, Any]) -> None:
+    """Raise `BadInputError` for a folder with other files, or with shards of other options."""
+    ours = re.compile(r"physion-.+\.tar(\.sha256)?|" + re.escape(MANIFEST))
+    names = sorted(path.name for path in out.iterdir() if not path.name.startswith("."))
+    if other := [name for name in names if not ours.fullmatch(name)]:
+        raise BadInputError(f"{out} contains {other[0]!r}; choose an empty or new folder")
+    path = out / MANIFEST
+    if path.is_file() and read_json(path, dict[str, Any]).get("options") != options:
+        raise BadInputError(
+            f"{out} contains shards of other options, see {path}; choose another folder"
+        )
 
 
 def _select(table: pd.DataFrame, split: str | None, scenario: str | None) -> pd.DataFrame:
@@ -248,54 +275,11 @@ def _plan(samples: Iterable[_Sample], shard_bytes: int) -> dict[str, list[_Sampl
     return plan
 
 
-def _write_all(
-    out: Path,
-    plan: Mapping[str, Sequence[_Sample]],
-    options: Mapping[str, Any],
-    executor: Executor | None,
-    progress: Progress | None,
-) -> ShardReport:
-    before = _known_shards(out, options)
-    done: dict[str, Shard] = {}
-    missing: dict[str, _ShardTask] = {}
-    for name, samples in plan.items():
-        contents = hashlib.sha256("".join(s.digest() for s in samples).encode()).hexdigest()
-        known = before.get(name)
-        if known is None or known.contents != contents or not _is_whole(out / name, known):
-            missing[name] = _ShardTask(out / name, tuple(samples), contents)
-        else:
-            done[name] = known
-
-    def list_shard(outcome: TaskOutcome[Shard]) -> None:
-        if outcome.error is None:
-            done[outcome.key] = outcome.value
-            # Shards of an earlier plan stay listed until their files are deleted.
-            _write_manifest(out, options, {**before, **done}, complete=False)
-
-    made, failed = run_tasks(
-        _write_shard,
-        missing,
-        folder=out,
-        what="shards",
-        executor=executor,
-        progress=progress,
-        on_outcome=list_shard,
-    )
-    if failed:
-        more = f" (and {len(failed) - 1} more shards failed)" if len(failed) > 1 else ""
-        raise BadInputError(f"{next(iter(failed.values()))}{more}")
-    for name in before.keys() - done.keys():
-        (out / name).unlink(missing_ok=True)
-    _write_manifest(out, options, done, complete=True)
-    return ShardReport(tuple(done[name] for name in plan), tuple(made), out / MANIFEST)
-
-
 def _write_shard(task: _ShardTask) -> Shard:
-    """Write one shard atomically."""
+    """Write one shard and its digest file."""
     data = _archive(task.samples)
-    write_atomic(task.path, data)
-    sha, split = hashlib.sha256(data).hexdigest(), task.samples[0].split
-    return Shard(task.path.name, split, len(task.samples), task.contents, len(data), sha)
+    write_with_digest(task.path, data)
+    return Shard(task.path.name, task.samples[0].split, len(task.samples), len(data))
 
 
 def _archive(samples: Sequence[_Sample]) -> bytes:
@@ -323,52 +307,12 @@ def _read(path: Path, size: int, sha: str) -> bytes:
     return data
 
 
-def _is_whole(path: Path, shard: Shard) -> bool:
-    """Return whether the file of a shard exists and is unchanged."""
-    if not path.is_file() or path.stat().st_size != shard.bytes:
-        return False
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest() == shard.sha256
-
-
-def _known_shards(out: Path, options: Mapping[str, Any]) -> dict[str, Shard]:
-    """Return the shards listed in the manifest of ``out``; none for a new or empty folder."""
-    path = out / MANIFEST
-    if not path.is_file():
-        others = sorted(item.name for item in out.iterdir() if not item.name.startswith("."))
-        # An export that was killed early leaves one shard and no manifest.
-        if others and not all(name.startswith("physion-") for name in others):
-            raise BadInputError(
-                f"{out} contains {others[0]!r} and no {MANIFEST}; choose an empty or new folder"
-            )
-        return {}
-    try:
-        known = json.loads(path.read_text(encoding="utf-8", errors="replace"))
-        before = {item["name"]: Shard(**item) for item in known["shards"]}
-        stored_options = known["options"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise BadInputError(
-            f"{path} is damaged ({error}); delete it to export everything again"
-        ) from error
-    if stored_options != options:
-        raise BadInputError(
-            f"{out} contains shards of other options, see {path}; choose another folder"
-        )
-    if not all(name.startswith("physion-") and Path(name).name == name for name in before):
-        raise BadInputError(f"{path} lists files that are not shards; choose another folder")
-    return before
-
-
-def _write_manifest(
-    out: Path, options: Mapping[str, Any], shards: Mapping[str, Shard], complete: bool
-) -> None:
-    listed = [asdict(shard) for _, shard in sorted(shards.items())]
+def _write_manifest(path: Path, options: Mapping[str, Any], shards: Sequence[Shard]) -> None:
     splits: dict[str, dict[str, int]] = {}
-    for shard in shards.values():
+    for shard in shards:
         total = splits.setdefault(shard.split, {"samples": 0, "bytes": 0, "shards": 0})
         total["samples"] += shard.samples
         total["bytes"] += shard.bytes
         total["shards"] += 1
-    content = {"complete": complete, "options": options, "splits": splits, "shards": listed}
-    text = json.dumps(content, indent=1, sort_keys=True) + "\n"
-    write_atomic(out / MANIFEST, text.encode())
+    content = {"options": options, "splits": splits, "shards": [asdict(one) for one in shards]}
+    write_atomic(path, (json.dumps(content, indent=1, sort_keys=True) + "\n").encode())

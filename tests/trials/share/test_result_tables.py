@@ -9,7 +9,7 @@ import pytest
 
 from physion.cli.main import main as cli
 from physion.core.errors import BadInputError
-from physion.trials.share.tables import export_result_tables
+from physion.trials.share.result_tables import OFFICIAL_COLUMNS, export_result_tables
 
 DATASET_COLUMNS = ("Encoder Training Dataset", "Dynamics Training Dataset", "Readout Train Data")
 NOTEBOOK_SCENARIOS = {
@@ -24,20 +24,19 @@ NOTEBOOK_SCENARIOS = {
 }
 
 
-def table(path: Path, **changes: object) -> Path:
+def table(path: Path) -> Path:
     rows = [
         {
-            "Model": "m",
-            "Readout Train Data": ours,
-            "Readout Test Data": ours,
-            "Predicted Prob_true": "0.6666666666666666",
-            "Predicted Outcome": True,
-            "Actual Outcome": number % 2 == 0,
-            "Stimulus Name": f"{ours}_testing_0000",
-            "Encoder Training Dataset": "",
-            "Dynamics Training Dataset": f"no_{ours}" if number % 2 else ours,
-            "Protocol": "full",
-            **changes,
+            "model": "m",
+            "readout": "full",
+            "protocol": ("only", "all-but")[number % 2],
+            "seed": "0",
+            "stimulus": f"{ours}_testing_0000",
+            "scenario": ours,
+            "p_contact": "0.6666666666666666",
+            "outcome": number % 2 == 0,
+            "train_accuracy": "0.5",
+            "decision": "logistic",
         }
         for number, ours in enumerate(NOTEBOOK_SCENARIOS)
     ]
@@ -65,7 +64,7 @@ def process_model_dataframe(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def test_the_notebooks_find_every_scenario(tmp_path: Path) -> None:
-    source = table(tmp_path / "evaluated/predictions/m.csv")
+    table(tmp_path / "evaluated/predictions/m.csv")
     (made,) = export_result_tables(tmp_path / "evaluated", tmp_path / "models")
     frame = pd.read_csv(made)
     # pandas 1.5, for which it was written, changes the type of an empty column by itself.
@@ -77,8 +76,9 @@ def test_the_notebooks_find_every_scenario(tmp_path: Path) -> None:
         wanted = "all_but_this" if number % 2 else "same"
         assert row["Dynamics Training Dataset Type"] == wanted
         assert row["correct"] == (number % 2 == 0)
-    text = source.read_text().splitlines()
-    assert made.read_text().splitlines()[0] == text[0]
+        assert (row["Readout Type"], row["Model"], row["Train Accuracy"]) == ("A", "m", 0.5)
+        assert row["Predicted Prob_false"] + row["Predicted Prob_true"] == 1
+    assert list(frame) == list(OFFICIAL_COLUMNS)
     assert "0.6666666666666666" in made.read_text()  # digits stay
 
 
