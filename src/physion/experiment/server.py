@@ -23,7 +23,7 @@ from physion.experiment.app import build_app
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.media import check_media
-from physion.experiment.study.recruitment import missing_settings
+from physion.experiment.study.recruitment import start_warnings
 from physion.experiment.study.study import load_study
 from physion.experiment.web.connections import LimitedHeadProtocol
 
@@ -92,7 +92,7 @@ def serve(
         Called with the URL once the server accepts connections.
     warn
         Called with one line for each setting that should be filled in before people take part
-        (`missing_settings`).
+        (`start_warnings`).
 
     Raises
     ------
@@ -104,7 +104,7 @@ def serve(
     _set_logging(log_requests)
     study = load_study(folder)
     check_media(study)
-    for line in missing_settings(study):
+    for line in start_warnings(study):
         warn(line)
     secrets = Secrets.load(folder)
     _allow_many_connections()

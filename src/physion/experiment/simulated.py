@@ -27,9 +27,9 @@ from physion.experiment.study.identity import Secrets
 from physion.experiment.study.media import read_media_path
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.recruitment import make_pass
-from physion.experiment.study.settings import Answer, Question
+from physion.experiment.study.settings import ALL_SCENARIOS, Answer, Question
 from physion.experiment.study.stimuli import ATTENTION, PHASES, STIMULUS_PHASES, Stimulus
-from physion.experiment.study.study import ALL_SCENARIOS, Study
+from physion.experiment.study.study import Study
 
 ABILITY = (1.2, 0.35)
 """Mean and standard deviation over people, in log odds of a correct answer."""

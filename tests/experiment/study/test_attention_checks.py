@@ -10,8 +10,9 @@ import pytest
 
 from physion.core.errors import BadInputError
 from physion.experiment.study.orders import instructed_response, session_trials, trial_order
+from physion.experiment.study.settings import Attention, Blocks
 from physion.experiment.study.stimuli import ATTENTION, STIMULI_FILE
-from physion.experiment.study.study import Attention, Blocks, Study, load_study, write_settings
+from physion.experiment.study.study import Study, load_study, write_settings
 from support.experiment.tiny_study import make_tiny_study
 
 

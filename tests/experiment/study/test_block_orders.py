@@ -17,8 +17,9 @@ from physion.experiment.study.orders import (
     session_trials,
     trial_order,
 )
+from physion.experiment.study.settings import ALL_SCENARIOS, Blocks
 from physion.experiment.study.stimuli import STIMULI_FILE, write_stimuli
-from physion.experiment.study.study import ALL_SCENARIOS, Blocks, Study, load_study, write_settings
+from physion.experiment.study.study import Study, load_study, write_settings
 from support.experiment.tiny_study import make_tiny_study
 
 THREE = ("collide", "drop", "roll")

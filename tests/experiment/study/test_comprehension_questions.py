@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from physion.core.errors import BadInputError
-from physion.experiment.study.settings import check_attempt
-from physion.experiment.study.study import format_settings, load_study, parse_settings
+from physion.experiment.study.settings import check_attempt, format_settings, parse_settings
+from physion.experiment.study.study import load_study
 from support.experiment.own_questions import COMPREHENSION, COMPREHENSION_TEXTS, RIGHT, WRONG
 from support.experiment.tiny_study import make_tiny_study
 
@@ -32,13 +32,15 @@ def test_the_check_is_read_back_and_needs_its_texts(tmp_path: Path) -> None:
     ("changed", "told"),
     [
         ({"right": "blue"}, "right answer blue, which is no option"),
-        ({"options": ["red"]}, "a list of 2 to 20"),
+        ({"options": ["red"]}, "must hold 2 values"),
         ({"name": "task"}, "task exists twice"),
         ({"correct": "red"}, "unknown key"),
     ],
 )
 def test_what_is_no_check_is_refused(tmp_path: Path, changed: dict[str, Any], told: str) -> None:
-    tables = tomllib.loads(format_settings(make_tiny_study(tmp_path, test=1, familiarization=1)))
+    tables = tomllib.loads(
+        format_settings(make_tiny_study(tmp_path, test=1, familiarization=1), Path())
+    )
     first = {"name": "task", "options": ["a", "b"], "right": "a"}
     second = {"name": "colour", "options": ["red", "green"], "right": "red"} | changed
     with pytest.raises(BadInputError, match=told):

@@ -35,7 +35,8 @@ from physion.experiment.study.orders import (
     prepared_order_seed,
     trial_order,
 )
-from physion.experiment.study.study import Study, Timing
+from physion.experiment.study.settings import Timing
+from physion.experiment.study.study import Study
 
 KEYS = Secrets(b"a" * 32, b"b" * 32)
 

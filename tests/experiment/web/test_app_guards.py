@@ -10,6 +10,7 @@ import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -58,8 +59,19 @@ async def _own_headers(request: Request) -> Response:
     return PlainTextResponse("", headers={"cache-control": "private", "x-own": "1"})
 
 
+NEEDED: Any = {"name": "n", "version": "1", "title": "t", "contact": "c", "scenarios": ("collide",)}
+
+
 def make_app(**settings: object) -> Starlette:
-    study = Study(Path(), "n", "1", "t", "c", ("collide",), **settings)  # type: ignore[arg-type]
+    study = Study(
+        folder=Path(),
+        name="n",
+        version="1",
+        title="t",
+        contact="c",
+        scenarios=("collide",),
+        **settings,
+    )  # type: ignore[arg-type]
     routes = [
         Route("/echo", _echo, methods=["POST", "GET"]),
         Route("/swallow", _swallow, methods=["POST"]),
@@ -246,7 +258,11 @@ class TestHeaders:
         assert "x-frame-options" not in headers
 
     def test_nothing_inline_and_nothing_from_elsewhere_runs(self) -> None:
-        policy = content_policy(Study(Path(), "n", "1", "t", "c", ("collide",)))
+        policy = content_policy(
+            Study(
+                folder=Path(), name="n", version="1", title="t", contact="c", scenarios=("collide",)
+            )
+        )
         assert "unsafe" not in policy
         assert "http" not in policy
         assert "script-src 'self';" in policy

@@ -25,6 +25,7 @@ from physion.experiment.study.recruitment import (
     make_pass,
     read_pass,
     session_code,
+    start_warnings,
 )
 from physion.experiment.study.study import Recruitment, Study
 from support.experiment.app_walk import served
@@ -85,6 +86,14 @@ class TestLinks:
         found = {one.name: one.lacks for one in links(bare, secrets, "http://x")}
         assert "prolific_code" in found["prolific"] and "sona_address" in found["sona"]
         assert found["mturk"] == ""
+
+    def test_serving_warns_where_ids_can_be_invented(self, study: Study) -> None:
+        (warning,) = start_warnings(study)
+        assert "ids of Prolific and SONA are not signed" in warning and "\n" not in warning
+        signed = replace(study.recruitment, signed_links="study")
+        assert start_warnings(replace(study, recruitment=signed)) == ()
+        assert start_warnings(replace(study, recruitment=Recruitment())) == ()
+        assert start_warnings(replace(study, allowed_ids=frozenset({"a"}))) == ()
 
     @pytest.mark.parametrize("base", [
         "", "lab.example.org", "ftp://lab.example.org", "https://", "https://x/deeper",

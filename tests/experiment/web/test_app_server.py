@@ -20,7 +20,6 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from physion.cli.experiment.init import Options
 from physion.cli.main import main
 from physion.experiment.server import Address
 from physion.experiment.study.study import Limits, Study
@@ -250,21 +249,6 @@ def test_a_folder_without_a_study_is_refused(
     said = capsys.readouterr().err
     assert "this is no study folder; create one with physion experiment init" in said
     assert said.count("\n") == 1
-
-
-def test_missing_settings_are_reported_when_serving(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def said(**settings: Any) -> str:
-        folder = tmp_path / str(len(list(tmp_path.iterdir())))
-        make_tiny_study(folder, test=2, familiarization=1, size=64, **settings)
-        (folder / "secret.json").unlink()  # so that it ends after the study was loaded
-        assert main(["experiment", "serve", str(folder)]) == 2
-        return capsys.readouterr().err
-
-    warning = "physion: warning: contact in study.toml is not filled in"
-    assert warning in said(contact=Options(Path("x")).contact)
-    assert "warning" not in said(contact="Ada, ada@example.org")
 
 
 def test_the_warning_is_printed(

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from physion.core.errors import BadInputError
-from physion.experiment.study.settings import NO_CONTACT
 
 if TYPE_CHECKING:
     from physion.experiment.study.choose import StimulusSelection
@@ -60,8 +59,8 @@ class Options:
     """Short name of the study. Default: the name of the folder."""
     title: str = "Predict what happens"
     """Title at the top of the participants' pages."""
-    contact: str = NO_CONTACT
-    """Contact for participants: name and e-mail address."""
+    contact: str = ""
+    """Contact for participants, needed: a name and an e-mail address, which the pages show."""
     participants: int = 100
     """Complete sessions wanted for each scenario."""
     languages: tuple[str, ...] = ("en", "de")
@@ -84,6 +83,11 @@ def main(options: Options) -> int:
     from physion.cli.output import Stages
     from physion.experiment.study.make import make_study
 
+    if not options.contact:
+        raise BadInputError(
+            'give --contact "NAME, EMAIL": participants see it with the consent, to ask questions '
+            "and to have their data deleted"
+        )
     password, chosen = _password(options.password_file), _choose(options)
     with Stages() as stages:
         study = make_study(
@@ -106,7 +110,7 @@ def _choose(options: Options) -> StimulusSelection:
         return _choose_listed(options)
     for name in ("familiarization", "familiarization_trials", "movies", "maps"):
         if getattr(options, name):
-            raise BadInputError(f"--{name.replace('_', '-')} goes with --stimuli alone")
+            raise BadInputError(f"--{name.replace('_', '-')} needs --stimuli")
     if options.trials is not None:
         return _choose_made(options, options.trials, options.scenario)
     return _choose_official(options)
@@ -246,7 +250,7 @@ def _print(options: Options, study: Study, chosen: StimulusSelection, password: 
     lines = [f"study: {study.folder}"]
     if password is not None:
         lines.append(f"password of the experimenter's pages, shown only now: {password}")
-    lines.append("next: set title and contact in study.toml, edit texts/ (the consent!), then run")
+    lines.append("next: set the title in study.toml, edit texts/ (the consent!), then run")
     lines.append(f"  physion experiment serve {study.folder}")
     for line in lines:
         console.print(line, markup=False, soft_wrap=True)

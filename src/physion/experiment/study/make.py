@@ -25,6 +25,7 @@ from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError
 from physion.core.files import folder_lock, read_plain, remove_leftovers, write_atomic
 from physion.experiment.study.identity import SECRET_FILE, Secrets, set_password
+from physion.experiment.study.settings import format_settings
 from physion.experiment.study.stimuli import (
     MAX_SIDE,
     MEDIA_FOLDER,
@@ -33,13 +34,7 @@ from physion.experiment.study.stimuli import (
     check_distinct_names,
     write_stimuli,
 )
-from physion.experiment.study.study import (
-    STUDY_FILE,
-    Study,
-    format_settings,
-    load_study,
-    write_settings,
-)
+from physion.experiment.study.study import STUDY_FILE, Study, load_study, write_settings
 from physion.experiment.study.texts import TEXTS_FOLDER, shipped_file
 from physion.scenes.scene import OBSERVED_FRAMES
 from physion.trials.files import encode_png
@@ -302,7 +297,7 @@ def make_study(
     """
     check_sources(sources)
     check_distinct_names(((s.scenario, s.stimulus) for s in sources), study.folder / STIMULI_FILE)
-    format_settings(study)
+    format_settings(study, study.folder / STUDY_FILE)
     texts = {language: shipped_file(language) for language in study.languages}
     folder = study.folder
     _check_folder(folder)

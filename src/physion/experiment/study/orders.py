@@ -18,8 +18,9 @@ from typing import Literal
 from physion.core.seeds import stable_hash
 from physion.experiment.protocol import Block, SessionTrials
 from physion.experiment.study.identity import Secrets, sign
+from physion.experiment.study.settings import ALL_SCENARIOS
 from physion.experiment.study.stimuli import ATTENTION, PHASES, Stimulus
-from physion.experiment.study.study import ALL_SCENARIOS, Study, StudyKey
+from physion.experiment.study.study import Study, StudyKey
 
 # Attention checks: trials mixed into the test whose right answer is obvious or stated.
 #

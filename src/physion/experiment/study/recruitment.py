@@ -17,12 +17,13 @@ from urllib.parse import parse_qsl, quote, unquote, urlencode, urlsplit, urlunsp
 from physion.core.errors import BadInputError
 from physion.experiment.protocol import Completion, Enter, Recruiter, Source
 from physion.experiment.study.identity import REFERENCE_LETTERS, check_signature, sign
-from physion.experiment.study.settings import ALL_SCENARIOS, NO_CONTACT
+from physion.experiment.study.settings import ALL_SCENARIOS
 from physion.experiment.study.study import under
 
 if TYPE_CHECKING:
     from physion.experiment.study.identity import Secrets
-    from physion.experiment.study.study import EarlyEnd, Study
+    from physion.experiment.study.settings import EarlyEnd
+    from physion.experiment.study.study import Study
 
 NO_ASSIGNMENT = "ASSIGNMENT_ID_NOT_AVAILABLE"
 """Value of ``assignmentId`` that MTurk sends while a worker previews a task."""
@@ -285,16 +286,21 @@ def signed_links(
     )
 
 
-def missing_settings(study: Study) -> tuple[str, ...]:
-    """Return a warning for each setting that must be filled in before recruiting.
-
-    Settings of single recruiters are not included: `links` reports them with each link.
-    """
-    if study.contact != NO_CONTACT:
+def start_warnings(study: Study) -> tuple[str, ...]:
+    """Return the warnings with which serving begins: recruiters whose ids anybody could invent."""
+    settings = study.recruitment
+    used = {
+        "Prolific": settings.prolific_code,
+        "SONA": settings.sona_address,
+        "MTurk": set(MTURK_HOSTS) & set(study.embed_from),
+    }
+    names = " and ".join(name for name, value in used.items() if value)
+    if not names or settings.signed_links != "no" or study.allowed_ids is not None:
         return ()
     return (
-        "warning: contact in study.toml is not filled in: participants could not ask you questions "
-        "or have their data deleted; fill it in before recruiting",
+        f"warning: ids of {names} are not signed: anybody who has the address can invent ids and "
+        'take all places; set signed_links = "study" in study.toml and enter the links that '
+        "physion experiment links prints, or give an allow_list",
     )
 
 

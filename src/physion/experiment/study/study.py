@@ -21,47 +21,32 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 from physion.core.errors import BadInputError
 from physion.core.files import check_plain, read_ids, read_plain, write_atomic
 from physion.core.names import canonical_name
 from physion.experiment.study.settings import (
-    ABOUT,
     ALL_SCENARIOS,
-    COMPREHENSION_ABOUT,
-    COMPREHENSION_KEYS,
-    CONDITIONS_ABOUT,
-    CONDITIONS_KEYS,
     EARLY_ENDS,
-    QUESTIONS_KEYS,
     Attention,
     Blocks,
     Bonus,
     Comprehension,
-    ComprehensionQuestion,
-    Condition,
     EarlyEnd,
     Limits,
     Plausibility,
     Practice,
-    Question,
     Recruitment,
     Screen,
+    StudySettings,
     Timing,
-    check_list,
-    check_tables,
     condition_text_keys,
-    format_list,
-    format_tables,
-    parse_comprehension,
-    parse_conditions,
-    parse_questions,
-    parse_toml,
+    format_settings,
+    parse_settings,
 )
 from physion.experiment.study.stimuli import MAX_BYTES as MAX_STIMULI_BYTES
 from physion.experiment.study.stimuli import PHASES, STIMULI_FILE, Stimulus, parse_stimuli
-from physion.experiment.study.texts import TEXTS_FOLDER, read_consent_file, read_texts
+from physion.experiment.study.texts import TEXTS_FOLDER, parse_bytes, read_consent_file, read_texts
 
 __all__ = [
     "ALL_SCENARIOS",
@@ -78,67 +63,23 @@ __all__ = [
     "Screen",
     "Study",
     "Timing",
-    "format_settings",
     "load_study",
-    "parse_settings",
     "write_settings",
 ]
 STUDY_FILE = "study.toml"
 MAX_BYTES = 1_000_000
 
 
-@dataclass(frozen=True)
-class Study:
-    """Settings of ``study.toml`` with the stimuli and texts of the study.
+@dataclass(frozen=True, kw_only=True)
+class Study(StudySettings):
+    """The settings of ``study.toml`` with the stimuli and texts of the study.
 
     Attributes
     ----------
     folder
         The study folder.
-    name, version, title, contact
-        Identification of the study; ``title`` and ``contact`` are shown to participants.
-    scenarios
-        Scenarios in which people can take part.
-    languages
-        Languages of the texts; the first is the default.
-    consent_version
-        Version of the consent text, stored with each consent.
-    participants
-        Complete sessions wanted for each scenario; later participants are told that it is full.
-    seed
-        Seed of all trial orders.
-    orders
-        0: each participant gets an individual order. Otherwise the number of prepared orders, used
-        least often first (the official study had 125).
-    exclusions
-        Rule set by which sessions are flagged, a name in
-        `physion.analysis.people.exclusions.RULE_SETS`.
-    percentile_from
-        Number of other finished participants needed before a percentile is shown.
-    preload
-        Number of trials loaded ahead of the current one.
-    familiarization_feedback
-        Whether familiarization answers get feedback: the outcome and the full movie.
-    demographics
-        Whether age, gender and education are asked.
-    embed_from
-        Sites that may show the pages in a frame (MTurk); none by default.
-    timing, blocks, comprehension, practice, attention, screen, plausibility, recruitment, limits
-        The tables of ``study.toml``.
-    declined, stopped, screened_out, device_refused, full
-        Codes and URLs of participants who gave no consent, who stopped, who failed the
-        comprehension check or the practice, whose device cannot show the movies, and who came when
-        the study was full.
-    bonus
-        The rule of the bonus in the table of payments.
-    questions
-        The lab's own questions at the end.
-    comprehension_questions
-        Questions of the comprehension check; none: there is no check.
-    conditions
-        Between-subject conditions.
     condition
-        The condition whose settings these are (`courses.variants.under`); empty: the study's own.
+        The condition whose settings these are (`under`); empty: the study's own.
     allowed_ids
         Ids of the allow list; None if the study has none.
     stimuli
@@ -155,40 +96,6 @@ class Study:
     """
 
     folder: Path
-    name: str
-    version: str
-    title: str
-    contact: str
-    scenarios: tuple[str, ...]
-    languages: tuple[str, ...] = ("en", "de")
-    consent_version: str = "1"
-    participants: int = 100
-    seed: int = 0
-    orders: int = 0
-    exclusions: str = "preregistered"
-    percentile_from: int = 10
-    preload: int = 8
-    familiarization_feedback: bool = True
-    demographics: bool = True
-    embed_from: tuple[str, ...] = ()
-    timing: Timing = field(default=Timing())
-    blocks: Blocks = field(default=Blocks())
-    comprehension: Comprehension = field(default=Comprehension())
-    practice: Practice = field(default=Practice())
-    attention: Attention = field(default=Attention())
-    screen: Screen = field(default=Screen())
-    plausibility: Plausibility = field(default=Plausibility())
-    recruitment: Recruitment = field(default=Recruitment())
-    declined: EarlyEnd = field(default=EarlyEnd())
-    stopped: EarlyEnd = field(default=EarlyEnd())
-    screened_out: EarlyEnd = field(default=EarlyEnd())
-    device_refused: EarlyEnd = field(default=EarlyEnd())
-    full: EarlyEnd = field(default=EarlyEnd())
-    bonus: Bonus = field(default=Bonus())
-    limits: Limits = field(default=Limits())
-    questions: tuple[Question, ...] = ()
-    comprehension_questions: tuple[ComprehensionQuestion, ...] = ()
-    conditions: tuple[Condition, ...] = ()
     condition: str = ""
     stimuli: tuple[Stimulus, ...] = ()
     allowed_ids: frozenset[str] | None = field(default=None, repr=False)
@@ -206,21 +113,6 @@ class Study:
         """Return the stimuli of one phase of a scenario, sorted by place."""
         chosen = [s for s in self.stimuli if (s.scenario, s.phase) == (scenario, phase)]
         return tuple(sorted(chosen, key=lambda stimulus: stimulus.place))
-
-
-_PARTS: dict[str, type[Any]] = {
-    "timing": Timing,
-    "blocks": Blocks,
-    "comprehension": Comprehension,
-    "practice": Practice,
-    "attention": Attention,
-    "screen": Screen,
-    "plausibility": Plausibility,
-    "recruitment": Recruitment,
-    **dict.fromkeys(EARLY_ENDS, EarlyEnd),
-    "bonus": Bonus,
-    "limits": Limits,
-}
 
 
 def load_study(folder: Path | str) -> Study:
@@ -243,7 +135,8 @@ def load_study(folder: Path | str) -> Study:
             f"{path} is missing: this is no study folder; create one with physion experiment init"
         )
     content = read_plain(path, MAX_BYTES)
-    study = replace(parse_settings(parse_toml(path, content), path), folder=folder)
+    settings = parse_settings(parse_bytes(path, content), path)
+    study = Study(folder=folder, **vars(settings))
     texts, files, written = {}, {}, []
     for language in study.languages:
         texts[language], text_file = read_texts(
@@ -275,60 +168,18 @@ def load_study(folder: Path | str) -> Study:
     )
 
 
-def parse_settings(table: Mapping[str, Any], path: Path) -> Study:
-    """Check the parsed content of a ``study.toml`` and return its settings as a study.
-
-    Stimuli and texts are left empty. ``path`` is the path of the file, which need not exist yet.
-    Raises the errors of `load_study`.
-    """
-    values = check_tables(table, path, ("questions", "comprehension_questions", "conditions"))
-    parts = {name: part(**values[name]) for name, part in _PARTS.items()}
-    asked = parse_questions(check_list(table, path, "questions", QUESTIONS_KEYS), path)
-    entries = check_list(table, path, "comprehension_questions", COMPREHENSION_KEYS)
-    checked = parse_comprehension(entries, path)
-    listed = check_list(table, path, "conditions", CONDITIONS_KEYS)
-    groups = parse_conditions(listed, values[""]["scenarios"], path)
-    return Study(
-        folder=path.parent,
-        **values[""],
-        **parts,
-        questions=asked,
-        comprehension_questions=checked,
-        conditions=groups,
-    )
-
-
-def format_settings(study: Study) -> str:
-    """Return the content of ``study.toml``: all keys with comments, as `parse_settings` reads it.
-
-    Raises `BadInputError`, naming the key, if a value is not allowed in the file.
-    """
-    values = {name: vars(getattr(study, name)) for name in _PARTS}
-    path = study.folder / STUDY_FILE
-    text = format_tables({"": vars(study), **values}, path)
-    for name, keys, about in (
-        ("comprehension_questions", COMPREHENSION_KEYS, COMPREHENSION_ABOUT),
-        ("questions", QUESTIONS_KEYS, ABOUT),
-        ("conditions", CONDITIONS_KEYS, CONDITIONS_ABOUT),
-    ):
-        entries = [vars(entry) for entry in getattr(study, name)]
-        text += format_list(name, keys, about, entries, path)
-    return text
-
-
 def own_text_keys(study: Study) -> tuple[str, ...]:
     """Return the keys of the texts that a study needs for its own questions and conditions."""
-    asked: tuple[ComprehensionQuestion | Question, ...]
-    asked = (*study.comprehension_questions, *study.questions)
+    asked = [key for question in study.comprehension_questions for key in question.text_keys]
+    asked += [key for question in study.questions for key in question.text_keys]
     several = study.blocks.all_scenarios
-    of_conditions = condition_text_keys(study.conditions, blocks=several)
-    return (*(key for question in asked for key in question.text_keys), *of_conditions)
+    return (*asked, *condition_text_keys(study.conditions, blocks=several))
 
 
 def write_settings(study: Study) -> Path:
     """Write ``study.toml`` into the study's folder atomically; return its path."""
     path = study.folder / STUDY_FILE
-    write_atomic(path, format_settings(study).encode())
+    write_atomic(path, format_settings(study, path).encode())
     return path
 
 
@@ -395,7 +246,7 @@ def _digest(*parts: bytes) -> str:
     return hashed.hexdigest()
 
 
-# The settings of a study in one of its conditions.
+# --- conditions ----------------------------------------------------------------------------------
 
 _OF_TIMING = ("cue_ms", "flash_hz", "break_every")
 

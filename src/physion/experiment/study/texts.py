@@ -24,7 +24,7 @@ from typing import Any
 
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import read_plain
-from physion.experiment.study.settings import parse_toml
+from physion.core.settings import parse_toml
 
 TEXTS_FOLDER = "texts"
 MAX_BYTES = 1_000_000
@@ -136,10 +136,18 @@ def shipped_texts() -> Mapping[str, str]:
     return _parse(Path(TEXTS_FOLDER) / "en.toml", shipped_file("en"))
 
 
+def parse_bytes(path: Path, content: bytes) -> dict[str, Any]:
+    """Parse the content of a TOML file that was read from ``path``."""
+    try:
+        return parse_toml(content.decode(), str(path))
+    except UnicodeDecodeError as error:
+        raise BadInputError(f"{path} is not TOML: {error}") from error
+
+
 def _parse(path: Path, content: bytes) -> dict[str, str]:
     """Return the texts of a file by their full keys, such as ``consent.title``."""
     texts: dict[str, str] = {}
-    _flatten(path, "", parse_toml(path, content), texts)
+    _flatten(path, "", parse_bytes(path, content), texts)
     return texts
 
 

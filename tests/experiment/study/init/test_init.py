@@ -386,4 +386,11 @@ def _interrupt(*_: object) -> None:
 
 
 def _study(folder: Path, scenarios: tuple[str, ...] = ("collide", "roll")) -> Study:
-    return Study(folder, "tiny", "1", "A title", "Ada, ada@example.org", scenarios)
+    return Study(
+        folder=folder,
+        name="tiny",
+        version="1",
+        title="A title",
+        contact="Ada, ada@example.org",
+        scenarios=scenarios,
+    )
