@@ -203,8 +203,8 @@ def test_conditions_that_cannot_be_served_are_refused(
     groups: Study, changed: tuple[Condition, ...], said: str
 ) -> None:
     try:
-        write_settings(replace(groups, conditions=changed))
         with pytest.raises(BadInputError, match=said):
+            write_settings(replace(groups, conditions=changed))
             load_study(groups.folder)
     finally:
         write_settings(groups)

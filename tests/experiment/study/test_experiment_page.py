@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import re
 import shlex
+import tomllib
 from dataclasses import fields
 from pathlib import Path
 
@@ -14,7 +15,12 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.cli.experiment.experiment import SUBVERBS
 from physion.experiment.store.database import METADATA
-from physion.experiment.study.settings import KEYS
+from physion.experiment.study.settings import (
+    StudySettings,
+    all_keys,
+    parse_settings,
+    settings_table,
+)
 
 DOCS = Path(__file__).parents[3] / "docs"
 PAGE = "".join(
@@ -43,21 +49,24 @@ def test_every_command_has_its_verb_and_options() -> None:
 
 
 def test_every_setting_that_is_given_is_one_that_the_file_may_have() -> None:
-    given = re.findall(r"`([a-z_]+) = ([^`]+)`", PAGE)
-    keys = {key.name: key for key in KEYS}
-    values = {"true": True, "false": False}
+    given = re.findall(r"`([a-z_]+ = [^`]+)`", PAGE)
+    tables = {key.name: key.table for key in reversed(all_keys())}
     assert len(given) >= 5
-    for name, written in given:
-        value: object = written.strip('"') if written.startswith('"') else written
-        if written.startswith("["):
-            value = re.findall(r'"([^"]+)"', written)
-        elif written in values:
-            value = values[written]
-        elif written.isdigit():
-            value = int(written)
-        keys[name].check(value)
+    needed = {"name": "n", "version": "1", "title": "t", "contact": "c", "scenarios": ["collide"]}
+    for line in given:
+        name = line.partition(" ")[0]
+        content = f"[{tables[name]}]\n{line}" if tables[name] else line
+        settings = parse_settings(needed | tomllib.loads(content), Path(line))
+        assert isinstance(settings, StudySettings)
+
+
+def test_the_table_of_settings_is_generated() -> None:
+    """To make it anew, print `settings_table()` into the section Settings."""
+    assert settings_table() in PAGE
 
 
 def test_every_table_is_described() -> None:
-    described = re.findall(r"^\| `([a-z_]+)` \|", PAGE, flags=re.MULTILINE)
+    described = re.findall(
+        r"^\| `([a-z_]+)` \|", PAGE.partition("## Settings")[0], flags=re.MULTILINE
+    )
     assert set(described) == set(METADATA.tables)
