@@ -174,5 +174,16 @@ def test_an_installed_wheel_runs_in_another_folder(built: Path, tmp_path: Path) 
     for split in ("testing", "familiarization"):
         command = ["generate", "trials", "--scenario", "drop", "--split", split, "--count", "2"]
         run(physion_, *command, *tiny)
-    run(physion_, "experiment", "init", "study", "--trials", "trials", "--practice", "2")
+    run(
+        physion_,
+        "experiment",
+        "init",
+        "--contact",
+        "Ada, ada@example.org",
+        "study",
+        "--trials",
+        "trials",
+        "--practice",
+        "2",
+    )
     assert (folder / "study" / "study.toml").is_file()

@@ -204,8 +204,7 @@ def test_conditions_that_cannot_be_served_are_refused(
 ) -> None:
     try:
         with pytest.raises(BadInputError, match=said):
-            write_settings(replace(groups, conditions=changed))
-            load_study(groups.folder)
+            load_study(write_settings(replace(groups, conditions=changed)).parent)
     finally:
         write_settings(groups)
 

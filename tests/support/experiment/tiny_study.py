@@ -31,6 +31,8 @@ UNCHECKED = Plausibility(server_checks=False, simulated_speed=1_000_000)
 """Lets tests answer without showing a movie, and simulated participants without waiting."""
 OBSERVED, FULL, RATE, BLOCKS = 45, 60, 30, 6
 PASSWORD = "tiny password"
+CONTACT = ("--contact", "Ada Lab, ada@example.org")
+"""Options of `physion experiment init`."""
 
 
 def make_tiny_study(

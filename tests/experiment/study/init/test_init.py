@@ -28,7 +28,7 @@ from physion.experiment.study.study import Study, load_study
 from physion.trials.index import read_index, write_index
 from physion.trials.video import read_frames
 from support.experiment.tiny_dataset import is_marked, make_tiny_dataset
-from support.experiment.tiny_study import OBSERVED, make_tiny_study, read_number
+from support.experiment.tiny_study import CONTACT, OBSERVED, make_tiny_study, read_number
 from support.paths import ROOT
 
 
@@ -260,7 +260,7 @@ def test_the_command_makes_a_study(
     dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "pilot-1"
-    assert main(["experiment", "init", str(folder), "--trials", str(dataset)]) == 0
+    assert main(["experiment", "init", *CONTACT, str(folder), "--trials", str(dataset)]) == 0
     out = capsys.readouterr().out
     study = load_study(folder)
     assert study.name == "pilot-1" and study.scenarios == ("collide", "roll")
@@ -278,7 +278,7 @@ def test_the_command_takes_a_password_and_prints_json(
     secret.write_text("correct horse battery\n")
     words = ["--trials", str(dataset), "--password-file", str(secret), "--scenario", "roll"]
     words += ["--test", "4", "--practice", "2", "--participants", "7", "--json"]
-    assert main(["experiment", "init", str(tmp_path / "study"), *words]) == 0
+    assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed["password"] is None and "correct horse" not in json.dumps(printed)
     assert printed["stimuli"] == {"roll": {"familiarization": 2, "test": 4}}
@@ -314,7 +314,7 @@ def test_bad_commands_are_one_line_and_leave_nothing(
     short.write_text("short\n")
     names = {"DATA": str(dataset), "SHORT": str(short)}
     given = [names.get(word, word) for word in words]
-    assert main(["experiment", "init", str(tmp_path / "study"), *given]) == 2
+    assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *given]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
     assert not (tmp_path / "study").exists()
@@ -340,9 +340,9 @@ def test_a_missing_extra_is_said_in_one_line(
     assert main(["experiment", word, str(tmp_path / "s"), *more]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
-    # The README's first command has the same form, for another extra.
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    found = re.search(r"(\S*pip install) -q (-e '\.\[)[a-z,]+(\]' -c \S+)", readme)
+    # The tutorial's first command has the same form, for more extras.
+    tutorial = (ROOT / "docs" / "tutorials" / "study.md").read_text(encoding="utf-8")
+    found = re.search(r"(\S*pip install) -q (-e '\.\[)[a-z,]+(\]' -c \S+)", tutorial)
     assert found is not None
     assert said.endswith(f": {found[1]} {found[2]}experiment{found[3]}\n")
 
@@ -352,7 +352,16 @@ def test_a_missing_extra_is_said_in_one_line(
 def test_a_killed_command_is_taken_up_again(tmp_path: Path) -> None:
     data, folder = tmp_path / "dataset", tmp_path / "study"
     make_tiny_dataset(data, test=30, familiarization=10, size=128)
-    words = ["-m", "physion.cli.main", "experiment", "init", str(folder), "--trials", str(data)]
+    words = [
+        "-m",
+        "physion.cli.main",
+        "experiment",
+        "init",
+        *CONTACT,
+        str(folder),
+        "--trials",
+        str(data),
+    ]
     first = subprocess.Popen(
         [sys.executable, *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )

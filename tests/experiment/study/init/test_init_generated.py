@@ -14,6 +14,7 @@ from physion.experiment.study.study import load_study
 from physion.trials.dataset import Dataset
 from physion.trials.files import TrialPaths
 from physion.trials.video import read_frames
+from support.experiment.tiny_study import CONTACT
 
 pytestmark = pytest.mark.slow
 OBSERVED = 45
@@ -26,7 +27,7 @@ def test_served_movies_are_the_first_45_frames_of_the_whole_ones(tmp_path: Path)
         words += ["--width", "64", "--height", "64", "--workers", "1"]
         assert main(["generate", str(data), *words]) == 0
     words = ["--trials", str(data), "--test", "2", "--practice", "2"]
-    assert main(["experiment", "init", str(folder), *words]) == 0
+    assert main(["experiment", "init", *CONTACT, str(folder), *words]) == 0
     dataset, study = Dataset(data), load_study(folder)
     assert Counter((s.phase, s.label) for s in study.stimuli) == {
         (phase, label): 1 for phase in ("test", "familiarization") for label in (True, False)

@@ -17,7 +17,7 @@ from physion.experiment.study.choose import choose_listed, list_scenario, read_l
 from physion.experiment.study.study import load_study
 from physion.trials.video import encode_movie, read_frames
 from support.experiment.tiny_dataset import make_tiny_dataset
-from support.experiment.tiny_study import FULL, OBSERVED, draw, draw_map, read_number
+from support.experiment.tiny_study import CONTACT, FULL, OBSERVED, draw, draw_map, read_number
 
 LIST = "human-physics-benchmarking-collision-pilot_production_2_experimental_stims.json"
 SIZE = 64
@@ -62,7 +62,7 @@ def test_the_command_makes_a_study_of_lists(
     _write_media(tmp_path / "mp4s", ids + practice, tmp_path / "maps")
     words = ["--stimuli", str(stimuli), "--familiarization", str(fam), "--movies"]
     words += [str(tmp_path / "mp4s"), "--json"]
-    assert main(["experiment", "init", str(tmp_path / "study"), *words]) == 0
+    assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 0
     assert json.loads(capsys.readouterr().out)["notes"] == []
     study = load_study(tmp_path / "study")
     assert study.scenarios == ("collide",)
@@ -86,7 +86,7 @@ def test_familiarization_may_come_from_a_dataset(tmp_path: Path) -> None:
     make_tiny_dataset(tmp_path / "dataset", test=0, familiarization=4)
     words = ["--stimuli", str(stimuli), "--movies", str(tmp_path / "movies"), "--practice", "4"]
     words += ["--familiarization-trials", str(tmp_path / "dataset")]
-    assert main(["experiment", "init", str(tmp_path / "study"), *words]) == 0
+    assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 0
     study = load_study(tmp_path / "study")
     assert Counter(s.phase for s in study.stimuli) == {"test": 4, "familiarization": 4}
 
@@ -101,7 +101,7 @@ def test_missing_movies_are_named_all_at_once(
         (tmp_path / "movies" / f"{name}.mp4").unlink()
     words = ["--stimuli", str(stimuli), "--familiarization", str(stimuli)]
     words += ["--movies", str(tmp_path / "movies")]
-    assert main(["experiment", "init", str(tmp_path / "study"), *words]) == 2
+    assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 2
     error = capsys.readouterr().err
     assert all(f"{name}.mp4" in error for name in ids[1:4]) and error.count("\n") == 1
     assert "3 of 12 files are missing" in error and f"{ids[0]}.mp4" not in error
@@ -115,7 +115,7 @@ def test_many_missing_movies_are_three_and_a_count(
     (tmp_path / "movies").mkdir()
     words = ["--stimuli", str(stimuli), "--familiarization", str(stimuli)]
     words += ["--movies", str(tmp_path / "movies")]
-    assert main(["experiment", "init", str(tmp_path / "study"), *words]) == 2
+    assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 2
     error = capsys.readouterr().err
     assert "16 of 16 files are missing" in error and error.endswith(", and 13 more\n")
     assert error.count(str(tmp_path / "movies")) == 3
@@ -130,7 +130,7 @@ def test_names_that_are_one_to_the_analysis_are_refused_before_movies_are_cut(
     _write_media(tmp_path / "movies", ids + looks)
     words = ["--stimuli", str(lists[0]), "--familiarization", str(lists[1])]
     words += ["--movies", str(tmp_path / "movies")]
-    assert main(["experiment", "init", str(tmp_path / "study"), *words]) == 2
+    assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 2
     error = capsys.readouterr().err
     assert "one stimulus to the analysis" in error and error.count("\n") == 1
     assert looks[0].removesuffix("_img") in error and not (tmp_path / "study").exists()
@@ -144,7 +144,7 @@ def test_a_stimulus_in_both_lists_is_refused(
     _write_media(tmp_path / "movies", ids)
     words = ["--stimuli", str(stimuli), "--familiarization", str(stimuli)]
     words += ["--movies", str(tmp_path / "movies")]
-    assert main(["experiment", "init", str(tmp_path / "study"), *words]) == 2
+    assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 2
     assert "is already in row" in capsys.readouterr().err
 
 
@@ -297,7 +297,7 @@ def test_own_movies_have_any_scenario_and_length(tmp_path: Path) -> None:
     _write_media(tmp_path / "movies", names + practice)
     words = ["--stimuli", str(listed), "--familiarization", str(fam)]
     words += ["--movies", str(tmp_path / "movies")]
-    assert main(["experiment", "init", str(tmp_path / "study"), *words]) == 0
+    assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 0
     study = load_study(tmp_path / "study")
     assert study.scenarios == ("billiards",)
     test = study.phase("billiards", "test")

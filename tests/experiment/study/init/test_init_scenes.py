@@ -18,6 +18,7 @@ from physion.experiment.study.study import load_study
 from physion.physics.replay import ReplayTask, replay_trial
 from physion.scenes.tdw.read_logs import ImportedTrial
 from physion.trials.dataset import Dataset
+from support.experiment.tiny_study import CONTACT
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +92,7 @@ def test_the_command_renders_official_scenes_and_makes_a_study(
 ) -> None:
     folder, made = tmp_path / "study", tmp_path / "study-trials"
     words = ["--scenes", "official", "--scenario", "collide", "--test", "2", "--practice", "2"]
-    assert main(["experiment", "init", str(folder), *words, "--workers", "1"]) == 0
+    assert main(["experiment", "init", *CONTACT, str(folder), *words, "--workers", "1"]) == 0
     assert "collide: 2 test and 2 familiarization trials" in capsys.readouterr().out
     recorded = {trial.scene.name: trial.outcome.contact for trial in official().trials}
     stimuli = load_study(folder).stimuli
@@ -103,7 +104,7 @@ def test_the_command_renders_official_scenes_and_makes_a_study(
     before = {path: path.stat().st_mtime_ns for path in made.rglob("*.h5")}
     assert len(before) == len(Dataset(made).index) == 4
     words += ["--rendered", str(made), "--workers", "1"]
-    assert main(["experiment", "init", str(tmp_path / "again"), *words]) == 0
+    assert main(["experiment", "init", *CONTACT, str(tmp_path / "again"), *words]) == 0
     assert {path: path.stat().st_mtime_ns for path in made.rglob("*.h5")} == before
     assert load_study(tmp_path / "again").stimuli == stimuli
 
@@ -112,7 +113,7 @@ def test_the_command_renders_official_scenes_and_makes_a_study(
     ("words", "message"),
     [
         (["--scenes", "official", "--trials", "."], "give either --trials DATASET, --scenes"),
-        (["--scenes", "official", "--movies", "."], "--movies goes with --stimuli alone"),
+        (["--scenes", "official", "--movies", "."], "--movies needs --stimuli"),
         (["--trials", ".", "--rendered", "x"], "--rendered goes with --scenes"),
         (["--scenes", "official", "--test", "3"], "--test must be even"),
         (["--scenes", "official", "--scenario", "colide"], "'colide'"),
@@ -122,7 +123,7 @@ def test_the_command_renders_official_scenes_and_makes_a_study(
 def test_bad_commands_are_one_line_and_leave_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
 ) -> None:
-    assert main(["experiment", "init", str(tmp_path / "study"), *words]) == 2
+    assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
     assert not list(tmp_path.iterdir())
