@@ -12,7 +12,6 @@ import pytest
 from physion.cli.main import main
 from physion.clips.batch import Provenance
 from physion.core.version import MADE_WITH, __version__
-from physion.readout.protocols import Readout
 from physion.readout.tables import ScenarioPredictions, make_table
 from physion.report.html import render_document
 from physion.report.viewer.build import render_viewer
@@ -35,14 +34,12 @@ def test_pages_name_the_version() -> None:
 )
 def test_each_row_of_predictions_names_the_version(stated: str, written: str) -> None:
     trials = ("a", "b")
-    part = ScenarioPredictions(
-        "drop", next(iter(Readout)), trials, np.array([0.2, 0.7]), 1.0, 4, -1, ""
-    )
+    part = ScenarioPredictions("drop", "observed", trials, np.array([0.2, 0.7]), 1.0, 4, -1, "")
     index = pd.DataFrame(
         {"trial": trials, "contact": True, "observed_contact": False, "recorded_contact": None}
     )
     table = make_table([part], Provenance("model", "none", versions=stated), index)
-    assert list(table["Versions"]) == [written] * 2
+    assert list(table["versions"]) == [written] * 2
 
 
 def test_numbers_of_a_replay_name_the_version(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from physion.compute.tasks import processor_and_cores
 from physion.core.names import SCENARIOS
 from physion.models import build_model
 from physion.physics.engine import DEFAULT_ENGINE, make_engine
-from physion.readout.decisions import GapReader, LogisticReader
+from physion.readout.decisions import GapDecision, LogisticDecision
 from physion.readout.features import Outcomes
 from physion.scenes.scene import OBSERVED_FRAMES
 from physion.scenes.tdw.read_logs import ImportedTrial, read_scenes
@@ -136,7 +136,7 @@ def constant_motion(motions: Sequence[Motion], labels: Labels) -> Predict:
 
     def predict(fit: Sequence[int], test: Sequence[int]) -> NDArray[np.float64]:
         outcomes = [{(): Outcomes(None, gaps[rows])} for rows in (fit, test)]
-        return GapReader().read(outcomes[0], labels[fit], outcomes[1]).probability
+        return GapDecision().decide(outcomes[0], labels[fit], outcomes[1]).probability
 
     return predict
 
@@ -154,7 +154,7 @@ def blob_centroids(motions: Sequence[Motion], labels: Labels) -> Predict:
     features = np.concatenate([model.encode(source.context([name])) for name in names])
 
     def predict(fit: Sequence[int], test: Sequence[int]) -> NDArray[np.float64]:
-        reading = LogisticReader().read([features[fit]], labels[fit], [features[test]])
+        reading = LogisticDecision().decide([features[fit]], labels[fit], [features[test]])
         return np.asarray(reading.probability)
 
     return predict

@@ -126,9 +126,9 @@ def test(model: ParticleSimulator, motions: Sequence[Motion], contacts: Iterable
         gaps += model.gaps(cut, futures)[:, 0].tolist()
         for motion, ((particles, poses),) in zip(group, futures, strict=True):
             rows = motion_error(motion, particles, poses, model.spec.stride, max(HORIZONS))
-            rows = rows.set_index("Frames").reindex(HORIZONS)
-            errors.append(rows["Error"].tolist())
-            constant.append(rows["Constant Velocity Error"].tolist())
+            rows = rows.set_index("frames").reindex(HORIZONS)
+            errors.append(rows["error"].tolist())
+            constant.append(rows["constant_velocity_error"].tolist())
             observed.append(label_contact(motion.scene, motion.trajectory).observed)
     return Tested(
         np.array(gaps), np.array(list(contacts)), np.array(observed),

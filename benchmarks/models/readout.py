@@ -69,18 +69,15 @@ def write_trials(folder: Path) -> None:
         factors = rng.normal(size=FACTORS) + drift
         values = factors @ mixing + 0.5 * rng.normal(size=(FRAMES, SIZE))
         features = (np.maximum(values + offset, 0) * scale).astype(np.float32)
-        write_features(
-            folder / f"{trial}.safetensors", {"trial": str(trial)}, {"features": features}
-        )
+        write_features(folder / f"{trial}.safetensors", {"features": features})
         outcomes.append(factors[-1, :4].sum() + 4 * rng.normal() > 0)
     np.save(folder / "outcomes.npy", np.array(outcomes))
 
 
 def open_trials(folder: Path) -> tuple[StoredFeatures, np.ndarray]:
-    """Return the features of all trials, whose checksums are verified, and their outcomes."""
+    """Return the features of all trials, and their outcomes."""
     rows: list[Any] = [
-        open_features(folder / f"{trial}.safetensors", {"trial": str(trial)})
-        for trial in range(FIT + TEST)
+        open_features(folder / f"{trial}.safetensors") for trial in range(FIT + TEST)
     ]
     names = [str(trial) for trial in range(FIT + TEST)]
     return StoredFeatures(names, rows), np.load(folder / "outcomes.npy")

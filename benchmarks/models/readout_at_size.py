@@ -51,7 +51,7 @@ def write_trials(folder: Path, size: int) -> None:
         features = factors @ mixing
         features += rng.standard_normal(features.shape, dtype=np.float32)
         path = folder / f"{trial}.safetensors"
-        write_features(path, {"trial": str(trial)}, {"features": features})
+        write_features(path, {"features": features})
         outcomes.append(float(factors[-1, :4].sum() + rng.normal()) > 0)
     np.save(folder / "outcomes.npy", np.array(outcomes))
 

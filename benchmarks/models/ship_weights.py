@@ -7,8 +7,8 @@
 TRAINED is the output folder of the trainings. Particle models were trained on the states of
 ``python benchmarks/models/particles.py data FOLDER``:
 
-    physion train dpi FOLDER/all --out TRAINED --steps 16000
-    physion train gns FOLDER/all --out TRAINED --steps 7000
+    physion train dpi FOLDER/all --out TRAINED --option steps=16000
+    physion train gns FOLDER/all --out TRAINED --option steps=7000
 
 GNS-RANSAC has the weights of GNS and thresholds that are fitted on its own rollouts, for which it
 needs ``--particles FOLDER``. Vision models were trained on movies of 64 px:
@@ -16,7 +16,7 @@ needs ``--particles FOLDER``. Vision models were trained on movies of 64 px:
     physion generate MOVIES --split training --count 200 --name small --width 64 --height 64 \
         --jitters 0
     physion train svg,cswm,rpin MOVIES --out TRAINED
-    physion train op3 MOVIES --out TRAINED --steps 1500
+    physion train op3 MOVIES --out TRAINED --option steps=1500
 
 The weights of SVG are stored as float16. With --scores only the cards are written again, with the
 digests of the weights and the tables of ``results/particles.md`` and ``results/vision_models.md``.
@@ -90,8 +90,8 @@ def ship(trained: Path, name: str, particles: Path | None) -> None:
         card = card.replace("gns-small", name).replace("| rigid | fit |", "| rigid | robust |")
     # Settings of the size; those of this training have a table of their own.
     card = "".join(line for line in card.splitlines(True) if not line.startswith("| training | {"))
-    card = card.split("## Use")[0] + "## Use\n`physion evaluate TRIALS "
-    card += f"{name.removesuffix('-small')} --weights shipped`\n"
+    card = card.split("## Use")[0] + "## Use\n`physion evaluate "
+    card += f"{name.removesuffix('-small')} TRIALS`\n"
     if isinstance(model, ParticleSimulator):
         touch = ", ".join(f"{value:.3f}" for value in model.touch.tolist())
         card += f"\n## Contact\nDistance that counts as contact, bodies and cloth, m: {touch}\n"

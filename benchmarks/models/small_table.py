@@ -30,7 +30,7 @@ from pathlib import Path
 import pandas as pd
 import torch
 
-from physion.cli.text_table import text_table
+from physion.cli.output import text_table
 from physion.compute.tasks import processor
 from physion.core.files import write_atomic
 
@@ -45,13 +45,13 @@ ANCHORS = (
 MOVIES, STATES = "movies", "states"
 """Folders of the trials."""
 PARTS: dict[str, tuple[str, ...]] = {
-    "vision models": (MOVIES, VISION, "--weights", "shipped"),
-    "particle models": (STATES, "dpi,gns,gns-ransac", "--weights", "shipped"),
-    "anchors": (MOVIES, ANCHORS),
-    "frozen encoders": (MOVIES, FROZEN),
-    "fine-tuned encoders": (MOVIES, FROZEN, "--option", "fine_tuned=true", "--steps", "200"),
+    "vision models": (VISION, MOVIES),
+    "particle models": ("dpi,gns,gns-ransac", STATES),
+    "anchors": (ANCHORS, MOVIES),
+    "frozen encoders": (FROZEN, MOVIES),
+    "fine-tuned encoders": (FROZEN, MOVIES, "--option", "fine_tuned=true", "steps=200"),
 }
-"""Trials, models and options of `physion evaluate` by part of the table."""
+"""Models, trials and options of `physion evaluate` by part of the table."""
 
 
 def run(folder: Path, part: str, *arguments: str) -> str:
@@ -84,10 +84,8 @@ def make_table(folder: Path, parts: dict[str, tuple[str, ...]]) -> pd.DataFrame:
     tables = []
     for part, options in parts.items():
         printed = run(folder, part, "evaluate", *options, "--out", "models", "--json")
-        results = folder / json.loads(printed)["results"]
-        tables.append(pd.read_csv(results, dtype={"protocol": str}))
-    # A model without training has an empty protocol, which pandas reads as NaN.
-    return pd.concat(tables, ignore_index=True).fillna({"protocol": ""})
+        tables.append(pd.DataFrame(json.loads(printed)["scores"]))
+    return pd.concat(tables, ignore_index=True)
 
 
 def generations() -> list[list[str]]:

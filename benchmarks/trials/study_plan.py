@@ -40,7 +40,7 @@ import torch
 import physion
 from physion.clips.rendered import MOST_BYTES
 from physion.compute.tasks import processor
-from physion.training.protocols import Training, TrainingSet, training_sets
+from physion.readout.folds import Protocol, TrainingSet, training_sets
 from physion.training.windows import VALIDATION_CLIPS
 from physion.trials.making.plan import FULL_COUNTS
 from study_schedule import Task, schedule
@@ -175,7 +175,7 @@ class Study:
 
 def all_sets(scenarios: Sequence[str]) -> list[TrainingSet]:
     """Return the 17 sets of training trials."""
-    return [chosen for protocol in Training for chosen in training_sets(protocol, scenarios)]
+    return [chosen for protocol in Protocol for chosen in training_sets(protocol, scenarios)]
 
 
 def plan(study: Study, machine: Machine, prices: tuple[float, float]) -> dict[str, Any]:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from physion.physics.engine import simulate
     from physion.physics.labels import label_contact
     from physion.readout.evaluate import evaluate
-    from physion.readout.trainings import train
+    from physion.readout.train import train
     from physion.rendering.renderer import Renderer
     from physion.scenes.sampling.sample import sample_scene
     from physion.trials.dataset import Dataset
@@ -58,7 +58,7 @@ _MODULES = {
     "official": "physion.data.official",
     "sample_scene": "physion.scenes.sampling.sample",
     "simulate": "physion.physics.engine",
-    "train": "physion.readout.trainings",
+    "train": "physion.readout.train",
 }
 """Module of each public name."""
 

@@ -103,7 +103,7 @@ def test_a_movie_that_does_not_fit_is_named(
         write_index(dots.folder, dots.index)
     out = ["--out", str(dots.folder.parent / "out"), "--accelerator", "cpu"]
     if verb == "evaluate":
-        error = refused(capsys, verb, str(dots.folder), MODEL, *out, "--untrained")
+        error = refused(capsys, verb, MODEL, str(dots.folder), *out, "--untrained")
     else:
         error = refused(capsys, verb, MODEL, str(dots.folder), *out)
     assert str(path) in error
@@ -124,8 +124,8 @@ def test_memory_that_is_used_up_names_what_to_lower(
     }
     for name, message in messages.items():
         train[1] = f"{file}:{name}"
-        assert message in refused(capsys, *train, "--batch", "4")
-    evaluate = ["evaluate", str(made.folder), f"{file}:HugeFeatures", "--out", str(tmp_path)]
+        assert message in refused(capsys, *train, "--option", "batch=4")
+    evaluate = ["evaluate", f"{file}:HugeFeatures", str(made.folder), "--out", str(tmp_path)]
     assert "lower --encoder-batch, now 4" in refused(capsys, *evaluate, *ENCODE)
     one = [*ENCODE, "--encoder-batch", "1"]
     assert "use a smaller image_size or size of the model" in refused(capsys, *evaluate, *one)
@@ -148,9 +148,9 @@ def test_weights_of_another_network_name_the_tensors(
     path = tmp_path / "w.safetensors"
     with torch.random.fork_rng(devices=[]):
         save_file(timm.create_model("test_resnet", pretrained=False).state_dict(), path)
-    options = ["--option", "encoder=test_vit", "image_size=64", "hidden=4"]
-    weights = ["--weights", str(path), "--out", str(tmp_path / "out")]
-    command = ["evaluate", str(made.folder), "frozen-encoder", *weights, *options, *ENCODE]
+    options = ["--option", "encoder=test_vit", "image_size=64", "hidden=4", f"weights={path}"]
+    out = ["--out", str(tmp_path / "out")]
+    command = ["evaluate", "frozen-encoder", str(made.folder), *out, *options, *ENCODE]
     error = refused(capsys, *command)
     assert "does not fit encoder 'test_vit'" in error and "missing ('" in error
     assert "unexpected ('" in error

@@ -1,4 +1,4 @@
-"""physion train: resumed after a kill, found by evaluate, on two processes as on one."""
+"""physion train and evaluate: resumed after a kill, on two processes as on one, tables."""
 
 from __future__ import annotations
 
@@ -10,24 +10,17 @@ import sys
 import time
 from pathlib import Path
 
-import pandas as pd
 import pytest
 
 from physion.cli.main import main
 from physion.trials.dataset import Dataset
-from support import trained_models
+from support import cell_models, trained_models
 from support.moving_dots import make_dots
-from support.plans import plan_models
 
 MODEL = f"{trained_models.__file__}:NextBrightness"
 SLOW = f"{trained_models.__file__}:SlowBrightness"
 TESTS = Path(__file__).parents[1]
 CPU = ["--accelerator", "cpu"]
-SLOW_MODULES = {
-    "torch", "numba", "scipy", "av", "h5py", "physion.readout.features",
-    "physion.clips.clips",
-}  # fmt: skip
-"""Libraries of models, movies and numerics, and what reads the trials."""
 
 
 @pytest.fixture(scope="module")
@@ -55,21 +48,6 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
 
 
-def run_apart(*commands: list[str]) -> tuple[str, set[str]]:
-    """Run commands in one new process; return what they print, and the slow modules they import."""
-    code = (
-        "import sys\n"
-        "from physion.cli.main import main\n"
-        f"assert not any([main(arguments) for arguments in {list(commands)!r}])\n"
-        f"print(*{SLOW_MODULES} & set(sys.modules), sep=', ')"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment(), capture_output=True, text=True, check=True
-    )
-    *shown, last = done.stdout.splitlines()
-    return "\n".join(shown), set(filter(None, last.split(", ")))
-
-
 def test_a_second_run_does_nothing_and_says_so(
     dots: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -77,10 +55,12 @@ def test_a_second_run_does_nothing_and_says_so(
     assert main(arguments) == 0
     (folder,) = (tmp_path / "training").iterdir()
     shown = capsys.readouterr().out
-    assert "all trained for 40 steps, loss " in shown and shown.rstrip().endswith(str(folder))
+    assert "all, seed 0 trained for 40 steps, loss " in shown and shown.rstrip().endswith(
+        str(folder)
+    )
     before = files_of(tmp_path)
     assert main(arguments) == 0
-    assert "all was trained before, loss " in capsys.readouterr().out
+    assert "all, seed 0 was trained before, loss " in capsys.readouterr().out
     assert main([*arguments, "--json"]) == 0
     (result,) = json.loads(capsys.readouterr().out)["trained"]
     assert result["loaded"] and result["folder"] == str(folder) and result["steps"] == 40
@@ -91,11 +71,11 @@ def test_protocols_and_settings_make_trainings_of_their_own(
     dots: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["train", MODEL, str(dots.folder), "--out", str(tmp_path), *CPU]
-    few = ["--steps", "3", "--batch", "2", "--betas", "0.8", "0.9", "--schedule", "cosine"]
+    few = ["--option", "steps=3", "batch=2", "betas=[0.8,0.9]", "schedule=cosine"]
     assert main([*arguments, *few, "--protocol", "all-but"]) == 0
     assert main([*arguments, *few, "--protocol", "only", "--scenario", "drop"]) == 0
     assert main([*arguments, *few, "--seed", "1"]) == 0
-    assert main([*arguments, *few, "--option", "hidden=9"]) == 0
+    assert main([*arguments, *few, "hidden=9"]) == 0
     names = sorted(path.name.rpartition("-")[0] for path in (tmp_path / "training").iterdir())
     expected = ["all", "all", "drop", "no_collide", "no_drop"]
     assert names == [f"NextBrightness-{name}" for name in expected]
@@ -106,11 +86,11 @@ def test_protocols_and_settings_make_trainings_of_their_own(
     ("arguments", "message"),
     [
         (["noisy-simulation"], "nothing to train"),
-        ([MODEL, "--size", "paper"], "size"),
+        ([MODEL, "--option", "size=paper"], "size"),
         ([MODEL, "--scenario", "drop"], "needs the protocol"),
         ([MODEL, "--protocol", "only", "--scenario", "dorp"], "'drop'|drop"),
-        ([MODEL, "--steps", "0"], "steps must be at least 1"),
-        ([MODEL, "--devices", "3", "--batch", "8", "--accelerator", "abacus"], "abacus"),
+        ([MODEL, "--option", "steps=0"], "steps must be at least 1"),
+        ([MODEL, "--devices", "3", "--option", "batch=8", "--accelerator", "abacus"], "abacus"),
         (["pVGG-lmp"], "pVGG-mlp"),
     ],
 )
@@ -129,8 +109,8 @@ def test_mistakes_are_one_line(
 
 @pytest.mark.slow
 def test_a_training_that_is_killed_ends_with_the_same_bytes(dots: Dataset, tmp_path: Path) -> None:
-    arguments = [str(dots.folder), "--steps", "60", "--checkpoint-every", "7"]
-    arguments += ["--option", "dropout=0.2", "--out"]
+    arguments = [str(dots.folder), "--option", "steps=60", "checkpoint_every=7", "dropout=0.2"]
+    arguments += ["--out"]
     parts = [*arguments, str(tmp_path / "parts")]
     running = subprocess.Popen(
         command(SLOW, *parts), env=environment(), stdout=subprocess.DEVNULL,
@@ -157,10 +137,10 @@ def test_a_training_that_is_killed_ends_with_the_same_bytes(dots: Dataset, tmp_p
 @pytest.mark.slow
 def test_two_processes_train_as_one_that_accumulates(dots: Dataset, tmp_path: Path) -> None:
     """Each process gets its part of the clips of a step; the gradients are averaged."""
-    arguments = [MODEL, str(dots.folder), "--log-every", "1", "--validate-every", "10"]
-    arguments += ["--clip", "0.5", "--option", "dropout=0.2", "--out"]
-    one = [*arguments, str(tmp_path / "one"), "--batch", "4", "--accumulate", "2"]
-    two = [*arguments, str(tmp_path / "two"), "--batch", "8", "--devices", "2"]
+    arguments = [MODEL, str(dots.folder), "--option", "log_every=1", "validate_every=10"]
+    arguments += ["clip=0.5", "dropout=0.2"]
+    one = [*arguments, "batch=4", "accumulate=2", "--out", str(tmp_path / "one")]
+    two = [*arguments, "batch=8", "--out", str(tmp_path / "two"), "--devices", "2"]
     assert main(["train", *one, *CPU]) == 0
     done = subprocess.run(
         command(*two), env=environment(), check=False, capture_output=True, text=True, timeout=300
@@ -182,82 +162,81 @@ def test_evaluate_finds_what_was_trained(
     dots: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     chosen = ["--option", "encoder=test_vit", "image_size=64", "weights=random", "hidden=16"]
-    chosen += ["--steps", "5", "--batch", "4", "--out", str(tmp_path), *CPU]
+    chosen += ["steps=5", "batch=4", "--out", str(tmp_path), *CPU]
     assert main(["train", "frozen-encoder", str(dots.folder), *chosen]) == 0
     before = {p: p.stat().st_mtime_ns for p in (tmp_path / "training").rglob("*")}
-    assert main(["evaluate", str(dots.folder), "frozen-encoder", *chosen]) == 0
+    assert main(["evaluate", "frozen-encoder", str(dots.folder), *chosen]) == 0
     assert "predictions: " in capsys.readouterr().out
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "training").rglob("*")} == before
 
 
-def test_a_plan_of_models_protocols_and_seeds(
+def test_models_protocols_and_seeds(
     dots: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """One training of three fails: the others are made, and a second run makes what is missing."""
-    fails = f"{plan_models.__file__}:FailsOnDrop"
-    imagining = f"{plan_models.__file__}:Imagining"
-    plan = ["--protocols", "all-but,only", "--seeds", "2", "--seed", "5"]
-    plan += ["--option", f"{fails}:hidden=3", "--out", str(tmp_path), *CPU]
-    arguments = ["train", f"{imagining},{fails}", str(dots.folder), *plan]
+    """One of two models fails: the other is trained, and a second run trains nothing again."""
+    fails = f"{cell_models.__file__}:FailsOnDrop"
+    imagining = f"{cell_models.__file__}:Imagining"
+    cells = ["--protocols", "all-but,only", "--seeds", "2", "--seed", "5"]
+    cells += ["--option", f"{fails}:hidden=3", "--out", str(tmp_path), *CPU]
+    arguments = ["train", f"{imagining},{fails}", str(dots.folder), *cells]
     assert main([*arguments, "--dry-run"]) == 0
-    shown = capsys.readouterr().out
-    assert "16 of 16 trainings to do" in shown and "measured steps" in shown
-    assert "collide" in shown and not list(tmp_path.iterdir())
+    assert "16 of 16 trainings to do" in capsys.readouterr().out and not list(tmp_path.iterdir())
     assert main(arguments) == 1
-    captured = capsys.readouterr()
-    assert captured.out.count("trained for 6 steps") == 12
-    assert captured.out.count("failed: ") == 4 and "no drop, please" in captured.out
-    assert f"{fails}, no_collide, seed 6: failed" in captured.err and " left" in captured.err
+    shown = capsys.readouterr().out
+    assert shown.count("trained for 6 steps") == 8
+    assert shown.count("failed: ") == 4 and f"failed: {fails}, only, seed 6: " in shown
     assert main([*arguments, "--json"]) == 1
     result = json.loads(capsys.readouterr().out)
-    assert len(result["trained"]) == 12 and all(row["loaded"] for row in result["trained"])
-    assert {row["seed"] for row in result["failed"]} == {5, 6}
-    assert {row["protocol"] for row in result["failed"]} == {"all-but", "only"}
-    assert main([*arguments, "--dry-run", "--json"]) == 0
-    rows = json.loads(capsys.readouterr().out)["plan"]
-    assert sum(row["from"] == "done" for row in rows) == 12
-    assert {row["from"] for row in rows} == {"done", "earlier trainings"}
+    assert len(result["trained"]) == 8 and all(row["loaded"] for row in result["trained"])
+    assert len(result["failed"]) == 4
 
 
-def test_evaluate_takes_the_same_plan(
+def test_evaluate_prints_a_table(
     dots: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    model = f"{plan_models.__file__}:Imagining"
-    plan = ["--protocols", "all,only", "--seeds", "2", "--out", str(tmp_path), *CPU]
-    trainings = ["train", model, str(dots.folder), *plan]
-    assert main(trainings) == 0
+    model = f"{cell_models.__file__}:Imagining"
+    cells = ["--protocols", "all,only", "--seeds", "2", "--out", str(tmp_path), *CPU]
+    assert main(["train", model, str(dots.folder), *cells]) == 0
     before = {p: p.stat().st_mtime_ns for p in (tmp_path / "training").rglob("*")}
     capsys.readouterr()
-    arguments = ["evaluate", str(dots.folder), model, *plan, "--readout.grid", "0.1", "1"]
+    arguments = ["evaluate", model, str(dots.folder), *cells, "--option", "logistic.grid=[0.1,1]"]
     assert main([*arguments, "--dry-run"]) == 0
-    assert "6 of 6 evaluations to do" in capsys.readouterr().out
+    assert "4 of 4 evaluations to do" in capsys.readouterr().out
     assert main(arguments) == 0
     shown = capsys.readouterr().out
     assert shown.count("predictions: ") == 4 and "observed+simulated" in shown
-    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "training").rglob("*")} == before
-    (table,) = (tmp_path / "results").iterdir()
-    rows = pd.read_csv(table)
-    assert list(rows.columns) == [
+    (header,) = (line.split() for line in shown.splitlines() if line.split()[0] == "model")
+    assert header == [
         "model", "init", "protocol", "readout", "scenario", "seeds", "trials", "accuracy",
         "spread",
     ]  # fmt: skip
-    assert len(rows) == 2 * 3 * 3 and (rows["seeds"] == 2).all() and rows["spread"].notna().all()
-    again, loaded = run_apart(trainings, arguments)
-    assert "6 of 6 trainings were done before" in again
-    assert "6 of 6 evaluations were done before" in again
-    assert not loaded, "what is done reads no trial and needs no library of models or movies"
+    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "training").rglob("*")} == before
     assert main([*arguments, "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
-    assert result["results"] == str(table) and len(result["evaluations"]) == 4
+    assert len(result["evaluations"]) == 4 and all(one["done"] for one in result["evaluations"])
+    assert len(result["scores"]) == 2 * 3 * 3
+    assert main([*arguments, "--dry-run"]) == 0
+    assert "0 of 4 evaluations to do" in capsys.readouterr().out
+
+
+def test_predictions_without_a_trial_to_fit_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A readout that had nothing to be fitted on gives every trial the same number."""
+    few = make_dots(tmp_path / "dots", {"testing": 1}, ("drop",))
+    arguments = ["evaluate", f"{cell_models.__file__}:NothingToTrain", str(few.folder)]
+    assert main([*arguments, "--out", str(tmp_path / "out"), *CPU]) == 0
+    assert "are the same number, since the readout had no trial to fit" in capsys.readouterr().err
 
 
 @pytest.mark.slow
-def test_a_plan_that_is_killed_goes_on_and_a_second_run_trains_nothing(
+def test_what_is_interrupted_goes_on_and_a_second_run_trains_nothing(
     dots: Dataset, tmp_path: Path
 ) -> None:
-    model = f"{plan_models.__file__}:Slow"
-    plan = [str(dots.folder), "--protocols", "all,only", "--steps", "40", "--checkpoint-every", "5"]
-    parts = [*plan, "--out", str(tmp_path / "parts")]
+    model = f"{cell_models.__file__}:Slow"
+    cells = [str(dots.folder), "--protocols", "all,only", "--option", "steps=40",
+             "checkpoint_every=5"]  # fmt: skip
+    parts = [*cells, "--out", str(tmp_path / "parts")]
     running = subprocess.Popen(
         command(model, *parts), env=environment(), stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL, preexec_fn=heed_interrupts,
@@ -278,9 +257,7 @@ def test_a_plan_that_is_killed_goes_on_and_a_second_run_trains_nothing(
             command(model, *parts), env=environment(), check=False, capture_output=True, text=True
         )
         assert again.returncode == 0, again.stderr
-        assert f"{before} of 3 trainings were done before" in again.stdout
-    _, loaded = run_apart(["train", model, *parts, *CPU])
-    assert not loaded, "a second run needs no library of models or movies"
-    assert main(["train", model, *plan, "--out", str(tmp_path / "whole"), *CPU]) == 0
+        assert again.stdout.count("was trained before") == before
+    assert main(["train", model, *cells, "--out", str(tmp_path / "whole"), *CPU]) == 0
     one, other = (files_of(tmp_path / name / "training") for name in ("parts", "whole"))
     assert one == other

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 
-from physion.cli.imagined_trials import imagine_with
 from physion.cli.main import main
 from physion.clips.clips import whole_source
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.models.build import build_model
+from physion.readout.imagined import imagine_with
 from physion.trials.dataset import Dataset
 from support.viewer_dataset import Plan, make_dataset
 

@@ -15,19 +15,15 @@ from physion.cli.main import main
 from physion.compute.local import LocalExecutor, SerialExecutor
 from physion.core.errors import BadInputError, PhysionError
 from physion.models import Batch
-from physion.readout.logistic import ReadoutConfig
-from physion.readout.settings import EvaluationConfig
-from physion.readout.trainings import TrainConfig
-from physion.training.loop import TrainingOverrides
+from physion.readout.logistic import LogisticSettings
+from physion.readout.settings import EvaluationSettings, HarnessSettings
 from physion.trials.dataset import Dataset
 from physion.trials.making.plan import GenerateSettings
 from support.moving_dots import make_dots
 from support.paths import ROOT
 
 EXAMPLES = ROOT / "examples" / "my_model"
-QUICK = EvaluationConfig(
-    steps=5, folds=2, accelerator="cpu", readout=ReadoutConfig(grid=(1e-2, 1.0))
-)
+QUICK = EvaluationSettings(folds=2, accelerator="cpu", logistic=LogisticSettings(grid=(1e-2, 1.0)))
 
 
 @pytest.fixture(scope="module")
@@ -58,10 +54,12 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 def test_the_examples_predict_every_trial(
     name: str, protocols: set[str], made: Dataset, tmp_path: Path
 ) -> None:
-    done = physion.evaluate(made, str(EXAMPLES / name), tmp_path, config=QUICK)
-    assert set(done.predictions["Protocol"]) == protocols and not done.problems
+    done = physion.evaluate(
+        str(EXAMPLES / name), made, tmp_path, options={"steps": 5}, settings=QUICK
+    )
+    assert set(done.predictions["readout"]) == protocols and not done.problems
     assert len(done.predictions) == len(protocols) * len(made)
-    assert done.predictions["Predicted Prob_true"].between(0, 1).all()
+    assert done.predictions["p_contact"].between(0, 1).all()
     trained = "Dynamics" in name
     assert len(list(tmp_path.glob("training/*"))) == (QUICK.folds if trained else 0)
 
@@ -69,22 +67,24 @@ def test_the_examples_predict_every_trial(
 def test_evaluation_finds_what_was_trained_before(made: Dataset, tmp_path: Path) -> None:
     model: Any = physion.build_model(f"{EXAMPLES / 'my_dynamics.py'}:MyDynamics", channels=4)
     initial = model.digest()
-    given: dict[str, Any] = {"settings": TrainingOverrides(steps=5)}
-    given["config"] = TrainConfig(folds=2, accelerator="cpu")
-    trained = physion.train(made, model, tmp_path, **given)
+    few = {"steps": 5}
+    settings = HarnessSettings(folds=2, accelerator="cpu")
+    trained = physion.train(model, made, tmp_path, options=few, settings=settings).trained
     assert len(trained) == 2 and not any(result.loaded for result in trained)
     assert model.digest() == initial, "the weights stay the initial ones"
-    assert all(result.loaded for result in physion.train(made, model, tmp_path, **given))
+    again = physion.train(model, made, tmp_path, options=few, settings=settings).trained
+    assert all(result.loaded for result in again)
     steps: list[str] = []
     done = physion.evaluate(
-        made, model, tmp_path, config=QUICK, progress=lambda what, *rest: steps.append(what)
-    )
-    assert "observed+simulated" in set(done.predictions["Protocol"])
+        model, made, tmp_path, options=few, settings=QUICK,
+        progress=lambda what, *rest: steps.append(what),
+    )  # fmt: skip
+    assert "observed+simulated" in set(done.predictions["readout"])
     assert not [what for what in steps if what.startswith("training")]
     assert model.digest() == initial, "the weights are the initial ones again"
     for function in (physion.train, physion.evaluate):
         with pytest.raises(BadInputError, match="options are for a model that is given by its"):
-            function(made, model, tmp_path, options={"channels": 4})  # type: ignore[operator]
+            function(model, made, tmp_path, options={"channels": 4})  # type: ignore[operator]
 
 
 def test_the_examples_are_short() -> None:
@@ -173,7 +173,7 @@ def test_what_a_model_does_wrong_is_an_error_that_says_it(
     body, message = WRONG[case]
     (tmp_path / "model.py").write_text(f"{HEAD}{body}\n")
     with pytest.raises(PhysionError, match=message):
-        physion.evaluate(dots, f"{tmp_path / 'model.py'}:Model", tmp_path / "out", config=QUICK)
+        physion.evaluate(f"{tmp_path / 'model.py'}:Model", dots, tmp_path / "out", settings=QUICK)
     assert not list(tmp_path.rglob("*.csv"))
 
 
@@ -183,7 +183,7 @@ def test_the_command_line_says_it_in_one_line(
     body, message = WRONG["encode raises"]
     (tmp_path / "model.py").write_text(f"{HEAD}{body}\n")
     model, out = f"{tmp_path / 'model.py'}:Model", str(tmp_path / "out")
-    assert main(["evaluate", str(dots.folder), model, "--out", out]) == 2
+    assert main(["evaluate", model, str(dots.folder), "--out", out]) == 2
     (error,) = capsys.readouterr().err.strip().splitlines()
     assert error.startswith("physion: ") and re.search(message, error), error
 
@@ -281,10 +281,10 @@ def test_a_simulator_in_a_file_runs_in_worker_processes(
     model = physion.build_model(f"{path}:Model")
     path.write_text("raise ValueError")
     evaluation = physion.evaluate(
-        dots, model, tmp_path / "out", executor=LocalExecutor(workers=2), config=QUICK
+        model, dots, tmp_path / "out", executor=LocalExecutor(workers=2), settings=QUICK
     )
     assert not evaluation.problems and len(evaluation.predictions) == 4
-    assert evaluation.predictions["Predicted Prob_true"].nunique() == 1
+    assert evaluation.predictions["p_contact"].nunique() == 1
 
 
 EXTRACTOR = """
@@ -319,10 +319,10 @@ def extractor(tmp_path: Path) -> str:
 def test_an_extractor_of_the_other_evaluator_becomes_a_model(
     extractor: str, dots: Dataset, tmp_path: Path
 ) -> None:
-    done = physion.evaluate(dots, extractor, tmp_path / "out", config=QUICK)
-    assert set(done.predictions["Protocol"]) == {"observed"}
-    assert set(done.predictions["Model"]) == {"Extractor"}
-    assert done.predictions["Init"].str.fullmatch("local:[0-9a-f]{64}").all()
+    done = physion.evaluate(extractor, dots, tmp_path / "out", settings=QUICK)
+    assert set(done.predictions["readout"]) == {"observed"}
+    assert set(done.predictions["model"]) == {"Extractor"}
+    assert done.predictions["init"].str.fullmatch("local:[0-9a-f]{64}").all()
     assert len(done.predictions) == 4 and not done.problems
 
 
@@ -396,4 +396,4 @@ def test_what_an_extractor_returns_is_checked(
     assert old in EXTRACTOR
     (tmp_path / "extractor.py").write_text(EXTRACTOR.replace(old, new))
     with pytest.raises(BadInputError, match=message):
-        physion.evaluate(dots, extractor, tmp_path / "out", config=QUICK)
+        physion.evaluate(extractor, dots, tmp_path / "out", settings=QUICK)

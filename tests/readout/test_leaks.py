@@ -13,24 +13,24 @@ from physion.clips.batch import Spec
 from physion.clips.clips import whole_source
 from physion.compute.local import SerialExecutor
 from physion.core.errors import BadInputError
-from physion.models import build_model, models
-from physion.readout.evaluate import evaluate, evaluate_model
-from physion.readout.leak_checks import (
-    with_exchanged_futures,
-    with_permuted_labels,
-    with_poisoned_futures,
-)
-from physion.readout.logistic import ReadoutConfig
-from physion.readout.settings import EvaluationConfig
+from physion.models import models
+from physion.readout.evaluate import evaluate
+from physion.readout.logistic import LogisticSettings
+from physion.readout.settings import EvaluationSettings
 from physion.trials.dataset import Dataset
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, plan_dataset
 from support.late_motions import make_late_motions
+from support.leak_checks import (
+    with_exchanged_futures,
+    with_permuted_labels,
+    with_poisoned_futures,
+)
 from support.moving_dots import make_dots
 from support.tiny_models import OPTIONS, TINY
 from support.viewer_dataset import make_dataset
 
-QUICK = EvaluationConfig(steps=3, accelerator="cpu", readout=ReadoutConfig(grid=(1e-2, 1.0)))
+QUICK = EvaluationSettings(accelerator="cpu", logistic=LogisticSettings(grid=(1e-2, 1.0)))
 PREDICTING = ("observed", "observed+simulated")
 
 
@@ -49,12 +49,11 @@ def poisoned(made: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Dataset
 
 
 def predict(dataset: Dataset, name: str, folder: Path) -> pd.DataFrame:
-    options = dict(OPTIONS.get(name, {}))
+    options: dict[str, Any] = {**OPTIONS.get(name, {}), "steps": 3}
     if name == "majority-of-people":
         options["humans"] = dict.fromkeys(dataset.trials(), 0.3)
-    model = build_model(name, **options)
-    table = evaluate_model(dataset, model, folder, config=QUICK).predictions
-    return table.set_index(["Protocol", "Stimulus Name"])["Predicted Prob_true"]
+    table = evaluate(name, dataset, folder, options=options, settings=QUICK).predictions
+    return table.set_index(["readout", "stimulus"])["p_contact"]
 
 
 @pytest.mark.slow
@@ -64,7 +63,7 @@ def test_what_follows_the_observed_part_changes_no_prediction(
 ) -> None:
     before = predict(made, name, tmp_path / "before")
     after = predict(poisoned, name, tmp_path / "after")
-    kept = before.index.get_level_values("Protocol").isin(PREDICTING)
+    kept = before.index.get_level_values("readout").isin(PREDICTING)
     assert kept.any() or name == "outcome", "each but the outcome itself predicts"
     assert before[kept].to_numpy().tobytes() == after[kept].to_numpy().tobytes()
     if (~kept).any() and name != "outcome":
@@ -135,12 +134,12 @@ def dots(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 def accuracy_of_full(dataset: Dataset, folder: Path, **options: Any) -> float:
-    config: Any = EvaluationConfig(
-        readouts=("full",), accelerator="cpu", readout=QUICK.readout, steps=20, batch=4, warmup=0
-    )
-    options = {**TINY, **options}
-    table = evaluate(dataset, "frozen-encoder", folder, options=options, config=config).predictions
-    return float((table["Predicted Outcome"] == table["Actual Outcome"]).mean())
+    settings = EvaluationSettings(readouts=("full",), accelerator="cpu", logistic=QUICK.logistic)
+    options = {**TINY, "steps": 20, "batch": 4, "warmup": 0, **options}
+    table = evaluate(
+        "frozen-encoder", dataset, folder, options=options, settings=settings
+    ).predictions
+    return float(((table["p_contact"] > 0.5) == table["outcome"]).mean())
 
 
 @pytest.mark.slow

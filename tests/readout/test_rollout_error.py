@@ -23,7 +23,7 @@ from physion.models.particles.bodies import (
 )
 from physion.readout.evaluate import evaluate
 from physion.readout.rollout_error import COLUMNS, motion_error, rollout_error
-from physion.readout.settings import EvaluationConfig
+from physion.readout.settings import EvaluationSettings
 from physion.scenes.scene import BodyEvent
 from physion.trials.dataset import Dataset
 from support.viewer_dataset import FRAMES, PLANS, make_dataset, make_scene, make_trajectory
@@ -85,35 +85,35 @@ def test_constant_motion_has_no_error_by_constant_velocity_and_standing_still_a_
     motion = true_motion()
     particles, poses = start_of(motion, range(2, 45, STRIDE))
     table = motion_error(motion, particles, standing_still(poses, 60), STRIDE, 105)
-    assert table["Frames"].tolist() == list(range(3, 106, 3))
-    fallen = np.minimum(table["Frames"], 15) * SPEED
-    assert table["Error"].to_numpy() == pytest.approx(fallen.to_numpy(), abs=1e-6)
+    assert table["frames"].tolist() == list(range(3, 106, 3))
+    fallen = np.minimum(table["frames"], 15) * SPEED
+    assert table["error"].to_numpy() == pytest.approx(fallen.to_numpy(), abs=1e-6)
     # After frame 59 the ball is at rest, and constant velocity goes on.
-    beyond = (table["Frames"] * SPEED - fallen).to_numpy()
+    beyond = (table["frames"] * SPEED - fallen).to_numpy()
     assert beyond[:5] == pytest.approx(0) and beyond[-1] == pytest.approx(90 * SPEED)
-    assert table["Constant Velocity Error"].to_numpy() == pytest.approx(beyond, abs=1e-5)
+    assert table["constant_velocity_error"].to_numpy() == pytest.approx(beyond, abs=1e-5)
 
 
 def test_cloth_counts_by_the_mean_of_its_particles() -> None:
     motion = true_motion(3)
     particles, poses = start_of(motion, range(2, 45, STRIDE))
     table = motion_error(motion, particles, standing_still(poses, 60), STRIDE, 15)
-    assert table["Error"].to_numpy() == pytest.approx(np.arange(3, 16, 3) / (FRAMES - 1), abs=1e-6)
-    assert table["Constant Velocity Error"].to_numpy() == pytest.approx(0, abs=1e-5)
+    assert table["error"].to_numpy() == pytest.approx(np.arange(3, 16, 3) / (FRAMES - 1), abs=1e-6)
+    assert table["constant_velocity_error"].to_numpy() == pytest.approx(0, abs=1e-5)
 
 
 def test_the_truth_has_no_error_also_if_it_is_held_at_its_end() -> None:
     motion = true_motion()
     particles, poses = start_of(motion, range(2, FRAMES, STRIDE))
     table = motion_error(motion, particles, poses, STRIDE, 60)
-    assert len(table) == 20 and table["Error"].max() == pytest.approx(0, abs=1e-6)
+    assert len(table) == 20 and table["error"].max() == pytest.approx(0, abs=1e-6)
 
 
 def test_a_trial_that_was_cut_has_no_later_frames() -> None:
     motion = true_motion(completed=False)
     particles, poses = start_of(motion, range(2, 45, STRIDE))
     still = standing_still(poses, 60)
-    assert motion_error(motion, particles, still, STRIDE, 105)["Frames"].tolist() == [
+    assert motion_error(motion, particles, still, STRIDE, 105)["frames"].tolist() == [
         *(3, 6, 9, 12, 15),
     ]
     trajectory = motion.trajectory
@@ -129,7 +129,7 @@ def test_objects_count_while_they_are_there_and_can_move() -> None:
     particles, poses = start_of(motion, range(2, 45, STRIDE))
     still = standing_still(poses, 60)
     gone = motion_error(Motion(vanishing, motion.trajectory), particles, still, STRIDE, 105)
-    assert gone["Frames"].tolist() == [3, 6, 9]
+    assert gone["frames"].tolist() == [3, 6, 9]
     bodies = tuple(dataclasses.replace(body, kinematic=True) for body in motion.scene.bodies)
     fixed = dataclasses.replace(motion.scene, bodies=bodies)
     particles = scene_particles(fixed, Sampling())
@@ -145,8 +145,8 @@ def test_errors_of_a_dataset_come_from_the_observed_part_alone(dataset: Dataset)
     model = Standstill()
     table = rollout_error(dataset, model, ["drop_0", "drape_0"], horizon=15)
     assert tuple(table.columns) == COLUMNS and len(table) == 10
-    assert set(table["Model"]) == {"standstill"} and table["Scenario"][9] == "drape"
-    assert table["Error"][4] == pytest.approx(15 * SPEED, abs=1e-4)
+    assert set(table["model"]) == {"standstill"} and table["scenario"][9] == "drape"
+    assert table["error"][4] == pytest.approx(15 * SPEED, abs=1e-4)
     assert [len(motion.trajectory) for motion in model.asked] == [45, 45]
 
 
@@ -159,24 +159,26 @@ def test_what_cannot_have_an_error_is_refused(dataset: Dataset) -> None:
 
     with pytest.raises(BadInputError, match="trial 'drop_0': positions that are not finite"):
         rollout_error(dataset, Lost(), ["drop_0"])
-    arguments = ["evaluate", str(dataset.folder), "constant-motion", "--rollout-error"]
+    arguments = ["evaluate", "constant-motion", str(dataset.folder), "--rollout-error"]
     assert main(arguments) == 2
     with pytest.raises(BadInputError, match=r"imagines no motion of objects.*such as dpi"):
-        evaluate(dataset, "constant-motion", "nowhere", rollout_errors=True)
+        evaluate("constant-motion", dataset, "nowhere", rollout_errors=True)
 
 
 def test_evaluate_writes_them_beside_the_predictions(dataset: Dataset, tmp_path: Path) -> None:
-    config = EvaluationConfig(untrained=True, folds=2, accelerator="cpu")
-    without = evaluate(dataset, "dpi", tmp_path, config=config)
-    assert without.rollout_errors is None and not (tmp_path / "rollout-errors").exists()
-    result = evaluate(dataset, "dpi", tmp_path, config=config, rollout_errors=True)
-    assert result.rollout_errors == tmp_path / "rollout-errors" / result.path.name
-    written = pd.read_csv(result.rollout_errors)
-    assert tuple(written.columns) == COLUMNS and set(written["Model"]) == {"dpi-small"}
-    assert sorted(set(written["Stimulus Name"])) == sorted(result.predictions["Stimulus Name"])
-    first = written[(written["Stimulus Name"] == "drop_1") & (written["Frames"] <= 15)]
-    assert len(first) == 5 and first["Constant Velocity Error"].max() < 1e-3
-    before = result.rollout_errors.stat().st_mtime_ns
-    again = evaluate(dataset, "dpi", tmp_path, config=config, rollout_errors=True)
-    assert again.rollout_errors == result.rollout_errors
-    assert result.rollout_errors.stat().st_mtime_ns == before
+    config = EvaluationSettings(untrained=True, folds=2, accelerator="cpu")
+    without = evaluate("dpi", dataset, tmp_path, settings=config)
+    assert without.evaluated[0].rollout_errors is None
+    assert not (tmp_path / "rollout-errors").exists()
+    result = evaluate("dpi", dataset, tmp_path, settings=config, rollout_errors=True)
+    errors = result.evaluated[0].rollout_errors
+    assert errors == tmp_path / "rollout-errors" / result.paths[0].name
+    written = pd.read_csv(errors)
+    assert tuple(written.columns) == COLUMNS and set(written["model"]) == {"dpi-small"}
+    assert sorted(set(written["stimulus"])) == sorted(result.predictions["stimulus"])
+    first = written[(written["stimulus"] == "drop_1") & (written["frames"] <= 15)]
+    assert len(first) == 5 and first["constant_velocity_error"].max() < 1e-3
+    before = errors.stat().st_mtime_ns
+    again = evaluate("dpi", dataset, tmp_path, settings=config, rollout_errors=True)
+    assert again.evaluated[0].rollout_errors == errors
+    assert errors.stat().st_mtime_ns == before

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from physion.clips.imagined import ImaginedTrial
 from physion.report.viewer.build import ViewerOptions, build_viewer
-from physion.report.viewer.imagined import ImaginedTrial
 from physion.trials.video import read_frames
 from support.browser import Browser
 from support.viewer_dataset import EVIL, Plan, make_dataset

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from physion.clips.imagined import ImaginedTrial
 from physion.core.errors import BadInputError
 from physion.report.viewer.build import ViewerOptions, build_viewer
-from physion.report.viewer.imagined import REACH, ImaginedTrial, caption, pack_imagined
+from physion.report.viewer.imagined import REACH, caption, pack_imagined
 from physion.report.viewer.motion import STEPS
 from support.viewer_dataset import PLANS, make_dataset, make_scene
 

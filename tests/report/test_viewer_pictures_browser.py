@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from physion.cli.imagined_trials import imagine_with
+from physion.clips.imagined import ImaginedTrial
+from physion.readout.imagined import imagine_with
 from physion.report.viewer.build import ViewerOptions, build_viewer
-from physion.report.viewer.imagined import ImaginedTrial
 from physion.trials.dataset import Dataset
 from support.browser import Browser
 from support.viewer_dataset import Plan, make_dataset

@@ -1,42 +1,40 @@
 """Train the dynamics and readouts of models on a dataset and write their predictions.
 
-Models, training protocols and seeds make a plan of evaluations. Those that are done are skipped,
-and one that fails does not stop the others. The results are one table, with mean and spread over
-seeds.
+Models with trained weights, such as those that ship, are not trained again. What is done is not
+done again, and one evaluation that fails does not stop the others.
 """
 
 from __future__ import annotations
 
 import json as json_module
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from physion.cli.output import Stages, console, text_table, write_text
-from physion.cli.plans.choose_models import choose_models
-from physion.cli.plans.tables import evaluations_table, print_estimates
+from physion.cli.model_options import choose_models, split_names
+from physion.cli.output import Stages, console, print_warnings, text_table
 from physion.compute.run_tasks import ExecutorSettings
-from physion.readout.plans.evaluation_plan import EvaluationPlan, EvaluationResults
-from physion.readout.plans.keys import key_of
-from physion.readout.plans.results import StoredEvaluation, summarise_accuracy
-from physion.readout.plans.selection import Selection, count_seeds, parse_protocols
-from physion.readout.plans.tasks import EvaluationTask
+from physion.core.settings import read_pairs
+from physion.readout.evaluate import EvaluatedModel, Evaluation, evaluate
+from physion.readout.logistic import LogisticSettings
 from physion.readout.settings import EvaluationSettings
 from physion.trials.dataset import Dataset
+
+LOGISTIC = "logistic."
+"""Start of the options of the logistic regression."""
 
 
 @dataclass(frozen=True)
 class Options:
     """Options of ``physion evaluate``."""
 
-    dataset: Annotated[Path, tyro.conf.Positional]
-    """Folder of a dataset."""
     models: Annotated[str, tyro.conf.Positional]
     """Names of models with commas (physion ls models lists them), or FILE.py:Class."""
-    protocols: Annotated[str, tyro.conf.arg(aliases=("--training",))] = "all"
+    dataset: Annotated[Path, tyro.conf.Positional]
+    """Folder of a dataset."""
+    protocols: Annotated[str, tyro.conf.arg(aliases=("--protocol",))] = "all"
     """Scenarios that train a model: all, all-but one, or only the tested one; several with
     commas."""
     scenario: str = ""
@@ -47,107 +45,100 @@ class Options:
     """First seed: of initial weights, folds and training."""
     out: Path = Path("runs/models")
     """Folder for predictions and caches."""
-    weights: str = ""
-    """Weights of the models, the same as --option weights=...: a file, random, or other names."""
     option: tuple[str, ...] = ()
-    """Fields of the models' configs as NAME=VALUE, such as encoder=resnet50 weights=imagenet; of
-    one of several models as MODEL:NAME=VALUE."""
-    config: Annotated[EvaluationSettings, tyro.conf.arg(name="")] = field(
+    """Settings of the models or of their training as NAME=VALUE, such as encoder=resnet50
+    weights=random steps=500; of one of several models as MODEL:NAME=VALUE; of the logistic
+    regression as logistic.NAME=VALUE, such as logistic.folds=3."""
+    settings: Annotated[EvaluationSettings, tyro.conf.arg(name="")] = field(
         default_factory=EvaluationSettings
     )
-    """Readouts, optimiser and cross-validation."""
+    """Readouts, decision, cross-validation and device."""
     rollout_error: bool = False
     """Also write how far imagined motion is from the true one over time, for particle models."""
     compute: Annotated[ExecutorSettings, tyro.conf.arg(name="")] = field(
         default_factory=ExecutorSettings
     )
-    """Where tasks run, and their limits: on Slurm and Ray one evaluation of the plan is a task, on
-    this machine a simulation."""
+    """Where tasks run: on Slurm and Ray, one model, protocol and seed is a task; on this machine a
+    simulation."""
     verify: bool = True
     """Compare files with their SHA-256 in the index before they are used."""
     dry_run: bool = False
-    """Print the plan, with the mean time of earlier evaluations of each model, and do nothing."""
+    """Print the evaluations and which are done, and evaluate nothing."""
     json: bool = False
     """Print one JSON object."""
 
 
 def main(options: Options) -> int:
     """Write the tables of predictions; return 1 if some trials, or evaluations, have none."""
-    selection = Selection(
-        tuple(choose_models(options.models, options.option, weights=options.weights)),
-        parse_protocols(options.protocols),
-        count_seeds(options.seed, options.seeds),
-        options.scenario,
-    )
-    plan = EvaluationPlan(
-        Dataset(options.dataset, verify=options.verify),
-        options.out,
-        selection,
-        options.config,
-        rollout_errors=options.rollout_error,
-    )
-    if options.dry_run:
-        print_estimates(evaluations_table(plan), "evaluations", options.json)
-        return 0
+    of_models = tuple(pair for pair in options.option if not pair.startswith(LOGISTIC))
+    fitted = [pair.removeprefix(LOGISTIC) for pair in options.option if pair not in of_models]
+    logistic = read_pairs(LogisticSettings, fitted, "--option logistic")
     with Stages() as stages:
+        done = evaluate(
+            choose_models(split_names(options.models, "model"), of_models),
+            Dataset(options.dataset, verify=options.verify),
+            options.out,
+            protocols=split_names(options.protocols, "training protocol"),
+            scenario=options.scenario,
+            seeds=options.seeds,
+            seed=options.seed,
+            settings=replace(options.settings, logistic=logistic),
+            rollout_errors=options.rollout_error,
+            executor=options.compute.open(),
+            progress=stages,
+            dry_run=options.dry_run,
+        )
+    _print(done, options)
+    return 1 if done.failed or done.problems else 0
 
-        def show(task: EvaluationTask, reason: str, left: Sequence[EvaluationTask]) -> None:
-            if len(plan.tasks) > 1:
-                outcome = f"failed: {reason}" if reason else "evaluated"
-                stages.note(f"{task.label}: {outcome}; {len(left)} left")
 
-        executor = options.compute.open()
-        cells = None if options.compute.executor == "local" else executor
-        results = plan.run(None if cells else executor, stages, show, cells=cells)
-    _print(plan, results, options)
-    return 1 if results.failed or results.problems else 0
-
-
-def _print(plan: EvaluationPlan, results: EvaluationResults, options: Options) -> None:
-    several = len(plan.tasks) > 1
-    summary = summarise_accuracy(results.evaluated)
-    path = options.out / "results" / f"{key_of([task.key for task in plan.tasks])[:12]}.csv"
-    if several and len(summary):
-        write_text(path, summary.round(6).to_csv(index=False, lineterminator="\n"))
+def _print(done: Evaluation, options: Options) -> None:
     if options.json:
         values: dict[str, Any] = {
-            "evaluations": [_values(task, evaluation) for task, evaluation in results.tables],
-            "failed": [{**_identity(task), "reason": why} for task, why in results.failed],
+            "evaluations": [_values(one) for one in done.evaluated],
+            "failed": [{"cell": label, "reason": why} for label, why in done.failed.items()],
         }
-        if several:
-            values["results"] = str(path)
+        if not options.dry_run:
+            values["scores"] = json_module.loads(done.scores.to_json(orient="records"))
         print(json_module.dumps(values))
         return
-    for where, reason in results.problems.items():
-        _line(f"no prediction: {where if several else where.partition(': ')[2]}: {reason}")
-    for _, evaluation in results.tables:
-        _line(f"{evaluation.count} predictions: {evaluation.path}")
-        if evaluation.rollout_errors is not None:
-            _line(f"errors of imagined motion: {evaluation.rollout_errors}")
-    if several:
-        if len(summary):
-            _line(text_table(summary))
-            _line(f"results: {path}")
-        if len(plan.done):
-            _line(f"{len(plan.done)} of {len(plan.tasks)} evaluations were done before")
-    for task, reason in results.failed:
-        _line(f"failed: {task.label}: {reason}")
+    if options.dry_run:
+        import pandas as pd
+
+        rows = [
+            {"model": one.model, "protocol": one.protocol, "seed": one.seed,
+             "done": "yes" if one.done else "no", "predictions": one.path}
+            for one in done.evaluated
+        ]  # fmt: skip
+        _line(text_table(pd.DataFrame(rows, dtype=object)))
+        left = sum(not one.done for one in done.evaluated)
+        _line(f"{left} of {len(rows)} evaluations to do")
+        return
+    for where, reason in done.problems.items():
+        _line(f"no prediction: {where}: {reason}")
+    for label, reason in done.failed.items():
+        _line(f"failed: {label}: {reason}")
+    if done.evaluated:
+        print_warnings(done.warnings)
+        _line(text_table(done.scores.dropna(axis="columns", how="all")))
+    for one in done.evaluated:
+        _line(f"predictions: {one.path}{' (done before)' if one.done else ''}")
+        if one.rollout_errors is not None:
+            _line(f"errors of imagined motion: {one.rollout_errors}")
 
 
-def _values(task: EvaluationTask, evaluation: StoredEvaluation) -> dict[str, Any]:
+def _values(one: EvaluatedModel) -> dict[str, Any]:
     values = {
-        **_identity(task),
-        "predictions": str(evaluation.path),
-        "problems": dict(evaluation.problems),
+        "model": one.model,
+        "protocol": one.protocol or None,
+        "seed": one.seed,
+        "done": one.done,
+        "predictions": str(one.path),
+        "problems": dict(one.problems),
     }
-    if evaluation.rollout_errors is not None:
-        values["rollout_errors"] = str(evaluation.rollout_errors)
+    if one.rollout_errors is not None:
+        values["rollout_errors"] = str(one.rollout_errors)
     return values
-
-
-def _identity(task: EvaluationTask) -> dict[str, Any]:
-    protocol = task.protocol.value if task.set_name else None
-    return {"model": task.choice.name, "protocol": protocol, "seed": task.seed}
 
 
 def _line(text: str) -> None:

@@ -28,7 +28,6 @@ VERBS = {
 
 MODULES = {
     "import": "import_trials",
-    "run": "run.run",
     "compare": "compare.compare",
     "experiment": "experiment.experiment",
 }
@@ -48,12 +47,12 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "physion replay --engines physion,mujoco --json replay.json",
     ),
     "train": (
-        "physion train gns trials --steps 1000",
+        "physion train gns trials --option steps=1000",
         "physion train gns,dpi trials --protocols all,all-but,only --seeds 3 --dry-run",
     ),
     "evaluate": (
-        "physion evaluate trials gns,constant-motion --out runs/models",
-        "physion evaluate trials my_model.py:MyEncoder",
+        "physion evaluate gns,constant-motion trials --out runs/models",
+        "physion evaluate my_model.py:MyEncoder trials",
     ),
     "compare": (
         "physion compare runs/models/predictions/*.csv --humans official",
@@ -77,7 +76,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "experiment forget": ("physion experiment forget study --participant 5f0c1e",),
     "view": (
         "physion view trials --scenario collide",
-        "physion view trials --predictions gns --option weights=shipped",
+        "physion view trials --predictions gns",
     ),
     "export": (
         "physion export trials official-files --layout official",

@@ -1,4 +1,4 @@
-"""List the available scenarios, presets, shapes, props, materials, models, readers and engines."""
+"""List scenarios, presets, shapes, props, materials, models, decisions and engines."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LISTS: Mapping[str, Callable[[], Names]] = {
     "props": lambda: sorted(NATURAL_SIZES),
     "materials": lambda: {family: list(names) for family, names in MATERIALS.items()},
     "models": models.names,
-    "readers": lambda: _readers().names(),
+    "decisions": lambda: _decisions().names(),
     "rooms": rooms.names,
     "engines": engines.names,
     "executors": executors.names,
@@ -40,18 +40,18 @@ LISTS: Mapping[str, Callable[[], Names]] = {
 
 DESCRIBED: Mapping[str, Callable[[], Registry[Any]]] = {
     "models": lambda: models,
-    "readers": lambda: _readers(),
+    "decisions": lambda: _decisions(),
     "engines": lambda: engines,
     "executors": lambda: executors,
 }
 """Lists that are printed with a line for each name, when they are asked for alone."""
 
 
-def _readers() -> Registry[Any]:
+def _decisions() -> Registry[Any]:
     # Imported late: it takes time.
-    from physion.readout.decisions import readers
+    from physion.readout.decisions import decisions
 
-    return readers
+    return decisions
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Options:
             "props",
             "materials",
             "models",
-            "readers",
+            "decisions",
             "rooms",
             "engines",
             "executors",

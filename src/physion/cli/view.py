@@ -12,9 +12,9 @@ import tyro
 
 from physion.cli.model_options import parse_options
 from physion.cli.output import Stages, console
+from physion.clips.imagined import Imagine
 from physion.core.errors import BadInputError
 from physion.report.viewer.build import ViewerOptions, build_viewer
-from physion.report.viewer.imagined import Imagine
 from physion.trials.dataset import Dataset
 
 
@@ -74,7 +74,7 @@ def _imagine(options: Options, stages: Stages) -> Imagine | None:
             raise BadInputError("--option is for the models of --predictions, which names none")
         return None
     # Models need libraries that a page without them does not.
-    from physion.cli.imagined_trials import imagine_with
+    from physion.readout.imagined import imagine_with
 
     if options.details < 1:
         raise BadInputError(

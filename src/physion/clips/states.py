@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from physion.clips.batch import Motion, cut_to_observed
-from physion.core.errors import UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.trials.files import IndexedFile
 from physion.trials.trial_file import Trial
 
@@ -90,6 +90,11 @@ class TrialMotions(Mapping[str, Motion]):
         stored = self._files[trial]
         opened = Trial(stored.read(), f"trial file {stored.path}")
         motion = Motion(opened.scene, opened.trajectory)
+        if np.isnan(motion.trajectory.positions).all():
+            raise BadInputError(
+                f"trial {trial!r} has no state, since it was imported from a movie; use a model "
+                "that sees pictures"
+            )
         if self._observed:
             motion = cut_motion(motion)
         with self._lock:

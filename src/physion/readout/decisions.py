@@ -1,27 +1,61 @@
-"""What a reader offers, and the registry of readers."""
+"""Decisions: what turns features or rollouts of a model into P(contact).
+
+The readout says which features of a clip a decision receives:
+
+| readout | official | features |
+|---|---|---|
+| *observed* | C | encoder, observed frames |
+| *observed+simulated* | B | encoder, observed frames; dynamics, the rest |
+| *full* | A | encoder, all frames |
+
+*full* is detection, not prediction: the frames show the outcome. It measures how much of the
+outcome the features of the encoder contain.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.core.errors import BadInputError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.registry import Registry
 from physion.models.noisy_simulation import best_threshold
 from physion.numerics.elementary import log
 from physion.readout.features import Knobs, Outcomes
-from physion.readout.logistic import ReadoutConfig, fit_readout
+from physion.readout.logistic import LogisticSettings, fit_readout
 
 Booleans = NDArray[np.bool_]
 
 
+class Readout(Enum):
+    """Readout; the value is its name in the paper."""
+
+    OBSERVED = "observed"
+    OBSERVED_SIMULATED = "observed+simulated"
+    FULL = "full"
+
+    @property
+    def sees_future(self) -> bool:
+        """Whether the readout receives frames after the observed part."""
+        return self is Readout.FULL
+
+    @classmethod
+    def named(cls, name: str) -> Readout:
+        """Return the readout called ``name``; raise `UnknownNameError` with the closest names."""
+        try:
+            return cls(name)
+        except ValueError:
+            raise UnknownNameError("readout", name, [r.value for r in cls]) from None
+
+
 @dataclass(frozen=True)
-class Reading:
+class Decided:
     """Probabilities of tested trials, and what was fitted to get them.
 
     - ``probability`` (m,): P(contact), 0..1. ``train_accuracy``: on the fit trials.
@@ -48,8 +82,8 @@ def fraction_of_futures(touches: Booleans) -> NDArray[np.float64]:
     return count if samples == 1 else (count + 0.5) / (samples + 1)
 
 
-class FeatureReader(Protocol):
-    """Reader of features.
+class FeatureDecision(Protocol):
+    """Decision on features.
 
     ``labels``: outcomes that it is fitted on: ``simulated``, of the trials as they were made, or
     ``recorded``, which prefers those of the official recording.
@@ -58,47 +92,48 @@ class FeatureReader(Protocol):
     input: Literal["features"]
     labels: Literal["simulated", "recorded"]
 
-    def read(self, fit: Sequence[Any], labels: Booleans, test: Sequence[Any]) -> Reading:
-        """Fit on the parts of the features of n trials and read those of m other ones.
+    def decide(self, fit: Sequence[Any], labels: Booleans, test: Sequence[Any]) -> Decided:
+        """Fit on the parts of the features of n trials and decide on those of m other ones.
 
         Every part is an array (n, T, D) or stored features; parts are joined in time.
         """
         ...
 
 
-class RolloutReader(Protocol):
-    """Reader of imagined gaps or contacts, for one or several values of the knobs."""
+class RolloutDecision(Protocol):
+    """Decision on imagined gaps or contacts, for one or several values of the knobs."""
 
     input: Literal["rollouts"]
     labels: Literal["simulated", "recorded"]
 
-    def read(
+    def decide(
         self, fit: Mapping[Knobs, Outcomes], labels: Booleans, test: Mapping[Knobs, Outcomes]
-    ) -> Reading:
-        """Fit on the outcomes of n trials at all knobs, and read those of m other trials."""
+    ) -> Decided:
+        """Fit on the outcomes of n trials at all knobs, and decide on those of m other trials."""
         ...
 
 
-ReaderFactory = Callable[[ReadoutConfig], FeatureReader | RolloutReader]
+DecisionFactory = Callable[[LogisticSettings], FeatureDecision | RolloutDecision]
 
-readers: Registry[ReaderFactory] = Registry(
-    "reader",
+decisions: Registry[DecisionFactory] = Registry(
+    "decision",
     {
-        "logistic": "physion.readout.decisions:LogisticReader",
-        "released": "physion.readout.decisions:released_reader",
-        "gap": "physion.readout.decisions:GapReader",
-        "touch": "physion.readout.decisions:TouchReader",
-        "noise": "physion.readout.decisions:NoiseReader",
+        "logistic": "physion.readout.decisions:LogisticDecision",
+        "released": "physion.readout.decisions:released_decision",
+        "gap": "physion.readout.decisions:GapDecision",
+        "touch": "physion.readout.decisions:TouchDecision",
+        "noise": "physion.readout.decisions:NoiseDecision",
     },
 )
-"""All readers by name; other packages add theirs with the entry point group physion.readers."""
+"""All decisions by name; other packages add theirs with the entry point group physion.decisions."""
 
 
-# Reader of rollouts by a threshold on the smallest distance of agent and patient.
+# Decisions on rollouts: a threshold on the smallest distance of agent and patient, the distance at
+# which the model itself says that objects touch, and the likeliest level of noise.
 
 
 @dataclass(frozen=True)
-class GapReader:
+class GapDecision:
     """Threshold on the gap, in metres, that is right for most of the fit trials.
 
     P(contact) is that of `fraction_of_futures`, where a gap of at most the threshold is a contact.
@@ -106,89 +141,83 @@ class GapReader:
     closest to 0; without fit trials it is 0.
     """
 
-    config: ReadoutConfig = field(default_factory=ReadoutConfig)
+    settings: LogisticSettings = field(default_factory=LogisticSettings)
     input: Literal["rollouts"] = "rollouts"
     labels: Literal["simulated", "recorded"] = "simulated"
 
-    def read(
+    def decide(
         self,
         fit: Mapping[Knobs, Outcomes],
         labels: NDArray[np.bool_],
         test: Mapping[Knobs, Outcomes],
-    ) -> Reading:
-        """Fit the threshold on the gaps (n, S) of the fit trials and read the others."""
+    ) -> Decided:
+        """Fit the threshold on the gaps (n, S) of the fit trials and apply it to the others."""
         (knobs,) = fit
         near, tested = fit[knobs].gap, test[knobs].gap
         if near is None or tested is None:
             raise BadInputError(
-                "the reader 'gap' needs distances, but the model gives contacts alone; "
-                "use the reader 'noise'"
+                "the decision 'gap' needs distances, but the model gives contacts only; "
+                "use the decision 'noise'"
             )
         threshold = best_threshold(np.median(near, axis=1), labels)
         predicted = fraction_of_futures(near <= threshold) > 0.5
         accuracy = float(np.mean(predicted == labels)) if len(labels) else float("nan")
-        return Reading(
+        return Decided(
             fraction_of_futures(tested <= threshold),
             accuracy,
             fitted={**dict(knobs), "gap": threshold},
         )
 
 
-# Reader of rollouts by the distance at which the model itself says that objects touch.
-
-
 @dataclass(frozen=True)
-class TouchReader:
+class TouchDecision:
     """Fraction of futures with a contact, or a gap of at most 0 (`fraction_of_futures`).
 
     Nothing is fitted.
     """
 
-    config: ReadoutConfig = field(default_factory=ReadoutConfig)
+    settings: LogisticSettings = field(default_factory=LogisticSettings)
     input: Literal["rollouts"] = "rollouts"
     labels: Literal["simulated", "recorded"] = "simulated"
 
-    def read(
+    def decide(
         self,
         fit: Mapping[Knobs, Outcomes],
         labels: NDArray[np.bool_],
         test: Mapping[Knobs, Outcomes],
-    ) -> Reading:
-        """Read the futures of the tested trials; the fit trials give the accuracy alone."""
+    ) -> Decided:
+        """Decide on the futures of the tested trials; the fit trials only give the accuracy."""
         (knobs,) = test
         known = fraction_of_futures(fit[knobs].touches()) > 0.5
         accuracy = float(np.mean(known == labels)) if len(labels) else float("nan")
         probability = fraction_of_futures(test[knobs].touches())
-        return Reading(probability, accuracy, fitted=dict(knobs))
-
-
-# Reader of noisy simulations: the level of noise under which outcomes are likeliest.
+        return Decided(probability, accuracy, fitted=dict(knobs))
 
 
 @dataclass(frozen=True)
-class NoiseReader:
+class NoiseDecision:
     """Fraction of simulations with a contact, at the knobs with the highest likelihood.
 
     It is fitted on recorded outcomes where there are any: compared with the outcomes of its own
     engine, a simulation would always fit best without noise.
     """
 
-    config: ReadoutConfig = field(default_factory=ReadoutConfig)
+    settings: LogisticSettings = field(default_factory=LogisticSettings)
     input: Literal["rollouts"] = "rollouts"
     labels: Literal["simulated", "recorded"] = "recorded"
 
-    def read(
+    def decide(
         self,
         fit: Mapping[Knobs, Outcomes],
         labels: NDArray[np.bool_],
         test: Mapping[Knobs, Outcomes],
-    ) -> Reading:
+    ) -> Decided:
         """Choose the knobs on the fit trials and return the fractions of the others."""
         fractions = {knobs: outcomes.fractions() for knobs, outcomes in fit.items()}
         samples = {knobs: outcomes.samples for knobs, outcomes in test.items()}
         chosen = fit_knobs(fractions, samples, labels)
         accuracy = np.mean((fractions[chosen] > 0.5) == labels) if len(labels) else float("nan")
-        return Reading(test[chosen].fractions(), float(accuracy), fitted=dict(chosen))
+        return Decided(test[chosen].fractions(), float(accuracy), fitted=dict(chosen))
 
 
 def log_likelihood(fractions: NDArray[Any], samples: int, outcomes: NDArray[Any]) -> float:
@@ -218,7 +247,7 @@ def fit_knobs(
     samples
         Simulations per trial, for each value.
     outcomes
-        Contact or not (n,), of fit trials alone. Without any, the middle value is returned.
+        Contact or not (n,), of fit trials only. Without any, the middle value is returned.
     """
     values = sorted(fractions)
     if len(outcomes) == 0:
@@ -227,21 +256,21 @@ def fit_knobs(
     return max(values, key=lambda k: log_likelihood(fractions[k], samples[k], outcomes))
 
 
-# Reader of features: L2 logistic regression, exact or as released.
+# Decision on features: L2 logistic regression, exact or as released.
 
 
 @dataclass(frozen=True)
-class LogisticReader:
+class LogisticDecision:
     """Logistic regression on standardised features of all frames (`physion.readout.logistic`)."""
 
-    config: ReadoutConfig = field(default_factory=ReadoutConfig)
+    settings: LogisticSettings = field(default_factory=LogisticSettings)
     input: Literal["features"] = "features"
     labels: Literal["simulated", "recorded"] = "simulated"
 
-    def read(self, fit: Sequence[Any], labels: NDArray[np.bool_], test: Sequence[Any]) -> Reading:
+    def decide(self, fit: Sequence[Any], labels: NDArray[np.bool_], test: Sequence[Any]) -> Decided:
         """Fit on the parts ``fit`` and return the probabilities of the parts ``test``."""
-        fitted = fit_readout(fit, labels, test, self.config)
-        return Reading(
+        fitted = fit_readout(fit, labels, test, self.settings)
+        return Decided(
             fitted.probability,
             fitted.train_accuracy,
             c=fitted.c,
@@ -250,6 +279,6 @@ class LogisticReader:
         )
 
 
-def released_reader(config: ReadoutConfig) -> LogisticReader:
+def released_decision(settings: LogisticSettings) -> LogisticDecision:
     """Return the readout as it was released: lbfgs stopped at 200 iterations, labels balanced."""
-    return LogisticReader(replace(config, released=True, balance=True))
+    return LogisticDecision(replace(settings, released=True, balance=True))

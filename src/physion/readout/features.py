@@ -1,7 +1,8 @@
-"""Features of trials, computed by a model and stored in one file per trial.
+"""Features and imagined futures of trials: computed once, and stored in one file per trial.
 
 A file is named by a hash of the digest of the model, asked when the file is written, and of the key
-of the clip, so that features of other weights, other movies or another `Spec` are never read.
+of the clip, so that features of other weights, other movies or another `Spec` are never read. The
+files are a cache: one that is damaged is deleted and made again.
 """
 
 from __future__ import annotations
@@ -12,10 +13,8 @@ import itertools
 import json
 import math
 import mmap
-import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 
 from physion.clips.batch import Batch, Rollout
 from physion.clips.source import ObservedSource, Part
+from physion.compute.local import SerialExecutor
 from physion.compute.tasks import Executor, Progress, tracked
 from physion.core.errors import BadInputError, PhysionError
 from physion.core.files import write_atomic
@@ -38,13 +38,8 @@ from physion.readout.model_calls import (
     to_array,
 )
 
-# Files of features: raw arrays that can be memory-mapped, and a checksum over every byte.
-#
-# A file is a safetensors file: the length of the header (8 bytes, little-endian), a JSON header,
-# and the arrays one after the other. The header's ``__metadata__`` holds what the features depend
-# on and ``sha256``, the SHA-256 of the header without this entry and of all arrays. A reader
-# writes the header anew from what it says and compares the bytes, so that no bit of a file can
-# change unnoticed.
+# Files: safetensors, whose raw arrays can be memory-mapped. They are the length of the header (8
+# bytes, little-endian), a JSON header, and the arrays one after the other.
 
 _DTYPES: dict[str, np.dtype[Any]] = {
     "F32": np.dtype("<f4"),
@@ -56,11 +51,6 @@ _ALIGNMENT = 64
 """The arrays start at a multiple of this many bytes."""
 _LENGTH = 8
 """Bytes of the length of the header."""
-_CHECKSUM = "sha256"
-
-
-class _DamagedError(Exception):
-    """Error for bytes that are not those of a file of features."""
 
 
 class FeatureArrays(Protocol):
@@ -94,76 +84,62 @@ class ArraysInMemory:
 
 @dataclass(frozen=True)
 class FeatureFile:
-    """File of features whose checksum was verified when it was opened.
+    """File with arrays of one trial.
 
-    - ``shapes``, ``offsets``: of the arrays, by name; offsets in bytes from the start.
-    - ``stamp``: inode, size and time of change. A file that no longer has it is not read.
+    ``dtypes``, ``shapes`` and ``offsets`` are of the arrays, by name; offsets in bytes.
     """
 
     path: Path
     dtypes: Mapping[str, np.dtype[Any]]
     shapes: Mapping[str, tuple[int, ...]]
     offsets: Mapping[str, int]
-    stamp: tuple[int, int, int]
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
         """Return values ``start`` to ``stop`` of the flattened array ``name``.
 
         The file is mapped for the time of the call only: Python keeps a file descriptor for every
-        map, and thousands of trials are read at a time.
-
-        Raises
-        ------
-        BadInputError
-            If the file was deleted or changed since it was opened.
+        map, and thousands of trials are read at a time. Raises `BadInputError` if it was deleted
+        or cut since it was opened.
         """
         dtype, size = self.dtypes[name], math.prod(self.shapes[name])
         stop = size if stop is None else min(stop, size)
         if stop <= start:
             return np.zeros(0, dtype)
+        offset = self.offsets[name] + start * dtype.itemsize
         try:
-            with _mapped(self.path) as (memory, stamp):
-                if stamp == self.stamp:
-                    offset = self.offsets[name] + start * dtype.itemsize
-                    return np.frombuffer(memory, dtype, stop - start, offset).copy()
-        except OSError as error:
+            with (
+                self.path.open("rb") as file,
+                mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as memory,
+            ):
+                return np.frombuffer(memory, dtype, stop - start, offset).copy()
+        except (OSError, ValueError) as error:
             raise BadInputError(
-                f"features {self.path} cannot be read ({error.strerror}); run again"
+                f"features {self.path} cannot be read ({error}); run again"
             ) from None
-        raise BadInputError(f"features {self.path} changed while they were in use; run again")
 
 
-def write_features(
-    path: Path, identity: Mapping[str, str], arrays: Mapping[str, NDArray[Any]]
-) -> None:
-    """Write a file of features such that no reader sees a part of it.
+def write_features(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays (float32, float64 or bool) to a file such that no reader sees a part of it.
 
-    Parameters
-    ----------
-    path
-        File to write or replace; its folder is made.
-    identity
-        What the features depend on: digest of the model, key of the clip, ...
-    arrays
-        float32, float64 or bool.
-
-    Raises
-    ------
-    BadInputError
-        If the file cannot be written, for example because the disk is full.
+    Raises `BadInputError` if it cannot be written, for example because the disk is full.
     """
-    values = [
-        np.ascontiguousarray(value, _DTYPES[_NAMES[value.dtype]]) for value in arrays.values()
-    ]
-    shapes = {
-        name: (_NAMES[value.dtype], value.shape) for name, value in zip(arrays, values, strict=True)
+    values = {
+        name: np.ascontiguousarray(value, _DTYPES[_NAMES[value.dtype]])
+        for name, value in arrays.items()
     }
-    data = b"".join(value.tobytes() for value in values)
-    checksum = _checksum(_header(identity, shapes, None), data)
-    head = _header(identity, shapes, checksum)
+    content: dict[str, Any] = {}
+    start = 0
+    for name, value in values.items():
+        stop = start + value.nbytes
+        dtype = _NAMES[value.dtype]
+        content[name] = {"dtype": dtype, "shape": list(value.shape), "data_offsets": [start, stop]}
+        start = stop
+    head = json.dumps(content, separators=(",", ":")).encode()
+    head += b" " * (-(_LENGTH + len(head)) % _ALIGNMENT)
+    data = [len(head).to_bytes(_LENGTH, "little"), head, *(v.tobytes() for v in values.values())]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, len(head).to_bytes(_LENGTH, "little") + head + data)
+        write_atomic(path, b"".join(data))
     except OSError as error:
         raise BadInputError(
             f"features cannot be stored in {path.parent} ({error.strerror}); free space there, or "
@@ -171,91 +147,29 @@ def write_features(
         ) from error
 
 
-def open_features(path: Path, identity: Mapping[str, str]) -> FeatureFile | None:
-    """Return the file at ``path`` after its checksum was verified.
-
-    Returns None if there is no such file, if a byte of it is damaged, or if its features depend on
-    something else than ``identity``: they must be computed again.
-    """
+def open_features(path: Path) -> FeatureFile | None:
+    """Return the file at ``path``; None if there is none, or if it is damaged, and deleted."""
     try:
-        with _mapped(path) as (memory, stamp):
-            return _verify(path, memory, stamp, identity)
-    except (OSError, _DamagedError):
+        with path.open("rb") as file:
+            length = int.from_bytes(file.read(_LENGTH), "little")
+            size = file.seek(0, 2)
+            file.seek(_LENGTH)
+            content = json.loads(file.read(min(length, size)))
+        shapes = {name: tuple(item["shape"]) for name, item in content.items()}
+        dtypes = {name: _DTYPES[item["dtype"]] for name, item in content.items()}
+        first = _LENGTH + length
+        offsets = {name: first + item["data_offsets"][0] for name, item in content.items()}
+        ends = [first + item["data_offsets"][1] for item in content.values()]
+        sizes = [math.prod(shapes[name]) * dtypes[name].itemsize for name in content]
+        starts = [end - bytes_of for end, bytes_of in zip(ends, sizes, strict=True)]
+        if starts != list(offsets.values()) or max(ends) != size:
+            raise ValueError("the arrays do not fill the file")
+    except OSError:
         return None
-
-
-def _verify(
-    path: Path, memory: mmap.mmap, stamp: tuple[int, int, int], identity: Mapping[str, str]
-) -> FeatureFile:
-    length = int.from_bytes(memory[:_LENGTH], "little")
-    if length > len(memory) - _LENGTH:
-        raise _DamagedError("header")
-    head, start = memory[_LENGTH : _LENGTH + length], _LENGTH + length
-    stored, shapes = _parse(head)
-    checksum = stored.pop(_CHECKSUM, None)
-    if stored != dict(identity) or head != _header(stored, shapes, checksum):
-        raise _DamagedError("header")
-    offsets = {}
-    for name, (dtype, shape) in shapes.items():
-        offsets[name] = start
-        start += math.prod(shape) * _DTYPES[dtype].itemsize
-    if start != len(memory):
-        raise _DamagedError("size")
-    with memoryview(memory) as view, view[_LENGTH + length :] as data:
-        if _checksum(_header(stored, shapes, None), data) != checksum:
-            raise _DamagedError("checksum")
-    dtypes = {name: _DTYPES[dtype] for name, (dtype, _) in shapes.items()}
-    return FeatureFile(path, dtypes, {n: s for n, (_, s) in shapes.items()}, offsets, stamp)
-
-
-def _parse(head: bytes) -> tuple[dict[str, Any], dict[str, tuple[str, tuple[int, ...]]]]:
-    """Return the metadata, and the data type and shape of every array."""
-    try:
-        content = json.loads(head)
-        metadata = content.pop("__metadata__")
-        shapes = {name: (item["dtype"], tuple(item["shape"])) for name, item in content.items()}
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        raise _DamagedError("header") from None
-    if not isinstance(metadata, dict):
-        raise _DamagedError("metadata")
-    for dtype, shape in shapes.values():
-        if dtype not in _DTYPES or not all(type(size) is int and size >= 0 for size in shape):
-            raise _DamagedError("shape")
-    return metadata, shapes
-
-
-def _header(
-    identity: Mapping[str, str],
-    shapes: Mapping[str, tuple[str, tuple[int, ...]]],
-    checksum: str | None,
-) -> bytes:
-    """Return the JSON header, padded with spaces so that the arrays are aligned."""
-    metadata = dict(identity) if checksum is None else {**identity, _CHECKSUM: checksum}
-    content: dict[str, Any] = {"__metadata__": metadata}
-    start = 0
-    for name, (dtype, shape) in shapes.items():
-        stop = start + math.prod(shape) * _DTYPES[dtype].itemsize
-        content[name] = {"dtype": dtype, "shape": list(shape), "data_offsets": [start, stop]}
-        start = stop
-    text = json.dumps(content, separators=(",", ":")).encode()
-    return text + b" " * (-(_LENGTH + len(text)) % _ALIGNMENT)
-
-
-def _checksum(head: bytes, data: bytes | memoryview) -> str:
-    digest = hashlib.sha256(head)
-    digest.update(data)
-    return digest.hexdigest()
-
-
-@contextmanager
-def _mapped(path: Path) -> Iterator[tuple[mmap.mmap, tuple[int, int, int]]]:
-    """Map a file into memory for reading, and tell its stamp; an empty file is an `OSError`."""
-    with path.open("rb") as file:
-        status = os.fstat(file.fileno())
-        if status.st_size == 0:
-            raise OSError(0, "empty file", str(path))
-        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as memory:
-            yield memory, (status.st_ino, status.st_size, status.st_mtime_ns)
+        path.unlink(missing_ok=True)
+        return None
+    return FeatureFile(path, dtypes, shapes, offsets)
 
 
 # Features of trials that are read from their files piece by piece.
@@ -396,20 +310,10 @@ def _split(arrays: Mapping[str, NDArray[Any]], clips: int) -> list[Arrays]:
     return [{name: value[row].copy() for name, value in arrays.items()} for row in range(clips)]
 
 
-# Imagined outcomes of trials, made in processes, and stored.
-#
-# Outcomes are small: for every trial, value of the knobs and sample, whether agent and patient
-# touch or how close they come. They are kept as one JSON file for a trial and value of the knobs,
-# under a digest of everything that decides them.
-
-Cell = tuple[list[bool] | None, list[float] | None]
-"""Contacts and gaps of the samples of one trial."""
+# Imagined futures of trials.
 
 Knobs = tuple[tuple[str, float], ...]
 """Values of the knobs of a model, sorted by name."""
-
-_VERSION = 1
-"""To be raised with every change of the stored files."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -432,7 +336,7 @@ class Outcomes:
         """Return for every trial and sample (n, S) whether agent and patient touch."""
         if self.contact is not None:
             return self.contact
-        assert self.gap is not None, "checked when they were made"
+        assert self.gap is not None, "one of them is given"
         return self.gap <= 0
 
     def fractions(self) -> NDArray[np.float64]:
@@ -441,118 +345,36 @@ class Outcomes:
 
 
 @dataclass(frozen=True, eq=False)
-class _Request:
-    """Trials at one value of the knobs: what a worker process needs.
+class Imagined:
+    """What a model imagined of n trials at one value of the knobs."""
 
-    ``files`` comes before ``model``, whose class may stand in one of them.
-    """
+    model: str
+    rows: Mapping[str, FeatureArrays]
 
-    files: LoadedFiles
-    model: Any
-    context: Batch
-    samples: int
-    seed: int
-    knobs: Knobs
+    @property
+    def trials(self) -> tuple[str, ...]:
+        """Names of the trials that could be imagined."""
+        return tuple(self.rows)
 
-
-class RolloutStore:
-    """Maker and store of imagined outcomes.
-
-    Parameters
-    ----------
-    folder
-        Where outcomes are kept; None keeps nothing.
-    executor
-        Runs the model, some trials and one value of the knobs a task. A network that is not
-        with ``trials_together`` uses `FeatureStore.imagined` instead.
-    """
-
-    def __init__(self, folder: Path | None, executor: Executor) -> None:
-        self._folder, self._executor = folder, executor
-        self.problems: dict[str, str] = {}
-        """Reasons of trials that could not be imagined, by name."""
-
-    def outcomes(
-        self,
-        model: Any,
-        source: ObservedSource,
-        trials: Sequence[str],
-        *,
-        samples: int,
-        seed: int,
-        knobs: Mapping[str, Sequence[float]],
-        together: int = 1,
-        progress: Progress | None = None,
-    ) -> dict[Knobs, dict[str, Cell]]:
-        """Return contacts and gaps of every trial at all values of the knobs.
-
-        The model is given ``together`` trials at a time. Trials that fail are left out; `problems`
-        names the reasons.
-        """
-        digest = model.digest()
-        found: dict[Knobs, dict[str, Any]] = {value: {} for value in all_knobs(knobs)}
-        missing: dict[Knobs, dict[str, Path | None]] = {value: {} for value in found}
-        for trial in dict.fromkeys(trials):
-            try:
-                key = source.key(trial, "context")
-            except BadInputError as error:
-                self.problems[trial] = str(error)
-                continue
-            for value in found:
-                path = self._path([digest, key, trial, samples, seed, value])
-                stored = _read(path, samples)
-                if stored is None:
-                    missing[value][trial] = path
-                else:
-                    found[value][trial] = stored
-        total = sum(len(cells) for cells in missing.values())
-        results = self._imagine(model, source, missing, samples, seed, together)
-        for done, (trial, value, outcome) in enumerate(results, start=1):
-            if isinstance(outcome, str):
-                self.problems[trial] = outcome
-            else:
-                _write(missing[value][trial], outcome)
-                found[value][trial] = outcome
-            if progress is not None:
-                progress("rollouts", done, total)
-        return found
-
-    def _imagine(
-        self,
-        model: Any,
-        source: ObservedSource,
-        missing: Mapping[Knobs, Mapping[str, Path | None]],
-        samples: int,
-        seed: int,
-        together: int,
-    ) -> Iterator[tuple[str, Knobs, Cell | str]]:
-        """Yield trial, value of the knobs, and the outcomes or why there are none."""
-        read: dict[tuple[str, ...], list[tuple[tuple[str, ...], Batch | str]]] = {}
-        requests: dict[str, _Request] = {}
-        for value, paths in missing.items():
-            trials = list(paths)
-            for row in range(0, len(trials), together):
-                group = tuple(trials[row : row + together])
-                if group not in read:
-                    read[group] = list(_contexts(source, group))
-                for part, context in read[group]:
-                    if isinstance(context, str):
-                        yield from ((trial, value, context) for trial in part)
-                        continue
-                    name = " ".join([part[0], *(f"{knob}={level:g}" for knob, level in value)])
-                    requests[name] = _Request(LoadedFiles(), model, context, samples, seed, value)
-        for outcome in self._executor.map(_run, requests):
-            request = requests[outcome.key]
-            for row, trial in enumerate(request.context.trials):
-                made = outcome.error if outcome.error else outcome.value[row]
-                yield trial, request.knobs, made
-
-    def _path(self, parts: Sequence[Any]) -> Path | None:
-        if self._folder is None:
+    def features(self) -> StoredFeatures | None:
+        """Return features (n, S * future, D), one future after the other, if the model gave any."""
+        if any(FEATURES not in row.shapes for row in self.rows.values()):
             return None
-        text = json.dumps([_VERSION, *parts])
-        name = hashlib.sha256(text.encode()).hexdigest()
-        return self._folder / name[:2] / f"{name}.json"
+        return StoredFeatures(self.trials, list(self.rows.values()))
+
+    def outcomes(self, trials: Sequence[str] | None = None) -> Outcomes:
+        """Return gaps and contacts of ``trials``, in order, or of all.
+
+        Raises `BadInputError` if the model gave neither.
+        """
+        rows = [self.rows[trial] for trial in (self.trials if trials is None else trials)]
+        if not rows:
+            return Outcomes(np.zeros((0, 1), np.bool_), np.zeros((0, 1), np.float64))
+        names = set.intersection(*(set(row.shapes) for row in rows))
+        gap, contact = (_stack(rows, name) if name in names else None for name in (GAP, CONTACT))
+        if gap is None and contact is None:
+            raise BadInputError(f"model {self.model!r}: imagine gave neither gap nor contact")
+        return Outcomes(contact, gap)
 
 
 def all_knobs(knobs: Mapping[str, Sequence[float]]) -> list[Knobs]:
@@ -562,105 +384,8 @@ def all_knobs(knobs: Mapping[str, Sequence[float]]) -> list[Knobs]:
     return [tuple(zip(names, chosen, strict=True)) for chosen in itertools.product(*values)]
 
 
-def stack_outcomes(
-    imagined: Mapping[Knobs, Mapping[str, Any]], trials: Sequence[str]
-) -> dict[Knobs, Outcomes]:
-    """Return the outcomes of ``trials``, in order, for every value of the knobs."""
-    stacked = {}
-    shape = (len(trials), -1) if trials else (0, 1)
-    for value, by_trial in imagined.items():
-        contacts = [by_trial[trial][0] for trial in trials]
-        gaps = [by_trial[trial][1] for trial in trials]
-        stacked[value] = Outcomes(
-            None
-            if any(c is None for c in contacts)
-            else np.array(contacts, np.bool_).reshape(shape),
-            None if any(g is None for g in gaps) else np.array(gaps, np.float64).reshape(shape),
-        )
-    return stacked
-
-
-def _contexts(
-    source: ObservedSource, trials: tuple[str, ...]
-) -> Iterator[tuple[tuple[str, ...], Batch | str]]:
-    """Yield the context of trials, or why a trial has none, with their names.
-
-    If one trial has none the others are read one by one.
-    """
-    try:
-        yield trials, source.context(trials)
-    except BadInputError as error:
-        if len(trials) == 1:
-            yield trials, str(error)
-        else:
-            for trial in trials:
-                yield from _contexts(source, (trial,))
-
-
-def _run(request: _Request) -> list[Cell | str]:
-    """Return contacts and gaps of every trial, or why it has none.
-
-    If trials cannot be imagined together they are imagined one by one.
-    """
-    context = request.context
-    try:
-        arrays = imagine_clips(
-            request.model, context, request.samples, request.seed, dict(request.knobs)
-        )
-    except PhysionError as error:
-        if len(context) == 1:
-            return [" ".join(str(error).split())]
-        alone = [
-            dataclasses.replace(request, context=context.select([i])) for i in range(len(context))
-        ]
-        return [cell for one in alone for cell in _run(one)]
-    return [_cell(request.model, row) for row in arrays]
-
-
-def _cell(model: Any, arrays: Arrays) -> Cell:
-    if CONTACT not in arrays and GAP not in arrays:
-        name = model.provenance().model
-        raise BadInputError(f"model {name!r}: imagine gave neither gap nor contact")
-    contact, gap = arrays.get(CONTACT), arrays.get(GAP)
-    return (
-        None if contact is None else [bool(value) for value in contact],
-        None if gap is None else [float(value) for value in gap],
-    )
-
-
-def _read(path: Path | None, samples: int) -> Cell | None:
-    """Return stored outcomes; None if there are none, or the file is damaged."""
-    if path is None or not path.is_file():
-        return None
-    try:
-        content = json.loads(path.read_bytes())
-        checksum, values = content["sha256"], content["outcomes"]
-        contact, gap = values["contact"], values["gap"]
-    except (ValueError, KeyError, TypeError):
-        return None
-    if checksum != _rollouts_checksum(values) or samples not in (
-        len(contact or ()),
-        len(gap or ()),
-    ):
-        return None
-    return contact, gap
-
-
-def _write(path: Path | None, outcome: Cell) -> None:
-    if path is None:
-        return
-    values = {"contact": outcome[0], "gap": outcome[1]}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    content = {"outcomes": values, "sha256": _rollouts_checksum(values)}
-    write_atomic(path, json.dumps(content).encode())
-
-
-def _rollouts_checksum(values: Any) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
-
-
-_FEATURE_STORE_VERSION = "1"
-"""To be increased with every change that can alter the features of a clip and model."""
+_VERSION = "2"
+"""To be increased with every change that can alter what is stored of a clip and model."""
 _WRITE_TRIALS, _WRITE_BYTES = 32, 2**26
 """Trials, or bytes, after which features are written. The digest is asked before each writing,
 which for a large network takes as long as encoding some clips."""
@@ -680,7 +405,7 @@ class _Work:
 
 
 class FeatureStore:
-    """Store of the features that models compute of trials.
+    """Store of what models compute of trials: features, and imagined futures.
 
     Parameters
     ----------
@@ -688,12 +413,19 @@ class FeatureStore:
         Folder of the files; None keeps features in memory.
     batch
         Clips that a model receives at a time, the *encoder batch*.
+    executor
+        Runs models whose futures are imagined in processes.
     """
 
-    def __init__(self, folder: Path | None, *, batch: int = 4) -> None:
+    def __init__(
+        self, folder: Path | None, *, batch: int = 4, executor: Executor | None = None
+    ) -> None:
         if batch < 1:
             raise BadInputError(f"the encoder batch must be at least 1, not {batch}")
         self._folder, self._batch = folder, batch
+        self._executor: Executor = executor if executor is not None else SerialExecutor()
+        self.problems: dict[str, str] = {}
+        """Reasons of trials that could not be imagined in processes, by name."""
 
     def encoded(
         self,
@@ -708,7 +440,7 @@ class FeatureStore:
         Parameters
         ----------
         model
-            Model that encodes; see `physion.models.interface.Model`.
+            Model that encodes; see `physion.models.interface`.
         source
             Source of the clips. Parts other than ``context`` need a `WholeSource`.
         trials
@@ -731,12 +463,10 @@ class FeatureStore:
             raise BadInputError(f"a source of the observed part has no part {part!r} of a clip")
 
         def compute(group: tuple[str, ...]) -> list[Arrays]:
-            batch = _feature_store_read(read, group)
-            return encode_clips(model, batch)
+            return encode_clips(model, _read_clips(read, group))
 
-        work = _Work(
-            "features", lambda: ask(model, "encoder_digest")(), compute, model_name(model), part
-        )
+        digest = ask(model, "encoder_digest")
+        work = _Work("features", digest, compute, model_name(model), part)
         rows = self._rows(work, source, trials, progress)
         return StoredFeatures(trials, [rows[trial] for trial in trials])
 
@@ -744,62 +474,66 @@ class FeatureStore:
         self,
         model: Model,
         source: ObservedSource,
-        context: StoredFeatures | None,
         trials: Sequence[str],
         *,
         samples: int,
         seed: int,
-        knobs: Mapping[str, float],
+        knobs: Mapping[str, Sequence[float]],
+        context: StoredFeatures | None = None,
+        together: int = 0,
         progress: Progress | None = None,
-    ) -> tuple[StoredFeatures | None, Outcomes]:
-        """Return what ``model.imagine`` gives for the context of ``trials``.
+    ) -> dict[Knobs, Imagined]:
+        """Return what ``model.imagine`` gives for the observed part of ``trials``, at all knobs.
 
         Parameters
         ----------
         model
-            Model that imagines; see `physion.models.interface.Model`.
+            Model that imagines; see `physion.models.interface`.
         source
             Source of the context.
-        context
-            Features of the context of at least ``trials``, for a model that also encodes.
         trials
-            Names, in the order of the result.
+            Names of trials.
         samples, seed, knobs
             Number of futures S, seed and settings for ``model.imagine``.
+        context
+            Features of the context of at least ``trials``, for a model that also encodes.
+        together
+            Trials that a process of the executor imagines at a time. With 0 this process imagines
+            them, an encoder batch at a time.
         progress
-            As `encoded`.
-
-        Returns
-        -------
-        tuple
-            Features (n, S * future, D), the futures of a trial one after the other, or None; and
-            the outcomes.
+            Learns how many groups of trials are done.
 
         Raises
         ------
         BadInputError, OutOfMemoryError
-            As `encoded`.
+            As `encoded`. In processes, a trial that fails is left out instead; `problems` names the
+            reason.
         """
         place = {trial: row for row, trial in enumerate(context.trials if context else ())}
+        found: dict[Knobs, Imagined] = {}
+        works: dict[Knobs, _Work] = {}
+        for value in all_knobs(knobs):
 
-        def compute(group: tuple[str, ...]) -> list[Arrays]:
-            batch = _feature_store_read(source.context, group)
-            if context is not None:
-                features = context.select([place[trial] for trial in group]).array()
-                batch = dataclasses.replace(batch, features=features)
-            return imagine_clips(model, batch, samples, seed, knobs)
+            def compute(group: tuple[str, ...], value: Knobs = value) -> list[Arrays]:
+                batch = _read_clips(source.context, group)
+                if context is not None:
+                    features = context.select([place[trial] for trial in group]).array()
+                    batch = dataclasses.replace(batch, features=features)
+                return imagine_clips(model, batch, samples, seed, dict(value))
 
-        values = {name: float(knobs[name]) for name in sorted(knobs)}
-        settings = {"samples": samples, "seed": seed, "knobs": values}
-        work = _Work(
-            "imagined", model.digest, compute, model_name(model), IMAGINED, json.dumps(settings)
-        )
-        by_trial = self._rows(work, source, trials, progress)
-        rows = [by_trial[trial] for trial in trials]
-        names = set(rows[0].shapes) if rows else set()
-        gap, contact = (_stack(rows, name) if name in names else None for name in (GAP, CONTACT))
-        features = StoredFeatures(trials, rows) if FEATURES in names else None
-        return features, Outcomes(contact, gap)
+            settings = json.dumps({"samples": samples, "seed": seed, "knobs": dict(value)})
+            works[value] = _Work(
+                IMAGINED, model.digest, compute, model_name(model), IMAGINED, settings
+            )
+        if together:
+            request = _Request(LoadedFiles(), model, None, samples, seed, ())
+            by_value = self._rows_of_processes(works, request, source, trials, together, progress)
+        else:
+            by_value = {v: self._rows(w, source, trials, progress) for v, w in works.items()}
+        for value, rows in by_value.items():
+            kept = {trial: rows[trial] for trial in trials if trial in rows}
+            found[value] = Imagined(model_name(model), kept)
+        return found
 
     def _rows(
         self,
@@ -811,16 +545,12 @@ class FeatureStore:
         """Return the arrays of every trial, read where they are stored, and computed elsewhere."""
         digest = _ask_digest(work)
         part: Any = "context" if work.part == IMAGINED else work.part
-        identities = {
-            trial: _identity(work, digest, source.key(trial, part), trial)
+        paths = {
+            trial: self._path(work, digest, source.key(trial, part), trial)
             for trial in dict.fromkeys(trials)
         }
-        rows: dict[str, FeatureArrays] = {}
-        for trial, identity in identities.items():
-            stored = self._open(identity)
-            if stored is not None:
-                rows[trial] = stored
-        missing = [trial for trial in identities if trial not in rows]
+        rows = _stored(paths)
+        missing = [trial for trial in paths if trial not in rows]
         for computed in self._compute(work, missing, progress):
             if _ask_digest(work) != digest:
                 raise BadInputError(
@@ -828,7 +558,7 @@ class FeatureStore:
                     "its methods must leave weights and settings as they are"
                 )
             for trial, arrays in computed.items():
-                rows[trial] = self._write(identities[trial], arrays)
+                rows[trial] = _write(paths[trial], arrays)
         return rows
 
     def _compute(
@@ -846,29 +576,128 @@ class FeatureStore:
         if pending:
             yield pending
 
-    def _path(self, identity: Mapping[str, str]) -> Path | None:
+    def _rows_of_processes(
+        self,
+        works: Mapping[Knobs, _Work],
+        request: _Request,
+        source: ObservedSource,
+        trials: Sequence[str],
+        together: int,
+        progress: Progress | None,
+    ) -> dict[Knobs, dict[str, FeatureArrays]]:
+        """Return the arrays of every trial at all knobs, computed by the executor."""
+        digest = _ask_digest(next(iter(works.values())))
+        paths: dict[Knobs, dict[str, Path | None]] = {value: {} for value in works}
+        for trial in dict.fromkeys(trials):
+            try:
+                key = source.key(trial, "context")
+            except BadInputError as error:
+                self.problems[trial] = str(error)
+                continue
+            for value, work in works.items():
+                paths[value][trial] = self._path(work, digest, key, trial)
+        found = {value: _stored(of_value) for value, of_value in paths.items()}
+        missing = {v: [t for t in paths[v] if t not in found[v]] for v in works}
+        requests: dict[str, _Request] = {}
+        read: dict[tuple[str, ...], list[Batch]] = {}
+        for value, left in missing.items():
+            for group in (tuple(left[i : i + together]) for i in range(0, len(left), together)):
+                if group not in read:
+                    read[group] = list(self._contexts(source, group))
+                for context in read[group]:
+                    knobs = " ".join(f"{knob}={level:g}" for knob, level in value)
+                    name = f"{context.trials[0]} {knobs}".strip()
+                    requests[name] = dataclasses.replace(request, context=context, knobs=value)
+        done, total = 0, sum(len(asked.trials) for asked in requests.values())
+        for outcome in self._executor.map(_imagine_request, requests):
+            asked = requests[outcome.key]
+            for row, trial in enumerate(asked.trials):
+                made = outcome.error if outcome.error else outcome.value[row]
+                if isinstance(made, str):
+                    self.problems[trial] = made
+                else:
+                    found[asked.knobs][trial] = _write(paths[asked.knobs][trial], made)
+                done += 1
+                if progress is not None:
+                    progress("rollouts", done, total)
+        return found
+
+    def _contexts(self, source: ObservedSource, trials: tuple[str, ...]) -> Iterator[Batch]:
+        """Yield the observed part of trials; if one has none, the others are read one by one."""
+        try:
+            yield source.context(trials)
+        except BadInputError as error:
+            if len(trials) == 1:
+                self.problems[trials[0]] = str(error)
+            else:
+                for trial in trials:
+                    yield from self._contexts(source, (trial,))
+
+    def _path(self, work: _Work, digest: str, key: str, trial: str) -> Path | None:
+        """Return the file of a trial, named by all that its arrays depend on."""
         if self._folder is None:
             return None
+        identity = [_VERSION, digest, key, trial, work.part, work.settings]
         name = hashlib.sha256(json.dumps(identity).encode()).hexdigest()
-        folder = self._folder / identity["part"] / identity["digest"][:16]
-        return folder / name[:2] / f"{name}.safetensors"
-
-    def _open(self, identity: Mapping[str, str]) -> FeatureArrays | None:
-        path = self._path(identity)
-        return None if path is None else open_features(path, identity)
-
-    def _write(self, identity: Mapping[str, str], arrays: Arrays) -> FeatureArrays:
-        path = self._path(identity)
-        if path is None:
-            return ArraysInMemory(arrays)
-        write_features(path, identity, arrays)
-        stored = open_features(path, identity)
-        if stored is None:
-            raise BadInputError(f"features {path} differ from what was written; check the disk")
-        return stored
+        return self._folder / work.part / digest[:16] / name[:2] / f"{name}.safetensors"
 
 
-def _feature_store_read(read: Callable[[tuple[str, ...]], Batch], group: tuple[str, ...]) -> Batch:
+@dataclass(frozen=True, eq=False)
+class _Request:
+    """Trials at one value of the knobs: what a worker process needs.
+
+    ``files`` comes before ``model``, whose class may stand in one of them.
+    """
+
+    files: LoadedFiles
+    model: Any
+    context: Batch | None
+    samples: int
+    seed: int
+    knobs: Knobs
+
+    @property
+    def trials(self) -> tuple[str, ...]:
+        """Names of the trials."""
+        return self.context.trials if self.context is not None else ()
+
+
+def _imagine_request(request: _Request) -> list[Arrays | str]:
+    """Return the arrays of every trial, or why it has none.
+
+    If trials cannot be imagined together they are imagined one by one.
+    """
+    context = request.context
+    assert context is not None, "set for every group of trials"
+    try:
+        knobs = dict(request.knobs)
+        return [*imagine_clips(request.model, context, request.samples, request.seed, knobs)]
+    except PhysionError as error:
+        if len(context) == 1:
+            return [" ".join(str(error).split())]
+        singles = [
+            dataclasses.replace(request, context=context.select([i])) for i in range(len(context))
+        ]
+        return [made for single in singles for made in _imagine_request(single)]
+
+
+def _stored(paths: Mapping[str, Path | None]) -> dict[str, FeatureArrays]:
+    """Return what is stored, by trial."""
+    opened = ((trial, open_features(path)) for trial, path in paths.items() if path is not None)
+    return {trial: arrays for trial, arrays in opened if arrays is not None}
+
+
+def _write(path: Path | None, arrays: Arrays) -> FeatureArrays:
+    if path is None:
+        return ArraysInMemory(arrays)
+    write_features(path, arrays)
+    stored = open_features(path)
+    if stored is None:
+        raise BadInputError(f"features {path} differ from what was written; check the disk")
+    return stored
+
+
+def _read_clips(read: Callable[[tuple[str, ...]], Batch], group: tuple[str, ...]) -> Batch:
     """Return the clips of a group of trials; `OutOfMemoryError` if memory is used up."""
     try:
         return read(group)
@@ -878,18 +707,6 @@ def _feature_store_read(read: Callable[[tuple[str, ...]], Batch], group: tuple[s
         raise OutOfMemoryError(
             f"reading {count} clips at a time ran out of memory; {advice}"
         ) from error
-
-
-def _identity(work: _Work, digest: str, key: str, trial: str) -> dict[str, str]:
-    """Return all that the arrays of a trial depend on."""
-    return {
-        "version": _FEATURE_STORE_VERSION,
-        "digest": digest,
-        "key": key,
-        "trial": trial,
-        "part": work.part,
-        "settings": work.settings,
-    }
 
 
 def _ask_digest(work: _Work) -> str:

@@ -1,19 +1,77 @@
-"""Folds of an evaluation: which trials train the dynamics, fit a readout, and are predicted."""
+"""Folds of an evaluation: which trials train the dynamics, fit a readout, and are predicted.
+
+A protocol says which scenarios train the dynamics that are tested on a scenario: *all*, *all-but*
+the tested one, or *only* the tested one.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum
 
 import pandas as pd
 
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.seeds import stable_hash
-from physion.training.protocols import Training, TrainingSet, set_name, training_sets
 
 TRAINING, READOUT, TESTING = "training", "readout", "testing"
 """Names of the splits in the index."""
 _COLUMNS = ["trial", "scenario", "split", "contact", "digest"]
+
+
+class Protocol(Enum):
+    """Training protocol; the value is its name in the study."""
+
+    ALL = "all"
+    ALL_BUT = "all-but"
+    ONLY = "only"
+
+    @classmethod
+    def named(cls, name: str) -> Protocol:
+        """Return the protocol called ``name``; raise `UnknownNameError` with the closest names."""
+        try:
+            return cls(name)
+        except ValueError:
+            raise UnknownNameError("training protocol", name, [p.value for p in cls]) from None
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingSet:
+    """Scenarios that train the dynamics (``trained``), and those tested with it (``tested``).
+
+    ``name`` is ``all``, ``no_<scenario>`` or ``<scenario>``.
+    """
+
+    name: str
+    trained: tuple[str, ...]
+    tested: tuple[str, ...]
+
+
+def set_name(protocol: Protocol, scenario: str) -> str:
+    """Return the name of the `TrainingSet` of a tested scenario."""
+    return {
+        Protocol.ALL: "all",
+        Protocol.ALL_BUT: f"no_{scenario}",
+        Protocol.ONLY: scenario,
+    }[protocol]
+
+
+def training_sets(protocol: Protocol, scenarios: Sequence[str]) -> list[TrainingSet]:
+    """Return the trainings that a protocol needs: one in all, or one per scenario."""
+    names = tuple(sorted(set(scenarios)))
+    if not names:
+        raise BadInputError("there is no scenario to train on")
+    if protocol is Protocol.ALL:
+        return [TrainingSet("all", names, names)]
+    if protocol is Protocol.ONLY:
+        return [TrainingSet(set_name(protocol, name), (name,), (name,)) for name in names]
+    if len(names) < 2:
+        raise BadInputError(f"all-but needs two scenarios or more; there is only {names[0]!r}")
+    return [
+        TrainingSet(set_name(protocol, name), tuple(n for n in names if n != name), (name,))
+        for name in names
+    ]
 
 
 @dataclass(frozen=True)
@@ -40,7 +98,7 @@ class Fold:
     number: int
 
 
-def plan_folds(index: pd.DataFrame, protocol: Training, folds: int, seed: int) -> list[Fold]:
+def plan_folds(index: pd.DataFrame, protocol: Protocol, folds: int, seed: int) -> list[Fold]:
     """Return the folds of an evaluation, in which every testing trial is predicted once.
 
     Readouts are fitted on the readout split; dynamics are trained on the training split, or on
@@ -92,10 +150,32 @@ def plan_folds(index: pd.DataFrame, protocol: Training, folds: int, seed: int) -
     return planned
 
 
-def select_scenario(names: Sequence[str], protocol: Training, scenario: str) -> list[int]:
-    """Return the positions in ``names``, of training sets, of the set of one tested scenario.
+def training_folds(index: pd.DataFrame, protocol: Protocol, folds: int, seed: int) -> list[Fold]:
+    """Return the folds that an evaluation of a dataset would train on.
 
-    All positions are returned if ``scenario`` is empty.
+    They are those of `plan_folds`. A dataset without testing trials has no scenario to predict: its
+    folds train on the split training, or readout where there is none.
+
+    Raises
+    ------
+    BadInputError
+        If there is nothing to train on.
+    """
+    if (index["split"] == TESTING).any():
+        return plan_folds(index, protocol, folds, seed)
+    pool = index[index["split"] == TRAINING]
+    if len(pool) == 0:
+        pool = index[index["split"] == READOUT]
+    if len(pool) == 0:
+        raise BadInputError(
+            f"the dataset has no trial in the splits {TRAINING}, {READOUT} or {TESTING} to train on"
+        )
+    sets = training_sets(protocol, sorted(set(pool["scenario"])))
+    return [Fold(s, _trials(pool, s.trained), (), -1) for s in sets]
+
+
+def select_scenario(folds: Sequence[Fold], protocol: Protocol, scenario: str) -> list[Fold]:
+    """Return the folds whose training set is for one tested scenario; all if it is empty.
 
     Raises
     ------
@@ -105,14 +185,15 @@ def select_scenario(names: Sequence[str], protocol: Training, scenario: str) -> 
         If the scenario has no training set.
     """
     if not scenario:
-        return list(range(len(names)))
-    if protocol is Training.ALL:
+        return list(folds)
+    if protocol is Protocol.ALL:
         raise BadInputError("a scenario needs the protocol all-but or only")
     wanted = set_name(protocol, scenario)
+    names = {fold.training.name for fold in folds}
     if wanted not in names:
         known = {name.removeprefix(set_name(protocol, "")) for name in names}
         raise UnknownNameError("scenario of the dataset", scenario, known)
-    return [position for position, name in enumerate(names) if name == wanted]
+    return [fold for fold in folds if fold.training.name == wanted]
 
 
 def assign_folds(table: pd.DataFrame, folds: int, seed: int) -> Mapping[str, int]:

@@ -235,8 +235,8 @@ _TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
-class ReadoutConfig:
-    """Settings of a readout."""
+class LogisticSettings:
+    """Settings of the logistic regression that reads features."""
 
     grid: tuple[float, ...] = C_GRID
     """Inverse penalties C among which cross-validation chooses, ascending."""
@@ -276,7 +276,7 @@ class FittedReadout:
 
 
 def fit_readout(
-    train: Parts, labels: Booleans, test: Parts, config: ReadoutConfig | None = None
+    train: Parts, labels: Booleans, test: Parts, settings: LogisticSettings | None = None
 ) -> FittedReadout:
     """Fit a readout on ``train`` and predict ``test``.
 
@@ -292,7 +292,7 @@ def fit_readout(
         cross-validation, and C is the middle of the grid.
     test
         Features of the m trials to predict, as ``train``.
-    config
+    settings
         Settings of the readout.
 
     Raises
@@ -300,12 +300,12 @@ def fit_readout(
     BadInputError
         If shapes do not match, or a feature is not finite.
     """
-    config = config if config is not None else ReadoutConfig()
+    settings = settings if settings is not None else LogisticSettings()
     labels = np.asarray(labels, bool)
     fit, tested = JoinedFeatures(train), JoinedFeatures(test, "test")
     _check(fit, labels, tested)
-    if config.balance:
-        kept = undersample(labels, config.seed)
+    if settings.balance:
+        kept = undersample(labels, settings.seed)
         fit, labels = fit.select(kept), labels[kept]
     hits, count = int(labels.sum()), len(labels)
     if hits in (0, count):
@@ -315,8 +315,8 @@ def fit_readout(
         return FittedReadout(
             np.full(tested.shape[0], p), accuracy, float("nan"), float("nan"), note
         )
-    solve = _solve_released if config.released else _solve_exactly
-    c, cv_accuracy, note, scores = solve(fit, labels, tested, config)
+    solve = _solve_released if settings.released else _solve_exactly
+    c, cv_accuracy, note, scores = solve(fit, labels, tested, settings)
     probability = 1 / (1 + np.exp(-np.clip(scores[count:], -700, 700)))
     accuracy = float(np.mean((scores[:count] > 0) == labels))
     return FittedReadout(probability, accuracy, cv_accuracy, c, note)
@@ -401,13 +401,13 @@ def _objective(design: Array, signs: Array, penalty: Array, x: Array) -> tuple[f
 
 
 def _solve_exactly(
-    train: JoinedFeatures, labels: Booleans, test: JoinedFeatures, config: ReadoutConfig
+    train: JoinedFeatures, labels: Booleans, test: JoinedFeatures, settings: LogisticSettings
 ) -> tuple[float, float, str, Array]:
     """Return the chosen C, its accuracy, a note, and the decision values (n + m,) of all trials.
 
     The Gram matrices of all folds and of the final fit are made in one pass over the features.
     """
-    splits, note = _splits(labels, config)
+    splits, note = _splits(labels, settings)
     count, everything = len(labels), np.arange(len(labels) + test.shape[0])
     final = Fit(everything[:count], everything[count:])
     *of_folds, (within, across) = grams(
@@ -415,17 +415,17 @@ def _solve_exactly(
     )
     scores = []
     for (fitted, _), (inner, outer) in zip(splits, of_folds, strict=True):
-        weights, intercepts = solve_path(inner, labels[fitted], config.grid)
+        weights, intercepts = solve_path(inner, labels[fitted], settings.grid)
         scores.append(outer @ weights + intercepts)
-    c, cv_accuracy = _choose(scores, splits, labels, config)
+    c, cv_accuracy = _choose(scores, splits, labels, settings)
     # The solution for one C starts from that for the next smaller one.
-    weights, intercepts = solve_path(within, labels, tuple(v for v in config.grid if v <= c))
+    weights, intercepts = solve_path(within, labels, tuple(v for v in settings.grid if v <= c))
     values: Array = np.concatenate([within, across]) @ weights[:, -1] + intercepts[-1]
     return c, cv_accuracy, note, values
 
 
 def _solve_released(
-    train: JoinedFeatures, labels: Booleans, test: JoinedFeatures, config: ReadoutConfig
+    train: JoinedFeatures, labels: Booleans, test: JoinedFeatures, settings: LogisticSettings
 ) -> tuple[float, float, str, Array]:
     """Return what `_solve_exactly` does, from scikit-learn's lbfgs with 200 iterations.
 
@@ -437,7 +437,7 @@ def _solve_released(
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
 
-    splits, note = _splits(labels, config)
+    splits, note = _splits(labels, settings)
     features = train.array()
 
     def fit(rows: Rows, c: float) -> Any:
@@ -448,30 +448,33 @@ def _solve_released(
             return model.fit(features[rows], labels[rows])
 
     scores = [
-        np.column_stack([fit(f, c).decision_function(features[held]) for c in config.grid])
+        np.column_stack([fit(f, c).decision_function(features[held]) for c in settings.grid])
         for f, held in splits
     ]
-    c, cv_accuracy = _choose(scores, splits, labels, config)
+    c, cv_accuracy = _choose(scores, splits, labels, settings)
     chosen = fit(np.arange(len(labels)), c)
     parts = [features, test.array()]
     values: Array = np.concatenate([chosen.decision_function(part) for part in parts if len(part)])
     return c, cv_accuracy, note, values
 
 
-def _splits(labels: Booleans, config: ReadoutConfig) -> tuple[list[tuple[Rows, Rows]], str]:
+def _splits(labels: Booleans, settings: LogisticSettings) -> tuple[list[tuple[Rows, Rows]], str]:
     """Return fitted and held-out rows of every fold of the cross-validation, and a note."""
-    folds = min(config.folds, int(labels.sum()), int((~labels).sum()))
-    if len(config.grid) == 1 or folds < 2:
-        return [], "" if len(config.grid) == 1 else "too few trials to choose C"
+    folds = min(settings.folds, int(labels.sum()), int((~labels).sum()))
+    if len(settings.grid) == 1 or folds < 2:
+        return [], "" if len(settings.grid) == 1 else "too few trials to choose C"
     from sklearn.model_selection import StratifiedKFold
 
-    splitter = StratifiedKFold(folds, shuffle=True, random_state=config.seed)
+    splitter = StratifiedKFold(folds, shuffle=True, random_state=settings.seed)
     splits = list(splitter.split(np.zeros(len(labels)), labels))
-    return splits, f"only {folds} folds" if folds < config.folds else ""
+    return splits, f"only {folds} folds" if folds < settings.folds else ""
 
 
 def _choose(
-    scores: list[Array], splits: list[tuple[Rows, Rows]], labels: Booleans, config: ReadoutConfig
+    scores: list[Array],
+    splits: list[tuple[Rows, Rows]],
+    labels: Booleans,
+    settings: LogisticSettings,
 ) -> tuple[float, float]:
     """Return the C with the highest mean accuracy over folds, and that accuracy.
 
@@ -479,14 +482,14 @@ def _choose(
     smallest C is taken; without folds, the middle of the grid.
     """
     if not splits:
-        return config.grid[len(config.grid) // 2], float("nan")
+        return settings.grid[len(settings.grid) // 2], float("nan")
     accuracies = [
         np.mean((values > 0) == labels[held][:, None], axis=0)
         for values, (_, held) in zip(scores, splits, strict=True)
     ]
     mean = np.mean(accuracies, axis=0)
     best = int(np.argmax(mean))
-    return config.grid[best], float(mean[best])
+    return settings.grid[best], float(mean[best])
 
 
 def _check(train: JoinedFeatures, labels: Booleans, test: JoinedFeatures) -> None:

@@ -28,14 +28,14 @@ from physion.trials.dataset import Dataset
 HORIZON = 105
 """Frames after frame 44 up to which errors are computed: to the usual end of a trial at rest."""
 COLUMNS = (
-    "Model",
-    "Scenario",
-    "Stimulus Name",
-    "Frames",
-    "Error",
-    "Constant Velocity Error",
+    "model",
+    "scenario",
+    "stimulus",
+    "frames",
+    "error",
+    "constant_velocity_error",
 )
-"""``Frames`` after frame 44; errors in metres."""
+"""``frames`` after frame 44; errors in metres."""
 _TRIALS = 16
 """Trials that a model imagines at a time."""
 
@@ -81,7 +81,7 @@ def rollout_error(
     Parameters
     ----------
     dataset
-        The dataset. The model gets the observed part alone.
+        The dataset. The model gets the observed part only.
     model
         Model with the method ``futures``; one future without noise is compared.
     trials
@@ -118,9 +118,9 @@ def rollout_error(
                     "check its weights"
                 )
             rows = motion_error(motion, particles, poses, model.spec.stride, horizon)
-            rows.insert(0, "Model", model_name(model))
-            rows.insert(1, "Scenario", str(scenarios[trial]))
-            rows.insert(2, "Stimulus Name", trial)
+            rows.insert(0, "model", model_name(model))
+            rows.insert(1, "scenario", str(scenarios[trial]))
+            rows.insert(2, "stimulus", trial)
             parts.append(rows)
         if progress is not None:
             progress("rollout errors", start + len(group), len(trials))
@@ -130,7 +130,7 @@ def rollout_error(
 def motion_error(
     motion: Motion, particles: SceneParticles, imagined: Poses, stride: int, horizon: int
 ) -> pd.DataFrame:
-    """Return the errors of one trial: ``Frames``, ``Error``, ``Constant Velocity Error``.
+    """Return the errors of one trial: ``frames``, ``error``, ``constant_velocity_error``.
 
     Objects that are not kinematic count in the frames in which they are present. Where the true
     trial ended because everything was at rest, or the imagined one is shorter, the last pose holds.
@@ -164,9 +164,9 @@ def motion_error(
     some = counted.any(axis=1)
     return pd.DataFrame(
         {
-            "Frames": (stride * steps)[some],
-            "Error": _mean_distance(reached, truth, counted)[some],
-            "Constant Velocity Error": _mean_distance(constant, truth, counted)[some],
+            "frames": (stride * steps)[some],
+            "error": _mean_distance(reached, truth, counted)[some],
+            "constant_velocity_error": _mean_distance(constant, truth, counted)[some],
         }
     )
 

@@ -1,26 +1,20 @@
-"""Settings of an evaluation."""
+"""Settings of evaluations and trainings."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
+
+import tyro
 
 from physion.core.errors import BadInputError
-from physion.readout.logistic import ReadoutConfig
-from physion.training.loop import TrainingOverrides
+from physion.readout.logistic import LogisticSettings
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluationSettings(TrainingOverrides):
-    """Settings that all evaluations of a plan have in common, and of the trainings they need."""
+class HarnessSettings:
+    """Settings that evaluations and trainings have in common."""
 
-    readouts: tuple[str, ...] = ()
-    """Protocols: observed, observed+simulated, full. Default: all that the model supports."""
-    untrained: bool = False
-    """Leave the weights of the model as they are; the table says untrained."""
-    reader: str = ""
-    """Reader of features or rollouts (physion ls readers); default: the model's own."""
-    readout: ReadoutConfig = field(default_factory=ReadoutConfig)
-    """Settings of the readout."""
     folds: int = 5
     """Folds of the cross-validation of a dataset without a readout split."""
     encoder_batch: int = 4
@@ -39,12 +33,17 @@ class EvaluationSettings(TrainingOverrides):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluationConfig(EvaluationSettings):
-    """Settings of one evaluation."""
+class EvaluationSettings(HarnessSettings):
+    """Settings of evaluations."""
 
-    training: str = "all"
-    """Scenarios that train the model: all, all-but or only the tested one."""
-    scenario: str = ""
-    """Tested scenario, under all-but and only; default: all of them."""
-    seed: int = 0
-    """Seed of folds and training."""
+    readouts: tuple[str, ...] = ()
+    """Readouts: observed, observed+simulated, full. Default: all that the model supports."""
+    decision: str = ""
+    """What turns features or rollouts into P(contact) (physion ls decisions); default: the model's
+    own."""
+    untrained: bool = False
+    """Leave the weights of the model as they are; the table says untrained."""
+    logistic: Annotated[LogisticSettings, tyro.conf.Suppress] = field(
+        default_factory=LogisticSettings
+    )
+    """Settings of the logistic regression."""

@@ -1,4 +1,4 @@
-"""The table of predictions, with the column names of the official result files."""
+"""The table of predictions: one row per trial, training protocol and readout."""
 
 from __future__ import annotations
 
@@ -14,116 +14,66 @@ import pandas as pd
 from physion.clips.batch import Provenance
 from physion.core.files import write_with_digest
 from physion.core.version import MADE_WITH
-from physion.readout.protocols import Readout
 
-OFFICIAL_COLUMNS = (
-    "Model",
-    "Readout Train Data",
-    "Readout Test Data",
-    "Train Accuracy",
-    "Test Accuracy",
-    "Readout Type",
-    "Predicted Prob_false",
-    "Predicted Prob_true",
-    "Predicted Outcome",
-    "Actual Outcome",
-    "Stimulus Name",
-    "Encoder Type",
-    "Dynamics Type",
-    "Encoder Pre-training Task",
-    "Encoder Pre-training Dataset",
-    "Encoder Pre-training Seed",
-    "Encoder Training Task",
-    "Encoder Training Dataset",
-    "Encoder Training Seed",
-    "Dynamics Training Task",
-    "Dynamics Training Dataset",
-    "Dynamics Training Seed",
-)
-"""Columns of the official files, in their order (docs/official-system.md, section 5.5)."""
+COLUMNS = (
+    "model", "readout", "protocol", "init", "seed", "stimulus", "scenario", "p_contact", "outcome",
+    "recorded_outcome", "observed_contact", "inputs", "decision", "train_accuracy",
+    "test_accuracy", "cv_accuracy", "fit_labels", "fit_trials", "fold", "readout_c", "noise_scale",
+    "gap_threshold", "validation_loss", "copy_last_loss", "encoder_type",
+    "encoder_pretraining_task", "encoder_pretraining_dataset", "encoder_pretraining_seed",
+    "encoder_training_task", "dynamics_type", "dynamics_training_task", "note", "versions",
+)  # fmt: skip
+"""Columns of the table, in their order.
 
-ORDER = ("Protocol", "Readout Test Data", "Stimulus Name")
-"""Columns by which the rows are sorted."""
-
-OWN_COLUMNS = (
-    "Protocol",
-    "Init",
-    "Inputs",
-    "Recorded Outcome",
-    "Observed Contact",
-    "Fit Labels",
-    "Fit Trials",
-    "Fold",
-    "Readout C",
-    "CV Accuracy",
-    "Reader",
-    "Noise Scale",
-    "Gap Threshold",
-    "Validation Loss",
-    "Copy-last Loss",
-    "Note",
-    "Versions",
-)
-"""Columns that this package adds.
-
-- ``Protocol``: readout protocol by its name. ``Init``: initial weights of the model.
-- ``Inputs``: what the model was given of a trial: names of `models.batch.INPUTS` with commas,
-  ``outcomes``, ``answers of people``, or ``base rate`` (nothing of the trial).
-- ``Recorded Outcome``: outcome in the official recording, empty where there is none;
-  ``Actual Outcome`` is that of the trial as simulated here.
-- ``Observed Contact``: whether agent and patient touched in the observed part already.
-- ``Fit Labels``: outcomes that the readout or the noise level was fitted on (`describe_labels`).
-- ``Fit Trials``: number of trials in the fit. ``Fold``: fold of a cross-validation, or -1.
-- ``Reader``: what turned features or rollouts into probabilities. ``Noise Scale`` and
-  ``Gap Threshold`` (metres): what it fitted. ``Copy-last Loss``: of the trivial predictor.
-- ``Versions``: of this package and of those that the model used.
-- The others are empty where they do not apply.
+- ``readout``: observed, observed+simulated or full. ``protocol``: scenarios that trained the model:
+  all, all-but or only; it and ``seed`` are empty for a model that was not trained.
+- ``init``: initial weights of the model. ``inputs``: what the model was given of a trial: names of
+  `clips.batch.INPUTS` with commas, ``outcomes``, ``answers of people``, or ``base rate`` (nothing).
+- ``p_contact``: P(contact). ``outcome``: that of the trial as it was shown; ``recorded_outcome``:
+  that of the official recording, empty where there is none; ``observed_contact``: whether agent
+  and patient touched in the observed part already.
+- ``decision``: what turned features or rollouts into probabilities. ``readout_c``, ``noise_scale``
+  and ``gap_threshold`` (metres): what it fitted.
+- ``train_accuracy``, ``test_accuracy``: means over all folds of a protocol, readout and scenario.
+- ``fit_labels``: outcomes that the decision was fitted on (`describe_labels`); ``fit_trials``:
+  number of trials in the fit; ``fold``: fold of a cross-validation, or -1.
+- ``copy_last_loss``: loss of the trivial predictor on held-out trials, as ``validation_loss``.
+- ``encoder_*``, ``dynamics_*``: the fields of `clips.batch.Provenance`.
+- ``versions``: of this package and of those that the model used.
 """
 
+ORDER = ("readout", "scenario", "stimulus")
+"""Columns by which the rows are sorted."""
 
 _NUMBERS = (
-    "Train Accuracy", "Test Accuracy", "Predicted Prob_false", "Predicted Prob_true",
-    "Readout C", "CV Accuracy", "Noise Scale", "Gap Threshold", "Validation Loss",
-    "Copy-last Loss",
+    "p_contact", "train_accuracy", "test_accuracy", "cv_accuracy", "readout_c", "noise_scale",
+    "gap_threshold", "validation_loss", "copy_last_loss",
 )  # fmt: skip
 """Columns of numbers, of which some may be empty."""
 _DTYPES = {
-    **dict.fromkeys((*OFFICIAL_COLUMNS, *OWN_COLUMNS), "str"),
+    **dict.fromkeys(COLUMNS, "str"),
     **dict.fromkeys(_NUMBERS, "float64"),
-    **dict.fromkeys(("Predicted Outcome", "Actual Outcome", "Observed Contact"), "bool"),
-    **dict.fromkeys(("Fit Trials", "Fold"), "int64"),
+    **dict.fromkeys(("outcome", "observed_contact"), "bool"),
+    **dict.fromkeys(("fit_trials", "fold"), "int64"),
 }
 """Types by column, of which `read_table` reads each column at once."""
 
 
 @dataclass(frozen=True)
-class Evaluation:
-    """Table of predictions, its file, and the reasons of trials that have none.
-
-    ``rollout_errors``: file of the errors of imagined motion, if they were asked for.
-    """
-
-    predictions: pd.DataFrame
-    path: Path
-    problems: Mapping[str, str]
-    rollout_errors: Path | None = None
-
-
-@dataclass(frozen=True)
 class ScenarioPredictions:
-    """Predictions of one scenario under one protocol in one fold; arrays are over ``trials``."""
+    """Predictions of one scenario under one readout in one fold; arrays are over ``trials``."""
 
     scenario: str
-    protocol: Readout
+    readout: str
     trials: tuple[str, ...]
     probability: np.ndarray
     train_accuracy: float
     fit_trials: int
     fold: int
     fit_labels: str
-    training_set: str = ""
-    training_seed: str = ""
-    reader: str = ""
+    protocol: str = ""
+    seed: str = ""
+    decision: str = ""
     c: float = float("nan")
     cv_accuracy: float = float("nan")
     fitted: Mapping[str, float] = field(default_factory=dict)
@@ -145,12 +95,9 @@ def describe_labels(recorded: Sequence[bool]) -> str:
 
 
 def make_table(
-    predictions: list[ScenarioPredictions], provenance: Provenance, index: pd.DataFrame
+    predictions: Sequence[ScenarioPredictions], provenance: Provenance, index: pd.DataFrame
 ) -> pd.DataFrame:
-    """Return the sorted table of predictions, one row per protocol and tested trial.
-
-    Accuracies are means over all folds of a protocol and scenario.
-    """
+    """Return the sorted table of predictions."""
     truth = index.set_index("trial")
     versions = provenance.versions
     if "physion " not in versions:
@@ -161,49 +108,45 @@ def make_table(
             recorded = truth["recorded_contact"][trial]
             rows.append(
                 {
-                    "Model": provenance.model,
-                    "Readout Train Data": part.scenario,
-                    "Readout Test Data": part.scenario,
-                    "Train Accuracy": part.train_accuracy,
-                    "Readout Type": part.protocol.letter,
-                    "Predicted Prob_false": 1 - float(p),
-                    "Predicted Prob_true": float(p),
-                    "Predicted Outcome": bool(p > 0.5),
-                    "Actual Outcome": bool(truth["contact"][trial]),
-                    "Stimulus Name": trial,
-                    "Encoder Type": provenance.encoder_type,
-                    "Dynamics Type": provenance.dynamics_type,
-                    "Encoder Pre-training Task": provenance.encoder_pretraining_task,
-                    "Encoder Pre-training Dataset": provenance.encoder_pretraining_dataset,
-                    "Encoder Pre-training Seed": provenance.encoder_pretraining_seed,
-                    "Encoder Training Task": provenance.encoder_training_task,
-                    "Dynamics Training Task": provenance.dynamics_training_task,
-                    "Dynamics Training Dataset": part.training_set,
-                    "Dynamics Training Seed": part.training_seed,
-                    "Protocol": part.protocol.value,
-                    "Init": provenance.init,
-                    "Inputs": provenance.inputs,
-                    "Recorded Outcome": "" if pd.isna(recorded) else bool(recorded),
-                    "Observed Contact": bool(truth["observed_contact"][trial]),
-                    "Fit Labels": part.fit_labels,
-                    "Fit Trials": part.fit_trials,
-                    "Fold": part.fold,
-                    "Readout C": part.c,
-                    "CV Accuracy": part.cv_accuracy,
-                    "Reader": part.reader,
-                    "Noise Scale": part.fitted.get("scale", float("nan")),
-                    "Gap Threshold": part.fitted.get("gap", float("nan")),
-                    "Validation Loss": part.validation_loss,
-                    "Copy-last Loss": part.copy_last_loss,
-                    "Note": part.note,
-                    "Versions": versions,
+                    "model": provenance.model,
+                    "readout": part.readout,
+                    "protocol": part.protocol,
+                    "init": provenance.init,
+                    "seed": part.seed,
+                    "stimulus": trial,
+                    "scenario": part.scenario,
+                    "p_contact": float(p),
+                    "outcome": bool(truth["contact"][trial]),
+                    "recorded_outcome": "" if pd.isna(recorded) else bool(recorded),
+                    "observed_contact": bool(truth["observed_contact"][trial]),
+                    "inputs": provenance.inputs,
+                    "decision": part.decision,
+                    "train_accuracy": part.train_accuracy,
+                    "cv_accuracy": part.cv_accuracy,
+                    "fit_labels": part.fit_labels,
+                    "fit_trials": part.fit_trials,
+                    "fold": part.fold,
+                    "readout_c": part.c,
+                    "noise_scale": part.fitted.get("scale", float("nan")),
+                    "gap_threshold": part.fitted.get("gap", float("nan")),
+                    "validation_loss": part.validation_loss,
+                    "copy_last_loss": part.copy_last_loss,
+                    "encoder_type": provenance.encoder_type,
+                    "encoder_pretraining_task": provenance.encoder_pretraining_task,
+                    "encoder_pretraining_dataset": provenance.encoder_pretraining_dataset,
+                    "encoder_pretraining_seed": provenance.encoder_pretraining_seed,
+                    "encoder_training_task": provenance.encoder_training_task,
+                    "dynamics_type": provenance.dynamics_type,
+                    "dynamics_training_task": provenance.dynamics_training_task,
+                    "note": part.note,
+                    "versions": versions,
                 }
             )
-    table = pd.DataFrame(rows, columns=[*OFFICIAL_COLUMNS, *OWN_COLUMNS])
-    hits = (table["Predicted Outcome"] == table["Actual Outcome"]).astype(float)
-    cells = [table["Protocol"], table["Readout Test Data"]]
-    table["Test Accuracy"] = hits.groupby(cells).transform("mean")
-    table["Train Accuracy"] = table["Train Accuracy"].astype(float).groupby(cells).transform("mean")
+    table = pd.DataFrame(rows, columns=list(COLUMNS))
+    hits = ((table["p_contact"] > 0.5) == table["outcome"]).astype(float)
+    cells = [table["readout"], table["scenario"]]
+    table["test_accuracy"] = hits.groupby(cells).transform("mean")
+    table["train_accuracy"] = table["train_accuracy"].astype(float).groupby(cells).transform("mean")
     return table.sort_values(list(ORDER), ignore_index=True)
 
 
@@ -228,3 +171,47 @@ def read_table(path: Path) -> pd.DataFrame:
         keep_default_na=False,
         na_values={name: [""] for name in _NUMBERS},
     )
+
+
+MEAN = "mean"
+"""Name of the rows with the mean of the scenarios."""
+_MODEL = ["model", "init", "protocol", "readout"]
+_GROUP = [*_MODEL, "scenario"]
+
+
+def summarise_accuracy(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the accuracy of predictions, as mean and spread over seeds.
+
+    Parameters
+    ----------
+    table
+        Predictions, with `COLUMNS`; none may occur twice.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns ``model``, ``init``, ``protocol``, ``readout``, ``scenario``, ``seeds`` and
+        ``trials`` (numbers of them), ``accuracy`` (0..1, mean of the seeds), ``spread`` (standard
+        deviation of a seed, n - 1; NaN for one seed). Rows with the scenario `MEAN` are of the mean
+        of the scenarios of each seed, where there are several.
+    """
+    if table.empty:
+        return pd.DataFrame(columns=[*_GROUP, "seeds", "trials", "accuracy", "spread"])
+    hits = ((table["p_contact"] > 0.5) == table["outcome"]).astype(float)
+    scored = table[[*_GROUP, "seed"]].assign(accuracy=hits)
+    by_seed = scored.groupby([*_GROUP, "seed"])["accuracy"].agg(["mean", "size"]).reset_index()
+    by_seed = by_seed.rename(columns={"mean": "accuracy", "size": "trials"})
+    whole = by_seed.groupby([*_MODEL, "seed"]).agg(
+        accuracy=("accuracy", "mean"), trials=("trials", "sum"), scenarios=("scenario", "size")
+    )
+    whole = whole[whole["scenarios"] > 1].reset_index().assign(scenario=MEAN)
+    every = pd.concat([by_seed, whole.drop(columns="scenarios")], ignore_index=True)
+    # So that the mean stands below the scenarios.
+    every["last"] = every["scenario"] == MEAN
+    summary = every.groupby([*_MODEL, "last", "scenario"]).agg(
+        seeds=("seed", "nunique"),
+        trials=("trials", "max"),
+        accuracy=("accuracy", "mean"),
+        spread=("accuracy", "std"),
+    )
+    return summary.reset_index().drop(columns="last")

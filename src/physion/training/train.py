@@ -126,14 +126,17 @@ _NOT_HASHED = ("log_every", "checkpoint_every")
 class TrainedModel:
     """Result of a training.
 
-    - ``name``: of the set of trials. ``folder``: its files, None if nothing is kept.
+    - ``model``, ``seed``: what was trained. ``name``: of the set of trials. ``folder``: its files,
+      None if nothing is kept.
     - ``loss``: mean of the last ``log_every`` steps. ``validation``: of held-out trials, and
       ``baseline`` that of a predictor that has learnt nothing; NaN if there is none.
     - ``config_hash``: of everything that determines the weights.
     - ``loaded``: whether it was there already. ``notes``: files that were found damaged.
     """
 
+    model: str
     name: str
+    seed: int
     folder: Path | None
     steps: int
     loss: float
@@ -202,12 +205,11 @@ def train_model(
         raise BadInputError(f"there is no trial to train {model.provenance().model!r} on")
     settings = settings if settings is not None else ask(model, "training_settings")
     fabric = fabric or make_fabric(Devices(accelerator), settings.precision)
-    config = _config(model, source, trials, settings, seed)
+    config = training_inputs(model, source, trials, settings, seed)
     config_hash = hash_config(config)
     kept = None
     if folder is not None:
-        title = re.sub(r"[^A-Za-z0-9._-]+", "-", f"{model.provenance().model}-{name}")
-        kept = TrainingFolder(folder / f"{title}-{config_hash[:12]}", config)
+        kept = TrainingFolder(training_path(folder, model, name, config), config)
     move_to_device(fabric, model)
     done = kept.finished() if kept is not None else None
     if kept is not None and done is not None:
@@ -215,7 +217,8 @@ def train_model(
         model.eval()
         if fabric.is_global_zero:
             kept.remove_checkpoints()
-        return _result(name, kept, TrainingState.of(done.metadata["state"]), config_hash, True)
+        state = TrainingState.of(done.metadata["state"])
+        return _result(model, name, seed, kept, state, config_hash, True)
     metadata = {
         "config": config,
         "config_hash": config_hash,
@@ -252,7 +255,7 @@ def train_model(
             card = model_card(model, name, trials, settings, seed, metadata, loop.state)
             kept.finish(tensors_of(model), loop.metadata(), card)
         fabric.barrier()
-    return _result(name, kept, loop.state, config_hash, False)
+    return _result(model, name, seed, kept, loop.state, config_hash, False)
 
 
 def check_trainable(model: Any) -> None:
@@ -261,7 +264,13 @@ def check_trainable(model: Any) -> None:
         raise BadInputError(f"model {model.provenance().model!r} has nothing to train")
 
 
-def _config(
+def training_path(folder: Path, model: Any, name: str, inputs: Mapping[str, Any]) -> Path:
+    """Return the folder of a training, named by a hash of all that determines the weights."""
+    title = re.sub(r"[^A-Za-z0-9._-]+", "-", f"{model.provenance().model}-{name}")
+    return folder / f"{title}-{hash_config(inputs)[:12]}"
+
+
+def training_inputs(
     model: Any, source: WholeSource, trials: Sequence[str], settings: TrainingSettings, seed: int
 ) -> dict[str, Any]:
     """Return JSON values of everything that determines the weights."""
@@ -368,10 +377,18 @@ def _named(progress: Progress | None, what: str) -> Callable[[int, int], None] |
 
 
 def _result(
-    name: str, folder: TrainingFolder | None, state: TrainingState, config_hash: str, loaded: bool
+    model: Any,
+    name: str,
+    seed: int,
+    folder: TrainingFolder | None,
+    state: TrainingState,
+    config_hash: str,
+    loaded: bool,
 ) -> TrainedModel:
     return TrainedModel(
+        model=model.provenance().model,
         name=name,
+        seed=seed,
         folder=folder.path if folder is not None else None,
         steps=state.step,
         loss=state.loss,

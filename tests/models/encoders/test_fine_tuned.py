@@ -17,8 +17,8 @@ from physion.models.checkpoint import WEIGHTS, load_weights
 from physion.models.encoders.encoder import FINE_TUNING, FineTunedEncoder
 from physion.models.interface import TrainingSettings
 from physion.readout.evaluate import evaluate
-from physion.readout.logistic import ReadoutConfig
-from physion.readout.settings import EvaluationConfig
+from physion.readout.logistic import LogisticSettings
+from physion.readout.settings import EvaluationSettings
 from physion.training.devices import Devices, make_fabric
 from physion.training.train import train_model
 from support.moving_dots import make_dots
@@ -213,13 +213,13 @@ def test_fine_tuning_without_what_keeps_features_apart_is_refused() -> None:
 def test_evaluation_trains_the_encoder_of_each_fold_and_reads_its_features(tmp_path: Path) -> None:
     counts = {"training": 4, "readout": 8, "testing": 4}
     dots = make_dots(tmp_path / "dots", counts, ("collide", "drop"))
-    config = EvaluationConfig(
-        steps=2, batch=2, accelerator="cpu", training="only", readout=ReadoutConfig(grid=(1e-2,)),
-    )  # fmt: skip
-    options = {**FEW, "context": 3, "image_size": 32}
-    table = evaluate(dots, "frozen-encoder", tmp_path, options=options, config=config).predictions
-    assert (table["Model"] == "random-test_vit-mlp-fine-tuned").all()
-    assert set(table["Protocol"]) == {"observed", "observed+simulated", "full"}
-    assert np.isfinite(table["Predicted Prob_true"]).all()
+    settings = EvaluationSettings(accelerator="cpu", logistic=LogisticSettings(grid=(1e-2,)))
+    options = {**FEW, "context": 3, "image_size": 32, "steps": 2, "batch": 2}
+    table = evaluate(
+        "frozen-encoder", dots, tmp_path, protocols="only", options=options, settings=settings
+    ).predictions
+    assert (table["model"] == "random-test_vit-mlp-fine-tuned").all()
+    assert set(table["readout"]) == {"observed", "observed+simulated", "full"}
+    assert np.isfinite(table["p_contact"]).all()
     # Features of two encoders, one for each training.
     assert len(list((tmp_path / "features" / "whole").iterdir())) == 2

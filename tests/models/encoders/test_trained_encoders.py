@@ -17,8 +17,8 @@ from physion.models.encoders.encoder import EncoderModel
 from physion.models.encoders.weights import EncoderWeights, create_encoder
 from physion.models.interface import TrainingSettings
 from physion.readout.evaluate import evaluate
-from physion.readout.logistic import ReadoutConfig
-from physion.readout.settings import EvaluationConfig
+from physion.readout.logistic import LogisticSettings
+from physion.readout.settings import EvaluationSettings
 from physion.training.train import train_model
 from support.moving_dots import make_dots
 from support.tiny_models import TINY
@@ -121,11 +121,11 @@ def test_an_evaluation_does_not_train_it_again(tmp_path: Path) -> None:
     counts = {"training": 4, "readout": 8, "testing": 4}
     dots = make_dots(tmp_path / "dots", counts, ("collide",))
     folder = train(make(context=3), tmp_path / "trainings")
-    config = EvaluationConfig(accelerator="cpu", readout=ReadoutConfig(grid=(1e-2,)))
+    config = EvaluationSettings(accelerator="cpu", logistic=LogisticSettings(grid=(1e-2,)))
     options = {**FEW, "context": 3, "weights": str(folder)}
     table = evaluate(
-        dots, "frozen-encoder", tmp_path / "out", options=options, config=config
+        "frozen-encoder", dots, tmp_path / "out", options=options, settings=config
     ).predictions
-    assert table["Init"].str.startswith("local:").all()
-    assert np.isfinite(table["Predicted Prob_true"]).all()
+    assert table["init"].str.startswith("local:").all()
+    assert np.isfinite(table["p_contact"]).all()
     assert not (tmp_path / "out" / "training").exists()

@@ -17,8 +17,8 @@ from torch import Tensor
 from physion.core.errors import BadInputError
 from physion.models import Batch, build_model
 from physion.readout.evaluate import evaluate
-from physion.readout.logistic import ReadoutConfig
-from physion.readout.settings import EvaluationConfig
+from physion.readout.logistic import LogisticSettings
+from physion.readout.settings import EvaluationSettings
 from support.moving_dots import make_dots
 from support.programs import absent
 from support.tiny_models import VIDEO
@@ -226,10 +226,10 @@ def test_clips_of_another_length_are_refused() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_it_is_evaluated_under_observed_and_full(name: str, tmp_path: Path) -> None:
     dots = make_dots(tmp_path / "dots", {"readout": 8, "testing": 4}, ("collide",))
-    config = EvaluationConfig(accelerator="cpu", readout=ReadoutConfig(grid=(1e-2,)))
-    table = evaluate(dots, name, tmp_path, options=VIDEO, config=config).predictions
-    assert set(table["Protocol"]) == {"observed", "full"}
-    assert (table["Model"] == f"random-{name}-small").all() and (table["Init"] == "random").all()
+    config = EvaluationSettings(accelerator="cpu", logistic=LogisticSettings(grid=(1e-2,)))
+    table = evaluate(name, dots, tmp_path, options=VIDEO, settings=config).predictions
+    assert set(table["readout"]) == {"observed", "full"}
+    assert (table["model"] == f"random-{name}-small").all() and (table["init"] == "random").all()
 
 
 def test_without_transformers_the_extra_is_named() -> None:

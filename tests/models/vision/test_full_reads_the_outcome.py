@@ -15,11 +15,11 @@ from typing import Any
 import pytest
 
 from physion.readout.evaluate import evaluate
-from physion.readout.leak_checks import with_exchanged_futures, with_permuted_labels
-from physion.readout.logistic import ReadoutConfig
-from physion.readout.settings import EvaluationConfig
+from physion.readout.logistic import LogisticSettings
+from physion.readout.settings import EvaluationSettings
 from physion.trials.dataset import Dataset
 from support.late_motions import make_late_motions
+from support.leak_checks import with_exchanged_futures, with_permuted_labels
 from support.moving_dots import make_dots
 
 pytestmark = pytest.mark.slow
@@ -67,13 +67,15 @@ def accuracy_of_full(
     dataset: Dataset, name: str, folder: Path, *, weights: str = "", **training: Any
 ) -> float:
     """Return the accuracy of a model, which is trained if it has settings of a ``training``."""
-    config = EvaluationConfig(
-        readouts=("full",), accelerator="cpu", readout=ReadoutConfig(grid=(1e-2, 1.0)),
-        batch=8, warmup=0, untrained=not training, **training,
+    config = EvaluationSettings(
+        readouts=("full",), accelerator="cpu", logistic=LogisticSettings(grid=(1e-2, 1.0)),
+        untrained=not training,
     )  # fmt: skip
-    options = {**OPTIONS.get(name, {}), **({"weights": weights} if weights else {})}
-    table = evaluate(dataset, name, folder, options=options, config=config).predictions
-    return float((table["Predicted Outcome"] == table["Actual Outcome"]).mean())
+    options: dict[str, Any] = {**OPTIONS.get(name, {}), "batch": 8, "warmup": 0, **training}
+    if name in TRAINING:
+        options["weights"] = weights or "random"
+    table = evaluate(name, dataset, folder, options=options, settings=config).predictions
+    return float(((table["p_contact"] > 0.5) == table["outcome"]).mean())
 
 
 @pytest.mark.parametrize("name", list(TRAINING))

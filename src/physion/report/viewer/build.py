@@ -20,6 +20,7 @@ from typing import Any
 
 import pandas as pd
 
+from physion.clips.imagined import Imagine, ImaginedTrial
 from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import write_atomic
@@ -27,7 +28,7 @@ from physion.core.version import MADE_WITH
 from physion.report.viewer import facts as viewer_facts
 from physion.report.viewer import motion as viewer_motion
 from physion.report.viewer import movies as viewer_movies
-from physion.report.viewer.imagined import Imagine, ImaginedTrial, pack_imagined
+from physion.report.viewer.imagined import pack_imagined
 from physion.trials.dataset import Dataset
 
 SCRIPTS = (

@@ -13,10 +13,11 @@ import pytest
 
 from physion.cli import output
 from physion.cli.main import main
-from physion.cli.run.plan import balanced_trials
+from physion.cli.run import balanced_trials
 from physion.data.official import official
 
-SMALL = ["--limit", "2", "--size", "64", "--steps", "10", "--samples", "4", "--workers", "2"]
+SMALL = ["--limit", "2", "--size", "64", "--workers", "2"]
+FEW = ["--option", "steps=10", "noisy-simulation:samples=4"]
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -30,7 +31,7 @@ def digests(folder: Path) -> dict[str, str]:
 
 @pytest.mark.slow
 def test_sampled_scenes_to_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["run", "--sampled", "--out", str(tmp_path), *SMALL, "--json"]
+    command = ["run", "--sampled", "--out", str(tmp_path), *SMALL, *FEW, "--json"]
     assert main(command) == 0
     answer = json.loads(capsys.readouterr().out)
     page = Path(answer["report"])
@@ -49,7 +50,7 @@ def test_the_first_command_compares_models_with_people(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     few = ["--models", "noisy-simulation,state-classifier,chance"]
-    command = ["run", "--out", str(tmp_path), *SMALL, *few, "--trial-pages", "--json"]
+    command = ["run", "--out", str(tmp_path), *SMALL, *FEW, *few, "--trial-pages", "--json"]
     assert main(command) == 0
     answer = json.loads(capsys.readouterr().out)
     scores = pd.DataFrame(answer["scores"])
@@ -87,7 +88,9 @@ def test_command_logs_against_people(
     command = ["run", "--scenes", str(official / "scenes"), "--humans", str(official / "humans")]
     command += [*SMALL, "--limit", "1", "--models", "chance", "--out", str(tmp_path)]
     assert main(command) == 0
-    assert re.match(r"report, \d+ rows, made in \d+ min \d+ s: ", capsys.readouterr().out)
+    *table, last = capsys.readouterr().out.splitlines()
+    assert re.match(r"report, made in \d+ min \d+ s: ", last)
+    assert table[0].split()[:3] == ["row", "readout", "accuracy"] and "chance" in table[1]
     assert main([*command, "--json"]) == 0
     scores = pd.DataFrame(json.loads(capsys.readouterr().out)["scores"])
     assert scores["human_accuracy"].notna().any()
@@ -105,13 +108,14 @@ def test_a_larger_limit_adds_to_the_trials_of_a_smaller_one() -> None:
 def test_nobody_has_seen_sampled_scenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["run", "--sampled", "--humans", "official", "--out", str(tmp_path / "out")]
     assert main(command) == 2
-    assert "seen by nobody" in capsys.readouterr().err
+    assert "nobody has seen" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
 def test_an_unknown_model_is_refused_before_anything_is_made(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["run", "--models", "chanse", "--out", str(tmp_path / "out")]) == 2
-    assert "chance" in capsys.readouterr().err
+    for names, message in (("chanse", "chance"), ("", "names no model")):
+        assert main(["run", "--models", names, "--out", str(tmp_path / "out")]) == 2
+        assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

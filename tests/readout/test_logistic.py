@@ -13,16 +13,15 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.readout.decisions import released_reader
+from physion.readout.decisions import Readout, released_decision
 from physion.readout.logistic import (
     C_GRID,
-    ReadoutConfig,
+    LogisticSettings,
     fit_readout,
     gram,
     solve_path,
     undersample,
 )
-from physion.readout.protocols import Readout, flatten_time
 
 
 def problem(n: int, d: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -90,7 +89,7 @@ def test_the_whole_readout_is_that_of_a_converged_grid_search() -> None:
     features, labels = problem(70, 300, seed=2)
     train, test, answers = features[:50], features[50:], labels[:50]
     grid = tuple(float(c) for c in np.logspace(-6, 2, 9))
-    fitted = fit_readout(train, answers, test, ReadoutConfig(grid=grid, seed=4))
+    fitted = fit_readout(train, answers, test, LogisticSettings(grid=grid, seed=4))
     search = GridSearchCV(
         make_pipeline(StandardScaler(), LogisticRegression(tol=1e-10, max_iter=100_000)),
         {"logisticregression__C": grid},
@@ -104,12 +103,12 @@ def test_the_whole_readout_is_that_of_a_converged_grid_search() -> None:
 
 def test_the_released_setting_is_scikit_learns_early_stop() -> None:
     features, labels = problem(60, 400, seed=3)
-    config = ReadoutConfig(grid=(1.0,), released=True)
+    config = LogisticSettings(grid=(1.0,), released=True)
     released = fit_readout(features[:40], labels[:40], features[40:], config)
     pipe = make_pipeline(StandardScaler(), LogisticRegression(C=1.0, max_iter=200))
     pipe.fit(features[:40], labels[:40])
     assert released.probability == pytest.approx(pipe.predict_proba(features[40:])[:, 1])
-    exact = fit_readout(features[:40], labels[:40], features[40:], ReadoutConfig(grid=(1.0,)))
+    exact = fit_readout(features[:40], labels[:40], features[40:], LogisticSettings(grid=(1.0,)))
     assert not np.allclose(exact.probability, released.probability, atol=1e-9)
 
 
@@ -124,7 +123,7 @@ def test_the_released_setting_stops_after_200_iterations() -> None:
         model = LogisticRegression(C=1e8, max_iter=iterations)
         return make_pipeline(StandardScaler(), model).fit(features[:120], labels[:120])
 
-    config = ReadoutConfig(grid=(1e8,), released=True)
+    config = LogisticSettings(grid=(1e8,), released=True)
     released = fit_readout(features[:120], labels[:120], features[120:], config)
     with pytest.warns(ConvergenceWarning):
         stopped = scikit_learn(200)
@@ -134,12 +133,12 @@ def test_the_released_setting_stops_after_200_iterations() -> None:
     assert np.abs(longer - released.probability).max() > 1e-3
 
 
-def test_the_released_reader_is_the_published_grid_search() -> None:
+def test_the_released_decision_is_the_published_grid_search() -> None:
     """17 values of C, 5 folds, lbfgs with 200 iterations, on equally many trials of each label."""
     features, labels = problem(90, 30, seed=5)
     labels[:60] |= np.arange(60) % 3 == 0
-    config = ReadoutConfig(seed=3)
-    reading = released_reader(config).read([features[:60]], labels[:60], [features[60:]])
+    config = LogisticSettings(seed=3)
+    reading = released_decision(config).decide([features[:60]], labels[:60], [features[60:]])
     kept = undersample(labels[:60], 3)
     assert labels[kept].sum() * 2 == len(kept) < 60
     search = GridSearchCV(
@@ -177,7 +176,7 @@ def test_no_trial_to_fit_is_a_coin() -> None:
 @pytest.mark.parametrize("released", [False, True])
 def test_constant_features_say_the_share_of_contacts(released: bool) -> None:
     labels = np.array([True] * 6 + [False] * 4)
-    config = ReadoutConfig(released=released)
+    config = LogisticSettings(released=released)
     fitted = fit_readout(np.full((10, 3), 7.7), labels, np.full((2, 3), 7.7), config)
     assert fitted.probability == pytest.approx([0.6, 0.6], abs=1e-3)
 
@@ -216,7 +215,7 @@ def test_undersampling_keeps_the_rarer_answer_whole() -> None:
     assert labels[kept].sum() == 3 and len(kept) == 6 and set(kept) >= {0, 1, 2}
     assert list(undersample(labels, 0)) == list(kept) != list(undersample(labels, 1))
     features, _ = problem(23, 4)
-    config = ReadoutConfig(balance=True)
+    config = LogisticSettings(balance=True)
     balanced = fit_readout(np.zeros((23, 4)), labels, features, config)
     assert balanced.probability == pytest.approx([0.5] * 23)
 
@@ -224,7 +223,7 @@ def test_undersampling_keeps_the_rarer_answer_whole() -> None:
 def test_seeds_are_explicit() -> None:
     features, labels = problem(60, 100, seed=9)
     first, second = (
-        fit_readout(features[:40], labels[:40], features[40:], ReadoutConfig(seed=1))
+        fit_readout(features[:40], labels[:40], features[40:], LogisticSettings(seed=1))
         for _ in range(2)
     )
     assert (first.probability == second.probability).all()
@@ -244,20 +243,10 @@ def test_bad_features_labels_and_settings_are_refused() -> None:
         fit_readout(features, labels[:4], features)
     for wrong in ({"grid": ()}, {"grid": (1.0, 0.1)}, {"grid": (-1.0, 1.0)}, {"folds": 1}):
         with pytest.raises(BadInputError):
-            ReadoutConfig(**wrong)  # type: ignore[arg-type]
+            LogisticSettings(**wrong)  # type: ignore[arg-type]
 
 
-def test_protocols_have_their_official_letters() -> None:
-    letters = {readout.value: readout.letter for readout in Readout}
-    assert letters == {"observed": "C", "observed+simulated": "B", "full": "A"}
+def test_readouts_are_named_as_in_the_paper() -> None:
     assert [readout for readout in Readout if readout.sees_future] == [Readout.FULL]
     with pytest.raises(UnknownNameError, match="observed"):
         Readout.named("observd")
-
-
-def test_time_is_flattened_trial_by_trial() -> None:
-    first, second = np.arange(12).reshape(2, 2, 3), np.arange(6).reshape(2, 1, 3)
-    flat = flatten_time(first, second)
-    assert flat.shape == (2, 9) and list(flat[1]) == [6, 7, 8, 9, 10, 11, 3, 4, 5]
-    with pytest.raises(BadInputError):
-        flatten_time(np.zeros((2, 3)))

@@ -5,9 +5,14 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 
-from physion.core.errors import BadInputError
-from physion.readout.folds import assign_folds, plan_folds
-from physion.training.protocols import Training
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.readout.folds import (
+    Protocol,
+    assign_folds,
+    plan_folds,
+    select_scenario,
+    training_folds,
+)
 
 
 def index(counts: dict[str, int], scenarios: tuple[str, ...] = ("drop", "roll")) -> pd.DataFrame:
@@ -27,7 +32,7 @@ def index(counts: dict[str, int], scenarios: tuple[str, ...] = ("drop", "roll"))
     return pd.DataFrame(rows)
 
 
-@pytest.mark.parametrize("protocol", list(Training))
+@pytest.mark.parametrize("protocol", list(Protocol))
 @pytest.mark.parametrize(
     "counts",
     [
@@ -39,7 +44,7 @@ def index(counts: dict[str, int], scenarios: tuple[str, ...] = ("drop", "roll"))
     ],
 )
 def test_every_tested_trial_is_predicted_once_by_what_never_saw_it(
-    protocol: Training, counts: dict[str, int]
+    protocol: Protocol, counts: dict[str, int]
 ) -> None:
     table = index(counts)
     folds = plan_folds(table, protocol, 4, 0)
@@ -57,7 +62,7 @@ def test_every_tested_trial_is_predicted_once_by_what_never_saw_it(
 
 
 def test_splits_are_used_as_they_are_meant() -> None:
-    (only,) = plan_folds(index({"training": 3, "readout": 2, "testing": 2}), Training.ALL, 5, 0)
+    (only,) = plan_folds(index({"training": 3, "readout": 2, "testing": 2}), Protocol.ALL, 5, 0)
     assert only.number == -1
     assert all("_training_" in trial for trial in only.train)
     assert all("_readout_" in trial for split in only.scenarios for trial in split.fit)
@@ -67,7 +72,7 @@ def test_a_readout_trial_with_the_physics_of_a_tested_one_is_not_used() -> None:
     table = index({"training": 3, "readout": 3, "testing": 2})
     table.loc[table["trial"] == "drop_readout_1", "digest"] = "droptesting0"
     table.loc[table["trial"] == "roll_training_2", "digest"] = "rolltesting1"
-    (only,) = plan_folds(table, Training.ALL, 5, 0)
+    (only,) = plan_folds(table, Protocol.ALL, 5, 0)
     assert only.scenarios[0].fit == ("drop_readout_0", "drop_readout_2")
     assert "roll_training_2" not in only.train
 
@@ -84,14 +89,51 @@ def test_twins_stay_in_one_part_and_labels_are_balanced() -> None:
 
 
 def test_fewer_trials_than_parts_still_work() -> None:
-    folds = plan_folds(index({"testing": 2}, ("drop",)), Training.ALL, 5, 0)
+    folds = plan_folds(index({"testing": 2}, ("drop",)), Protocol.ALL, 5, 0)
     assert [len(fold.scenarios[0].test) for fold in folds] == [1, 1]
 
 
 def test_nothing_to_test_and_impossible_plans_are_refused() -> None:
     with pytest.raises(BadInputError, match="testing"):
-        plan_folds(index({"training": 3, "readout": 3}), Training.ALL, 5, 0)
+        plan_folds(index({"training": 3, "readout": 3}), Protocol.ALL, 5, 0)
     with pytest.raises(BadInputError, match="folds"):
-        plan_folds(index({"testing": 9}), Training.ALL, 1, 0)
+        plan_folds(index({"testing": 9}), Protocol.ALL, 1, 0)
     with pytest.raises(BadInputError, match="two scenarios"):
-        plan_folds(index({"testing": 9}, ("drop",)), Training.ALL_BUT, 5, 0)
+        plan_folds(index({"testing": 9}, ("drop",)), Protocol.ALL_BUT, 5, 0)
+
+
+@pytest.mark.parametrize("protocol", list(Protocol))
+@pytest.mark.parametrize("counts", [{"training": 3, "readout": 4, "testing": 5}, {"testing": 10}])
+def test_trainings_are_those_of_an_evaluation(protocol: Protocol, counts: dict[str, int]) -> None:
+    table = index(counts)
+    assert training_folds(table, protocol, 5, 3) == plan_folds(table, protocol, 5, 3)
+
+
+@pytest.mark.parametrize(("counts", "split"), [({"training": 3, "readout": 2}, "training"),
+                                               ({"readout": 2}, "readout")])  # fmt: skip
+def test_without_testing_trials_all_of_a_split_are_trained_on(
+    counts: dict[str, int], split: str
+) -> None:
+    table = index(counts)
+    (every,) = training_folds(table, Protocol.ALL, 5, 0)
+    assert every.training.name == "all"
+    assert set(every.train) == set(table["trial"][table["split"] == split])
+    but = {f.training.name: f.train for f in training_folds(table, Protocol.ALL_BUT, 5, 0)}
+    assert set(but) == {"no_drop", "no_roll"}
+    assert not any(trial.startswith("roll") for trial in but["no_roll"])
+    with pytest.raises(BadInputError, match="no trial in the splits"):
+        training_folds(index({"familiarization": 3}), Protocol.ALL, 5, 0)
+
+
+def test_one_scenario_can_be_chosen() -> None:
+    table = index({"training": 3, "readout": 2, "testing": 2})
+    only, but, every = (plan_folds(table, p, 5, 0) for p in
+                        (Protocol.ONLY, Protocol.ALL_BUT, Protocol.ALL))  # fmt: skip
+    (fold,) = select_scenario(only, Protocol.ONLY, "roll")
+    assert {trial.partition("_")[0] for trial in fold.train} == {"roll"}
+    (fold,) = select_scenario(but, Protocol.ALL_BUT, "roll")
+    assert {trial.partition("_")[0] for trial in fold.train} == {"drop"}
+    with pytest.raises(UnknownNameError, match="roll"):
+        select_scenario(only, Protocol.ONLY, "rlol")
+    with pytest.raises(BadInputError, match="protocol all-but or only"):
+        select_scenario(every, Protocol.ALL, "roll")

@@ -13,7 +13,7 @@ import pytest
 
 from physion.core.errors import BadInputError
 from physion.readout.features import ArraysInMemory, StoredFeatures, open_features, write_features
-from physion.readout.logistic import Fit, JoinedFeatures, ReadoutConfig, fit_readout, gram, grams
+from physion.readout.logistic import Fit, JoinedFeatures, LogisticSettings, fit_readout, gram, grams
 
 
 def features_of(n: int, steps: int, size: int, seed: int = 0) -> np.ndarray:
@@ -28,10 +28,9 @@ def stored(folder: Path, values: np.ndarray) -> StoredFeatures:
     """Return features that are written to files."""
     rows = []
     for number, row in enumerate(values):
-        identity = {"trial": str(number), "steps": str(values.shape)}
         path = folder / f"{values.shape[1]}-{number}.safetensors"
-        write_features(path, identity, {"features": row})
-        rows.append(open_features(path, identity))
+        write_features(path, {"features": row})
+        rows.append(open_features(path))
         assert rows[-1] is not None
     return StoredFeatures([f"trial {number}" for number in range(len(values))], rows)  # type: ignore[arg-type]
 
@@ -99,7 +98,7 @@ def test_a_readout_of_files_is_that_of_arrays(tmp_path: Path, released: bool) ->
     context, imagined = features_of(50, 3, 40), features_of(50, 2, 40, seed=1)
     labels = context[:, 0, 0] + imagined[:, 1, 3] > np.median(context[:, 0, 0])
     flat = np.concatenate([context, imagined], axis=1).reshape(50, -1)
-    config = ReadoutConfig(grid=(1e-4, 1e-2, 1.0), balance=True, released=released)
+    config = LogisticSettings(grid=(1e-4, 1e-2, 1.0), balance=True, released=released)
     arrays = fit_readout(flat[:40], labels[:40], flat[40:], config)
     parts = [stored(tmp_path, context), stored(tmp_path, imagined)]
     train, test = ([part.select(rows) for part in parts] for rows in (range(40), range(40, 50)))
@@ -142,8 +141,8 @@ rows = []
 for number in range(trials):
     path = folder / str(number)
     features = rng.standard_normal((steps, size), np.float32) + number % 2 / 10
-    write_features(path, {}, {"features": features})
-    rows.append(open_features(path, {}))
+    write_features(path, {"features": features})
+    rows.append(open_features(path))
 features = StoredFeatures([str(number) for number in range(trials)], rows)
 peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 before = peak()

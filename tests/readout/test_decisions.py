@@ -1,4 +1,4 @@
-"""Readers of rollouts: the threshold of a gap and the level of noise."""
+"""Decisions on rollouts: the threshold of a gap and the level of noise."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import pytest
 
 from physion.core.errors import BadInputError
 from physion.readout.decisions import (
-    GapReader,
-    NoiseReader,
+    GapDecision,
+    NoiseDecision,
     best_threshold,
+    decisions,
     fit_knobs,
     log_likelihood,
-    readers,
 )
 from physion.readout.features import Knobs, Outcomes, all_knobs
-from physion.readout.logistic import ReadoutConfig
+from physion.readout.logistic import LogisticSettings
 
 NO_KNOBS: Knobs = ()
 
@@ -28,10 +28,13 @@ def gaps(*rows: list[float]) -> dict[Knobs, Outcomes]:
     return {NO_KNOBS: Outcomes(None, np.array(rows, np.float64))}
 
 
-@pytest.mark.parametrize("name", readers.names())
-def test_every_reader_says_what_it_reads(name: str) -> None:
-    reader = readers.get(name)(ReadoutConfig())
-    assert reader.input in ("features", "rollouts") and reader.labels in ("simulated", "recorded")
+@pytest.mark.parametrize("name", decisions.names())
+def test_every_decision_says_what_it_needs(name: str) -> None:
+    decision = decisions.get(name)(LogisticSettings())
+    assert decision.input in ("features", "rollouts") and decision.labels in (
+        "simulated",
+        "recorded",
+    )
 
 
 def test_all_combinations_of_knobs_are_tried_in_the_order_of_their_names() -> None:
@@ -71,9 +74,9 @@ def test_noise_gives_the_fractions_of_the_chosen_level() -> None:
     tested = Outcomes(np.array([[True, False]]), None)
     fit = {knobs(1.0): sure, knobs(2.0): wrong}
     test = {knobs(1.0): tested, knobs(2.0): wrong}
-    reading = NoiseReader().read(fit, np.array([True, False]), test)
-    assert reading.probability.tolist() == [0.5] and reading.train_accuracy == 1.0
-    assert reading.fitted == {"scale": 1.0}
+    decided = NoiseDecision().decide(fit, np.array([True, False]), test)
+    assert decided.probability.tolist() == [0.5] and decided.train_accuracy == 1.0
+    assert decided.fitted == {"scale": 1.0}
 
 
 def test_the_threshold_separates_gaps_and_stays_near_zero() -> None:
@@ -88,14 +91,14 @@ def test_the_threshold_separates_gaps_and_stays_near_zero() -> None:
 def test_gaps_of_several_samples_give_probabilities() -> None:
     fit = gaps([0.02, 0.03], [0.04, 0.05], [0.5, 0.6], [0.7, 0.8])
     labels = np.array([True, True, False, False])
-    reading = GapReader().read(fit, labels, gaps([0.0, 0.9], [0.0, 0.0]))
-    assert reading.probability == pytest.approx([0.5, 2.5 / 3]) and reading.train_accuracy == 1.0
-    one = GapReader().read(gaps([0.1], [0.6]), np.array([True, False]), gaps([0.2], [0.5]))
+    decided = GapDecision().decide(fit, labels, gaps([0.0, 0.9], [0.0, 0.0]))
+    assert decided.probability == pytest.approx([0.5, 2.5 / 3]) and decided.train_accuracy == 1.0
+    one = GapDecision().decide(gaps([0.1], [0.6]), np.array([True, False]), gaps([0.2], [0.5]))
     assert one.probability.tolist() == [1.0, 0.0]
     assert one.fitted["gap"] == pytest.approx(0.35)
 
 
 def test_contacts_alone_have_no_threshold() -> None:
     contacts = {NO_KNOBS: Outcomes(np.array([[True]]), None)}
-    with pytest.raises(BadInputError, match="use the reader 'noise'"):
-        GapReader().read(contacts, np.array([True]), contacts)
+    with pytest.raises(BadInputError, match="use the decision 'noise'"):
+        GapDecision().decide(contacts, np.array([True]), contacts)

@@ -16,12 +16,11 @@ from physion.core.errors import BadInputError
 from physion.models import Batch, Provenance, Spec
 from physion.models.noisy_simulation import NoisySimulation, NoisySimulationConfig
 from physion.physics.trajectory import Contacts, State, Trajectory
-from physion.readout.evaluate import evaluate, evaluate_model
-from physion.readout.folds import plan_folds
+from physion.readout.evaluate import evaluate
+from physion.readout.folds import Protocol, plan_folds
 from physion.readout.predictor import Predictor, choose_readouts
-from physion.readout.settings import EvaluationConfig
+from physion.readout.settings import EvaluationSettings
 from physion.scenes.scene import Body, Camera, Roles, Scene
-from physion.training.protocols import Training
 from physion.trials.trial_file import Trial
 
 FRAMES = 100
@@ -124,8 +123,8 @@ def shelves_in_place_of_files(monkeypatch: pytest.MonkeyPatch) -> None:
 def fitted_scale(shelf: Any, model: Any, folder: Path) -> tuple[float, np.ndarray]:
     """Return the fitted scale and the probabilities of the tested trials."""
     ways = choose_readouts(model, ())
-    predictor = Predictor(shelf, model, ways, EvaluationConfig(), folder)
-    (fold,) = plan_folds(shelf.index, Training.ALL, 5, 0)
+    predictor = Predictor(shelf, model, ways, EvaluationSettings(), folder=folder)
+    (fold,) = plan_folds(shelf.index, Protocol.ALL, 5, 0)
     (answers,) = predictor.predict(fold)
     return answers.fitted["scale"], answers.probability
 
@@ -159,22 +158,22 @@ def test_the_table_names_the_outcomes_that_were_fitted(
     outcomes[(shelf.index["split"] == "readout") & (np.arange(len(outcomes)) >= known)] = pd.NA
     shelf.index["recorded_contact"] = outcomes
     model = NoisySimulation(CONFIG, Flight())
-    table = evaluate_model(shelf, model, tmp_path, config=EvaluationConfig()).predictions
-    assert set(table["Fit Labels"]) == {expected}
+    table = evaluate(model, shelf, tmp_path).predictions
+    assert set(table["fit_labels"]) == {expected}
 
 
 def test_predictions_are_fractions_and_state_their_scale(tmp_path: Path) -> None:
     shelf: Any = Shelf()
     model = NoisySimulation(replace(CONFIG, scales=(1.0,)), Flight())
-    evaluation = evaluate_model(shelf, model, tmp_path, config=EvaluationConfig())
+    evaluation = evaluate(model, shelf, tmp_path)
     table = evaluation.predictions
     assert len(table) == 10 and evaluation.problems == {}
-    shares = table["Predicted Prob_true"].to_numpy() * 20
+    shares = table["p_contact"].to_numpy() * 20
     assert np.allclose(shares, shares.round()) and (shares % 20 != 0).sum() > 0
-    assert (table["Noise Scale"] == 1.0).all() and set(table["Readout Type"]) == {"B"}
-    assert table["Test Accuracy"].iloc[0] > 0.7
-    assert set(table["Recorded Outcome"]) == {"True", "False"}
-    assert (table["Init"] == "none").all()
+    assert (table["noise_scale"] == 1.0).all() and set(table["readout"]) == {"observed+simulated"}
+    assert table["test_accuracy"].iloc[0] > 0.7
+    assert set(table["recorded_outcome"]) == {"True", "False"}
+    assert (table["init"] == "none").all()
 
 
 def test_simulations_are_stored_and_not_made_again(tmp_path: Path) -> None:
@@ -183,42 +182,40 @@ def test_simulations_are_stored_and_not_made_again(tmp_path: Path) -> None:
     found, stored = [], []
     for engine, config in zip(engines, (CONFIG, CONFIG, replace(CONFIG, seed=1)), strict=True):
         found.append(fitted_scale(shelf, NoisySimulation(config, engine), tmp_path)[1])
-        stored.append(sorted(tmp_path.rglob("*.json")))
+        stored.append(sorted(tmp_path.rglob("*.safetensors")))
     assert engines[0].calls > 0 and engines[1].calls == 0
     assert engines[2].calls == engines[0].calls
     assert (found[0] == found[1]).all()
     assert len(stored[0]) == 7 * 3 and len(stored[2]) == 2 * 7 * 3
-    text = stored[0][0].read_text()
-    changed = text.replace("true", "TRUE", 1).replace("false", "true", 1).replace("TRUE", "false")
-    for damaged in ('{"contacts": 3}', text[:-5], changed):
-        stored[0][0].write_text(damaged)
-        engines[1].calls = 0
-        again = fitted_scale(shelf, NoisySimulation(CONFIG, engines[1]), tmp_path)[1]
-        assert engines[1].calls == 20 and (again == found[0]).all()
-    assert stored[0][0].read_text() == text
+    whole = stored[0][0].read_bytes()
+    stored[0][0].write_bytes(whole[:-5])
+    engines[1].calls = 0
+    again = fitted_scale(shelf, NoisySimulation(CONFIG, engines[1]), tmp_path)[1]
+    assert engines[1].calls == 20 and (again == found[0]).all()
+    assert stored[0][0].read_bytes() == whole
 
 
 def test_a_trial_that_fails_is_named_and_the_others_go_on(tmp_path: Path) -> None:
     shelf: Any = Shelf(4, 3)
     broken = NoisySimulation(CONFIG, Flight(fail="collide_testing_1"))
-    evaluation = evaluate_model(shelf, broken, tmp_path, config=EvaluationConfig())
-    assert set(evaluation.predictions["Stimulus Name"]) == {
+    evaluation = evaluate(broken, shelf, tmp_path)
+    assert set(evaluation.predictions["stimulus"]) == {
         "collide_testing_0",
         "collide_testing_2",
     }
-    assert "diverged" in evaluation.problems["collide_testing_1"]
-    assert evaluation.path.name.endswith(".partial.csv")
+    assert "diverged" in evaluation.evaluated[0].problems["collide_testing_1"]
+    assert evaluation.paths[0].name.endswith(".partial.csv")
     whole = NoisySimulation(CONFIG, Flight())
-    again = evaluate_model(shelf, whole, tmp_path, config=EvaluationConfig())
+    again = evaluate(whole, shelf, tmp_path)
     assert len(again.predictions) == 3 and not again.problems
 
 
 def test_without_readout_trials_the_tested_ones_are_cross_fitted(tmp_path: Path) -> None:
     shelf: Any = Shelf(0, 10)
     model = NoisySimulation(CONFIG, Flight())
-    table = evaluate_model(shelf, model, tmp_path, config=EvaluationConfig()).predictions
-    assert len(table) == 10 and set(table["Fold"]) == {0, 1, 2, 3, 4}
-    assert (table["Fit Trials"] == 8).all()
+    table = evaluate(model, shelf, tmp_path).predictions
+    assert len(table) == 10 and set(table["fold"]) == {0, 1, 2, 3, 4}
+    assert (table["fit_trials"] == 8).all()
 
 
 class Oracle:
@@ -247,14 +244,14 @@ def test_other_state_models_are_shown_the_observed_part_alone(tmp_path: Path) ->
     shelf: Any = Shelf()
     assert shelf.index["contact"].any()
     oracle = Oracle()
-    table = evaluate_model(shelf, oracle, tmp_path, config=EvaluationConfig()).predictions
+    table = evaluate(oracle, shelf, tmp_path).predictions
     assert set(oracle.shown) == {(45, 0)}, "neither later frames nor later contacts"
-    assert len(table) == 10 and (table["Predicted Prob_true"] == 0).all()
-    assert set(table["Fit Labels"]) == {""}, "nothing is fitted"
-    assert set(table["Readout Type"]) == {"C"}
-    assert set(table["Inputs"]) == {"state"}, "what its Spec asks for"
+    assert len(table) == 10 and (table["p_contact"] == 0).all()
+    assert set(table["fit_labels"]) == {""}, "nothing is fitted"
+    assert set(table["readout"]) == {"observed"}
+    assert set(table["inputs"]) == {"state"}, "what its Spec asks for"
     with pytest.raises(BadInputError, match="not a probability"):
-        evaluate_model(shelf, Oracle(1.5), tmp_path / "b", config=EvaluationConfig())
+        evaluate(Oracle(1.5), shelf, tmp_path / "b")
 
 
 @pytest.mark.slow
@@ -273,13 +270,13 @@ def test_evaluation_of_generated_trials(tmp_path: Path) -> None:
     dataset = Dataset(tmp_path / "data")
     options: dict[str, Any] = {
         "encoder": "test_vit", "image_size": 64, "weights": "random", "hidden": 16,
+        "steps": 10,
     }  # fmt: skip
-    config = EvaluationConfig(steps=10, accelerator="cpu")
-    seen = evaluate(dataset, "frozen-encoder", tmp_path / "out", options=options, config=config)
+    config = EvaluationSettings(accelerator="cpu")
+    seen = evaluate("frozen-encoder", dataset, tmp_path / "out", options=options, settings=config)
     assert len(seen.predictions) == 9
-    simulated = evaluate(
-        dataset, "noisy-simulation", tmp_path / "out",
+    simulated = evaluate("noisy-simulation", dataset, tmp_path / "out",
         options={"samples": 5, "scales": (0.2, 1.0)}, executor=LocalExecutor(2),
     )  # fmt: skip
     assert simulated.problems == {} and len(simulated.predictions) == 3
-    assert simulated.predictions["Predicted Prob_true"].between(0, 1).all()
+    assert simulated.predictions["p_contact"].between(0, 1).all()

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from physion.clips.batch import Batch, Rollout
 from physion.clips.clips import whole_source
+from physion.clips.imagined import SHOWABLE, Imagine, ImaginedTrial
 from physion.clips.source import WholeSource
 from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError
@@ -19,7 +20,6 @@ from physion.models.interface import Model, ask, can
 from physion.readout.decisions import fraction_of_futures
 from physion.readout.features import Outcomes
 from physion.readout.model_calls import call_model, check_identity, is_network, model_name, to_array
-from physion.report.viewer.imagined import SHOWABLE, Imagine, ImaginedTrial
 from physion.trials.dataset import Dataset
 
 Arrays = NDArray[Any]

@@ -1,1 +1,0 @@
-"""Plans on the command line: choice of models, and tables of tasks."""

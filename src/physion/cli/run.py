@@ -1,0 +1,349 @@
+"""Run the whole pipeline: scenes, physics, rendering, trials, models, readouts, report.
+
+Without options, a balanced sample of the official scenes that ship with the package is simulated
+and rendered, models predict them, and all are compared with the people of the original study. A
+second run resumes, and a larger --limit only adds.
+"""
+
+from __future__ import annotations
+
+import json as json_module
+import os
+import time
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import zip_longest
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from physion.cli.model_options import choose_models, split_names
+from physion.cli.output import Stages, console, print_warnings, text_table
+from physion.core.errors import BadInputError
+from physion.data.official import PACKAGED
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from physion.readout.evaluate import Evaluation
+    from physion.scenes.tdw.read_logs import ImportedTrial
+    from physion.trials.making.plan import TrialTask
+
+OFFICIAL_MODELS = (
+    "pEffNetLite0-mlp",
+    "noisy-simulation",
+    "gns",
+    "gns-ransac",
+    "dpi",
+    "state-classifier",
+    "constant-motion",
+    "already-touched",
+    "chance",
+)
+"""Models of a run on official scenes, in the order of the report."""
+SAMPLED_MODELS = ("frozen-encoder", "noisy-simulation")
+SIMULATIONS = ("noisy-simulation", "noisy-simulation-outcomes", "noisy-simulation-people")
+SHIPPED = ("gns", "gns-ransac", "dpi", "svg", "op3", "cswm", "rpin")
+TRAINING = {"steps": 300}
+"""Settings of the training of models that learn; more steps take longer."""
+COLUMNS = {
+    "model": "row",
+    "readout": "readout",
+    "accuracy": "accuracy",
+    "pearson_r": "r with people",
+    "kappa": "kappa",
+}
+"""Columns of the table on the terminal, by those of the scores."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of ``physion run``."""
+
+    scenes: Path = Path(PACKAGED)
+    """Official scenes: those of the package (official), a folder made by import, or one with
+    command logs."""
+    humans: Path | None = None
+    """Answers of people to these scenes: official, or a folder with human_accuracy-*.csv. Default:
+    official with the scenes of the package, else none."""
+    sampled: bool = False
+    """Sample scenes of Dominoes, Collide and Drop instead; nobody has seen them."""
+    models: str | None = None
+    """Names of models with commas (physion ls models); default: nine for official scenes."""
+    out: Path | None = None
+    """Folder for trials, predictions and the report; default: runs/official or runs/sampled."""
+    limit: int | None = None
+    """Testing trials per scenario, 10 by default, and as many for the readout (twice as many of
+    sampled ones); 0 takes all official ones."""
+    size: int = 128
+    """Pixels per side of the movies."""
+    option: tuple[str, ...] = ()
+    """Settings of the models or of their training as NAME=VALUE, such as steps=1000; of one model
+    as MODEL:NAME=VALUE, such as noisy-simulation:samples=50."""
+    engine: str = "physion"
+    """Engine of the trials and of noisy-simulation (physion ls engines); mujoco has no cloth."""
+    encoder_batch: int = 4
+    """Clips that a network encodes at a time; lower it when memory runs out."""
+    workers: int = os.cpu_count() or 1
+    """Number of processes."""
+    trial_pages: bool = False
+    """Also write a page for each stimulus, to trials/ in the folder of the report."""
+    json: bool = False
+    """Print one JSON object instead of a table."""
+
+
+def main(options: Options) -> int:
+    """Run the whole pipeline, or what is missing of it; return 1 if something failed."""
+    started = time.monotonic()
+    options = _complete(options)
+    assert options.out is not None, "completed"
+    models = model_options(options)
+    check_models(models)
+    plan = (
+        plan_sampled(options.limit)
+        if options.sampled
+        else plan_official(options.scenes, options.humans, options.limit)
+    )
+    failures = [*plan.failures, *write_trials(options, plan.tasks)]
+    done = predict(options, models)
+    failures += [f"{where}: {why}" for where, why in {**done.problems, **done.failed}.items()]
+    page, scores = write_report(options, plan, done)
+    if options.json:
+        rows = json_module.loads(scores.to_json(orient="records"))
+        answer = {"report": str(page), "scores": rows, "failures": failures}
+        print(json_module.dumps(answer, indent=1))
+        return 1 if failures else 0
+    for failure in failures:
+        console.print(f"failed: {failure}", markup=False, soft_wrap=True)
+    _print(scores)
+    minutes, seconds = divmod(round(time.monotonic() - started), 60)
+    console.print(
+        f"report, made in {minutes} min {seconds} s: {page}", markup=False, soft_wrap=True
+    )
+    return 1 if failures else 0
+
+
+def _print(scores: pd.DataFrame) -> None:
+    """Print one line for each row: scores of all stimuli together."""
+    pooled = scores[scores["scenario"] == "pooled"]
+    shown = pooled[[name for name in COLUMNS if name in pooled]].rename(columns=COLUMNS)
+    table = text_table(shown.dropna(axis="columns", how="all"))
+    console.print(table, markup=False, soft_wrap=True)
+
+
+def _complete(options: Options) -> Options:
+    """Return the options with what follows from others; raise `BadInputError` if they disagree."""
+    from physion.data.official import find_official, humans_folder
+
+    if options.sampled and options.humans is not None:
+        raise BadInputError("--humans does not apply to --sampled: nobody has seen these scenes")
+    least = 1 if options.sampled else 0
+    if options.limit is not None and options.limit < least:
+        raise BadInputError(f"--limit must be at least {least}, not {options.limit}")
+    out = options.out or Path("runs") / ("sampled" if options.sampled else "official")
+    humans = options.humans
+    if not options.sampled and humans is None and find_official(options.scenes) is not None:
+        humans = options.scenes
+    humans = None if humans is None else humans_folder(humans)
+    return replace(options, out=out, humans=humans)
+
+
+def model_options(options: Options) -> dict[str, dict[str, Any]]:
+    """Return the models of a run and the options of each."""
+    default = SAMPLED_MODELS if options.sampled else OFFICIAL_MODELS
+    names = list(default) if options.models is None else split_names(options.models, "model")
+    presets: dict[str, dict[str, Any]] = {
+        # Frames of the size of the movies: enlarging them would only take time.
+        "pEffNetLite0-mlp": {"image_size": options.size},
+        "pEffNetLite0-lstm": {"image_size": options.size},
+        "frozen-encoder": {"encoder": "resnet18", "weights": "random"},
+        **{name: {"weights": "shipped"} for name in SHIPPED},
+        **{name: {"samples": 20, "engine": options.engine} for name in SIMULATIONS},
+    }
+    known = {name: {**TRAINING, **presets.get(name, {})} for name in names}
+    return choose_models(names, options.option, known)
+
+
+def check_models(models: Mapping[str, Mapping[str, Any]]) -> None:
+    """Build every model, so that a wrong name or a missing library fails before trials are made."""
+    from physion.readout.cells import choose_models as choose
+
+    for chosen in choose(models):
+        chosen.build(0)
+
+
+def predict(options: Options, models: Mapping[str, Mapping[str, Any]]) -> Evaluation:
+    """Write the predictions of every model."""
+    from physion.compute.local import LocalExecutor
+    from physion.readout.evaluate import evaluate
+    from physion.readout.settings import EvaluationSettings
+
+    assert options.out is not None, "completed"
+    with Stages() as stages:
+        return evaluate(
+            models,
+            options.out / "trials",
+            options.out / "models",
+            settings=EvaluationSettings(encoder_batch=options.encoder_batch),
+            executor=LocalExecutor(workers=options.workers),
+            progress=stages,
+        )
+
+
+def write_trials(options: Options, tasks: list[TrialTask]) -> list[str]:
+    """Simulate, label, render and store missing trials; return the failures."""
+    from physion.compute.local import LocalExecutor
+    from physion.trials.making.generate import make_trials
+    from physion.trials.making.plan import GenerateSettings
+
+    assert options.out is not None, "completed"
+    with Stages() as stages:
+        report = make_trials(
+            options.out / "trials",
+            tasks,
+            GenerateSettings(
+                width=options.size,
+                height=options.size,
+                look="redyellow",
+                jitters=0,
+                engine=options.engine,
+            ),
+            executor=LocalExecutor(workers=options.workers),
+            progress=stages,
+        )
+    return [f"{name}: {reason}" for name, reason in report.failed.items()]
+
+
+def write_report(options: Options, plan: RunPlan, done: Evaluation) -> tuple[Path, pd.DataFrame]:
+    """Write the report; return its page and the table of scores."""
+    import pandas as pd
+
+    from physion.core.names import canonical_name
+    from physion.report.build import compare_files
+    from physion.report.html import movies_of
+    from physion.trials.dataset import Dataset
+
+    assert options.out is not None, "completed"
+    dataset = Dataset(options.out / "trials")
+    page = compare_files(
+        done.paths,
+        options.humans,
+        {canonical_name(name): contact for name, contact in plan.recorded.items()} or None,
+        options.out / "report",
+        methods=methods(options, dataset.index),
+        movies=movies_of(dataset.folder),
+        question="Will the red object touch the yellow one?",
+        trial_pages=options.trial_pages,
+    )
+    report = json_module.loads((page.parent / "report.json").read_text(encoding="utf-8"))
+    print_warnings([*done.warnings, *report["warnings"]])
+    return page, pd.read_csv(page.parent / "tables" / "comparison.csv")
+
+
+def methods(options: Options, index: pd.DataFrame) -> dict[str, str]:
+    """Return the settings of a run as texts for the report."""
+    splits = index.groupby("split").size()
+    counts = ", ".join(f"{count} {split}" for split, count in splits.items())
+    source = "sampled by this package" if options.sampled else "official scenes"
+    return {
+        "Scenes": f"{source}; trials: {counts}; movies of {options.size} x {options.size} pixels",
+        "Readout": "one L2 logistic regression per scenario on standardised features, C from 17 "
+        "values in 1e-8 to 1e8 by stratified 5-fold cross-validation on readout trials",
+        "Training": f"models that learn: {TRAINING['steps']} steps on the readout trials, no labels"
+        + (f"; options: {' '.join(options.option)}" if options.option else ""),
+        "Noise of the simulation": "20 simulations per trial from the true state at the end of the "
+        "observed part; the noise scale is fitted on readout trials only",
+        "Engine": ", ".join(sorted(set(index["engine"]))),
+        "Renderer": ", ".join(sorted(set(index["renderer"]))),
+    }
+
+
+# Trials of a run: the official scenes that people saw, or sampled ones.
+
+SAMPLED_SCENARIOS = ("dominoes", "collide", "drop")
+LIMIT = 10
+"""Testing trials of a scenario, if no number is asked for."""
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """Trials to make, recorded outcomes by stimulus, and failures of the import."""
+
+    tasks: list[TrialTask]
+    recorded: Mapping[str, bool]
+    failures: list[str]
+
+
+def plan_sampled(limit: int | None) -> RunPlan:
+    """Plan a small set of sampled trials: testing, and twice as many for the readout."""
+    from physion.trials.making.plan import plan_dataset
+
+    count = LIMIT if limit is None else limit
+    tasks = plan_dataset("sampled", SAMPLED_SCENARIOS, {"readout": 2 * count, "testing": count})
+    return RunPlan(tasks, {}, [])
+
+
+def plan_official(scenes: Path, humans: Path | None, limit: int | None) -> RunPlan:
+    """Plan official scenes: those that people saw are tested, others fit models and readouts.
+
+    ``limit`` is the number of testing trials of a scenario, balanced by recorded outcome; as many
+    others are fitted. 0 takes all.
+    """
+    from physion.analysis.tables import read_humans
+    from physion.core.names import canonical_name
+    from physion.data.official import read_official_trials
+    from physion.trials.making.plan import check_names, plan_scenes
+
+    limit = LIMIT if limit is None else limit or None
+    seen = set(read_humans(humans)["stimulus"]) if humans is not None else None
+    logs = read_official_trials(scenes)
+    logs.require_trials()
+    recorded = {trial.scene.name: trial.outcome.contact for trial in logs.trials}
+    parts: dict[str, list[ImportedTrial]] = {"testing": [], "readout": []}
+    for trial in logs.trials:
+        # Familiarization trials are neither tested nor fitted.
+        if "familiarization" not in trial.scene.name:
+            tested = seen is None or canonical_name(trial.scene.name) in seen
+            parts["testing" if tested else "readout"].append(trial)
+    # Scenes with the physics of a tested one are not fitted.
+    known = {trial.scene.physics_digest() for trial in parts["testing"]}
+    parts["readout"] = [t for t in parts["readout"] if t.scene.physics_digest() not in known]
+    tasks: list[TrialTask] = []
+    for split, trials in parts.items():
+        chosen = [trial.scene for trial in balanced_trials(trials, limit)]
+        tasks += plan_scenes("official", chosen, split, recorded)
+    if not any(task.split == "testing" for task in tasks):
+        raise BadInputError(f"none of the scenes in {scenes} is in {humans}")
+    check_names(tasks)
+    return RunPlan(tasks, recorded, [str(failure) for failure in logs.failures])
+
+
+def balanced_trials(trials: Iterable[ImportedTrial], limit: int | None) -> list[ImportedTrial]:
+    """Return at most ``limit`` trials per scenario, with and without contact alternately.
+
+    The choice depends on names and outcomes only; a larger limit includes the trials of a smaller
+    one. Without a limit all trials are returned.
+    """
+    from physion.core.seeds import stable_hash
+
+    groups: dict[str, list[ImportedTrial]] = defaultdict(list)
+    for trial in sorted(trials, key=lambda trial: stable_hash("limit", trial.scene.name)):
+        groups[trial.scene.scenario].append(trial)
+    # Scenarios begin with either kind, so that one trial of each is balanced, too.
+    ordered = sorted(groups)
+    return [
+        trial
+        for place, scenario in enumerate(ordered)
+        for trial in _alternating(groups[scenario], first=place % 2 == 0)[:limit]
+    ]
+
+
+def _alternating(trials: Sequence[ImportedTrial], *, first: bool) -> list[ImportedTrial]:
+    """Return trials with the outcome ``first`` and with the other, alternately.
+
+    What is left of the more frequent kind comes last.
+    """
+    same = [trial for trial in trials if trial.outcome.contact == first]
+    others = [trial for trial in trials if trial.outcome.contact != first]
+    pairs = zip_longest(same, others)
+    return [trial for pair in pairs for trial in pair if trial is not None]

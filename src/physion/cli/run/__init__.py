@@ -1,1 +1,0 @@
-"""The verb ``run``: which trials, which models, and the report."""

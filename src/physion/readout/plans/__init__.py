@@ -1,1 +1,0 @@
-"""Plans: all trainings, or all evaluations, of models x training protocols x scenarios x seeds."""

@@ -1,0 +1,218 @@
+"""Evaluation of models, from movies to the table of predictions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from physion.analysis.tables import check_predictions
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.models import build_model, models
+from physion.readout.evaluate import Evaluation, evaluate
+from physion.readout.logistic import LogisticSettings
+from physion.readout.settings import EvaluationSettings
+from physion.readout.tables import COLUMNS, MEAN, read_table, summarise_accuracy, write_table
+from physion.trials.dataset import Dataset
+from support.moving_dots import make_dots
+from support.tiny_models import TINY
+
+QUICK = EvaluationSettings(accelerator="cpu", logistic=LogisticSettings(grid=(1e-4, 1e-2, 1.0)))
+OPTIONS: dict[str, Any] = {**TINY, "steps": 20}
+COUNTS = {"training": 4, "readout": 24, "testing": 20}
+
+
+@pytest.fixture(scope="module")
+def dots(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return make_dots(tmp_path_factory.mktemp("dots"), COUNTS, ("collide", "drop"))
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("work")
+
+
+@pytest.fixture(scope="module")
+def done(dots: Dataset, work: Path) -> Evaluation:
+    return evaluate("frozen-encoder", dots, work, options=OPTIONS, settings=QUICK)
+
+
+def accuracy(table: pd.DataFrame, protocol: str) -> float:
+    rows = table[table["readout"] == protocol]
+    return float(((rows["p_contact"] > 0.5) == rows["outcome"]).mean())
+
+
+@pytest.mark.slow
+def test_full_is_far_above_chance_and_observed_is_not(done: Evaluation) -> None:
+    """The dot changes direction after the observed part, which therefore does not predict it."""
+    table = done.predictions
+    assert accuracy(table, "full") > 0.5 + 3 * np.sqrt(0.25 / 40)
+    for protocol in ("observed", "observed+simulated"):
+        assert abs(accuracy(table, protocol) - 0.5) < 3 * np.sqrt(0.25 / 40)
+
+
+def test_the_table_has_one_row_per_trial_and_readout(done: Evaluation, dots: Dataset) -> None:
+    table = done.predictions
+    assert tuple(table.columns) == COLUMNS
+    assert len(table) == 3 * 2 * COUNTS["testing"]
+    assert (table["init"] == "random").all()
+    assert (table["inputs"] == "rgb").all()
+    assert (table["model"] == "random-test_vit-mlp").all()
+    assert set(table["readout"]) == {"full", "observed+simulated", "observed"}
+    assert set(table["protocol"]) == {"all"} and set(table["seed"]) == {"0"}
+    truth = dots.index.set_index("trial")["contact"]
+    assert (table["outcome"] == table["stimulus"].map(truth)).all()
+    cell = table[(table["readout"] == "full") & (table["scenario"] == "drop")]
+    hits = (cell["p_contact"] > 0.5) == cell["outcome"]
+    assert cell["test_accuracy"].unique() == pytest.approx([hits.mean()])
+    assert (table["fit_trials"] == COUNTS["readout"]).all() and (table["fold"] == -1).all()
+    assert (table["recorded_outcome"] == "").all()
+    assert (table["fit_labels"] == "simulated").all()
+    assert table["validation_loss"].notna().all() and table["copy_last_loss"].gt(0).all()
+
+
+def test_the_comparison_reads_the_table(done: Evaluation) -> None:
+    checked = check_predictions(pd.read_csv(done.paths[0]))
+    assert set(checked["readout"]) == {"observed", "observed+simulated", "full"}
+    assert len(checked) == len(done.predictions)
+
+
+def test_a_second_run_does_nothing_and_says_the_same(
+    done: Evaluation, dots: Dataset, work: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: list[str] = []
+
+    def note(what: str, done: int, total: int) -> None:
+        steps.append(what)
+
+    again = evaluate("frozen-encoder", dots, work, options=OPTIONS, settings=QUICK, progress=note)
+    assert steps == [] and again.paths[0] == done.paths[0]
+    pd.testing.assert_frame_equal(again.predictions, done.predictions)
+    content = done.paths[0].read_bytes()
+    done.paths[0].unlink()
+    evaluate("frozen-encoder", dots, work, options=OPTIONS, settings=QUICK, progress=note)
+    assert "features" not in steps and "training all" not in steps
+    assert done.paths[0].read_bytes() == content
+
+
+@pytest.mark.parametrize("damage", ["cut", "empty", "no text", "another number"])
+def test_a_damaged_table_is_made_again(
+    done: Evaluation, dots: Dataset, work: Path, damage: str
+) -> None:
+    content = done.paths[0].read_bytes()
+    changed = {
+        "cut": b"\n".join(content.split(b"\n")[:3]) + b"\n",
+        "empty": b"",
+        "no text": b"\xff\xfe" + content,
+        "another number": content.replace(b"True", b"Trve", 1),
+    }[damage]
+    assert changed != content
+    done.paths[0].write_bytes(changed)
+    again = evaluate("frozen-encoder", dots, work, options=OPTIONS, settings=QUICK)
+    assert again.paths[0].read_bytes() == content
+    pd.testing.assert_frame_equal(again.predictions, done.predictions)
+
+
+def test_other_dynamics_share_the_features(done: Evaluation, dots: Dataset, work: Path) -> None:
+    steps: list[str] = []
+    settings = replace(QUICK, readouts=("observed+simulated",))
+    evaluation = evaluate(
+        "frozen-encoder", dots, work, options={**TINY, "dynamics": "lstm", "steps": 5},
+        settings=settings, progress=lambda what, done, total: steps.append(what),
+    )  # fmt: skip
+    assert "features" not in steps and steps.count("training all") >= 5
+    assert set(evaluation.predictions["model"]) == {"random-test_vit-lstm"}
+
+
+def test_without_a_readout_split_the_tested_trials_are_cross_fitted(
+    dots: Dataset, work: Path, done: Evaluation
+) -> None:
+    tested = Dataset(dots.folder)
+    tested.index = tested.index[tested.index["split"] == "testing"].reset_index(drop=True)
+    settings = replace(QUICK, folds=4, readouts=("observed", "full"))
+    table = evaluate("frozen-encoder", tested, work, options=OPTIONS, settings=settings).predictions
+    assert set(table["fold"]) == {0, 1, 2, 3} and len(table) == 2 * 2 * COUNTS["testing"]
+    assert (table["fit_trials"] < COUNTS["testing"]).all()
+    assert accuracy(table, "full") > 0.7
+
+
+def test_a_broken_movie_is_one_clear_error_and_leaves_no_table(tmp_path: Path) -> None:
+    dots = make_dots(tmp_path / "data", {"readout": 2, "testing": 2}, ("drop",))
+    path = dots.paths("drop_testing_0001").observed_movie
+    path.write_bytes(path.read_bytes()[:400])
+    with pytest.raises(BadInputError, match="drop_testing_0001"):
+        evaluate("frozen-encoder", dots, tmp_path / "out", options=OPTIONS, settings=QUICK)
+    assert list((tmp_path / "out").rglob("*.csv")) == []
+    assert list((tmp_path / "out").rglob("*.part")) == []
+
+
+def test_unknown_and_impossible_readouts_are_refused(dots: Dataset, tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match="observed"):
+        evaluate("chance", dots, tmp_path, settings=EvaluationSettings(readouts=("obs",)))
+    with pytest.raises(BadInputError, match="does not support the readout"):
+        evaluate(
+            "noisy-simulation", dots, tmp_path, settings=EvaluationSettings(readouts=("full",))
+        )
+    with pytest.raises(UnknownNameError, match="all-but"):
+        evaluate("chance", dots, tmp_path, protocols="but-all")
+    with pytest.raises(UnknownNameError, match="logistic"):
+        evaluate("chance", dots, tmp_path, settings=EvaluationSettings(decision="logistics"))
+    assert "frozen-encoder" in models
+
+
+def test_an_encoder_without_dynamics_has_two_readouts(
+    dots: Dataset, work: Path, done: Evaluation
+) -> None:
+    inner: Any = build_model("frozen-encoder", **TINY)
+
+    class Seeing:
+        spec = inner.spec
+        provenance = inner.provenance
+        digest = encoder_digest = inner.encoder_digest
+
+        def encode(self, batch: Any) -> Any:
+            return inner.encode(batch.to("cpu")).numpy()
+
+    table = evaluate(Seeing(), dots, work, settings=QUICK).predictions
+    assert set(table["readout"]) == {"observed", "full"}
+    assert (table["protocol"] == "").all()
+    again = done.predictions[done.predictions["readout"] == "full"].reset_index(drop=True)
+    same = table[table["readout"] == "full"].reset_index(drop=True)
+    assert np.allclose(same["p_contact"], again["p_contact"])
+
+
+def test_tables_survive_their_file(done: Evaluation, tmp_path: Path) -> None:
+    write_table(done.predictions, tmp_path / "t.csv")
+    read = read_table(tmp_path / "t.csv")
+    pd.testing.assert_frame_equal(read, done.predictions, check_exact=True)
+
+
+def rows_of(hits: dict[str, list[bool]], seed: int = 0, **changes: str) -> pd.DataFrame:
+    """Return predictions that are right or not as ``hits`` says, by scenario."""
+    rows = [
+        {"model": "m", "init": "random", "protocol": "all", "readout": "full", "seed": str(seed),
+         "scenario": scenario, "outcome": True, "p_contact": float(hit), **changes}
+        for scenario, values in hits.items()
+        for hit in values
+    ]  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def test_scores_are_means_and_deviations_over_seeds() -> None:
+    first = rows_of({"collide": [True, True, False, False], "drop": [True, True]})
+    second = rows_of({"collide": [True, True, True, False], "drop": [True, False]}, seed=1)
+    summary = summarise_accuracy(pd.concat([first, second]))
+    assert list(summary["scenario"]) == ["collide", "drop", MEAN]
+    assert list(summary["seeds"]) == [2, 2, 2] and list(summary["trials"]) == [4, 2, 6]
+    assert summary["accuracy"].tolist() == pytest.approx([0.625, 0.75, 0.6875])
+    expected = [np.std(pair, ddof=1) for pair in ([0.5, 0.75], [1.0, 0.5], [0.75, 0.625])]
+    assert summary["spread"].tolist() == pytest.approx(expected)
+    other = rows_of({"collide": [True]}, init="imagenet")
+    both = summarise_accuracy(pd.concat([first, other]))
+    assert set(both["init"]) == {"random", "imagenet"}, "whose rows are not averaged"
+    assert both["seeds"].tolist() == [1] * len(both) and both["spread"].isna().all()
+    assert len(summarise_accuracy(first.iloc[:0])) == 0
