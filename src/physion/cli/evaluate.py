@@ -14,8 +14,9 @@ from typing import Annotated, Any
 import tyro
 
 from physion.cli.model_options import choose_models, split_names
-from physion.cli.output import Stages, console, print_warnings, text_table
+from physion.cli.output import Stages, console, print_warnings, scores_table, text_table
 from physion.compute.run_tasks import ExecutorSettings
+from physion.core.errors import BadInputError
 from physion.core.settings import read_pairs
 from physion.readout.evaluate import EvaluatedModel, Evaluation, evaluate
 from physion.readout.logistic import LogisticSettings
@@ -121,10 +122,30 @@ def _print(done: Evaluation, options: Options) -> None:
     if done.evaluated:
         print_warnings(done.warnings)
         _line(text_table(done.scores.dropna(axis="columns", how="all")))
+        _print_people(done)
     for one in done.evaluated:
         _line(f"predictions: {one.path}{' (done before)' if one.done else ''}")
         if one.rollout_errors is not None:
             _line(f"errors of imagined motion: {one.rollout_errors}")
+
+
+def _print_people(done: Evaluation) -> None:
+    """Print how similar the predictions are to people's, of official stimuli that people saw."""
+    import physion
+    from physion.analysis.tables import read_humans, read_predictions
+    from physion.data.official import official
+
+    data = official()
+    people, predictions = read_humans(data.humans), read_predictions(done.paths)
+    if not set(predictions["stimulus"]) & set(people["stimulus"]):
+        return
+    try:
+        results = physion.compare(predictions, people, data.labels)
+    except BadInputError as error:
+        print_warnings([f"no comparison with people: {error}"])
+        return
+    _line("With the people of the original study:")
+    _line(scores_table(results.comparison.scores))
 
 
 def _values(one: EvaluatedModel) -> dict[str, Any]:

@@ -124,6 +124,24 @@ def counted(number: int, singular: str, plural: str = "") -> str:
     return f"{number} {singular if number == 1 else plural or singular + 's'}"
 
 
+SCORES = {
+    "model": "row",
+    "stimuli": "stimuli",
+    "accuracy": "accuracy",
+    "human_accuracy": "of people",
+    "r": "r with people",
+    "kappa_from_averages": "kappa",
+}
+"""Columns of `scores_table` by those of the scores of a comparison."""
+
+
+def scores_table(scores: pd.DataFrame) -> str:
+    """Return a text table with one line for each row of a comparison, all stimuli together."""
+    pooled = scores[scores["scenario"] == "pooled"]
+    shown = pooled[[name for name in SCORES if name in pooled]].rename(columns=SCORES)
+    return text_table(shown.dropna(axis="columns", how="all"))
+
+
 def text_table(table: pd.DataFrame, title: str = "") -> str:
     """Return a table as text: a header and one line per row, columns separated by two spaces.
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from physion.cli.model_options import choose_models, split_names
-from physion.cli.output import Stages, console, print_warnings, text_table
+from physion.cli.output import Stages, console, print_warnings, scores_table
 from physion.core.errors import BadInputError
 from physion.data.official import PACKAGED
 
@@ -46,14 +46,6 @@ SIMULATIONS = ("noisy-simulation", "noisy-simulation-outcomes", "noisy-simulatio
 SHIPPED = ("gns", "gns-ransac", "dpi", "svg", "op3", "cswm", "rpin")
 TRAINING = {"steps": 300}
 """Settings of the training of models that learn; more steps take longer."""
-COLUMNS = {
-    "model": "row",
-    "readout": "readout",
-    "accuracy": "accuracy",
-    "pearson_r": "r with people",
-    "kappa": "kappa",
-}
-"""Columns of the table on the terminal, by those of the scores."""
 
 
 @dataclass(frozen=True)
@@ -115,20 +107,12 @@ def main(options: Options) -> int:
         return 1 if failures else 0
     for failure in failures:
         console.print(f"failed: {failure}", markup=False, soft_wrap=True)
-    _print(scores)
+    console.print(scores_table(scores), markup=False, soft_wrap=True)
     minutes, seconds = divmod(round(time.monotonic() - started), 60)
     console.print(
         f"report, made in {minutes} min {seconds} s: {page}", markup=False, soft_wrap=True
     )
     return 1 if failures else 0
-
-
-def _print(scores: pd.DataFrame) -> None:
-    """Print one line for each row: scores of all stimuli together."""
-    pooled = scores[scores["scenario"] == "pooled"]
-    shown = pooled[[name for name in COLUMNS if name in pooled]].rename(columns=COLUMNS)
-    table = text_table(shown.dropna(axis="columns", how="all"))
-    console.print(table, markup=False, soft_wrap=True)
 
 
 def _complete(options: Options) -> Options:

@@ -81,7 +81,8 @@ class ChosenModel:
         """Return the settings of the training of a built model; None if it does not learn."""
         if not (is_network(model) and can(model, "loss")):
             return None
-        return dataclasses.replace(ask(model, "training_settings"), **self.training)
+        own: TrainingSettings = ask(model, "training_settings")
+        return dataclasses.replace(own, **self.training)
 
 
 def choose_models(models: Models, options: Mapping[str, Any] | None = None) -> list[ChosenModel]:

@@ -211,7 +211,8 @@ def train(
 
     if devices * nodes > 1 or dry_run:
         # A failure ends the run: the processes on other devices would wait for this one.
-        lists, failed = [here(cell) for cell in cells.cells], {}
+        lists = [here(cell) for cell in cells.cells]
+        failed: dict[str, str] = {}
     else:
         lists, failed = cells.run(here, work, Path(out), "trainings", executor, progress)
     made = [one for of_cell in lists for one in of_cell]
