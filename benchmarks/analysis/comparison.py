@@ -28,7 +28,7 @@ import pandas as pd
 
 from physion.analysis import compare as results
 from physion.core.names import SCENARIOS
-from physion.report import build, people
+from physion.report import build, compare, people
 
 RESULTS = Path(__file__).parents[1] / "results"
 PEOPLE, STIMULI, PRACTICE = 100, 150, 10
@@ -173,9 +173,8 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
         predicted, answered, sessions = write_study(folder)
         start, cpu = time.perf_counter(), time.process_time()
-        page = build.compare_files(
-            [predicted], None, None, folder / "report", responses=[answered], sessions=sessions
-        )
+        result = compare(predicted, responses=answered, sessions=sessions)
+        page = result.report(folder / "report")
         wall, cpu = time.perf_counter() - start, time.process_time() - cpu
         size = page.stat().st_size
     result = {

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 from physion.core.version import __version__
 
 if TYPE_CHECKING:
-    from physion.analysis.compare import compare
     from physion.clips.clips import clips
     from physion.data.official import official
     from physion.models.build import build_model
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from physion.readout.evaluate import evaluate
     from physion.readout.train import train
     from physion.rendering.renderer import Renderer
+    from physion.report.compare import compare
     from physion.scenes.sampling.sample import sample_scene
     from physion.trials.dataset import Dataset
     from physion.trials.making.generate import generate
@@ -51,7 +51,7 @@ _MODULES = {
     "Renderer": "physion.rendering.renderer",
     "build_model": "physion.models.build",
     "clips": "physion.clips.clips",
-    "compare": "physion.analysis.compare",
+    "compare": "physion.report.compare",
     "evaluate": "physion.readout.evaluate",
     "generate": "physion.trials.making.generate",
     "label_contact": "physion.physics.labels",

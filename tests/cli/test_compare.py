@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -12,8 +13,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.cli.compare.compare import SUBVERBS
 from physion.cli.main import main
+from physion.data.official import official as physion_official
 from physion.trials.files import TrialPaths
 from physion.trials.index import COLUMNS
 
@@ -39,27 +40,10 @@ def predictions(official: Path, path: Path, model: str = "m", skill: float = 0.8
     return path
 
 
-@pytest.mark.parametrize("verb", sorted(SUBVERBS))
-def test_every_verb_below_has_help(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as left:
-        main(["compare", verb, "--help"])
-    assert left.value.code == 0
-    assert f"physion compare {verb}" in capsys.readouterr().out
-
-
-def test_help_names_the_verbs_below(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["compare", "--help"])
-    out = capsys.readouterr().out
-    assert all(f"physion compare {verb}" in out for verb in SUBVERBS)
-    assert "physion compare FILES... --humans DIR" in out
-
-
-@pytest.mark.parametrize("words", [["compare"], *(["compare", verb] for verb in sorted(SUBVERBS))])
-def test_help_imports_nothing_heavy(words: list[str]) -> None:
+def test_help_imports_nothing_heavy() -> None:
     code = (
         "import sys\nfrom physion.cli.main import main\n"
-        f"try: main({[*words, '--help']!r})\nexcept SystemExit: pass\n"
+        "try: main(['compare', '--help'])\nexcept SystemExit: pass\n"
         "heavy = {'numpy', 'torch', 'scipy', 'matplotlib', 'pandas'} & set(sys.modules)\n"
         "sys.exit(' '.join(heavy) or 0)"
     )
@@ -67,8 +51,35 @@ def test_help_imports_nothing_heavy(words: list[str]) -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_two_columns_are_enough_and_the_terminal_shows_the_results(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    labels = physion_official().labels
+    names = [name for name in labels if name.startswith(("pilot_it2_drop", "pilot_it2_coll"))]
+    p = [0.9 if labels[name] else 0.2 for name in names]
+    for name, columns in (("good", ["stimulus", "p_contact"]), ("same", ["stimulus", "p"])):
+        table = pd.DataFrame({columns[0]: names, columns[1]: p})
+        table.to_csv(tmp_path / f"{name}.csv", index=False)
+    files = [str(tmp_path / f"{name}.csv") for name in ("good", "same")]
+    command = ["compare", *files, "--humans", "official", "--out", str(tmp_path / "out")]
+    assert main(command) == 0
+    out = capsys.readouterr().out
+    lines = [line for line in out.splitlines() if line.strip()]
+    assert lines[1].split() == ["model", "stimuli", "accuracy", "r", "with", "people", "kappa"]
+    rows = [re.split(r"\s{2,}", line) for line in lines[2:-1]]
+    assert [row[0] for row in rows] == [
+        "one person with another", "good", "same", "recorded outcome", "majority of people"
+    ]  # fmt: skip
+    assert rows[1][2] == "1.000 [1.000, 1.000]" and rows[1][1:] == rows[2][1:]
+    assert lines[-1] == f"report: {tmp_path / 'out' / 'report.html'}"
+    assert main([*command, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    own = [row for row in found["scores"] if row["model"] == "good" and row["scenario"] == "mean"]
+    assert own[0]["accuracy"] == 1 and own[0]["kind"] == "model" and own[0]["kappa"] is None
+
+
 @pytest.mark.slow
-def test_the_old_form_writes_the_report(
+def test_files_with_official_headers_write_the_report(
     official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = predictions(official, tmp_path / "m.csv")
@@ -79,9 +90,9 @@ def test_the_old_form_writes_the_report(
 
 
 def test_without_files_it_says_so(capsys: pytest.CaptureFixture[str]) -> None:
-    for words in ([], ["validate"]):
+    for words, said in (([], "no predictions"), (["--check"], "nothing to check")):
         assert main(["compare", *words]) == 2
-        assert "no file of predictions" in capsys.readouterr().err
+        assert said in capsys.readouterr().err
 
 
 @dataclass(frozen=True)
@@ -160,7 +171,7 @@ def test_every_option_of_a_comparison_reaches_the_report(
     )
     assert all(row["reason"] for row in plain["people_hypotheses"] if row["hypothesis"] == "H1")
     command += ["--expected", str(own.expected), "--attributes", str(own.dataset)]
-    command += ["--movies", str(own.dataset), "--rules", "official-code", "--seed", "5"]
+    command += ["--dataset", str(own.dataset), "--rules", "official-code", "--seed", "5"]
     command += ["--trial-pages"]
     assert main(command) == 0
     found = json.loads(capsys.readouterr().out)
@@ -223,7 +234,7 @@ def test_options_that_do_not_fit_are_one_line(
         ([*people, "--expected", str(other)], "stimulus"),
         ([*people, "--rules", "offical-code"], "official-code"),
         ([*people, "--resamples", "0"], "resamples"),
-        ([*people, "--movies", str(tmp_path)], "dataset"),
+        ([*people, "--dataset", str(tmp_path)], "dataset"),
     ):
         if words[-1] == str(other) and "--expected" in words:
             other.write_text("session\ndrop-p0\n")
@@ -233,15 +244,15 @@ def test_options_that_do_not_fit_are_one_line(
     assert not (tmp_path / "out").exists()
 
 
-# --- official -----------------------------------------------------------------------------------
+# --- published numbers --------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_official_prints_and_writes_the_published_numbers(
+def test_published_prints_and_writes_the_published_numbers(
     official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "tables"
-    assert main(["compare", "official", str(official), "--out", str(out)]) == 0
+    assert main(["compare", "--published", "--humans", str(official), "--out", str(out)]) == 0
     text = capsys.readouterr().out
     for part in ("Accuracy as published", "Panel A", "Panel C", "Panel D", "Panel E",
                  "Regressions", "168 of 168", "0.748", "800 - 112 = 688"):  # fmt: skip
@@ -256,64 +267,69 @@ def test_official_prints_and_writes_the_published_numbers(
     }  # fmt: skip
 
 
-def test_official_as_json(official: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["compare", "official", str(official), "--json"]) == 0
+def test_published_as_json(official: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compare", "--published", "--humans", str(official), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     dpi = [row for row in found["tables"]["accuracies"] if row["model"] == "DPI"]
     assert len(dpi) == 8 and all(0 < row["published"] < 1 for row in dpi)
     assert "detection" in found["words"]["accuracies"]
 
 
-def test_official_of_another_folder_is_one_line(
+def test_published_of_another_folder_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["compare", "official", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert (
+        main(["compare", "--published", "--humans", str(tmp_path), "--out", str(tmp_path / "out")])
+        == 2
+    )
     message = capsys.readouterr().err
     assert message.count("\n") == 1 and "results" in message
     assert not (tmp_path / "out").exists()
 
 
-# --- validate -----------------------------------------------------------------------------------
+# --- check -----------------------------------------------------------------------------------
 
 
-def test_validate_a_good_file(
+def test_check_a_good_file(
     official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = predictions(official, tmp_path / "m.csv")
-    assert main(["compare", "validate", str(file), "--humans", str(official / "humans")]) == 0
+    assert main(["compare", "--check", str(file), "--humans", str(official / "humans")]) == 0
     out = capsys.readouterr().out
-    assert "1200 rows, 1 models, 0 errors, 0 warnings" in out and "leakage" in out
+    assert "1200 rows, 1 model, 0 errors, 0 warnings" in out and "leakage" in out
 
 
-def test_validate_names_the_bad_row(
+def test_check_names_the_bad_row(
     official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     good, bad = (predictions(official, tmp_path / f"{name}.csv") for name in ("good", "bad"))
     rows = pd.read_csv(bad, dtype=str)
     rows.loc[41, "Predicted Prob_true"] = "1.5"
     rows.to_csv(bad, index=False)
-    assert main(["compare", "validate", str(good), str(bad)]) == 1
+    assert main(["compare", "--check", str(good), str(bad)]) == 1
     line = next(line for line in capsys.readouterr().out.splitlines() if "error: " in line)
     assert "row 42" in line and rows.loc[41, "Stimulus Name"] in line and "bad.csv" in line
-    assert main(["compare", "validate", str(good), str(bad), "--json"]) == 1
+    assert main(["compare", "--check", str(good), str(bad), "--json"]) == 1
     first, second = json.loads(capsys.readouterr().out)
     assert (first["errors"], second["errors"]) == (0, 1)
     assert second["faults"][0]["row"] == 42 and second["faults"][0]["level"] == "error"
 
 
-def test_validate_finds_what_the_readout_was_fitted_on(
+def test_check_finds_what_the_readout_was_fitted_on(
     official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = predictions(official, tmp_path / "m.csv")
     fitted = tmp_path / "fitted.txt"
     fitted.write_text(str(pd.read_csv(file)["Stimulus Name"].iloc[7]) + "\n")
-    assert main(["compare", "validate", str(file), "--fitted", str(fitted)]) == 1
+    assert main(["compare", "--check", str(file), "--fitted", str(fitted)]) == 1
     assert "row 8" in capsys.readouterr().out
 
 
-def test_validate_needs_the_labels_that_were_asked_for(
+def test_check_needs_the_labels_that_were_asked_for(
     official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = predictions(official, tmp_path / "m.csv")
-    assert main(["compare", "validate", str(file), "--humans", str(tmp_path)]) == 2
+    people = sorted((official / "humans").glob("human_accuracy-drop*.csv"))[0]
+    (tmp_path / people.name).write_bytes(people.read_bytes())
+    assert main(["compare", "--check", str(file), "--humans", str(tmp_path)]) == 2
     assert "--labels" in capsys.readouterr().err

@@ -12,10 +12,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis import Bootstrap, Comparison
+from physion.analysis import Comparison
 from physion.analysis.tables import MEAN
 from physion.core.errors import BadInputError
-from physion.report import ReportInputs, build_report, compare_files
+from physion.report import ReportInputs, build_report, compare
 from physion.report.html import Picture
 from physion.report.inputs import EXPECTED_METHODS
 from physion.report.page import render_page
@@ -245,11 +245,11 @@ def test_files_in_report_out(tmp_path: Path) -> None:
     humans = people_folder(tmp_path)
     predicted = predictions_file(tmp_path / "p.csv")
     out = tmp_path / "out"
-    with pytest.raises(BadInputError, match="give the file with the labels"):
-        compare_files([predicted], humans, None, out)
+    with pytest.raises(BadInputError, match="give the labels"):
+        compare([predicted], humans=humans)
     assert not out.exists()
     labels = {f"s_{i}": i % 2 == 0 for i in range(12)}
-    given = compare_files([predicted], humans, labels, out, bootstrap=Bootstrap(50))
+    given = compare(predicted, humans=humans, labels=labels, resamples=50).report(out)
     assert "those recorded with the trials" in page_of(given).text
     # The official layout: labels and zone lie in the folders beside the people's.
     (tmp_path / "stimuli").mkdir()
@@ -259,7 +259,7 @@ def test_files_in_report_out(tmp_path: Path) -> None:
     (tmp_path / "results" / "human_accuracy_by_scenario.csv").write_text(
         "agent,scenario,pct_2.5,pct_97.5\nhuman,collision,.6,.9\n"
     )
-    path = compare_files([predicted], humans, None, tmp_path / "two", bootstrap=Bootstrap(50))
+    path = compare([predicted], humans=humans, resamples=50).report(tmp_path / "two")
     found, before = (
         pd.read_csv(folder / "tables" / "comparison.csv") for folder in (tmp_path / "two", out)
     )
@@ -277,13 +277,14 @@ def test_the_official_people_make_a_page(official: Path, tmp_path: Path) -> None
     table["Predicted Outcome"], table["Actual Outcome"] = p > 0.5, names["label"]
     table["Stimulus Name"] = names["stim_ID"]
     table.to_csv(tmp_path / "p.csv", index=False)
-    path = compare_files([tmp_path / "p.csv"], official / "humans", None, tmp_path / "out")
+    result = compare(tmp_path / "p.csv", humans=official / "humans")
+    path = result.report(tmp_path / "out")
     left = pd.read_csv(tmp_path / "out" / "tables" / "left_out.csv")
     assert dict(zip(left["reason"], left["stimuli"], strict=True)) == {
         "Roll stimulus with a ledge": 56
     }
     scores = pd.read_csv(tmp_path / "out" / "tables" / "comparison.csv")
-    scores = scores[scores["model"] == "coin"].set_index("scenario")
+    scores = scores[scores["base_model"] == "coin"].set_index("scenario")
     assert scores.loc[MEAN, "accuracy"] == pytest.approx(0.5, abs=0.06)
     assert scores.loc[MEAN, "r_low"] < 0 < scores.loc[MEAN, "r_high"]
     assert "coin" in page_of(path).text

@@ -11,14 +11,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis import Bootstrap
 from physion.analysis.model_tests import permutations_of
 from physion.analysis.people.responses import PERSON, REHEARSAL
 from physion.analysis.statistics.agreement import cross_kappa
 from physion.analysis.tables import attributes_from_table
 from physion.cli.main import main
 from physion.core.errors import BadInputError, ExclusionError, UnknownNameError
-from physion.report import compare_files
+from physion.report import compare
 
 SCENARIOS = ("collide", "drop")
 STEMS = {"collide": "pilot_it2_collision_simple_box", "drop": "pilot_it2_drop_simple_box"}
@@ -66,10 +65,12 @@ def build(folder: Path, name: str = "out", **options: object) -> Path:
     assert isinstance(table, pd.DataFrame)
     table.to_csv(folder / "responses.csv", index=False)
     predictions().to_csv(folder / "predictions.csv", index=False)
-    return compare_files(
-        [folder / "predictions.csv"], None, None, folder / name, bootstrap=Bootstrap(60),
-        responses=[folder / "responses.csv"], **options,
-    )  # type: ignore[arg-type]  # fmt: skip
+    page = {name: options.pop(name) for name in ("trial_pages", "movies") if name in options}
+    result = compare(
+        folder / "predictions.csv", responses=folder / "responses.csv", resamples=60,
+        **options,  # type: ignore[arg-type]
+    )  # fmt: skip
+    return result.report(folder / name, **page)
 
 
 @pytest.fixture(scope="module")
@@ -185,8 +186,7 @@ def test_bytes_repeat(report: Path, tmp_path: Path) -> None:
 
 def test_two_kinds_of_people_are_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="not both"):
-        compare_files([_predictions(tmp_path)], tmp_path, None, tmp_path / "out",
-                      responses=[tmp_path / "r.csv"])  # fmt: skip
+        compare(_predictions(tmp_path), humans=tmp_path, responses=tmp_path / "r.csv")
 
 
 def _predictions(folder: Path) -> Path:
@@ -204,9 +204,7 @@ def test_labels_that_contradict_are_refused(tmp_path: Path) -> None:
     labels = {answers["stimulus"].iloc[0]: False}
     answers.to_csv(tmp_path / "r.csv", index=False)
     with pytest.raises(BadInputError, match="ends otherwise"):
-        compare_files([_predictions(tmp_path)], None, labels, tmp_path / "out",
-                      responses=[tmp_path / "r.csv"])  # fmt: skip
-    assert not (tmp_path / "out").exists()
+        compare(_predictions(tmp_path), labels=labels, responses=tmp_path / "r.csv")
 
 
 def test_no_session_left_is_refused(tmp_path: Path) -> None:
@@ -293,8 +291,7 @@ def test_permutations_let_holm_find_something() -> None:
 def test_people_alone(report: Path, tmp_path: Path) -> None:
     responses().to_csv(tmp_path / "responses.csv", index=False)
     pages = [
-        compare_files([], None, None, tmp_path / name, bootstrap=Bootstrap(60),
-                      responses=[tmp_path / "responses.csv"])
+        compare(responses=tmp_path / "responses.csv", resamples=60).report(tmp_path / name)
         for name in ("one", "two")
     ]  # fmt: skip
     assert pages[0].read_bytes() == pages[1].read_bytes()
@@ -332,8 +329,7 @@ def test_a_rehearsal_with_people_alone_is_marked(
 def test_people_alone_have_no_results_of_models(tmp_path: Path) -> None:
     responses().to_csv(tmp_path / "responses.csv", index=False)
     with pytest.raises(BadInputError, match="about predictions"):
-        compare_files([], None, None, tmp_path / "out", trial_pages=True,
-                      responses=[tmp_path / "responses.csv"])  # fmt: skip
-    with pytest.raises(BadInputError, match="no file of predictions"):
-        compare_files([], None, None, tmp_path / "out")
+        compare(responses=tmp_path / "responses.csv").report(tmp_path / "out", trial_pages=True)
+    with pytest.raises(BadInputError, match="no predictions"):
+        compare()
     assert not (tmp_path / "out").exists()

@@ -14,10 +14,9 @@ import pytest
 from PIL import Image
 
 from physion.analysis import Comparison
-from physion.report import ReportInputs, build_report
+from physion.report import ReportInputs, build_report, compare
 from physion.report.html import PageMovies, make_poster
 from physion.report.page import DISAGREE, OPENING, render_page
-from physion.report.people import read_by_model
 from physion.report.scores import inputs_sentence, weights_sentence
 from physion.report.trials import (
     MOST_ANSWERS,
@@ -249,10 +248,15 @@ def test_the_page_opens_with_the_trials(make_comparison: Maker, movie: Path) -> 
 def test_one_sentence_says_what_each_model_was_given(
     make_comparison: Maker, tmp_path: Path
 ) -> None:
-    (tmp_path / "a.csv").write_text("Model,Inputs\nsimulation,state\nsimulation,state\n")
-    (tmp_path / "b.csv").write_text('Model,Inputs\nencoder,"rgb, depth"\n')
-    (tmp_path / "c.csv").write_text("Model\nencoder\n")
-    given = read_by_model([tmp_path / name for name in ("a.csv", "b.csv", "c.csv")], "Inputs")
+    head = "stimulus,p_contact,model"
+    (tmp_path / "a.csv").write_text(f"{head},inputs\ns,0.5,simulation,state\n")
+    (tmp_path / "b.csv").write_text(f'{head},Inputs\ns,0.5,encoder,"rgb, depth"\n')
+    (tmp_path / "c.csv").write_text(f"{head}\nt,0.5,encoder\n")
+    files = [tmp_path / name for name in ("a.csv", "b.csv", "c.csv")]
+    people = pd.DataFrame(
+        {"stimulus": ["s", "t"], "scenario": "drop", "accuracy": 0.6, "count": 9.0}
+    )
+    given = compare(files, humans=people, labels={"s": True, "t": False}).inputs.model_inputs
     assert given == {"simulation": "state", "encoder": "rgb, depth"}
     comparison = make_comparison()
     words = inputs_sentence(ReportInputs(comparison, model_inputs=given))
@@ -265,10 +269,9 @@ def test_one_sentence_says_what_each_model_was_given(
 
 
 def test_one_sentence_says_which_weights_each_model_started_from(
-    make_comparison: Maker, tmp_path: Path
+    make_comparison: Maker,
 ) -> None:
-    (tmp_path / "a.csv").write_text("Model,Init\nsimulation,none\nencoder,imagenet\n")
-    found = read_by_model([tmp_path / "a.csv"], "Init")
+    found = {"simulation": "none", "encoder": "imagenet"}
     inputs = ReportInputs(make_comparison(), model_weights=found)
     sentence = "Weights that each network started from: encoder: imagenet."
     assert weights_sentence(inputs) == sentence and sentence in render_page(inputs, [])

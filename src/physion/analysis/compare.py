@@ -1,4 +1,8 @@
-"""All results of a comparison, computed here so that the report only draws."""
+"""All results of a comparison, computed here so that the report only draws.
+
+`all_results` is what `physion.compare` calls: scores of models by stimulus (`comparison`), models
+with single participants (`compare_everywhere`), tests, calibration and mixed models.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from physion.analysis.comparison import Comparison, compare_scores
@@ -171,7 +176,7 @@ class ComparisonResults:
     warnings: tuple[str, ...] = ()
 
 
-def compare(
+def all_results(
     predictions: pd.DataFrame,
     humans: pd.DataFrame | None = None,
     labels: Mapping[str, bool] | None = None,
@@ -285,3 +290,31 @@ def _with_participants(
         mixed=(*fits_of_people(people), *fits_of_models(main)),
         warnings=(*people.warnings, *main.warnings),
     )
+
+
+def tidy_scores(results: ComparisonResults) -> pd.DataFrame:
+    """Return people, models and baselines in one table: one row per model and scenario.
+
+    Columns as `Comparison.all_scores`, with ``kind`` *people* for one person with another, who come
+    first; ``kappa`` with its interval, which needs single participants; and ``interval``: what the
+    intervals of the row are about, *people and stimuli*, or *stimuli* where only averages of people
+    are known and in row `POOLED`.
+    """
+    table = results.comparison.all_scores
+    kind = table["kind"].mask(table["model"] == TWO_PEOPLE, "people")
+    table = table.assign(kind=kind, kappa=np.nan, kappa_low=np.nan, kappa_high=np.nan)
+    table["interval"] = "stimuli"
+    if results.beside is not None:
+        keys = pd.MultiIndex.from_frame(table[["model", "scenario"]])
+        measures = results.beside.scores.set_index(["model", "scenario"])
+        table["interval"] = np.where(keys.isin(measures.index), "people and stimuli", "stimuli")
+        for name, rows in measures.groupby("measure"):
+            if f"{name}_low" not in table:
+                continue
+            own = rows.reindex(keys)
+            known = keys.isin(rows.index)
+            given = {name: "value", f"{name}_low": "low_both", f"{name}_high": "high_both"}
+            for column, of in given.items():
+                table[column] = np.where(known, own[of].to_numpy(np.float64), table[column])
+    rank = table["kind"].map({"people": 0, "model": 1, "baseline": 2})
+    return table.iloc[np.argsort(rank.to_numpy(), kind="stable")].reset_index(drop=True)

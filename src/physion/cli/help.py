@@ -28,7 +28,6 @@ VERBS = {
 
 MODULES = {
     "import": "import_trials",
-    "compare": "compare.compare",
     "experiment": "experiment.experiment",
 }
 """Modules of verbs that are Python keywords, have sub-verbs or stand in a folder."""
@@ -57,10 +56,9 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "compare": (
         "physion compare runs/models/predictions/*.csv --humans official",
         "physion compare --responses study/export/trials.csv",
+        "physion compare --check predictions.csv --humans official",
+        "physion compare --published --out runs/published",
     ),
-    "compare official": ("physion compare official official --out runs/published",),
-    "compare validate": ("physion compare validate predictions.csv --labels labels.csv",),
-    "compare power": ("physion compare power --effect 0.1 --people 20 40 --stimuli 60 100",),
     "experiment": ("physion experiment init study --trials trials",),
     "experiment init": (
         "physion experiment init study --trials trials --test 80 --languages en",
@@ -73,6 +71,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "experiment password": ("physion experiment password study",),
     "experiment accounts": ("physion experiment accounts study --add grace --role analyst",),
     "experiment backup": ("physion experiment backup study --out backups",),
+    "experiment power": ("physion experiment power --effect 0.1 --people 20 40 --stimuli 60 100",),
     "experiment forget": ("physion experiment forget study --participant 5f0c1e",),
     "view": (
         "physion view trials --scenario collide",

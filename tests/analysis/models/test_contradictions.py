@@ -10,12 +10,12 @@ import pandas as pd
 import pytest
 
 from physion.analysis import Bootstrap, compare_scores, read_humans, read_labels
-from physion.analysis.compare import compare
+from physion.analysis.compare import all_results
 from physion.analysis.comparison import check_coverage
 from physion.analysis.tables import check_predictions, name_models
 from physion.cli.main import main
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.report import compare_files
+from physion.report import compare
 
 QUICK = Bootstrap(resamples=20)
 STEM = "pilot_it2_drop_simple_box"
@@ -115,11 +115,11 @@ def test_a_stimulus_in_two_scenarios_is_refused() -> None:
 def test_a_misspelt_stimulus_to_exclude_is_refused() -> None:
     rows = name_models(check_predictions(predictions()))
     some = [f"{STEM}_0003", "pilot_towers_nb2_fr015_SJ010_mono0_dis0_occ0_tdwroom_0001"]
-    results = compare(rows, humans(), LABELS, exclude=some, bootstrap=QUICK)
+    results = all_results(rows, humans(), LABELS, exclude=some, bootstrap=QUICK)
     assert results.comparison.stimuli["stimulus"].nunique() == COUNT - 1
     for wrong in (f"{STEM}_003", "pilot_it2_drop_simpel_box_0003"):
         with pytest.raises(UnknownNameError, match=f"'{wrong}'; closest: {STEM}"):
-            compare(rows, humans(), LABELS, exclude=[wrong], bootstrap=QUICK)
+            all_results(rows, humans(), LABELS, exclude=[wrong], bootstrap=QUICK)
 
 
 def write(folder: Path, table: pd.DataFrame) -> Path:
@@ -149,7 +149,8 @@ def test_a_cut_official_table_is_told_on_page_and_terminal(
         {"Model": "m", "Readout Type": "B", "Predicted Outcome": truth, "Actual Outcome": truth,
          "Predicted Prob_true": truth * 0.8 + 0.1, "Stimulus Name": drop}
     )  # fmt: skip
-    page = compare_files([write(tmp_path, table)], people, None, tmp_path / "out", bootstrap=QUICK)
+    result = compare(write(tmp_path, table), humans=people, resamples=20)
+    page = result.report(tmp_path / "out")
     text = page.read_text(encoding="utf-8")
     assert "<strong>Warnings</strong>" in text and "drop: 30 of 150 stimuli" in text
     command = ["compare", str(tmp_path / "m.csv"), "--humans", str(people)]

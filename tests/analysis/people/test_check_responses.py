@@ -61,10 +61,10 @@ def test_the_verb_checks_responses_and_predictions_against_them(
                          "Recorded Outcome": ~label.to_numpy(), "Readout Test Data": "drop",
                          "Stimulus Name": label.index})  # fmt: skip
     rows.to_csv(tmp_path / "m.csv", index=False)
-    assert main(["compare", "validate", "--responses", str(file), "--json"]) == 0
+    assert main(["compare", "--check", "--responses", str(file), "--json"]) == 0
     (found,) = json.loads(capsys.readouterr().out)
     assert found["people"] == {"drop": 6} and found["errors"] == 0
-    command = ["compare", "validate", str(tmp_path / "m.csv"), "--responses", str(file), "--json"]
+    command = ["compare", "--check", str(tmp_path / "m.csv"), "--responses", str(file), "--json"]
     assert main(command) == 1
     _, predictions = json.loads(capsys.readouterr().out)
     assert predictions["errors"] > 0

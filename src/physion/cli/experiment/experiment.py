@@ -18,6 +18,8 @@
 
 `physion experiment forget DIR`: delete recruiters' ids, or all data of a session.
 
+`physion experiment power`: how many people and stimuli a study needs.
+
 For details, use --help after any of these.
 """
 
@@ -41,6 +43,7 @@ SUBVERBS = {
     "accounts": "physion.cli.experiment.accounts",
     "backup": "physion.cli.experiment.backup",
     "forget": "physion.cli.experiment.forget",
+    "power": "physion.cli.experiment.power",
 }
 """Sub-verbs of ``physion experiment``, and the module of each."""
 NEEDED = ("fastapi", "uvicorn", "sqlalchemy", "alembic", "argon2", "jinja2", "pydantic")
@@ -52,7 +55,7 @@ class Options:
     """Options of ``physion experiment`` without a sub-verb."""
 
     words: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """One of init, serve, links, simulate, export, password, accounts, backup, forget."""
+    """One of init, serve, links, simulate, export, password, accounts, backup, forget, power."""
 
 
 def main(options: Options) -> int:

@@ -82,15 +82,9 @@ def main(options: Options) -> int:
 
 def _fractions(options: Options) -> pd.DataFrame:
     """Return ``p_yes``, ``count`` and ``label`` of the stimuli that people answered."""
-    from physion.analysis.tables import (
-        LABELS_FILE,
-        find_next_to,
-        read_humans,
-        read_labels,
-        with_labels,
-    )
+    from physion.analysis.tables import LABELS_FILE, with_labels
     from physion.core.errors import BadInputError
-    from physion.data.official import find_official
+    from physion.report.compare import read_averages
 
     if options.responses:
         from physion.analysis.people.measures import accuracy_by_stimulus
@@ -99,16 +93,10 @@ def _fractions(options: Options) -> pd.DataFrame:
         test = read_any_responses(options.responses, options.sessions).test
         rows = accuracy_by_stimulus(test)
     else:
-        data = find_official(options.humans)
-        folder = options.humans if data is None else data.humans
-        file = options.labels or find_next_to(folder, "stimuli", LABELS_FILE)
-        if file is not None:
-            labels = read_labels(file)
-        elif data is not None:
-            labels = data.labels
-        else:
-            raise BadInputError(f"no {LABELS_FILE} lies near {folder}; give --labels")
-        rows = with_labels(read_humans(folder), labels)
+        people, labels, _, _ = read_averages(options.humans, options.labels)
+        if labels is None:
+            raise BadInputError(f"no {LABELS_FILE} lies near {options.humans}; give --labels")
+        rows = with_labels(people, labels)
         rows = rows[rows["label"].notna()]
     if options.scenario:
         rows = rows[rows["scenario"] == options.scenario]

@@ -1,0 +1,526 @@
+"""Comparison of models with people, from Python objects or files: `compare` and its result.
+
+It stands above the analysis, which computes the tables, and the report, which draws them, so that
+a result can write its own report.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from physion.analysis.compare import all_results, tidy_scores
+from physion.analysis.comparison import check_coverage
+from physion.analysis.intervals import Bootstrap
+from physion.analysis.people.exclusions import PREREGISTERED, Expected, find_expected, read_expected
+from physion.analysis.people.responses import Participants, check_labels, keep_where
+from physion.analysis.people.results import (
+    PeopleResults,
+    analyse_people,
+    read_any_responses,
+    read_attributes,
+    rules_called,
+)
+from physion.analysis.rollout_errors import read_rollout_errors, rollout_error_table
+from physion.analysis.tables import (
+    LABELS_FILE,
+    MEAN,
+    POOLED,
+    DominoesLook,
+    check_excluded_names,
+    check_predictions,
+    find_next_to,
+    in_order,
+    name_models,
+    read_csv,
+    read_human_zone,
+    read_humans,
+    read_labels,
+    read_stimulus_list,
+    require_columns,
+)
+from physion.core.errors import BadInputError
+from physion.data.official import find_official
+from physion.report.build import build_people_report, build_report
+from physion.report.html import plural
+from physion.report.inputs import PeopleReport, ReportInputs
+from physion.report.people import describe_attributes
+
+ZONE_FILE = "human_accuracy_by_scenario.csv"
+
+Predictions = Mapping[str, Mapping[str, float]] | pd.DataFrame | Path | str
+"""P(contact) by model and stimulus; a table of `physion.analysis.tables.PREDICTIONS`; or its CSV
+file."""
+
+_LOOKS = {
+    "plain": "those who saw free colours with flashing overlays, as in the paper",
+    "redyellow": "those who saw a red agent and a yellow patient",
+    "pooled": "those of both looks, weighted by their number",
+}
+
+
+@dataclass(frozen=True)
+class CompareResult:
+    """Result of `compare`.
+
+    - ``scores``: one row per model (people first, baselines last) and scenario, then `MEAN` over
+      scenarios with equal weights and `POOLED` over all stimuli. Columns: ``model``, ``kind``
+      (people, model, baseline), ``base_model``, ``readout``, ``scenario``, ``stimuli``, every
+      metric with its 95 % interval (``accuracy``, ``accuracy_low``, ``accuracy_high``, ``r``, ...),
+      ``ceiling`` of r, and ``reason`` of what is undefined. ``kappa`` is that with single
+      participants; it needs their answers.
+    - ``people``: the analysis of single participants; None without their answers.
+    - ``inputs``: all that a report shows.
+    """
+
+    scores: pd.DataFrame
+    people: PeopleResults | None
+    inputs: ReportInputs | PeopleReport
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What may make the results wrong, one sentence each."""
+        if isinstance(self.inputs, PeopleReport):
+            return self.inputs.people.warnings
+        return self.inputs.warnings
+
+    @property
+    def summary(self) -> pd.DataFrame:
+        """One row per model with accuracy, r and kappa as text with their intervals.
+
+        Over the scenarios with equal weights or, where that has no number because scenarios have
+        too few stimuli, over all stimuli together.
+        """
+        rows = self.scores[self.scores["scenario"] == self.summary_of]
+        kappa = "kappa" if rows["kappa"].notna().any() else "kappa_from_averages"
+        columns = {"accuracy": "accuracy", "r with people": "r", "kappa": kappa}
+        table = rows[["model", "stimuli"]].copy()
+        for heading, name in columns.items():
+            if rows[name].notna().any():
+                table[heading] = [_with_interval(row, name) for _, row in rows.iterrows()]
+        return table.reset_index(drop=True)
+
+    @property
+    def summary_of(self) -> str:
+        """Scenario of the rows of ``summary``: `MEAN`, or `POOLED` where that has more numbers."""
+        kinds = self.scores[self.scores["kind"] == "model"]
+        rows = self.scores if kinds.empty else kinds
+        mean, pooled = (
+            int(rows.loc[rows["scenario"] == name, ["accuracy", "r"]].notna().sum().sum())
+            for name in (MEAN, POOLED)
+        )
+        return POOLED if pooled > mean else MEAN
+
+    def report(self, folder: Path | str, **page: Any) -> Path:
+        """Write page, tables and figures to ``folder``; return the path of the page.
+
+        Parameters
+        ----------
+        folder
+            Folder for ``report.html``, ``report.json``, ``tables/`` and ``figures/``.
+        **page
+            Fields of `physion.report.ReportInputs` such as ``movies``, ``trial_pages``, ``title``
+            and ``methods``, which are added to those of the comparison.
+
+        Raises
+        ------
+        BadInputError
+            Before anything is written, if ``folder`` is a file or a movie cannot be read.
+        """
+        methods = {**self.inputs.methods, **page.pop("methods", {})}
+        if isinstance(self.inputs, PeopleReport):
+            page = {name: value for name, value in page.items() if value}
+            if set(page) - {"movies", "title"}:
+                raise BadInputError("pages of stimuli are about predictions: give some")
+            return build_people_report(replace(self.inputs, methods=methods, **page), Path(folder))
+        return build_report(replace(self.inputs, methods=methods, **page), Path(folder))
+
+    def __repr__(self) -> str:
+        return f"{self._heading()}\n{self.summary.to_string(index=False)}"
+
+    def _repr_html_(self) -> str:
+        return f"<p>{self._heading()}</p>{self.summary.to_html(index=False)}"
+
+    def _heading(self) -> str:
+        names = [name for name in self.scores["scenario"].unique() if name not in (MEAN, POOLED)]
+        over = "mean over scenarios" if self.summary_of == MEAN else "all stimuli pooled"
+        return f"{', '.join(names)}; {over}; 95 % intervals"
+
+
+def _with_interval(row: pd.Series, name: str) -> str:
+    value, low, high = row[name], row.get(f"{name}_low"), row.get(f"{name}_high")
+    if pd.isna(value):
+        return ""
+    return f"{value:.3f}" + ("" if pd.isna(low) else f" [{low:.3f}, {high:.3f}]")
+
+
+def compare(
+    predictions: Predictions | Sequence[Predictions] = (),
+    *,
+    humans: str | Path | pd.DataFrame | None = None,
+    responses: str | Path | Sequence[str | Path] = (),
+    labels: str | Path | Mapping[str, bool] | None = None,
+    sessions: Path | None = None,
+    rules: str = PREREGISTERED.name,
+    expected: Path | Expected | None = None,
+    accept_rules: Collection[str] = (),
+    simulated: bool = False,
+    where: Sequence[str] = (),
+    attributes: Path | pd.DataFrame | None = None,
+    exclude: Path | Iterable[str] = (),
+    ledge: bool = False,
+    dominoes: DominoesLook = "plain",
+    zone: Path | None = None,
+    rollout_errors: Sequence[Path] = (),
+    resamples: int = 1000,
+    seed: int = 0,
+) -> CompareResult:
+    """Compare models with people: accuracy, correlation, kappa, each with its interval.
+
+    Parameters
+    ----------
+    predictions
+        P(contact) by model and stimulus, tables, CSV files, or several of these. A table needs the
+        columns ``stimulus`` and ``p_contact`` only; `physion.analysis.tables.PREDICTIONS` has the
+        others. None: an analysis of the people in ``responses``.
+    humans
+        Averages of people: ``official`` for those of the package, a folder of
+        ``human_accuracy-*.csv``, or a table with ``stimulus``, ``scenario``, ``accuracy`` and
+        ``count``.
+    responses
+        Answers of single participants in place of ``humans``: the file of our export, or the
+        study's raw files.
+    labels
+        Outcome by stimulus, its table (``stimulus``, ``contact``), or ``official``. None: those of
+        the people; for stimuli without one ``recorded_outcome`` of the predictions.
+    sessions
+        Table of sessions of our export, with ``responses``.
+    rules
+        Name of the exclusion rules: ``preregistered`` or ``official-code``.
+    expected
+        Stimuli that a session must have, by scenario or by session, or their table. None:
+        ``expected.csv`` beside the responses, else those that half of the scenario's sessions
+        answered.
+    accept_rules
+        Exclusion rules that may leave out more than a third of a scenario's sessions.
+    simulated
+        Whether to rehearse with the simulated participants of ``responses``, who are left out
+        otherwise.
+    where
+        Values that the sessions must have, such as ``condition=fast``.
+    attributes
+        Elements, distractors and occluders of one's own stimuli: a table, its file, or a dataset.
+    exclude
+        Stimuli to exclude, or a file with one per line.
+    ledge
+        Whether to keep the Roll stimuli with a ledge, which the study excluded.
+    dominoes
+        Which people count for Dominoes in ``humans``.
+    zone
+        Official table of participants' percentiles; None: looked for beside ``humans``.
+    rollout_errors
+        Files of ``physion evaluate --rollout-errors``, for a figure of them.
+    resamples, seed
+        Draws of people for their accuracy and agreement, of halves, and of permutations.
+
+    Returns
+    -------
+    result
+        The scores as one table, and all that a report shows.
+
+    Raises
+    ------
+    BadInputError
+        For a table that is not complete, or tables that contradict each other.
+
+    Examples
+    --------
+    >>> import physion
+    >>> p = {name: 0.9 if contact else 0.2 for name, contact in physion.official().labels.items()}
+    >>> result = physion.compare({"nearly right": p}, humans="official")
+    >>> float(result.scores.query("scenario == 'mean' and kind == 'model'")["accuracy"].iloc[0])
+    1.0
+    """
+    try:
+        draws = Bootstrap(resamples, seed=seed)
+    except ValueError as error:
+        raise BadInputError(f"resamples {resamples}: {error}") from error
+    rows = _rows(predictions)
+    files = [Path(responses)] if isinstance(responses, str | Path) else [*map(Path, responses)]
+    if rows is None and not files:
+        raise BadInputError(
+            "no predictions: give some, or responses for an analysis of people (--responses)"
+        )
+    if rows is None and rollout_errors:
+        raise BadInputError("rollout errors are about predictions: give some")
+    errors = read_rollout_errors(rollout_errors) if rollout_errors else None
+    excluded = read_stimulus_list(exclude) if isinstance(exclude, Path) else list(exclude)
+    settings: dict[str, Any] = {
+        "exclude": excluded,
+        "exclude_ledge": not ledge,
+        "bootstrap": draws,
+    }
+    if files:
+        if humans is not None:
+            raise BadInputError("give averages of people (humans) or their responses, not both")
+        people, methods = _participants(
+            files, sessions, rules, labels, expected, accept_rules, simulated, where, attributes,
+            settings,
+        )  # fmt: skip
+        if rows is None:
+            check_excluded_names(excluded, people.stimuli)
+            methods |= {"Intervals": _describe_intervals(draws)}
+            return CompareResult(_scores_of_people(people), people, PeopleReport(people, methods))
+        results = all_results(rows, people=people, **settings)
+    else:
+        assert rows is not None
+        about = (sessions, expected, attributes)
+        if any(one is not None for one in about) or accept_rules or simulated or where:
+            raise BadInputError(
+                "sessions, expected, attributes, accepted rules, chosen values (where) and "
+                "simulated participants are about responses: give those"
+            )
+        averages = _averages(rows, humans, labels, zone, dominoes)
+        methods = averages.methods
+        results = all_results(
+            rows, averages.people, averages.labels, zone=averages.zone,
+            zone_origin=averages.zone_origin, **settings,
+        )  # fmt: skip
+        results = replace(results, warnings=(*results.warnings, *averages.warnings))
+    inputs = ReportInputs.of(
+        results,
+        methods=methods,
+        model_inputs=_by_model(rows, "inputs"),
+        model_weights=_by_model(rows, "init"),
+        rollout_errors=None if errors is None else rollout_error_table(errors, draws.level),
+    )
+    return CompareResult(tidy_scores(results), results.people, inputs)
+
+
+def _rows(predictions: Predictions | Sequence[Predictions]) -> pd.DataFrame | None:
+    """Return all predictions as one table with unique names of models; None if there is none."""
+    single = isinstance(predictions, Mapping | pd.DataFrame | Path | str)
+    given: Sequence[Predictions] = [predictions] if single else predictions  # type: ignore[list-item,assignment]
+    tables = []
+    for one in given:
+        if isinstance(one, Mapping):
+            for model, values in one.items():
+                columns = {"stimulus": list(values), "p_contact": list(values.values())}
+                tables.append(check_predictions(pd.DataFrame(columns), model, model))
+        elif isinstance(one, pd.DataFrame):
+            tables.append(check_predictions(one))
+        else:
+            path = Path(one)
+            tables.append(check_predictions(read_csv(path), str(path), path.stem))
+    return name_models(pd.concat(tables, ignore_index=True)) if tables else None
+
+
+def _by_model(rows: pd.DataFrame, column: str) -> dict[str, str]:
+    """Return a column of the predictions by model; several values are joined by ``or``."""
+    given = rows[rows[column] != ""]
+    pairs = given[["base_model", column]].drop_duplicates()
+    return {
+        str(model): " or ".join(values) for model, values in pairs.groupby("base_model")[column]
+    }
+
+
+@dataclass(frozen=True)
+class Averages:
+    """Averages of people by stimulus (None: no people), outcomes, zones, and where they are from.
+
+    ``labels``: outcome by stimulus; ``zone``: see `read_human_zone`; ``methods``: the sources as
+    text by name; ``warnings``: what the tables lack.
+    """
+
+    people: pd.DataFrame | None
+    labels: Mapping[str, bool] | None = None
+    zone: pd.DataFrame | None = None
+    zone_origin: str = ""
+    methods: Mapping[str, str] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+
+def _averages(
+    rows: pd.DataFrame,
+    humans: str | Path | pd.DataFrame | None,
+    labels: str | Path | Mapping[str, bool] | None,
+    zone: Path | None,
+    dominoes: DominoesLook,
+) -> Averages:
+    """Return averages of people, their outcomes and their zone."""
+    if humans is None:
+        return Averages(None, read_outcomes(labels))
+    averages, known, origin, zone_file = read_averages(humans, labels, dominoes)
+    if known is None and rows["recorded_outcome"].isna().all():
+        raise BadInputError(f"no {LABELS_FILE} lies near {humans}; give the labels (--labels)")
+    zone = zone_file if zone is None else zone
+    zone_table = None if zone is None else read_human_zone(zone)
+    zone_origin = "" if zone is None else f"official table {zone.name}"
+    warnings = []
+    # Outcomes that were given as values may be of more stimuli than people saw.
+    if known and not isinstance(labels, Mapping):
+        warnings += check_coverage(averages, known)
+    if zone_table is not None:
+        absent = set(averages["scenario"]) - set(zone_table["scenario"])
+        warnings += [f"{name}: {zone_origin} has no row: is it cut?" for name in in_order(absent)]
+    methods = {"Official outcomes": origin, "People for Dominoes": _LOOKS[dominoes]}
+    return Averages(averages, known, zone_table, zone_origin, methods, tuple(warnings))
+
+
+def read_averages(
+    humans: str | Path | pd.DataFrame,
+    labels: str | Path | Mapping[str, bool] | None = None,
+    dominoes: DominoesLook = "plain",
+) -> tuple[pd.DataFrame, dict[str, bool] | None, str, Path | None]:
+    """Return answers of people by stimulus, the outcomes with their source, and a file of zones.
+
+    ``humans`` and ``labels`` are those of `compare`. The outcomes are None if none are known, and
+    the file is None if there is none.
+    """
+    known, origin = read_outcomes(labels), "those recorded with the trials"
+    if isinstance(labels, str | Path):
+        origin = Path(labels).name
+    if isinstance(humans, pd.DataFrame):
+        require_columns(humans, ("stimulus", "scenario", "accuracy", "count"), "the averages")
+        return humans, known, origin, None
+    data = find_official(humans)
+    folder = Path(humans) if data is None else data.humans
+    if known is None:
+        file = find_next_to(folder, "stimuli", LABELS_FILE)
+        if file is not None:
+            known, origin = read_labels(file), file.name
+        elif data is not None:
+            known, origin = dict(data.labels), "those of the study"
+    zone = find_next_to(folder, "results", ZONE_FILE)
+    return read_humans(folder, dominoes), known, origin, zone
+
+
+def read_outcomes(labels: str | Path | Mapping[str, bool] | None) -> dict[str, bool] | None:
+    """Return outcomes by stimulus from a table, or those of the study for ``official``."""
+    if labels is None or isinstance(labels, Mapping):
+        return None if labels is None else dict(labels)
+    data = find_official(labels)
+    return read_labels(Path(labels)) if data is None else dict(data.labels)
+
+
+def _participants(
+    files: Sequence[Path],
+    sessions: Path | None,
+    rules: str,
+    labels: str | Path | Mapping[str, bool] | None,
+    expected: Path | Expected | None,
+    accept_rules: Collection[str],
+    simulated: bool,
+    where: Sequence[str],
+    attributes: Path | pd.DataFrame | None,
+    settings: Mapping[str, Any],
+) -> tuple[PeopleResults, dict[str, str]]:
+    """Return the analysis of single participants, and its settings as text."""
+    expected = find_expected(files) if expected is None else expected
+    people = _read_people(
+        files, sessions, rules, read_outcomes(labels), settings["exclude"],
+        settings["exclude_ledge"], settings["bootstrap"],
+        expected=read_expected(expected) if isinstance(expected, Path) else expected,
+        accept_rules=accept_rules,
+        participants="simulated" if simulated else "people",
+        attributes=read_attributes(attributes) if isinstance(attributes, Path) else attributes,
+        where=where,
+    )  # fmt: skip
+    chosen = f"; of the sessions with {', '.join(where)} only" if where else ""
+    return people, {
+        "Official outcomes": "those recorded with the responses",
+        "People": _describe_people(files, people) + chosen,
+        "Trials of a whole session": _describe_expected(people, expected is not None),
+        "Attributes of stimuli": describe_attributes(people),
+    }
+
+
+_PEOPLE_COLUMNS = ("model", "kind", "base_model", "readout", "scenario", "stimuli", "accuracy",
+                   "accuracy_low", "accuracy_high")  # fmt: skip
+
+
+def _scores_of_people(people: PeopleResults) -> pd.DataFrame:
+    """Return accuracy of people by scenario with the columns of `CompareResult.scores`."""
+    rows = people.tables["by_scenario"]
+    return pd.DataFrame(
+        {
+            "model": "people",
+            "kind": "people",
+            "scenario": rows["scenario"],
+            "stimuli": rows["stimuli"],
+            "accuracy": rows["accuracy"],
+            "accuracy_low": rows["accuracy_low"],
+            "accuracy_high": rows["accuracy_high"],
+        }
+    ).reindex(columns=[*_PEOPLE_COLUMNS, "r", "kappa", "kappa_from_averages"])
+
+
+def _read_people(
+    responses: Sequence[Path],
+    sessions: Path | None,
+    rules: str,
+    labels: Mapping[str, bool] | None,
+    excluded: list[str],
+    exclude_ledge: bool,
+    draws: Bootstrap,
+    *,
+    expected: Expected | None = None,
+    accept_rules: Collection[str] = (),
+    participants: Participants = "people",
+    attributes: pd.DataFrame | None = None,
+    where: Sequence[str] = (),
+) -> PeopleResults:
+    """Read responses and run every analysis of people."""
+    chosen = rules_called(rules)
+    read = keep_where(read_any_responses(responses, sessions, participants), where)
+    if labels is not None:
+        check_labels(read, labels)
+    return analyse_people(
+        read,
+        rules=chosen,
+        expected=expected,
+        accept_rules=accept_rules,
+        attributes=attributes,
+        exclude=excluded,
+        exclude_ledge=exclude_ledge,
+        bootstrap=draws,
+    )
+
+
+def _describe_people(responses: Sequence[Path], people: PeopleResults) -> str:
+    """Describe the responses and the flagged sessions."""
+    flags = people.tables["flags"]
+    kind = "simulated" if people.mark else "single"
+    return (
+        f"answers of {kind} participants from {', '.join(path.name for path in responses)}: "
+        f"{len(flags)} sessions, {int(flags['flagged'].sum())} of them flagged by the rules "
+        f"“{people.rules.name}” and left out of the main analysis"
+    )
+
+
+def _describe_expected(people: PeopleResults, given: bool) -> str:
+    """Describe how many stimuli a session must have, and how many sessions lack some."""
+    flags = people.tables["flags"]
+    counts = flags.groupby("scenario")["expected"].agg(["min", "max"])
+    each = ", ".join(
+        f"{name} {row['min']}" + (f" to {row['max']}" if row["max"] > row["min"] else "")
+        for name, row in counts.iterrows()
+    )
+    by = (
+        "by the study's list"
+        if given
+        else "stimuli that at least half of the scenario's sessions answered"
+    )
+    return f"{by}: {each}; {plural(int(flags['incomplete'].sum()), 'session')} lacked some"
+
+
+def _describe_intervals(draws: Bootstrap) -> str:
+    """Describe the intervals of results about people."""
+    return (
+        f"{draws.level:.0%} percentile bootstrap, people drawn within each scenario, "
+        f"{draws.resamples} resamples, seed {draws.seed}"
+    )
