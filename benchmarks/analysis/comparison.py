@@ -28,7 +28,8 @@ import pandas as pd
 
 from physion.analysis import compare as results
 from physion.core.names import SCENARIOS
-from physion.report import build, compare, people
+from physion.report import build, people
+from physion.report.compare import compare
 
 RESULTS = Path(__file__).parents[1] / "results"
 PEOPLE, STIMULI, PRACTICE = 100, 150, 10

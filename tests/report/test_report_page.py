@@ -15,7 +15,8 @@ import pytest
 from physion.analysis import Comparison
 from physion.analysis.tables import MEAN
 from physion.core.errors import BadInputError
-from physion.report import ReportInputs, build_report, compare
+from physion.report import ReportInputs, build_report
+from physion.report.compare import compare
 from physion.report.html import Picture
 from physion.report.inputs import EXPECTED_METHODS
 from physion.report.page import render_page

@@ -17,7 +17,7 @@ from physion.analysis.statistics.agreement import cross_kappa
 from physion.analysis.tables import attributes_from_table
 from physion.cli.main import main
 from physion.core.errors import BadInputError, ExclusionError, UnknownNameError
-from physion.report import compare
+from physion.report.compare import compare
 
 SCENARIOS = ("collide", "drop")
 STEMS = {"collide": "pilot_it2_collision_simple_box", "drop": "pilot_it2_drop_simple_box"}

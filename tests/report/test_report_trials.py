@@ -14,7 +14,8 @@ import pytest
 from PIL import Image
 
 from physion.analysis import Comparison
-from physion.report import ReportInputs, build_report, compare
+from physion.report import ReportInputs, build_report
+from physion.report.compare import compare
 from physion.report.html import PageMovies, make_poster
 from physion.report.page import DISAGREE, OPENING, render_page
 from physion.report.scores import inputs_sentence, weights_sentence

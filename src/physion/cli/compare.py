@@ -100,7 +100,7 @@ def main(options: Options) -> int:
 
 def _compare(options: Options) -> int:
     from physion.cli.output import print_warnings
-    from physion.report import compare
+    from physion.report.compare import compare
     from physion.report.html import movies_of
 
     movies = {} if options.dataset is None else movies_of(options.dataset)

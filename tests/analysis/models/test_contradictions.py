@@ -15,7 +15,7 @@ from physion.analysis.comparison import check_coverage
 from physion.analysis.tables import check_predictions, name_models
 from physion.cli.main import main
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.report import compare
+from physion.report.compare import compare
 
 QUICK = Bootstrap(resamples=20)
 STEM = "pilot_it2_drop_simple_box"
