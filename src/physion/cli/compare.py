@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
     from physion.analysis.check import Checked, Reference
     from physion.analysis.published.claims import PublishedResults
-    from physion.report.compare import CompareResult
 
 
 @dataclass(frozen=True)
@@ -99,7 +98,7 @@ def main(options: Options) -> int:
 
 
 def _compare(options: Options) -> int:
-    from physion.cli.output import print_warnings
+    from physion.cli.output import print_scores, print_warnings
     from physion.report.compare import compare
     from physion.report.html import movies_of
 
@@ -130,17 +129,9 @@ def _compare(options: Options) -> int:
         scores = json_module.loads(result.scores.to_json(orient="records", double_precision=15))
         print(json_module.dumps({"report": str(page), "scores": scores, **numbers}))
     else:
-        print_result(result, page)
+        print_scores(result)
+        _print(f"report: {page}")
     return 0
-
-
-def print_result(result: CompareResult, page: Path) -> None:
-    """Print the table of results and the path of the page."""
-    from physion.analysis.tables import MEAN
-
-    over = "mean over scenarios" if result.summary_of == MEAN else "all stimuli pooled"
-    _show(f"People and models, {over}, with 95 % intervals", result.summary)
-    _print(f"report: {page}")
 
 
 # --- check ---------------------------------------------------------------------------------------

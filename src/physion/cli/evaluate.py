@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import tyro
 
 from physion.cli.model_options import choose_models, split_names
-from physion.cli.output import Stages, console, print_warnings, scores_table, text_table
+from physion.cli.output import Stages, console, print_warnings, text_table
 from physion.compute.run_tasks import ExecutorSettings
 from physion.core.errors import BadInputError
 from physion.core.settings import read_pairs
@@ -132,20 +132,18 @@ def _print(done: Evaluation, options: Options) -> None:
 def _print_people(done: Evaluation) -> None:
     """Print how similar the predictions are to people's, of official stimuli that people saw."""
     import physion
-    from physion.analysis.tables import read_humans, read_predictions
+    from physion.analysis.tables import read_predictions
     from physion.data.official import official
 
-    data = official()
-    people, predictions = read_humans(data.humans), read_predictions(done.paths)
-    if not set(predictions["stimulus"]) & set(people["stimulus"]):
+    if not set(read_predictions(done.paths)["stimulus"]) & set(official().labels):
         return
     try:
-        results = physion.compare(predictions, people, data.labels)
+        result = physion.compare(done.paths, humans="official")
     except BadInputError as error:
         print_warnings([f"no comparison with people: {error}"])
         return
     _line("With the people of the original study:")
-    _line(scores_table(results.comparison.scores))
+    _line(text_table(result.summary))
 
 
 def _values(one: EvaluatedModel) -> dict[str, Any]:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from physion.compute.run_tasks import RunReport
+    from physion.report.compare import CompareResult
 
 
 class OutputConsole(Console):
@@ -124,22 +125,13 @@ def counted(number: int, singular: str, plural: str = "") -> str:
     return f"{number} {singular if number == 1 else plural or singular + 's'}"
 
 
-SCORES = {
-    "model": "row",
-    "stimuli": "stimuli",
-    "accuracy": "accuracy",
-    "human_accuracy": "of people",
-    "r": "r with people",
-    "kappa_from_averages": "kappa",
-}
-"""Columns of `scores_table` by those of the scores of a comparison."""
+def print_scores(result: CompareResult) -> None:
+    """Print the table of results of a comparison: people, models, baselines."""
+    from physion.analysis.tables import MEAN
 
-
-def scores_table(scores: pd.DataFrame) -> str:
-    """Return a text table with one line for each row of a comparison, all stimuli together."""
-    pooled = scores[scores["scenario"] == "pooled"]
-    shown = pooled[[name for name in SCORES if name in pooled]].rename(columns=SCORES)
-    return text_table(shown.dropna(axis="columns", how="all"))
+    over = "mean over scenarios" if result.summary_of == MEAN else "all stimuli pooled"
+    title = f"People and models, {over}, with 95 % intervals"
+    console.print(text_table(result.summary, title) + "\n", markup=False, soft_wrap=True)
 
 
 def text_table(table: pd.DataFrame, title: str = "") -> str:

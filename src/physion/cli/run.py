@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from physion.cli.model_options import choose_models, split_names
-from physion.cli.output import Stages, console, print_warnings, scores_table
+from physion.cli.output import Stages, console, print_scores, print_warnings
 from physion.core.errors import BadInputError
 from physion.data.official import PACKAGED
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from physion.readout.evaluate import Evaluation
+    from physion.report.compare import CompareResult
     from physion.scenes.tdw.read_logs import ImportedTrial
     from physion.trials.making.plan import TrialTask
 
@@ -99,15 +100,15 @@ def main(options: Options) -> int:
     failures = [*plan.failures, *write_trials(options, plan.tasks)]
     done = predict(options, models)
     failures += [f"{where}: {why}" for where, why in {**done.problems, **done.failed}.items()]
-    page, scores = write_report(options, plan, done)
+    page, result = write_report(options, plan, done)
     if options.json:
-        rows = json_module.loads(scores.to_json(orient="records"))
+        rows = json_module.loads(result.scores.to_json(orient="records"))
         answer = {"report": str(page), "scores": rows, "failures": failures}
         print(json_module.dumps(answer, indent=1))
         return 1 if failures else 0
     for failure in failures:
         console.print(f"failed: {failure}", markup=False, soft_wrap=True)
-    console.print(scores_table(scores), markup=False, soft_wrap=True)
+    print_scores(result)
     minutes, seconds = divmod(round(time.monotonic() - started), 60)
     console.print(
         f"report, made in {minutes} min {seconds} s: {page}", markup=False, soft_wrap=True
@@ -198,30 +199,26 @@ def write_trials(options: Options, tasks: list[TrialTask]) -> list[str]:
     return [f"{name}: {reason}" for name, reason in report.failed.items()]
 
 
-def write_report(options: Options, plan: RunPlan, done: Evaluation) -> tuple[Path, pd.DataFrame]:
-    """Write the report; return its page and the table of scores."""
-    import pandas as pd
-
+def write_report(options: Options, plan: RunPlan, done: Evaluation) -> tuple[Path, CompareResult]:
+    """Write the report; return its page and the comparison."""
     from physion.core.names import canonical_name
-    from physion.report.build import compare_files
+    from physion.report.compare import compare
     from physion.report.html import movies_of
     from physion.trials.dataset import Dataset
 
     assert options.out is not None, "completed"
     dataset = Dataset(options.out / "trials")
-    page = compare_files(
-        done.paths,
-        options.humans,
-        {canonical_name(name): contact for name, contact in plan.recorded.items()} or None,
+    recorded = {canonical_name(name): contact for name, contact in plan.recorded.items()}
+    result = compare(done.paths, humans=options.humans, labels=recorded or None)
+    page = result.report(
         options.out / "report",
         methods=methods(options, dataset.index),
         movies=movies_of(dataset.folder),
         question="Will the red object touch the yellow one?",
         trial_pages=options.trial_pages,
     )
-    report = json_module.loads((page.parent / "report.json").read_text(encoding="utf-8"))
-    print_warnings([*done.warnings, *report["warnings"]])
-    return page, pd.read_csv(page.parent / "tables" / "comparison.csv")
+    print_warnings([*done.warnings, *result.warnings])
+    return page, result
 
 
 def methods(options: Options, index: pd.DataFrame) -> dict[str, str]:
