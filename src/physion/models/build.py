@@ -1,142 +1,28 @@
-"""Registry of models, and building of a model from its name and options."""
+"""Registry of models, and building of a model from its name and options.
+
+A model is built by a function or a class. Its options are the fields of a dataclass, if it takes
+one argument ``settings`` that is annotated with one, or else its named arguments. Each value is
+checked against the declared type.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
+import inspect
 import sys
 import traceback
 import types
 import typing
 from collections.abc import Callable, Mapping
-from importlib.abc import ExecutionLoader
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from physion.clips.batch import Spec
 from physion.core.errors import BadInputError, MissingExtraError, PhysionError, UnknownNameError
 from physion.core.registry import Registry
-from physion.core.seeds import stable_hash
-from physion.core.settings import field_types, read_settings, shown
-from physion.models.interface import Model
-
-# Models in a user's Python file, named as ``FILE.py:Class``, without an installation.
-
-_loaded: dict[str, tuple[Path, str]] = {}
-"""Path and text of the files that were loaded, by name of the module."""
-
-
-class FileLoader(ExecutionLoader):
-    """Loader of a module from a text, which was read from ``path`` and may differ from it now."""
-
-    def __init__(self, path: Path, text: str) -> None:
-        self.path, self.text = path, text
-
-    def get_filename(self, fullname: str) -> str:
-        """Return the path, for tracebacks and ``__file__``."""
-        return str(self.path)
-
-    def get_source(self, fullname: str) -> str:
-        """Return the text."""
-        return self.text
-
-
-class LoadedFiles:
-    """The files that were loaded; whatever process unpickles this object loads them, too.
-
-    Pickled before a model, it makes the classes of the model known where it is unpickled.
-    """
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _load_again, (dict(_loaded),)
-
-
-def _load_again(files: dict[str, tuple[Path, str]]) -> LoadedFiles:
-    for known, (path, text) in files.items():
-        if known not in sys.modules:
-            _run(known, path, text)
-    return LoadedFiles()
-
-
-def is_file_name(name: str) -> bool:
-    """Return whether a model's name is of the form ``FILE.py:Class``."""
-    return Path(name.partition(":")[0]).suffix == ".py"
-
-
-def load_from_file(name: str) -> Any:
-    """Import a Python file and return the class or function after the colon.
-
-    The file is run as it stands, as any program that the user starts. It may import modules beside
-    it. Raises `BadInputError` if it is missing or fails, with the line that failed, and
-    `UnknownNameError` if it does not define the name.
-    """
-    text, _, attribute = name.partition(":")
-    path = Path(text).resolve()
-    if not path.is_file():
-        raise BadInputError(f"model {name!r}: there is no file {text}")
-    if not attribute:
-        raise BadInputError(f"model {name!r} names a file alone; write {text}:NameOfTheClass")
-    module = _import(path, name)
-    if not hasattr(module, attribute):
-        public = [key for key in vars(module) if not key.startswith("_")]
-        raise UnknownNameError(f"name in {text}", attribute, public)
-    return getattr(module, attribute)
-
-
-def _import(path: Path, name: str) -> Any:
-    # A name of its own, so that a user's file called torch.py or physion.py hides nothing. It
-    # depends on the text: a file that was edited, in a session that goes on, is another module.
-    try:
-        text = importlib.util.decode_source(path.read_bytes())
-    except (OSError, SyntaxError, UnicodeDecodeError) as error:
-        raise BadInputError(f"model {name!r}: {path} cannot be read: {error}") from error
-    known = f"physion_model_{path.stem}_{stable_hash(str(path), text) % 2**32:08x}"
-    if known in sys.modules:
-        return sys.modules[known]
-    try:
-        return _run(known, path, text)
-    except ModuleNotFoundError as error:
-        raise BadInputError(
-            f"model {name!r} needs the library {error.name!r}, which is not installed"
-        ) from error
-    except Exception as error:
-        where = _line_in(error, path)
-        what = error.msg if isinstance(error, SyntaxError) else error
-        raise BadInputError(
-            f"model {name!r}: {path.name}{where} raised {type(error).__name__}: {what}"
-        ) from error
-
-
-def _run(known: str, path: Path, text: str) -> Any:
-    """Run the text of a file as the module ``known``; leave no module behind if it fails."""
-    loader = FileLoader(path, text)
-    spec = importlib.util.spec_from_loader(known, loader)
-    assert spec is not None, "there is a loader"
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[known] = module
-    sys.path.insert(0, str(path.parent))
-    try:
-        loader.exec_module(module)
-    except BaseException:
-        del sys.modules[known]
-        raise
-    finally:
-        sys.path.remove(str(path.parent))
-    _loaded[known] = path, text
-    return module
-
-
-def _line_in(error: BaseException, path: Path) -> str:
-    """Return ``", line N"`` of the last line of ``path`` in the traceback of an error."""
-    if isinstance(error, SyntaxError):
-        return f", line {error.lineno}"
-    line, trace = None, error.__traceback__
-    while trace is not None:
-        if trace.tb_frame.f_code.co_filename == str(path):
-            line = trace.tb_lineno
-        trace = trace.tb_next
-    return "" if line is None else f", line {line}"
-
+from physion.core.settings import field_types, read_settings
+from physion.models.interface import RANDOM, Model, SizedSettings
+from physion.models.user_files import is_file_name, load_from_file
 
 # What the code of a model raised, in one line. This module does not import torch.
 
@@ -167,16 +53,16 @@ def describe_raised(error: Exception, model: str, method: str) -> BadInputError:
     )
 
 
-C = TypeVar("C")
-
 _EXTRAS = {
     **dict.fromkeys(("torch", "torchvision", "timm", "safetensors", "lightning_fabric"), "models"),
     "transformers": "video",
 }
 """Extra that installs a library, by name of the library."""
 
+S = TypeVar("S")
+
 ModelFactory = Callable[..., Model]
-"""Function that builds a model from the fields of its config."""
+"""Class or function that builds a model, from its settings or from named options."""
 
 models: Registry[ModelFactory] = Registry(
     "model",
@@ -188,9 +74,9 @@ models: Registry[ModelFactory] = Registry(
         "pDeIT-lstm": "physion.models.encoders.encoder:pdeit_lstm",
         "pEffNetLite0-mlp": "physion.models.encoders.encoder:peffnet_mlp",
         "pEffNetLite0-lstm": "physion.models.encoders.encoder:peffnet_lstm",
-        "cswm": "physion.models.cswm:cswm",
-        "svg": "physion.models.svg:svg",
-        "op3": "physion.models.op3:op3",
+        "cswm": "physion.models.cswm:Cswm",
+        "svg": "physion.models.svg:Svg",
+        "op3": "physion.models.op3:Op3",
         "pDINO-mlp": "physion.models.encoders.encoder:pdino_mlp",
         "pDINO-lstm": "physion.models.encoders.encoder:pdino_lstm",
         "pDINOv2-mlp": "physion.models.encoders.encoder:pdinov2_mlp",
@@ -200,18 +86,18 @@ models: Registry[ModelFactory] = Registry(
         "gns": "physion.models.particles.simulator:gns",
         "gns-ransac": "physion.models.particles.simulator:gns_ransac",
         "dpi": "physion.models.particles.simulator:dpi",
-        "rpin": "physion.models.rpin:rpin",
+        "rpin": "physion.models.rpin:Rpin",
         "noisy-simulation": "physion.models.noisy_simulation:noisy_simulation",
         "noisy-simulation-outcomes": "physion.models.noisy_simulation:noise_of_outcomes",
         "noisy-simulation-people": "physion.models.noisy_simulation:noise_of_people",
-        "outcome": "physion.models.baselines.answers:outcome",
-        "majority-of-people": "physion.models.baselines.answers:majority_of_people",
-        "state-classifier": "physion.models.baselines.motion:state_classifier",
-        "already-touched": "physion.models.baselines.motion:already_touched",
-        "chance": "physion.models.baselines.answers:base_rate",
-        "constant-motion": "physion.models.baselines.motion:constant_motion",
-        "blob-centroids": "physion.models.baselines.pixels:blob_centroids",
-        "copy-last-frame": "physion.models.baselines.pixels:copy_last_frame",
+        "outcome": "physion.models.baselines.answers:Outcome",
+        "majority-of-people": "physion.models.baselines.answers:MajorityOfPeople",
+        "state-classifier": "physion.models.baselines.motion:StateClassifier",
+        "already-touched": "physion.models.baselines.motion:AlreadyTouched",
+        "chance": "physion.models.baselines.answers:BaseRate",
+        "constant-motion": "physion.models.baselines.motion:ConstantMotion",
+        "blob-centroids": "physion.models.baselines.pixels:BlobCentroids",
+        "copy-last-frame": "physion.models.baselines.pixels:CopyLastFrame",
     },
 )
 """All models by name; other packages add theirs with the entry point group physion.models."""
@@ -220,6 +106,8 @@ models: Registry[ModelFactory] = Registry(
 def build_model(name: str, **options: Any) -> Model:
     """Build a model by its name.
 
+    Where trained weights ship with this package, they are the default (`SizedSettings`).
+
     Parameters
     ----------
     name
@@ -227,13 +115,13 @@ def build_model(name: str, **options: Any) -> Model:
         Python file. A class with ``transform`` and ``extract_features``, as the evaluator of
         Physion 1.5 takes it, becomes a model by `physion.models.extractor.ExtractorModel`.
     **options
-        Fields of the model's config, which override its defaults; arguments of the class.
+        Fields of the model's settings, or named arguments of the class.
 
     Returns
     -------
     model
-        Object with ``spec``, ``provenance``, ``digest`` and some of the methods of
-        `physion.models.interface`.
+        Object with ``spec``, ``provenance``, ``digest`` and some of the other methods of
+        `physion.models.interface.Model`.
 
     Raises
     ------
@@ -242,15 +130,17 @@ def build_model(name: str, **options: Any) -> Model:
     MissingExtraError
         If the libraries of a model of this package are not installed.
     BadInputError
-        If a library of a plug-in is not installed, or the model cannot be built, or lacks what
-        every model has.
+        For an option of another type, if a library of a plug-in is not installed, or if the model
+        cannot be built, or lacks what every model has.
     """
-    if is_file_name(name):
-        factory: ModelFactory = load_from_file(name)
-    else:
-        factory = _registered(name)
+    factory = _factory(name)
+    kind = settings_type(factory)
     try:
-        model: Model = _adapted(factory(**options))
+        if kind is not None:
+            built = factory(make_settings(kind, name, options))
+        else:
+            built = factory(**_checked(_arguments(factory, name), name, options))
+        model: Model = _adapted(built)
     except PhysionError:
         raise
     except ModuleNotFoundError as error:
@@ -259,6 +149,121 @@ def build_model(name: str, **options: Any) -> Model:
         raise describe_raised(error, name, "building it") from error
     _check_parts(model, name)
     return model
+
+
+def build_untrained(name: str, **options: Any) -> Model:
+    """Build a model with the weights that its training starts from.
+
+    They are random where `build_model` would take shipped ones. An encoder that is pretrained
+    starts from its pretrained weights in either case.
+    """
+    kind = settings_type(_factory(name))
+    if kind is not None and issubclass(kind, SizedSettings):
+        options = {"weights": RANDOM, **options}
+    return build_model(name, **options)
+
+
+def option_names(name: str) -> tuple[str, ...]:
+    """Return the names of the options of a model, without building it."""
+    factory = _factory(name)
+    kind = settings_type(factory)
+    return tuple(_arguments(factory, name) if kind is None else _options_of(kind))
+
+
+def settings_type(factory: Any) -> type | None:
+    """Return the dataclass that a class or function takes as ``settings``; None for another one."""
+    try:
+        parameters = list(inspect.signature(factory).parameters)
+    except (TypeError, ValueError):
+        return None
+    kind = _hints(factory).get("settings") if parameters[:1] == ["settings"] else None
+    return kind if isinstance(kind, type) and dataclasses.is_dataclass(kind) else None
+
+
+def make_settings(kind: type[S], model: str, options: Mapping[str, Any]) -> S:
+    """Build the settings of a model from options, each checked against the type of its field.
+
+    Parameters
+    ----------
+    kind
+        A dataclass. Its method ``defaults``, if it has one, gives defaults that depend on the name
+        of the model and on other options, as in `ModelSettings`; and a field ``model`` is set.
+    model
+        Name of the model.
+    options
+        Values by name.
+
+    Raises
+    ------
+    UnknownNameError
+        For an unknown option.
+    BadInputError
+        For a value of another type than the field declares, or one that the settings refuse.
+    """
+    values = _checked(_options_of(kind), model, options)
+    find_defaults = getattr(kind, "defaults", None)
+    if find_defaults is not None:
+        values = {**find_defaults(model, values), **values}
+    if "model" in field_types(kind):
+        values["model"] = model
+    return kind(**values)
+
+
+def _factory(name: str) -> Any:
+    return load_from_file(name) if is_file_name(name) else _registered(name)
+
+
+def _options_of(kind: Any) -> dict[str, Any]:
+    """Return the types of the options of a settings class by name."""
+    return {name: part for name, part in field_types(kind).items() if name != "model"}
+
+
+def _hints(factory: Any) -> dict[str, Any]:
+    """Return the annotated types of the arguments of a class or function."""
+    try:
+        return typing.get_type_hints(factory.__init__ if isinstance(factory, type) else factory)
+    except (NameError, TypeError, AttributeError):  # names that are known to a type checker only
+        return {}
+
+
+def _arguments(factory: Any, name: str) -> dict[str, Any]:
+    """Return the types of named arguments; ``**`` stands for any other one."""
+    try:
+        parameters = inspect.signature(factory).parameters.values()
+    except (TypeError, ValueError):
+        return {"**": Any}
+    hints = _hints(factory)
+    any_name = {part.name for part in parameters if part.kind is part.VAR_KEYWORD}
+    named = (
+        part.name
+        for part in parameters
+        if part.kind in (part.POSITIONAL_OR_KEYWORD, part.KEYWORD_ONLY)
+    )
+    return {**{part: hints.get(part, Any) for part in named}, **({"**": Any} if any_name else {})}
+
+
+def _checked(known: Mapping[str, Any], model: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options as values of their declared types."""
+    values = {}
+    for option, value in options.items():
+        if option not in known and "**" not in known:
+            raise UnknownNameError(f"option of model {model}", option, known)
+        kind = known.get(option, Any)
+        where = f"option {option} of model {model}"
+        values[option] = read_settings(kind, value, where) if _is_plain(kind) else value
+    return values
+
+
+def _is_plain(kind: Any) -> bool:
+    """Return whether JSON can express the values of a type, so that they can be checked."""
+    origin, parts = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Literal:
+        return True
+    if origin in (types.UnionType, typing.Union):
+        return all(_is_plain(part) for part in parts)
+    if origin in (tuple, list, dict):
+        return all(_is_plain(part) for part in parts if part is not Ellipsis)
+    return kind in (bool, int, float, str, types.NoneType)
 
 
 def _adapted(built: Any) -> Any:
@@ -302,50 +307,3 @@ def _missing(name: str, error: ModuleNotFoundError) -> Exception:
     if library in _EXTRAS:
         return MissingExtraError(f"model {name!r}", _EXTRAS[library])
     return BadInputError(f"model {name!r} needs the library {error.name!r}, which is not installed")
-
-
-def make_config(kind: type[C], model: str, options: Mapping[str, Any]) -> C:
-    """Build a config of the dataclass ``kind`` from options, each checked against its type.
-
-    Raises
-    ------
-    UnknownNameError
-        For an unknown option.
-    BadInputError
-        For a value of another type than the field declares, or one that the config refuses.
-    """
-    known = field_types(kind)
-    values = {}
-    for option, value in options.items():
-        if option not in known:
-            raise UnknownNameError(f"option of model {model}", option, known)
-        values[option] = _as_declared(known[option], value, f"option {option} of model {model}")
-    config = kind(**values)
-    # After the config's own checks, which say more about a wrong name.
-    for option in values:
-        chosen, names = getattr(config, option), typing.get_args(known[option])
-        if typing.get_origin(known[option]) is Literal and chosen not in names:
-            listed = ", ".join(map(str, names))
-            raise BadInputError(
-                f"option {option} of model {model} must be one of {listed}, not {shown(chosen)}"
-            )
-    return config
-
-
-def _as_declared(kind: Any, value: Any, where: str) -> Any:
-    """Return the value of an option as its field's type; raise `BadInputError` for another type.
-
-    Values of fields that JSON cannot express, such as functions, stay as they are.
-    """
-    if not _is_plain(kind) or dataclasses.is_dataclass(value):
-        return value
-    return read_settings(kind, value, where)
-
-
-def _is_plain(kind: Any) -> bool:
-    """Return whether JSON can express the values of a type."""
-    origin = typing.get_origin(kind)
-    if origin is types.UnionType:
-        parts = typing.get_args(kind)
-        return all(_is_plain(part) or typing.get_origin(part) is Literal for part in parts)
-    return kind in (bool, int, float, str, types.NoneType) or origin is tuple

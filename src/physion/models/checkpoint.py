@@ -23,6 +23,7 @@ from torch.optim import Optimizer
 from physion.core.errors import BadInputError
 from physion.core.files import file_sha256, write_atomic
 from physion.core.version import __version__
+from physion.models.interface import RANDOM, SHIPPED, ask
 
 _METADATA = "physion"
 _VERSION = 1
@@ -236,8 +237,6 @@ def _shown(values: Mapping[str, Any], key: str) -> str:
 
 # Weights of models that this package trained: those that come with it, and those of a user.
 
-RANDOM, SHIPPED = "random", "shipped"
-"""Names of weights that are no path of a file: those to be trained, and those of the package."""
 FOLDER = "physion.data.weights"
 """Name of the folder with the weights that are installed with the package."""
 BUILT_AS = "built_as"
@@ -337,10 +336,9 @@ def _load(path: Path, model: nn.Module) -> None:
     # Large weights are shipped in half precision.
     halves = {name for name, value in stored.items() if value.dtype == torch.float16}
     tensors = {name: v.float() if name in halves else v for name, v in stored.items()}
-    built_as = getattr(model, "built_as", None)
-    if built_as is not None:
+    if built_as := ask(model, BUILT_AS)():
         advice = "build the model that the weights belong to, or give weights of this one"
         if differences := describe_tensors(tensors, model):
             advice = f"{differences}; {advice}"
-        check_same(path, "model", metadata.get(BUILT_AS, {}), built_as(), advice)
+        check_same(path, "model", metadata.get(BUILT_AS, {}), built_as, advice)
     load_tensors(path, tensors, model)

@@ -1,9 +1,23 @@
-"""Settings of C-SWM, and its sizes."""
+"""C-SWM: contrastively trained structured world model.
+
+Tensors (B clips, T pictures, h = ``settings.stacked``, S = T - h + 1 states, K slots of D values):
+
+- pictures (B, T, 3, H, W). Each run of h successive ones is stacked to 3 h channels.
+- states (B, S, K, D), at the last picture of each run.
+- features (B, T, K D): slots of the states, one after the other. As in the published code, the
+  first state stands for the h - 1 frames before it too.
+- next state z' = z + T(z), or z + T(z, z - z_before) with a ``memory`` of 2
+  (`SlotTransition`): motion is known from several pictures in one state, or from two
+  states.
+
+Source: docs/official-system.md, section 5, and Kipf et al. 2020.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
@@ -11,16 +25,25 @@ from torch.nn import functional
 
 from physion.clips.batch import Batch, Provenance, Rollout, Spec
 from physion.core.errors import BadInputError
-from physion.models.build import make_config
 from physion.models.checkpoint import load_named
-from physion.models.interface import TrainingSettings
+from physion.models.interface import Sizes, TrainingSettings
 from physion.models.torch_model import initial_weights
-from physion.models.vision import Size, VisionModel, VisionOptions, normalized_pictures
+from physion.models.vision import VisionModel, VisionSettings, normalized_pictures
+
+NAME, VERSION = "cswm", 1
+
+_PAPER: Mapping[str, Any] = {
+    "image_size": 224, "slots": 10, "slot_size": 128, "hidden": 512, "channels": 32,
+    "kernels": (9, 5), "strides": (1, 5),
+}  # fmt: skip
+_RELEASED: Mapping[str, Any] = {
+    **_PAPER, "stacked": 7, "memory": 1, "transitions": 1, "negatives": "permuted",
+}  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class CswmConfig:
-    """All settings of C-SWM.
+@dataclass(frozen=True, kw_only=True)
+class CswmSettings(VisionSettings):
+    """Settings of C-SWM; also see `SizedSettings`.
 
     - ``image_size``: pixels per side. ``stacked``: successive pictures that make one state.
     - ``memory``: states from which the next one is predicted: 1, or 2, the present one and its
@@ -32,15 +55,14 @@ class CswmConfig:
     - ``sigma``: unit of distances in the energy. ``hinge``: energy from which a negative is far
       enough.
     - ``transitions``: pairs of successive states in a training clip.
-    - ``negatives``: ``all`` other states of the batch (`contrast.all_pairs_loss`); or ``permuted``,
-      as published: one state each, in a random order that may leave it in its place. Clips differ
-      in their objects, so that without other steps the slots need not follow any motion.
-    - ``training``: optimiser and schedule.
+    - ``negatives``: ``all`` other states of the batch (`all_pairs_loss`); or ``permuted``, as
+      published: one state each, in a random order that may leave it in its place. Clips differ in
+      their objects, so that without other steps the slots need not follow any motion.
     """
 
-    image_size: int = 64
+    model: str = NAME
     stacked: int = 1
-    memory: int = 2
+    memory: Literal[1, 2] = 2
     slots: int = 6
     slot_size: int = 32
     hidden: int = 128
@@ -51,46 +73,32 @@ class CswmConfig:
     hinge: float = 1.0
     transitions: int = 3
     negatives: Literal["all", "permuted"] = "all"
-    training: TrainingSettings = field(default_factory=TrainingSettings)
+
+    sizes: ClassVar[Sizes] = {"small": {}, "paper": _PAPER, "released": _RELEASED}
+
+    def __post_init__(self) -> None:
+        self.at_least(
+            1, "image_size", "stacked", "slots", "slot_size", "hidden", "channels", "transitions"
+        )
 
 
-_SMALL = CswmConfig(
-    training=TrainingSettings(
-        steps=6000,
-        batch=32,
-        learning_rate=1e-3,
-        schedule="cosine",
-        warmup=50,
-        validate_every=250,
-        log_every=25,
-        checkpoint_every=250,
-    )
+_SMALL_TRAINING = TrainingSettings(
+    steps=6000,
+    batch=32,
+    learning_rate=1e-3,
+    schedule="cosine",
+    warmup=50,
+    validate_every=250,
+    log_every=25,
+    checkpoint_every=250,
 )
-_PAPER = CswmConfig(
-    image_size=224,
-    slots=10,
-    slot_size=128,
-    hidden=512,
-    channels=32,
-    kernels=(9, 5),
-    strides=(1, 5),
-    training=replace(_SMALL.training, steps=100_000, learning_rate=5e-4, warmup=1000),
-)
-_RELEASED = replace(
-    _PAPER,
-    stacked=7,
-    memory=1,
-    transitions=1,
-    negatives="permuted",
+_PAPER_TRAINING = replace(_SMALL_TRAINING, steps=100_000, learning_rate=5e-4, warmup=1000)
+TRAINING: Mapping[str, TrainingSettings] = {
+    "small": _SMALL_TRAINING,
+    "paper": _PAPER_TRAINING,
     # The published code makes a new Adam at every step, which equals betas of 0.
-    training=replace(_PAPER.training, schedule="constant", warmup=0, betas=(0.0, 0.0)),
-)
-_SIZES: dict[Size, CswmConfig] = {"small": _SMALL, "paper": _PAPER, "released": _RELEASED}
-
-
-def cswm_config(size: Size) -> CswmConfig:
-    """Return the settings of a size."""
-    return _SIZES[size]
+    "released": replace(_PAPER_TRAINING, schedule="constant", warmup=0, betas=(0.0, 0.0)),
+}
 
 
 # Networks of C-SWM: extraction and encoding of slots, and their transition.
@@ -98,16 +106,14 @@ def cswm_config(size: Size) -> CswmConfig:
 # - `SlotExtractor`: pictures (N, C, H, W) to K maps (N, K, h, w) in 0..1.
 # - `SlotEncoder`: each map on its own to a slot z_k (N, K, D), with common weights.
 # - `SlotTransition`: slots to their changes, a graph network in which every slot receives from
-#   every
-#   other. With what is known of a slot, x_k = z_k, or z_k and its last change,
+#   every other. With what is known of a slot, x_k = z_k, or z_k and its last change,
 #
 #     m_k = sum_{l != k} f(x_k, x_l),    dz_k = g(x_k, m_k)
 #
 # References
 # ----------
 # T. Kipf, E. van der Pol and M. Welling, Contrastive learning of structured world models, ICLR
-#   2020,
-# section 3 and appendix B.
+# 2020, section 3 and appendix B.
 
 
 class SlotExtractor(nn.Module):
@@ -292,49 +298,41 @@ def ranking(ranks: Tensor) -> Ranking:
     return Ranking(float((values == 1).double().mean()), float((1 / values).mean()))
 
 
-# C-SWM: contrastively trained structured world model.
-#
-# Tensors (B clips, T pictures, h = ``config.stacked``, S = T - h + 1 states, K slots of D values):
-#
-# - pictures (B, T, 3, H, W). Each run of h successive ones is stacked to 3 h channels.
-# - states (B, S, K, D), at the last picture of each run.
-# - features (B, T, K D): slots of the states, one after the other. As in the published code, the
-#   first state stands for the h - 1 frames before it too.
-# - next state z' = z + T(z), or z + T(z, z - z_before) with a ``memory`` of 2
-#   (`networks.SlotTransition`): motion is known from several pictures in one state, or from two
-#   states.
-#
-# Source: docs/official-system.md, section 5, and Kipf et al. 2020 (`networks`, `contrast`).
-
-NAME, VERSION = "cswm", 1
+# The model: loss, and imagination.
 
 
 class Cswm(VisionModel):
-    """Slots of pictures, trained to be predictable, and different in different states."""
+    """C-SWM, slots of pictures that are predictable, and different in different states."""
 
-    def __init__(self, config: CswmConfig, options: VisionOptions) -> None:
+    settings: CswmSettings
+
+    def __init__(self, settings: CswmSettings) -> None:
         spec = Spec(
-            image_size=config.image_size,
+            image_size=settings.image_size,
             mean=(0.0, 0.0, 0.0),
             std=(1.0, 1.0, 1.0),
-            framewise=config.stacked == 1,
+            framewise=settings.stacked == 1,
         )
-        super().__init__(NAME, VERSION, config, config.training, options, spec)
-        self.config = self.settings = config
-        self.window = config.stacked + config.memory - 1 + config.transitions
-        with initial_weights("cswm", options.seed):
+        super().__init__(VERSION, settings, TRAINING[settings.size], spec)
+        self.window = settings.stacked + settings.memory - 1 + settings.transitions
+        with initial_weights("cswm", settings.seed):
             self.extractor = SlotExtractor(
-                3 * config.stacked, config.channels, config.slots, config.kernels, config.strides
+                3 * settings.stacked,
+                settings.channels,
+                settings.slots,
+                settings.kernels,
+                settings.strides,
             )
-            pixels = self.extractor.map_size(config.image_size) ** 2
-            self.encoder = SlotEncoder(pixels, config.hidden, config.slot_size)
+            pixels = self.extractor.map_size(settings.image_size) ** 2
+            self.encoder = SlotEncoder(pixels, settings.hidden, settings.slot_size)
             self.transition = SlotTransition(
-                config.memory * config.slot_size, config.slot_size, config.hidden
+                settings.memory * settings.slot_size, settings.slot_size, settings.hidden
             )
-        if config.memory == 2:
+        if settings.memory == 2:
             # An untrained network predicts that nothing changes.
             nn.init.zeros_(self.transition.change.weight)
             nn.init.zeros_(self.transition.change.bias)
+        load_named(self, settings.weights)
 
     def provenance(self) -> Provenance:
         """Return name, size and origin of the weights."""
@@ -343,7 +341,7 @@ class Cswm(VisionModel):
     def encode(self, batch: Batch) -> Tensor:
         """Return the features (B, T, K D) of the pictures of a batch."""
         states = self._states(batch).flatten(2)
-        before = states[:, :1].expand(-1, self.config.stacked - 1, -1)
+        before = states[:, :1].expand(-1, self.settings.stacked - 1, -1)
         return torch.cat([before, states], 1)
 
     def imagine(self, context: Batch, samples: int, seed: int, **knobs: Any) -> Rollout:
@@ -354,8 +352,8 @@ class Cswm(VisionModel):
         and under ``context_masks`` the maps (B, T, K, h, w) of the context.
         """
         features = self.encode(context) if context.features is None else context.features
-        states = features[:, -self.config.memory :]
-        states = states.view(*states.shape[:2], self.config.slots, -1)
+        states = features[:, -self.settings.memory :]
+        states = states.view(*states.shape[:2], self.settings.slots, -1)
         imagined = []
         for _ in range(self.spec.future):
             states = torch.cat([states[:, 1:], self._predicted(states)], 1)
@@ -364,8 +362,8 @@ class Cswm(VisionModel):
         if knobs.get("show", 0) <= 0:
             return Rollout(features=future)
         maps = self.maps(context)
-        before = maps[:, :1].expand(-1, self.config.stacked - 1, -1, -1, -1)
-        slots = future.reshape(*future.shape[:3], self.config.slots, -1)
+        before = maps[:, :1].expand(-1, self.settings.stacked - 1, -1, -1, -1)
+        slots = future.reshape(*future.shape[:3], self.settings.slots, -1)
         shown = {"slots": slots, "context_masks": torch.cat([before, maps], 1).float()}
         return Rollout(features=future, shown=shown)
 
@@ -383,7 +381,7 @@ class Cswm(VisionModel):
     def baseline(self, batch: Batch) -> Tensor:
         """Return the loss with the present state as the prediction of the next one."""
         states = self._states(batch)
-        return self._contrast(states, states[:, self.config.memory - 1 : -1])["loss"]
+        return self._contrast(states, states[:, self.settings.memory - 1 : -1])["loss"]
 
     def next_state_ranks(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """Return the ranks of the true next states among all states of a batch.
@@ -398,7 +396,7 @@ class Cswm(VisionModel):
         copied : Tensor
             The same for the present state as the prediction.
         """
-        states, memory = self._states(batch), self.config.memory
+        states, memory = self._states(batch), self.settings.memory
         rows = torch.arange(states.shape[0] * states.shape[1], device=states.device)
         true = rows.view(states.shape[:2])[:, memory:].flatten()
         candidates = states.flatten(2).flatten(0, 1)
@@ -411,14 +409,14 @@ class Cswm(VisionModel):
 
     def _contrast(self, states: Tensor, predicted: Tensor) -> dict[str, Tensor]:
         """Return the loss of states (B, S, K, D), the last ones of which were predicted."""
-        config = self.config
-        apart = energy(predicted, states[:, config.memory :], config.sigma).mean()
-        if config.negatives == "permuted":
-            flat = states[:, config.memory - 1 : -1].flatten(0, 1)
+        settings = self.settings
+        apart = energy(predicted, states[:, settings.memory :], settings.sigma).mean()
+        if settings.negatives == "permuted":
+            flat = states[:, settings.memory - 1 : -1].flatten(0, 1)
             order = torch.randperm(len(flat)).to(flat.device)
-            far = hinge_loss(flat, flat[order], config.sigma, config.hinge)
+            far = hinge_loss(flat, flat[order], settings.sigma, settings.hinge)
         else:
-            far = all_pairs_loss(states, config.sigma, config.hinge)
+            far = all_pairs_loss(states, settings.sigma, settings.hinge)
         return {"loss": apart + far, "next": apart, "negatives": far}
 
     def _predicted(self, states: Tensor) -> Tensor:
@@ -426,8 +424,8 @@ class Cswm(VisionModel):
 
         With a memory of 2, the first state has no prediction.
         """
-        known = now = states[:, self.config.memory - 1 :]
-        if self.config.memory == 2:
+        known = now = states[:, self.settings.memory - 1 :]
+        if self.settings.memory == 2:
             known = torch.cat([now, now - states[:, :-1]], -1)
         change: Tensor = self.transition(known.flatten(0, 1))
         return now + change.view(now.shape)
@@ -441,7 +439,7 @@ class Cswm(VisionModel):
     def _stacked(self, batch: Batch) -> Tensor:
         """Return runs of h pictures as (B, S, 3 h, H, W), the oldest first."""
         pictures = normalized_pictures(batch, self.spec, self.name)
-        stacked = self.config.stacked
+        stacked = self.settings.stacked
         if pictures.shape[1] < stacked:
             raise BadInputError(
                 f"{self.name}: a state needs {stacked} pictures, and a clip has only "
@@ -449,14 +447,3 @@ class Cswm(VisionModel):
             )
         runs = pictures.unfold(1, stacked, 1)  # (B, S, 3, H, W, h)
         return runs.permute(0, 1, 5, 2, 3, 4).flatten(2, 3)
-
-
-# Building of C-SWM by name, with random, shipped or given weights.
-
-
-def cswm(**options: Any) -> Cswm:
-    """Build a contrastively trained world model; ``options`` are those of `VisionOptions`."""
-    chosen = make_config(VisionOptions, NAME, options)
-    model = Cswm(cswm_config(chosen.size), chosen)
-    load_named(model, chosen.weights)
-    return model

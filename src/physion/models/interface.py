@@ -117,6 +117,8 @@ class ModelSettings:
         return {}
 
 
+Sizes = Mapping[str, Mapping[str, Any]]
+"""By size, the settings that differ from the defaults of the fields."""
 RANDOM, SHIPPED = "random", "shipped"
 """Weights that are no path of a file: those to be trained, and those of the package."""
 
@@ -137,8 +139,7 @@ class SizedSettings(ModelSettings):
     weights: str = SHIPPED
     seed: int = 0
 
-    sizes: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType({"small": {}})
-    """Settings of each size that differ from the defaults of the fields."""
+    sizes: ClassVar[Sizes] = MappingProxyType({"small": {}})
     any_weights: ClassVar[frozenset[str]] = frozenset({"model", "weights", "seed", "samples"})
     """Settings that do not change what weights are for."""
 

@@ -16,17 +16,16 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from physion.clips.batch import Batch, Provenance, Rollout, Spec, cut_to_observed
-from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError
 from physion.core.seeds import stable_hash
 from physion.core.version import __version__
-from physion.models.build import make_config
-from physion.models.interface import Model
+from physion.models.interface import Model, ModelSettings
 from physion.models.state_noise import NoiseLevels, ObservedTrial, simulate_contacts
 from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine
 from physion.physics.labels import label_contact
@@ -68,46 +67,55 @@ def fitted_levels(target: str, scene: Scene) -> NoiseLevels:
 
 LAST_OBSERVED = OBSERVED_FRAMES - 1
 
+NAME = "noisy-simulation"
 NOISE_VERSION = 2
 """Version of the random numbers; stored simulations of another version are not used."""
 
 
-@dataclass(frozen=True, slots=True)
-class NoisySimulationConfig(NoiseLevels):
-    """Settings of `NoisySimulation`: the levels of the noise, and others.
+@dataclass(frozen=True, kw_only=True)
+class NoisySimulationSettings(NoiseLevels, ModelSettings):
+    """Settings of `NoisySimulation`: the levels of the noise (`NoiseLevels`), and others.
 
-    - ``levels``: ``given``, the levels of this config, or those fitted to ``outcomes`` or to
-      ``people`` (`physion.models.noisy_simulation`), which no other level may be given with.
+    ``noisy-simulation-outcomes`` and ``noisy-simulation-people`` take no levels: theirs are fitted.
+
     - ``scale``: factor of all standard deviations.
-    - ``scales``: values of ``scale`` among which a reader chooses; with one value nothing is
+    - ``scales``: values of ``scale`` among which a decision chooses; with one value nothing is
       fitted.
     - ``samples``: simulations per trial. ``engine``: name of the engine. ``seed``: of the noise.
     """
 
-    levels: Literal["given", "outcomes", "people"] = "given"
+    model: str = NAME
     scale: float = 1.0
     scales: tuple[float, ...] = (0.5, 1.0, 2.0)
     samples: int = 20
     engine: str = DEFAULT_ENGINE
     seed: int = 0
 
+    @classmethod
+    def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the settings of simulations with fitted noise, which have one scale."""
+        return {} if model == NAME else {"scales": (1.0,)}
+
+    @property
+    def fitted_to(self) -> str:
+        """What the levels were fitted to, a key of `FITTED`; empty for given levels."""
+        return self.model.removeprefix(NAME).removeprefix("-")
+
     def __post_init__(self) -> None:
-        self.check("noisy-simulation")
-        if self.levels not in ("given", *FITTED):
-            raise UnknownNameError("levels of noisy-simulation", self.levels, ("given", *FITTED))
+        self.check(self.model)
         changed = [
             field.name
             for field in dataclasses.fields(NoiseLevels)
             if getattr(self, field.name) != field.default
         ]
-        if self.levels != "given" and changed:
+        if self.fitted_to and changed:
             raise BadInputError(
-                f"noisy-simulation: levels={self.levels} sets all levels; leave out {changed[0]}"
+                f"the noise of {self.model} is fitted: leave out {changed[0]}, or use {NAME}"
             )
         if min((self.scale, *self.scales)) < 0:
-            raise BadInputError("noisy-simulation: scales must not be negative")
+            raise BadInputError(f"{self.model}: scales must not be negative")
         if self.samples < 1 or not self.scales:
-            raise BadInputError("noisy-simulation needs at least one sample and one scale")
+            raise BadInputError(f"{self.model} needs at least one sample and one scale")
 
 
 def cut_trial(scene: Scene, trajectory: Trajectory) -> ObservedTrial:
@@ -132,16 +140,16 @@ def cut_trial(scene: Scene, trajectory: Trajectory) -> ObservedTrial:
 class NoisySimulation(Model):
     """Model that simulates the rest of a trial several times with noise; see the module.
 
-    ``engine`` is an engine object for use in this process; by default the one named in the config.
+    ``engine`` is an engine object for use in this process; by default the settings name one.
     """
 
     decision = "noise"
 
-    def __init__(self, config: NoisySimulationConfig, engine: Engine | None = None) -> None:
-        self.config = self.settings = config
+    def __init__(self, settings: NoisySimulationSettings, engine: Engine | None = None) -> None:
+        self.settings = settings
         self.spec = Spec(inputs=("state",), context_at="end", stride=1, context=1, future=0)
-        self.samples, self.seed = config.samples, config.seed
-        self.knobs = {"scale": config.scales}
+        self.samples, self.seed = settings.samples, settings.seed
+        self.knobs = {"scale": settings.scales}
         self._given = engine
         self._built: Engine | None = None
 
@@ -149,22 +157,21 @@ class NoisySimulation(Model):
     def engine(self) -> Engine:
         """The engine that simulates."""
         if self._built is None:
-            self._built = self._given or make_engine(self.config.engine)
+            self._built = self._given or make_engine(self.settings.engine)
         return self._built
 
     def levels_for(self, scene: Scene) -> NoiseLevels:
         """Return the levels of the noise for a scene."""
-        if self.config.levels == "given":
-            return self.config
-        return fitted_levels(self.config.levels, scene)
+        fitted = self.settings.fitted_to
+        return fitted_levels(fitted, scene) if fitted else self.settings
 
     def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
         """Simulate every trial ``samples`` times; ``contact`` says whether agent and patient touch.
 
-        ``scale`` is the only knob; by default it is that of the config. The noise of a sample is a
-        function of ``seed``, the trial's name and the number of the sample.
+        ``scale`` is the only knob; by default it is that of the settings. The noise of a sample is
+        a function of ``seed``, the trial's name and the number of the sample.
         """
-        scale = knobs.get("scale", self.config.scale)
+        scale = knobs.get("scale", self.settings.scale)
         assert context.state is not None, "the spec asks for states"
         found = [
             simulate_contacts(
@@ -181,22 +188,22 @@ class NoisySimulation(Model):
 
     def digest(self) -> str:
         """Return the SHA-256 of engine and noise; scales and number of samples are no part."""
-        config = dataclasses.asdict(self.config)
-        settings = {field.name: config[field.name] for field in dataclasses.fields(NoiseLevels)}
-        parts: list[Any] = [NOISE_VERSION, self.engine.name, settings]
-        if self.config.levels != "given":
-            parts += [dataclasses.asdict(levels) for levels in FITTED[self.config.levels]]
+        settings = dataclasses.asdict(self.settings)
+        levels = {field.name: settings[field.name] for field in dataclasses.fields(NoiseLevels)}
+        parts: list[Any] = [NOISE_VERSION, self.engine.name, levels]
+        if fitted := self.settings.fitted_to:
+            parts += [dataclasses.asdict(levels) for levels in FITTED[fitted]]
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions, and what noise was fitted to."""
-        fitted = self.config.levels != "given"
+        fitted = self.settings.fitted_to
         return Provenance(
-            model=f"noisy-simulation-{self.config.levels}" if fitted else "noisy-simulation",
+            model=self.settings.model,
             init="none",
             encoder_type="true state",
             dynamics_type="physics engine",
-            dynamics_training_task=f"noise fitted to {self.config.levels}" if fitted else "",
+            dynamics_training_task=f"noise fitted to {fitted}" if fitted else "",
             versions=f"{self.engine.name}, physion {__version__}",
         )
 
@@ -205,29 +212,19 @@ class NoisySimulation(Model):
         return {**self.__dict__, "_built": None}
 
 
-def noisy_simulation(**options: Any) -> NoisySimulation:
-    """Build simulations that start from the true state with noise added.
-
-    ``options`` are the fields of `NoisySimulationConfig`. Fitted levels have one scale, 1, unless
-    ``scales`` are given.
-    """
-    return _build("noisy-simulation", options)
+def noisy_simulation(settings: NoisySimulationSettings) -> NoisySimulation:
+    """Build simulations that start from the true state with noise added."""
+    return NoisySimulation(settings)
 
 
-def noise_of_outcomes(**options: Any) -> NoisySimulation:
+def noise_of_outcomes(settings: NoisySimulationSettings) -> NoisySimulation:
     """Build simulations whose noise was fitted to outcomes of other configurations."""
-    return _build("noisy-simulation-outcomes", {**options, "levels": "outcomes"})
+    return NoisySimulation(settings)
 
 
-def noise_of_people(**options: Any) -> NoisySimulation:
+def noise_of_people(settings: NoisySimulationSettings) -> NoisySimulation:
     """Build simulations whose noise was fitted to people's answers to other configurations."""
-    return _build("noisy-simulation-people", {**options, "levels": "people"})
-
-
-def _build(name: str, options: dict[str, Any]) -> NoisySimulation:
-    if options.get("levels", "given") != "given":
-        options = {"scales": (1.0,), **options}
-    return NoisySimulation(make_config(NoisySimulationConfig, name, options))
+    return NoisySimulation(settings)
 
 
 # Threshold on a distance that separates contacts from misses best.

@@ -1,14 +1,31 @@
-"""Settings of OP3, and its sizes."""
+"""OP3: K slots that explain a picture together, and that predict how they go on.
+
+The steps of `SlotInference` follow a schedule: the slots of the first frame are refined
+``seed_steps`` times; those of each later frame that is seen are predicted, then refined once;
+those of the frames after them are only predicted. With the objective O_i after step i = 1, 2,
+..., for the picture of its frame,
+
+    loss = sum_i i O_i / sum_i i / pixels
+
+where moving pixels (`physion.models.vision`) have the weight 1 + w, w = 0 as published.
+
+Features are the states of all slots, with the means of their random part: after the refinement
+for frames that are seen, after the prediction for imagined ones. When features are computed, the
+slots of all trials start from the same random numbers, so that a slot tends to hold the same
+thing.
+
+Source: Veerapaneni et al. 2020, "Entity Abstraction in Visual Model-Based Reinforcement
+Learning"; docs/reference/vision-models.md says in what the sizes differ from the published code.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -16,13 +33,12 @@ from torch.nn import functional
 from physion.clips.batch import Batch, Provenance, Rollout
 from physion.core.errors import BadInputError
 from physion.core.seeds import generator
-from physion.models.build import make_config
 from physion.models.checkpoint import load_named
-from physion.models.interface import TrainingSettings
+from physion.models.interface import SizedSettings, Sizes, TrainingSettings
 from physion.models.torch_model import initial_weights
 from physion.models.vision import (
     PictureModel,
-    VisionOptions,
+    PictureSettings,
     context_pictures,
     future_error,
     gaussian_divergence,
@@ -32,39 +48,22 @@ from physion.models.vision import (
     window_pictures,
 )
 
+Density = Literal["gaussian", "released"]
+NAME = "op3"
+VERSION = 1
+"""To be raised with every change of what equal weights compute, or of the training."""
 
-@dataclass(frozen=True, slots=True)
-class Op3Options(VisionOptions):
-    """What a user chooses of OP3; also see `VisionOptions`.
-
-    - ``slots``: by default (0) those of the size. Weights fit any number of slots.
-    - ``samples``: futures of a trial, whose features the readout joins.
-    """
-
-    slots: int = 0
-    samples: int = 1
-
-    def __post_init__(self) -> None:
-        # Not super(): a dataclass with slots is made anew, which super() does not know.
-        VisionOptions.__post_init__(self)
-        for name, least in (("slots", 0), ("samples", 1)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < least:
-                raise BadInputError(f"{name} must be a whole number from {least} on, not {value!r}")
+_PAPER: Mapping[str, Any] = {
+    "image_size": 64, "slots": 8, "deterministic": 64, "stochastic": 64, "width": 32, "kernel": 5,
+    "layers": 5, "step": 1, "hidden": 128, "motion": 0.0, "update": "replace", "seed_steps": 4,
+}  # fmt: skip
 
 
-_COUNTS = (
-    "image_size", "slots", "deterministic", "stochastic", "width", "layers", "step", "hidden",
-    "effect", "seed_steps", "past", "imagined", "stride", "context",
-)  # fmt: skip
-"""Settings that must be at least 1."""
+@dataclass(frozen=True, kw_only=True)
+class Op3Settings(PictureSettings):
+    """Settings of OP3; also see `PictureSettings` and `SizedSettings`.
 
-
-@dataclass(frozen=True, slots=True)
-class Op3Config:
-    """All settings of OP3.
-
-    - ``image_size``: pixels per side. ``slots``: K.
+    - ``slots``: K. Weights fit any number of slots.
     - ``deterministic``, ``stochastic``: sizes of the two parts of the state of a slot.
     - ``width``: channels of the convolutions, with ``kernel`` x ``kernel`` weights; ``layers`` of
       the decoder; ``step``, the stride of those of the refinement.
@@ -73,16 +72,11 @@ class Op3Config:
     - ``update``: whether refinement and dynamics ``add`` to the state or ``replace`` it, as in the
       published code.
     - ``density``: of a pixel given a slot: ``gaussian``, or ``released``, that of the published
-      code (`op3.pixels`), with the standard deviation ``sigma``.
-    - ``beta``: weight of the divergence.
-    - ``motion``: additional weight of moving pixels in the loss; published 0. Few pixels move, and
-      a short training would learn the scenery alone.
+      code (`log_likelihood`), with the standard deviation ``sigma``.
     - ``seed_steps``: refinements with the first frame; each later one that is seen has one.
-    - ``past``, ``imagined``: frames of a training clip that are seen, and that follow.
-    - ``stride``, ``context``, ``future``: see `physion.clips.batch.Spec`.
-    - ``training``: optimiser and schedule.
     """
 
+    model: str = NAME
     image_size: int = 32
     slots: int = 5
     deterministic: int = 16
@@ -94,22 +88,26 @@ class Op3Config:
     hidden: int = 64
     effect: int = 32
     update: Literal["add", "replace"] = "add"
-    density: Literal["gaussian", "released"] = "gaussian"
+    density: Density = "gaussian"
     sigma: float = 0.1
     beta: float = 1e-2
-    motion: float = 20.0
     seed_steps: int = 3
     past: int = 4
     imagined: int = 3
-    stride: int = 6
-    context: int = 7
-    future: int = 18
-    training: TrainingSettings = field(default_factory=TrainingSettings)
+
+    sizes: ClassVar[Sizes] = {
+        "small": {},
+        "paper": _PAPER,
+        "released": {**_PAPER, "density": "released"},
+    }
+    any_weights: ClassVar[frozenset[str]] = SizedSettings.any_weights | {"slots"}
 
     def __post_init__(self) -> None:
-        for name in _COUNTS:
-            if getattr(self, name) < 1:
-                raise BadInputError(f"OP3: {name} must be at least 1, not {getattr(self, name)}")
+        super().__post_init__()
+        self.at_least(
+            1, "slots", "deterministic", "stochastic", "width", "step", "hidden", "effect",
+            "seed_steps",
+        )  # fmt: skip
         if self.layers < 2 or self.kernel % 2 == 0:
             raise BadInputError(
                 f"OP3: layers must be at least 2 and kernel odd, not {self.layers} and "
@@ -117,8 +115,8 @@ class Op3Config:
             )
 
 
-_SMALL = TrainingSettings(
-    steps=3000,
+SMALL_TRAINING = TrainingSettings(
+    steps=1500,
     batch=8,
     learning_rate=1e-3,
     schedule="cosine",
@@ -129,33 +127,10 @@ _SMALL = TrainingSettings(
     checkpoint_every=500,
 )
 # Published for Physion, before the paper: 300 epochs, whose length is not known.
-_PAPER = replace(
-    _SMALL, steps=180_000, batch=16, learning_rate=3e-4, schedule="constant", warmup=0,
+PAPER_TRAINING = replace(
+    SMALL_TRAINING, steps=180_000, batch=16, learning_rate=3e-4, schedule="constant", warmup=0,
     validate_every=600,
 )  # fmt: skip
-
-
-def op3_config(options: Op3Options) -> Op3Config:
-    """Return the settings of a size."""
-    config = Op3Config(training=_SMALL)
-    if options.size != "small":
-        config = Op3Config(
-            image_size=64,
-            slots=8,
-            deterministic=64,
-            stochastic=64,
-            width=32,
-            kernel=5,
-            layers=5,
-            step=1,
-            hidden=128,
-            motion=0.0,
-            update="replace",
-            density="released" if options.size == "released" else "gaussian",
-            seed_steps=4,
-            training=_PAPER,
-        )
-    return replace(config, slots=options.slots or config.slots)
 
 
 # Pixels as a mixture of what the slots show.
@@ -171,7 +146,6 @@ def op3_config(options: Op3Options) -> Op3Config:
 #
 # Source: Veerapaneni et al. 2020, section 3 and appendix; Greff et al. 2019 (IODINE), section 3.
 
-Density = Literal["gaussian", "released"]
 _CHANNELS = 3
 _FLOOR = math.log(1e-12)
 _LARGEST = 5.0
@@ -262,7 +236,7 @@ def slope_maps(decoded: Decoded, likelihood: Likelihood, color_slope: Tensor) ->
 # Source: Veerapaneni et al. 2020, section 3 and appendix, and the code that the authors published.
 
 PLAIN, NORMALIZED = 9, 6
-"""Channels of the images of `op3.pixels.plain_maps` and `op3.pixels.slope_maps`."""
+"""Channels of the images of `plain_maps` and `slope_maps`."""
 _NORMALIZED_PARTS = [1, 1, 1, 3]
 """Channels that are normalised together: gradient by the mask, likelihood, the one without the
 slot, gradient by the colours."""
@@ -306,15 +280,15 @@ class BroadcastConv(nn.Module):
 class SlotDecoder(nn.Module):
     """States (B, K, R) to colours and masks, by spatial broadcast (Watters et al. 2019)."""
 
-    def __init__(self, config: Op3Config) -> None:
+    def __init__(self, settings: Op3Settings) -> None:
         super().__init__()
-        self.size = config.image_size
-        inputs = config.deterministic + config.stochastic
-        self.first = BroadcastConv(inputs, config.width, config.kernel)
+        self.size = settings.image_size
+        inputs = settings.deterministic + settings.stochastic
+        self.first = BroadcastConv(inputs, settings.width, settings.kernel)
         layers: list[nn.Module] = []
-        for layer in range(1, config.layers):
-            outputs = 4 if layer + 1 == config.layers else config.width
-            layers += [nn.ELU(), _conv(config.width, outputs, config.kernel)]
+        for layer in range(1, settings.layers):
+            outputs = 4 if layer + 1 == settings.layers else settings.width
+            layers += [nn.ELU(), _conv(settings.width, outputs, settings.kernel)]
         self.rest = nn.Sequential(*layers)
         _initialize(self.first.conv)
 
@@ -327,20 +301,20 @@ class SlotDecoder(nn.Module):
 class Refinement(nn.Module):
     """Changes of the beliefs about slots, from what they show and from gradients."""
 
-    def __init__(self, config: Op3Config) -> None:
+    def __init__(self, settings: Op3Settings) -> None:
         super().__init__()
-        size, width = config.stochastic, config.width
+        size, width = settings.stochastic, settings.width
         self.map_norms = nn.ModuleList([nn.GroupNorm(1, part) for part in _NORMALIZED_PARTS])
         self.gradient_norms = nn.ModuleList([nn.LayerNorm(size), nn.LayerNorm(size)])
         layers: list[nn.Module] = []
         channels = [PLAIN + NORMALIZED + 2, width, width, max(size, width)]
         for before, after in pairwise(channels):
-            layers += [_conv(before, after, config.kernel, config.step), nn.ELU()]
+            layers += [_conv(before, after, settings.kernel, settings.step), nn.ELU()]
         self.look = nn.Sequential(*layers)
-        self.inner = nn.Linear(channels[-1], config.hidden)
-        self.memory = nn.LSTMCell(config.hidden + 5 * size, config.hidden)
-        self.mean = nn.Linear(config.hidden, size)
-        self.raw = nn.Linear(config.hidden, size)
+        self.inner = nn.Linear(channels[-1], settings.hidden)
+        self.memory = nn.LSTMCell(settings.hidden + 5 * size, settings.hidden)
+        self.mean = nn.Linear(settings.hidden, size)
+        self.raw = nn.Linear(settings.hidden, size)
 
     def forward(
         self,
@@ -355,7 +329,7 @@ class Refinement(nn.Module):
         Parameters
         ----------
         plain, normalized : Tensor
-            Images (N, 9, H, W) and (N, 6, H, W) of `op3.pixels`.
+            Images (N, 9, H, W) and (N, 6, H, W).
         gradients
             Of the objective by mean and raw scale, (N, Rs) each.
         beliefs : Tensor
@@ -380,9 +354,9 @@ class SlotDynamics(nn.Module):
     s'_k = heads(merge(e_k, sum_(j != k) effect(p_kj) attention(p_kj)))
     """
 
-    def __init__(self, config: Op3Config) -> None:
+    def __init__(self, settings: Op3Settings) -> None:
         super().__init__()
-        size, hidden = config.deterministic + config.stochastic, config.effect
+        size, hidden = settings.deterministic + settings.stochastic, settings.effect
         self.inertia = _mlp(size, size, size)
         self.pair = _mlp(2 * size, 2 * size, size)
         self.effect = _mlp(size, size, hidden)
@@ -390,9 +364,9 @@ class SlotDynamics(nn.Module):
             nn.Linear(size, size), nn.ELU(), nn.Linear(size, 1), nn.Sigmoid()
         )
         self.merge = _mlp(size + hidden, size, size)
-        self.deterministic = _head(size, config.deterministic)
-        self.mean = _head(size, config.stochastic)
-        self.raw = _head(size, config.stochastic)
+        self.deterministic = _head(size, settings.deterministic)
+        self.mean = _head(size, settings.stochastic)
+        self.raw = _head(size, settings.stochastic)
 
     def forward(self, states: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return deterministic part, mean and raw scale (B, K, ...) from states (B, K, R)."""
@@ -523,13 +497,13 @@ class Explained:
 class SlotInference(nn.Module):
     """Decoder, refinement and dynamics, with the learned start of the slots."""
 
-    def __init__(self, config: Op3Config) -> None:
+    def __init__(self, settings: Op3Settings) -> None:
         super().__init__()
-        self.config = self.settings = config
-        self.decoder = SlotDecoder(config)
-        self.refinement = Refinement(config)
-        self.dynamics = SlotDynamics(config)
-        sizes = (config.deterministic, config.stochastic, config.stochastic)
+        self.settings = settings
+        self.decoder = SlotDecoder(settings)
+        self.refinement = Refinement(settings)
+        self.dynamics = SlotDynamics(settings)
+        sizes = (settings.deterministic, settings.stochastic, settings.stochastic)
         first = [torch.randn(size) / math.sqrt(size) for size in sizes]
         self.deterministic, self.mean, self.raw = (nn.Parameter(value) for value in first)
 
@@ -544,11 +518,11 @@ class SlotInference(nn.Module):
 
     def explain(self, slots: Slots, pictures: Tensor) -> Explained:
         """Compare what slots show with pictures (B, 3, H, W)."""
-        config = self.config
+        settings = self.settings
         decoded = self.decoder(slots.states)
-        likelihood = log_likelihood(decoded, pictures, config.sigma, config.density)
+        likelihood = log_likelihood(decoded, pictures, settings.sigma, settings.density)
         nll, kl = -likelihood.pixels.sum((1, 2)), slots.divergence()
-        return Explained(slots, decoded, likelihood, nll, kl, nll + config.beta * kl)
+        return Explained(slots, decoded, likelihood, nll, kl, nll + settings.beta * kl)
 
     def refine(self, explained: Explained, pictures: Tensor, noise: Tensor) -> Slots:
         """Return the beliefs after one refinement; ``noise`` (B, K, Rs) is that of their samples.
@@ -570,20 +544,20 @@ class SlotInference(nn.Module):
             slots.memory,
         )
         mean, raw = (value.view_as(slots.mean) for value in (mean, raw))
-        if self.config.update == "add":
+        if self.settings.update == "add":
             mean, raw = slots.mean + mean, slots.raw + raw
         return replace(slots, mean=mean, raw=raw, noise=noise, memory=memory)
 
     def predict(self, slots: Slots, noise: Tensor) -> Slots:
         """Return the beliefs about the next frame; ``noise`` (B, K, Rs) is that of the samples."""
         deterministic, mean, raw = self.dynamics(slots.states)
-        if self.config.update == "add":
+        if self.settings.update == "add":
             deterministic = slots.deterministic + deterministic
             mean, raw = slots.sample + mean, slots.raw + raw
         return Slots(deterministic, mean, raw, mean, raw, noise, self._memory(noise))
 
     def _memory(self, noise: Tensor) -> tuple[Tensor, Tensor]:
-        zero = noise.new_zeros(noise.shape[0] * noise.shape[1], self.config.hidden)
+        zero = noise.new_zeros(noise.shape[0] * noise.shape[1], self.settings.hidden)
         return zero, zero
 
 
@@ -591,28 +565,7 @@ def _log_variance(raw: Tensor) -> Tensor:
     return (functional.softplus(raw) + _LEAST_VARIANCE).log()
 
 
-# OP3: K slots that explain a picture together, and that predict how they go on.
-#
-# The steps of `op3.inference` follow a schedule: the slots of the first frame are refined
-# ``seed_steps`` times; those of each later frame that is seen are predicted, then refined once;
-# those of the frames after them are only predicted. With the objective O_i after step i = 1, 2,
-# ..., for the picture of its frame,
-#
-#     loss = sum_i i O_i / sum_i i / pixels
-#
-# where moving pixels (`physion.models.vision`) have the weight 1 + w, w = 0 as published.
-#
-# Features are the states of all slots, with the means of their random part: after the refinement
-# for frames that are seen, after the prediction for imagined ones. When features are computed, the
-# slots of all trials start from the same random numbers, so that a slot tends to hold the same
-# thing.
-#
-# Source: Veerapaneni et al. 2020, "Entity Abstraction in Visual Model-Based Reinforcement
-# Learning"; docs/reference/vision-models.md says in what the sizes differ from the published code.
-
-NAME = "op3"
-VERSION = 1
-"""To be raised with every change of what equal weights compute, or of the training."""
+# The model: loss, and imagination.
 
 Noise = Callable[[], Tensor]
 """Function that gives standard normal numbers (B, K, Rs), new ones at every call."""
@@ -629,19 +582,22 @@ class TrainingClips:
 
 
 class Op3(PictureModel):
-    """Model of pictures as slots, and of how they move one another."""
+    """OP3, slots that explain pictures together and move one another."""
 
-    def __init__(self, config: Op3Config, options: Op3Options) -> None:
-        super().__init__(NAME, VERSION, config, options, samples=options.samples, framewise=False)
-        self.config = self.settings = config
-        if options.slots:
-            self.name += f"-{options.slots}-slots"
-        with initial_weights("op3", options.seed):
-            self.slots = SlotInference(config)
+    settings: Op3Settings
+
+    def __init__(self, settings: Op3Settings) -> None:
+        training = SMALL_TRAINING if settings.size == "small" else PAPER_TRAINING
+        super().__init__(VERSION, settings, training, framewise=False)
+        if settings.slots != settings.sizes[settings.size].get("slots", 5):
+            self.name += f"-{settings.slots}-slots"
+        with initial_weights("op3", settings.seed):
+            self.slots = SlotInference(settings)
+        load_named(self, settings.weights)
 
     def provenance(self) -> Provenance:
         """Return name, weights and versions for the table of predictions."""
-        encoder = f"{self.config.slots} slots {self.config.image_size} px"
+        encoder = f"{self.settings.slots} slots {self.settings.image_size} px"
         return self.origin(encoder, "interaction network", "pictures of slots")
 
     def encode(self, batch: Batch) -> Tensor:
@@ -651,29 +607,28 @@ class Op3(PictureModel):
     def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
         """Return the states (B, S, future, K R) of ``samples`` futures; no frame of them is seen.
 
-        They follow from ``seed`` and the name of the trial alone. With the knob ``show`` above 0,
+        They follow from ``seed`` and the name of the trial only. With the knob ``show`` above 0,
         ``shown`` holds pictures, ``rgb`` (B, S, future, H, W, 3) uint8, and ``masks``
         (B, S, future, K, H, W) float32, and under ``context_masks`` those of the frames that were
         seen (B, T, K, H, W).
         """
         _, seen = self._watch(context_pictures(context, self.spec, self.name))
         slots = seen[-1]
-        config, clips = self.config, len(context)
-        shape = (samples, config.future + 1, config.slots, config.stochastic)
-        draws = [generator(NAME, seed, trial).standard_normal(shape) for trial in context.trials]
-        noise = torch.from_numpy(np.concatenate(draws)).to(slots.mean)
+        settings, clips = self.settings, len(context)
+        shape = (samples, settings.future + 1, settings.slots, settings.stochastic)
+        noise = self.imagined_noise(context.trials, seed, shape).to(slots.mean)
         shows = knobs.get("show", 0) > 0
         features, shown, found = [], [], []
         with torch.no_grad():
             if shows:
                 found = [self.slots.decoder(beliefs.states) for beliefs in seen]
             state = _repeated(slots, samples, noise[:, 0])
-            for step in range(config.future):
+            for step in range(settings.future):
                 state = self.slots.predict(state, noise[:, step + 1])
                 features.append(state.features())
                 if shows:
                     shown.append(self.slots.decoder(state.states))
-        values = torch.stack(features, 1).float().view(clips, samples, config.future, -1)
+        values = torch.stack(features, 1).float().view(clips, samples, settings.future, -1)
         return Rollout(features=values, shown=_shown(shown, found, clips, samples))
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
@@ -697,11 +652,11 @@ class Op3(PictureModel):
 
     def _run(self, pictures: Tensor, valid: Tensor) -> TrainingClips:
         """Return the objective of training clips (B, T, 3, H, W)."""
-        config, inference = self.config, self.slots
+        settings, inference = self.settings, self.slots
         clips, frames, _, height, width = pictures.shape
 
         def noise() -> Tensor:
-            return torch.randn(clips, config.slots, config.stochastic).to(pictures)
+            return torch.randn(clips, settings.slots, settings.stochastic).to(pictures)
 
         slots, steps, imagined = inference.start(noise()), [], []
         explained = inference.explain(slots, pictures[:, 0])
@@ -710,27 +665,27 @@ class Op3(PictureModel):
             if frame:
                 explained = inference.explain(inference.predict(explained.slots, noise()), picture)
                 steps.append((frame, explained))
-            if frame >= config.past:
+            if frame >= settings.past:
                 imagined.append(explained.decoded.picture())
                 continue
-            for _ in range(1 if frame else config.seed_steps):
+            for _ in range(1 if frame else settings.seed_steps):
                 refined = inference.refine(explained, picture, noise())
                 explained = inference.explain(refined, picture)
                 steps.append((frame, explained))
         moves = nn.functional.pad(moving_pixels(pictures), (0, 0, 0, 0, 1, 0))
-        nll, kl = weighted_means(steps, valid, 1 + config.motion * moves)
-        objective = nll + config.beta * kl / (height * width)
+        nll, kl = weighted_means(steps, valid, 1 + settings.motion * moves)
+        objective = nll + settings.beta * kl / (height * width)
         return TrainingClips(objective, nll, kl, torch.stack(imagined, 1))
 
     def _watch(self, pictures: Tensor) -> tuple[Tensor, list[Slots]]:
         """Return features (B, T, K R) of clips (B, T, 3, H, W), and beliefs after each frame."""
-        config, inference = self.config, self.slots
+        settings, inference = self.settings, self.slots
         rng = generator(NAME, "slots")
         features, beliefs = [], []
         # The refinement needs gradients, which tensors of the inference mode cannot have.
         with torch.inference_mode(False), torch.enable_grad():
             seen = pictures.clone()
-            shape = (config.slots, config.stochastic)
+            shape = (settings.slots, settings.stochastic)
 
             def noise() -> Tensor:
                 values = torch.from_numpy(rng.standard_normal(shape)).to(seen)
@@ -740,7 +695,7 @@ class Op3(PictureModel):
             for frame in range(seen.shape[1]):
                 if frame:
                     slots = inference.predict(slots, noise())
-                for _ in range(1 if frame else config.seed_steps):
+                for _ in range(1 if frame else settings.seed_steps):
                     explained = inference.explain(slots.detached(), seen[:, frame])
                     slots = inference.refine(explained, seen[:, frame], noise())
                 features.append(slots.features().detach())
@@ -806,14 +761,3 @@ def _shown(
 def _masks(steps: list[Decoded]) -> Tensor:
     """Return the masks (B, T, K, H, W) of T steps, float32."""
     return torch.stack([step.masks[:, :, 0] for step in steps], 1).float()
-
-
-# Building of OP3 by its name, with random, shipped or given weights.
-
-
-def op3(**options: Any) -> Op3:
-    """Build OP3; ``options`` are those of `Op3Options`."""
-    chosen = make_config(Op3Options, NAME, options)
-    model = Op3(op3_config(chosen), chosen)
-    load_named(model, chosen.weights)
-    return model

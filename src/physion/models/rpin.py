@@ -1,9 +1,24 @@
-"""Settings of RPIN, and its sizes."""
+"""RPIN: region proposal interaction network, which predicts boxes.
+
+Tensors (B clips, T frames, h = ``settings.history``, K objects, states of C x p x p values):
+
+- boxes (B, T, K, 4): centre and size in 0..1, without NaN (`known_boxes`).
+- states (B, T, K, C, p, p): regions of the boxes in the feature maps of the pictures.
+- features (B, T, K (C p p + 4)): state and box of each object, one object after the other. They
+  are zeros for an object that no frame of the clip shows.
+
+The boxes are those of the ids, as in the published experiments: the model is supervised by them.
+The published code encodes no boxes apart from the regions; here the box and its last change are
+part of the state (`Dynamics`).
+
+Source: docs/official-system.md, section 5, and Qi et al. 2021.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -12,16 +27,24 @@ from torchvision.ops import roi_align
 
 from physion.clips.batch import Batch, Provenance, Rollout, Spec
 from physion.core.errors import BadInputError
-from physion.models.build import make_config
 from physion.models.checkpoint import load_named
-from physion.models.interface import TrainingSettings
+from physion.models.interface import Sizes, TrainingSettings
 from physion.models.torch_model import initial_weights
-from physion.models.vision import Size, VisionModel, VisionOptions, normalized_pictures
+from physion.models.vision import VisionModel, VisionSettings, normalized_pictures
+
+NAME, VERSION = "rpin", 1
+
+_PAPER: Mapping[str, Any] = {
+    "image_size": 256, "objects": 10, "rollout": 11, "width": 256, "groups": 32, "depth": 4,
+}  # fmt: skip
+_RELEASED: Mapping[str, Any] = {
+    **_PAPER, "history": 5, "sampling": 1, "aligned": False, "outputs": "published",
+}  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class RpinConfig:
-    """All settings of RPIN.
+@dataclass(frozen=True, kw_only=True)
+class RpinSettings(VisionSettings):
+    """Settings of RPIN; also see `SizedSettings`.
 
     - ``image_size``: pixels per side. ``objects``: rows of boxes K.
     - ``history``: observed frames h from which the next one is predicted. ``rollout``: frames that
@@ -34,10 +57,9 @@ class RpinConfig:
     - ``outputs``: what is decoded: ``boxes``, the changes of centre and size; or ``published``, the
       change of the centre and, on its own, the centre, in pixels, while sizes stay.
     - ``offset_weight``, ``position_weight``: of the published loss.
-    - ``training``: optimiser and schedule.
     """
 
-    image_size: int = 64
+    model: str = NAME
     objects: int = 8
     history: int = 4
     rollout: int = 8
@@ -51,40 +73,34 @@ class RpinConfig:
     outputs: Literal["boxes", "published"] = "boxes"
     offset_weight: float = 100.0
     position_weight: float = 1.0
-    training: TrainingSettings = field(default_factory=TrainingSettings)
+
+    sizes: ClassVar[Sizes] = {"small": {}, "paper": _PAPER, "released": _RELEASED}
+
+    def __post_init__(self) -> None:
+        self.at_least(
+            1, "image_size", "objects", "history", "rollout", "width", "groups", "depth", "pool",
+            "sampling",
+        )  # fmt: skip
 
 
-_SMALL = RpinConfig(
-    training=TrainingSettings(
-        steps=1800,
-        batch=16,
-        learning_rate=1e-3,
-        schedule="cosine",
-        warmup=30,
-        clip=1.0,
-        validate_every=100,
-        log_every=20,
-        checkpoint_every=100,
-    )
+_SMALL_TRAINING = TrainingSettings(
+    steps=1800,
+    batch=16,
+    learning_rate=1e-3,
+    schedule="cosine",
+    warmup=30,
+    clip=1.0,
+    validate_every=100,
+    log_every=20,
+    checkpoint_every=100,
 )
-_PAPER = RpinConfig(
-    image_size=256,
-    objects=10,
-    rollout=11,
-    width=256,
-    groups=32,
-    depth=4,
-    training=replace(_SMALL.training, steps=100_000, learning_rate=2e-4, warmup=2000),
-)
-_RELEASED = replace(
-    _PAPER,
-    history=5,
-    sampling=1,
-    aligned=False,
-    outputs="published",
+_PAPER_TRAINING = replace(_SMALL_TRAINING, steps=100_000, learning_rate=2e-4, warmup=2000)
+TRAINING: Mapping[str, TrainingSettings] = {
+    "small": _SMALL_TRAINING,
+    "paper": _PAPER_TRAINING,
     # The published code makes a new Adam at every step, which equals betas of 0.
-    training=replace(
-        _PAPER.training,
+    "released": replace(
+        _PAPER_TRAINING,
         steps=1_000_000,
         learning_rate=2e-6,
         weight_decay=1e-6,
@@ -93,13 +109,7 @@ _RELEASED = replace(
         warmup=0,
         clip=0.0,
     ),
-)
-_SIZES: dict[Size, RpinConfig] = {"small": _SMALL, "paper": _PAPER, "released": _RELEASED}
-
-
-def rpin_config(size: Size) -> RpinConfig:
-    """Return the settings of a size."""
-    return _SIZES[size]
+}
 
 
 # Boxes of objects as centre and size, (x, y, w, h) in 0..1 of the picture.
@@ -384,23 +394,8 @@ class Dynamics(nn.Module):
         return state, self.decode(state.flatten(2))
 
 
-# RPIN: region proposal interaction network, which predicts boxes.
-#
-# Tensors (B clips, T frames, h = ``config.history``, K objects, states of C x p x p values):
-#
-# - boxes (B, T, K, 4): centre and size in 0..1, without NaN (`boxes.known_boxes`).
-# - states (B, T, K, C, p, p): regions of the boxes in the feature maps of the pictures.
-# - features (B, T, K (C p p + 4)): state and box of each object, one object after the other. They
-#   are
-#   zeros for an object that no frame of the clip shows.
-#
-# The boxes are those of the ids, as in the published experiments: the model is supervised by them.
-# The published code encodes no boxes apart from the regions; here the box and its last change are
-# part of the state (`networks.Dynamics.place`).
-#
-# Source: docs/official-system.md, section 5, and Qi et al. 2021 (`networks`).
+# The model: loss, and imagination.
 
-NAME, VERSION = "rpin", 1
 _LEAST_SIZE = 1e-3
 """Least width and height of an imagined box."""
 
@@ -421,31 +416,33 @@ class Targets(NamedTuple):
 
 
 class Rpin(VisionModel):
-    """Network that sees pictures and boxes of objects, and predicts their boxes."""
+    """RPIN, which sees pictures and boxes of objects, and predicts their boxes."""
 
-    def __init__(self, config: RpinConfig, options: VisionOptions) -> None:
+    settings: RpinSettings
+
+    def __init__(self, settings: RpinSettings) -> None:
         spec = Spec(
             inputs=("rgb", "boxes"),
-            image_size=config.image_size,
+            image_size=settings.image_size,
             mean=(0.5, 0.5, 0.5),
             std=(0.25, 0.25, 0.25),
             stride=9,
             context=5,
             future=11,
-            objects=config.objects,
+            objects=settings.objects,
             framewise=False,
         )
-        super().__init__(NAME, VERSION, config, config.training, options, spec)
-        self.config = self.settings = config
-        self.window = config.history + config.rollout
-        with initial_weights("rpin", options.seed):
-            self.backbone = Backbone(config.width, config.depth, config.groups)
-            self.region = convolution(config.width, config.width)
-            self.dynamics = Dynamics(config.width, config.pool, config.history)
-        if config.outputs == "boxes":
+        super().__init__(VERSION, settings, TRAINING[settings.size], spec)
+        self.window = settings.history + settings.rollout
+        with initial_weights("rpin", settings.seed):
+            self.backbone = Backbone(settings.width, settings.depth, settings.groups)
+            self.region = convolution(settings.width, settings.width)
+            self.dynamics = Dynamics(settings.width, settings.pool, settings.history)
+        if settings.outputs == "boxes":
             # An untrained network predicts that nothing moves.
             nn.init.zeros_(self.dynamics.decode.weight)
             nn.init.zeros_(self.dynamics.decode.bias)
+        load_named(self, settings.weights)
 
     def provenance(self) -> Provenance:
         """Return name, size and origin of the weights."""
@@ -464,7 +461,7 @@ class Rpin(VisionModel):
         ``shown`` holds the boxes; they are NaN for absent objects.
         """
         features = self.encode(context) if context.features is None else context.features
-        states, boxes = self._split(features[:, -self.config.history :])
+        states, boxes = self._split(features[:, -self.settings.history :])
         imagined = self._roll_out(states, boxes, self.spec.future)
         joined = torch.cat([imagined.states.flatten(3), imagined.boxes], -1).flatten(2)
         absent = ~is_present(boxes[:, -1])[:, None, :, None]
@@ -486,9 +483,9 @@ class Rpin(VisionModel):
         frame does not show do not count.
         """
         boxes, targets = self._task(batch)
-        history = batch.steps(slice(0, self.config.history))
+        history = batch.steps(slice(0, self.settings.history))
         imagined = self._roll_out(self._states(history, boxes), boxes, targets.boxes.shape[1])
-        if self.config.outputs == "boxes":
+        if self.settings.outputs == "boxes":
             return {"loss": self._distance(imagined.boxes, targets)}
         return {"loss": self._published(imagined, boxes[:, -1:], targets)}
 
@@ -496,11 +493,11 @@ class Rpin(VisionModel):
         """Return the loss of boxes that go on at constant velocity."""
         boxes, targets = self._task(batch)
         predicted = constant_velocity(boxes, targets.boxes.shape[1])
-        if self.config.outputs == "boxes":
+        if self.settings.outputs == "boxes":
             return self._distance(predicted, targets)
         before = torch.cat([boxes[:, -1:], predicted[:, :-1]], 1)
         change = (predicted - before)[..., :2]
-        decoded = torch.cat([change, predicted[..., :2]], -1) * self.config.image_size
+        decoded = torch.cat([change, predicted[..., :2]], -1) * self.settings.image_size
         imagined = Imagined(predicted, predicted, decoded)
         return self._published(imagined, boxes[:, -1:], targets)
 
@@ -515,7 +512,7 @@ class Rpin(VisionModel):
             The same for boxes at constant velocity.
         """
         boxes, targets = self._task(batch)
-        history = batch.steps(slice(0, self.config.history))
+        history = batch.steps(slice(0, self.settings.history))
         steps = targets.boxes.shape[1]
         imagined = self._roll_out(self._states(history, boxes), boxes, steps).boxes
         counted = targets.counted.sum((0, 2))
@@ -541,8 +538,8 @@ class Rpin(VisionModel):
 
     def _decoded_box(self, box: Tensor, decoded: Tensor) -> Tensor:
         """Return the next box (B, K, 4) from the last one and what was decoded."""
-        if self.config.outputs == "published":
-            return torch.cat([decoded[..., 2:] / self.config.image_size, box[..., 2:]], -1)
+        if self.settings.outputs == "published":
+            return torch.cat([decoded[..., 2:] / self.settings.image_size, box[..., 2:]], -1)
         moved = box + UNIT * decoded
         return torch.cat([moved[..., :2], moved[..., 2:].clamp(min=_LEAST_SIZE)], -1)
 
@@ -555,19 +552,19 @@ class Rpin(VisionModel):
 
     def _published(self, imagined: Imagined, last: Tensor, targets: Targets) -> Tensor:
         """Return the published loss; ``last`` are the last known boxes (B, 1, K, 4)."""
-        config = self.config
-        true = targets.boxes[..., :2] * config.image_size
-        before = torch.cat([last[..., :2] * config.image_size, true[:, :-1]], 1)
+        settings = self.settings
+        true = targets.boxes[..., :2] * settings.image_size
+        before = torch.cat([last[..., :2] * settings.image_size, true[:, :-1]], 1)
         offset, position = imagined.decoded[..., :2], imagined.decoded[..., 2:]
         errors = (
-            config.offset_weight * (offset - (true - before)).pow(2)
-            + config.position_weight * (position - true).pow(2)
+            settings.offset_weight * (offset - (true - before)).pow(2)
+            + settings.position_weight * (position - true).pow(2)
         ).sum(-1)
         return _mean(errors, targets.counted)
 
     def _task(self, batch: Batch) -> tuple[Tensor, Targets]:
         """Return the boxes of the first h frames, and what follows them."""
-        history = self.config.history
+        history = self.settings.history
         all_boxes = self._seen(batch)
         if all_boxes.shape[1] <= history:
             raise BadInputError(
@@ -596,15 +593,15 @@ class Rpin(VisionModel):
 
     def _states(self, batch: Batch, boxes: Tensor) -> Tensor:
         """Return the states (B, T, K, C, p, p) of objects with known boxes (B, T, K, 4)."""
-        config = self.config
+        settings = self.settings
         pictures = normalized_pictures(batch, self.spec, self.name)
         regions = cut_regions(
             self.backbone(pictures.flatten(0, 1)),
             boxes.flatten(0, 1),
-            config.pool,
-            config.margin,
-            sampling=config.sampling,
-            aligned=config.aligned,
+            settings.pool,
+            settings.margin,
+            sampling=settings.sampling,
+            aligned=settings.aligned,
         )
         states: Tensor = self.region(regions.flatten(0, 1))
         shaped = states.view(*boxes.shape[:3], *states.shape[1:])
@@ -612,9 +609,9 @@ class Rpin(VisionModel):
 
     def _split(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return states and boxes of features (B, T, K (C p p + 4))."""
-        config = self.config
-        cells = (config.width, config.pool, config.pool)
-        objects = features.view(*features.shape[:2], config.objects, -1)
+        settings = self.settings
+        cells = (settings.width, settings.pool, settings.pool)
+        objects = features.view(*features.shape[:2], settings.objects, -1)
         return objects[..., :-4].reshape(*objects.shape[:3], *cells), objects[..., -4:]
 
 
@@ -622,14 +619,3 @@ def _mean(values: Tensor, counted: Tensor) -> Tensor:
     """Return the mean of the values that count; 0 if none does."""
     total: Tensor = (values * counted).sum()
     return total / counted.sum().clamp(min=1)
-
-
-# Building of RPIN by name, with random, shipped or given weights.
-
-
-def rpin(**options: Any) -> Rpin:
-    """Build a region proposal interaction network; ``options`` are those of `VisionOptions`."""
-    chosen = make_config(VisionOptions, NAME, options)
-    model = Rpin(rpin_config(chosen.size), chosen)
-    load_named(model, chosen.weights)
-    return model

@@ -30,12 +30,12 @@ MOVING = 1e-3
 """Speed in metres per second above which a body moves."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class NoiseLevels:
     """Standard deviations of the noise.
 
     - ``position``: metres, along x and y. ``vertical``: metres, along z, of bodies in the air
-      alone: it would push others into what they rest on.
+      only: it would push others into what they rest on.
     - ``velocity``: metres per second. ``angular_velocity``: radians per second.
     - ``rotation``: radians, about any axis for bodies in the air, about the vertical for others.
     - ``mass``, ``friction``: of the logarithm, so that 0.1 is about 10 %.

@@ -1,27 +1,42 @@
-"""Settings of SVG, and its sizes."""
+"""SVG-LP: predicts the next picture from a code, and from a random variable with a learned prior.
+
+With codes h_t and inner activations of an encoder of picture x_t:
+
+    p_t = N(mean, var)(h_1, ..., h_(t-1))          prior, LSTM
+    q_t = N(mean, var)(h_1, ..., h_t)              posterior, LSTM
+    g_t = LSTM(h_(t-1), z_t; its state)            predicted code, z_t from q_t in training
+    y_t = decoder(g_t, inner activations of the last observed frame)
+    loss = mean_t [ mean_p (1 + w m_tp) (y_tp - x_tp)^2 + beta KL(q_t || p_t) ]
+
+with the moving pixels m (`physion.models.vision`), whose weight w is 0 as published. In
+training h_(t-1) is the code of the true picture. To imagine, z_t is drawn from p_t, and h_t is
+the code of y_t after the last observed frame.
+
+Features are the codes h_t of observed frames and the predicted codes g_t of imagined ones.
+
+Source: Denton and Fergus 2018, "Stochastic Video Generation with a Learned Prior", sections 3, 4
+and appendix; docs/reference/vision-models.md says how the sizes differ from the published code.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from physion.clips.batch import Batch, Provenance, Rollout
 from physion.core.errors import BadInputError
-from physion.core.seeds import generator
-from physion.models.build import make_config
 from physion.models.checkpoint import load_named
-from physion.models.interface import TrainingSettings
+from physion.models.interface import Sizes, TrainingSettings
 from physion.models.torch_model import initial_weights
 from physion.models.vision import (
     PictureModel,
-    VisionOptions,
+    PictureSettings,
     context_pictures,
     future_error,
     gaussian_divergence,
@@ -31,83 +46,59 @@ from physion.models.vision import (
     window_pictures,
 )
 
+NAME = "svg"
+VERSION = 1
+"""To be raised with every change of what equal weights compute, or of the training."""
 Backbone = Literal["dcgan", "vgg"]
 LARGEST_IMAGE = 256
 
-
-@dataclass(frozen=True, slots=True)
-class SvgOptions(VisionOptions):
-    """What a user chooses of SVG; also see `VisionOptions`.
-
-    - ``backbone``: ``dcgan`` or ``vgg``; by default (empty) that of the size.
-    - ``image_size``: pixels per side, a power of 2 from 16 on; by default (0) that of the size, 64.
-    - ``samples``: futures of a trial, whose features the readout joins.
-    """
-
-    backbone: Backbone | Literal[""] = ""
-    image_size: int = 0
-    samples: int = 1
-
-    def __post_init__(self) -> None:
-        # Not super(): a dataclass with slots is made anew, which super() does not know.
-        VisionOptions.__post_init__(self)
-        if self.backbone not in ("", "dcgan", "vgg"):
-            raise BadInputError(f"SVG has the backbones dcgan and vgg, not {self.backbone!r}")
-        if isinstance(self.samples, bool) or not isinstance(self.samples, int) or self.samples < 1:
-            raise BadInputError(f"samples must be a whole number from 1 on, not {self.samples!r}")
+_PAPER: Mapping[str, Any] = {
+    "backbone": "vgg", "width": 64, "norm": "batch", "code": 128, "latent": 64, "hidden": 256,
+    "past": 4, "imagined": 6, "motion": 0.0,
+}  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class SvgConfig:
-    """All settings of SVG.
+@dataclass(frozen=True, kw_only=True)
+class SvgSettings(PictureSettings):
+    """Settings of SVG; also see `PictureSettings` and `SizedSettings`.
 
-    - ``backbone``, ``image_size``, ``width``: channels of the first stage of the encoder; they
-      double to at most 8 times as many.
+    - ``backbone``: ``dcgan`` or ``vgg``.
+    - ``image_size``: pixels per side, a power of 2 from 16 on.
+    - ``width``: channels of the first stage of the encoder; they double to at most 8 times as many.
     - ``norm``: ``batch`` as published, or ``group``, which does not depend on the other clips.
     - ``code``: g, size of the features. ``latent``: size of z. ``hidden``: units of the LSTMs;
       ``layers``: of the LSTM that predicts, the others have one.
-    - ``past``, ``imagined``: frames of a training clip that are observed, and that follow.
-    - ``beta``: weight of the divergence.
-    - ``motion``: additional weight of moving pixels in the loss; published 0. Few pixels move, and
-      a short training would learn the scenery alone.
     - ``skip``: whose frame's inner activations the decoder sees: ``last`` observed one, or the one
       ``before`` it, as in the published code.
-    - ``stride``, ``context``, ``future``: see `physion.clips.batch.Spec`.
-    - ``training``: optimiser and schedule.
     """
 
+    model: str = NAME
     backbone: Backbone = "dcgan"
-    image_size: int = 64
     width: int = 16
     norm: Literal["batch", "group"] = "group"
     code: int = 64
     latent: int = 10
     hidden: int = 128
     layers: int = 2
-    past: int = 7
-    imagined: int = 9
-    beta: float = 1e-4
-    motion: float = 20.0
     skip: Literal["last", "before"] = "last"
-    stride: int = 6
-    context: int = 7
-    future: int = 18
-    training: TrainingSettings = field(default_factory=TrainingSettings)
+
+    sizes: ClassVar[Sizes] = {
+        "small": {},
+        "paper": _PAPER,
+        "released": {**_PAPER, "skip": "before"},
+    }
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         size = self.image_size
         if size < 16 or size > LARGEST_IMAGE or size & (size - 1):
             raise BadInputError(
                 f"SVG: image_size must be 16, 32, 64, 128 or {LARGEST_IMAGE}, not {size}"
             )
-        if min(self.past, self.context) < 2 or self.imagined < 1:
-            raise BadInputError(
-                f"SVG: past {self.past} and context {self.context} must be at least 2, and "
-                f"imagined {self.imagined} at least 1"
-            )
+        self.at_least(2, "past", "context")
 
 
-_SMALL = TrainingSettings(
+SMALL_TRAINING = TrainingSettings(
     steps=3000,
     batch=16,
     learning_rate=1e-3,
@@ -119,34 +110,10 @@ _SMALL = TrainingSettings(
     checkpoint_every=500,
 )
 # Published for Physion, before the paper: 300 epochs of 600 steps.
-_PAPER = replace(
-    _SMALL, steps=180_000, batch=40, learning_rate=2e-3, schedule="constant", warmup=0, clip=0.0,
-    betas=(0.9, 0.999), validate_every=600,
+PAPER_TRAINING = replace(
+    SMALL_TRAINING, steps=180_000, batch=40, learning_rate=2e-3, schedule="constant", warmup=0,
+    clip=0.0, validate_every=600,
 )  # fmt: skip
-
-
-def svg_config(options: SvgOptions) -> SvgConfig:
-    """Return the settings of a size."""
-    config = SvgConfig(training=_SMALL)
-    if options.size != "small":
-        config = SvgConfig(
-            "vgg",
-            width=64,
-            norm="batch",
-            code=128,
-            latent=64,
-            hidden=256,
-            past=4,
-            imagined=6,
-            motion=0.0,
-            skip="before" if options.size == "released" else "last",
-            training=_PAPER,
-        )
-    return replace(
-        config,
-        backbone=options.backbone or config.backbone,
-        image_size=options.image_size or config.image_size,
-    )
 
 
 # Networks of SVG: encoder and decoder of pictures, and LSTMs that predict codes.
@@ -168,35 +135,35 @@ _INITIAL = 0.02
 """Standard deviation of initial weights."""
 
 
-def stage_widths(config: SvgConfig) -> list[int]:
+def stage_widths(settings: SvgSettings) -> list[int]:
     """Return the channels of the encoder's stages."""
-    stages = int(math.log2(config.image_size // 4))
-    return [config.width * min(2**stage, 8) for stage in range(stages)]
+    stages = int(math.log2(settings.image_size // 4))
+    return [settings.width * min(2**stage, 8) for stage in range(stages)]
 
 
 class Encoder(nn.Module):
     """Pictures (B, 3, H, W) to codes (B, g) in -1..1, and the activations of all stages."""
 
-    def __init__(self, config: SvgConfig) -> None:
+    def __init__(self, settings: SvgSettings) -> None:
         super().__init__()
-        widths = stage_widths(config)
+        widths = stage_widths(settings)
         self.stages = nn.ModuleList()
         for stage, (before, width) in enumerate(pairwise([3, *widths])):
-            if config.backbone == "dcgan":
-                layers = [*_conv(config, before, width, kernel=4, stride=2)]
+            if settings.backbone == "dcgan":
+                layers = [*_conv(settings, before, width, kernel=4, stride=2)]
             else:
                 # The last convolution's output is the skip connection; pooling comes before.
                 layers = [nn.MaxPool2d(2)] if stage else []
                 inner = [before, *[width] * (2 if stage < 2 else _VGG_LAYERS)]
                 for a, b in pairwise(inner):
-                    layers += _conv(config, a, b)
+                    layers += _conv(settings, a, b)
             self.stages.append(nn.Sequential(*layers))
-        pool = [nn.MaxPool2d(2)] if config.backbone == "vgg" else []
+        pool = [nn.MaxPool2d(2)] if settings.backbone == "vgg" else []
         self.head = nn.Sequential(
             *pool,
-            nn.Conv2d(widths[-1], config.code, 4),
+            nn.Conv2d(widths[-1], settings.code, 4),
             # One position has no statistics of a group.
-            *([nn.BatchNorm2d(config.code)] if config.norm == "batch" else []),
+            *([nn.BatchNorm2d(settings.code)] if settings.norm == "batch" else []),
             nn.Tanh(),
         )
         initialize(self)
@@ -213,27 +180,27 @@ class Encoder(nn.Module):
 class Decoder(nn.Module):
     """Codes (B, g) and the encoder's activations to pictures (B, 3, H, W) in 0..1."""
 
-    def __init__(self, config: SvgConfig) -> None:
+    def __init__(self, settings: SvgSettings) -> None:
         super().__init__()
-        widths = stage_widths(config)[::-1]
-        first = nn.ConvTranspose2d(config.code, widths[0], 4)
-        self.first = nn.Sequential(first, *_after(config, widths[0]))
-        self.enlarge = nn.Upsample(scale_factor=2) if config.backbone == "vgg" else nn.Identity()
+        widths = stage_widths(settings)[::-1]
+        first = nn.ConvTranspose2d(settings.code, widths[0], 4)
+        self.first = nn.Sequential(first, *_after(settings, widths[0]))
+        self.enlarge = nn.Upsample(scale_factor=2) if settings.backbone == "vgg" else nn.Identity()
         self.stages = nn.ModuleList()
         for stage, (width, after) in enumerate(pairwise([*widths, 0])):
             last = stage + 1 == len(widths)
-            if config.backbone == "dcgan":
+            if settings.backbone == "dcgan":
                 out = nn.ConvTranspose2d(2 * width, 3 if last else after, 4, 2, 1)
-                layers = [out, *([nn.Sigmoid()] if last else _after(config, after))]
+                layers = [out, *([nn.Sigmoid()] if last else _after(settings, after))]
             else:
                 # As many convolutions as the encoder's stage of the same size.
                 count = 2 if len(widths) - stage <= 2 else _VGG_LAYERS
                 inner = [2 * width, *[width] * (count - 1)]
-                layers = [layer for a, b in pairwise(inner) for layer in _conv(config, a, b)]
+                layers = [layer for a, b in pairwise(inner) for layer in _conv(settings, a, b)]
                 if last:
                     layers += [nn.Conv2d(width, 3, 3, padding=1), nn.Sigmoid()]
                 else:
-                    layers += _conv(config, width, after)
+                    layers += _conv(settings, width, after)
             self.stages.append(nn.Sequential(*layers))
         initialize(self)
 
@@ -249,11 +216,11 @@ class Decoder(nn.Module):
 class CodePredictor(nn.Module):
     """LSTM over sequences (B, T, inputs) to codes (B, T, g) in -1..1."""
 
-    def __init__(self, inputs: int, config: SvgConfig) -> None:
+    def __init__(self, inputs: int, settings: SvgSettings) -> None:
         super().__init__()
-        self.embed = nn.Linear(inputs, config.hidden)
-        self.lstm = nn.LSTM(config.hidden, config.hidden, config.layers, batch_first=True)
-        self.out = nn.Linear(config.hidden, config.code)
+        self.embed = nn.Linear(inputs, settings.hidden)
+        self.lstm = nn.LSTM(settings.hidden, settings.hidden, settings.layers, batch_first=True)
+        self.out = nn.Linear(settings.hidden, settings.code)
         initialize(self)
 
     def forward(self, inputs: Tensor, state: State | None = None) -> tuple[Tensor, State]:
@@ -265,12 +232,12 @@ class CodePredictor(nn.Module):
 class GaussianPredictor(nn.Module):
     """LSTM over codes (B, T, g) to mean and log variance (B, T, z) of Gaussians."""
 
-    def __init__(self, config: SvgConfig) -> None:
+    def __init__(self, settings: SvgSettings) -> None:
         super().__init__()
-        self.embed = nn.Linear(config.code, config.hidden)
-        self.lstm = nn.LSTM(config.hidden, config.hidden, batch_first=True)
-        self.mean = nn.Linear(config.hidden, config.latent)
-        self.log_variance = nn.Linear(config.hidden, config.latent)
+        self.embed = nn.Linear(settings.code, settings.hidden)
+        self.lstm = nn.LSTM(settings.hidden, settings.hidden, batch_first=True)
+        self.mean = nn.Linear(settings.hidden, settings.latent)
+        self.log_variance = nn.Linear(settings.hidden, settings.latent)
         initialize(self)
 
     def forward(self, codes: Tensor, state: State | None = None) -> tuple[Tensor, Tensor, State]:
@@ -295,41 +262,20 @@ def initialize(network: nn.Module) -> None:
 
 
 def _conv(
-    config: SvgConfig, inputs: int, outputs: int, *, kernel: int = 3, stride: int = 1
+    settings: SvgSettings, inputs: int, outputs: int, *, kernel: int = 3, stride: int = 1
 ) -> list[nn.Module]:
-    return [nn.Conv2d(inputs, outputs, kernel, stride, padding=1), *_after(config, outputs)]
+    return [nn.Conv2d(inputs, outputs, kernel, stride, padding=1), *_after(settings, outputs)]
 
 
-def _after(config: SvgConfig, channels: int) -> list[nn.Module]:
+def _after(settings: SvgSettings, channels: int) -> list[nn.Module]:
     """Return the normalisation and nonlinearity that follow a convolution."""
-    if config.norm == "batch":
+    if settings.norm == "batch":
         return [nn.BatchNorm2d(channels), nn.LeakyReLU(_SLOPE)]
     groups = math.gcd(_GROUPS, channels)
     return [nn.GroupNorm(groups, channels), nn.LeakyReLU(_SLOPE)]
 
 
-# SVG-LP: predicts the next picture from a code, and from a random variable with a learned prior.
-#
-# With codes h_t and inner activations of an encoder of picture x_t:
-#
-#     p_t = N(mean, var)(h_1, ..., h_(t-1))          prior, LSTM
-#     q_t = N(mean, var)(h_1, ..., h_t)              posterior, LSTM
-#     g_t = LSTM(h_(t-1), z_t; its state)            predicted code, z_t from q_t in training
-#     y_t = decoder(g_t, inner activations of the last observed frame)
-#     loss = mean_t [ mean_p (1 + w m_tp) (y_tp - x_tp)^2 + beta KL(q_t || p_t) ]
-#
-# with the moving pixels m (`physion.models.vision`), whose weight w is 0 as published. In
-# training h_(t-1) is the code of the true picture. To imagine, z_t is drawn from p_t, and h_t is
-# the code of y_t after the last observed frame.
-#
-# Features are the codes h_t of observed frames and the predicted codes g_t of imagined ones.
-#
-# Source: Denton and Fergus 2018, "Stochastic Video Generation with a Learned Prior", sections 3, 4
-# and appendix; docs/reference/vision-models.md says how the sizes differ from the published code.
-
-NAME = "svg"
-VERSION = 1
-"""To be raised with every change of what equal weights compute, or of the training."""
+# The model: loss, and imagination.
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,30 +287,33 @@ class ImaginedClips:
 
 
 class Svg(PictureModel):
-    """Model of the future of pictures, trained to predict the next one."""
+    """SVG, which predicts pictures from a code and a random variable."""
 
-    def __init__(self, config: SvgConfig, options: SvgOptions) -> None:
-        super().__init__(NAME, VERSION, config, options, samples=options.samples, framewise=True)
-        self.config = self.settings = config
-        if options.backbone:
-            self.name += f"-{options.backbone}"
-        if options.image_size:
-            self.name += f"-{options.image_size}"
-        with initial_weights("svg", options.seed):
-            self.encoder = Encoder(config)
-            self.decoder = Decoder(config)
-            self.predictor = CodePredictor(config.code + config.latent, config)
-            self.prior = GaussianPredictor(config)
-            self.posterior = GaussianPredictor(config)
+    settings: SvgSettings
+
+    def __init__(self, settings: SvgSettings) -> None:
+        training = SMALL_TRAINING if settings.size == "small" else PAPER_TRAINING
+        super().__init__(VERSION, settings, training, framewise=True)
+        usual = {"backbone": "dcgan", "image_size": 64, **settings.sizes[settings.size]}
+        for name in ("backbone", "image_size"):
+            if (chosen := getattr(settings, name)) != usual[name]:
+                self.name += f"-{chosen}"
+        with initial_weights("svg", settings.seed):
+            self.encoder = Encoder(settings)
+            self.decoder = Decoder(settings)
+            self.predictor = CodePredictor(settings.code + settings.latent, settings)
+            self.prior = GaussianPredictor(settings)
+            self.posterior = GaussianPredictor(settings)
+        load_named(self, settings.weights)
 
     def provenance(self) -> Provenance:
         """Return name, weights and versions for the table of predictions."""
-        encoder = f"{self.config.backbone.upper()} {self.config.image_size} px"
+        encoder = f"{self.settings.backbone.upper()} {self.settings.image_size} px"
         return self.origin(encoder, "LSTM with learned prior", "next picture")
 
     @torch.no_grad()
     def encode(self, batch: Batch) -> Tensor:
-        """Return the codes (B, T, g) of the pictures of a batch, each of its frame alone."""
+        """Return the codes (B, T, g) of the pictures of a batch, each of its frame only."""
         pictures = normalized_pictures(batch, self.spec, self.name)
         codes: Tensor = self.encoder(pictures.flatten(0, 1))[0]
         return codes.float().view(*pictures.shape[:2], -1)
@@ -373,14 +322,13 @@ class Svg(PictureModel):
     def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
         """Return the predicted codes (B, S, future, g) of ``samples`` futures.
 
-        They follow from ``seed`` and the name of the trial alone. With the knob ``show`` above 0,
+        They follow from ``seed`` and the name of the trial only. With the knob ``show`` above 0,
         ``shown`` holds the pictures under ``rgb`` (B, S, future, H, W, 3), uint8.
         """
         pictures = context_pictures(context, self.spec, self.name)
         steps = self.spec.context - 1 + self.spec.future
-        shape = (samples, steps, self.config.latent)
-        draws = [generator(NAME, seed, trial).standard_normal(shape) for trial in context.trials]
-        noise = torch.from_numpy(np.concatenate(draws)).to(pictures)
+        shape = (samples, steps, self.settings.latent)
+        noise = self.imagined_noise(context.trials, seed, shape).to(pictures)
         imagined = self._roll_out(pictures, noise)
         codes, shown = (
             value.view(len(context), samples, *value.shape[1:])
@@ -403,17 +351,17 @@ class Svg(PictureModel):
         objective = self._objective(pictures, batch.valid)
         if self.training:
             return objective
-        config = self.config
-        steps = config.past - 1 + config.imagined
-        noise = torch.randn(len(pictures), steps, config.latent).to(pictures)
-        imagined = self._roll_out(pictures[:, : config.past], noise)
+        settings = self.settings
+        steps = settings.past - 1 + settings.imagined
+        noise = torch.randn(len(pictures), steps, settings.latent).to(pictures)
+        imagined = self._roll_out(pictures[:, : settings.past], noise)
         error = future_error(imagined.pictures, pictures, batch.valid)
         parts = {"error": error.pixels, "objective": objective["loss"]}
         return {"loss": error.moving, **parts}
 
     def _objective(self, pictures: Tensor, valid: Tensor) -> dict[str, Tensor]:
         """Return loss, error and divergence of clips (B, T, 3, H, W), means over the frames."""
-        config = self.config
+        settings = self.settings
         clips, frames = pictures.shape[:2]
         flat, skips = self.encoder(pictures.flatten(0, 1))
         codes = flat.unflatten(0, (clips, frames))
@@ -422,19 +370,19 @@ class Svg(PictureModel):
         latents = gaussian_values(mean, log_variance, torch.randn_like(mean))
         predicted, _ = self.predictor(torch.cat([codes[:, :-1], latents], -1))
         # Frame t is decoded with the activations of frame t - 1, or of the last observed one.
-        limit = config.past - (1 if config.skip == "before" else 0)
+        limit = settings.past - (1 if settings.skip == "before" else 0)
         rows = [min(frame, limit) - 1 for frame in range(1, frames)]
         chosen = [skip.unflatten(0, (clips, frames))[:, rows].flatten(0, 1) for skip in skips]
         shown = self.decoder(predicted.flatten(0, 1), chosen).unflatten(0, (clips, frames - 1))
         squares = (shown - pictures[:, 1:]).pow(2).mean(2)
-        errors = (squares * (1 + config.motion * moving_pixels(pictures))).mean((2, 3))
+        errors = (squares * (1 + settings.motion * moving_pixels(pictures))).mean((2, 3))
         divergences = gaussian_divergence(mean, log_variance, of_mean, of_log_variance)
         weights = valid[:, 1:].to(errors.dtype)
         error, divergence = (
             (values * weights).sum() / weights.sum().clamp_min(1)
             for values in (errors, divergences)
         )
-        return {"loss": error + config.beta * divergence, "error": error, "kl": divergence}
+        return {"loss": error + settings.beta * divergence, "error": error, "kl": divergence}
 
     def _roll_out(self, pictures: Tensor, noise: Tensor) -> ImaginedClips:
         """Return what follows pictures (B, c, 3, H, W).
@@ -446,7 +394,7 @@ class Svg(PictureModel):
         samples = len(noise) // clips
         flat, skips = self.encoder(pictures.flatten(0, 1))
         codes = flat.unflatten(0, (clips, observed)).repeat_interleave(samples, 0)
-        row = observed - (2 if self.config.skip == "before" else 1)
+        row = observed - (2 if self.settings.skip == "before" else 1)
         skips = [
             skip.unflatten(0, (clips, observed))[:, row].repeat_interleave(samples, 0)
             for skip in skips
@@ -465,14 +413,3 @@ class Svg(PictureModel):
             shown.append(picture)
             last = self.encoder(picture)[0][:, None]
         return ImaginedClips(torch.stack(predicted, 1), torch.stack(shown, 1))
-
-
-# Building of SVG by its name, with random, shipped or given weights.
-
-
-def svg(**options: Any) -> Svg:
-    """Build SVG; ``options`` are those of `SvgOptions`."""
-    chosen = make_config(SvgOptions, NAME, options)
-    model = Svg(svg_config(chosen), chosen)
-    load_named(model, chosen.weights)
-    return model

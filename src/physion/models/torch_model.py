@@ -18,8 +18,8 @@ from torch import Tensor, nn
 
 from physion.clips.batch import Provenance, Spec
 from physion.core.seeds import stable_hash
-from physion.models.build import FileLoader
 from physion.models.interface import Model
+from physion.models.user_files import FileLoader
 
 _KNOWN_PACKAGES = {"abc", "builtins", "physion", "torch", "typing"}
 """Packages whose versions, not sources, belong to the digest of a model."""

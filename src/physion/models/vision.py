@@ -1,44 +1,34 @@
-"""Options and base class of the vision models that are trained from pictures."""
+"""What the vision models that are trained from pictures have in common: SVG, OP3, C-SWM, RPIN.
+
+Settings and base classes, Gaussians of random variables, the error of predicted pictures where
+something moves, and the pictures of a batch as input.
+"""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from physion.clips.batch import Batch, Provenance, Spec
 from physion.core.errors import BadInputError
-from physion.models.checkpoint import RANDOM
-from physion.models.interface import Diet, TrainingSettings
+from physion.core.seeds import generator
+from physion.models.interface import SizedSettings, TrainingSettings
 from physion.models.torch_model import TorchModel, digest_of
 
-Size = Literal["small", "paper", "released"]
 
+@dataclass(frozen=True, kw_only=True)
+class VisionSettings(SizedSettings):
+    """Settings of a vision model that is trained from pictures.
 
-@dataclass(frozen=True, slots=True)
-class VisionOptions:
-    """What a user chooses of a vision model.
-
-    - ``size``: ``small`` (for a CPU) or ``paper``, or ``released``, with the settings of the
-      published code where they differ from the paper.
-    - ``weights``: ``random``, to be trained; ``shipped``, those that come with the package; or the
-      path of a ``model.safetensors`` that ``physion train`` wrote, or of its folder.
-    - ``seed``: of the initial weights.
+    - ``image_size``: pixels per side.
     """
 
-    size: Size = "small"
-    weights: str = RANDOM
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.size not in ("small", "paper", "released"):
-            raise BadInputError(
-                f"a vision model has the sizes small, paper and released, not {self.size!r}"
-            )
+    image_size: int = 64
 
 
 class VisionModel(TorchModel):
@@ -46,43 +36,28 @@ class VisionModel(TorchModel):
 
     Parameters
     ----------
-    name
-        Name of the family, such as ``cswm``; the size is added to it.
     version
         To be raised with every change of what equal weights compute, or of the training.
-    config
-        Dataclass with all settings of the model.
+    settings
+        What the user chose.
     training
         Optimiser and schedule, which are no part of the digest.
-    options
-        What the user chose.
     spec
         What the model asks for.
     """
 
-    diet: Diet = "clips"
+    settings: VisionSettings
     decision = "logistic"
-    samples, seed = 1, 0
 
     def __init__(
-        self,
-        name: str,
-        version: int,
-        config: Any,
-        training: TrainingSettings,
-        options: VisionOptions,
-        spec: Spec,
+        self, version: int, settings: VisionSettings, training: TrainingSettings, spec: Spec
     ) -> None:
         super().__init__()
-        self.name = f"{name}-{options.size}"
-        self.version, self.options, self.spec = version, options, spec
+        settings.check_shipped()
+        self.name = f"{settings.model}-{settings.size}"
+        self.version, self.settings, self.spec = version, settings, spec
         self.training_settings = training
-        self.trained = False
-        self.knobs: Mapping[str, tuple[float, ...]] = {}
-        self._config = {k: v for k, v in dataclasses.asdict(config).items() if k != "training"}
-
-    def prepare(self, sample: Batch) -> None:
-        """Do nothing: these models have no statistics to set before a training."""
+        self.seed = settings.seed
 
     def built_as(self) -> dict[str, Any]:
         """Return what the weights were made for: name, with the size, and version."""
@@ -90,7 +65,8 @@ class VisionModel(TorchModel):
 
     def digest(self) -> str:
         """Return the SHA-256 of code version, settings and weights."""
-        parts = [self.name, self.version, self._config, repr(self.spec), torch.__version__]
+        settings = {k: v for k, v in asdict(self.settings).items() if k not in ("weights", "seed")}
+        parts = [self.name, self.version, settings, repr(self.spec), torch.__version__]
         return digest_of(parts, self.state_dict().items())
 
     def origin(self, encoder: str, dynamics: str, task: str) -> Provenance:
@@ -275,29 +251,29 @@ def context_pictures(batch: Batch, spec: Spec, model: str) -> Tensor:
 # Base class of the vision models that predict pictures.
 
 
-class PictureConfig(Protocol):
-    """Settings that a model of pictures has.
+@dataclass(frozen=True, kw_only=True)
+class PictureSettings(VisionSettings):
+    """Settings of a model that predicts pictures.
 
-    - ``image_size``: pixels per side.
     - ``past``, ``imagined``: frames of a training clip that are seen, and that follow.
     - ``stride``, ``context``, ``future``: see `physion.clips.batch.Spec`.
-    - ``training``: optimiser and schedule.
+    - ``beta``: weight of the divergence in the loss.
+    - ``motion``: additional weight of moving pixels in the loss; published 0. Few pixels move, and
+      a short training would learn the scenery only.
+    - ``samples``: futures of a trial, whose features the readout joins.
     """
 
-    @property
-    def image_size(self) -> int: ...
-    @property
-    def past(self) -> int: ...
-    @property
-    def imagined(self) -> int: ...
-    @property
-    def stride(self) -> int: ...
-    @property
-    def context(self) -> int: ...
-    @property
-    def future(self) -> int: ...
-    @property
-    def training(self) -> TrainingSettings: ...
+    past: int = 7
+    imagined: int = 9
+    stride: int = 6
+    context: int = 7
+    future: int = 18
+    beta: float = 1e-4
+    motion: float = 20.0
+    samples: int = 1
+
+    def __post_init__(self) -> None:
+        self.at_least(1, "image_size", "past", "imagined", "stride", "context", "samples")
 
 
 class PictureModel(VisionModel):
@@ -305,39 +281,45 @@ class PictureModel(VisionModel):
 
     Parameters
     ----------
-    name, version, config, options
+    version, settings, training
         As for `VisionModel`.
-    samples
-        Futures of a trial.
     framewise
-        Whether the features of a frame depend on that frame alone.
+        Whether the features of a frame depend on that frame only.
     """
+
+    settings: PictureSettings
 
     def __init__(
         self,
-        name: str,
         version: int,
-        config: PictureConfig,
-        options: VisionOptions,
+        settings: PictureSettings,
+        training: TrainingSettings,
         *,
-        samples: int,
         framewise: bool,
     ) -> None:
         spec = Spec(
-            image_size=config.image_size,
+            image_size=settings.image_size,
             mean=(0.0, 0.0, 0.0),
             std=(1.0, 1.0, 1.0),
-            stride=config.stride,
-            context=config.context,
-            future=config.future,
+            stride=settings.stride,
+            context=settings.context,
+            future=settings.future,
             framewise=framewise,
         )
-        super().__init__(name, version, config, config.training, options, spec)
-        self.window = config.past + config.imagined
-        self._imagined = config.imagined
-        self.samples, self.seed = samples, options.seed
+        super().__init__(version, settings, training, spec)
+        self.window = settings.past + settings.imagined
+        self.samples = settings.samples
+
+    def imagined_noise(self, trials: Sequence[str], seed: int, shape: tuple[int, ...]) -> Tensor:
+        """Return standard normal numbers (B S, ...) of S futures of each trial, float64.
+
+        ``shape`` is (S, ...); the numbers follow from ``seed`` and the name of the trial.
+        """
+        name = self.settings.model
+        draws = [generator(name, seed, trial).standard_normal(shape) for trial in trials]
+        return torch.from_numpy(np.concatenate(draws))
 
     def baseline(self, batch: Batch) -> Tensor:
         """Return the squared error of moving pixels if the last observed picture is repeated."""
         pictures = window_pictures(batch, self.spec, self.name, self.window)
-        return copy_error(pictures, self._imagined, batch.valid).moving
+        return copy_error(pictures, self.settings.imagined, batch.valid).moving

@@ -28,8 +28,9 @@ from physion.compute.local import SerialExecutor
 from physion.compute.tasks import Executor, Progress, tracked
 from physion.core.errors import BadInputError, PhysionError
 from physion.core.files import write_atomic
-from physion.models.build import LoadedFiles, OutOfMemoryError
+from physion.models.build import OutOfMemoryError
 from physion.models.interface import Model, ask
+from physion.models.user_files import LoadedFiles
 from physion.readout.model_calls import (
     MEMORY_ADVICE,
     call_model,

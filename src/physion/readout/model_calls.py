@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from physion.clips.batch import Batch, Provenance
 from physion.core.errors import BadInputError, PhysionError
 from physion.models.build import OutOfMemoryError, describe_raised, is_out_of_memory
-from physion.models.interface import Model
+from physion.models.interface import Model, can
 
 MEMORY_ADVICE = "use a smaller image_size or size of the model, or fewer samples"
 """What to do if memory is used up by a single clip."""
@@ -45,9 +45,9 @@ def call_model(model: Model, method: str, batch: Batch, /, *arguments: Any, **op
     BadInputError
         If the model lacks the method or raises an exception. A `PhysionError` is passed on.
     """
-    function = getattr(model, method, None)
-    if function is None:
+    if not can(model, method):
         raise BadInputError(f"model {model_name(model)!r} has no method {method}")
+    function = getattr(model, method)
     try:
         if not is_network(model):
             return function(batch, *arguments, **options)

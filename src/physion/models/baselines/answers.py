@@ -1,4 +1,4 @@
-"""Anchor `chance`: the base rate of the fitted trials, whatever the trial."""
+"""Baselines that look at no trial: `chance`, `outcome`, `majority-of-people`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,31 +16,36 @@ from numpy.typing import NDArray
 from physion.clips.batch import Batch, Motion, Provenance, Spec
 from physion.core.errors import BadInputError
 from physion.core.names import canonical_name
-from physion.core.version import __version__
-from physion.models.baselines.motion import motions, require_motion, settings_digest, touched
-from physion.models.build import make_config
-from physion.models.interface import Model
+from physion.models.baselines.motion import (
+    Baseline,
+    motions,
+    require_motion,
+    settings_digest,
+    touched,
+)
+from physion.models.interface import ModelSettings
 from physion.scenes.scene import OBSERVED_FRAMES
 
-NAME, VERSION = "chance", 1
+# Baseline `chance`: the base rate of the fitted trials, whatever the trial.
 
 
-@dataclass(frozen=True, slots=True)
-class BaseRateConfig:
+@dataclass(frozen=True, kw_only=True)
+class BaseRateSettings(ModelSettings):
     """`BaseRate` has no settings."""
 
 
-class BaseRate(Model):
+class BaseRate(Baseline):
     """Model that gives every trial of a scenario the same probability.
 
     P(contact) is (k + 1) / (n + 2) with k contacts among the n fitted trials (Laplace's rule of
     succession), so that its yes or no is the more frequent outcome.
     """
 
+    name = "chance"
     answers = "observed"
 
-    def __init__(self, config: BaseRateConfig) -> None:
-        self.config = self.settings = config
+    def __init__(self, settings: BaseRateSettings) -> None:
+        super().__init__(settings)
         self.spec = Spec(inputs=("state",), stride=1, context=1, future=0, context_at="end")
 
     def fit(self, batch: Batch, labels: NDArray[np.bool_], seed: int) -> FittedBaseRate:
@@ -50,12 +54,7 @@ class BaseRate(Model):
 
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions."""
-        versions = f"physion {__version__}"
-        return Provenance(NAME, "none", versions=versions, inputs="base rate")
-
-    def digest(self) -> str:
-        """Return the SHA-256 of the code version."""
-        return settings_digest(NAME, VERSION, dataclasses.asdict(self.config))
+        return dataclasses.replace(super().provenance(), inputs="base rate")
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,50 +69,41 @@ class FittedBaseRate:
         return np.full(len(batch), self.base_rate)
 
 
-def base_rate(**options: Any) -> BaseRate:
-    """Build a model that gives the base rate of the fitted trials, whatever the trial.
-
-    It has no options.
-    """
-    return BaseRate(make_config(BaseRateConfig, NAME, options))
+# Baseline `outcome`: answers with the outcome itself, as a perfect simulator would.
 
 
-# Anchor `outcome`: answers with the outcome itself, as a perfect simulator would.
-
-OUTCOME_NAME, OUTCOME_VERSION = "outcome", 1
-
-
-@dataclass(frozen=True, slots=True)
-class OutcomeConfig:
+@dataclass(frozen=True, kw_only=True)
+class OutcomeSettings(ModelSettings):
     """Settings of `Outcome`.
 
     - ``outcomes``: whether agent and patient touch, by name of the stimulus, for instance as the
       official files record it. Names are those of `physion.core.names.canonical_name`.
     """
 
-    outcomes: Mapping[str, bool] | None = None
+    outcomes: dict[str, bool] | None = None
 
 
-class Outcome(Model):
+class Outcome(Baseline):
     """Model that answers 1 if agent and patient touch, else 0.
 
-    The outcome is the known one of a stimulus (`OutcomeConfig`, `with_outcomes`), else that of its
-    whole motion. Accuracy is 1 by construction; its likeness to people is that of a perfect
+    The outcome is the known one of a stimulus (`OutcomeSettings`, `with_outcomes`), else that of
+    its whole motion. Accuracy is 1 by construction; its likeness to people is that of a perfect
     simulator. The protocol is ``full``: it sees everything. The evaluator gives it the outcomes of
-    the dataset (`Model.with_outcomes`), which only an anchor may have: its
-    predictions say something about outcomes and people, and nothing about a model.
+    the dataset, which only a baseline may have: its predictions say something about outcomes and
+    people, and nothing about a model.
     """
 
+    name = "outcome"
     answers = "full"
 
-    def __init__(self, config: OutcomeConfig) -> None:
-        self.config = self.settings = config
-        self.outcomes = read_outcomes(config.outcomes or {})
+    def __init__(self, settings: OutcomeSettings) -> None:
+        super().__init__(settings)
+        self.outcomes = read_outcomes(settings.outcomes or {})
         self.spec = Spec(inputs=("state",), stride=1, context=1, future=0)
 
     def with_outcomes(self, outcomes: Mapping[str, bool]) -> Outcome:
         """Return the model with more outcomes by stimulus; those that it has take precedence."""
-        return Outcome(OutcomeConfig(read_outcomes(outcomes) | self.outcomes))
+        return Outcome(OutcomeSettings(outcomes=read_outcomes(outcomes) | self.outcomes))
 
     def predict(self, batch: Batch) -> NDArray[np.float64]:
         """Return 1 or 0 (B,) for every trial.
@@ -125,18 +115,17 @@ class Outcome(Model):
         for row, trial in enumerate(batch.trials):
             known = self.outcomes.get(canonical_name(trial))
             answers[row] = (
-                _simulated(motions(batch, OUTCOME_NAME)[row], trial) if known is None else known
+                _simulated(motions(batch, self.name)[row], trial) if known is None else known
             )
         return answers
 
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions."""
-        versions = f"physion {__version__}"
-        return Provenance(OUTCOME_NAME, "none", versions=versions, inputs="outcomes")
+        return dataclasses.replace(super().provenance(), inputs="outcomes")
 
     def digest(self) -> str:
         """Return the SHA-256 of code version and known outcomes."""
-        return settings_digest(OUTCOME_NAME, OUTCOME_VERSION, self.outcomes)
+        return settings_digest(self.name, self.version, self.outcomes)
 
 
 def read_outcomes(outcomes: Mapping[str, bool]) -> dict[str, bool]:
@@ -154,29 +143,21 @@ def read_outcomes(outcomes: Mapping[str, bool]) -> dict[str, bool]:
     return known
 
 
-def outcome(**options: Any) -> Outcome:
-    """Build a model that answers with the outcome itself, as a perfect simulator would.
-
-    ``options`` are the fields of `OutcomeConfig`.
-    """
-    return Outcome(make_config(OutcomeConfig, OUTCOME_NAME, options))
-
-
 def _simulated(motion: Motion, trial: str) -> bool:
     """Return whether agent and patient touch in a whole motion."""
     require_motion(motion, trial)
     if len(motion.trajectory) <= OBSERVED_FRAMES:
         raise BadInputError(
-            f"trial {trial!r}: {OUTCOME_NAME} needs the whole motion, not its "
+            f"trial {trial!r}: {Outcome.name} needs the whole motion, not its "
             f"{len(motion.trajectory)} observed frames; give its outcome or use the protocol full"
         )
     return touched(motion)
 
 
-# Strict reader of the fraction of people who answered yes, by stimulus.
+# Table of the fraction of people who answered yes, by stimulus.
 #
-# `physion.analysis.tables` reads the same files for the comparison with people; models
-# cannot import it, because the analysis must run on tables alone.
+# `physion.analysis.tables` reads the same files for the comparison with people; models cannot
+# import it, because the analysis must run on tables only.
 
 FILES = re.compile(r"human_accuracy-[a-zA-Z]+(-redyellow)?_pilot-.*\.csv$")
 """Names of the official files."""
@@ -282,35 +263,35 @@ def _rows(file: Path, columns: tuple[str, ...]) -> Iterator[tuple[int, dict[str,
             raise BadInputError(f"{file}: people's answers cannot be read: {error}") from error
 
 
-# Anchor `majority-of-people`: answers a stimulus as people did.
-
-MAJORITY_OF_PEOPLE_NAME, MAJORITY_OF_PEOPLE_VERSION = "majority-of-people", 1
+# Baseline `majority-of-people`: answers a stimulus as people did.
 
 
-@dataclass(frozen=True, slots=True)
-class MajorityOfPeopleConfig:
+@dataclass(frozen=True, kw_only=True)
+class MajorityOfPeopleSettings(ModelSettings):
     """Settings of `MajorityOfPeople`.
 
     - ``humans``: people's answers: a mapping from stimulus to the fraction who answered yes, or a
-      file or folder that `people_files.read_people` reads.
+      file or folder that `read_people` reads.
     """
 
-    humans: Mapping[str, float] | str | Path | None = None
+    humans: dict[str, float] | str | None = None
 
 
-class MajorityOfPeople(Model):
+class MajorityOfPeople(Baseline):
     """Model whose P(contact) is the fraction of people who answered yes.
 
     Its yes or no is that of the majority: no model that gives one answer to a stimulus can agree
     with single people more often. It answers under ``observed``, because that is what people saw.
     """
 
+    name = "majority-of-people"
     answers = "observed"
+    settings: MajorityOfPeopleSettings
 
-    def __init__(self, config: MajorityOfPeopleConfig) -> None:
-        self.config = self.settings = config
+    def __init__(self, settings: MajorityOfPeopleSettings) -> None:
+        super().__init__(settings)
         self.spec = Spec(inputs=("state",), stride=1, context=1, future=0)
-        self.fractions = _fractions(config.humans)
+        self.fractions = _fractions(settings.humans)
 
     def predict(self, batch: Batch) -> NDArray[np.float64]:
         """Return the fraction of people (B,) who answered yes.
@@ -320,9 +301,9 @@ class MajorityOfPeople(Model):
         fractions = [self.fractions.get(canonical_name(trial)) for trial in batch.trials]
         unknown = [t for t, p in zip(batch.trials, fractions, strict=True) if p is None]
         if unknown:
-            given = "no answers at all" if self.config.humans is None else "no answers of people"
+            given = "no answers at all" if self.settings.humans is None else "no answers of people"
             raise BadInputError(
-                f"{MAJORITY_OF_PEOPLE_NAME} has {given} to {len(unknown)} of "
+                f"{self.name} has {given} to {len(unknown)} of "
                 f"{len(batch)} stimuli, the first of them {unknown[0]!r}; "
                 "give the option humans a table of the same stimuli"
             )
@@ -330,36 +311,25 @@ class MajorityOfPeople(Model):
 
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions."""
-        versions = f"physion {__version__}"
-        return Provenance(
-            MAJORITY_OF_PEOPLE_NAME, "none", versions=versions, inputs="answers of people"
-        )
+        return dataclasses.replace(super().provenance(), inputs="answers of people")
 
     def digest(self) -> str:
         """Return the SHA-256 of code version and answers."""
-        return settings_digest(MAJORITY_OF_PEOPLE_NAME, MAJORITY_OF_PEOPLE_VERSION, self.fractions)
+        return settings_digest(self.name, self.version, self.fractions)
 
 
-def majority_of_people(**options: Any) -> MajorityOfPeople:
-    """Build a model that answers a stimulus as people did.
-
-    ``options`` are the fields of `MajorityOfPeopleConfig`.
-    """
-    return MajorityOfPeople(make_config(MajorityOfPeopleConfig, MAJORITY_OF_PEOPLE_NAME, options))
-
-
-def _fractions(humans: Mapping[str, float] | str | Path | None) -> dict[str, float]:
+def _fractions(humans: Mapping[str, float] | str | None) -> dict[str, float]:
     """Return the fractions of yes by canonical name from the option ``humans``."""
     if humans is None:
         return {}
-    if isinstance(humans, str | Path):
+    if isinstance(humans, str):
         return read_people(Path(humans))
     fractions: dict[str, float] = {}
     for stimulus, fraction in humans.items():
         name = canonical_name(stimulus)
         if name in fractions:
             raise BadInputError(
-                f"{MAJORITY_OF_PEOPLE_NAME}: stimulus {name!r} occurs twice in humans"
+                f"{MajorityOfPeople.name}: stimulus {name!r} occurs twice in humans"
             )
-        fractions[name] = as_fraction(fraction, f"{MAJORITY_OF_PEOPLE_NAME}, stimulus {stimulus!r}")
+        fractions[name] = as_fraction(fraction, f"{MajorityOfPeople.name}, stimulus {stimulus!r}")
     return fractions

@@ -1,14 +1,16 @@
-"""Anchor `already-touched`: certain if the contact was seen, else the base rate."""
+"""Baselines that see the true motion: `already-touched`, `constant-motion`, `state-classifier`.
+
+Also what all baselines have in common: `Baseline`, and how they read the observed part of a motion.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import sklearn
@@ -26,8 +28,7 @@ from physion.clips.batch import (
 )
 from physion.core.errors import BadInputError
 from physion.core.version import __version__
-from physion.models.build import make_config
-from physion.models.interface import Model
+from physion.models.interface import Model, ModelSettings
 from physion.numerics.kernel import kernel
 from physion.numerics.linear_algebra import apply, multiply, norm
 from physion.numerics.rotations import axis_angle_matrix, rotate_vectors, rotation_matrices
@@ -48,7 +49,7 @@ from physion.physics.trajectory import State
 from physion.scenes.scene import FRAME_TIME, Body, Scene
 from physion.scenes.shapes.primitives import shape
 
-# What anchors read from a motion: its observed part, and nothing after it.
+# What baselines read from a motion: its observed part, and nothing after it.
 
 
 def motions(batch: Batch, model: str) -> tuple[Motion, ...]:
@@ -395,7 +396,7 @@ def _between(first: Thing | None, second: Thing | None) -> F64:
     return np.concatenate([apart, speed, [float(norm(apart))]])
 
 
-# Digest of an anchor: what it is, its settings, and what it was fitted to.
+# What all baselines have in common.
 
 
 def settings_digest(
@@ -421,11 +422,35 @@ def settings_digest(
     return sha.hexdigest()
 
 
-NAME, VERSION = "already-touched", 1
+class Baseline(Model):
+    """Model that sees too little to predict; its score shows what that of another model is worth.
+
+    ``version`` is to be raised with every change of the code that can alter a prediction.
+    """
+
+    name: ClassVar[str]
+    version: ClassVar[int] = 1
+    sees: ClassVar[str] = ""
+    """What it looks at, for the column *Encoder Type*."""
+
+    def __init__(self, settings: ModelSettings) -> None:
+        self.settings = settings
+
+    def provenance(self) -> Provenance:
+        """Return name and versions for the table of predictions."""
+        versions = f"physion {__version__}"
+        return Provenance(self.name, "none", encoder_type=self.sees, versions=versions)
+
+    def digest(self) -> str:
+        """Return the SHA-256 of code version and settings."""
+        return settings_digest(self.name, self.version, dataclasses.asdict(self.settings))
 
 
-@dataclass(frozen=True, slots=True)
-class AlreadyTouchedConfig:
+# Baseline `already-touched`: certain if the contact was seen, else the base rate.
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlreadyTouchedSettings(ModelSettings):
     """Settings of `AlreadyTouched`.
 
     - ``margin``: what is left for the other outcome: probabilities lie in margin .. 1 - margin.
@@ -436,81 +461,65 @@ class AlreadyTouchedConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.margin < 0.5:
             raise BadInputError(
-                f"{NAME}: margin must be at least 0 and below 0.5, not {self.margin}"
+                f"already-touched: margin must be at least 0 and below 0.5, not {self.margin}"
             )
 
 
-class AlreadyTouched(Model):
+class AlreadyTouched(Baseline):
     """Model that knows one thing: whether agent and patient touched in the observed part.
 
     P(contact) is 1 - margin if they did, else the base rate: the fraction of contacts among the
     fitted trials that had not touched, and 0.5 without such a trial.
     """
 
+    name = "already-touched"
     answers = "observed"
+    settings: AlreadyTouchedSettings
 
-    def __init__(self, config: AlreadyTouchedConfig) -> None:
-        self.config = self.settings = config
+    def __init__(self, settings: AlreadyTouchedSettings) -> None:
+        super().__init__(settings)
         self.spec = Spec(inputs=("state",), stride=1, context=1, future=0, context_at="end")
 
     def fit(self, batch: Batch, labels: NDArray[np.bool_], seed: int) -> TouchedOrBaseRate:
         """Return the model with the base rate of some trials and outcomes (B,); no seed is used."""
         if len(labels) != len(batch):
-            raise BadInputError(f"{NAME}: {len(labels)} labels for {len(batch)} trials")
+            raise BadInputError(f"{self.name}: {len(labels)} labels for {len(batch)} trials")
         later = np.asarray(labels, np.bool_)[~_touched(batch)]
         rate = np.count_nonzero(later) / len(later) if len(later) else 0.5
-        return TouchedOrBaseRate(self.config, rate)
-
-    def provenance(self) -> Provenance:
-        """Return name and versions for the table of predictions."""
-        return Provenance(NAME, "none", versions=f"physion {__version__}")
-
-    def digest(self) -> str:
-        """Return the SHA-256 of code version and settings."""
-        return settings_digest(NAME, VERSION, dataclasses.asdict(self.config))
+        return TouchedOrBaseRate(self.settings, rate)
 
 
 @dataclass(frozen=True, slots=True)
 class TouchedOrBaseRate:
     """`AlreadyTouched` with a base rate in 0..1."""
 
-    config: AlreadyTouchedConfig
+    settings: AlreadyTouchedSettings
     base_rate: float
     answers: str = "observed"
 
     def predict(self, batch: Batch) -> NDArray[np.float64]:
         """Return P(contact) (B,)."""
-        margin = self.config.margin
+        margin = self.settings.margin
         rate = min(max(self.base_rate, margin), 1 - margin)
         return np.where(_touched(batch), 1 - margin, rate)
 
     def digest(self) -> str:
         """Return the SHA-256 of code version, settings and base rate."""
-        settings = dataclasses.asdict(self.config) | {"base_rate": self.base_rate}
-        return settings_digest(NAME, VERSION, settings)
-
-
-def already_touched(**options: Any) -> AlreadyTouched:
-    """Build a model that is certain if the contact was seen, and else gives the base rate.
-
-    ``options`` are the fields of `AlreadyTouchedConfig`.
-    """
-    return AlreadyTouched(make_config(AlreadyTouchedConfig, NAME, options))
+        settings = dataclasses.asdict(self.settings) | {"base_rate": self.base_rate}
+        return settings_digest(AlreadyTouched.name, AlreadyTouched.version, settings)
 
 
 def _touched(batch: Batch) -> NDArray[np.bool_]:
     """Return which trials (B,) had a contact in the observed part."""
-    pairs = zip(motions(batch, NAME), batch.trials, strict=True)
+    pairs = zip(motions(batch, AlreadyTouched.name), batch.trials, strict=True)
     return np.array([touched(observed_motion(motion, trial)) for motion, trial in pairs], np.bool_)
 
 
-# Anchor `constant-motion`: bodies go on as they move at the last observed frame.
-
-CONSTANT_MOTION_NAME, CONSTANT_MOTION_VERSION = "constant-motion", 1
+# Baseline `constant-motion`: bodies keep moving as at the last observed frame.
 
 
-@dataclass(frozen=True, slots=True)
-class ConstantMotionConfig:
+@dataclass(frozen=True, kw_only=True)
+class ConstantMotionSettings(ModelSettings):
     """Settings of `ConstantMotion`.
 
     - ``frames``: how far it looks ahead, in frames of 0.01 s. The default ends with frame 150, the
@@ -521,12 +530,10 @@ class ConstantMotionConfig:
 
     def __post_init__(self) -> None:
         if self.frames < 1:
-            raise BadInputError(
-                f"{CONSTANT_MOTION_NAME}: frames must be at least 1, not {self.frames}"
-            )
+            raise BadInputError(f"constant-motion: frames must be at least 1, not {self.frames}")
 
 
-class ConstantMotion(Model):
+class ConstantMotion(Baseline):
     """Simulator without forces: constant velocity and angular velocity from frame 44 on.
 
     Gravity, contacts and joints have no effect; a body that lies or flies goes on alike. The gap is
@@ -535,63 +542,42 @@ class ConstantMotion(Model):
     better.
     """
 
+    name = "constant-motion"
+    sees = "true state"
     decision = "gap"
-    samples = 1
     seed = 0
-    knobs: Mapping[str, tuple[float, ...]] = MappingProxyType({})
+    settings: ConstantMotionSettings
 
-    def __init__(self, config: ConstantMotionConfig) -> None:
-        self.config = self.settings = config
+    def __init__(self, settings: ConstantMotionSettings) -> None:
+        super().__init__(settings)
         self.spec = Spec(
-            inputs=("state",), stride=1, context=1, future=config.frames, context_at="end"
+            inputs=("state",), stride=1, context=1, future=settings.frames, context_at="end"
         )
 
     def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
         """Return gaps and contacts (B, samples); nothing is random and there are no knobs."""
-        pairs = zip(motions(context, CONSTANT_MOTION_NAME), context.trials, strict=True)
+        pairs = zip(motions(context, self.name), context.trials, strict=True)
         gaps = np.array([self._gap(observed_motion(motion, trial)) for motion, trial in pairs])
         repeated = np.repeat(gaps.reshape(-1, 1), samples, axis=1)
         return Rollout(gap=repeated, contact=repeated <= 0)
 
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions."""
-        return Provenance(
-            CONSTANT_MOTION_NAME,
-            "none",
-            encoder_type="true state",
-            dynamics_type="constant velocity",
-            versions=f"physion {__version__}",
-        )
-
-    def digest(self) -> str:
-        """Return the SHA-256 of code version and settings."""
-        return settings_digest(
-            CONSTANT_MOTION_NAME, CONSTANT_MOTION_VERSION, dataclasses.asdict(self.config)
-        )
+        return dataclasses.replace(super().provenance(), dynamics_type="constant velocity")
 
     def _gap(self, motion: Motion) -> float:
         """Return the gap of one observed motion."""
         if touched(motion):
             return 0.0
         state = motion.trajectory.state(LAST_OBSERVED)
-        return gap_in_constant_motion(motion.scene, state, self.config.frames)
+        return gap_in_constant_motion(motion.scene, state, self.settings.frames)
 
 
-def constant_motion(**options: Any) -> ConstantMotion:
-    """Build a model in which bodies go on as they move at the last observed frame.
-
-    ``options`` are the fields of `ConstantMotionConfig`.
-    """
-    return ConstantMotion(make_config(ConstantMotionConfig, CONSTANT_MOTION_NAME, options))
+# Baseline `state-classifier`: a statistical shortcut from the state at the last observed frame.
 
 
-# Anchor `state-classifier`: a statistical shortcut from the state at the last observed frame.
-
-STATE_CLASSIFIER_NAME, STATE_CLASSIFIER_VERSION = "state-classifier", 1
-
-
-@dataclass(frozen=True, slots=True)
-class StateClassifierConfig:
+@dataclass(frozen=True, kw_only=True)
+class StateClassifierSettings(ModelSettings):
     """Settings of `StateClassifier`: number of trees, and smallest number of trials of a leaf."""
 
     trees: int = 500
@@ -599,10 +585,10 @@ class StateClassifierConfig:
 
     def __post_init__(self) -> None:
         if min(self.trees, self.leaf) < 1:
-            raise BadInputError(f"{STATE_CLASSIFIER_NAME}: trees and leaf must be at least 1")
+            raise BadInputError("state-classifier: trees and leaf must be at least 1")
 
 
-class StateClassifier(Model):
+class StateClassifier(Baseline):
     """Extremely randomised trees on the true state of agent, patient and probe at one instant.
 
     It sees positions, rotations, velocities and sizes (`state_features`) and knows nothing of
@@ -613,10 +599,13 @@ class StateClassifier(Model):
     P. Geurts, D. Ernst, L. Wehenkel, Extremely randomized trees, Machine Learning 63, 2006.
     """
 
+    name = "state-classifier"
+    sees = "true state"
     answers = "observed"
+    settings: StateClassifierSettings
 
-    def __init__(self, config: StateClassifierConfig) -> None:
-        self.config = self.settings = config
+    def __init__(self, settings: StateClassifierSettings) -> None:
+        super().__init__(settings)
         self.spec = Spec(inputs=("state",), stride=1, context=1, future=0, context_at="end")
 
     def fit(self, batch: Batch, labels: NDArray[np.bool_], seed: int) -> FittedTrees:
@@ -625,30 +614,22 @@ class StateClassifier(Model):
         The order of the trials does not matter. Raises `BadInputError` without trials.
         """
         if len(labels) != len(batch) or len(batch) == 0:
-            raise BadInputError(
-                f"{STATE_CLASSIFIER_NAME}: {len(labels)} labels for {len(batch)} trials"
-            )
+            raise BadInputError(f"{self.name}: {len(labels)} labels for {len(batch)} trials")
         order = np.argsort(np.array(batch.trials), kind="stable")
         trees = ExtraTreesClassifier(
-            self.config.trees, min_samples_leaf=self.config.leaf, random_state=seed, n_jobs=1
+            self.settings.trees, min_samples_leaf=self.settings.leaf, random_state=seed, n_jobs=1
         )
         trees.fit(_features(batch)[order], np.asarray(labels, np.bool_)[order])
-        return FittedTrees(self.config, trees)
+        return FittedTrees(self.settings, trees)
 
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions."""
-        return Provenance(
-            STATE_CLASSIFIER_NAME,
-            "none",
-            encoder_type="true state",
-            versions=f"scikit-learn {sklearn.__version__}, physion {__version__}",
-        )
+        versions = f"scikit-learn {sklearn.__version__}, physion {__version__}"
+        return dataclasses.replace(super().provenance(), versions=versions)
 
     def digest(self) -> str:
         """Return the SHA-256 of code version and settings."""
-        return settings_digest(
-            STATE_CLASSIFIER_NAME, STATE_CLASSIFIER_VERSION, _settings(self.config)
-        )
+        return settings_digest(self.name, self.version, _fit_settings(self.settings))
 
 
 class FittedTrees:
@@ -656,8 +637,8 @@ class FittedTrees:
 
     answers = "observed"
 
-    def __init__(self, config: StateClassifierConfig, trees: ExtraTreesClassifier) -> None:
-        self.config = self.settings = config
+    def __init__(self, settings: StateClassifierSettings, trees: ExtraTreesClassifier) -> None:
+        self.settings = settings
         self.trees = trees
 
     def predict(self, batch: Batch) -> NDArray[np.float64]:
@@ -677,26 +658,17 @@ class FittedTrees:
             parts = tree.tree_
             arrays += [parts.children_left, parts.children_right, parts.feature]
             arrays += [parts.threshold, parts.value]
-        return settings_digest(
-            STATE_CLASSIFIER_NAME, STATE_CLASSIFIER_VERSION, _settings(self.config), arrays
-        )
+        kind = StateClassifier
+        return settings_digest(kind.name, kind.version, _fit_settings(self.settings), arrays)
 
 
-def state_classifier(**options: Any) -> StateClassifier:
-    """Build extremely randomised trees on the state at the last observed frame.
-
-    ``options`` are the fields of `StateClassifierConfig`.
-    """
-    return StateClassifier(make_config(StateClassifierConfig, STATE_CLASSIFIER_NAME, options))
-
-
-def _settings(config: StateClassifierConfig) -> list[Any]:
+def _fit_settings(settings: StateClassifierSettings) -> list[Any]:
     """Return what determines the fit, as JSON values."""
-    return [dataclasses.asdict(config), NAMES, sklearn.__version__]
+    return [dataclasses.asdict(settings), NAMES, sklearn.__version__]
 
 
 def _features(batch: Batch) -> NDArray[np.float64]:
     """Return the features (B, D) of all trials."""
-    pairs = zip(motions(batch, STATE_CLASSIFIER_NAME), batch.trials, strict=True)
+    pairs = zip(motions(batch, StateClassifier.name), batch.trials, strict=True)
     rows = [state_features(observed_motion(motion, trial)) for motion, trial in pairs]
     return np.array(rows).reshape(len(batch), len(NAMES))

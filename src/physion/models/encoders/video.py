@@ -15,7 +15,6 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -25,7 +24,6 @@ from torch import Tensor, nn
 
 from physion.clips.batch import Batch, Provenance, Spec
 from physion.core.errors import BadInputError
-from physion.models.build import make_config
 from physion.models.encoders.encoder import SMALL
 from physion.models.encoders.weights import (
     GRID,
@@ -40,6 +38,7 @@ from physion.models.encoders.weights import (
     read_state_dict,
     weights_sha256,
 )
+from physion.models.interface import ModelSettings
 from physion.models.torch_model import TorchModel, digest_of, initial_weights
 from physion.models.vision import normalized_pictures
 
@@ -54,10 +53,11 @@ TUBELET = 2
 """Frames of a tubelet."""
 
 
-@dataclass(frozen=True, slots=True)
-class VideoConfig:
+@dataclass(frozen=True, kw_only=True)
+class VideoSettings(ModelSettings):
     """Settings of a video encoder.
 
+    - ``size``: ``small`` or ``paper``; sets the defaults of the other options.
     - ``weights``: ``hub:NAME`` of a repository of huggingface.co, ``random``, or the path of a
       state dict.
     - ``image_size``, ``patch``: pixels per side. ``frames``: of a clip, a multiple of 2.
@@ -66,6 +66,8 @@ class VideoConfig:
     - ``pooling``: ``pooled`` or ``grid``. ``seed``: of random weights.
     """
 
+    model: str = "VideoMAE"
+    size: str = SMALL
     weights: str = RANDOM
     image_size: int = 224
     patch: int = 16
@@ -77,6 +79,14 @@ class VideoConfig:
     later: int = 3
     pooling: Pooling = POOLED
     seed: int = 0
+
+    @classmethod
+    def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the settings of a size."""
+        sizes, size = FAMILIES[model].sizes, options.get("size", SMALL)
+        if size not in sizes:
+            raise BadInputError(f"model {model} has the sizes {', '.join(sizes)}, not {size!r}")
+        return sizes[size]
 
     def __post_init__(self) -> None:
         check_pooling(self.pooling)
@@ -95,49 +105,49 @@ class VideoFamily:
     """Kind of video encoder.
 
     - ``name``: of its models. ``task``, ``dataset``: what trained the named weights.
-    - ``build``: returns the network of a config, which maps (B, T, 3, H, W) to tokens.
+    - ``build``: returns the network for settings, which maps (B, T, 3, H, W) to tokens.
     - ``renamed``: pairs of a part of a tensor's name in a file and its replacement.
     - ``unused``: starts of names, once replaced, of tensors that features do not need.
-    - ``sizes``: configs by size.
+    - ``sizes``: settings by size.
     """
 
     name: str
     task: str
     dataset: str
-    build: Callable[[VideoConfig], nn.Module]
+    build: Callable[[VideoSettings], nn.Module]
     renamed: tuple[tuple[str, str], ...]
     unused: tuple[str, ...]
-    sizes: Mapping[str, VideoConfig]
+    sizes: Mapping[str, Mapping[str, Any]]
 
 
-def _videomae(config: VideoConfig) -> nn.Module:
-    settings = transformers.VideoMAEConfig(
-        image_size=config.image_size,
-        patch_size=config.patch,
-        num_frames=config.frames,
+def _videomae(settings: VideoSettings) -> nn.Module:
+    library_config = transformers.VideoMAEConfig(
+        image_size=settings.image_size,
+        patch_size=settings.patch,
+        num_frames=settings.frames,
         tubelet_size=TUBELET,
-        hidden_size=config.width,
-        num_hidden_layers=config.depth,
-        num_attention_heads=config.heads,
-        intermediate_size=4 * config.width,
+        hidden_size=settings.width,
+        num_hidden_layers=settings.depth,
+        num_attention_heads=settings.heads,
+        intermediate_size=4 * settings.width,
         use_mean_pooling=False,
     )
-    network: nn.Module = transformers.VideoMAEModel(settings)
+    network: nn.Module = transformers.VideoMAEModel(library_config)
     return network
 
 
-def _vjepa2(config: VideoConfig) -> nn.Module:
-    settings = transformers.VJEPA2Config(
-        crop_size=config.image_size,
-        patch_size=config.patch,
-        frames_per_clip=config.frames,
+def _vjepa2(settings: VideoSettings) -> nn.Module:
+    library_config = transformers.VJEPA2Config(
+        crop_size=settings.image_size,
+        patch_size=settings.patch,
+        frames_per_clip=settings.frames,
         tubelet_size=TUBELET,
-        hidden_size=config.width,
-        num_hidden_layers=config.depth,
-        num_attention_heads=config.heads,
+        hidden_size=settings.width,
+        num_hidden_layers=settings.depth,
+        num_attention_heads=settings.heads,
         pred_num_hidden_layers=1,  # of the predictor, which features do not need
     )
-    encoder: nn.Module = transformers.VJEPA2Model(settings).encoder
+    encoder: nn.Module = transformers.VJEPA2Model(library_config).encoder
     return encoder
 
 
@@ -155,12 +165,10 @@ VIDEOMAE = VideoFamily(
         ("fc_norm.", "layernorm."),
     ),
     unused=("decoder.", "encoder_to_decoder.", "mask_token", "classifier."),
-    sizes=MappingProxyType(
-        {
-            "small": VideoConfig(weights=f"{HUB}MCG-NJU/videomae-small-finetuned-kinetics"),
-            "paper": VideoConfig(weights=f"{HUB}MCG-NJU/videomae-base", width=768, heads=12),
-        }
-    ),
+    sizes={
+        "small": {"weights": f"{HUB}MCG-NJU/videomae-small-finetuned-kinetics"},
+        "paper": {"weights": f"{HUB}MCG-NJU/videomae-base", "width": 768, "heads": 12},
+    },
 )
 VJEPA2 = VideoFamily(
     name="V-JEPA2",
@@ -169,22 +177,21 @@ VJEPA2 = VideoFamily(
     build=_vjepa2,
     renamed=(("vjepa2.", ""), ("encoder.", "")),
     unused=("predictor.", "pooler.", "classifier."),
-    sizes=MappingProxyType(
-        {
-            "small": VideoConfig(),
-            "paper": VideoConfig(
-                weights=f"{HUB}facebook/vjepa2-vitl-fpc64-256",
-                image_size=256,
-                width=1024,
-                depth=24,
-                heads=16,
-            ),
-        }
-    ),
+    sizes={
+        "small": {},
+        "paper": {
+            "weights": f"{HUB}facebook/vjepa2-vitl-fpc64-256",
+            "image_size": 256,
+            "width": 1024,
+            "depth": 24,
+            "heads": 16,
+        },
+    },
 )
+FAMILIES = {family.name: family for family in (VIDEOMAE, VJEPA2)}
 
 
-def create_video_encoder(family: VideoFamily, config: VideoConfig) -> tuple[nn.Module, str]:
+def create_video_encoder(family: VideoFamily, settings: VideoSettings) -> tuple[nn.Module, str]:
     """Build a frozen network in evaluation mode, and return it with the origin of its weights.
 
     The origin is ``random``, ``hub:<name>`` or ``local:<start of the file's SHA-256>``.
@@ -195,12 +202,12 @@ def create_video_encoder(family: VideoFamily, config: VideoConfig) -> tuple[nn.M
         If the weights cannot be had or are those of another network; the message names tensors
         that differ.
     """
-    with initial_weights("video encoder", family.name, config.seed):
-        network = family.build(config)
-    origin = config.weights
-    if config.weights != RANDOM:
-        path = _weights_file(config.weights)
-        if not config.weights.startswith(HUB):
+    with initial_weights("video encoder", family.name, settings.seed):
+        network = family.build(settings)
+    origin = settings.weights
+    if settings.weights != RANDOM:
+        path = _weights_file(settings.weights)
+        if not settings.weights.startswith(HUB):
             origin = f"local:{weights_sha256(path)[:12]}"
         state = _renamed(read_state_dict(path), family)
         unused = [name for name in state if name.startswith(family.unused)]
@@ -244,76 +251,69 @@ class VideoEncoder(TorchModel):
 
     decision = "logistic"
 
-    def __init__(self, family: VideoFamily, size: str, config: VideoConfig) -> None:
+    settings: VideoSettings
+
+    def __init__(self, settings: VideoSettings) -> None:
         super().__init__()
-        self.family, self.size, self.config = family, size, config
-        self.settings = config
+        self.settings, self.family = settings, FAMILIES[settings.model]
         self.spec = Spec(
-            image_size=config.image_size,
-            stride=config.stride,
-            context=config.frames,
-            future=config.later * config.frames,
+            image_size=settings.image_size,
+            stride=settings.stride,
+            context=settings.frames,
+            future=settings.later * settings.frames,
             context_at="end",
             framewise=False,
         )
-        self.network, self.init = create_video_encoder(family, config)
+        self.network, self.init = create_video_encoder(self.family, settings)
 
     @torch.no_grad()
     def encode(self, batch: Batch) -> Tensor:
         """Return features (B, T / 2, D) of pictures (B, T, H, W, 3), T a multiple of ``frames``."""
         pictures = normalized_pictures(batch, self.spec, self.name())
         clips, steps = pictures.shape[:2]
-        frames, size = self.config.frames, self.config.image_size
+        frames, size = self.settings.frames, self.settings.image_size
         if steps % frames:
             raise BadInputError(f"{self.name()} encodes clips of {frames} frames, not {steps}")
         tokens: Tensor = self.network(pictures.reshape(-1, frames, 3, size, size)).last_hidden_state
-        side, width = size // self.config.patch, tokens.shape[-1]
+        side, width = size // self.settings.patch, tokens.shape[-1]
         maps = tokens.reshape(-1, side, side, width).permute(0, 3, 1, 2)
-        features = average_cells(maps) if self.config.pooling == GRID else maps.mean((2, 3))
+        features = average_cells(maps) if self.settings.pooling == GRID else maps.mean((2, 3))
         return features.float().reshape(clips, steps // TUBELET, -1)
 
     def digest(self) -> str:
         """Return the SHA-256 of settings, versions and weights."""
-        settings = dataclasses.asdict(self.config)
+        settings = dataclasses.asdict(self.settings)
         settings.pop("weights")  # which count as they are
         parts = [_VERSION, self.family.name, settings, torch.__version__, transformers.__version__]
         return digest_of(parts, self.state_dict().items())
 
     def name(self) -> str:
         """Return the name for tables, such as ``VideoMAE-paper`` or ``random-VideoMAE-paper``."""
-        grid = "grid" * (self.config.pooling == GRID)
-        parts = ["random" * (self.init == RANDOM), self.family.name, grid, self.size]
+        grid = "grid" * (self.settings.pooling == GRID)
+        parts = ["random" * (self.init == RANDOM), self.family.name, grid, self.settings.size]
         return "-".join(part for part in parts if part)
 
     def provenance(self) -> Provenance:
         """Return name, weights and versions for the table of predictions."""
-        named = self.init != RANDOM and self.init == self.family.sizes[self.size].weights
+        named = self.init != RANDOM and self.init == self.family.sizes[self.settings.size].get(
+            "weights", RANDOM
+        )
         return Provenance(
             model=self.name(),
             init=self.init,
             encoder_type=self.family.name,
             encoder_pretraining_task=self.family.task if named else "",
             encoder_pretraining_dataset=self.family.dataset if named else "",
-            encoder_pretraining_seed=str(self.config.seed) if self.init == RANDOM else "",
+            encoder_pretraining_seed=str(self.settings.seed) if self.init == RANDOM else "",
             versions=f"torch {torch.__version__}, transformers {transformers.__version__}",
         )
 
 
-def videomae(**options: Any) -> VideoEncoder:
-    """Build VideoMAE, a transformer on 16 frames (options: `VideoConfig`, and the size)."""
-    return _build(VIDEOMAE, options)
+def videomae(settings: VideoSettings) -> VideoEncoder:
+    """Build VideoMAE, a transformer on 16 frames."""
+    return VideoEncoder(settings)
 
 
-def vjepa2(**options: Any) -> VideoEncoder:
-    """Build V-JEPA 2, a transformer on 16 frames (options: `VideoConfig`, and the size)."""
-    return _build(VJEPA2, options)
-
-
-def _build(family: VideoFamily, options: dict[str, Any]) -> VideoEncoder:
-    chosen = dict(options)
-    size = chosen.pop("size", SMALL)
-    if size not in family.sizes:
-        sizes = ", ".join(family.sizes)
-        raise BadInputError(f"model {family.name} has the sizes {sizes}, not {size!r}")
-    settings = {**dataclasses.asdict(family.sizes[size]), **chosen}
-    return VideoEncoder(family, size, make_config(VideoConfig, family.name, settings))
+def vjepa2(settings: VideoSettings) -> VideoEncoder:
+    """Build V-JEPA 2, a transformer on 16 frames."""
+    return VideoEncoder(settings)

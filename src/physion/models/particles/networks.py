@@ -207,7 +207,7 @@ class Graph:
 
     Nodes are the particles of all objects that can move, and those of kinematic bodies that have
     an edge: the others would change nothing. For DPI-Net, whose bodies move as wholes, they are
-    the particles of cloths, and of bodies those alone that have an edge or, if the body can move,
+    the particles of cloths, and of bodies only those that have an edge or, if the body can move,
     come nearer to the floor than the radius in the step.
 
     - ``particles``: P. ``rows`` (N,): particle of each node. ``owners`` (N,): its object.
@@ -403,7 +403,7 @@ def _moments(layout: SceneLayout, offsets: Tensor) -> Tensor:
     return (means / means[:, :3].sum(-1, keepdim=True).clamp_min(1e-12)).float()
 
 
-# Graph networks of the particle models, in this package's own form.
+# Graph networks of the particle models.
 #
 # `MessageNetwork` (GNS): nodes pass messages along edges, in rounds with weights of their own and
 # residual updates with layer normalisation (Sanchez-Gonzalez et al. 2020).

@@ -291,7 +291,7 @@ def rotated(window: Window) -> Window:
 def disturbed(window: Window, velocity_noise: float, relative_noise: float) -> Window:
     """Return a window with noise, so that a network learns to correct its own errors.
 
-    The first state alone is moved: the last velocity is wrong, and the states that are to be
+    Only the first state is moved: the last velocity is wrong, and the states that are to be
     predicted are not (Sanchez-Gonzalez et al. 2020, section 3.3). The noise of a rotation moves the
     rim of a body as far as that of its centre moves the centre.
 
@@ -339,7 +339,7 @@ def smallest_distance(
 
     Learned bodies can overlap, and the deeper they do, the surer is the contact. The distance is
     at most `FAR`, also if one of them is absent, and at most `TOLERANCE` too large; depths are
-    those at the rows of the motion alone.
+    those at the rows of the motion only.
 
     Parameters
     ----------

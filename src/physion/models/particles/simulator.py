@@ -1,11 +1,11 @@
-"""Learned simulators of particles: GNS, GNS-RANSAC and DPI-Net in this package's own form.
+"""Learned simulators of particles: GNS, GNS-RANSAC and DPI-Net.
 
 Of every object a simulator knows the last two poses, of a cloth the last two positions of its
-particles. If it goes on as it moved, a particle at x moves by u (`graph`). The network predicts
+particles. If it goes on as it moved, a particle at x moves by u (`networks`). The network predicts
 what is added to this motion:
 
 - GNS: a change a of the displacement of every particle, x' = x + u + a. Bodies are kept rigid by
-  the rigid motion that fits the x' of their particles best; GNS-RANSAC fits those particles alone
+  the rigid motion that fits the x' of their particles best; GNS-RANSAC fits only those particles
   that agree with one another.
 - DPI-Net: changes of velocity and spin of every body, and of the displacements of the particles of
   cloths.
@@ -15,15 +15,15 @@ The loss is the squared distance of the predicted particles from where they went
 ``knee`` it grows linearly (`_softened`).
 
 Source: paper, section 4 and supplement; docs/official-system.md, section 6. It differs from the
-published code (`released_gns`, `released_dpi`) in what the module `graph` says, and in particles
-that lie on surfaces, where contacts happen.
+published code in what the module `networks` says, and in particles that lie on surfaces, where
+contacts happen.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal, cast
+from dataclasses import asdict, dataclass, replace
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 import torch
@@ -42,10 +42,8 @@ from physion.clips.batch import (
 from physion.core.errors import BadInputError
 from physion.core.seeds import generator
 from physion.models.baselines.motion import FAR
-from physion.models.build import make_config
-from physion.models.checkpoint import SHIPPED as CheckpointSHIPPED
 from physion.models.checkpoint import load_named
-from physion.models.interface import Diet, TrainingSettings
+from physion.models.interface import RANDOM, Diet, SizedSettings, Sizes, TrainingSettings
 from physion.models.noisy_simulation import best_threshold
 from physion.models.particles.bodies import (
     CLOTH,
@@ -93,82 +91,61 @@ from physion.models.torch_model import TorchModel, digest_of, initial_weights
 from physion.physics.labels import label_contact
 from physion.scenes.scene import FRAME_TIME
 
-# Settings of the particle models, and their sizes.
+MESSAGES, OBJECTS = "messages", "objects"
+"""Networks: messages between particles (GNS), and changes of whole objects (DPI-Net)."""
 
-Size = Literal["small", "paper"]
-RANDOM, SHIPPED = "random", "shipped"
+_SMALL: Mapping[str, Mapping[str, Any]] = {
+    MESSAGES: {"rounds": 5, "limit": 50, "inner": 6},
+    OBJECTS: {"rounds": 3},
+}
+_PAPER: Mapping[str, Mapping[str, Any]] = {
+    MESSAGES: {"rounds": 10, "inner": 10},
+    OBJECTS: {"rounds": 4},
+}
 
 
-@dataclass(frozen=True, slots=True)
-class ParticleOptions:
-    """What a user chooses of a particle model.
+@dataclass(frozen=True, kw_only=True)
+class ParticleSettings(SizedSettings):
+    """Settings of a particle model; also see `SizedSettings`. Some differ between GNS and DPI-Net.
 
-    - ``size``: ``small`` or ``paper``.
-    - ``weights``: ``random``, to be trained; ``shipped``, those that come with the package,
-      trained on all scenarios; or the path of a ``model.safetensors`` that ``physion train`` wrote,
-      or of its folder.
     - ``swept``: whether particles that come close during a step are neighbours.
     - ``samples``: futures of a trial, and ``spread``: standard deviation of the noise on their
       initial velocities, m/s. One future has no noise.
-    - ``stride``: frames of 0.01 s in one step.
-    - ``seed``: of initial weights, and of the noise of futures.
-    """
-
-    size: Size = "small"
-    weights: str = RANDOM
-    swept: bool = True
-    samples: int = 1
-    spread: float = 0.05
-    stride: int = 3
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.size not in ("small", "paper"):
-            raise BadInputError(
-                f"a particle model has the sizes small and paper, not {self.size!r}"
-            )
-        if isinstance(self.samples, bool) or not isinstance(self.samples, int) or self.samples < 1:
-            raise BadInputError(f"samples must be a whole number from 1 on, not {self.samples!r}")
-        if self.stride not in (1, 3):
-            raise BadInputError(f"stride must be 1 or 3 frames, not {self.stride!r}")
-        if not self.spread >= 0:
-            raise BadInputError(f"spread must not be negative, not {self.spread!r}")
-
-
-@dataclass(frozen=True, slots=True)
-class ParticleConfig:
-    """All settings of a particle model of this package's own form.
-
-    - ``network``: ``messages`` (GNS) or ``objects`` (DPI-Net), with ``width`` and ``rounds``.
-    - ``particles``: how objects become particles.
-    - ``radius``: metres within which particles of different objects are neighbours; with ``swept``
-      also those that come so close during a step.
-    - ``rigid``: how GNS keeps bodies rigid: ``fit`` to all particles, or ``robust`` (RANSAC).
+    - ``stride``: frames of 0.01 s in one step, 3 or 1.
+    - ``width``, ``rounds``: of the network.
+    - ``spacing``, ``limit``, ``still_limit``, ``cloth_step``, ``inner``: how objects become
+      particles (`Sampling`).
+    - ``radius``: metres within which particles of different objects are neighbours.
     - ``velocity_noise``, ``relative_noise``: metres a step, and fraction of the speed; standard
       deviations of the noise in training, drawn for every rigid body and for every particle of a
-      cloth. Noise that is large beside a slow motion teaches that it stops.
+      cloth. Noise that is large compared with a slow motion teaches that it stops.
     - ``pushforward``: steps that follow the first one in training. They start from what the network
       predicted, without gradient, so that it learns to correct its own errors (Brandstetter et al.
       2022, section 3.1).
     - ``abrupt``: fraction of the training windows that are drawn from moments at which bodies
-      change their velocity abruptly, as at contacts (`windows.start_probabilities`); the others
+      change their velocity abruptly, as at contacts (`rollout.start_probabilities`); the others
       are drawn from all moments.
     - ``rest``: metres a step; in a rollout a body whose centre and rim would move less together
       stays where it is, as bodies sleep in physics engines. Otherwise small errors, which add up as
       a velocity, tip what stands.
-    - ``knee``: errors of an object count squared up to this many units (``simulator.CHANGE``), and
-      linearly beyond.
+    - ``knee``: errors of an object count squared up to this many units (`CHANGE`), and linearly
+      beyond.
     - ``gap_spacing``, ``gap_limit``: of the particles by which distances are measured.
-    - ``training``: optimiser and schedule.
     """
 
-    network: Literal["messages", "objects"]
+    model: str = "gns"
+    swept: bool = True
+    samples: int = 1
+    spread: float = 0.05
+    stride: Literal[1, 3] = 3
     width: int = 64
     rounds: int = 3
-    particles: Sampling = field(default_factory=Sampling)
+    spacing: float = 0.10
+    limit: int = 100
+    still_limit: int = 600
+    cloth_step: int = 3
+    inner: int = 0
     radius: float = 0.12
-    swept: bool = True
-    rigid: Literal["fit", "robust"] = "fit"
     velocity_noise: float = 3e-4
     relative_noise: float = 0.02
     pushforward: int = 1
@@ -177,11 +154,50 @@ class ParticleConfig:
     knee: float = 1.0
     gap_spacing: float = 0.04
     gap_limit: int = 300
-    training: TrainingSettings = field(default_factory=TrainingSettings)
+
+    sizes: ClassVar[Sizes] = {
+        "small": {},
+        "paper": {
+            "width": 128, "spacing": 0.05, "limit": 1000, "cloth_step": 1, "radius": 0.08,
+            "gap_spacing": 0.03, "gap_limit": 1000,
+        },
+    }  # fmt: skip
+    any_weights: ClassVar[frozenset[str]] = SizedSettings.any_weights | {"spread"}
+
+    @classmethod
+    def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the settings of a size, a network, and a length of the step."""
+        sized = dict(super().defaults(model, options))
+        small = options.get("size", "small") == "small"
+        sized |= (_SMALL if small else _PAPER)[network_of(model)]
+        if options.get("stride") == 1:
+            # A shorter step: what is counted in metres a step is less. Nothing is shipped for it.
+            sized |= {"velocity_noise": cls.velocity_noise / 3, "rest": cls.rest / 3}
+        return sized
+
+    @property
+    def network(self) -> str:
+        """Kind of the network, `MESSAGES` or `OBJECTS`."""
+        return network_of(self.model)
+
+    @property
+    def sampling(self) -> Sampling:
+        """How objects become particles."""
+        return Sampling(self.spacing, self.limit, self.still_limit, self.cloth_step, self.inner)
+
+    def __post_init__(self) -> None:
+        self.at_least(1, "samples", "width", "rounds", "gap_limit")
+        self.at_least(0, "spread", "pushforward", "velocity_noise", "relative_noise", "rest")
+        _ = self.sampling  # which checks its numbers
 
 
-_SMALL = TrainingSettings(
-    steps=3000,
+def network_of(model: str) -> str:
+    """Return the network of a model by its name."""
+    return OBJECTS if model == "dpi" else MESSAGES
+
+
+_SMALL_TRAINING = TrainingSettings(
+    steps=7000,
     batch=24,
     learning_rate=2e-3,
     schedule="cosine",
@@ -191,39 +207,17 @@ _SMALL = TrainingSettings(
     log_every=50,
     checkpoint_every=500,
 )
-_PAPER = replace(_SMALL, steps=500_000, learning_rate=5e-4, warmup=2000, validate_every=5000)
-_FINE = Sampling(spacing=0.05, limit=1000, cloth_step=1)
+_PAPER_TRAINING = replace(
+    _SMALL_TRAINING, steps=500_000, learning_rate=5e-4, warmup=2000, validate_every=5000
+)
 
 
-def own_config(network: Literal["messages", "objects"], options: ParticleOptions) -> ParticleConfig:
-    """Return the settings of the sizes ``small`` and ``paper``."""
-    inner = network == "messages"
-    if options.size == "small":
-        config = ParticleConfig(
-            network,
-            rounds=5 if inner else 3,
-            particles=Sampling(limit=50, inner=6) if inner else Sampling(),
-            training=_SMALL,
-        )
-    else:
-        config = ParticleConfig(
-            network,
-            width=128,
-            rounds=10 if inner else 4,
-            particles=replace(_FINE, inner=10 if inner else 0),
-            radius=0.08,
-            gap_spacing=0.03,
-            gap_limit=1000,
-            training=_PAPER,
-        )
-    # A step of fewer frames is shorter, and so is what is counted in metres a step.
-    part = options.stride / 3
-    return replace(
-        config,
-        swept=options.swept,
-        velocity_noise=config.velocity_noise * part,
-        rest=config.rest * part,
-    )
+def training_of(settings: ParticleSettings) -> TrainingSettings:
+    """Return optimiser and schedule; those of the small size made the shipped weights."""
+    if settings.size != "small":
+        return _PAPER_TRAINING
+    small = _SMALL_TRAINING
+    return replace(small, steps=16_000) if settings.network == OBJECTS else small
 
 
 # Imagined motions of trials: their start, how near agent and patient come, and what is shown.
@@ -233,10 +227,10 @@ Futures = list[tuple[SceneParticles, Poses]]
 """Particles and motion of every sample of a trial."""
 
 
-def observed_start(motion: Motion, frames: range, settings: Sampling) -> Start:
+def observed_start(motion: Motion, frames: range, sampling: Sampling) -> Start:
     """Return the observed motion of a scene in these frames, and the steps to its end."""
     scene = motion.scene
-    own = scene_particles(scene, settings, scene.present(LAST_OBSERVED))
+    own = scene_particles(scene, sampling, scene.present(LAST_OBSERVED))
     poses = poses_of(own, motion, frames)
     # What was put somewhere between the last two steps did not move there.
     put = np.isin(own.things, put_by_events(scene, frames[-2], frames[-1]))
@@ -290,7 +284,7 @@ def join_futures(
 def smallest_gaps(
     motions: Sequence[Motion],
     futures: Sequence[Futures],
-    config: ParticleConfig,
+    settings: ParticleSettings,
     *,
     first: int,
     touch: F64,
@@ -298,13 +292,13 @@ def smallest_gaps(
     """Return the smallest gaps (B, S) of agent and patient, metres, less ``touch``.
 
     After a contact that was observed, by the rule of the label, they are -`FAR`, below every
-    threshold that a reader can fit.
+    threshold that a decision can fit.
 
     Parameters
     ----------
     motions, futures
         Observed motion and futures of each trial.
-    config
+    settings
         Settings of the search for the smallest distance.
     first
         Row of the motions from which they count, that of frame 44.
@@ -316,7 +310,7 @@ def smallest_gaps(
         for column, (particles, poses) in enumerate(own):
             later = later_poses(poses, first)
             distance = smallest_distance(
-                motion.scene, particles, later, config.gap_spacing, config.gap_limit
+                motion.scene, particles, later, settings.gap_spacing, settings.gap_limit
             )
             pair = [particles.agent, particles.patient]
             soft = min(pair) >= 0 and CLOTH in particles.kinds[pair]
@@ -349,7 +343,7 @@ def shown_particles(futures: Sequence[Futures], observed: int) -> dict[str, NDAr
     return {"particles": positions, "things": things}
 
 
-VERSIONS = {"messages": 3, "objects": 4}
+VERSIONS = {MESSAGES: 3, OBJECTS: 4}
 """By network; to be raised with every change of what equal weights predict, or of the training."""
 UNIT, CHANGE = 0.06, 0.02
 """Metres a step of 3 frames: units of displacements, and of their changes. A body that falls for
@@ -377,18 +371,17 @@ class ParticleSimulator(TorchModel):
     calibration_trials = 256
     touch: Tensor
 
-    def __init__(self, name: str, config: ParticleConfig, options: ParticleOptions) -> None:
+    settings: ParticleSettings
+
+    def __init__(self, settings: ParticleSettings) -> None:
         super().__init__()
-        self.config = self.settings = config
-        self.options = options
-        self._made_of: tuple[Any, ...] = (name, config, options)
-        self.name = f"{name}-{options.size}"
-        self.training_settings = config.training
-        self.window = 3 + config.pushforward
-        self.trained = False
-        self.samples, self.seed = options.samples, options.seed
-        self.knobs: Mapping[str, tuple[float, ...]] = {}
-        stride = options.stride
+        settings.check_shipped()
+        self.settings = settings
+        self.name = f"{settings.model}-{settings.size}"
+        self.training_settings = training_of(settings)
+        self.window = 3 + settings.pushforward
+        self.samples, self.seed = settings.samples, settings.seed
+        stride = settings.stride
         self._unit, self._change = UNIT * (stride / 3), CHANGE * (stride / 3) ** 2
         self.spec = Spec(
             inputs=("state",),
@@ -397,9 +390,11 @@ class ParticleSimulator(TorchModel):
             future=0,
             context_at="end",
         )
-        with initial_weights("particle model", options.seed):
-            self.network = self._make_network()
+        with initial_weights("particle model", settings.seed):
+            kind = MessageNetwork if settings.network == MESSAGES else ObjectNetwork
+            self.network: nn.Module = kind(settings.width, settings.rounds)
         self.register_buffer("touch", torch.zeros(2, dtype=torch.float64))
+        load_named(self, settings.weights)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how another process makes the same model, on its CPU.
@@ -408,7 +403,7 @@ class ParticleSimulator(TorchModel):
         every tensor and task.
         """
         weights = {name: value.detach().cpu().numpy() for name, value in self.state_dict().items()}
-        return _made_again, (type(self), self._made_of, weights, self.init, self.trained)
+        return _made_again, (self.settings, weights, self.init, self.trained)
 
     @property
     def trials_together(self) -> int:
@@ -434,52 +429,45 @@ class ParticleSimulator(TorchModel):
     @property
     def _weights_version(self) -> int:
         # Before, steps of one frame had the units of steps of three.
-        return VERSIONS[self.config.network] + (self.options.stride == 1)
+        return VERSIONS[self.settings.network] + (self.settings.stride == 1)
 
     def digest(self) -> str:
         """Return the SHA-256 of settings and weights; the number of futures is no part."""
-        config = asdict(self.config)
-        config.pop("training")
-        options = self.options
-        parts = [
-            self._weights_version, config, options.stride, options.spread, torch.__version__
-        ]  # fmt: skip
+        settings = asdict(self.settings)
+        for name in ("weights", "seed", "samples"):
+            settings.pop(name)
+        parts = [self._weights_version, settings, torch.__version__]
         return digest_of(parts, self.state_dict().items())
 
     def built_as(self) -> dict[str, Any]:
         """Return what the weights were made for: name, version, step, edges."""
-        options = self.options
         return {
             "model": self.name,
             "version": self._weights_version,
-            "stride": options.stride,
-            "swept": options.swept,
+            "stride": self.settings.stride,
+            "swept": self.settings.swept,
         }
 
     def start_probabilities(self, motion: Motion) -> F64:
-        """Return how often a training window starts at each frame; see `ParticleConfig.abrupt`."""
+        """Return how often a training window starts at each frame; see ``abrupt``."""
         return start_probabilities(
-            motion.trajectory, self.options.stride, self.window, self.config.abrupt
+            motion.trajectory, self.settings.stride, self.window, self.settings.abrupt
         )
 
-    def prepare(self, sample: Batch) -> None:
-        """Do nothing: the units do not depend on the clips.
-
-        A few collisions decide the standard deviation of changes, so that a sample of clips would
-        give another loss for every seed.
-        """
+    # Nothing is prepared: units do not depend on clips. A few collisions decide the standard
+    # deviation of changes, so that a sample of clips would give another loss for every seed.
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return the loss of a batch of windows, the mean over the steps that are predicted.
 
         All steps but the first start from what the network predicted, without gradient.
         """
-        config = self.config
+        settings = self.settings
         window = self._read(batch)
         if not self.training:
             # A validation is without noise, as the loss of the trivial predictor is.
             return {"loss": self._loss(window, window.later[:1])}
-        window = disturbed(rotated(window), config.velocity_noise, config.relative_noise)
+        window = disturbed(rotated(window), settings.velocity_noise, settings.relative_noise)
         return {"loss": self._loss(window, window.later)}
 
     def baseline(self, batch: Batch) -> Tensor:
@@ -525,27 +513,29 @@ class ParticleSimulator(TorchModel):
 
         Rows are ``spec.stride`` frames apart; the last observed one is frame 44.
         """
-        stride = self.options.stride
+        stride = self.settings.stride
         frames = range(LAST_OBSERVED % stride, LAST_OBSERVED + 1, stride)
         observed: list[Start] = []
         starts: list[Start] = []
         for motion in motions:
-            start = self._start(motion, frames)
+            start = observed_start(motion, frames, self.settings.sampling)
             observed += [start] * samples
             for sample in range(samples):
                 rng = generator("particle future", seed, motion.scene.name, sample)
-                spread = self.options.spread * FRAME_TIME * stride if samples > 1 else 0.0
+                spread = self.settings.spread * FRAME_TIME * stride if samples > 1 else 0.0
                 starts.append(disturbed_start(start, spread, rng))
         was_training = self.training
         self.eval()
-        known, imagined = self._prepared(observed), self._roll_out(self._prepared(starts))
+        imagined = roll_out(starts, self.step, self.device, FRAME_TIME * stride)
         self.train(was_training)
-        return join_futures(known, imagined, samples)
+        return join_futures(observed, imagined, samples)
 
     def step(self, layout: SceneLayout, before: ObjectState, now: ObjectState) -> ObjectState:
         """Return the state after the next step."""
         drift = drift_of(layout, before, now)
-        _, after = self._predict_next(layout, now, drift, robust=self.config.rigid == "robust")
+        _, after = self._predict_next(
+            layout, now, drift, robust=self.settings.model == "gns-ransac"
+        )
         return self._rested(layout, now, after)
 
     def _loss(self, window: Window, later: Sequence[ObjectState]) -> Tensor:
@@ -590,49 +580,31 @@ class ParticleSimulator(TorchModel):
         """Return the next state, but bodies that hardly move stay where they are."""
         turn = vector_from_rotation(after.rotations @ now.rotations.transpose(-1, -2))
         moved = (after.centers - now.centers).norm(dim=-1) + turn.norm(dim=-1) * layout.size
-        rests = ((layout.kinds == RIGID) & (moved < self.config.rest))[:, None]
+        rests = ((layout.kinds == RIGID) & (moved < self.settings.rest))[:, None]
         return ObjectState(
             torch.where(rests, now.centers, after.centers),
             torch.where(rests[:, None], now.rotations, after.rotations),
             after.loose,
         )
 
-    def _make_network(self) -> nn.Module:
-        config = self.config
-        kind = MessageNetwork if config.network == "messages" else ObjectNetwork
-        return kind(config.width, config.rounds)
-
-    def _start(self, motion: Motion, frames: range) -> Start:
-        """Return the observed motion of a scene in these frames, and the steps to its end."""
-        return observed_start(motion, frames, self.config.particles)
-
-    def _prepared(self, starts: Sequence[Start]) -> Sequence[Start]:
-        """Return scenes in the form in which the network moves them."""
-        return starts
-
-    def _roll_out(self, starts: Sequence[Start]) -> list[Poses]:
-        """Return what the model imagines to follow each start."""
-        return roll_out(starts, self.step, self.device, FRAME_TIME * self.options.stride)
-
     def gaps(self, motions: Sequence[Motion], futures: Sequence[Futures]) -> F64:
         """Return the smallest gaps (B, S) of agent and patient, less ``touch``.
 
         They count from frame 44 on. After a contact that was observed, by the rule of the label,
-        they are -`FAR`, below every threshold that a reader can fit.
+        they are -`FAR`, below every threshold that a decision can fit.
         """
         touch = self.touch.cpu().numpy()
         first = self.spec.context - 1
-        return smallest_gaps(motions, futures, self.config, first=first, touch=touch)
+        return smallest_gaps(motions, futures, self.settings, first=first, touch=touch)
 
     def _read(self, batch: Batch) -> Window:
-        config = self.config
-        return read_window(batch, config.particles, self.device)
+        return read_window(batch, self.settings.sampling, self.device)
 
     def _graph(self, layout: SceneLayout, drift: Drift) -> Graph:
-        config = self.config
-        near_only = config.network == "objects"
+        settings = self.settings
+        near_only = settings.network == OBJECTS
         return make_graph(
-            layout, drift, config.radius, self._unit, swept=config.swept, near_only=near_only
+            layout, drift, settings.radius, self._unit, swept=settings.swept, near_only=near_only
         )
 
     def _changes(self, graph: Graph) -> Tensor:
@@ -661,7 +633,7 @@ class ParticleSimulator(TorchModel):
         if not robust:
             return fit_rigid(layout.shape, goal, layout.owners, layout.objects)
         draws = torch.rand(_HYPOTHESES, 4, generator=torch.Generator().manual_seed(0))
-        tolerance = _INLIER * self.config.particles.spacing
+        tolerance = _INLIER * self.settings.spacing
         rotations, centers, _ = fit_robust(
             layout.shape, goal, layout.owners, layout.objects, tolerance, draws.to(goal.device)
         )
@@ -669,7 +641,7 @@ class ParticleSimulator(TorchModel):
 
     def _error(self, layout: SceneLayout, target: ObjectState, predicted: Tensor) -> Tensor:
         squares = ((predicted - target.positions(layout)) / self._change).pow(2).sum(-1)
-        errors = _softened(mean_by(squares, layout.owners, layout.objects), self.config.knee)
+        errors = _softened(mean_by(squares, layout.owners, layout.objects), self.settings.knee)
         free = (layout.kinds != KINEMATIC).double()
         return ((errors * free).sum() / free.sum().clamp_min(1)).float()
 
@@ -680,13 +652,12 @@ def _counts(layout: SceneLayout) -> Tensor:
 
 
 def _made_again(
-    kind: type[ParticleSimulator],
-    made_of: tuple[Any, ...],
+    settings: ParticleSettings,
     weights: Mapping[str, NDArray[np.generic]],
     init: str,
     trained: bool,
 ) -> ParticleSimulator:
-    model = kind(*made_of)
+    model = ParticleSimulator(replace(settings, weights=RANDOM))
     model.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
     model.init, model.trained = init, trained
     return model.eval()
@@ -697,46 +668,16 @@ def _softened(squares: Tensor, knee: float) -> Tensor:
     return 2 * knee**2 * ((1 + squares / knee**2).sqrt() - 1)
 
 
-# Building of the particle models by name, with random, shipped or given weights.
+def gns(settings: ParticleSettings) -> ParticleSimulator:
+    """Build a graph network simulator (GNS)."""
+    return ParticleSimulator(settings)
 
 
-def gns(**options: Any) -> ParticleSimulator:
-    """Build a graph network simulator (GNS); ``options`` are those of `ParticleOptions`."""
-    return _build("gns", "messages", options)
+def gns_ransac(settings: ParticleSettings) -> ParticleSimulator:
+    """Build a GNS that keeps bodies rigid by a robust fit."""
+    return ParticleSimulator(settings)
 
 
-def gns_ransac(**options: Any) -> ParticleSimulator:
-    """Build a GNS that keeps bodies rigid by a robust fit; ``options`` as `gns`."""
-    return _build("gns-ransac", "messages", options, robust=True)
-
-
-def dpi(**options: Any) -> ParticleSimulator:
-    """Build a DPI-Net; ``options`` are those of `ParticleOptions`."""
-    return _build("dpi", "objects", options)
-
-
-def _build(
-    name: str,
-    network: Literal["messages", "objects"],
-    options: Mapping[str, Any],
-    *,
-    robust: bool = False,
-) -> ParticleSimulator:
-    chosen = make_config(ParticleOptions, name, options)
-    config = own_config(network, chosen)
-    if robust:
-        config = replace(config, rigid="robust")
-    return _weighted(ParticleSimulator(name, config, chosen))
-
-
-def _weighted(model: ParticleSimulator) -> ParticleSimulator:
-    """Return a model with the weights that its options name."""
-    options = model.options
-    own = options.size == "small" and options.swept and options.stride == 3
-    if options.weights == CheckpointSHIPPED and not own:
-        raise BadInputError(
-            "weights of particle models are shipped for size=small, swept=true and stride=3; "
-            "train others with physion train"
-        )
-    load_named(model, options.weights)
-    return model
+def dpi(settings: ParticleSettings) -> ParticleSimulator:
+    """Build a DPI-Net."""
+    return ParticleSimulator(settings)
