@@ -294,7 +294,7 @@ def moving_errors(model: Any, batch: Batch) -> tuple[float, float, float]:
     assert batch.rgb is not None, "the clips have pictures"
     pictures = torch.as_tensor(batch.rgb).permute(0, 1, 4, 2, 3).float() / 255
     valid = torch.as_tensor(batch.valid)
-    empty = empty_scene_error(pictures, model.config.imagined, valid).moving
+    empty = empty_scene_error(pictures, model.settings.imagined, valid).moving
     own, copied = model.loss(batch)["loss"], model.baseline(batch)
     return 1000 * float(own), 1000 * float(copied), 1000 * float(empty)
 

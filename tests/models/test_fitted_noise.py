@@ -56,35 +56,34 @@ def test_the_model_simulates_with_these_levels(half: int) -> None:
     fitted = build_model("noisy-simulation-people").imagine(batch, 20, 0)
     given = build_model("noisy-simulation", **levels).imagine(batch, 20, 0)
     assert np.array_equal(fitted.contact, given.contact)
-    named = build_model("noisy-simulation", levels="people").imagine(batch, 20, 0)
-    assert np.array_equal(fitted.contact, named.contact)
 
 
 def test_the_table_of_predictions_says_what_the_noise_was_fitted_to() -> None:
-    names = {build_model("noisy-simulation", levels=name).provenance() for name in FITTED}
+    names = {build_model(f"noisy-simulation-{name}").provenance() for name in FITTED}
     assert {p.model for p in names} == {"noisy-simulation-outcomes", "noisy-simulation-people"}
     assert all(p.dynamics_training_task.startswith("noise fitted to") for p in names)
     assert build_model("noisy-simulation").provenance().dynamics_training_task == ""
 
 
 def test_fitted_levels_have_digests_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    digests = {build_model("noisy-simulation", levels=name).digest() for name in ("given", *FITTED)}
+    names = ("noisy-simulation", *(f"noisy-simulation-{name}" for name in FITTED))
+    digests = {build_model(name).digest() for name in names}
     assert len(digests) == 3
     other = {**FITTED, "people": (FITTED["people"][0], NoiseLevels(velocity=9.0))}
     monkeypatch.setattr("physion.models.noisy_simulation.FITTED", other)
-    assert build_model("noisy-simulation", levels="people").digest() not in digests
+    assert build_model("noisy-simulation-people").digest() not in digests
 
 
 def test_nothing_is_fitted_to_the_trials_at_hand() -> None:
-    assert build_model("noisy-simulation", levels="people").knobs == {"scale": (1.0,)}
+    assert build_model("noisy-simulation-people").knobs == {"scale": (1.0,)}
     assert build_model("noisy-simulation").knobs == {"scale": (0.5, 1.0, 2.0)}
 
 
 def test_levels_are_fitted_or_given() -> None:
-    with pytest.raises(BadInputError, match="levels=people sets all levels; leave out velocity"):
+    with pytest.raises(BadInputError, match="is fitted: leave out velocity"):
         build_model("noisy-simulation-people", velocity=0.3)
-    with pytest.raises(UnknownNameError, match="'persons'"):
-        build_model("noisy-simulation", levels="persons")
+    with pytest.raises(UnknownNameError, match="'noisy-simulation-persons'"):
+        build_model("noisy-simulation-persons")
 
 
 def test_a_scene_without_a_configuration_counts_by_its_name() -> None:

@@ -13,7 +13,7 @@ from physion.compute.local import LocalExecutor
 from physion.core.errors import BadInputError
 from physion.core.seeds import child_generator, trial_seed
 from physion.models import Batch, Motion, build_model
-from physion.models.noisy_simulation import NoisySimulation, NoisySimulationConfig, cut_trial
+from physion.models.noisy_simulation import NoisySimulation, NoisySimulationSettings, cut_trial
 from physion.models.state_noise import add_noise, simulate_contacts
 from physion.numerics.elementary import exp_of, standard_normal
 from physion.physics.engine import make_engine, simulate
@@ -86,7 +86,7 @@ class StraightEngine:
 
 
 def model(**options: Any) -> NoisySimulation:
-    return NoisySimulation(NoisySimulationConfig(**options), StraightEngine())
+    return NoisySimulation(NoisySimulationSettings(**options), StraightEngine())
 
 
 def context(trial: Scene, truth: Trajectory) -> Batch:
@@ -126,7 +126,7 @@ def test_contact_that_was_seen_needs_no_simulation() -> None:
     assert truth.contacts.frame[0] < 45
     # It flies out on the other side, so simulating on from frame 44 could find nothing.
     truth = replace(truth, velocities=truth.velocities * -1)
-    assert fraction(NoisySimulation(NoisySimulationConfig(), engine), trial, truth) == 1.0
+    assert fraction(NoisySimulation(NoisySimulationSettings(), engine), trial, truth) == 1.0
     assert engine.starts == []
 
 
@@ -152,7 +152,7 @@ def test_it_goes_on_from_the_last_observed_frame_under_the_trials_own_ending() -
     trial = scene(0.5)
     engine = StraightEngine()
     truth = engine.simulate(trial)
-    fraction(NoisySimulation(NoisySimulationConfig(samples=2), engine), trial, truth)
+    fraction(NoisySimulation(NoisySimulationSettings(samples=2), engine), trial, truth)
     assert [start.frame for start in engine.starts] == [44, 44]
     ending = engine.scenes[0].ending
     assert (ending.min_frames, ending.max_frames) == (151 - 44, 302 - 44)
@@ -161,7 +161,7 @@ def test_it_goes_on_from_the_last_observed_frame_under_the_trials_own_ending() -
 def test_noise_has_the_stated_size_and_spares_what_cannot_move() -> None:
     trial = scene()
     question = cut_trial(trial, StraightEngine().simulate(trial))
-    config = NoisySimulationConfig(position=0.1, velocity=0.3, mass=0.2)
+    config = NoisySimulationSettings(position=0.1, velocity=0.3, mass=0.2)
     pairs = [add_noise(question, config, 2.0, sample, 0) for sample in range(400)]
     places = np.array([state.positions for _, state in pairs]) - question.state.positions
     speeds = np.array([state.velocities for _, state in pairs]) - question.state.velocities
@@ -180,7 +180,7 @@ def test_joined_bodies_move_together_and_a_cloth_moves_whole() -> None:
     base = StraightEngine().simulate(replace(trial, cloths=()))
     truth = replace(base, cloth_vertices=np.zeros((FRAMES, 9, 3), np.float32))
     question = cut_trial(trial, truth)
-    _, state = add_noise(question, NoisySimulationConfig(), 1.0, 0, 0)
+    _, state = add_noise(question, NoisySimulationSettings(), 1.0, 0, 0)
     moved = state.positions - question.state.positions
     assert moved[0] == pytest.approx(moved[1]) and moved[0].any()
     cloth = state.cloth_vertices - question.state.cloth_vertices
@@ -191,7 +191,7 @@ def test_joined_bodies_move_together_and_a_cloth_moves_whole() -> None:
 def test_noise_of_the_pose_is_that_of_bodies_in_the_air() -> None:
     trial = scene()
     question = cut_trial(trial, StraightEngine().simulate(trial))
-    config = NoisySimulationConfig(
+    config = NoisySimulationSettings(
         vertical=0.1, rotation=0.2, angular_velocity=0.5, friction=0.3, position=0.0
     )
     pairs = [add_noise(question, config, 2.0, sample, 0) for sample in range(400)]
@@ -215,7 +215,7 @@ def test_bodies_that_touch_something_are_not_lifted() -> None:
     trial = scene()
     question = cut_trial(trial, StraightEngine().simulate(trial))
     resting = replace(question, touching=frozenset({0}))
-    config = NoisySimulationConfig(vertical=0.1, rotation=0.2)
+    config = NoisySimulationSettings(vertical=0.1, rotation=0.2)
     _, state = add_noise(resting, config, 1.0, 0, 0)
     assert (state.positions[:, 2] == question.state.positions[:, 2]).all()
     assert not state.rotations[0, 1:3].any() and state.rotations[0, 3] != 0
@@ -224,8 +224,8 @@ def test_bodies_that_touch_something_are_not_lifted() -> None:
 def test_a_level_of_zero_leaves_the_random_numbers_of_the_others() -> None:
     trial = scene()
     question = cut_trial(trial, StraightEngine().simulate(trial))
-    _, base = add_noise(question, NoisySimulationConfig(), 1.0, 3, 0)
-    _, more = add_noise(question, NoisySimulationConfig(vertical=0.1, friction=0.2), 1.0, 3, 0)
+    _, base = add_noise(question, NoisySimulationSettings(), 1.0, 3, 0)
+    _, more = add_noise(question, NoisySimulationSettings(vertical=0.1, friction=0.2), 1.0, 3, 0)
     assert np.array_equal(base.velocities, more.velocities)
     assert np.array_equal(base.positions[:, :2], more.positions[:, :2])
     assert np.array_equal(base.rotations, question.state.rotations)
@@ -238,7 +238,7 @@ def test_lapses_are_answers_at_random() -> None:
         lapse: np.mean(
             simulate_contacts(
                 question,
-                NoisySimulationConfig(scale=0.0, lapse=lapse),
+                NoisySimulationSettings(scale=0.0, lapse=lapse),
                 0.0,
                 1000,
                 0,
@@ -269,7 +269,7 @@ def relayed() -> Scene:
 
 def test_noise_at_contacts_acts_where_bodies_meet() -> None:
     """Without a contact nothing changes; after one, the paths spread."""
-    still = NoisySimulationConfig(position=0.0, velocity=0.0, mass=0.0)
+    still = NoisySimulationSettings(position=0.0, velocity=0.0, mass=0.0)
     noisy = replace(still, contact=0.4)
     missed, hit = rolling(3.0), relayed()
     engine = make_engine("physion")
@@ -286,7 +286,7 @@ def test_noise_depends_on_seed_trial_and_sample_alone() -> None:
 
     def state(seed: int, name: str, sample: int) -> list[float]:
         question = cut_trial(scene(name=name), truth)
-        _, noisy = add_noise(question, NoisySimulationConfig(), 1.0, sample, seed)
+        _, noisy = add_noise(question, NoisySimulationSettings(), 1.0, sample, seed)
         return noisy.positions.ravel().tolist()
 
     assert state(0, "a", 0) == state(0, "a", 0)
@@ -299,7 +299,7 @@ def test_noise_depends_on_seed_trial_and_sample_alone() -> None:
 def test_noise_is_that_of_the_platform_independent_functions() -> None:
     trial = scene()
     question = cut_trial(trial, StraightEngine().simulate(trial))
-    config = NoisySimulationConfig(position=0.1, velocity=0.3, mass=0.2)
+    config = NoisySimulationSettings(position=0.1, velocity=0.3, mass=0.2)
     noisy, state = add_noise(question, config, 2.0, 7, config.seed)
     rng = child_generator(trial_seed(config.seed, trial.scenario, trial.name, 7), "noise")
     shift, kick = standard_normal(rng, (3, 2)), standard_normal(rng, (3, 3))
@@ -338,7 +338,7 @@ def test_seed_and_scale_of_the_rollouts_are_those_of_the_call() -> None:
 )
 def test_impossible_settings_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(BadInputError):
-        NoisySimulationConfig(**wrong)
+        NoisySimulationSettings(**wrong)
     with pytest.raises(BadInputError, match="fewer than the 45"):
         cut_trial(scene(), replace_length(StraightEngine().simulate(scene()), 44))
 

@@ -18,8 +18,9 @@ from PIL import Image
 from torch import Tensor
 
 from physion.core.errors import BadInputError, MissingExtraError, UnknownNameError
+from physion.models.build import make_settings
 from physion.models.encoders import weights as packages
-from physion.models.encoders.encoder import FAMILIES
+from physion.models.encoders.encoder import EncoderSettings
 from physion.models.encoders.weights import (
     EncoderWeights,
     WeightsPackage,
@@ -131,7 +132,7 @@ def test_the_origin_is_named() -> None:
 
 def test_models_with_packaged_weights_have_the_network_and_size_of_the_package() -> None:
     for size in ("small", "paper"):
-        config = FAMILIES["pEffNetLite0"][size].config
+        config = make_settings(EncoderSettings, "pEffNetLite0-mlp", {"size": size})
         package = EncoderWeights(config.weights).package
         assert package is not None and package.encoder == config.encoder
         assert (config.image_size == package.image_size) is (size == "paper")

@@ -11,18 +11,17 @@ import pytest
 
 from physion.cli.model_options import parse_options
 from physion.core.errors import BadInputError, PhysionError
-from physion.models.baselines.pixels import BlobCentroidsConfig
-from physion.models.build import build_model, make_config
-from physion.models.encoders.encoder import EncoderConfig
-from physion.models.encoders.video import VideoConfig
-from physion.models.noisy_simulation import NoisySimulationConfig
-from physion.models.particles.simulator import ParticleOptions
-from physion.models.vision import VisionOptions
-
-CONFIGS: list[Any] = [
-    BlobCentroidsConfig, EncoderConfig, NoisySimulationConfig, ParticleOptions, VideoConfig,
-    VisionOptions,
-]  # fmt: skip
+from physion.models.build import (
+    build_model,
+    build_untrained,
+    make_settings,
+    models,
+    option_names,
+    settings_type,
+)
+from physion.models.interface import Model, ModelSettings
+from physion.models.noisy_simulation import NoisySimulationSettings
+from support.tiny_models import UNTRAINED, tiny
 
 
 @pytest.mark.parametrize(
@@ -48,23 +47,88 @@ def test_values_of_another_type_are_one_line(option: str, says: str) -> None:
     assert "\n" not in str(error.value) and len(str(error.value)) < 300
 
 
-def test_a_choice_without_a_check_of_its_own_is_checked() -> None:
-    with pytest.raises(PhysionError, match="pooled"):
-        make_config(EncoderConfig, "m", {"pooling": "other"})
-    with pytest.raises(BadInputError, match="dynamics must be mlp or lstm"):
-        make_config(EncoderConfig, "m", {"dynamics": "other"})
+def test_a_choice_is_checked() -> None:
+    with pytest.raises(BadInputError, match="pooling of model frozen-encoder must be .pooled. or"):
+        build_model("frozen-encoder", pooling="other")
 
 
-@pytest.mark.parametrize("kind", CONFIGS)
-def test_defaults_are_of_their_types(kind: Any) -> None:
-    values = {f.name: getattr(kind(), f.name) for f in dataclasses.fields(kind)}
-    assert make_config(kind, "m", values) == kind()
+@pytest.mark.parametrize("name", models.names())
+def test_every_field_of_the_settings_is_an_option(name: str) -> None:
+    """The values that a model has can be given again, and give the same settings."""
+    kind = settings_type(models.get(name))
+    assert kind is not None and issubclass(kind, ModelSettings)
+    built = tiny(name).settings
+    values = dataclasses.asdict(built)
+    assert values.pop("model") in (name, built.model) and tuple(values) == option_names(name)
+    if not (name.startswith("noisy-simulation-") or name == "frozen-encoder"):
+        assert make_settings(kind, name, values) == built
+
+
+@pytest.mark.parametrize("name", ["svg", "op3", "cswm", "rpin", "gns", "gns-ransac", "dpi"])
+def test_shipped_weights_are_the_default_and_only_for_their_settings(name: str) -> None:
+    shipped: Any = build_model(name)
+    assert shipped.trained and shipped.init.startswith("shipped:")
+    fresh: Any = build_untrained(name)
+    assert not fresh.trained and fresh.init == "random"
+    assert fresh.digest() == build_model(name, **UNTRAINED).digest() != shipped.digest()
+    paper = settings_type(models.get(name))
+    assert paper is not None and make_settings(paper, name, {"size": "paper"}).weights == "random"
+    with pytest.raises(BadInputError, match=f"shipped weights of {name} are for .*weights=random"):
+        build_model(
+            name,
+            **{
+                "rollout"
+                if name == "rpin"
+                else "hidden"
+                if "hidden" in option_names(name)
+                else "width": 24
+            },
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class BlinkSettings:
+    """Settings of a user's model."""
+
+    rate: float = 1.0
+
+
+class Blink(Model):
+    """Model of a user; its options are the fields of the settings."""
+
+    def __init__(self, settings: BlinkSettings) -> None:
+        self.settings = settings
+
+
+class Plain(Model):
+    """Model of a user with plain arguments."""
+
+    def __init__(self, gain: float = 1.0, name: str = "", extra: Any = None) -> None:
+        self.gain, self.name, self.extra = gain, name, extra
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "says"),
+    [
+        (Blink, {"rate": "high"}, "option rate of model own must be a finite number, not 'high'"),
+        (Blink, {"rat": 1.0}, "unknown option of model own 'rat'; closest: rate"),
+        (Plain, {"gain": "high"}, "option gain of model own must be a finite number, not 'high'"),
+        (Plain, {"gian": 1.0}, "unknown option of model own 'gian'; closest: gain"),
+    ],
+)
+def test_options_of_a_model_of_ones_own_are_checked(
+    kind: Any, options: dict[str, Any], says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("physion.models.build._factory", lambda name: kind)
+    with pytest.raises(PhysionError, match=says) as error:
+        build_model("own", **options)
+    assert "\n" not in str(error.value)
 
 
 def test_python_may_give_tuples_numbers_of_numpy_and_whole_numbers() -> None:
-    config = make_config(
-        NoisySimulationConfig,
-        "m",
+    config = make_settings(
+        NoisySimulationSettings,
+        "noisy-simulation",
         {"samples": np.int64(3), "scales": (1, np.float32(0.5)), "scale": 2},
     )
     assert (config.samples, config.scales, config.scale) == (3, (1.0, 0.5), 2.0)

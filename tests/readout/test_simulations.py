@@ -14,7 +14,7 @@ import pytest
 import physion.clips.states
 from physion.core.errors import BadInputError
 from physion.models import Batch, Provenance, Spec
-from physion.models.noisy_simulation import NoisySimulation, NoisySimulationConfig
+from physion.models.noisy_simulation import NoisySimulation, NoisySimulationSettings
 from physion.physics.trajectory import Contacts, State, Trajectory
 from physion.readout.evaluate import evaluate
 from physion.readout.folds import Protocol, plan_folds
@@ -24,7 +24,7 @@ from physion.scenes.scene import Body, Camera, Roles, Scene
 from physion.trials.trial_file import Trial
 
 FRAMES = 100
-CONFIG = NoisySimulationConfig(
+CONFIG = NoisySimulationSettings(
     position=0.05, velocity=0.0, mass=0.0, scales=(0.0, 1.0, 40.0), samples=20
 )
 

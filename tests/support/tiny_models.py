@@ -18,9 +18,11 @@ VIDEO: dict[str, Any] = {
     "weights": "random", "image_size": 32, "patch": 8, "frames": 4, "width": 24, "depth": 2,
     "heads": 2, "later": 2,
 }  # fmt: skip
+UNTRAINED: dict[str, Any] = {"weights": "random"}
 OPTIONS: dict[str, dict[str, Any]] = {
     **dict.fromkeys(FROZEN, TINY),
     **dict.fromkeys(("VideoMAE", "V-JEPA2"), VIDEO),
+    **dict.fromkeys(("svg", "op3", "cswm", "rpin", "gns", "gns-ransac", "dpi"), UNTRAINED),
     "noisy-simulation": {"samples": 3},
     "noisy-simulation-outcomes": {"samples": 3},
     "noisy-simulation-people": {"samples": 3},

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -10,24 +9,24 @@ import torch
 from torch import nn
 
 from physion.core.errors import BadInputError
-from physion.models.build import build_model
+from physion.models.build import build_model, make_settings
 from physion.models.cswm import (
+    TRAINING,
     Cswm,
+    CswmSettings,
     SlotExtractor,
     SlotTransition,
     all_pairs_loss,
-    cswm_config,
     energy,
     hinge_loss,
     rank_next_states,
     ranking,
 )
-from physion.models.vision import VisionOptions
 from support.moving_squares import squares, with_arrays
 
 
 def model_of(**options: Any) -> Any:
-    return build_model("cswm", **options).eval()  # type: ignore[attr-defined]
+    return build_model("cswm", **{"weights": "random", **options}).eval()  # type: ignore[attr-defined]
 
 
 def test_energy_of_given_states() -> None:
@@ -171,7 +170,7 @@ def test_every_slot_depends_on_every_other() -> None:
 
 @pytest.mark.parametrize("size", ["small", "paper", "released"])
 def test_maps_have_the_computed_size(size: Any) -> None:
-    config = cswm_config(size)
+    config = make_settings(CswmSettings, "cswm", {"size": size})
     extractor = SlotExtractor(3, 4, config.slots, config.kernels, config.strides).eval()
     with torch.no_grad():
         maps = extractor(torch.zeros(1, 3, config.image_size, config.image_size))
@@ -192,7 +191,7 @@ def test_a_state_is_made_of_successive_pictures_the_oldest_first() -> None:
 
 
 def test_features_begin_with_the_first_state_as_published() -> None:
-    model = Cswm(replace(cswm_config("small"), stacked=3, memory=1), VisionOptions()).eval()
+    model = Cswm(CswmSettings(stacked=3, memory=1, weights="random")).eval()
     batch = squares(2, 5, model.spec)
     with torch.no_grad():
         features, states = model.encode(batch), model._states(batch).flatten(2)
@@ -208,7 +207,7 @@ def test_a_clip_that_is_too_short_is_refused() -> None:
 
 
 def test_betas_of_zero_are_an_adam_that_is_made_anew_at_every_step() -> None:
-    betas = cswm_config("released").training.betas
+    betas = TRAINING["released"].betas
     start = torch.randn(5, generator=torch.Generator().manual_seed(0))
     kept, renewed = start.clone().requires_grad_(), start.clone().requires_grad_()
     optimizer = torch.optim.Adam([kept], 5e-4, betas=betas)

@@ -17,7 +17,6 @@ from physion.models.encoders.encoder import (
     FINE_TUNING,
     RELEASED_TRAINING,
     EncoderModel,
-    frozen_encoder,
 )
 from physion.models.encoders.weights import (
     IMAGENET,
@@ -37,7 +36,9 @@ def test_family_and_size_stand_in_the_name(family: str, size: str) -> None:
     assert model.provenance().model == f"{family}-lstm-{size}{pretraining}"
     assert model.provenance().encoder_pretraining_task
     random = build_model(f"{family}-lstm", size=size, hidden=2, weights="random").provenance()
-    assert random.model == f"random-{model.config.encoder}-lstm-{size}" and random.init == "random"
+    assert (
+        random.model == f"random-{model.settings.encoder}-lstm-{size}" and random.init == "random"
+    )
     assert random.encoder_pretraining_task == random.encoder_pretraining_dataset == ""
 
 
@@ -52,8 +53,8 @@ def test_encoders_are_those_of_the_paper_and_of_the_released_code() -> None:
     for (name, size), (encoder, features) in expected.items():
         model: Any = build_model(name, size=size, hidden=2, weights="random")
         assert (model.provenance().encoder_type, model.feature_size) == (encoder, features)
-        assert model.spec.image_size == 224 and model.config.residual is False
-        assert model.config.standardised is (size == "paper")
+        assert model.spec.image_size == 224 and model.settings.residual is False
+        assert model.settings.standardised is (size == "paper")
 
 
 def test_another_encoder_does_not_bear_the_name_of_the_family(tmp_path: Path) -> None:
@@ -98,7 +99,7 @@ def test_weights_that_timm_lacks_are_refused_at_once(
     encoder: str, weights: str, known: str
 ) -> None:
     with pytest.raises(BadInputError, match=rf"timm has no weights '{weights}'.*{known}") as caught:
-        frozen_encoder(encoder=encoder, weights=weights, image_size=112)
+        build_model("frozen-encoder", encoder=encoder, weights=weights, image_size=112)
     assert "\n" not in str(caught.value)
 
 
@@ -161,7 +162,7 @@ def test_training_follows_the_size() -> None:
 
 
 def test_without_standardisation_features_stay_as_they_are() -> None:
-    model = frozen_encoder(**TINY, standardised=False)
+    model = build_model("frozen-encoder", **TINY, standardised=False)
     assert isinstance(model, EncoderModel)
     features = torch.randn(3, 9, model.feature_size) * 5 + 2
     model.set_scale(features)

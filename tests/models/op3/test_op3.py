@@ -14,7 +14,7 @@ from torch.distributions import Categorical, Independent, MixtureSameFamily, Nor
 
 from physion.clips.batch import Batch
 from physion.core.errors import BadInputError
-from physion.models.build import build_model
+from physion.models.build import build_model, make_settings
 from physion.models.checkpoint import tensors_of, write_checkpoint
 from physion.models.op3 import (
     BroadcastConv,
@@ -22,15 +22,13 @@ from physion.models.op3 import (
     Explained,
     Likelihood,
     Op3,
-    Op3Config,
-    Op3Options,
+    Op3Settings,
     SlotDecoder,
     SlotDynamics,
     SlotInference,
     Slots,
     coordinates,
     log_likelihood,
-    op3_config,
     plain_maps,
     slope_maps,
     weighted_means,
@@ -38,14 +36,14 @@ from physion.models.op3 import (
 from physion.models.vision import normalized_pictures
 from support.moving_squares import squares, with_arrays
 
-TINY = Op3Config(
+TINY = Op3Settings(
     image_size=16, slots=3, deterministic=4, stochastic=5, width=6, hidden=8, effect=4,
-    seed_steps=2, past=2, imagined=2, context=3, future=3,
+    seed_steps=2, past=2, imagined=2, context=3, future=3, weights="random",
 )  # fmt: skip
 
 
 def tiny(**changes: Any) -> Op3:
-    return Op3(replace(TINY, **changes), Op3Options()).eval()
+    return Op3(replace(TINY, **changes)).eval()
 
 
 def context_of(model: Op3, clips: int = 2) -> Batch:
@@ -196,7 +194,9 @@ def test_later_steps_weigh_more_and_missing_frames_do_not_count() -> None:
 
 def test_sizes_and_their_names() -> None:
     assert build_model("op3").provenance().model == "op3-small"
-    paper, released = (op3_config(Op3Options(size=size)) for size in ("paper", "released"))
+    paper, released = (
+        make_settings(Op3Settings, "op3", {"size": size}) for size in ("paper", "released")
+    )
     assert (paper.slots, paper.deterministic, paper.stochastic) == (8, 64, 64)
     assert replace(released, density="gaussian") == paper and released.density == "released"
     assert tiny(density="released").digest() != tiny().digest()

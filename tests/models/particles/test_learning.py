@@ -65,7 +65,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.fixture(scope="module")
 def result(dataset: Dataset) -> Result:
     """Train a model and imagine the tested trials."""
-    model = build_model("dpi", seed=0)
+    model = build_model("dpi", seed=0, weights="random")
     assert isinstance(model, ParticleSimulator)
     train_model(
         model,

@@ -65,7 +65,7 @@ def test_a_resumed_training_gives_the_files_of_an_uninterrupted_one(tmp_path: Pa
         validate_every=4, log_every=2, checkpoint_every=3,
     )  # fmt: skip
 
-    source = Simulated(build_model("dpi").spec)
+    source = Simulated(build_model("dpi", weights="random").spec)
 
     def train(folder: str, killed: int | None = None) -> tuple[Any, list[int]]:
         """Return the model and the steps that were counted."""
@@ -76,7 +76,7 @@ def test_a_resumed_training_gives_the_files_of_an_uninterrupted_one(tmp_path: Pa
             if done == killed:
                 raise Killed
 
-        model = build_model("dpi")
+        model = build_model("dpi", weights="random")
         train_model(
             model, source, source.trials, seed=1, name="all", folder=tmp_path / folder,
             settings=settings, accelerator="cpu", progress=progress,
@@ -96,6 +96,8 @@ def test_a_resumed_training_gives_the_files_of_an_uninterrupted_one(tmp_path: Pa
     torch.rand(3)  # the state of torch's generator does not matter
     resumed, later = train("parts")
     assert steps[0] == 1 and later[0] == 4, "it goes on after the checkpoint"
-    assert equal_weights(resumed, whole) and not equal_weights(resumed, build_model("dpi"))
+    assert equal_weights(resumed, whole) and not equal_weights(
+        resumed, build_model("dpi", weights="random")
+    )
     assert files("parts") == files("whole")
     assert any(Path(path).name == WEIGHTS for path in files("parts"))

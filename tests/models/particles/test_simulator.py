@@ -66,7 +66,7 @@ def observed(*motions: Motion) -> Batch:
 
 
 def model_of(name: str, **options: object) -> ParticleSimulator:
-    model = build_model(name, **options)
+    model = build_model(name, **{"weights": "random", **options})
     assert isinstance(model, ParticleSimulator)
     return model
 
@@ -82,7 +82,7 @@ def silent(name: str, **options: object) -> ParticleSimulator:
 
 def last_states(model: ParticleSimulator, *motions: Motion):  # type: ignore[no-untyped-def]
     """Return layout and the last two observed states."""
-    particles = [scene_particles(m.scene, model.config.particles) for m in motions]
+    particles = [scene_particles(m.scene, model.settings.sampling) for m in motions]
     poses = [poses_of(p, m, [41, 44]) for p, m in zip(particles, motions, strict=True)]
     layout = join_scenes(particles, model.device)
     return layout, join_poses(poses, 0, model.device), join_poses(poses, 1, model.device)
@@ -207,7 +207,7 @@ def test_the_graph_of_dpi_has_particles_near_something_alone(collide: Motion) ->
     def expected(before: ObjectState, now: ObjectState) -> torch.Tensor:
         drift = drift_of(layout, before, now)
         ends = torch.stack([drift.positions, drift.positions + drift.moves])[..., 2]
-        return free & (ends.min(0).values - layout.floor[layout.owners] < model.config.radius)
+        return free & (ends.min(0).values - layout.floor[layout.owners] < model.settings.radius)
 
     assert without_edge(now, now).any()
     assert not without_edge(at(0.3), at(0.3)).any()
@@ -269,7 +269,7 @@ def test_the_moments_of_an_object_turn_with_it(collide: Motion) -> None:
 
 def test_a_body_that_hardly_moves_rests(collide: Motion) -> None:
     model = model_of("dpi")
-    rest = model.config.rest
+    rest = model.settings.rest
     layout, _, now = last_states(model, collide)
     free = (layout.kinds == RIGID).nonzero()[:, 0]
     shifts = torch.zeros_like(now.centers)
@@ -291,7 +291,7 @@ def test_a_body_that_hardly_moves_rests(collide: Motion) -> None:
 def test_later_steps_of_a_training_start_from_the_prediction(name: str, collide: Motion) -> None:
     model = model_of(name)
     batch = window(collide, steps=4)
-    states = read_window(batch, model.config.particles, model.device)
+    states = read_window(batch, model.settings.sampling, model.device)
     layout, (first, second) = states.layout, states.later
     predicted = model.step(layout, states.before, states.now)
     assert (predicted.centers - first.centers).abs().max() > 1e-3
@@ -310,7 +310,7 @@ def test_a_network_overfits_one_window(
     model = model_of(name)
     batch = window(collide, motion("drop", 4), start=60)
     model.prepare(batch)
-    model.config = replace(model.config, velocity_noise=0.0, relative_noise=0.0)
+    model.settings = replace(model.settings, velocity_noise=0.0, relative_noise=0.0)
     baseline = float(model.baseline(batch))
     optimizer = torch.optim.Adam(model.parameters(), 2e-3)
     torch.manual_seed(0)
@@ -329,8 +329,7 @@ def test_single_particles_and_bodies_at_one_place_give_finite_numbers(
 ) -> None:
     """Sizes, moments, spreads and distances of 0 are divided by, and normalized."""
     model = model_of(name)
-    particles = replace(model.config.particles, limit=limit)
-    model.config = replace(model.config, particles=particles)
+    model.settings = replace(model.settings, limit=limit)
     scene = scene_of(body("a"), body("b"))
     starts = np.array([[0.0, 0.0, 0.05], [apart, 0.0, 0.05]])
     path = starts + np.linspace(0, 0.1, 10)[:, None, None]
@@ -341,7 +340,7 @@ def test_single_particles_and_bodies_at_one_place_give_finite_numbers(
     edges = model._graph(layout, drift_of(layout, before, now)).edges
     outer = edges[edges[:, -1] == 0]
     assert len(layout.owners) == 2 * limit
-    assert outer[:, 3].min() * model.config.radius == pytest.approx(apart, abs=1e-6)
+    assert outer[:, 3].min() * model.settings.radius == pytest.approx(apart, abs=1e-6)
     after = model.step(layout, before, now)
     assert after.centers.isfinite().all() and after.rotations.isfinite().all()
     model.loss(batch)["loss"].backward()  # type: ignore[no-untyped-call]
@@ -356,8 +355,7 @@ def test_single_particles_and_bodies_at_one_place_give_finite_numbers(
 )
 def test_bodies_of_few_particles_are_not_turned_by_the_network(name: str, limit: int) -> None:
     model = model_of(name)
-    particles = replace(model.config.particles, limit=limit)
-    model.config = replace(model.config, particles=particles)
+    model.settings = replace(model.settings, limit=limit)
     path = np.broadcast_to([0.0, 0.0, 0.05], (10, 2, 3))
     own = Motion(scene_of(body("a"), body("b")), trajectory_of(path))
     states = read_window(window(own, start=0, steps=4), particles, model.device)
@@ -395,8 +393,7 @@ def test_the_size_paper_learns_and_imagines(name: str) -> None:
     """With fewer particles, so that it is quick, but all of its network."""
     model = model_of(name, size="paper")
     assert model.provenance().model == f"{name}-paper"
-    particles = replace(model.config.particles, limit=40, still_limit=40, cloth_step=8)
-    model.config = replace(model.config, particles=particles, gap_limit=100)
+    model.settings = replace(model.settings, limit=40, still_limit=40, cloth_step=8, gap_limit=100)
     motions = [motion("collide", 3, 60), motion("drape", 1, 60)]
     model.loss(window(*motions))["loss"].backward()  # type: ignore[no-untyped-call]
     for weight in model.parameters():
@@ -439,7 +436,7 @@ def test_the_gap_of_the_true_motion_is_that_of_the_label() -> None:
     for scenario in ("collide", "drop", "dominoes"):
         for seed in range(6):
             own = motion(scenario, seed, 200)
-            particles = scene_particles(own.scene, model_of("dpi").config.particles)
+            particles = scene_particles(own.scene, model_of("dpi").settings.sampling)
             poses = poses_of(particles, own, range(0, len(own.trajectory), 3))
             gap = smallest_distance(own.scene, particles, poses, 0.04, 300)
             contact = label_contact(own.scene, own.trajectory).contact
@@ -462,7 +459,7 @@ def test_what_an_event_put_somewhere_did_not_go_there(collide: Motion) -> None:
     start = model._start(moved, range(2, 45, 3))
     own = start.particles.agent
     assert np.array_equal(start.poses.centers[-2, own], start.poses.centers[-1, own])
-    read = read_window(window(moved, start=39), model.config.particles, model.device)
+    read = read_window(window(moved, start=39), model.settings.sampling, model.device)
     assert len(read.layout.kinds) == len(start.particles.kinds) - 1
 
 
@@ -501,7 +498,7 @@ def test_calibration_finds_the_distance_that_separates(collide: Motion) -> None:
     def futures(given, samples, seed):  # type: ignore[no-untyped-def]
         result = []
         for m in given:
-            own = scene_particles(m.scene, model.config.particles)
+            own = scene_particles(m.scene, model.settings.sampling)
             whole = truth[m.scene.name]
             result.append([(own, poses_of(own, whole, range(2, len(whole.trajectory), 3)))])
         return result
@@ -541,12 +538,13 @@ def test_weights_of_a_file_are_loaded_and_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"size": "huge"}, "sizes small and paper"),
+        ({"size": "huge"}, "sizes small, paper"),
         ({"samples": 1.5}, "samples of model dpi must be a whole number"),
-        ({"samples": 0}, "samples must be a whole number"),
-        ({"stride": 2}, "stride must be 1 or 3"),
-        ({"spread": -1.0}, "spread must not be negative"),
-        ({"weights": "shipped", "size": "paper"}, "shipped for size=small"),
+        ({"samples": 0}, "samples must be at least 1"),
+        ({"stride": 2}, "stride of model dpi must be 1 or 3"),
+        ({"spread": -1.0}, "spread must be at least 0"),
+        ({"weights": "shipped", "size": "paper"}, "no weights are shipped for dpi-paper"),
+        ({"swept": False}, "shipped weights of dpi are for swept=True, not False"),
     ],
 )
 def test_bad_options_are_named(options: dict[str, object], words: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -18,24 +17,23 @@ from physion.models.rpin import (
     Imagined,
     Interaction,
     Rpin,
+    RpinSettings,
     Targets,
     constant_velocity,
     cut_regions,
     is_present,
     known_boxes,
     last_changes,
-    rpin_config,
     to_center,
     to_edges,
 )
-from physion.models.vision import VisionOptions
 from support.moving_squares import squares, with_arrays
 
 NAN = float("nan")
 
 
 def model_of(**options: Any) -> Any:
-    return build_model("rpin", **options).eval()  # type: ignore[attr-defined]
+    return build_model("rpin", **{"weights": "random", **options}).eval()  # type: ignore[attr-defined]
 
 
 def with_boxes(batch: Batch, boxes: torch.Tensor) -> Batch:
@@ -158,8 +156,8 @@ def missing_objects(model: Any, frames: int) -> Batch:
 
 @pytest.mark.parametrize("outputs", ["boxes", "published"])
 def test_objects_that_are_not_seen_leave_no_nan(outputs: Any) -> None:
-    model = Rpin(replace(rpin_config("small"), outputs=outputs), VisionOptions()).eval()
-    clip = missing_objects(model, model.config.history + 2)
+    model = Rpin(RpinSettings(outputs=outputs, weights="random")).eval()
+    clip = missing_objects(model, model.settings.history + 2)
     losses = model.loss(clip)
     losses["loss"].backward()
     gradients = [p.grad for p in model.parameters() if p.grad is not None]
@@ -190,7 +188,7 @@ def test_boxes_at_constant_velocity_cost_the_baseline_nothing() -> None:
     assert model.baseline(batch).item() == pytest.approx(0, abs=1e-6)
     with torch.no_grad():
         errors, constant = model.center_errors(batch)
-    steps = model.config.rollout
+    steps = model.settings.rollout
     assert errors.shape == constant.shape == (steps,)
     assert constant.max() < 1e-6
 
@@ -198,7 +196,7 @@ def test_boxes_at_constant_velocity_cost_the_baseline_nothing() -> None:
 def test_an_untrained_network_predicts_that_nothing_moves() -> None:
     model = model_of()
     batch = squares(3, model.window, model.spec)
-    history = model.config.history
+    history = model.settings.history
     true = to_center(batch.boxes[:, :, :2])
     moved = (true[:, history:] - true[:, history - 1 : history])[..., :2].norm(dim=-1)
     with torch.no_grad():
@@ -223,7 +221,7 @@ def test_the_distance_of_given_boxes() -> None:
 def test_the_published_loss_of_given_values() -> None:
     """100 (1 + 4) + (9 + 16) for one object that moved by 2 and 3 pixels to (52, 33)."""
     model = model_of(size="released")
-    size = model.config.image_size
+    size = model.settings.image_size
     last = torch.tensor([50.0, 30.0, 10.0, 10.0]).view(1, 1, 1, 4) / size
     true = torch.tensor([52.0, 33.0, 10.0, 10.0]).view(1, 1, 1, 4) / size
     decoded = torch.tensor([3.0, 5.0, 55.0, 37.0]).view(1, 1, 1, 4)
@@ -279,5 +277,5 @@ def test_bad_boxes_are_named() -> None:
 def test_history_lies_in_the_context_of_every_size() -> None:
     for size in ("small", "paper", "released"):
         model = model_of(size=size)
-        assert model.config.history == rpin_config(size).history <= model.spec.context  # type: ignore[arg-type]
+        assert model.settings.history <= model.spec.context
         assert model.spec.all_frames()[-1] == 135

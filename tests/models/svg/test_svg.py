@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from physion.clips.batch import Batch
 from physion.core.errors import BadInputError
-from physion.models.build import build_model
+from physion.models.build import build_model, make_settings
 from physion.models.checkpoint import tensors_of, write_checkpoint
 from physion.models.svg import (
     CodePredictor,
@@ -20,20 +20,23 @@ from physion.models.svg import (
     Encoder,
     GaussianPredictor,
     Svg,
-    SvgConfig,
-    SvgOptions,
-    svg_config,
+    SvgSettings,
 )
 from physion.models.vision import copy_error, moving_pixels
 from support.moving_squares import squares, with_arrays
 
-TINY = SvgConfig(
-    image_size=16, width=4, code=6, latent=3, hidden=8, past=3, imagined=2, context=4, future=3
-)
+TINY = SvgSettings(
+    image_size=16, width=4, code=6, latent=3, hidden=8, past=3, imagined=2, context=4, future=3,
+    weights="random",
+)  # fmt: skip
+
+
+def sized(size: str, **options: Any) -> SvgSettings:
+    return make_settings(SvgSettings, "svg", {"size": size, **options})
 
 
 def tiny(**changes: Any) -> Svg:
-    return Svg(replace(TINY, **changes), SvgOptions()).eval()
+    return Svg(replace(TINY, **changes)).eval()
 
 
 def context_of(model: Svg, clips: int = 2) -> Batch:
@@ -65,7 +68,7 @@ def convolutions(network: nn.Module) -> list[tuple[int, int, int]]:
 
 def test_paper_has_the_published_layers() -> None:
     """Of vgg_64 and dcgan_128 with one code of 128."""
-    vgg = svg_config(SvgOptions(size="paper"))
+    vgg = sized("paper")
     stages = [(64, 2), (128, 2), (256, 3), (512, 3)]
     expected, before = [], 3
     for width, count in stages:
@@ -77,7 +80,7 @@ def test_paper_has_the_published_layers() -> None:
         (128, 512, 4), (1024, 512, 3), (512, 512, 3), (512, 256, 3), (512, 256, 3), (256, 256, 3),
         (256, 128, 3), (256, 128, 3), (128, 64, 3), (128, 64, 3), (64, 3, 3),
     ]  # fmt: skip
-    dcgan = svg_config(SvgOptions(size="paper", backbone="dcgan", image_size=128))
+    dcgan = sized("paper", backbone="dcgan", image_size=128)
     assert convolutions(Encoder(dcgan)) == [
         (3, 64, 4), (64, 128, 4), (128, 256, 4), (256, 512, 4), (512, 512, 4), (512, 128, 4),
     ]  # fmt: skip
@@ -87,10 +90,10 @@ def test_paper_has_the_published_layers() -> None:
 
 
 def test_sizes_and_their_names() -> None:
-    small, released = build_model("svg"), svg_config(SvgOptions(size="released"))
+    small, released = build_model("svg"), sized("released")
     assert small.provenance().model == "svg-small" and small.spec.image_size == 64
-    assert released.skip == "before" and svg_config(SvgOptions(size="paper")).skip == "last"
-    named = build_model("svg", backbone="vgg", image_size=32)
+    assert released.skip == "before" and sized("paper").skip == "last"
+    named = build_model("svg", backbone="vgg", image_size=32, weights="random")
     assert isinstance(named, Svg) and named.name == "svg-small-vgg-32"
     assert named.encode(squares(1, 2, named.spec)).shape == (1, 2, 64)
 
@@ -181,7 +184,7 @@ def test_a_validation_is_of_what_is_imagined_from_the_observed_frames() -> None:
     model = tiny()
     batch = squares(2, model.window, model.spec)
     later = batch.rgb.clone()
-    later[:, model.config.past :] = 0
+    later[:, model.settings.past :] = 0
     seen: list[Tensor] = []
     roll_out = model._roll_out
 

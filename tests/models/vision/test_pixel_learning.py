@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from physion.models.interface import TrainingSettings
-from physion.models.op3 import Op3, Op3Config, Op3Options
-from physion.models.svg import Svg, SvgConfig, SvgOptions
+from physion.models.op3 import Op3, Op3Settings
+from physion.models.svg import Svg, SvgSettings
 from physion.models.vision import future_error
 from physion.training.train import train_model
 from physion.training.windows import ClipWindows, validation_requests
@@ -30,19 +30,25 @@ TRAINED, TESTED = 400, 100
 
 
 def svg_of(seed: int) -> Svg:
-    config = SvgConfig(
-        image_size=16, code=32, hidden=64, past=3, imagined=3, context=3, future=4,
-        training=replace(SETTINGS, steps=600),
+    model = Svg(
+        SvgSettings(
+            image_size=16, code=32, hidden=64, past=3, imagined=3, context=3, future=4, seed=seed,
+            weights="random",
+        )
     )  # fmt: skip
-    return Svg(config, SvgOptions(seed=seed))
+    model.training_settings = replace(SETTINGS, steps=600)
+    return model
 
 
 def op3_of(seed: int) -> Op3:
-    config = Op3Config(
-        image_size=16, slots=3, width=12, layers=3, hidden=32, effect=16, seed_steps=2, past=3,
-        imagined=3, context=3, future=4, training=replace(SETTINGS, steps=150),
+    model = Op3(
+        Op3Settings(
+            image_size=16, slots=3, width=12, layers=3, hidden=32, effect=16, seed_steps=2, past=3,
+            imagined=3, context=3, future=4, seed=seed, weights="random",
+        )
     )  # fmt: skip
-    return Op3(config, Op3Options(seed=seed))
+    model.training_settings = replace(SETTINGS, steps=150)
+    return model
 
 
 def held_out_error(model: Any) -> tuple[float, float, float]:
@@ -53,7 +59,7 @@ def held_out_error(model: Any) -> tuple[float, float, float]:
     (request,) = validation_requests(windows, TESTED, 0)
     batch = windows.read(request).to("cpu")
     pictures = batch.rgb.permute(0, 1, 4, 2, 3).float() / 255
-    empty = torch.full_like(pictures[:, -model.config.imagined :], BACKGROUND / 255)
+    empty = torch.full_like(pictures[:, -model.settings.imagined :], BACKGROUND / 255)
     without = future_error(empty, pictures, batch.valid).moving
     torch.manual_seed(0)
     with torch.no_grad():

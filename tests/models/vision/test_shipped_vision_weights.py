@@ -54,5 +54,5 @@ def scores(name: str, movies: Dataset, weights: str) -> list[float]:
         own, constant = model.center_errors(batch)
         return [float(own.nanmean()), float(constant.nanmean())]
     pictures = batch.rgb.permute(0, 1, 4, 2, 3).float() / 255
-    empty = empty_scene_error(pictures, model.config.imagined, batch.valid).moving
+    empty = empty_scene_error(pictures, model.settings.imagined, batch.valid).moving
     return [float(model.loss(batch)["loss"]), float(model.baseline(batch)), float(empty)]

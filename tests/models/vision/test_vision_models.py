@@ -40,7 +40,7 @@ OVERFITTED = {
 
 
 def model_of(name: str, **options: Any) -> Any:
-    return build_model(name, **options).eval()  # type: ignore[attr-defined]
+    return build_model(name, **{"weights": "random", **options}).eval()  # type: ignore[attr-defined]
 
 
 def tiny_encoder(name: str) -> dict[str, Any]:
