@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import os
 import sys
 import traceback
 import types
@@ -250,6 +251,7 @@ def _checked(known: Mapping[str, Any], model: str, options: Mapping[str, Any]) -
             raise UnknownNameError(f"option of model {model}", option, known)
         kind = known.get(option, Any)
         where = f"option {option} of model {model}"
+        value = os.fspath(value) if isinstance(value, os.PathLike) else value
         values[option] = read_settings(kind, value, where) if _is_plain(kind) else value
     return values
 

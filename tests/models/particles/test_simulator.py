@@ -335,7 +335,7 @@ def test_single_particles_and_bodies_at_one_place_give_finite_numbers(
     path = starts + np.linspace(0, 0.1, 10)[:, None, None]
     own = Motion(scene, trajectory_of(path))
     batch = window(own, start=0, steps=4)
-    states = read_window(batch, particles, model.device)
+    states = read_window(batch, model.settings.sampling, model.device)
     layout, before, now = states.layout, states.before, states.now
     edges = model._graph(layout, drift_of(layout, before, now)).edges
     outer = edges[edges[:, -1] == 0]
@@ -358,7 +358,7 @@ def test_bodies_of_few_particles_are_not_turned_by_the_network(name: str, limit:
     model.settings = replace(model.settings, limit=limit)
     path = np.broadcast_to([0.0, 0.0, 0.05], (10, 2, 3))
     own = Motion(scene_of(body("a"), body("b")), trajectory_of(path))
-    states = read_window(window(own, start=0, steps=4), particles, model.device)
+    states = read_window(window(own, start=0, steps=4), model.settings.sampling, model.device)
     turn = rotation_from_vector(torch.tensor([[0.9, 0.2, 0.1]], dtype=torch.float64))
     now = replace(states.now, rotations=turn @ states.now.rotations)
     before = replace(states.before, rotations=turn @ states.before.rotations)

@@ -9,7 +9,8 @@ import pytest
 
 from physion.clips.batch import Motion
 from physion.core.errors import BadInputError
-from physion.models.baselines.motion import BLOCK, NAMES, state_classifier, state_features
+from physion.models import build_model
+from physion.models.baselines.motion import BLOCK, NAMES, state_features
 from physion.scenes.scene import Body, BodyEvent, Cloth, Roles
 from support.crossing_bodies import batch_of, crossing, some_crossings
 
@@ -90,7 +91,7 @@ def accuracy(fit_labels: np.ndarray, test_labels: np.ndarray) -> float:
     """Return the accuracy on 200 trials after a fit on 200 others with given labels."""
     fit, _ = some_crossings(200, 10)
     test, _ = some_crossings(200, 11)
-    predicted = state_classifier(trees=50).fit(fit, fit_labels, 0).predict(test)
+    predicted = build_model("state-classifier", trees=50).fit(fit, fit_labels, 0).predict(test)
     assert ((predicted >= 0) & (predicted <= 1)).all()
     return float(np.mean((predicted > 0.5) == test_labels))
 
@@ -108,7 +109,7 @@ def test_trees_learn_what_the_state_tells_and_nothing_from_permuted_outcomes() -
 def test_order_of_the_fitted_trials_does_not_matter_and_the_seed_does() -> None:
     fit, labels = some_crossings(50, 12)
     order = np.random.default_rng(0).permutation(50)
-    model = state_classifier(trees=10)
+    model = build_model("state-classifier", trees=10)
     first = model.fit(fit, labels, 1)
     same = model.fit(fit.select(order), labels[order], 1)
     other = model.fit(fit, labels, 2)
@@ -119,7 +120,7 @@ def test_order_of_the_fitted_trials_does_not_matter_and_the_seed_does() -> None:
 @pytest.mark.parametrize("only", [False, True])
 def test_one_outcome_alone_is_predicted_again(only: bool) -> None:
     fit, _ = some_crossings(10, 13)
-    model = state_classifier(trees=3).fit(fit, np.full(10, only), 0)
+    model = build_model("state-classifier", trees=3).fit(fit, np.full(10, only), 0)
     assert model.predict(fit).tolist() == [float(only)] * 10
     assert model.predict(fit.select([])).shape == (0,)
 
@@ -127,14 +128,14 @@ def test_one_outcome_alone_is_predicted_again(only: bool) -> None:
 def test_wrong_input_is_refused() -> None:
     fit, labels = some_crossings(10, 13)
     with pytest.raises(BadInputError, match="9 labels for 10 trials"):
-        state_classifier().fit(fit, labels[:9], 0)
+        build_model("state-classifier").fit(fit, labels[:9], 0)
     with pytest.raises(BadInputError, match="0 labels for 0 trials"):
-        state_classifier().fit(fit.select([]), labels[:0], 0)
+        build_model("state-classifier").fit(fit.select([]), labels[:0], 0)
     with pytest.raises(BadInputError, match="trees and leaf"):
-        state_classifier(trees=0)
+        build_model("state-classifier", trees=0)
 
 
 def test_a_batch_of_one_motion_is_a_batch() -> None:
     fit, labels = some_crossings(20, 14)
-    model = state_classifier(trees=5).fit(fit, labels, 0)
+    model = build_model("state-classifier", trees=5).fit(fit, labels, 0)
     assert model.predict(batch_of([crossing()])).shape == (1,)

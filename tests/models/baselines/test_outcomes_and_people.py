@@ -10,8 +10,8 @@ import pytest
 
 from physion.core.errors import BadInputError
 from physion.core.names import scenario_of
-from physion.models.baselines.answers import majority_of_people, outcome, read_people
-from physion.models.baselines.motion import already_touched
+from physion.models import build_model
+from physion.models.baselines.answers import read_people
 from support.crossing_bodies import batch_of, crossing, some_crossings
 
 DOMINOES = "pilot_dominoes_1mid_boxroom"
@@ -30,13 +30,13 @@ def write_humans(folder: Path, rows: str, labels: str | None) -> Path:
 
 def test_outcome_is_that_of_the_whole_motion() -> None:
     batch = batch_of([crossing(touch=(50,)), crossing(), crossing(touch=(3, 4))])
-    assert outcome().predict(batch).tolist() == [1, 0, 1]
+    assert build_model("outcome").predict(batch).tolist() == [1, 0, 1]
 
 
 def test_known_outcomes_replace_simulated_ones() -> None:
     names = ("known_img.mp4", "known", "pilot-redyellow_0001", "simulated")
     batch = batch_of([crossing(name=name, touch=(50,)) for name in names])
-    model = outcome(outcomes={"known": False, "pilot_0001": False})
+    model = build_model("outcome", outcomes={"known": False, "pilot_0001": False})
     assert model.predict(batch).tolist() == [0, 0, 0, 1]
     shown = model.with_outcomes({"known": True, "simulated": False})
     assert shown.predict(batch).tolist() == [0, 0, 0, 0], "the outcomes of the option come first"
@@ -46,12 +46,12 @@ def test_known_outcomes_replace_simulated_ones() -> None:
 
 def test_known_outcomes_need_no_motion() -> None:
     batch = batch_of([crossing(name="movie", agent=(float("nan"), 0.0, 0.0))])
-    assert outcome(outcomes={"movie": True}).predict(batch).tolist() == [1]
+    assert build_model("outcome", outcomes={"movie": True}).predict(batch).tolist() == [1]
 
 
 def test_outcome_refuses_the_observed_part_of_an_unknown_trial() -> None:
     with pytest.raises(BadInputError, match="'cut': outcome needs the whole motion"):
-        outcome().predict(batch_of([crossing(name="cut", frames=45)]))
+        build_model("outcome").predict(batch_of([crossing(name="cut", frames=45)]))
 
 
 @pytest.mark.parametrize(
@@ -60,11 +60,11 @@ def test_outcome_refuses_the_observed_part_of_an_unknown_trial() -> None:
 )
 def test_wrong_outcomes_are_refused(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(BadInputError, match=message):
-        outcome(outcomes=wrong)
+        build_model("outcome", outcomes=wrong)
 
 
 def test_people_answer_as_the_mapping_says() -> None:
-    model = majority_of_people(humans={"a": 0.25, "b_img.mp4": 1})
+    model = build_model("majority-of-people", humans={"a": 0.25, "b_img.mp4": 1})
     batch = batch_of([crossing(name=name) for name in ("b", "a-redyellow", "b")])
     assert model.predict(batch).tolist() == [1, 0.25, 1]
 
@@ -72,15 +72,15 @@ def test_people_answer_as_the_mapping_says() -> None:
 def test_stimuli_that_nobody_answered_are_counted() -> None:
     batch = batch_of([crossing(name=name) for name in ("a", "b", "c")])
     with pytest.raises(BadInputError, match=r"answers of people to 2 of 3 stimuli.* 'b'"):
-        majority_of_people(humans={"a": 0.25}).predict(batch)
+        build_model("majority-of-people", humans={"a": 0.25}).predict(batch)
     with pytest.raises(BadInputError, match=r"no answers at all.*option humans"):
-        majority_of_people().predict(batch)
+        build_model("majority-of-people").predict(batch)
 
 
 @pytest.mark.parametrize("wrong", [1.5, -0.1, float("nan"), "many", None])
 def test_fractions_lie_between_0_and_1(wrong: Any) -> None:
     with pytest.raises(BadInputError, match="not a fraction from 0 to 1"):
-        majority_of_people(humans={"a": wrong})
+        build_model("majority-of-people", humans={"a": wrong})
 
 
 def test_correct_answers_become_yes_by_the_outcome(tmp_path: Path) -> None:
@@ -95,8 +95,8 @@ def test_a_table_of_fractions_is_read(tmp_path: Path) -> None:
     table = tmp_path / "people.csv"
     table.write_text("\ufeffstimulus,n,p_yes\na,7,0.5\nb_img.mp4,9,1\n", "utf-8")
     assert read_people(table) == {"a": 0.5, "b": 1.0}
-    model = majority_of_people(humans=str(table))
-    assert model.digest() == majority_of_people(humans={"a": 0.5, "b": 1.0}).digest()
+    model = build_model("majority-of-people", humans=str(table))
+    assert model.digest() == build_model("majority-of-people", humans={"a": 0.5, "b": 1.0}).digest()
 
 
 @pytest.mark.parametrize(
@@ -152,29 +152,31 @@ def test_base_rate_is_that_of_trials_that_had_not_touched() -> None:
     seen, later = crossing(touch=(44,)), crossing(touch=(45,))
     fit = batch_of([seen, seen, later, later, later, later])
     labels = np.array([True, True, True, False, False, False])
-    model = already_touched(margin=0.05).fit(fit, labels, 0)
+    model = build_model("already-touched", margin=0.05).fit(fit, labels, 0)
     assert model.predict(batch_of([later, seen])).tolist() == [0.25, 0.95]
 
 
 @pytest.mark.parametrize(("labels", "rate"), [([], 0.5), ([False], 0.01), ([True], 0.99)])
 def test_base_rate_stays_within_the_margin(labels: list[bool], rate: float) -> None:
-    model = already_touched().fit(batch_of([crossing()] * len(labels)), np.array(labels, bool), 0)
+    model = build_model("already-touched").fit(
+        batch_of([crossing()] * len(labels)), np.array(labels, bool), 0
+    )
     assert model.predict(batch_of([crossing()])).tolist() == [rate]
 
 
 def test_permuted_outcomes_leave_the_base_rate() -> None:
     fit, labels = some_crossings(80, 4)
     permuted = np.random.default_rng(0).permutation(labels)
-    predicted = already_touched().fit(fit, permuted, 0).predict(fit)
+    predicted = build_model("already-touched").fit(fit, permuted, 0).predict(fit)
     assert np.unique(predicted) == pytest.approx(labels.mean())
 
 
 @pytest.mark.parametrize("margin", [-0.1, 0.5, float("nan")])
 def test_wrong_margins_are_refused(margin: float) -> None:
     with pytest.raises(BadInputError, match="margin"):
-        already_touched(margin=margin)
+        build_model("already-touched", margin=margin)
 
 
 def test_labels_must_fit_the_trials() -> None:
     with pytest.raises(BadInputError, match="2 labels for 1 trials"):
-        already_touched().fit(batch_of([crossing()]), np.array([True, False]), 0)
+        build_model("already-touched").fit(batch_of([crossing()]), np.array([True, False]), 0)

@@ -11,7 +11,8 @@ import pytest
 
 from physion.clips.batch import Motion
 from physion.core.errors import BadInputError
-from physion.models.baselines.motion import FAR, TOLERANCE, constant_motion, minimise
+from physion.models import build_model
+from physion.models.baselines.motion import FAR, TOLERANCE, minimise
 from physion.physics.cloth.simulate import ClothSettings
 from physion.physics.cloth.solver import CLOTH_CONTACT_GAP
 from physion.scenes.scene import Body, BodyEvent, Cloth, Roles, Vec3
@@ -20,7 +21,7 @@ from support.crossing_bodies import batch_of, crossing
 
 def gap(motion: Motion, **options: Any) -> float:
     """Return the gap that the model imagines."""
-    rollout = constant_motion(**options).imagine(batch_of([motion]), 1, 0)
+    rollout = build_model("constant-motion", **options).imagine(batch_of([motion]), 1, 0)
     assert rollout.contact.tolist() == [[bool(rollout.gap[0, 0] <= 0)]]
     return float(rollout.gap[0, 0])
 
@@ -133,11 +134,11 @@ def test_cloth_touches_by_the_rule_of_the_label(roles: Roles) -> None:
 
 def test_samples_are_equal_and_the_seed_is_not_used() -> None:
     batch = batch_of([crossing(), crossing(agent=(1.0, 0.0, 0.0))])
-    rollout = constant_motion().imagine(batch, 3, 0)
+    rollout = build_model("constant-motion").imagine(batch, 3, 0)
     assert rollout.gap.shape == rollout.contact.shape == (2, 3)
     assert (rollout.gap == rollout.gap[:, :1]).all() and rollout.gap[0, 0] != rollout.gap[1, 0]
     assert rollout.gap.dtype == np.float64 and rollout.contact.dtype == np.bool_
-    assert (constant_motion().imagine(batch, 3, 1).gap == rollout.gap).all()
+    assert (build_model("constant-motion").imagine(batch, 3, 1).gap == rollout.gap).all()
 
 
 def test_minimum_of_a_function_is_found_between_frames() -> None:
@@ -162,4 +163,4 @@ def test_search_ends_at_a_touch() -> None:
 @pytest.mark.parametrize("frames", [0, -1])
 def test_at_least_one_frame_is_looked_ahead(frames: int) -> None:
     with pytest.raises(BadInputError, match="frames must be at least 1"):
-        constant_motion(frames=frames)
+        build_model("constant-motion", frames=frames)

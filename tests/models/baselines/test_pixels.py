@@ -7,7 +7,8 @@ import pytest
 
 from physion.clips.batch import Batch
 from physion.core.errors import BadInputError
-from physion.models.baselines.pixels import blob_centroids, color_masks, copy_last_frame
+from physion.models import build_model
+from physion.models.baselines.pixels import BlobCentroids, CopyLastFrame, color_masks
 from physion.rendering.renderer import Renderer
 from physion.scenes.looks import in_look
 from physion.scenes.scene import Body, Camera, Roles, Scene
@@ -41,7 +42,7 @@ def test_centroids_and_areas_of_discs_are_exact() -> None:
     picture = np.full((SIZE, SIZE, 3), 120, np.uint8)
     red = draw_disc(picture, 12, 40, 6, RED)
     yellow = draw_disc(picture, 45, 20, 9.5, YELLOW)
-    features = blob_centroids().encode(clips(picture[None, None]))
+    features = build_model("blob-centroids").encode(clips(picture[None, None]))
     expected = [12.5 / 64, 40.5 / 64, red / 64**2, 45.5 / 64, 20.5 / 64, yellow / 64**2]
     assert features.dtype == np.float32 and features.shape == (1, 1, 6)
     assert features[0, 0] == pytest.approx(expected, abs=1e-7)
@@ -49,7 +50,9 @@ def test_centroids_and_areas_of_discs_are_exact() -> None:
 
 def test_blobs_that_are_not_seen_are_in_the_middle_without_area() -> None:
     gray = np.full((1, 1, SIZE, SIZE, 3), 90, np.uint8)
-    assert blob_centroids().encode(clips(gray)).tolist() == [[[0.5, 0.5, 0, 0.5, 0.5, 0]]]
+    assert build_model("blob-centroids").encode(clips(gray)).tolist() == [
+        [[0.5, 0.5, 0, 0.5, 0.5, 0]]
+    ]
 
 
 @pytest.mark.parametrize(
@@ -86,7 +89,7 @@ def test_blobs_of_a_rendered_scene_are_agent_and_patient() -> None:
         0, ("color", "ids")
     )
     assert frame.color is not None and frame.ids is not None
-    features = blob_centroids().encode(clips(frame.color[None, None]))[0, 0]
+    features = build_model("blob-centroids").encode(clips(frame.color[None, None]))[0, 0]
     for place, number in ((0, 1), (3, 2)):
         rows, columns = np.nonzero(frame.ids == number)
         middle = [(columns.mean() + 0.5) / SIZE, (rows.mean() + 0.5) / SIZE]
@@ -94,9 +97,11 @@ def test_blobs_of_a_rendered_scene_are_agent_and_patient() -> None:
         assert features[place + 2] == pytest.approx(len(rows) / SIZE**2, rel=0.15)
 
 
-@pytest.mark.parametrize("model", [blob_centroids(), copy_last_frame()], ids=["blobs", "copy"])
+@pytest.mark.parametrize(
+    "model", [build_model("blob-centroids"), build_model("copy-last-frame")], ids=["blobs", "copy"]
+)
 def test_features_of_a_frame_depend_on_it_alone(model: object) -> None:
-    assert isinstance(model, type(blob_centroids()) | type(copy_last_frame()))
+    assert isinstance(model, BlobCentroids | CopyLastFrame)
     size = model.spec.image_size
     rgb = noise(4, 9, size, size, 3)
     features = model.encode(clips(rgb))
@@ -111,14 +116,14 @@ def test_features_of_a_frame_depend_on_it_alone(model: object) -> None:
 
 def test_pixels_are_the_features_of_a_copy() -> None:
     rgb = noise(2, 7, 32, 32, 3)
-    features = copy_last_frame().encode(clips(rgb))
+    features = build_model("copy-last-frame").encode(clips(rgb))
     assert features.shape == (2, 7, 32 * 32 * 3) and features.dtype == np.float32
     assert features[1, 2] == pytest.approx(rgb[1, 2].ravel() / 255)
 
 
 @pytest.mark.parametrize("stored", [False, True])
 def test_the_last_context_frame_is_imagined(stored: bool) -> None:
-    model, rgb = copy_last_frame(), noise(2, 7, 32, 32, 3)
+    model, rgb = build_model("copy-last-frame"), noise(2, 7, 32, 32, 3)
     features = model.encode(clips(rgb))
     context = clips(rgb)
     if stored:
@@ -132,9 +137,11 @@ def test_the_last_context_frame_is_imagined(stored: bool) -> None:
         assert (rollout.shown["rgb"] == rgb[:, None, -1:]).all()
 
 
-@pytest.mark.parametrize("model", [blob_centroids(), copy_last_frame()], ids=["blobs", "copy"])
+@pytest.mark.parametrize(
+    "model", [build_model("blob-centroids"), build_model("copy-last-frame")], ids=["blobs", "copy"]
+)
 def test_other_pictures_are_refused(model: object) -> None:
-    assert isinstance(model, type(blob_centroids()) | type(copy_last_frame()))
+    assert isinstance(model, BlobCentroids | CopyLastFrame)
     with pytest.raises(BadInputError, match=r"pictures \(input rgb\) of .*\(48, 48, 3\)"):
         model.encode(clips(noise(1, 1, 48, 48, 3)))
     batch = clips(noise(1, 1, 48, 48, 3))

@@ -1,4 +1,4 @@
-"""What holds for all anchors: settings, no torch, no leak, no dependence on the batch."""
+"""What holds for all baselines: settings, no torch, no leak, no dependence on the batch."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ OTHERS: dict[str, dict[str, Any]] = {
     "blob-centroids": {"image_size": 48},
     "copy-last-frame": {"image_size": 16},
 }
-"""Every anchor, with options that are not the default."""
+"""Every baseline, with options that are not the default."""
 
 
 def fitted(name: str, fit: Batch, labels: np.ndarray) -> Any:
-    """Return the anchor, fitted if it can be."""
+    """Return the baseline, fitted if it can be."""
     options = {"majority-of-people": {"humans": PEOPLE}, "state-classifier": {"trees": 20}}
     model = build_model(name, **options.get(name, {}))
     return model.fit(fit, labels, 3) if can(model, "fit") else model
@@ -43,7 +43,7 @@ def answers(model: Any, batch: Batch) -> np.ndarray:
 
 
 def seen_by(name: str) -> tuple[Any, Batch]:
-    """Return a fitted anchor and motions that it was not fitted to; some have touched."""
+    """Return a fitted baseline and motions that it was not fitted to; some have touched."""
     fit, labels = some_crossings(60, 0)
     test, _ = some_crossings(59, 1)
     touching = crossing(name="crossing_1_0059", touch=(30,), agent=(1.0, 2.0, 0.0))
@@ -61,11 +61,11 @@ def test_digest_and_provenance_follow_the_settings(name: str) -> None:
         build_model(name, sampels=1)
 
 
-def test_digests_of_different_anchors_differ() -> None:
+def test_digests_of_different_baselines_differ() -> None:
     assert len({build_model(name).digest() for name in OTHERS}) == len(OTHERS)
 
 
-def test_anchors_that_look_at_no_trial_say_so() -> None:
+def test_baselines_that_look_at_no_trial_say_so() -> None:
     stated = {name: build_model(name).provenance().inputs for name in [*OTHERS, "chance"]}
     assert {name: words for name, words in stated.items() if words} == {
         "outcome": "outcomes", "majority-of-people": "answers of people", "chance": "base rate",
@@ -136,7 +136,7 @@ def test_trials_that_end_in_the_observed_part_are_refused(name: str) -> None:
         answers(model, batch_of([crossing(name="short", frames=44)]))
 
 
-def test_anchors_run_without_torch() -> None:
+def test_baselines_run_without_torch() -> None:
     code = f"""
 import sys
 class Absent:
