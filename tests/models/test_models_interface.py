@@ -42,7 +42,7 @@ def test_spec_shows_the_frames_of_the_released_models() -> None:
     assert Spec(stride=9, context=5, future=11).all_frames()[-1] == 135
 
 
-def test_spec_anchored_at_the_end_shows_the_last_observed_frame() -> None:
+def test_spec_with_its_context_at_the_end_shows_the_last_observed_frame() -> None:
     spec = Spec(context_at="end", stride=5, context=4, future=2)
     assert spec.context_frames() == (29, 34, 39, 44)
     assert spec.future_frames() == (49, 54)
@@ -186,7 +186,7 @@ def test_unknown_names_get_the_closest_ones() -> None:
         build_model("pVGG-lsm")
     with pytest.raises(UnknownNameError, match="resnet18"):
         build_model("frozen-encoder", encoder="resnet81", weights="random")
-    with pytest.raises(BadInputError, match="mlp or lstm"):
+    with pytest.raises(BadInputError, match="'mlp' or 'lstm'"):
         build_model("frozen-encoder", **{**TINY, "dynamics": "gru"})
 
 

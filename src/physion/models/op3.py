@@ -34,7 +34,7 @@ from physion.clips.batch import Batch, Provenance, Rollout
 from physion.core.errors import BadInputError
 from physion.core.seeds import generator
 from physion.models.checkpoint import load_named
-from physion.models.interface import SizedSettings, Sizes, TrainingSettings
+from physion.models.interface import Sizes, TrainingSettings
 from physion.models.torch_model import initial_weights
 from physion.models.vision import (
     PictureModel,
@@ -63,7 +63,7 @@ _PAPER: Mapping[str, Any] = {
 class Op3Settings(PictureSettings):
     """Settings of OP3; also see `PictureSettings` and `SizedSettings`.
 
-    - ``slots``: K. Weights fit any number of slots.
+    - ``slots``: K.
     - ``deterministic``, ``stochastic``: sizes of the two parts of the state of a slot.
     - ``width``: channels of the convolutions, with ``kernel`` x ``kernel`` weights; ``layers`` of
       the decoder; ``step``, the stride of those of the refinement.
@@ -100,7 +100,6 @@ class Op3Settings(PictureSettings):
         "paper": _PAPER,
         "released": {**_PAPER, "density": "released"},
     }
-    any_weights: ClassVar[frozenset[str]] = SizedSettings.any_weights | {"slots"}
 
     def __post_init__(self) -> None:
         super().__post_init__()

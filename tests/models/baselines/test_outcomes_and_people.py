@@ -1,4 +1,4 @@
-"""Anchors that know the outcome, what people answered, or whether the contact was seen."""
+"""Baselines that know the outcome, what people answered, or whether the contact was seen."""
 
 from __future__ import annotations
 
@@ -56,7 +56,10 @@ def test_outcome_refuses_the_observed_part_of_an_unknown_trial() -> None:
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
-    [({"a": "yes"}, "'a' must be true or false"), ({"a": True, "a.mp4": False}, "'a' is there")],
+    [
+        ({"a": "yes"}, "outcome.a must be true or false"),
+        ({"a": True, "a.mp4": False}, "'a' is there"),
+    ],
 )
 def test_wrong_outcomes_are_refused(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(BadInputError, match=message):
@@ -77,9 +80,15 @@ def test_stimuli_that_nobody_answered_are_counted() -> None:
         build_model("majority-of-people").predict(batch)
 
 
-@pytest.mark.parametrize("wrong", [1.5, -0.1, float("nan"), "many", None])
-def test_fractions_lie_between_0_and_1(wrong: Any) -> None:
-    with pytest.raises(BadInputError, match="not a fraction from 0 to 1"):
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        *((value, "not a fraction from 0 to 1") for value in (1.5, -0.1)),
+        *((value, "humans") for value in (float("nan"), "many", None)),
+    ],
+)
+def test_fractions_lie_between_0_and_1(wrong: Any, says: str) -> None:
+    with pytest.raises(BadInputError, match=says):
         build_model("majority-of-people", humans={"a": wrong})
 
 

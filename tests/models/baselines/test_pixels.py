@@ -1,4 +1,4 @@
-"""Anchors that see pictures: coloured blobs, and a copy of the last frame."""
+"""Baselines that see pictures: coloured blobs, and a copy of the last frame."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ from physion.models.particles.networks import (
     rotate_scenes,
 )
 from physion.models.particles.rollout import Window, read_window, smallest_distance
-from physion.models.particles.simulator import ParticleSimulator
+from physion.models.particles.simulator import ParticleSimulator, observed_start
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
 from physion.scenes.scene import BodyEvent, Ending
@@ -456,7 +456,7 @@ def test_what_an_event_put_somewhere_did_not_go_there(collide: Motion) -> None:
         replace(scene, events=(event,)), replace(collide.trajectory, positions=positions)
     )
     model = model_of("dpi")
-    start = model._start(moved, range(2, 45, 3))
+    start = observed_start(moved, range(2, 45, 3), model.settings.sampling)
     own = start.particles.agent
     assert np.array_equal(start.poses.centers[-2, own], start.poses.centers[-1, own])
     read = read_window(window(moved, start=39), model.settings.sampling, model.device)

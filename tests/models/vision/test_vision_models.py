@@ -277,7 +277,7 @@ def test_bad_input_is_named(name: str) -> None:
         model.encode(small)
     with pytest.raises(BadInputError, match=f"{name}-small: pictures must be .* not none"):
         model.encode(with_arrays(context, rgb=None))
-    with pytest.raises(BadInputError, match="sizes small, paper and released"):
+    with pytest.raises(BadInputError, match="sizes small, paper, released"):
         model_of(name, size="huge")
     with pytest.raises(BadInputError, match="no weights at"):
         model_of(name, weights="absent.safetensors")
