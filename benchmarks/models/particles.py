@@ -51,6 +51,7 @@ from physion.clips.clips import observed_source, whole_source
 from physion.compute.tasks import processor
 from physion.core.names import canonical_name
 from physion.data.official import official
+from physion.models.build import build_untrained
 from physion.models.interface import can
 from physion.models.particles.bodies import poses_of, rotation_from_vector, scene_particles
 from physion.models.particles.networks import (
@@ -62,7 +63,7 @@ from physion.models.particles.networks import (
     make_graph,
     rotate_scenes,
 )
-from physion.models.particles.simulator import ParticleSimulator
+from physion.models.particles.simulator import OBJECTS, ParticleSimulator
 from physion.physics.labels import label_contact
 from physion.readout.rollout_error import motion_error
 from physion.scenes.sampling.build import scenarios
@@ -143,7 +144,7 @@ def fractions(
     spread: float = SPREAD,
 ) -> NDArray[np.float64]:
     """Return the fraction of futures with a contact, for every motion."""
-    model.options = dataclasses.replace(model.options, spread=spread)
+    model.settings = dataclasses.replace(model.settings, spread=spread)
     cut = [Motion(m.scene, cut_to_observed(m.scene, m.trajectory)) for m in motions]
     step = GROUP // samples
     groups = [cut[first : first + step] for first in range(0, len(cut), step)]
@@ -162,12 +163,12 @@ def trained(
     dataset: Dataset, trials: Sequence[str], steps: int, **options: Any
 ) -> tuple[ParticleSimulator, float]:
     """Return a DPI-Net trained on some trials, and the processor time that it took."""
-    model = build_model("dpi", **options)
+    model = build_untrained("dpi", **options)
     assert isinstance(model, ParticleSimulator)
     start = time.process_time()
     train_model(
         model, whole_source(dataset, model.spec), trials, name="benchmark", folder=None,
-        settings=dataclasses.replace(model.training_settings, steps=steps), seed=model.options.seed,
+        settings=dataclasses.replace(model.training_settings, steps=steps), seed=model.settings.seed,
         accelerator="cpu",
     )  # fmt: skip
     return model, time.process_time() - start
@@ -388,7 +389,7 @@ def last_states(
     model: ParticleSimulator, motion: Motion
 ) -> tuple[SceneLayout, ObjectState, ObjectState]:
     """Return the layout of a scene and its last two observed states."""
-    particles = scene_particles(motion.scene, model.config.particles)
+    particles = scene_particles(motion.scene, model.settings.sampling)
     poses = [poses_of(particles, motion, [LAST_OBSERVED - 3, LAST_OBSERVED])]
     before, now = (join_poses(poses, row, model.device) for row in (0, 1))
     return join_scenes([particles], model.device), before, now
@@ -417,8 +418,8 @@ def step_of_drape(name: str, size: str) -> list[str]:
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     layout, *states = last_states(model, motion)
     drift = drift_of(layout, *states)
-    near_only = model.config.network == "objects"
-    graph = make_graph(layout, drift, model.config.radius, 1.0, swept=True, near_only=near_only)
+    near_only = model.settings.network == OBJECTS
+    graph = make_graph(layout, drift, model.settings.radius, 1.0, swept=True, near_only=near_only)
     counts = [len(layout.owners), len(graph.senders), before // 1024, most // 1024]
     return [f"{count:,}" for count in counts]
 

@@ -33,9 +33,10 @@ from typing import Any
 
 import torch
 
-from physion import Dataset, build_model
+from physion import Dataset
 from physion.clips.clips import whole_source
 from physion.compute.tasks import processor
+from physion.models.build import build_untrained
 from physion.models.checkpoint import (
     BUILT_AS,
     DIGESTS,
@@ -81,17 +82,15 @@ def ship(trained: Path, name: str, particles: Path | None) -> None:
     folder = find(trained, SOURCES[name])
     tensors, metadata = read_checkpoint(folder / "model.safetensors")
     card = (folder / "model_card.md").read_text()
-    model: Any = build_model(name.removesuffix("-small"))
+    model: Any = build_untrained(name.removesuffix("-small"))
     load_tensors(folder, tensors, model)
     if name != SOURCES[name]:
         if particles is None:
             raise SystemExit(f"{name} needs --particles FOLDER")
         fit_distances(model, Dataset(particles / "all"), metadata["config"])
-        card = card.replace("gns-small", name).replace("| rigid | fit |", "| rigid | robust |")
-    # Settings of the size; those of this training have a table of their own.
-    card = "".join(line for line in card.splitlines(True) if not line.startswith("| training | {"))
-    card = card.split("## Use")[0] + "## Use\n`physion evaluate "
-    card += f"{name.removesuffix('-small')} TRIALS`\n"
+        card = card.replace("gns-small", name).replace("| model | gns |", "| model | gns-ransac |")
+    use = f"`physion evaluate {name.removesuffix('-small')} TRIALS`"
+    card = card.split("## Use")[0] + f"## Use\n{use}\n"
     if isinstance(model, ParticleSimulator):
         touch = ", ".join(f"{value:.3f}" for value in model.touch.tolist())
         card += f"\n## Contact\nDistance that counts as contact, bodies and cloth, m: {touch}\n"

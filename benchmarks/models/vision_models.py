@@ -64,6 +64,7 @@ from physion.clips.source import ObservedBatches, TrialReaders, WholeBatches
 from physion.clips.states import TrialMotions
 from physion.compute.tasks import processor
 from physion.core.seeds import generator, stable_hash
+from physion.models.build import build_untrained
 from physion.models.cswm import ranking
 from physion.models.vision import empty_scene_error
 from physion.readout.features import FeatureStore
@@ -133,7 +134,7 @@ def speed(names: list[str], repeats: int, device: str, precision: str) -> Rows:
         if name not in names:
             continue
         clips = few if device == "cpu" else 16 * few
-        model: Any = build_model(name, **options).to(device)  # type: ignore[attr-defined]
+        model: Any = build_untrained(name, **options).to(device)  # type: ignore[attr-defined]
         spec = model.spec
         window = random_clips(clips, model.window, spec).to(device)
         context = random_clips(clips, spec.context, spec).to(device)
@@ -189,7 +190,7 @@ def learn(folder: Path, names: list[str], steps: int, seeds: int) -> Rows:
     with tempfile.TemporaryDirectory() as kept:
         store = FeatureStore(Path(kept))
         for name, seed in itertools.product(names, range(seeds)):
-            model: Any = build_model(name, seed=seed)
+            model: Any = build_untrained(name, seed=seed)
             source = whole_source(dataset, model.spec)
             clips = tested_clips(model, source, dataset.trials("testing"))
             features = None
@@ -226,7 +227,7 @@ def shipped(folder: Path, names: list[str]) -> Rows:
         source = whole_source(dataset, model.spec)
         clips = tested_clips(model, source, dataset.trials("testing"))
         after, *trivial = metric(name, model, clips)
-        before, *_ = metric(name, build_model(name), clips)
+        before, *_ = metric(name, build_untrained(name), clips)
         yield [model.name, METRICS[name], *metric_cells(after, before, *trivial)]
 
 
@@ -307,7 +308,7 @@ def boxes(folder: Path, steps: int) -> Rows:
     lengths = {trial: len(motions[trial].trajectory) for trial in trials}
     first = 0.0
     for kept, most_bytes in (("none", 0), ("of earlier windows", MOST_BYTES), ("all", MOST_BYTES)):
-        model: Any = build_model("rpin")
+        model: Any = build_untrained("rpin")
         renderer = MotionRenderer(
             motions,
             ["boxes"],

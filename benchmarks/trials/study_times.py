@@ -149,10 +149,10 @@ def measure_model(name: str, dataset: Dataset) -> ModelTimes:
     """Return the times of a model on the GPU, if torch sees one, or on a core."""
     random = {"weights": "random"} if name.startswith("p") else {}
     model: Any = build_model(name, size="paper", **random)
-    fabric = make_fabric(Devices(), model.settings.precision)
+    fabric = make_fabric(Devices(), model.training_settings.precision)
     move_to_device(fabric, model)
     clock = Clock(fabric.device)
-    batch = model.settings.batch
+    batch = model.training_settings.batch
     slow = clock.device.type == "cpu"
     clips = min(batch, CPU_CLIPS.get(name, batch)) if slow else batch
     evaluated = evaluate_times(model, dataset, 1 if slow else ENCODER_BATCH, clock)
@@ -160,12 +160,12 @@ def measure_model(name: str, dataset: Dataset) -> ModelTimes:
     return ModelTimes(
         name=name,
         diet=model.diet,
-        encoder=getattr(model.config, "encoder", ""),
+        encoder=getattr(model.settings, "encoder", ""),
         boxes=model.spec.objects if "boxes" in model.spec.inputs else 0,
-        steps=model.settings.steps,
-        batch=batch * model.settings.accumulate,
+        steps=model.training_settings.steps,
+        batch=batch * model.training_settings.accumulate,
         measured_batch=clips,
-        validate_every=model.settings.validate_every,
+        validate_every=model.training_settings.validate_every,
         calibration_trials=getattr(model, "calibration_trials", 0),
         context=model.spec.context,
         whole=model.spec.total,
@@ -265,7 +265,7 @@ def rollout_seconds(model: Any, motions: Sequence[Motion], clock: Clock) -> floa
         for row in range(0, len(cut), ENCODER_BATCH):
             group = cut[row : row + ENCODER_BATCH]
             starts = [
-                dataclasses.replace(observed_start(m, frames, model.config.particles), steps=steps)
+                dataclasses.replace(observed_start(m, frames, model.settings.sampling), steps=steps)
                 for m in group
             ]
             later = roll_out(starts, model.step, clock.device, FRAME_TIME * stride)
