@@ -168,8 +168,8 @@ def trained(
     start = time.process_time()
     train_model(
         model, whole_source(dataset, model.spec), trials, name="benchmark", folder=None,
-        settings=dataclasses.replace(model.training_settings, steps=steps), seed=model.settings.seed,
-        accelerator="cpu",
+        settings=dataclasses.replace(model.training_settings, steps=steps),
+        seed=model.settings.seed, accelerator="cpu",
     )  # fmt: skip
     return model, time.process_time() - start
 

@@ -204,7 +204,7 @@ def train_times(
         model.prepare(windows.sample(0).to(clock.device))
         validate = clock.least(lambda: losses_of(model, batch.to(clock.device)))
     settings = dataclasses.replace(
-        model.settings, steps=STEPS, batch=clips, accumulate=1, schedule="constant"
+        model.training_settings, steps=STEPS, batch=clips, accumulate=1, schedule="constant"
     )
     ends: list[float] = []
     loop = TrainingLoop(
