@@ -36,7 +36,8 @@ def test_weights_have_a_card_and_load(key: str) -> None:
     assert model.init == f"shipped:{shipped_digests()[key][:12]}"
     assert model.trained and model.digest() != build_model(name, weights="random").digest()
     # What `physion train` does by default makes these weights again.
-    training = dict(line.strip("| ").split(" | ") for line in card.splitlines() if " | " in line)
+    rows = (line.strip("| ").split(" | ") for line in card.splitlines())
+    training = dict(row for row in rows if len(row) == 2)
     for option in ("steps", "batch", "schedule", "warmup", "validate_every"):
         assert str(getattr(model.training_settings, option)) == training[option]
     assert all(weight.dtype == torch.float32 for weight in model.parameters())
