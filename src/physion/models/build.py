@@ -222,7 +222,9 @@ def _options_of(kind: Any) -> dict[str, Any]:
 def _hints(factory: Any) -> dict[str, Any]:
     """Return the annotated types of the arguments of a class or function."""
     try:
-        return typing.get_type_hints(factory.__init__ if isinstance(factory, type) else factory)
+        return typing.get_type_hints(
+            getattr(factory, "__init__") if isinstance(factory, type) else factory  # noqa: B009
+        )
     except (NameError, TypeError, AttributeError):  # names that are known to a type checker only
         return {}
 
