@@ -6,7 +6,6 @@ Settings of a model and of its training are options of the model: ``options={"st
 from __future__ import annotations
 
 import dataclasses
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +14,11 @@ from typing import Any, TypeVar
 from physion.compute.local import SerialExecutor
 from physion.compute.run_tasks import run_tasks
 from physion.compute.tasks import Executor, Progress
-from physion.core.errors import BadInputError, PhysionError, UnknownNameError
+from physion.core.errors import BadInputError, PhysionError
 from physion.core.settings import field_types, read_settings
-from physion.models.build import build_model, is_file_name, load_from_file
+from physion.models.build import build_model, build_untrained, option_names
 from physion.models.interface import Model, TrainingSettings, ask, can
+from physion.models.user_files import is_file_name
 from physion.readout.folds import Protocol
 from physion.readout.model_calls import is_network
 from physion.trials.dataset import Dataset
@@ -30,8 +30,8 @@ Models = str | Model | Sequence[str | Model] | Mapping[str, Mapping[str, Any]]
 """
 
 
-SEED, WEIGHTS, RANDOM = "seed", "weights", "random"
-"""Options of models that `ChosenModel.build` sets, and the value of ``weights``."""
+SEED, WEIGHTS = "seed", "weights"
+"""Options of models: seed of the initial weights, and trained weights."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,19 +58,10 @@ class ChosenModel:
         """
         if not isinstance(self.model, str):
             return self.model
-        options = {SEED: seed, **self.options}
-        if is_file_name(self.model) and SEED not in _parameters(self.model):
-            options = dict(self.options)
-        try:
-            model = build_model(self.model, **options)
-        except UnknownNameError as error:
-            if error.name != SEED or SEED in self.options:
-                raise
-            options = dict(self.options)
-            model = build_model(self.model, **options)
-        if untrained and self.comes_trained(model):
-            return build_model(self.model, **options, weights=RANDOM)
-        return model
+        options = dict(self.options)
+        if SEED in option_names(self.model):
+            options.setdefault(SEED, seed)
+        return (build_untrained if untrained else build_model)(self.model, **options)
 
     def comes_trained(self, model: Any) -> bool:
         """Return whether a built model has trained weights that the user did not ask for."""
@@ -112,7 +103,7 @@ def choose_models(models: Models, options: Mapping[str, Any] | None = None) -> l
 def _choose(model: Any, options: Mapping[str, Any]) -> ChosenModel:
     kinds = field_types(TrainingSettings)
     # An argument of a user's class may have the name of a setting of the training.
-    own = _parameters(model) if isinstance(model, str) and is_file_name(model) else set()
+    own = option_names(model) if isinstance(model, str) and is_file_name(model) else ()
     training = {
         name: read_settings(kinds[name], v, f"option {name} of the training")
         for name, v in options.items()
@@ -123,11 +114,6 @@ def _choose(model: Any, options: Mapping[str, Any]) -> ChosenModel:
     if rest and not isinstance(model, str):
         raise BadInputError("options are for a model that is given by its name; this one is built")
     return ChosenModel(model, rest, training)
-
-
-def _parameters(name: str) -> set[str]:
-    """Return the names of the arguments of ``FILE.py:Class``."""
-    return set(inspect.signature(load_from_file(name)).parameters)
 
 
 def open_dataset(dataset: Dataset | Path | str) -> Dataset:
