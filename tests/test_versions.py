@@ -11,6 +11,7 @@ import pytest
 
 from physion.cli.main import main
 from physion.clips.batch import Provenance
+from physion.core.html import Markup
 from physion.core.version import MADE_WITH, __version__
 from physion.readout.tables import ScenarioPredictions, make_table
 from physion.report.html import render_document
@@ -20,8 +21,8 @@ GENERATOR = f'<meta name="generator" content="physion {__version__}">'
 
 
 def test_pages_name_the_version() -> None:
-    assert GENERATOR in render_document("title", "", [])
-    assert GENERATOR in render_viewer("title", [], {}, {})
+    assert GENERATOR in render_document("title", Markup(), [])
+    assert GENERATOR in render_viewer("title", [], {})
 
 
 @pytest.mark.parametrize(

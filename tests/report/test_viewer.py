@@ -21,10 +21,8 @@ from physion.core.errors import BadInputError, UnknownNameError
 from physion.report.viewer import build as viewer
 from physion.report.viewer import facts as viewer_facts
 from physion.report.viewer.build import ViewerOptions, build_viewer, choose_trials, embed_json
-from physion.report.viewer.motion import STEPS, pack_grid, pack_motion, pack_shapes
+from physion.report.viewer.imagined import STEPS, pack_grid
 from physion.report.viewer.movies import fitted
-from physion.scenes.shapes.meshes import Mesh, solid_properties
-from physion.scenes.shapes.primitives import shape
 from physion.trials.dataset import Dataset
 from physion.trials.video import read_frames
 from support.viewer_dataset import (
@@ -33,8 +31,6 @@ from support.viewer_dataset import (
     PLANS,
     Plan,
     make_dataset,
-    make_scene,
-    make_trajectory,
 )
 
 SMALL = ViewerOptions(card_size=32, pass_size=32, stride=6)
@@ -146,11 +142,14 @@ def test_policy_allows_its_own_script_and_style_and_no_network(page: Page) -> No
     assert policy is not None
     rules = dict(rule.split(" ", 1) for rule in policy.split("; "))
     for name, kind in (("script-src", "script"), ("style-src", "style")):
-        digest = hashlib.sha256(page.blocks[kind].encode()).digest()
-        assert rules.pop(name) == f"'sha256-{base64.b64encode(digest).decode()}'"
+        parts = re.findall(rf"<{kind}>(.*?)</{kind}>", page.raw, flags=re.S)
+        digests = [base64.b64encode(hashlib.sha256(p.encode()).digest()).decode() for p in parts]
+        assert rules.pop(name).split() == [f"'sha256-{digest}'" for digest in digests]
     assert rules.pop("media-src") == "blob:"
     assert set(rules.values()) == {"'none'"} and "default-src" in rules
-    assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)|@import|url\(|<link", page.raw)
+    own = re.sub(r"<script>var Three.*?</script>", "", page.raw, flags=re.S)
+    assert len(own) < len(page.raw) - 500_000
+    assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)|@import|url\(|<link", own)
     names = ("src", "href", "srcset", "poster", "data", "action", "style")
     assert not [name for _, a in page.tags for name in names if name in a]
     assert not [name for _, a in page.tags for name in a if name.startswith("on")]
@@ -162,8 +161,8 @@ def test_foreign_text_cannot_leave_its_block(tmp_path: Path) -> None:
     page = Page(tmp_path / "v.html")
     assert "img" not in {tag for tag, _ in page.tags}
     assert [a.get("id") for t, a in page.tags if t == "script"] == [
-        *("cards", "totals", "shapes", "movie-0", "detail-0"),
-        None,
+        *("cards", "totals", "movie-0", "detail-0"),
+        *(None, None),
     ]
     assert page.blocks["title"] == "by-hand" + EVIL
     detail = page.json("detail-0")
@@ -214,8 +213,8 @@ def test_details_only_where_asked(dataset: Path, tmp_path: Path) -> None:
     report = build_viewer(dataset, tmp_path / "v.html", options)
     assert (report.shown, report.left_out) == (1, 2)
     page = Page(tmp_path / "v.html")
-    assert not {"passes", "motion"} & page.json("detail-0").keys()
-    assert page.json("shapes") == {}
+    assert not {"passes", "gltf"} & page.json("detail-0").keys()
+    assert page.raw.count("<script>") == 1, "no library where nothing is in 3D"
 
 
 @pytest.mark.parametrize(
@@ -346,41 +345,38 @@ def test_points_come_back_to_half_a_step() -> None:
     assert _points(pack_grid(np.zeros((0, 3)))).shape == (0, 3)
 
 
-@pytest.mark.parametrize("name", ["cube", "bowl", "prop:vase"])
-def test_meshes_come_back_whole(name: str) -> None:
-    packed = pack_shapes([name, name])[name]
-    points, mesh = _points(packed["points"]), shape(name).mesh
-    faces = _unpack(packed["faces"], "<u2").reshape(-1, 3).astype(np.int32)
-    normals = _unpack(packed["normals"], "<i1").reshape(-1, 3)
-    assert len(points) == len(normals) and faces.max() == len(points) - 1
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 127, atol=2)
-    volume = solid_properties(Mesh(points, faces))[0]
-    assert volume == pytest.approx(solid_properties(mesh)[0], rel=1e-3)
+def test_paths_and_touch_points_are_those_of_the_trial(dataset: Path) -> None:
+    trial = Dataset(dataset).trial("drop_0")
+    (path,) = (_unpack(text, "<f4") for text in viewer_facts.paths(trial).values())
+    centres = trial.trajectory.positions[:, 0] + [0, 0, 0.25]  # the pivot of a sphere is its foot
+    np.testing.assert_allclose(path.reshape(FRAMES, 3)[:, :2], centres[:, :2], atol=1e-6)
+    np.testing.assert_allclose(np.ptp(path.reshape(FRAMES, 3)[:, 2]), 0.8, atol=1e-5)
+    touches = viewer_facts.touches(trial)
+    assert touches[0] == pytest.approx([50, 0.1, 0.2, 0.2])
+    assert [touch[0] for touch in touches] == list(PLANS[0].touch)
+    sheet = Dataset(dataset).trial("drape_0")
+    (path,) = (_unpack(text, "<f4") for text in viewer_facts.paths(sheet).values())
+    np.testing.assert_allclose(
+        path.reshape(FRAMES, 3), sheet.trajectory.cloth_vertices.mean(axis=1), atol=1e-5
+    )
 
 
-def test_motion_keeps_what_moves_frame_by_frame() -> None:
-    scene = make_scene(PLANS[0])
-    trajectory = make_trajectory(scene, PLANS[0])
-    motion = pack_motion(scene, trajectory)
-    assert motion["moving"] == [0]
-    positions = _unpack(motion["positions"], "<f4").reshape(FRAMES, 1, 3)
-    np.testing.assert_array_equal(positions, trajectory.positions[:, :1])
-    turns = _unpack(motion["rotations"], "<i2").reshape(FRAMES, 1, 4) / 32767
-    np.testing.assert_allclose(turns, trajectory.rotations[:, :1], atol=2e-5)
-    assert len(_unpack(motion["start"]["positions"], "<f4")) == 9
-    assert [body["role"] for body in motion["bodies"]] == ["agent", "patient", None]
-    assert motion["contactPoints"][0] == pytest.approx([50, 0.1, 0.2, 0.2])
-    assert [touch[0] for touch in motion["contactPoints"]] == list(PLANS[0].touch)
+def test_the_scene_in_3d_is_a_gltf_file(page: Page) -> None:
+    for number, things in ((0, ["plate", "vase", "sheet"]), (1, ["ball", "plate", "vase"])):
+        data = base64.b64decode(page.json(f"detail-{number}")["gltf"])
+        size = int.from_bytes(data[12:16], "little")
+        parts = json.loads(data[20 : 20 + size])
+        assert data[:4] == b"glTF" and [n["name"] for n in parts["nodes"]][:3] == things
+        assert parts["scenes"][0]["extras"]["trial"] == ("drape_0", "drop_0")[number]
 
 
-def test_cloth_keeps_its_corners_and_its_ends() -> None:
-    scene = make_scene(PLANS[3])
-    trajectory = make_trajectory(scene, PLANS[3])
-    cloth = pack_motion(scene, trajectory)["cloths"][0]
-    assert (cloth["side"], cloth["role"], cloth["instants"]) == (26, "agent", list(range(FRAMES)))
-    points = _points(cloth["points"]).reshape(FRAMES, 26, 26, 3)
-    corners = trajectory.cloth_vertices.reshape(FRAMES, 31, 31, 3)[:, ::30, ::30]
-    np.testing.assert_allclose(points[:, ::25, ::25], corners, atol=1e-4)
+def test_the_library_of_the_3d_view_is_the_one_of_the_lock_with_its_licence(page: Page) -> None:
+    folder = Path(viewer.__file__).parent / "vendor"
+    lock = json.loads((folder / "vendor.lock.json").read_text())
+    data = (folder / lock["file"]).read_bytes()
+    assert hashlib.sha256(data).hexdigest() == lock["sha256"] and len(data) < 1_000_000
+    assert "three.js authors" in (folder / lock["license"]).read_text()
+    assert data.decode() in page.raw
 
 
 def test_sizes_are_even_and_keep_the_shape() -> None:

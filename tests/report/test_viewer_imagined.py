@@ -15,8 +15,7 @@ import pytest
 from physion.clips.imagined import ImaginedTrial
 from physion.core.errors import BadInputError
 from physion.report.viewer.build import ViewerOptions, build_viewer
-from physion.report.viewer.imagined import REACH, caption, pack_imagined
-from physion.report.viewer.motion import STEPS
+from physion.report.viewer.imagined import REACH, STEPS, caption, pack_imagined
 from support.viewer_dataset import PLANS, make_dataset, make_scene
 
 SCENE = make_scene(PLANS[0])

@@ -1,7 +1,8 @@
-"""Text of the viewer's page: template, style, script and data, all escaped.
+"""Writer of the viewer: one HTML page that shows a dataset, by scenario and in detail.
 
 Everything that comes from trials goes into blocks of JSON, which the script shows as text. The
-page's policy allows only its own script and style, by their hashes, and no network.
+page's policy allows only its own scripts and style, by their hashes, and no network. The scene in
+3D is the glTF file of the trial, shown by three.js (folder ``vendor``).
 """
 
 from __future__ import annotations
@@ -12,10 +13,8 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from importlib.resources import files
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import pandas as pd
@@ -24,29 +23,20 @@ from physion.clips.imagined import Imagine, ImaginedTrial
 from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import write_atomic
+from physion.core.html import Markup, environment
 from physion.core.version import MADE_WITH
+from physion.report.html import style
 from physion.report.viewer import facts as viewer_facts
-from physion.report.viewer import motion as viewer_motion
 from physion.report.viewer import movies as viewer_movies
 from physion.report.viewer.imagined import pack_imagined
 from physion.trials.dataset import Dataset
+from physion.trials.share.gltf import motion_gltf
+from physion.trials.trial_file import Trial
 
-SCRIPTS = (
-    "dom",
-    "player",
-    "timeline",
-    "matrix",
-    "webgl",
-    "motion",
-    "particles",
-    "pictures",
-    "predictions",
-    "scene3d",
-    "grid",
-    "detail",
-    "main",
-)
-"""Parts of the script in the order in which they need each other."""
+SCRIPTS = ("scene", "pictures", "detail", "page")
+"""Parts of the script; the last one starts it."""
+CLOTH_SIDE, CLOTH_KEYS = 26, 50
+"""Largest number of vertices along a side of a cloth, and of its key frames, in the page."""
 
 
 @dataclass(frozen=True)
@@ -58,32 +48,24 @@ class TrialData:
     detail: Mapping[str, Any]
 
 
-def render_viewer(
-    title: str,
-    trials: Sequence[TrialData],
-    totals: Mapping[str, int],
-    shapes: Mapping[str, Any],
-) -> str:
-    """Return the page as text. ``totals``: trials of each scenario; ``shapes``: see
-    `pack_shapes`.
-    """
-    style, script = _style(), _script()
-    blocks = [
-        _block("cards", [trial.card for trial in trials]),
-        _block("totals", totals),
-        _block("shapes", shapes),
-    ]
+def render_viewer(title: str, trials: Sequence[TrialData], totals: Mapping[str, int]) -> str:
+    """Return the page as text; ``totals``: trials of each scenario."""
+    detailed = any("gltf" in trial.detail for trial in trials)
+    look = Markup("\n") + style() + Markup(_part("templates", "viewer.css"))
+    # The library is needed only where a trial has a scene in 3D.
+    scripts = [_part("viewer", "vendor", "three.min.js")] if detailed else []
+    scripts.append(_script())
+    blocks = [("cards", [trial.card for trial in trials]), ("totals", totals)]
     for number, trial in enumerate(trials):
-        blocks.append(_block(f"movie-{number}", trial.movie))
-        blocks.append(_block(f"detail-{number}", trial.detail))
-    return Template(_part("page.html")).substitute(
-        policy=_policy(style, script),
-        title=escape(title),
+        blocks += [(f"movie-{number}", trial.movie), (f"detail-{number}", trial.detail)]
+    return environment("physion.report").get_template("viewer.html").render(
+        policy=_policy(look, scripts),
+        title=title,
         made_with=MADE_WITH,
-        style=style,
-        blocks="\n".join(blocks),
-        script=script,
-    )
+        style=look,
+        blocks=[(name, Markup(embed_json(value))) for name, value in blocks],
+        scripts=[Markup(script) for script in scripts],
+    )  # fmt: skip
 
 
 def embed_json(value: Any) -> str:
@@ -97,15 +79,11 @@ def embed_json(value: Any) -> str:
     return text
 
 
-def _block(name: str, value: Any) -> str:
-    return f'<script type="application/json" id="{name}">{embed_json(value)}</script>'
-
-
-def _policy(style: str, script: str) -> str:
+def _policy(look: str, scripts: Sequence[str]) -> str:
     rules = {
         "default-src": "'none'",
-        "script-src": _hash(script),
-        "style-src": _hash(style),
+        "script-src": " ".join(_hash(script) for script in scripts),
+        "style-src": _hash(look),
         "media-src": "blob:",
         "base-uri": "'none'",
         "form-action": "'none'",
@@ -118,22 +96,13 @@ def _hash(text: str) -> str:
     return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
 
 
-def _style() -> str:
-    """Return the style of the report, followed by that of the viewer."""
-    report = files("physion.report").joinpath("templates", "report.css").read_text(encoding="utf-8")
-    return "\n" + report + _part("viewer.css")
-
-
 def _script() -> str:
-    parts = "\n".join(_part(f"{name}.js") for name in SCRIPTS)
+    parts = "\n".join(_part("viewer", f"{name}.js") for name in SCRIPTS)
     return f'\n(() => {{\n"use strict";\n{parts}}})();\n'
 
 
-def _part(name: str) -> str:
-    return files("physion.report").joinpath("viewer", name).read_text(encoding="utf-8")
-
-
-# Writer of the viewer: one HTML page that shows a dataset, by scenario and in detail.
+def _part(*names: str) -> str:
+    return files("physion.report").joinpath(*names).read_text(encoding="utf-8")
 
 
 @dataclass(frozen=True)
@@ -205,14 +174,12 @@ def build_viewer(
     rows = [row for _, row in chosen.iterrows()]
     detailed = [str(row["trial"]) for row in rows if row["detailed"]]
     imagined = imagine(detailed) if imagine is not None else {}
-    shapes: set[str] = set()
-    found = []
-    for row in tracked(rows, "viewing", len(rows), progress):
-        data, names = _trial_data(dataset, row, options, imagined.get(row["trial"], ()))
-        found.append(data)
-        shapes |= names
+    found = [
+        _trial_data(dataset, row, options, imagined.get(row["trial"], ()))
+        for row in tracked(rows, "viewing", len(rows), progress)
+    ]
     title = ", ".join(sorted(set(dataset.index["dataset"].astype(str)))) or "no trials"
-    page = render_viewer(title, found, totals, viewer_motion.pack_shapes(shapes)).encode()
+    page = render_viewer(title, found, totals).encode()
     try:
         write_atomic(out, page)
     except OSError as error:
@@ -250,8 +217,8 @@ def choose_trials(
 
 def _trial_data(
     dataset: Dataset, row: pd.Series, options: ViewerOptions, imagined: Sequence[ImaginedTrial]
-) -> tuple[TrialData, set[str]]:
-    """Return the data of one trial, and the shapes that its 3D view needs."""
+) -> TrialData:
+    """Return the data of one trial."""
     paths = dataset.paths(row["trial"])
     trial = dataset.trial(row["trial"])
     if trial.metadata.playback_rate < 1:
@@ -261,20 +228,36 @@ def _trial_data(
         "runs": viewer_facts.contact_runs(trial),
         "legend": viewer_facts.legend(trial.scene),
     }
-    shapes: set[str] = set()
     if row["detailed"]:
         strip, ranges = viewer_movies.passes_movie(trial, options.pass_size, options.stride)
         detail["passes"] = strip.as_record()
         detail["ranges"] = {"near": ranges.near, "far": ranges.far, "flow": ranges.flow}
-        detail["motion"] = viewer_motion.pack_motion(trial.shown("redyellow"), trial.trajectory)
+        detail["gltf"] = base64.b64encode(_scene(trial)).decode("ascii")
+        detail["scenery"] = any(body.scenery for body in trial.scene.bodies)
+        detail["paths"] = viewer_facts.paths(trial)
+        detail["touches"] = viewer_facts.touches(trial)
         detail["imagined"] = [
             pack_imagined(one, trial.scene, trial.metadata.frames, observed=trial.labels.observed)
             for one in imagined
         ]
-        shapes = {body.shape for body in trial.scene.bodies}
     stored = dataset.file(row["trial"], "movie")
     if stored is not None:
         stored.check()
     movie = viewer_movies.small_movie(paths.movie, trial, options.card_size)
     size = {"width": movie.width, "height": movie.height}
-    return TrialData(viewer_facts.card(trial) | size, movie.as_record(), detail), shapes
+    return TrialData(viewer_facts.card(trial) | size, movie.as_record(), detail)
+
+
+def _scene(trial: Trial) -> bytes:
+    """Return the trial as a glTF file, with agent red, patient yellow, and coarse cloths."""
+    meta = trial.metadata
+    return motion_gltf(
+        trial.shown("redyellow"),
+        trial.trajectory,
+        frame_time=meta.frame_time,
+        aspect=meta.width / meta.height,
+        cloth_keys=CLOTH_KEYS,
+        cloth_side=CLOTH_SIDE,
+        contacts=False,
+        facts={"trial": meta.trial},
+    )

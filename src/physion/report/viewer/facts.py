@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
+from physion.numerics.rotations import rotate_vectors
 from physion.physics.labels import contact_frames
-from physion.report.viewer.motion import role_of
 from physion.report.viewer.movies import thing_colors
 from physion.scenes.scene import Scene
+from physion.scenes.shapes.primitives import shape
+from physion.trials.share.gltf import role_of
 from physion.trials.trial_file import Trial
 
 Table = dict[str, Any]
@@ -75,6 +80,51 @@ def contact_runs(trial: Trial) -> list[list[int]]:
         else:
             runs.append([frame, frame])
     return runs
+
+
+def touches(trial: Trial) -> list[list[float]]:
+    """Return the contact points of agent and patient: rows of frame, x, y, z."""
+    scene, trajectory = trial.scene, trial.trajectory
+    agent, patient = (scene.index(name) for name in (scene.roles.agent, scene.roles.patient))
+    contacts = trajectory.contacts
+    pair = (contacts.bodies == sorted((agent, patient))).all(axis=1)
+    counted = np.isin(contacts.frame, contact_frames(scene, trajectory))
+    rows = np.flatnonzero(pair & counted)
+    points = np.round(np.nan_to_num(contacts.point[rows].astype(np.float64)), 4)
+    found: list[list[float]] = [
+        [int(contacts.frame[row]), *(float(v) for v in point)]
+        for row, point in zip(rows, points, strict=True)
+    ]
+    # The page counts those up to a frame, and a file may hold them in any order.
+    return sorted(found)
+
+
+def paths(trial: Trial) -> dict[str, str]:
+    """Return the paths of agent, patient and probe, if they move: the centre of a body's bounding
+    box or of a cloth in each frame, as base64 of x, y, z in single precision.
+    """
+    scene, trajectory = trial.scene, trial.trajectory
+    found = {}
+    for role in ("agent", "patient", "probe"):
+        name = getattr(scene.roles, role)
+        if name is None:
+            continue
+        index = scene.index(name)
+        if index < len(scene.bodies):
+            vertices = np.asarray(shape(scene.bodies[index].shape).mesh.vertices)
+            centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2 * scene.bodies[index].scale
+            turns = trajectory.rotations[:, index].astype(np.float64)
+            path = rotate_vectors(turns, np.tile(centre, (len(turns), 1)))
+            path = path + trajectory.positions[:, index]
+        else:
+            sizes = [cloth.resolution**2 for cloth in scene.cloths]
+            first = sum(sizes[: index - len(scene.bodies)])
+            sheet = trajectory.cloth_vertices[:, first : first + sizes[index - len(scene.bodies)]]
+            path = sheet.mean(axis=1)
+        if np.any(path != path[0]):
+            values = np.nan_to_num(path).astype("<f4")
+            found[role] = base64.b64encode(values.tobytes()).decode("ascii")
+    return found
 
 
 def legend(scene: Scene) -> list[dict[str, Any]]:

@@ -15,9 +15,9 @@ from PIL import Image
 
 from physion.clips.imagined import PICTURES, SHOWABLE, Arrays, ImaginedTrial
 from physion.core.errors import BadInputError
-from physion.report.viewer.motion import pack_grid, role_of
 from physion.report.viewer.movies import AGENT, OTHERS, PATIENT
 from physion.scenes.scene import OBSERVED_FRAMES, Scene
+from physion.trials.share.gltf import evenly, role_of
 
 
 def caption(imagined: ImaginedTrial, *, observed: bool = False) -> str:
@@ -41,13 +41,6 @@ def caption(imagined: ImaginedTrial, *, observed: bool = False) -> str:
     return f"{text}: {'; '.join(facts)}." if facts else f"{text}."
 
 
-def evenly(count: int, most: int) -> NDArray[np.int64]:
-    """Return at most ``most`` of the rows 0 to ``count`` - 1, with the first and the last."""
-    if count <= most:
-        return np.arange(count)
-    return np.unique(np.rint(np.linspace(0, count - 1, most)).astype(np.int64))
-
-
 # Imagined particles for the viewer: positions next to the true motion, in few bytes.
 
 PARTICLES = 1500
@@ -56,6 +49,25 @@ PARTICLE_BYTES = 700_000
 """Largest size of their positions before base64, which adds a third."""
 REACH = 50.0
 """Metres from the origin beyond which particles are not followed: models may lose objects."""
+
+
+STEPS = 65535
+"""Steps of the grid on which coordinates are stored: a thirtieth of a millimetre over 2 m."""
+
+
+def pack_grid(values: NDArray[np.floating]) -> dict[str, Any]:
+    """Quantise points (..., 3) to a grid of `STEPS` over their bounds: ``low``, ``size`` and
+    ``data``.
+    """
+    points = np.nan_to_num(np.asarray(values, np.float64)).reshape(-1, 3)
+    low = points.min(axis=0) if len(points) else np.zeros(3)
+    size = np.ptp(points, axis=0) if len(points) else np.zeros(3)
+    steps = np.rint((points - low) / np.where(size > 0, size, 1.0) * STEPS)
+    return {
+        "low": [float(v) for v in low],
+        "size": [float(v) for v in size],
+        "data": base64.b64encode(steps.astype("<u2").tobytes()).decode("ascii"),
+    }
 
 
 def pack_particles(imagined: ImaginedTrial, scene: Scene, length: int) -> dict[str, Any]:

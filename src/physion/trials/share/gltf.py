@@ -300,6 +300,7 @@ class _Writer:
                 "camera": self.part("cameras", value),
                 "translation": [float(part) for part in camera.position],
                 "rotation": _looking(camera).tolist(),
+                "extras": {"target": [float(part) for part in camera.target]},
             }
         )
 

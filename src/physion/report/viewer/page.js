@@ -1,3 +1,69 @@
+// The page: helpers, the grid of cards with its filters, and the open trial in the address.
+
+// DOM helpers and decoding of data. Text of trials becomes text nodes and attributes, never markup.
+
+/** @param {string} id @returns {any} */
+const byId = (id) => document.getElementById(id);
+
+/**
+ * Create an element.
+ * @param {string} tag
+ * @param {Record<string, any>} [attributes] `true` gives an empty attribute; `false` and `null` none.
+ * @param {...(Node|string)} children
+ * @returns {any}
+ */
+function createElement(tag, attributes = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (value !== null && value !== false) element.setAttribute(name, value === true ? "" : value);
+  }
+  element.append(...children);
+  return element;
+}
+
+// Parse a JSON block of the page.
+const readData = (id) => JSON.parse(byId(id).textContent);
+
+// Decode base64.
+function decodeBytes(base64) {
+  const text = atob(base64);
+  const array = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i++) array[i] = text.charCodeAt(i);
+  return array;
+}
+
+// Decode base64 to a typed array.
+const decodeArray = (base64, Kind) => new Kind(decodeBytes(base64).buffer);
+
+// Decode points that are quantised to 16 bits within their bounding box.
+function decodePoints(grid) {
+  const steps = decodeArray(grid.data, Uint16Array);
+  const points = new Float32Array(steps.length);
+  for (let i = 0; i < steps.length; i++) {
+    points[i] = grid.low[i % 3] + (steps[i] / 65535) * grid.size[i % 3];
+  }
+  return points;
+}
+
+const movieUrl = (base64) =>
+  URL.createObjectURL(new Blob([decodeBytes(base64)], { type: "video/mp4" }));
+
+const plural = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s"}`;
+
+const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
+
+// Short facts about a trial; those that reveal the outcome have a class by which they can be hidden.
+function badges(card) {
+  const spans = [];
+  const add = (label, kind) => spans.push(createElement("span", { class: `badge ${kind}` }, label));
+  add(card.contact ? `contact at ${card.firstContact}` : "no contact", `answer ${card.contact ? "yes" : ""}`);
+  if (card.observed) add("while observed", "answer yes");
+  if (card.robust !== null) add(`robust ${card.robust.toFixed(2)}`, "answer");
+  add(card.split, "");
+  if (card.preset) add(card.preset, "");
+  return spans;
+}
+
 // The grid of cards by scenario, with filters, and the playback of their movies.
 
 class Grid {
@@ -153,3 +219,68 @@ class Grid {
     }
   }
 }
+
+// The page: the grid, the open trial, and its name in the URL.
+
+const cards = readData("cards");
+const title = document.title;
+
+// Return the number of the trial that the URL names, -1 for none.
+const namedTrial = () => {
+  const match = /^#trial=(.*)$/.exec(location.hash);
+  if (!match) return -1;
+  try {
+    const name = decodeURIComponent(match[1]);
+    return cards.findIndex((card) => card.trial === name);
+  } catch {
+    return -1;
+  }
+};
+
+const setHash = (hash) => {
+  if (location.hash !== hash) history.replaceState(null, "", hash || location.pathname + location.search);
+};
+
+let openTrial = -1;
+const detail = new Detail(cards, () => {
+  grid.setCovered(false);
+  grid.items[openTrial]?.button.focus();
+  openTrial = -1;
+  document.title = title;
+  setHash("");
+});
+const show = (number) => {
+  openTrial = number;
+  grid.setCovered(true);
+  document.title = `${cards[number].trial} – ${title}`;
+  detail.open(number);
+  setHash(`#trial=${encodeURIComponent(cards[number].trial)}`);
+};
+const grid = new Grid(cards, readData("totals"), show);
+
+// Show the next (1) or previous (-1) of the trials that match the filters.
+const showNeighbour = (by) => {
+  const numbers = grid.shown.map((item) => item.number);
+  const index = numbers.indexOf(openTrial);
+  if (numbers.length) show(numbers[(index + by + numbers.length) % numbers.length]);
+};
+byId("next").onclick = () => showNeighbour(1);
+byId("previous").onclick = () => showNeighbour(-1);
+
+byId("labels").onclick = () => {
+  const labelsShown = !grid.labelsShown;
+  document.body.classList.toggle("unlabelled", !labelsShown);
+  byId("labels").textContent = labelsShown ? "Labels shown" : "Labels hidden";
+  grid.showLabels(labelsShown);
+  detail.showLabels(labelsShown);
+};
+
+addEventListener("hashchange", () => {
+  const number = namedTrial();
+  if (number >= 0 && number !== openTrial) show(number);
+});
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+  detail.scene?.draw();
+  detail.predictions?.draw();
+});
+if (namedTrial() >= 0) show(namedTrial());
