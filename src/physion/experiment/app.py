@@ -15,7 +15,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from physion.core.errors import BadInputError
-from physion.experiment.experimenter.routes import build_router
+from physion.experiment.experimenter.pages import build_router
 from physion.experiment.protocol import Refused
 from physion.experiment.study.media import read_media
 from physion.experiment.study.texts import TEXTS_FOLDER, read_consent_file

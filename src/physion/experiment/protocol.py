@@ -10,7 +10,8 @@ request                       body, answer               meaning
 ``GET /api/study``            `public_study.PublicStudy`  settings that the page needs before a
                                                          session begins
 ``GET /api/texts/{language}`` flat object of texts       texts of the pages
-``POST /api/enter``           `Enter`, `Entered`         begin or continue a session
+``POST /api/enter``           `Enter`, `Entered`         continue a session, or show the consent
+                                                         to a visitor, who is not stored yet
 ``GET /api/session``          `SessionState`             current stage and trial; ``?load=true``
                                                          once for each time that the page is loaded
 ``GET /api/trials/{phase}``   `TrialList`                media of the trials, without stimulus names
@@ -24,7 +25,6 @@ request                       body, answer               meaning
                                                          finished session
 ``GET /api/ending``           `SessionEnd`               completion of a session that was declined
                                                          or stopped
-``POST /api/jump``            `Jump`, `SessionState`     go to any page or trial of a preview
 ``GET /api/health``           `Health`                   health check for load balancers, including
                                                          the database
 ============================  =========================  ==========================================
@@ -183,6 +183,7 @@ REFUSALS = {
     "other_browser": 403,
     "already_took_part": 409,
     "study_full": 409,
+    "held": 409,
     "paused": 409,
     "wrong_stage": 409,
     "out_of_order": 409,
@@ -251,8 +252,6 @@ class Enter(Message):
         Wanted scenario and language; the server chooses if they are absent.
     condition
         The condition that the link fixes; the link must be signed for it.
-    take_back
-        Take part after all in a session that was declined or stopped before the first answer.
     pass_
         Sent as ``pass``: signed key of the link (`recruitment.LINK_KEYS`).
     device
@@ -269,7 +268,6 @@ class Enter(Message):
     scenario: Name | None = None
     condition: Name | None = None
     language: Annotated[str, StringConstraints(max_length=20)] = ""
-    take_back: bool = False
     pass_: Annotated[str, StringConstraints(max_length=200)] | None = Field(
         default=None, alias="pass"
     )
@@ -304,8 +302,6 @@ class SessionState(Message):
     stage: Stage
     ended: bool
     """Whether the session ended before it was complete."""
-    places: list[Stage]
-    """Stages to which a preview can go; empty for others."""
     trial: int | None
     trials: dict[Phase, int]
     comprehension_attempts: int
@@ -368,17 +364,6 @@ class PageDone(Message):
     page: Stage | Literal["withdraw"]
     data: Annotated[dict[Name, bool | int | float | Text | Names | None],
                     Field(max_length=50)] = {}  # fmt: skip
-
-
-class Jump(Message):
-    """Page or trial to which a preview goes.
-
-    ``trial`` counts from 0; for ``ready`` and ``block`` it is the index of the block, for ``block``
-    of the one that the page ends; ignored for other pages.
-    """
-
-    stage: Stage
-    trial: Annotated[int, Field(ge=0, le=100_000)] = 0
 
 
 class Showing(Message):
@@ -475,14 +460,9 @@ class Completion(Message):
 
 
 class SessionEnd(Message):
-    """End of a session before it was complete.
-
-    ``can_take_back``: nothing was answered, so that the participant can still take part
-    (`Enter.take_back`).
-    """
+    """End of a session before it was complete."""
 
     completion: Completion
-    can_take_back: bool
 
 
 class Result(Message):
@@ -574,6 +554,8 @@ class PublicStudy(Message):
     break_every: int
     """Number of test trials between two breaks; 0: no breaks."""
     familiarization_feedback: bool
+    hold_minutes: int
+    """Minutes after which people who are told that all places are taken may come back."""
     preload: int
     """Number of trials whose media are loaded ahead."""
     interrupted: Literal["repeat", "void"]  # see `Plausibility`

@@ -25,7 +25,6 @@ from physion.experiment.study.identity import Secrets
 from physion.experiment.study.media import check_media
 from physion.experiment.study.recruitment import start_warnings
 from physion.experiment.study.study import load_study
-from physion.experiment.web.connections import LimitedHeadProtocol
 
 STOP_SECONDS = 5
 """Time that running requests and open connections get to end when the server shuts down."""
@@ -71,7 +70,6 @@ class Address:
 def serve(
     folder: Path,
     address: Address,
-    database: str | None = None,
     log_requests: bool = False,
     ready: Callable[[str], None] = lambda url: None,
     warn: Callable[[str], None] = lambda line: None,
@@ -84,8 +82,6 @@ def serve(
         The study folder.
     address
         Where to listen.
-    database
-        URL of the database; SQLite in the study folder if None.
     log_requests
         Also log every request (method, path and status).
     ready
@@ -98,7 +94,7 @@ def serve(
     ------
     PhysionError
         The study does not exist or is invalid, the port is in use, the certificate is bad, or the
-        database cannot be reached or is used by another server.
+        database cannot be read or is used by another server.
     """
     _check_address(address)
     _set_logging(log_requests)
@@ -111,7 +107,7 @@ def serve(
     with contextlib.closing(_listen(address)) as listening:
         port = int(listening.getsockname()[1])
         url = address.base_url.rstrip("/") or f"{address.scheme}://{_url_host(address.host)}:{port}"
-        store = Store.open(study, secrets, database)
+        store = Store.open(study, secrets)
         try:
             app = build_app(study, secrets, store)
             server = _Server(_configure(app, address), lambda: ready(url))
@@ -161,7 +157,6 @@ def _configure(app: FastAPI, address: Address) -> uvicorn.Config:
     """Return uvicorn's configuration, with every feature off that the study does not need."""
     config = uvicorn.Config(
         app,
-        http=LimitedHeadProtocol,
         ws="none",
         lifespan="on",
         log_config=None,

@@ -28,8 +28,6 @@ class ServerProcess:
     ----------
     folder
         The study folder.
-    database
-        URL of the database; the study's SQLite file if None.
     options
         Further command line options of ``serve``.
     command
@@ -39,14 +37,12 @@ class ServerProcess:
     def __init__(
         self,
         folder: Path,
-        database: str | None = None,
         options: Sequence[str] = (),
         command: Sequence[str] = (sys.executable, "-m", "physion.cli.main"),
     ) -> None:
         self.port = _free_port()
         self.url = f"http://{HOST}:{self.port}"
         arguments = ["experiment", "serve", str(folder), "--host", HOST, "--port", str(self.port)]
-        arguments += [] if database is None else ["--database", database]
         self._command = [*command, *arguments, *options]
         self._process: subprocess.Popen[bytes] | None = None
         self._output = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as this object

@@ -25,6 +25,7 @@ from physion.experiment.experimenter.statistics.summaries import (
 )
 from physion.experiment.experimenter.statistics.worker import StatisticsWorker
 from physion.experiment.experimenter.templating import minutes
+
 from physion.experiment.protocol import Stage
 from physion.experiment.store.database import ANSWERS, SESSIONS, open_database, upgrade
 from physion.experiment.study.identity import Secrets

@@ -9,10 +9,10 @@ import pandas as pd
 import pytest
 import sqlalchemy as sa
 from pandas.testing import assert_frame_equal
+from physion.experiment.experimenter.statistics.summaries import SummaryCache
 
 from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS, check_table
 from physion.core.errors import PhysionError, UnknownNameError
-from physion.experiment.experimenter.statistics.summaries import SummaryCache
 from physion.experiment.export import trial_rows
 from physion.experiment.export.answer_tables import read_tables, snapshot
 from physion.experiment.export.session_rows import (

@@ -11,12 +11,13 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from physion.analysis.check import check_responses
-from physion.analysis.people.exclusions import flag_sessions, read_expected
-from physion.analysis.people.results import read_any_responses
 from physion.experiment.experimenter.overview import compute_overview
 from physion.experiment.experimenter.statistics.flagging import Flags, find_flags
 from physion.experiment.experimenter.statistics.summaries import SummaryCache
+
+from physion.analysis.check import check_responses
+from physion.analysis.people.exclusions import flag_sessions, read_expected
+from physion.analysis.people.results import read_any_responses
 from physion.experiment.export.export_study import export_study
 from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.store import Store

@@ -11,14 +11,15 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
+from physion.experiment.experimenter.overview import compute_overview
+from physion.experiment.experimenter.statistics.flagging import Flags
+from physion.experiment.experimenter.statistics.summaries import SummaryCache
+
 from physion.analysis.people.effects import accuracy_by_background, background
 from physion.analysis.people.measures import accuracy_by_condition
 from physion.analysis.people.responses import keep_where
 from physion.analysis.people.results import read_any_responses
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.experiment.experimenter.overview import compute_overview
-from physion.experiment.experimenter.statistics.flagging import Flags
-from physion.experiment.experimenter.statistics.summaries import SummaryCache
 from physion.experiment.export.export_study import export_study
 from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.store import Store

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from physion.experiment.experimenter.statistics.summaries import SummaryCache
 
 from physion.analysis.people.exclusions import flag_sessions, read_expected
 from physion.analysis.people.responses import read_responses
-from physion.experiment.experimenter.statistics.summaries import SummaryCache
 from physion.experiment.export.export_study import export_study
 from physion.experiment.protocol import Jump
 from physion.experiment.store.database import SESSIONS

@@ -16,6 +16,7 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
+from physion.experiment.web.rate_limits import Buckets, RateLimits, network_of
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request
@@ -27,7 +28,6 @@ from physion.experiment.protocol import MAX_BODY
 from physion.experiment.study.study import Limits, Study
 from physion.experiment.web import connections, guards
 from physion.experiment.web.guards import Guards, content_policy
-from physion.experiment.web.rate_limits import Buckets, RateLimits, network_of
 from support.experiment.live_app import HOST, exchange, read_all, running
 
 TOKENS = {"good", "other"}

@@ -15,7 +15,6 @@ import pytest
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.cli.experiment import serve
-from physion.experiment.store.database import open_database
 
 ROOT = Path(__file__).parents[3]
 SERVER = ROOT / "examples" / "server"
@@ -41,14 +40,6 @@ def test_the_command_is_one_that_serve_accepts(services: dict[str, Any]) -> None
     options = options_of(services["study"]["command"])
     assert set(options) <= set(DEFAULTS)
     assert ipaddress.ip_network(options["behind_proxy"]) == ipaddress.ip_network(services["subnet"])
-    address = open_database(options["database"]).url
-    database = services["database"]["environment"]
-    assert (address.host, address.username, address.database) == (
-        "database", database["POSTGRES_USER"], database["POSTGRES_DB"],
-    )  # fmt: skip
-    # The password is in the environment, where the list of processes does not show it.
-    assert address.password is None
-    assert services["study"]["environment"]["PGPASSWORD"] == database["POSTGRES_PASSWORD"]
     assert services["study"]["volumes"][0].endswith(":/study")
 
 
@@ -57,7 +48,7 @@ def test_the_proxy_reaches_the_study(services: dict[str, Any]) -> None:
     assert target is not None
     assert target[1] in services and int(target[2]) == DEFAULTS["port"]
     assert services["proxy"]["volumes"][0].startswith("./Caddyfile:")
-    assert "ports" not in services["study"] and "ports" not in services["database"]
+    assert "ports" not in services["study"]
 
 
 def test_the_image_is_built_from_what_is_there(services: dict[str, Any]) -> None:

@@ -21,8 +21,6 @@ class Options:
     """Folder of the study."""
     out: Path | None = None
     """Folder of backups, in which a new folder is made. Default: STUDY/backups."""
-    database: str | None = None
-    """URL of a PostgreSQL database. Default: responses.sqlite in the study folder."""
     media: bool = False
     """Copy movies and maps too."""
     secret: bool = False
@@ -41,7 +39,6 @@ def main(options: Options) -> int:
     made = back_up(
         options.study,
         options.out or options.study / "backups",
-        options.database,
         media=options.media,
         secret=options.secret,
     )

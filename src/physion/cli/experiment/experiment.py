@@ -46,7 +46,7 @@ SUBVERBS = {
     "power": "physion.cli.experiment.power",
 }
 """Sub-verbs of ``physion experiment``, and the module of each."""
-NEEDED = ("fastapi", "uvicorn", "sqlalchemy", "alembic", "argon2", "jinja2", "pydantic")
+NEEDED = ("fastapi", "uvicorn", "sqlalchemy", "argon2", "jinja2", "pydantic")
 """Modules that the extra ``experiment`` installs."""
 
 

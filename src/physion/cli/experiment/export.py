@@ -21,8 +21,6 @@ class Options:
     """Folder of the study."""
     out: Path | None = None
     """Folder to write; an existing export is replaced. Default: STUDY/export."""
-    database: str | None = None
-    """URL of a PostgreSQL database. Default: responses.sqlite in the study folder."""
     scenario: str | None = None
     """Export only this scenario."""
     simulated: bool = True
@@ -40,13 +38,12 @@ def main(options: Options) -> int:
     require_extra()
     from physion.experiment.export.descriptions import count_lines
     from physion.experiment.export.export_study import export_study
-    from physion.experiment.store.database import check_version, open_database, sqlite_url
+    from physion.experiment.store.database import open_database
     from physion.experiment.study.study import load_study
 
     study = load_study(options.study)
-    engine = open_database(options.database or sqlite_url(options.study), must_exist=True)
+    engine = open_database(options.study)
     try:
-        check_version(engine)
         report = export_study(
             engine,
             study,

@@ -27,8 +27,6 @@ class Options:
     """Delete the ids of all participants."""
     session: tuple[str, ...] = ()
     """Delete all data of the sessions with these references (such as K7QF-29XM)."""
-    database: str | None = None
-    """URL of a PostgreSQL database. Default: responses.sqlite in the study folder."""
     json: bool = False
     """Print one JSON object."""
 
@@ -43,14 +41,12 @@ def main(options: Options) -> int:
             "give the ids to delete, --participant HASH or --all, or a session, --session REFERENCE"
         )
     require_extra()
-    from physion.experiment.store.database import sqlite_url
     from physion.experiment.store.lab import forget, forget_sessions
 
-    url = options.database or sqlite_url(options.study)
     if options.session:
-        count, what = forget_sessions(url, options.session), "session"
+        count, what = forget_sessions(options.study, options.session), "session"
     else:
-        count, what = forget(url, None if options.all else options.participant), "id"
+        count, what = forget(options.study, None if options.all else options.participant), "id"
     if options.json:
         print(json_module.dumps({"forgotten": count}))
     else:

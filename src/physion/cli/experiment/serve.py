@@ -24,8 +24,6 @@ class Options:
     """IP address to listen on; 0.0.0.0 for all."""
     port: int = 8000
     """Port to listen on; 0 for any free port."""
-    database: str | None = None
-    """URL of a PostgreSQL database. Default: responses.sqlite in the study folder."""
     base_url: str = ""
     """Public root URL of the server, if it differs (behind a proxy)."""
     behind_proxy: tuple[str, ...] = ()
@@ -76,5 +74,5 @@ def main(options: Options) -> int:
             f"links:        physion experiment links {options.study} --base-url {url}", flush=True
         )
 
-    serve(options.study, address, options.database, options.log_requests, say, warn)
+    serve(options.study, address, options.log_requests, say, warn)
     return 0

@@ -38,8 +38,6 @@ class Options:
     """Only this scenario. Default: all scenarios of the study."""
     url: str | None = None
     """URL of a running server, such as http://127.0.0.1:8000. Default: start one and stop it."""
-    database: str | None = None
-    """URL of a PostgreSQL database for the server that is started."""
     pace: float = 0.0
     """Further seconds before each answer."""
     seed: int = 0
@@ -116,8 +114,6 @@ def _check(options: Options) -> None:
 
     if options.participants < 1 or options.at_once < 1:
         raise BadInputError("--participants and --at-once must be 1 or more")
-    if options.database is not None and options.url is not None:
-        raise BadInputError("--database goes with a server that is started here, not with --url")
     if not 0 <= options.dropouts <= 1:
         raise BadInputError(f"--dropouts must be from 0 to 1, not {options.dropouts:g}")
     if not 0 <= options.pace <= 3600:
@@ -132,7 +128,7 @@ def _server(options: Options) -> Iterator[str]:
         return
     from physion.experiment.server_process import ServerProcess
 
-    with ServerProcess(options.study, options.database) as server:
+    with ServerProcess(options.study) as server:
         yield server.url
 
 

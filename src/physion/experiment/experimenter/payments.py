@@ -1,127 +1,111 @@
-"""Rows of the payments page: sessions of people with their recruiters' ids."""
+"""Payments: one row per session of a person whose recruiter's id is stored; also as CSV."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 from sqlalchemy import Engine, func, select
 
-from physion.experiment.store.database import RAW_IDS, SESSIONS
+from physion.experiment.experimenter.progress import SessionLine
+from physion.experiment.export.spreadsheet import guard_cell
+from physion.experiment.store.database import RAW_IDS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import completion
-from physion.experiment.study.study import Study
+from physion.experiment.study.study import Bonus, Study
 
-PAGE = 100
-"""Rows per page."""
-_SESSION = ("source", "session", "reference", "scenario", "finished_at", "withdrawn_at",
-            "answered_test", "implausible")  # fmt: skip
+COLUMNS = (
+    "source", "id", "reference", "scenario", "state", "finished_at", "test_trials", "correct",
+    "accuracy", "flags", "bonus", "completion_code", "recruiter",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Payment:
-    """Session of a person with the raw id; ``recruiter``: further parameters of the entry URL.
-
-    ``implausible``: why no person can have made it; its ``code`` was not shown to the participant.
-    """
-
-    source: str
-    raw_id: str
-    session: str
-    reference: str
-    scenario: str
-    finished_at: float | None
-    withdrawn_at: float | None
-    trials: int
-    implausible: str | None
-    code: str | None
-    recruiter: Mapping[str, str]
-
-
-@dataclass(frozen=True)
-class Payments:
-    """One page of the list of payments.
+    """Session of a person with the raw id.
 
     Attributes
     ----------
-    rows
-        Payments on this page.
-    total
-        Number of selected sessions, on all pages.
-    page, pages
-        This page, and number of pages.
-    ids
-        Unique raw ids of all selected sessions that are plausible, in order.
-    sources
-        Recruiters of the stored ids.
-    stored
-        Number of raw ids in the database, including those of other kinds of sessions.
+    line
+        The session. An implausible one is not paid without a look at it: its code was not shown to
+        the participant.
+    raw_id, recruiter
+        Id at the recruiter, and further parameters of the entry URL.
+    code
+        Completion code of a finished session.
+    bonus
+        In the lab's currency.
     """
 
-    rows: tuple[Payment, ...]
-    total: int
-    page: int
-    pages: int
-    ids: tuple[str, ...]
-    sources: tuple[str, ...]
-    stored: int
+    line: SessionLine
+    raw_id: str
+    recruiter: Mapping[str, str]
+    code: str | None
+    bonus: float
 
 
 def read_payments(
-    study: Study, secrets: Secrets, engine: Engine, *, source: str, finished: bool, page: int | None
-) -> Payments:
-    """Read a page of the sessions of people whose raw id is stored, last finished first.
+    study: Study, secrets: Secrets, engine: Engine, lines: Sequence[SessionLine], finished: bool
+) -> tuple[list[Payment], int]:
+    """Return the payments of these sessions of people, and the number of stored raw ids.
 
-    Parameters
-    ----------
-    study, secrets
-        The study and its keys, for completion codes.
-    engine
-        The database.
-    source
-        Only sessions from this recruiter; empty: from all.
-    finished
-        Only finished sessions.
-    page
-        Number of the page from 1; numbers out of range give the closest page. None: all rows on
-        one page.
+    ``finished``: only those of finished sessions.
     """
-    session, ids = SESSIONS.c, RAW_IDS.c
-    chosen = [session.kind == "person"]
-    if source:
-        chosen.append(session.source == source)
-    if finished:
-        chosen.append(session.finished_at.is_not(None))
-    order = (session.finished_at.is_(None), session.finished_at.desc(), session.started_at.desc())
-    joined = RAW_IDS.join(SESSIONS, session.participant == ids.participant)
-    names = (
-        select(ids.raw_id, session.implausible).select_from(joined).where(*chosen).order_by(*order)
-    )
-    columns = [session[name] for name in _SESSION]
-    lines = select(*columns, ids.raw_id, ids.recruiter).select_from(joined).where(*chosen)
     with engine.connect() as connection:
-        all_names = connection.execute(names).all()
-        size = PAGE if page is not None else max(1, len(all_names))
-        pages = max(1, -(-len(all_names) // size))
-        page = min(max(1, page or 1), pages)
-        part = lines.order_by(*order).limit(size).offset((page - 1) * size)
-        rows = connection.execute(part).all()
-        stored = connection.execute(select(func.count()).select_from(RAW_IDS)).scalar_one()
-        sources = connection.execute(select(ids.source).distinct()).scalars().all()
-    shown = tuple(
-        Payment(
-            row.source, row.raw_id, row.session, row.reference, row.scenario, row.finished_at,
-            row.withdrawn_at, row.answered_test, row.implausible,
-            _code(study, secrets, row), row.recruiter,
+        stored = connection.scalar(select(func.count()).select_from(RAW_IDS)) or 0
+        ids = {row.participant: row for row in connection.execute(select(RAW_IDS))}
+    payments = []
+    for line in lines:
+        raw = ids.get(line.row.participant)
+        done = line.row.finished_at is not None
+        if raw is None or (finished and not done):
+            continue
+        code = completion(study, secrets, line.row, raw).code if done else None
+        payments.append(Payment(line, raw.raw_id, raw.recruiter, code, bonus_of(study.bonus, line)))
+    return payments, stored
+
+
+def bonus_of(rule: Bonus, line: SessionLine) -> float:
+    """Return the bonus in the lab's currency, rounded to cents; 0 unless the session is finished.
+
+    ``bonus = min(most, per_correct · max(0, correct - above · trials))``, with no upper limit if
+    ``most`` is 0.
+    """
+    if line.state != "finished":
+        return 0.0
+    counted = max(0.0, line.correct - rule.above * line.trials)
+    amount = rule.per_correct * counted
+    return round(min(amount, rule.most) if rule.most else amount, 2)
+
+
+def payment_csv(payments: Sequence[Payment]) -> bytes:
+    """Return the payments as CSV with `COLUMNS`; texts are protected against formulas."""
+    lines = io.StringIO(newline="")
+    writer = csv.writer(lines, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for payment in payments:
+        line = payment.line
+        finished_at = line.row.finished_at
+        texts = (
+            line.row.source,
+            payment.raw_id,
+            line.row.reference,
+            line.row.scenario,
+            line.state,
+            ""
+            if finished_at is None
+            else datetime.fromtimestamp(finished_at, UTC).isoformat("T", "seconds"),
+            str(line.trials),
+            str(line.correct),
+            "" if line.accuracy is None else f"{line.accuracy:.4f}",
+            " ".join(line.flags),
+            f"{payment.bonus:.2f}",
+            payment.code or "",
+            json.dumps(dict(payment.recruiter), ensure_ascii=False) if payment.recruiter else "",
         )
-        for row in rows
-    )  # fmt: skip
-    plausible = [name for name, implausible in all_names if implausible is None]
-    ids_once = tuple(dict.fromkeys(plausible))
-    return Payments(shown, len(all_names), page, pages, ids_once, tuple(sorted(sources)), stored)
-
-
-def _code(study: Study, secrets: Secrets, row: object) -> str | None:
-    """Return the completion code of a finished session."""
-    finished = getattr(row, "finished_at", None) is not None
-    return completion(study, secrets, row, row).code if finished else None
+        writer.writerow([guard_cell(text) for text in texts])
+    return lines.getvalue().encode()

@@ -77,14 +77,5 @@ def read_tables(
 @contextlib.contextmanager
 def snapshot(engine: Engine) -> Iterator[Connection]:
     """Open a read connection that sees the database as of its first query, despite later writes."""
-    with engine.connect() as connection:
-        if engine.dialect.name == "postgresql":
-            connection.execution_options(
-                isolation_level="REPEATABLE READ", postgresql_readonly=True
-            )
-        with connection.begin():
-            if engine.dialect.name == "postgresql":
-                # Without table statistics, the planner would otherwise scan all answers for each
-                # batch of sessions.
-                connection.exec_driver_sql("SET LOCAL enable_seqscan = off")
-            yield connection
+    with engine.connect() as connection, connection.begin():
+        yield connection

@@ -63,7 +63,6 @@ def _index(column: Any, values: Sequence[str]) -> ColumnElement[int]:
 
 def _or_absent(column: Any) -> ColumnElement[Any]:
     """Return the SQL expression of a column with `_ABSENT` in place of NULL."""
-    # Of the column's own type, else PostgreSQL would convert both to slow decimals.
     return func.coalesce(column, _ABSENT if isinstance(column.type, Float) else int(_ABSENT))
 
 
@@ -124,8 +123,7 @@ def _fetch(connection: Connection, names: Sequence[str], details: bool) -> list[
     query = select(*texts, *_NUMBERS.values()).where(*chosen)
     text = query.compile(dialect=connection.dialect, compile_kwargs={"literal_binds": True})
     # Plain rows of the driver: SQLAlchemy's row objects would double the time.
-    binary = {"binary": True} if connection.dialect.name == "postgresql" else {}
-    cursor = connection.connection.cursor(**binary)
+    cursor = connection.connection.cursor()
     try:
         cursor.execute(str(text))
         return list(cursor.fetchall())

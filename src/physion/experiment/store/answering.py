@@ -1,4 +1,9 @@
-"""Store answers: only to the next trial and each once; give feedback in familiarization."""
+"""What a participant sends: answers, showings of trials, and the pages between the trials.
+
+An answer is stored only to the next trial and each once; in familiarization it gets feedback. What
+a request may change follows from the stage of the session, so every request may be sent again.
+`FetchedMedia` remembers which movies and maps the server has sent.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +14,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from sqlalchemy import Connection, bindparam, delete, func, insert, select, update
+from sqlalchemy import Connection, bindparam, func, insert, select, update
 
 from physion.experiment.protocol import (
     ENDED,
@@ -19,7 +24,6 @@ from physion.experiment.protocol import (
     AnswerStored,
     Course,
     Feedback,
-    Jump,
     PageDone,
     Refused,
     SessionState,
@@ -29,8 +33,6 @@ from physion.experiment.protocol import (
 from physion.experiment.store.database import (
     ANSWERS,
     EVENTS,
-    PRACTICE_REPEATS,
-    RAW_IDS,
     SESSIONS,
     SHOWINGS,
 )
@@ -45,14 +47,12 @@ from physion.experiment.store.judging import (
     speed,
 )
 from physion.experiment.store.sessions import (
-    ENTERED_AGAIN,
     Session,
     answered,
     change_session,
     insert_or_skip,
     stage_of,
     state_of,
-    storable,
     with_check,
 )
 from physion.experiment.study.identity import Secrets
@@ -61,146 +61,6 @@ from physion.experiment.study.orders import trial_order
 from physion.experiment.study.settings import check_answers, check_attempt
 from physion.experiment.study.stimuli import ATTENTION, PHASES, Stimulus
 from physion.experiment.study.study import Study
-
-# Attempts at the comprehension check: the next page after each, and the end after too many.
-
-ATTEMPT = "comprehension_attempt"
-"""Kind of the event of an attempt; its data are its number, whether all was right, the answers."""
-
-
-def judge_attempt(
-    connection: Connection,
-    study: Study,
-    session: Session,
-    answers: Mapping[str, str],
-    now: float,
-) -> dict[str, Any]:
-    """Store an attempt as an event and return the columns of SESSIONS that it changes.
-
-    After a wrong answer the instructions are next; after the last attempt the session has ended.
-
-    Parameters
-    ----------
-    connection
-        Connection of the writer, in a transaction.
-    study, session
-        The study, and the session whose comprehension check is next.
-    answers
-        Answers from `study.comprehension.check_attempt`.
-    now
-        Time of the server in seconds since 1970.
-    """
-    attempts = session.comprehension_attempts + 1
-    right = all(answers[each.name] == each.right for each in study.comprehension_questions)
-    event = {
-        "session": session.session,
-        "kind": ATTEMPT,
-        "at_ms": 0.0,
-        "stored_at": now,
-        "data": {"attempt": attempts, "right": right, **answers},
-    }
-    connection.execute(insert(EVENTS), event)
-    columns: dict[str, Any] = {"comprehension_attempts": attempts}
-    if right:
-        return columns | {"comprehended_at": now}
-    if attempts >= study.comprehension.attempts:
-        return columns | {"screened_out_at": now, "screened_out_by": "comprehension"}
-    return columns | {"instructed_at": None}
-
-
-# Showings of trials: store that one begins, and read what an answer needs of them.
-
-MAX_STORED = 50
-"""Showings stored for one trial, so that nobody can fill the disk."""
-_OF_TRIAL = select(func.count(), func.max(SHOWINGS.c.began_at)).where(
-    SHOWINGS.c.session == bindparam("of_session"),
-    SHOWINGS.c.phase == bindparam("of_phase"),
-    SHOWINGS.c.trial == bindparam("of_trial"),
-)
-
-
-def store_showing(
-    connection: Connection,
-    course: Course,
-    session: Session,
-    showing: Showing,
-    now: float,
-) -> Shown:
-    """Store that the next trial begins; the same key is stored once.
-
-    It cannot have begun before the previous trial had ended (``Session.next_from``). A showing of a
-    trial that is answered already, which was delayed on its way, is not stored.
-
-    Raises
-    ------
-    Refused
-        Another trial or another page is next.
-    """
-    phase, trial = showing.phase, showing.trial
-    if trial < answered(session, phase):
-        return Shown(showings=_read(connection, session, phase, trial)[0])
-    if stage_of(session, course) != phase:
-        raise Refused("wrong_stage", "No trial of this phase is next.", state_of(session, course))
-    if trial != answered(session, phase):
-        raise Refused("out_of_order", "Another trial is next.", state_of(session, course))
-    count, _ = _read(connection, session, phase, trial)
-    if count < MAX_STORED:
-        row = {
-            "session": session.session,
-            "key": showing.key,
-            "phase": phase,
-            "trial": trial,
-            "began_at": max(now - showing.ago_ms / 1000, session.next_from or 0.0),
-            "stored_at": now,
-        }
-        count += connection.execute(insert_or_skip(connection, SHOWINGS), row).rowcount
-    return Shown(showings=count)
-
-
-def read_presentation(
-    connection: Connection,
-    study: Study,
-    course: Course,
-    session: Session,
-    answer: Answer,
-    fetched_at: float | None,
-) -> Presentation:
-    """Return what is known of the showings of the trial of an answer.
-
-    Parameters
-    ----------
-    connection
-        Connection of the writer.
-    study
-        The study; without its ``server_checks`` a trial need not have been announced.
-    course
-        What the session consists of.
-    session, answer
-        The session, and its answer to the next trial.
-    fetched_at
-        `FetchedMedia.sent_at` of the trial.
-
-    Raises
-    ------
-    Refused
-        The trial was never announced.
-    """
-    count, began_at = _read(connection, session, answer.phase, answer.trial)
-    if not study.plausibility.server_checks:
-        return Presentation(count, began_at or 0.0, None)
-    if began_at is None:
-        raise Refused("not_shown", "This trial was not shown yet.", state_of(session, course))
-    return Presentation(count, began_at, fetched_at)
-
-
-def _read(
-    connection: Connection, session: Session, phase: str, trial: int
-) -> tuple[int, float | None]:
-    """Return the number of showings of a trial, and the start of the last one."""
-    values = {"of_session": session.session, "of_phase": phase, "of_trial": trial}
-    count, began_at = connection.execute(_OF_TRIAL, values).one()
-    return count, began_at
-
 
 MAX_DETAILS = 16 * 1024
 _STORED = select(ANSWERS.c.key, ANSWERS.c.response).where(
@@ -386,7 +246,7 @@ def _insert_answer(
         "answered_at": now,
     }
     # Only a key that another trial has can conflict; then nothing is written.
-    if connection.execute(insert_or_skip(connection, ANSWERS), row).rowcount != 1:
+    if connection.execute(insert_or_skip(ANSWERS), row).rowcount != 1:
         raise Refused(
             "already_answered", "This key belongs to another trial.", state_of(session, course)
         )
@@ -424,7 +284,97 @@ def _build_feedback(
     )
 
 
-# Submitted pages between the trials: validate their fields and write them to the session.
+MAX_STORED = 50
+"""Showings stored for one trial, so that nobody can fill the disk."""
+_OF_TRIAL = select(func.count(), func.max(SHOWINGS.c.began_at)).where(
+    SHOWINGS.c.session == bindparam("of_session"),
+    SHOWINGS.c.phase == bindparam("of_phase"),
+    SHOWINGS.c.trial == bindparam("of_trial"),
+)
+
+
+def store_showing(
+    connection: Connection,
+    course: Course,
+    session: Session,
+    showing: Showing,
+    now: float,
+) -> Shown:
+    """Store that the next trial begins; the same key is stored once.
+
+    It cannot have begun before the previous trial had ended (``Session.next_from``). A showing of a
+    trial that is answered already, which was delayed on its way, is not stored.
+
+    Raises
+    ------
+    Refused
+        Another trial or another page is next.
+    """
+    phase, trial = showing.phase, showing.trial
+    if trial < answered(session, phase):
+        return Shown(showings=_read(connection, session, phase, trial)[0])
+    if stage_of(session, course) != phase:
+        raise Refused("wrong_stage", "No trial of this phase is next.", state_of(session, course))
+    if trial != answered(session, phase):
+        raise Refused("out_of_order", "Another trial is next.", state_of(session, course))
+    count, _ = _read(connection, session, phase, trial)
+    if count < MAX_STORED:
+        row = {
+            "session": session.session,
+            "key": showing.key,
+            "phase": phase,
+            "trial": trial,
+            "began_at": max(now - showing.ago_ms / 1000, session.next_from or 0.0),
+            "stored_at": now,
+        }
+        count += connection.execute(insert_or_skip(SHOWINGS), row).rowcount
+    return Shown(showings=count)
+
+
+def read_presentation(
+    connection: Connection,
+    study: Study,
+    course: Course,
+    session: Session,
+    answer: Answer,
+    fetched_at: float | None,
+) -> Presentation:
+    """Return what is known of the showings of the trial of an answer.
+
+    Parameters
+    ----------
+    connection
+        Connection of the writer.
+    study
+        The study; without its ``server_checks`` a trial need not have been announced.
+    course
+        What the session consists of.
+    session, answer
+        The session, and its answer to the next trial.
+    fetched_at
+        `FetchedMedia.sent_at` of the trial.
+
+    Raises
+    ------
+    Refused
+        The trial was never announced.
+    """
+    count, began_at = _read(connection, session, answer.phase, answer.trial)
+    if not study.plausibility.server_checks:
+        return Presentation(count, began_at or 0.0, None)
+    if began_at is None:
+        raise Refused("not_shown", "This trial was not shown yet.", state_of(session, course))
+    return Presentation(count, began_at, fetched_at)
+
+
+def _read(
+    connection: Connection, session: Session, phase: str, trial: int
+) -> tuple[int, float | None]:
+    """Return the number of showings of a trial, and the start of the last one."""
+    values = {"of_session": session.session, "of_phase": phase, "of_trial": trial}
+    count, began_at = connection.execute(_OF_TRIAL, values).one()
+    return count, began_at
+
 
 MIN_AGE, MAX_AGE = 18, 130
 MAX_LABEL = 200
@@ -455,7 +405,7 @@ def _check_label(value: Any) -> str | None:
         return None
     if not isinstance(value, str) or len(value) > MAX_LABEL:
         raise ValueError(f"text of at most {MAX_LABEL} characters, or null")
-    return storable(value).strip() or None
+    return value.strip() or None
 
 
 def _check_difficulty(value: Any) -> int:
@@ -469,7 +419,7 @@ def _check_text(value: Any) -> str:
     """Validate a text, which may be empty."""
     if not isinstance(value, str):
         raise ValueError("text, which may be empty")
-    return storable(value).strip()
+    return value.strip()
 
 
 def _check_index(value: Any) -> int:
@@ -537,11 +487,8 @@ def check_page(study: Study, done: PageDone) -> dict[str, Any]:
 
 def _check_own_questions(study: Study, data: Mapping[str, Any]) -> dict[str, Any]:
     """Return the validated answers to the lab's own questions."""
-    given = {
-        name: storable(value) if isinstance(value, str) else value for name, value in data.items()
-    }
     try:
-        return {"own_answers": check_answers(study.questions, given)}
+        return {"own_answers": check_answers(study.questions, data)}
     except ValueError as error:
         raise Refused("bad_request", f"data.{error}") from None
 
@@ -583,8 +530,6 @@ def submit_page(
             raise Refused("wrong_stage", "This session is finished.", state_of(session, course))
         if stage not in ENDED:
             change_session(connection, session, withdrawn_at=now, last_seen=now)
-            if session.consented_at is None:
-                _forget_declined(connection, session)
         return state_of(session, course)
     if "block" in values and values["block"] < session.block and stage not in ENDED:
         return state_of(session, course)  # a page of an earlier block, sent again
@@ -600,30 +545,11 @@ def submit_page(
     return state_of(session, course)
 
 
-def _forget_declined(connection: Connection, session: Session) -> None:
-    """Delete the data of a person who declined: the device, and the raw id if no other session
-    needs it.
-    """
-    change_session(connection, session, device={})
-    again = (EVENTS.c.session == session.session) & (EVENTS.c.kind == ENTERED_AGAIN)
-    connection.execute(update(EVENTS).where(again).values(data={}))
-    other = select(SESSIONS.c.session).where(
-        SESSIONS.c.participant == session.participant, SESSIONS.c.session != session.session
-    )
-    own = RAW_IDS.c.participant == session.participant
-    connection.execute(delete(RAW_IDS).where(own, ~other.exists()))
-
-
 def _columns(
     study: Study, session: Session, page: str, values: Mapping[str, Any], now: float
 ) -> dict[str, Any]:
     """Return the columns of SESSIONS that a page sets, besides the time at which it was sent."""
     match page:
-        case "consent":
-            # Store the language in which the consent was read.
-            known = values.get("language") in study.languages
-            language = {"language": values["language"]} if known else {}
-            return {"consent_version": study.consent_version, **language}
         case "block":
             return {"block": session.block + 1, "ready_at": None, "practice_repeats": 0}
         case "demographics":
@@ -641,9 +567,49 @@ def _columns(
             return {}
 
 
-# Memory of the movies and maps that the server has sent, for the trials not yet answered.
-#
-# It is not stored: after a restart nothing is known about the sessions that began before.
+ATTEMPT = "comprehension_attempt"
+"""Kind of the event of an attempt; its data are its number, whether all was right, the answers."""
+
+
+def judge_attempt(
+    connection: Connection,
+    study: Study,
+    session: Session,
+    answers: Mapping[str, str],
+    now: float,
+) -> dict[str, Any]:
+    """Store an attempt as an event and return the columns of SESSIONS that it changes.
+
+    After a wrong answer the instructions are next; after the last attempt the session has ended.
+
+    Parameters
+    ----------
+    connection
+        Connection of the writer, in a transaction.
+    study, session
+        The study, and the session whose comprehension check is next.
+    answers
+        Answers from `study.comprehension.check_attempt`.
+    now
+        Time of the server in seconds since 1970.
+    """
+    attempts = session.comprehension_attempts + 1
+    right = all(answers[each.name] == each.right for each in study.comprehension_questions)
+    event = {
+        "session": session.session,
+        "kind": ATTEMPT,
+        "at_ms": 0.0,
+        "stored_at": now,
+        "data": {"attempt": attempts, "right": right, **answers},
+    }
+    connection.execute(insert(EVENTS), event)
+    columns: dict[str, Any] = {"comprehension_attempts": attempts}
+    if right:
+        return columns | {"comprehended_at": now}
+    if attempts >= study.comprehension.attempts:
+        return columns | {"screened_out_at": now, "screened_out_by": "comprehension"}
+    return columns | {"instructed_at": None}
+
 
 MAX_SESSIONS = 20_000
 """Sessions remembered; the least recently used are dropped first."""
@@ -700,74 +666,3 @@ class FetchedMedia:
             trials = self._sent.get(tag)
             if trials is not None:
                 trials.pop((phase, trial), None)
-
-
-# Move a preview to any page or trial.
-
-_ENDS = ("withdrawn_at", "closed_at", "screened_out_at", "screened_out_by")
-"""Columns of sessions that ended early."""
-
-
-def jump(
-    connection: Connection, course: Course, session: Session, to: Jump, now: float
-) -> SessionState:
-    """Move a preview to a page or trial: all before it is taken as done, all from it on as open.
-
-    Parameters
-    ----------
-    connection
-        Connection of the writer, in a transaction.
-    course
-        What the session consists of.
-    session
-        The session; it is updated.
-    to
-        The page, or the phase and the trial.
-    now
-        Time of the server in seconds since 1970.
-
-    Raises
-    ------
-    Refused
-        The session is no preview, or the study has no such page or trial.
-    """
-    if session.kind != "preview":
-        raise Refused("bad_request", "Only a preview can go to any page.")
-    if to.stage not in course.stages:
-        raise Refused("bad_request", f"stage: the study has no {to.stage}")
-    block = _block_of(course, to)
-    done = course.stages[: course.stages.index(to.stage)]
-    values: dict[str, Any] = dict.fromkeys(_ENDS)
-    values |= {"comprehension_attempts": 0, "practice_repeats": 0, "failed_checks": None,
-               "attention_failed": 0}  # fmt: skip
-    repeated = PRACTICE_REPEATS.c.session == session.session
-    connection.execute(delete(PRACTICE_REPEATS).where(repeated))
-    for stage, page in PAGES.items():
-        values[page.column] = now if stage in done else None
-    for phase in PHASES:
-        own = course.trials.blocks[block].of(phase)
-        here = to.trial if phase == to.stage else own.start
-        values[f"answered_{phase}"] = own.stop if phase in done else here
-        open_from = values[f"answered_{phase}"]
-        phases = (phase, ATTENTION) if phase == "test" else (phase,)
-        of_phase = (ANSWERS.c.session == session.session) & ANSWERS.c.phase.in_(phases)
-        connection.execute(delete(ANSWERS).where(of_phase, ANSWERS.c.trial >= open_from))
-    change_session(connection, session, block=block, **values)
-    return state_of(session, course)
-
-
-def _block_of(course: Course, to: Jump) -> int:
-    """Return the index of the block to which a jump goes; `Refused` if there is none."""
-    last = len(course.trials.blocks) - 1
-    if to.stage in PHASES:
-        for index, block in enumerate(course.trials.blocks):
-            if to.trial in block.of(to.stage):
-                return index
-        raise Refused("bad_request", f"trial: the last one is {course.trials[to.stage] - 1}")
-    if to.stage == "block" or (to.stage == "ready" and last > 0):
-        # No page follows the last block.
-        most = last - 1 if to.stage == "block" else last
-        if to.trial > most:
-            raise Refused("bad_request", f"trial: the last such block is {most}")
-        return to.trial
-    return 0 if course.stages.index(to.stage) <= course.stages.index("ready") else last

@@ -1,22 +1,21 @@
-"""Tables of a study's database, the same for SQLite and PostgreSQL.
+"""The database of a study: its tables, and one SQLite file in the study folder that holds them.
 
 Times are seconds since 1970 (UTC) of the server's clock. Values that can be computed (order of
 trials, correctness) are not stored; labels are in the study folder only.
+
+A commit is on the disk when it returns (write-ahead log, ``synchronous=FULL``), and only one server
+at a time writes: what was acknowledged survives ``kill -9`` and a power failure. The version of the
+tables is in the file itself (``PRAGMA user_version``).
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import os
-import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, InvalidStateError
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
 from sqlalchemy import (
@@ -38,25 +37,15 @@ from sqlalchemy import (
     UniqueConstraint,
     create_engine,
     event,
-    text,
+    inspect,
 )
-from sqlalchemy.engine import URL, ExceptionContext, make_url
-from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
+from sqlalchemy.exc import OperationalError, SQLAlchemyError
 
 from physion.core.errors import BadInputError, PhysionError
 from physion.core.files import folder_lock
-from physion.core.seeds import stable_hash
 from physion.experiment.protocol import Refused
 
-METADATA = MetaData(
-    naming_convention={
-        "ix": "ix_%(table_name)s_%(column_0_N_name)s",
-        "uq": "uq_%(table_name)s_%(column_0_N_name)s",
-        "ck": "ck_%(table_name)s_%(constraint_name)s",
-        "fk": "fk_%(table_name)s_%(column_0_N_name)s",
-        "pk": "pk_%(table_name)s",
-    }
-)
+METADATA = MetaData()
 
 STUDIES = Table(
     "studies",
@@ -108,7 +97,7 @@ SESSIONS = Table(
     Column("consented_at", Float),
     Column("instructed_at", Float),
     Column("comprehended_at", Float),
-    Column("comprehension_attempts", Integer, nullable=False, server_default="0"),
+    Column("comprehension_attempts", Integer, nullable=False, default=0),
     Column("ready_at", Float),
     Column("demographics_at", Float),
     Column("questions_at", Float),
@@ -122,17 +111,17 @@ SESSIONS = Table(
     Column("browser", String(32)),
     Column("progressed_at", Float),
     Column("next_from", Float),
-    Column("practice_repeats", Integer, nullable=False, server_default="0"),
+    Column("practice_repeats", Integer, nullable=False, default=0),
     Column("failed_checks", String(100)),
-    Column("attention_failed", Integer, nullable=False, server_default="0"),
+    Column("attention_failed", Integer, nullable=False, default=0),
     Column("answered_familiarization", Integer, nullable=False, default=0),
     Column("answered_test", Integer, nullable=False, default=0),
-    Column("block", Integer, nullable=False, server_default="0"),
+    Column("block", Integer, nullable=False, default=0),
     Column("block_at", Float),
     Column("condition", String(40)),
-    Column("fast_answers", Integer, nullable=False, server_default="0"),
-    Column("unfetched", Integer, nullable=False, server_default="0"),
-    Column("replayed", Integer, nullable=False, server_default="0"),
+    Column("fast_answers", Integer, nullable=False, default=0),
+    Column("unfetched", Integer, nullable=False, default=0),
+    Column("replayed", Integer, nullable=False, default=0),
     Column("implausible", String(100)),
     Column("loads", Integer, nullable=False, default=0),
     Column("loaded_at_phase", String(15)),
@@ -273,81 +262,77 @@ EVENTS = Table(
 """Other events in the browser or of the session. ``batch`` is the key under which the browser sent
 several events together."""
 
-ACTIONS = Table(
-    "actions",
-    METADATA,
-    Column("action_number", Integer, primary_key=True, autoincrement=True),
-    Column("at", Float, nullable=False),
-    Column("account", String(40), nullable=False),
-    Column("role", String(20), nullable=False),
-    Column("action", String(40), nullable=False),
-    Column("subject", String(200), nullable=False),
-)
-"""Log of what experimenters did, one row an action; ``account`` is empty for the command line.
-``subject``: reference of a session, or a number; never an id or an answer."""
-
-
-# Open a study's database: SQLite in the study folder, or PostgreSQL.
-#
-# Both are configured so that a commit is on disk when it returns: SQLite with its write-ahead log
-# and ``synchronous=FULL``, PostgreSQL with ``synchronous_commit=on``. Only one server at a time
-# writes.
-
 DATABASE_FILE = "responses.sqlite"
+SCHEMA = 1
+"""Version of the tables above; raise it with every change of them."""
 BUSY_MS = 10_000
 """Time in milliseconds that SQLite waits for a lock of another process, such as a backup."""
-MIGRATIONS = Path(__file__).parent / "migrations"
-_LOCK = stable_hash("physion experiment: one server") >> 65
 _WRITES = "physion_writes"
+T = TypeVar("T")
+Command = Callable[[Connection], T]
 
 
-def sqlite_url(folder: Path) -> str:
-    """Return the URL of the default database of a study folder."""
-    return f"sqlite:///{folder.resolve() / DATABASE_FILE}"
-
-
-def open_database(url: str, *, must_exist: bool = False) -> Engine:
-    """Return an engine for ``sqlite:///FILE`` or ``postgresql://...``, without connecting yet.
+def open_database(folder: Path) -> Engine:
+    """Return an engine for the database of a study that has been served.
 
     Error messages contain statements without their values, so that no participant's id reaches a
-    log. A new SQLite file is readable by its owner only.
+    log.
 
     Raises
     ------
     BadInputError
-        The URL is of another kind, or with ``must_exist`` the SQLite file does not exist.
+        The study has no database yet, or it has tables of another version.
+    PhysionError
+        The file cannot be read, or is no database.
     """
-    address = _parse_url(url)
-    if address.get_backend_name() == "postgresql":
-        return _open_postgresql(address)
-    assert address.database is not None
-    path = Path(address.database)
-    if must_exist and not path.exists():
+    path = folder / DATABASE_FILE
+    if not path.exists():
         raise BadInputError(f"there is no database {path}; has the study been served yet?")
-    return _open_sqlite(address, path)
-
-
-def _parse_url(url: str) -> URL:
-    """Parse a database URL and choose its driver."""
+    engine = _engine(path)
     try:
-        address = make_url(url)
-        backend = address.get_backend_name()
-    except (ArgumentError, ValueError) as error:
-        raise BadInputError("a database URL is sqlite:///FILE or postgresql://...") from error
-    if backend in ("postgresql", "postgres"):
-        return address.set(drivername="postgresql+psycopg")
-    if backend != "sqlite" or address.database in (None, "", ":memory:"):
-        raise BadInputError("a database URL is sqlite:///FILE or postgresql://...")
-    return address.set(drivername="sqlite+pysqlite")
+        with engine.connect() as connection:
+            version = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
+    except SQLAlchemyError as error:
+        engine.dispose()
+        raise _unreadable(path, error) from error
+    if version != SCHEMA:
+        engine.dispose()
+        raise BadInputError(
+            f"{path} has tables of version {version}, this package reads version {SCHEMA}: use the "
+            "version of the package that wrote it"
+        )
+    return engine
 
 
-def _open_sqlite(address: URL, path: Path) -> Engine:
-    """Return an engine for an SQLite file, which is created if it is missing."""
-    if not path.parent.is_dir():
-        raise BadInputError(f"there is no folder {path.parent} for the database")
-    # SQLite creates its log files with the permissions of the database file.
+def create_database(folder: Path) -> Engine:
+    """Return an engine for the database of a study; make it with its tables if it is missing.
+
+    A new file is readable by its owner only. Raises the errors of `open_database`.
+    """
+    path = folder / DATABASE_FILE
+    # SQLite makes its log files with the permissions of the database file.
     os.close(os.open(path, os.O_CREAT | os.O_RDWR | getattr(os, "O_NOFOLLOW", 0), 0o600))
-    engine = create_engine(address, hide_parameters=True, connect_args={"timeout": BUSY_MS / 1000})
+    engine = _engine(path)
+    try:
+        with engine.execution_options(**{_WRITES: True}).begin() as connection:
+            # A server that was killed as it began leaves a file without tables.
+            if not inspect(connection).get_table_names():
+                METADATA.create_all(connection)
+                connection.exec_driver_sql(f"PRAGMA user_version = {SCHEMA}")
+    except SQLAlchemyError as error:
+        raise _unreadable(path, error) from error
+    finally:
+        engine.dispose()
+    return open_database(folder)
+
+
+def _engine(path: Path) -> Engine:
+    """Return an engine for an SQLite file, with durable commits and overwritten deletions."""
+    engine = create_engine(
+        f"sqlite:///{path.resolve()}",
+        hide_parameters=True,
+        connect_args={"timeout": BUSY_MS / 1000},
+    )
 
     @event.listens_for(engine, "connect")
     def prepare(connection: Any, _: Any) -> None:
@@ -365,84 +350,23 @@ def _open_sqlite(address: URL, path: Path) -> Engine:
     return engine
 
 
-def _open_postgresql(address: URL) -> Engine:
-    """Return an engine for a PostgreSQL database."""
-    # Test pooled connections before use: a restart of the database closes them.
-    engine = create_engine(
-        address,
-        hide_parameters=True,
-        pool_pre_ping=True,
-        pool_size=8,
-        connect_args={"connect_timeout": 10},
-    )
-
-    @event.listens_for(engine, "connect")
-    def prepare(connection: Any, _: Any) -> None:
-        connection.autocommit = True
-        connection.execute("SET synchronous_commit = on")
-        connection.execute("SET timezone = 'UTC'")
-        connection.autocommit = False
-
-    @event.listens_for(engine, "handle_error")
-    def shorten(context: ExceptionContext) -> None:
-        # Lines after the first contain the values of whole rows.
-        for error in (context.original_exception, context.sqlalchemy_exception):
-            if error is not None and error.args:
-                error.args = (str(error.args[0]).partition("\n")[0], *error.args[1:])
-
-    return engine
-
-
-def connect_writer(engine: Engine) -> Connection:
-    """Open the single writing connection; on PostgreSQL it also holds the server lock.
-
-    Raises
-    ------
-    PhysionError
-        Another server uses the database.
-    """
-    connection = engine.connect().execution_options(**{_WRITES: True})
-    if engine.dialect.name != "postgresql":
-        return connection
-    try:
-        free = connection.scalar(text("SELECT pg_try_advisory_lock(:key)"), {"key": _LOCK})
-        connection.commit()
-    except BaseException:
-        connection.invalidate()
-        connection.close()
-        raise
-    if not free:
-        connection.close()
-        raise PhysionError("another server uses this database; stop it first")
-    return connection
-
-
-def close_writer(connection: Connection) -> None:
-    """Close the connection without returning it to the pool, which releases its server lock."""
-    with contextlib.suppress(SQLAlchemyError):
-        connection.invalidate()
-    connection.close()
+def _unreadable(path: Path, error: SQLAlchemyError) -> PhysionError:
+    """Return the error for a database that SQLite cannot open."""
+    return PhysionError(f"{path} cannot be read: {getattr(error, 'orig', error)}")
 
 
 @contextlib.contextmanager
-def server_lock(engine: Engine) -> Iterator[None]:
-    """Hold the lock that keeps other servers from the database.
-
-    On PostgreSQL this does nothing, since the connection of `connect_writer` holds the lock.
+def server_lock(folder: Path) -> Iterator[None]:
+    """Hold the lock that keeps other servers from the database of a study.
 
     Raises
     ------
     PhysionError
         Another process holds the lock.
     """
-    if engine.dialect.name == "postgresql":
-        yield
-        return
-    assert engine.url.database is not None
-    folder = Path(engine.url.database).resolve().parent
     with contextlib.ExitStack() as held:
         try:
-            held.enter_context(folder_lock(folder))
+            held.enter_context(folder_lock(folder.resolve()))
         except PhysionError as error:
             raise PhysionError(
                 f"another process writes into {folder}; stop the server of this study first, or "
@@ -451,323 +375,38 @@ def server_lock(engine: Engine) -> Iterator[None]:
         yield
 
 
-def _load_migrations() -> tuple[Any, Any]:
-    """Return Alembic's configuration and directory of migration scripts."""
-    from alembic.config import Config
-    from alembic.script import ScriptDirectory
-
-    config = Config()
-    config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
-    return config, ScriptDirectory.from_config(config)
-
-
-def _read_version(connection: Connection) -> str | None:
-    """Return the schema version of the database, None if it is empty."""
-    from alembic.runtime.migration import MigrationContext
-
-    return MigrationContext.configure(connection).get_current_revision()
-
-
-def upgrade(engine: Engine) -> None:
-    """Migrate the tables to the current version, in one transaction; create missing tables.
-
-    Raises
-    ------
-    BadInputError
-        A newer version of this package wrote the database.
-    PhysionError
-        The database does not answer.
-    """
-    from alembic import command
-
-    config, script = _load_migrations()
-    try:
-        options = {_WRITES: True}
-        with engine.execution_options(**options).begin() as connection:
-            version = _read_version(connection)
-            if version == script.get_current_head():
-                return
-            _refuse_unknown(engine, script, version)
-            config.attributes["connection"] = connection
-            command.upgrade(config, "head")
-    except DBAPIError as error:
-        raise _unreachable(engine, error) from error
-
-
-def check_version(engine: Engine) -> None:
-    """Raise `BadInputError` unless the tables have the current version; change nothing."""
-    _, script = _load_migrations()
-    try:
-        with engine.connect() as connection:
-            version = _read_version(connection)
-    except SQLAlchemyError as error:
-        raise _unreachable(engine, error) from error
-    _refuse_unknown(engine, script, version)
-    if version != script.get_current_head():
-        raise BadInputError(
-            f"{_display_url(engine)} lacks the tables of the current version; serve the study once "
-            "to create them"
-        )
-
-
-def _refuse_unknown(engine: Engine, script: Any, version: str | None) -> None:
-    """Raise `BadInputError` if the schema version is newer than this package."""
-    if version is not None and version not in {each.revision for each in script.walk_revisions()}:
-        raise BadInputError(
-            f"{_display_url(engine)} was written by a newer version of this package "
-            f"(tables {version[:40]}); install that version"
-        )
-
-
-def _unreachable(engine: Engine, error: SQLAlchemyError) -> PhysionError:
-    """Return the error for a database that does not answer."""
-    reason = str(getattr(error, "orig", error)).splitlines()
-    return PhysionError(
-        f"{_display_url(engine)} does not answer: {reason[0] if reason else 'no reason given'}"
-    )
-
-
-def _display_url(engine: Engine) -> str:
-    """Return the URL of the database without its password."""
-    return engine.url.render_as_string(hide_password=True)
-
-
-# Writer thread with group commit: many commands per transaction, acknowledged after its commit.
-#
-# A commit waits for the disk. Commands that arrive meanwhile share the next transaction, so an
-# answer costs little, and none is acknowledged before it is on disk.
-
-T = TypeVar("T")
-Command = Callable[[Connection], T]
-MAX_GROUP = 256
-"""Commands in one transaction."""
-MAX_WAITING = 10_000
-"""Commands in the queue; more are refused."""
-PATIENCE_S = 20.0
-"""Time that commands wait for an unreachable database, such as one that is restarting."""
-PAUSE_S = 0.1
-"""Pause between attempts to reach the database."""
-_log = logging.getLogger(__name__)
-
-
-@dataclass(slots=True)
-class _QueuedCommand:
-    """A queued command with the future of its result and the future's event loop."""
-
-    command: Command[Any]
-    future: Any
-    loop: asyncio.AbstractEventLoop | None
-
-
-@dataclass(slots=True)
-class _Outcome:
-    """Result or error of a command."""
-
-    value: Any = None
-    error: BaseException | None = None
-
-
 class Writer:
-    """Thread that runs commands one after the other, in groups of one transaction each.
+    """One thread that runs commands one after the other, each in a transaction of its own.
 
-    A command is a function of the connection. It is run again if its group failed, so it must not
-    draw random names or read the clock, and it must be idempotent: the connection may be lost after
-    the database committed but before it confirmed. A command must raise `Refused` before it writes
-    anything; any other exception rolls back all that it wrote.
-
-    Parameters
-    ----------
-    connect
-        Opens the writing connection; called again after the connection was lost.
-    group
-        Largest number of commands in one transaction.
-    waiting
-        Largest number of commands in the queue.
-    patience_s
-        Seconds that commands wait for an unreachable database.
+    A command is a function of the connection. It is acknowledged after the commit; whatever it
+    raises rolls back all that it wrote.
     """
 
-    def __init__(
-        self,
-        connect: Callable[[], Connection],
-        *,
-        group: int = MAX_GROUP,
-        waiting: int = MAX_WAITING,
-        patience_s: float = PATIENCE_S,
-    ) -> None:
-        self._connect, self._group, self._waiting = connect, group, waiting
-        self._patience_s = patience_s
-        self._queue: SimpleQueue[_QueuedCommand | None] = SimpleQueue()
-        self._closing = False
-        self._lock = threading.Lock()
-        self._down_since: float | None = None
-        self._connection: Connection | None = connect()
-        self._thread = threading.Thread(target=self._work, name="writer", daemon=True)
-        self._thread.start()
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine.execution_options(**{_WRITES: True})
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="writer")
 
     def submit(self, command: Command[T]) -> Future[T]:
         """Queue a command; the returned future is done once its effects are committed."""
-        future: Future[T] = Future()
-        self._put(_QueuedCommand(command, future, None))
-        return future
+        try:
+            return self._thread.submit(self._write, command)
+        except RuntimeError as error:
+            raise Refused("unavailable", "The server is stopping; try again soon.") from error
 
     async def run(self, command: Command[T]) -> T:
-        """Run a command and await its result; a whole group wakes the event loop only once."""
-        loop = asyncio.get_running_loop()
-        future: asyncio.Future[T] = loop.create_future()
-        self._put(_QueuedCommand(command, future, loop))
-        return await future
+        """Run a command and await its result."""
+        return await asyncio.wrap_future(self.submit(command))
 
     def close(self) -> None:
         """Run all waiting commands, then stop the thread. Later commands are refused."""
-        with self._lock:
-            if not self._closing:
-                self._closing = True
-                self._queue.put(None)
-        self._thread.join()
+        self._thread.shutdown()
 
-    def _put(self, item: _QueuedCommand) -> None:
-        """Queue a command, or raise `Refused` if the writer is overloaded or closing."""
-        if self._queue.qsize() >= self._waiting:
-            raise Refused("unavailable", "The server is overloaded; try again soon.")
-        with self._lock:  # no command may be queued after the end mark
-            if self._closing:
-                raise Refused("unavailable", "The server is stopping; try again soon.")
-            self._queue.put(item)
-
-    def _work(self) -> None:
-        """Run groups of commands until the writer is closed."""
-        ended = False
-        while not ended:
-            group, ended = self._take_group()
-            if group:
-                self._run_group(group)
-        self._disconnect()
-
-    def _take_group(self) -> tuple[list[_QueuedCommand], bool]:
-        """Wait for a command; return it with the other waiting ones, and whether to stop then."""
-        first = self._queue.get()
-        if first is None:
-            return [], True
-        group = [first]
-        while len(group) < self._group:
-            try:
-                item = self._queue.get_nowait()
-            except Empty:
-                break
-            if item is None:
-                return group, True
-            group.append(item)
-        return group, False
-
-    def _run_group(self, group: list[_QueuedCommand]) -> None:
-        """Run and acknowledge a group; on failure wait for the database or run items one by one."""
-        while True:
-            try:
-                connection = self._begin()
-            except Exception as error:
-                self._disconnect()
-                if self._wait(group, error):
-                    continue
-                return
-            try:
-                outcomes = [_run(item.command, connection) for item in group]
-                connection.commit()
-            except Exception as error:
-                if self._roll_back(error):
-                    if self._wait(group, error):
-                        continue
-                elif len(group) > 1:
-                    for item in group:
-                        self._run_group([item])
-                else:
-                    _set_outcomes(group, [_Outcome(error=error)])
-                return
-            self._down_since = None
-            _set_outcomes(group, outcomes)
-            return
-
-    def _begin(self) -> Connection:
-        """Return the connection, with a transaction begun."""
-        if self._connection is None:
-            self._connection = self._connect()
-        self._connection.begin()
-        return self._connection
-
-    def _roll_back(self, error: Exception) -> bool:
-        """Roll back a group; return whether it failed because the connection was lost."""
-        connection = self._connection
-        lost = isinstance(error, DBAPIError) and error.connection_invalidated
+    def _write(self, command: Command[T]) -> T:
+        """Run one command in a transaction."""
         try:
-            assert connection is not None
-            connection.rollback()
-        except Exception:
-            lost = True
-        if lost:
-            self._disconnect()
-        return lost
-
-    def _wait(self, group: list[_QueuedCommand], error: Exception) -> bool:
-        """Pause until the next attempt; after ``patience_s`` refuse the group and return False."""
-        now = time.monotonic()
-        if self._down_since is None:
-            self._down_since = now
-            _log.warning("the database does not answer: %s", _first_line(error))
-        if self._closing or now - self._down_since > self._patience_s:
-            _set_outcomes(group, [_Outcome(error=_unavailable(error)) for _ in group])
-            return False
-        time.sleep(PAUSE_S)
-        return True
-
-    def _disconnect(self) -> None:
-        """Close the connection if there is one."""
-        if self._connection is not None:
-            with contextlib.suppress(SQLAlchemyError):
-                close_writer(self._connection)
-            self._connection = None
-
-
-def _run(command: Command[Any], connection: Connection) -> _Outcome:
-    """Run a command; a refusal becomes its outcome, other errors are raised."""
-    try:
-        return _Outcome(value=command(connection))
-    except Refused as refusal:
-        return _Outcome(error=refusal)
-
-
-def _set_outcomes(group: Sequence[_QueuedCommand], outcomes: Sequence[_Outcome]) -> None:
-    """Set the futures of a group, with one wake-up of each event loop."""
-    by_loop: dict[asyncio.AbstractEventLoop | None, list[tuple[Any, _Outcome]]] = {}
-    for item, outcome in zip(group, outcomes, strict=True):
-        by_loop.setdefault(item.loop, []).append((item.future, outcome))
-    for loop, pairs in by_loop.items():
-        if loop is None:
-            _set_futures(pairs)
-            continue
-        with contextlib.suppress(RuntimeError):  # the loop has ended
-            loop.call_soon_threadsafe(_set_futures, pairs)
-
-
-def _set_futures(pairs: Sequence[tuple[Any, _Outcome]]) -> None:
-    """Set the results or errors of futures."""
-    for future, outcome in pairs:
-        if future.done():  # cancelled
-            continue
-        with contextlib.suppress(InvalidStateError):  # cancelled just now
-            if outcome.error is not None:
-                future.set_exception(outcome.error)
-            else:
-                future.set_result(outcome.value)
-
-
-def _unavailable(error: Exception) -> Refused:
-    """Return the refusal for an unreachable database."""
-    refusal = Refused("unavailable", "The server cannot reach its database; try again soon.")
-    refusal.__cause__ = error
-    return refusal
-
-
-def _first_line(error: Exception) -> str:
-    """Return the first line of the database driver's error message."""
-    original = getattr(error, "orig", None) if not isinstance(error, PhysionError) else error
-    return str(original or error).partition("\n")[0]
+            with self._engine.begin() as connection:
+                return command(connection)
+        except OperationalError as error:  # a full disk, or a lock of another program
+            raise Refused(
+                "unavailable", "The server cannot write into its database; try again soon."
+            ) from error

@@ -1,18 +1,28 @@
-"""Identify the visitor who enters, by link and id, or by the key of the browser."""
+"""Enter a study: who the visitor is, what a session is assigned, and how one is continued.
+
+Nothing is stored of a person before consent. A new visitor lives in the server's memory (`Visit`)
+with all that the consent page needs, among it the scenario, the condition and the order of trials
+that are kept for this person; the session is stored when the person agrees. Who declines or leaves
+is forgotten, and may open the link again.
+
+Condition, scenario and order are those that the fewest sessions have, visitors who still read the
+consent included. A place of the study is taken by a finished session, and held by one that has come
+through the practice and still goes on.
+"""
 
 from __future__ import annotations
 
 import time
-from collections import defaultdict
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from secrets import token_hex
-from typing import NamedTuple
+from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, and_, case, func, insert, or_, select
 
 from physion.core.seeds import stable_hash
-from physion.experiment.protocol import Enter, Entered, Kind, Refused
+from physion.experiment.protocol import Enter, Kind, Refused
 from physion.experiment.store.database import EVENTS, PARTICIPANTS, RAW_IDS, SESSIONS, TOKENS
 from physion.experiment.store.lab import is_paused
 from physion.experiment.store.sessions import (
@@ -21,14 +31,11 @@ from physion.experiment.store.sessions import (
     SESSION_COLUMNS,
     Courses,
     Session,
-    can_take_back,
     change_session,
     insert_or_skip,
     mark_loaded,
+    new_session_of,
     session_from_row,
-    state_of,
-    storable,
-    storable_values,
 )
 from physion.experiment.study.identity import (
     Secrets,
@@ -55,7 +62,7 @@ from physion.experiment.study.study import ALL_SCENARIOS, Study, under, variants
 
 @dataclass(frozen=True)
 class Visitor:
-    """An identified visitor, with all random names drawn, so that entering can be repeated."""
+    """An identified visitor, with the random names of the token and of a new session."""
 
     enter: Enter
     kind: Kind
@@ -96,7 +103,7 @@ def identify_visitor(study: Study, secrets: Secrets, enter: Enter, token: str = 
             "The recruiter did not fill in your id: this link contains only its placeholder. "
             "Open the study from the recruiter's own page.",
         )
-    raw_id = storable(enter.id or "").strip() or None
+    raw_id = (enter.id or "").strip() or None
     needed = study.recruitment.id_needed or enter.source != "link"
     if raw_id is None and kind == "person" and needed:
         raise Refused("id_needed", "This link lacks your id; open the link that you were given.")
@@ -129,238 +136,30 @@ def identify_visitor(study: Study, secrets: Secrets, enter: Enter, token: str = 
     )
 
 
-# Assign condition, scenario and order of trials to a new session: those that the fewest have.
+@dataclass(frozen=True)
+class Visit:
+    """Somebody who reads the consent: the session as it will be, of which nothing is stored yet.
 
-
-def choose_course(
-    connection: Connection, study: Study, visitor: Visitor, done: set[str], own: str | None
-) -> tuple[Study, str]:
-    """Return the study under the condition of a new session, and its scenario.
-
-    The condition is that of the person's earlier sessions, else the one that the link fixes, else
-    the one with the fewest sessions among those that have a place left in a wanted scenario.
-
-    Parameters
-    ----------
-    connection
-        Connection of the writer.
-    study, visitor
-        The study, and who enters.
-    done
-        Scenarios in which the visitor has a session already.
-    own
-        Condition of these sessions, if there are any.
-
-    Raises
-    ------
-    Refused
-        As `choose_scenario` does, for all conditions.
-    """
-    fixed = own or visitor.enter.condition
-    ranked = variants(study) if fixed is None else (under(study, fixed),)
-    if len(ranked) > 1:
-        ranked = _fewest_first(connection, study, visitor)
-    refused: Refused | None = None
-    for variant in ranked:
-        if visitor.enter.scenario not in (None, *variant.offered):
-            continue
-        try:
-            return variant, choose_scenario(connection, variant, visitor, done)
-        except Refused as error:
-            refused = refused or error
-    raise refused or Refused("bad_link", "This link names a scenario that its condition lacks.")
-
-
-def _fewest_first(connection: Connection, study: Study, visitor: Visitor) -> tuple[Study, ...]:
-    """Return the study under each condition, fewest sessions first; equal ones by seed.
-
-    Sessions that ended early, are void or implausible, or that nobody goes on with, do not count.
-    If the link names a scenario, sessions of this scenario alone do.
-    """
-    columns = SESSIONS.c
-    wanted = visitor.enter.scenario
-    statement = (
-        select(columns.condition, func.count())
-        .where(
-            *_counted(study, visitor),
-            *([] if wanted is None else [columns.scenario == wanted]),
-        )
-        .group_by(columns.condition)
-    )
-    used: dict[str | None, int] = dict(connection.execute(statement).all())
-
-    def rank(variant: Study) -> tuple[int, int]:
-        tie = stable_hash("condition", study.seed, visitor.participant, variant.condition)
-        return used.get(variant.condition, 0), tie
-
-    return tuple(sorted(variants(study), key=rank))
-
-
-def _counted(study: Study, visitor: Visitor) -> tuple[ColumnElement[bool], ...]:
-    """Return the conditions for plausible sessions of the visitor's kind that did not end early."""
-    columns = SESSIONS.c
-    return (
-        columns.kind == visitor.kind,
-        columns.withdrawn_at.is_(None),
-        columns.voided_at.is_(None),
-        columns.screened_out_at.is_(None),
-        columns.implausible.is_(None),
-        or_(*_in_use(study, visitor.now)),
-    )
-
-
-def choose_scenario(connection: Connection, study: Study, visitor: Visitor, done: set[str]) -> str:
-    """Return the scenario of a new session: the requested one, else the one with fewest sessions.
-
-    Scenarios in ``done`` are excluded, and for people also those that have enough participants.
-    """
-    requested = visitor.enter.scenario
-    available = [
-        scenario
-        for scenario in study.offered
-        if scenario not in done and requested in (None, scenario)
-    ]
-    if not available:
-        raise Refused("already_took_part", "You have taken part already. Thank you!")
-    if visitor.kind == "person" and is_paused(connection):
-        raise Refused("paused", "The study takes in nobody at the moment; try again later.")
-    counts = _count_sessions(connection, study, visitor)
-    if visitor.kind == "person":
-        available = [each for each in available if counts[each].taken < study.participants]
-    if not available:
-        raise Refused(
-            "study_full",
-            "The study has all the participants that it needs. Thank you!",
-            completion=ending_completion(study.full, visitor.enter.source),
-        )
-    return min(available, key=lambda scenario: counts[scenario].begun)
-
-
-class _SessionCounts(NamedTuple):
-    """Numbers of sessions of a scenario.
-
-    ``taken``: places of plausible sessions, finished or held for people who go on.
-    ``begun``: finished and active sessions.
+    ``values`` are the columns of the session that will be inserted, ``session`` those that
+    determine how it continues.
     """
 
-    taken: int = 0
-    begun: int = 0
-
-
-def _count_sessions(
-    connection: Connection, study: Study, visitor: Visitor
-) -> Mapping[str, _SessionCounts]:
-    """Count the sessions of the visitor's kind in each scenario."""
-    counts_by_scenario: dict[str, _SessionCounts] = defaultdict(_SessionCounts)
-    if visitor.kind != "person" and visitor.enter.scenario is not None:
-        return counts_by_scenario  # the counts would not be used
-    columns = SESSIONS.c
-    finished, active, held = _in_use(study, visitor.now)
-    taken = case((and_(columns.implausible.is_(None), or_(finished, held)), 1), else_=0)
-    begun = case((or_(finished, active), 1), else_=0)
-    statement = (
-        select(columns.scenario, func.sum(taken), func.sum(begun))
-        .where(
-            columns.kind == visitor.kind,
-            columns.withdrawn_at.is_(None),
-            columns.voided_at.is_(None),
-            columns.screened_out_at.is_(None),
-            or_(finished, active, held),
-        )
-        .group_by(columns.scenario)
-    )
-    for scenario, *counts in connection.execute(statement):
-        counts_by_scenario[scenario] = _SessionCounts(*counts)
-    return counts_by_scenario
-
-
-def _in_use(study: Study, now: float) -> tuple[ColumnElement[bool], ...]:
-    """Return the conditions for sessions that are finished, active, or hold a place.
-
-    A place is held from the consent on, until no page or answer has come for ``hold_minutes``.
-    """
-    columns = SESSIONS.c
-    progressed_at = func.coalesce(columns.progressed_at, columns.last_seen)
-    held_since = now - 60 * study.recruitment.hold_minutes
-    return (
-        columns.finished_at.is_not(None),
-        columns.last_seen >= now - ACTIVE_WITHIN,
-        # Somebody who only opened the page may never consent, and must not take a place.
-        and_(columns.consented_at.is_not(None), progressed_at >= held_since),
-    )
-
-
-def assign_order(
-    connection: Connection, study: Study, secrets: Secrets, scenario: str, visitor: Visitor
-) -> tuple[int, int]:
-    """Return the number of the prepared order of a new session, 0 if there is none, and its seed.
-
-    The seed also determines the order of the blocks; the least used order is taken.
-    """
-    if study.orders:
-        number = _least_used_order(connection, study, scenario, visitor.kind)
-        return number, prepared_order_seed(study, secrets, scenario, number)
-    blocks = 0
-    if scenario == ALL_SCENARIOS:
-        blocks = _least_used_blocks(connection, study, visitor)
-    return 0, individual_order_seed(study, scenario, visitor.participant, blocks)
-
-
-def _least_used_blocks(connection: Connection, study: Study, visitor: Visitor) -> int:
-    """Return the index of the order of blocks with the fewest sessions; equal ones by seed.
-
-    Sessions that ended early, or that nobody goes on with, give their place back.
-    """
-    count = len(block_orders(len(study.scenarios)))
-    columns = SESSIONS.c
-    index = columns.order_seed % count
-    statement = (
-        select(index, func.count())
-        .where(
-            columns.scenario == ALL_SCENARIOS,
-            func.coalesce(columns.condition, "") == study.condition,
-            *_counted(study, visitor),
-        )
-        .group_by(index)
-    )
-    used: dict[int, int] = dict(connection.execute(statement).all())
-
-    def rank(number: int) -> tuple[int, int]:
-        tie = stable_hash("order of blocks", study.seed, visitor.participant, number)
-        return used.get(number, 0), tie
-
-    return min(range(count), key=rank)
-
-
-def _least_used_order(connection: Connection, study: Study, scenario: str, kind: str) -> int:
-    """Return the number (from 1) of the prepared order with the fewest sessions so far."""
-    columns = SESSIONS.c
-    statement = (
-        select(columns.order_number, func.count())
-        .where(
-            columns.scenario == scenario,
-            func.coalesce(columns.condition, "") == study.condition,
-            columns.kind == kind,
-            columns.withdrawn_at.is_(None),
-            columns.voided_at.is_(None),
-            columns.screened_out_at.is_(None),
-        )
-        .group_by(columns.order_number)
-    )
-    used: dict[int, int] = dict(connection.execute(statement).all())
-    return min(range(1, study.orders + 1), key=lambda number: (used.get(number, 0), number))
-
-
-# Begin or continue a session of a visitor.
+    visitor: Visitor
+    session: Session
+    values: dict[str, Any]
 
 
 def enter_session(
-    connection: Connection, study: Study, secrets: Secrets, courses: Courses, visitor: Visitor
-) -> Entered:
-    """Begin a session, or issue another token for the session that the visitor has begun.
+    connection: Connection,
+    study: Study,
+    secrets: Secrets,
+    courses: Courses,
+    visitor: Visitor,
+    others: Sequence[Visit] = (),
+) -> Session | Visit:
+    """Continue the session that the visitor has begun, with another token, or begin a `Visit`.
 
-    A visitor who declined or stopped gets a token for the ended session, and takes it up again if
-    `Enter.take_back` says so.
+    A visitor who stopped gets a token for the ended session.
 
     Parameters
     ----------
@@ -372,58 +171,150 @@ def enter_session(
         The courses of its scenarios.
     visitor
         Who enters.
+    others
+        Who reads the consent at the moment.
 
     Raises
     ------
     Refused
         The visitor has taken part already, the session belongs to another browser, or the study is
-        full or paused.
+        full, held or paused.
     """
-    sessions = [
-        session_from_row(study, row)
-        for row in connection.execute(
-            select(*SESSION_COLUMNS).where(SESSIONS.c.participant == visitor.participant)
-        )
-    ]
-    session = _find_unfinished(sessions, visitor.enter.scenario)
+    sessions = _sessions_of(connection, study, visitor)
+    known = _known_session(connection, study, courses, sessions, visitor)
+    if known is not None:
+        return known
     own = next((each.condition for each in sessions if each.condition), None)
-    ended = None
-    if session is None:
-        ended = _find_ended(under(study, own), sessions, visitor.enter.scenario)
-    begun = session or ended
-    if begun is not None:
-        _check_browser(connection, begun, visitor)
-    if ended is not None and visitor.enter.take_back and can_take_back(ended):
-        offered = set(under(study, own).offered)
-        choose_scenario(connection, under(study, own), visitor, offered - {ended.scenario})
-        _take_back(connection, ended, visitor)
-        session, ended = ended, None
+    done = {each.scenario for each in sessions}
+    places = _Places(connection, study, visitor, others)
+    chosen, scenario = _choose_course(study, places, visitor, done, own)
+    number, seed = _assign_order(connection, chosen, secrets, scenario, places)
+    values = {
+        "session": visitor.session,
+        "participant": visitor.participant,
+        "scenario": scenario,
+        "condition": chosen.condition or None,
+        "kind": visitor.kind,
+        "source": visitor.enter.source,
+        "study": study.digest,
+        "reference": visitor.reference,
+        "order_seed": seed,
+        "order_number": number,
+        "buttons": draw_buttons(chosen, visitor.participant),
+        "language": _match_language(study, visitor.enter.language),
+        "browser": visitor.browser,
+        "started_at": visitor.now,
+        "last_seen": visitor.now,
+        "device": visitor.enter.device.model_dump(),
+    }
+    return Visit(visitor, new_session_of(values), values)
+
+
+def begin_session(
+    connection: Connection,
+    study: Study,
+    courses: Courses,
+    visit: Visit,
+    language: str | None,
+    now: float,
+) -> Session:
+    """Store the session of a visitor who agreed, or continue the one begun meanwhile elsewhere.
+
+    Parameters
+    ----------
+    connection
+        Connection of the writer, in a transaction.
+    study, courses
+        The study and the courses of its scenarios.
+    visit
+        Who agreed, and to what.
+    language
+        Language in which the consent was read.
+    now
+        Time of the server in seconds since 1970.
+
+    Raises
+    ------
+    Refused
+        The study has become full, held or paused while the consent was read, or the visitor has
+        taken part already.
+    """
+    visitor = visit.visitor
+    sessions = _sessions_of(connection, study, visitor)
+    known = _known_session(connection, study, courses, sessions, visitor)
+    if known is not None:
+        return known
+    scenario, condition = visit.session.scenario, visit.session.condition
+    if scenario in {each.scenario for each in sessions}:
+        raise Refused("already_took_part", "You have taken part already. Thank you!")
+    _Places(connection, study, visitor).require(under(study, condition), (scenario,))
+    times = dict.fromkeys(("consented_at", "progressed_at", "next_from", "last_seen"), now)
+    values = visit.values | times | {"consent_version": study.consent_version}
+    if language in study.languages:
+        values["language"] = language
+    seen = {"participant": visitor.participant, "first_seen": visitor.now}
+    connection.execute(insert_or_skip(PARTICIPANTS), seen)
+    connection.execute(insert(SESSIONS), values)
+    _keep(connection, visitor, visitor.session)
+    return new_session_of(values)
+
+
+def _sessions_of(connection: Connection, study: Study, visitor: Visitor) -> list[Session]:
+    """Return the stored sessions of the visitor."""
+    own = SESSIONS.c.participant == visitor.participant
+    rows = connection.execute(select(*SESSION_COLUMNS).where(own))
+    return [session_from_row(study, row) for row in rows]
+
+
+def _known_session(
+    connection: Connection,
+    study: Study,
+    courses: Courses,
+    sessions: list[Session],
+    visitor: Visitor,
+) -> Session | None:
+    """Return the session that the visitor continues or has stopped; None for a new one."""
+    wanted = visitor.enter.scenario
+    session = _find_unfinished(sessions, wanted)
     if session is not None:
+        _check_browser(connection, session, visitor)
         _continue(connection, courses, session, visitor)
-    elif ended is None:
-        done = {each.scenario for each in sessions}
-        chosen, scenario = choose_course(connection, study, visitor, done, own)
-        session = _begin_session(connection, chosen, secrets, scenario, visitor)
-    if ended is None:
-        _keep_raw_id(connection, visitor)  # not of somebody who declined
-    session = session or ended
-    assert session is not None
-    connection.execute(
-        insert_or_skip(connection, TOKENS),
-        {"token_hash": hash_token(visitor.token), "session": session.session, "made": visitor.now},
-    )
-    return Entered(token=visitor.token, state=state_of(session, courses.of(session)))
+    else:
+        own = next((each.condition for each in sessions if each.condition), None)
+        session = _find_ended(under(study, own), sessions, wanted)
+        if session is None:
+            return None
+        _check_browser(connection, session, visitor)
+    _keep(connection, visitor, session.session)
+    return session
+
+
+def _keep(connection: Connection, visitor: Visitor, session: str) -> None:
+    """Store the visitor's token of a session, and the raw id for payment.
+
+    The recruiter's parameters are those of the latest visit.
+    """
+    token = {"token_hash": hash_token(visitor.token), "session": session, "made": visitor.now}
+    connection.execute(insert_or_skip(TOKENS), token)
+    if visitor.raw_id is None:
+        return
+    values = {
+        "source": visitor.enter.source,
+        "raw_id": visitor.raw_id,
+        "recruiter": visitor.enter.recruiter,
+        "seen": visitor.now,
+    }
+    statement = RAW_IDS.update().where(RAW_IDS.c.participant == visitor.participant)
+    if connection.execute(statement.values(**values)).rowcount == 0:
+        connection.execute(insert(RAW_IDS), {"participant": visitor.participant, **values})
 
 
 def _check_browser(connection: Connection, session: Session, visitor: Visitor) -> None:
     """Raise `Refused` unless the visitor's browser may continue the session.
 
-    It may with its own key, with a token of the session, or by a signed link. Sessions of older
-    versions have no key; the next browser gives them one.
+    It may with its own key, with a token of the session, or by a signed link.
     """
-    if visitor.signed or session.browser is None:
-        return
-    if session.browser and session.browser == visitor.browser:
+    if visitor.signed or (session.browser and session.browser == visitor.browser):
         return
     known = select(TOKENS.c.token_hash).where(
         TOKENS.c.session == session.session,
@@ -451,7 +342,7 @@ def _find_unfinished(sessions: list[Session], scenario: str | None) -> Session |
 
 
 def _find_ended(study: Study, sessions: list[Session], scenario: str | None) -> Session | None:
-    """Return the latest session, of ``scenario`` if it is given, if it was declined or stopped.
+    """Return the latest session, of ``scenario`` if it is given, if it was stopped.
 
     None if another scenario is left in which the visitor may begin, and for sessions that the lab
     ended. Who was screened out cannot begin in another scenario.
@@ -468,46 +359,6 @@ def _find_ended(study: Study, sessions: list[Session], scenario: str | None) -> 
     return last if last.withdrawn_at is not None and not by_lab else None
 
 
-def _take_back(connection: Connection, session: Session, visitor: Visitor) -> None:
-    """Take up a session again that was declined or stopped; the device was deleted with it."""
-    device = storable_values(visitor.enter.device.model_dump())
-    change_session(connection, session, withdrawn_at=None, device=device)
-
-
-def _begin_session(
-    connection: Connection, study: Study, secrets: Secrets, scenario: str, visitor: Visitor
-) -> Session:
-    """Insert a new session under the condition of ``study``, and return it."""
-    number, seed = assign_order(connection, study, secrets, scenario, visitor)
-    connection.execute(
-        insert_or_skip(connection, PARTICIPANTS),
-        {"participant": visitor.participant, "first_seen": visitor.now},
-    )
-    values = {
-        "session": visitor.session,
-        "participant": visitor.participant,
-        "scenario": scenario,
-        "condition": study.condition or None,
-        "kind": visitor.kind,
-        "source": visitor.enter.source,
-        "study": study.digest,
-        "reference": visitor.reference,
-        "order_seed": seed,
-        "order_number": number,
-        "buttons": draw_buttons(study, visitor.participant),
-        "language": _match_language(study, visitor.enter.language),
-        "browser": visitor.browser,
-        "started_at": visitor.now,
-        "last_seen": visitor.now,
-        "device": storable_values(visitor.enter.device.model_dump()),
-    }
-    connection.execute(insert(SESSIONS), values)
-    row = connection.execute(
-        select(*SESSION_COLUMNS).where(SESSIONS.c.session == visitor.session)
-    ).one()
-    return session_from_row(study, row)
-
-
 def _match_language(study: Study, wanted: str) -> str:
     """Return the best matching language of the study; ``de-AT`` falls back to ``de``."""
     known = {language.lower(): language for language in study.languages}
@@ -518,28 +369,264 @@ def _match_language(study: Study, wanted: str) -> str:
 def _continue(connection: Connection, courses: Courses, session: Session, visitor: Visitor) -> None:
     """Record that the visitor entered an unfinished session again."""
     marks = mark_loaded(session, courses.of(session))
-    browser = {} if session.browser is not None else {"browser": visitor.browser}
-    change_session(connection, session, last_seen=visitor.now, **browser, **marks)
+    change_session(connection, session, last_seen=visitor.now, **marks)
     event = {
         "session": session.session,
         "kind": ENTERED_AGAIN,
         "at_ms": 0.0,
         "stored_at": visitor.now,
-        "data": storable_values(visitor.enter.device.model_dump()),
+        "data": visitor.enter.device.model_dump(),
     }
     connection.execute(insert(EVENTS), event)
 
 
-def _keep_raw_id(connection: Connection, visitor: Visitor) -> None:
-    """Store the raw id for payment, with the recruiter's parameters of the latest visit."""
-    if visitor.raw_id is None:
-        return
-    values = {
-        "source": visitor.enter.source,
-        "raw_id": visitor.raw_id,
-        "recruiter": storable_values(visitor.enter.recruiter),
-        "seen": visitor.now,
-    }
-    statement = RAW_IDS.update().where(RAW_IDS.c.participant == visitor.participant)
-    if connection.execute(statement.values(**values)).rowcount == 0:
-        connection.execute(insert(RAW_IDS), {"participant": visitor.participant, **values})
+@dataclass
+class _Count:
+    """Numbers of sessions of one scenario, condition and prepared order.
+
+    Attributes
+    ----------
+    total
+        Sessions that did not end early.
+    counted
+        The plausible ones that are finished, active, or hold a place.
+    begun
+        Finished and active ones.
+    taken
+        Places: plausible sessions that are finished, or held by people who go on.
+    finished
+        Plausible finished ones.
+    """
+
+    total: int = 0
+    counted: int = 0
+    begun: int = 0
+    taken: int = 0
+    finished: int = 0
+
+
+class _Places:
+    """Which scenarios, conditions and orders the sessions of the visitor's kind have.
+
+    ``others``: visitors who read the consent; they count for the choice, but take no place.
+    """
+
+    def __init__(
+        self,
+        connection: Connection,
+        study: Study,
+        visitor: Visitor,
+        others: Sequence[Visit] = (),
+    ) -> None:
+        self.visitor = visitor
+        self._paused = visitor.kind == "person" and is_paused(connection)
+        self.reading = [
+            each
+            for each in others
+            if each.session.kind == visitor.kind
+            and each.session.withdrawn_at is None
+            and each.session.started_at >= visitor.now - ACTIVE_WITHIN
+        ]
+        columns = SESSIONS.c
+        finished, active, held = in_use(study, visitor.now)
+        plausible = columns.implausible.is_(None)
+
+        def number(*conditions: ColumnElement[bool]) -> ColumnElement[int]:
+            return func.sum(case((and_(*conditions), 1), else_=0))
+
+        statement = (
+            select(
+                columns.scenario,
+                columns.condition,
+                columns.order_number,
+                func.count(),
+                number(plausible, or_(finished, active, held)),
+                number(or_(finished, active)),
+                number(plausible, or_(finished, held)),
+                number(plausible, finished),
+            )
+            .where(*live(visitor.kind))
+            .group_by(columns.scenario, columns.condition, columns.order_number)
+        )
+        self._rows = [
+            (scenario, condition, order, _Count(*counts))
+            for scenario, condition, order, *counts in connection.execute(statement)
+        ]
+        for each in self.reading:
+            own, order = each.session, int(each.values["order_number"])
+            self._rows.append((own.scenario, own.condition, order, _Count(1, 1, 1)))
+
+    def count(self, what: str, **where: Any) -> int:
+        """Sum a field of `_Count` over the rows of a scenario, condition or order."""
+        names = ("scenario", "condition", "order")
+        return sum(
+            getattr(count, what)
+            for *keys, count in self._rows
+            if all(keys[names.index(name)] == value for name, value in where.items())
+        )
+
+    def require(self, study: Study, scenarios: Sequence[str]) -> list[str]:
+        """Return the scenarios that have a place left; all of them unless people are counted.
+
+        Raises
+        ------
+        Refused
+            Recruitment is paused, or all places are taken or held.
+        """
+        if self._paused:
+            raise Refused("paused", "The study takes in nobody at the moment; try again later.")
+        if self.visitor.kind != "person":
+            return list(scenarios)
+        wanted = study.participants
+        free = [each for each in scenarios if self.count("taken", scenario=each) < wanted]
+        if free:
+            return free
+        if any(self.count("finished", scenario=each) < wanted for each in scenarios):
+            minutes = study.recruitment.hold_minutes
+            raise Refused(
+                "held",
+                "All places are taken at the moment, but not everybody may finish. Please come "
+                f"back in {minutes} minutes.",
+            )
+        raise Refused(
+            "study_full",
+            "The study has all the participants that it needs. Thank you!",
+            completion=ending_completion(study.full, self.visitor.enter.source),
+        )
+
+
+def live(kind: str) -> tuple[ColumnElement[bool], ...]:
+    """Return the conditions for sessions of a kind that did not end early and are not void."""
+    columns = SESSIONS.c
+    return (
+        columns.kind == kind,
+        columns.withdrawn_at.is_(None),
+        columns.voided_at.is_(None),
+        columns.screened_out_at.is_(None),
+    )
+
+
+def in_use(study: Study, now: float) -> tuple[ColumnElement[bool], ...]:
+    """Return the conditions for sessions that are finished, active, or hold a place.
+
+    A place is held once the practice is over, until no page or answer has come for
+    ``hold_minutes``: a script that only sends the first pages takes no place from people.
+    """
+    columns = SESSIONS.c
+    practised = or_(columns.ready_at.is_not(None), columns.block > 0, columns.answered_test > 0)
+    held_since = now - 60 * study.recruitment.hold_minutes
+    return (
+        columns.finished_at.is_not(None),
+        columns.last_seen >= now - ACTIVE_WITHIN,
+        and_(practised, columns.progressed_at >= held_since),
+    )
+
+
+def _choose_course(
+    study: Study, places: _Places, visitor: Visitor, done: set[str], own: str | None
+) -> tuple[Study, str]:
+    """Return the study under the condition of a new session, and its scenario.
+
+    The condition is that of the person's earlier sessions, else the one that the link fixes, else
+    the one with the fewest sessions among those that have a place left in a wanted scenario. If the
+    link names a scenario, only sessions of this scenario count.
+
+    Parameters
+    ----------
+    study, places, visitor
+        The study, its sessions, and who enters.
+    done
+        Scenarios in which the visitor has a session already.
+    own
+        Condition of these sessions, if there are any.
+
+    Raises
+    ------
+    Refused
+        As `_choose_scenario` does, for all conditions.
+    """
+    wanted = visitor.enter.scenario
+    fixed = own or visitor.enter.condition
+    ranked: Iterable[Study] = (under(study, fixed),)
+    if fixed is None:
+        only = {} if wanted is None else {"scenario": wanted}
+
+        def rank(variant: Study) -> tuple[int, int]:
+            tie = stable_hash("condition", study.seed, visitor.participant, variant.condition)
+            return places.count("counted", condition=variant.condition or None, **only), tie
+
+        ranked = sorted(variants(study), key=rank)
+    refused: Refused | None = None
+    for variant in ranked:
+        if wanted not in (None, *variant.offered):
+            continue
+        try:
+            return variant, _choose_scenario(variant, places, wanted, done)
+        except Refused as error:
+            refused = refused or error
+    raise refused or Refused("bad_link", "This link names a scenario that its condition lacks.")
+
+
+def _choose_scenario(study: Study, places: _Places, wanted: str | None, done: set[str]) -> str:
+    """Return the scenario of a new session: the wanted one, else the one with fewest sessions.
+
+    Scenarios in ``done`` are excluded, and for people also those that have enough participants.
+    """
+    available = [each for each in study.offered if each not in done and wanted in (None, each)]
+    if not available:
+        raise Refused("already_took_part", "You have taken part already. Thank you!")
+    free = places.require(study, available)
+    return min(free, key=lambda scenario: places.count("begun", scenario=scenario))
+
+
+def _assign_order(
+    connection: Connection, study: Study, secrets: Secrets, scenario: str, places: _Places
+) -> tuple[int, int]:
+    """Return the number of the prepared order of a new session, 0 if there is none, and its seed.
+
+    The seed also determines the order of the blocks; the least used order is taken.
+    """
+    visitor = places.visitor
+    if study.orders:
+        own = {"scenario": scenario, "condition": study.condition or None}
+        number = min(
+            range(1, study.orders + 1),
+            key=lambda order: (places.count("total", order=order, **own), order),
+        )
+        return number, prepared_order_seed(study, secrets, scenario, number)
+    blocks = 0
+    if scenario == ALL_SCENARIOS:
+        blocks = _least_used_blocks(connection, study, places)
+    return 0, individual_order_seed(study, scenario, visitor.participant, blocks)
+
+
+def _least_used_blocks(connection: Connection, study: Study, places: _Places) -> int:
+    """Return the index of the order of blocks with the fewest sessions; equal ones by seed.
+
+    Sessions that ended early, or that nobody goes on with, give their place back.
+    """
+    count, columns, visitor = len(block_orders(len(study.scenarios))), SESSIONS.c, places.visitor
+    index = columns.order_seed % count
+    statement = (
+        select(index, func.count())
+        .where(
+            columns.scenario == ALL_SCENARIOS,
+            func.coalesce(columns.condition, "") == study.condition,
+            columns.implausible.is_(None),
+            or_(*in_use(study, visitor.now)),
+            *live(visitor.kind),
+        )
+        .group_by(index)
+    )
+    used: Counter[int] = Counter(dict(connection.execute(statement).all()))
+    used.update(
+        each.session.order_seed % count
+        for each in places.reading
+        if (each.session.condition or "") == study.condition
+    )
+
+    def rank(number: int) -> tuple[int, int]:
+        tie = stable_hash("order of blocks", study.seed, visitor.participant, number)
+        return used[number], tie
+
+    return min(range(count), key=rank)

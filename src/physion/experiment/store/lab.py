@@ -1,4 +1,9 @@
-"""Log of what experimenters did: who paused, voided, deleted, exported, and when."""
+"""What a lab does with a stored study: pause it, void sessions, back it up, and forget people.
+
+Forgetting deletes recruiters' ids, or all data of a session, so that the bytes cannot be recovered
+from the file. The remaining keyed hash identifies a participant only to someone who has the study's
+key and the id itself.
+"""
 
 from __future__ import annotations
 
@@ -7,21 +12,18 @@ import os
 import re
 import shutil
 import sqlite3
-import subprocess
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import Connection, Engine, Table, delete, func, insert, select, update
+from sqlalchemy import Connection, Engine, delete, insert, select, update
 
 from physion.core.errors import BadInputError, PhysionError
 from physion.core.files import sync_folder
 from physion.experiment.store.database import (
-    ACTIONS,
     ANSWERS,
     DATABASE_FILE,
     EVENTS,
@@ -31,12 +33,9 @@ from physion.experiment.store.database import (
     SESSIONS,
     SHOWINGS,
     TOKENS,
-    check_version,
-    close_writer,
-    connect_writer,
+    Writer,
     open_database,
     server_lock,
-    sqlite_url,
 )
 from physion.experiment.study.identity import SECRET_FILE
 from physion.experiment.study.stimuli import MEDIA_FOLDER, STIMULI_FILE
@@ -46,69 +45,17 @@ from physion.experiment.study.texts import TEXTS_FOLDER
 if TYPE_CHECKING:
     from physion.experiment.store.store import Store
 
-
-Action = Literal[
-    "logged in",
-    "paused recruitment",
-    "resumed recruitment",
-    "made a session void",
-    "counted a session again",
-    "deleted a session",
-    "deleted ids",
-    "opened the payments",
-    "downloaded the payments",
-    "exported",
-]
-
-PAGE = 100
-"""Actions on one page of the log."""
-
-
-@dataclass(frozen=True)
-class LogPage:
-    """One page of the log, latest first; ``lines`` have the columns of the table ``actions``."""
-
-    lines: tuple[tuple[float, str, str, str, str], ...]
-    page: int
-    pages: int
-
-
-def note_action(
-    connection: Connection, action: Action, subject: str = "", account: str = "", role: str = ""
-) -> None:
-    """Add an action to the log, in the transaction of ``connection``.
-
-    ``subject``: what it was about, cut after 200 characters, never an id; ``account`` and ``role``
-    are empty for the command line.
-    """
-    connection.execute(
-        insert(ACTIONS),
-        {
-            "at": time.time(),
-            "account": account,
-            "role": role,
-            "action": action,
-            "subject": subject[:200],
-        },
-    )
-
-
-def read_log(connection: Connection, page: int) -> LogPage:
-    """Return a page of the log; a number beyond the last page gives the last page."""
-    total = connection.scalar(select(func.count()).select_from(ACTIONS)) or 0
-    pages = max(1, -(-total // PAGE))
-    page = min(max(1, page), pages)
-    columns = ACTIONS.c
-    rows = connection.execute(
-        select(columns.at, columns.account, columns.role, columns.action, columns.subject)
-        .order_by(columns.action_number.desc())
-        .limit(PAGE)
-        .offset((page - 1) * PAGE)
-    )
-    return LogPage(tuple((r.at, r.account, r.role, r.action, r.subject) for r in rows), page, pages)
-
-
-# Changes that an experimenter makes while a study is served: pause recruitment, void a session.
+_OF_SESSION = (ANSWERS, PRACTICE_REPEATS, SHOWINGS, EVENTS, TOKENS)
+"""Tables whose rows of a forgotten session are deleted."""
+_EMPTIED = dict.fromkeys((
+    "instructed_at", "comprehended_at", "screened_out_at", "screened_out_by", "failed_checks",
+    "ready_at", "demographics_at", "questions_at", "questions_study", "own_answers", "finished_at",
+    "loaded_at_phase", "loaded_at_trial", "block_at", "browser", "progressed_at", "next_from",
+    "implausible", "age", "gender", "education", "difficulty", "technical_problems", "feedback",
+)) | {"answered_familiarization": 0, "answered_test": 0, "block": 0, "comprehension_attempts": 0,
+      "practice_repeats": 0, "attention_failed": 0, "fast_answers": 0, "unfetched": 0,
+      "replayed": 0, "loads": 0, "device": {}}  # fmt: skip
+"""Column values that replace the data of a forgotten session."""
 
 
 def is_paused(connection: Connection) -> bool:
@@ -163,19 +110,11 @@ def set_voided(connection: Connection, session: str, voided: bool, now: float) -
     return connection.execute(changed).rowcount > 0
 
 
-# Back up a study while it is served: a consistent copy of its database, settings and texts.
-
-DUMP_FILE = "responses.dump"
-"""Copy of a PostgreSQL database, for ``pg_restore``."""
-
-
-def back_up(
-    study: Path, out: Path, url: str | None = None, *, media: bool = False, secret: bool = False
-) -> Path:
+def back_up(study: Path, out: Path, *, media: bool = False, secret: bool = False) -> Path:
     """Copy database, settings, texts and stimuli into a new folder below ``out``; return it.
 
     The folder is called by the time in UTC and complete or absent; only its owner may read it. A
-    server may be running. A copy of SQLite is checked for damage.
+    server may be running. The copy is checked for damage.
 
     Parameters
     ----------
@@ -183,8 +122,6 @@ def back_up(
         The study folder.
     out
         Folder of all backups of the study; made if it is missing.
-    url
-        URL of the database; SQLite in the study folder if None.
     media
         Whether to copy the movies and maps too, which never change.
     secret
@@ -195,24 +132,19 @@ def back_up(
     BadInputError
         There is no such study or database, or a backup was made in the same second.
     PhysionError
-        The database does not answer, the copy is damaged, or ``pg_dump`` is missing or fails.
+        The database cannot be read, or the copy is damaged.
     """
     if not (study / STUDY_FILE).is_file():
         raise BadInputError(f"{study} is no study folder: it has no {STUDY_FILE}")
     target = out / datetime.now(UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
     if target.exists():
         raise BadInputError(f"{target} is there already; wait a second and try again")
-    engine = open_database(url or sqlite_url(study), must_exist=True)
+    open_database(study).dispose()  # refuses a database of another version
     part = out / f".{target.name}.part"
     out.mkdir(parents=True, exist_ok=True)
     part.mkdir(mode=0o700)
     try:
-        check_version(engine)
-        if engine.dialect.name == "postgresql":
-            _dump_postgresql(engine, part / DUMP_FILE)
-        else:
-            assert engine.url.database is not None
-            _copy_sqlite(Path(engine.url.database), part / DATABASE_FILE)
+        _copy_database(study / DATABASE_FILE, part / DATABASE_FILE)
         names = [STUDY_FILE, STIMULI_FILE, TEXTS_FOLDER]
         names += [MEDIA_FOLDER] if media else []
         names += [SECRET_FILE] if secret else []
@@ -222,14 +154,12 @@ def back_up(
     except BaseException:
         shutil.rmtree(part, ignore_errors=True)
         raise
-    finally:
-        engine.dispose()
     sync_folder(out)
     return target
 
 
-def _copy_sqlite(path: Path, copy: Path) -> None:
-    """Copy an SQLite database with the content of its write-ahead log, and check the copy."""
+def _copy_database(path: Path, copy: Path) -> None:
+    """Copy a database with the content of its write-ahead log, and check the copy."""
     os.close(os.open(copy, os.O_CREAT | os.O_EXCL, 0o600))
     try:
         with closing(sqlite3.connect(path)) as source, closing(sqlite3.connect(copy)) as target:
@@ -241,34 +171,6 @@ def _copy_sqlite(path: Path, copy: Path) -> None:
         raise PhysionError(f"{path} could not be copied: {error}") from error
     if found != "ok":
         raise PhysionError(f"the copy of {path} is damaged: {found}; check the disk")
-    _sync(copy)
-
-
-def _dump_postgresql(engine: Engine, copy: Path) -> None:
-    """Write a PostgreSQL database in the custom format of ``pg_dump``."""
-    address = engine.url
-    given = {
-        "--host": address.host or address.query.get("host"),
-        "--port": address.port or address.query.get("port"),
-        "--username": address.username,
-        "--dbname": address.database,
-    }
-    options = [f"{name}={value}" for name, value in given.items() if value]
-    # Not as an option, where other users of the machine could read it.
-    password = {"PGPASSWORD": address.password} if address.password else {}
-    os.close(os.open(copy, os.O_CREAT | os.O_EXCL, 0o600))
-    command = ["pg_dump", "--format=custom", f"--file={copy}", "--no-password", *options]
-    try:
-        done = subprocess.run(
-            command, env={**os.environ, **password}, capture_output=True, text=True, check=False
-        )
-    except FileNotFoundError as error:
-        raise PhysionError(
-            "pg_dump is missing: install the client programs of PostgreSQL"
-        ) from error
-    if done.returncode != 0:
-        lines = done.stderr.strip().splitlines()
-        raise PhysionError(f"pg_dump failed: {lines[0] if lines else done.returncode}")
     _sync(copy)
 
 
@@ -292,29 +194,10 @@ def _sync(path: Path) -> None:
         os.close(descriptor)
 
 
-# Delete recruiters' ids, or all data of a session, so that the bytes cannot be recovered.
-#
-# The remaining keyed hash identifies a participant only to someone who has the study's key and the
-# id itself.
-
-_OF_SESSION = (ANSWERS, PRACTICE_REPEATS, SHOWINGS, EVENTS, TOKENS)
-"""Tables whose rows of a forgotten session are deleted."""
-_EMPTIED = dict.fromkeys((
-    "instructed_at", "comprehended_at", "screened_out_at", "screened_out_by", "failed_checks",
-    "ready_at", "demographics_at", "questions_at", "questions_study", "own_answers", "finished_at",
-    "loaded_at_phase", "loaded_at_trial", "block_at", "browser", "progressed_at", "next_from",
-    "implausible", "age", "gender", "education", "difficulty", "technical_problems", "feedback",
-)) | {"answered_familiarization": 0, "answered_test": 0, "block": 0, "comprehension_attempts": 0,
-      "practice_repeats": 0, "attention_failed": 0, "fast_answers": 0, "unfetched": 0,
-      "replayed": 0, "loads": 0, "device": {}}  # fmt: skip
-"""Column values that replace the data of a forgotten session."""
-
-
-def forget(url: str, participants: Sequence[str] | None) -> int:
+def forget(folder: Path, participants: Sequence[str] | None) -> int:
     """Delete the raw ids of these participants (hashes; None for all) and return their number.
 
-    In SQLite the deleted bytes are overwritten in the file and its log. PostgreSQL rewrites the
-    table; its write-ahead log and backups keep the old bytes for as long as they exist.
+    The deleted bytes are overwritten in the file and its log.
 
     Raises
     ------
@@ -324,16 +207,10 @@ def forget(url: str, participants: Sequence[str] | None) -> int:
         The study is being served, or another program reads the database.
     """
     _check_participants(participants)
-
-    def work(connection: Connection) -> int:
-        count = _delete_raw_ids(connection, participants)
-        note_action(connection, "deleted ids", f"{count}")
-        return count
-
-    return _run_exclusively(url, work, (RAW_IDS,))
+    return _run_exclusively(folder, lambda connection: _delete_raw_ids(connection, participants))
 
 
-def forget_sessions(url: str, references: Sequence[str]) -> int:
+def forget_sessions(folder: Path, references: Sequence[str]) -> int:
     """Delete all data of the sessions with these references and return the number of sessions.
 
     Deleted are answers, events, tokens, demographics, free text and device, and the raw id if the
@@ -349,34 +226,30 @@ def forget_sessions(url: str, references: Sequence[str]) -> int:
         The study is being served, or another program reads the database.
     """
     wanted = list(dict.fromkeys(reference.strip().upper() for reference in references))
-
     now = time.time()
 
     def work(connection: Connection) -> int:
         for reference in wanted:
             _forget_session(connection, reference, now)
-            note_action(connection, "deleted a session", reference)
         return len(wanted)
 
-    return _run_exclusively(url, work, (RAW_IDS, *_OF_SESSION, SESSIONS))
+    return _run_exclusively(folder, work)
 
 
-def _run_exclusively(url: str, work: Callable[[Connection], int], tables: Sequence[Table]) -> int:
-    """Run ``work`` in one transaction while no server runs, then vacuum ``tables``.
+def _run_exclusively(folder: Path, work: Callable[[Connection], int]) -> int:
+    """Run ``work`` in one transaction while no server runs, then vacuum the file.
 
     Vacuuming overwrites the deleted rows, so that they cannot be recovered from the file.
     """
-    engine = open_database(url, must_exist=True)
+    engine = open_database(folder)
     try:
-        check_version(engine)
-        with server_lock(engine):
-            connection = connect_writer(engine)
+        with server_lock(folder):
+            writer = Writer(engine)
             try:
-                with connection.begin():
-                    count = work(connection)
+                count = writer.submit(work).result()
             finally:
-                close_writer(connection)
-            _erase_deleted_bytes(engine, tables, compact=True)
+                writer.close()
+            _erase_deleted_bytes(engine, compact=True)
     finally:
         engine.dispose()
     return count
@@ -390,19 +263,15 @@ async def forget_raw_ids(store: Store, participants: Sequence[str] | None = None
     """
     _check_participants(participants)
     count = await store.write(lambda connection: _delete_raw_ids(connection, participants))
-    await asyncio.to_thread(_erase_deleted_bytes, store.engine, (RAW_IDS,), compact=False)
+    await asyncio.to_thread(_erase_deleted_bytes, store.engine, compact=False)
     return count
 
 
 async def forget_session(store: Store, reference: str) -> None:
-    """Delete all data of one session as `forget_sessions` does, while the study is served.
-
-    In PostgreSQL only the raw ids are rewritten, which is quick; the other deleted rows are
-    overwritten when the database vacuums by itself.
-    """
+    """Delete all data of one session as `forget_sessions` does, while the study is served."""
     now = time.time()
     await store.write(lambda connection: _forget_session(connection, reference, now))
-    await asyncio.to_thread(_erase_deleted_bytes, store.engine, (RAW_IDS,), compact=False)
+    await asyncio.to_thread(_erase_deleted_bytes, store.engine, compact=False)
 
 
 def _check_participants(participants: Sequence[str] | None) -> None:
@@ -449,27 +318,17 @@ def _forget_session(connection: Connection, reference: str, now: float) -> None:
         connection.execute(delete(RAW_IDS).where(RAW_IDS.c.participant == participant))
 
 
-def _erase_deleted_bytes(engine: Engine, tables: Sequence[Table], *, compact: bool) -> None:
+def _erase_deleted_bytes(engine: Engine, *, compact: bool) -> None:
     """Remove deleted bytes from disk: empty the log and, with ``compact``, vacuum the file."""
     connection = engine.raw_connection()
     try:
         driver: Any = connection.driver_connection
-        if engine.dialect.name == "postgresql":
-            driver.autocommit = True
-            for table in tables:
-                driver.execute(f"VACUUM FULL {table.name}")
-            return
         if compact:
             driver.execute("VACUUM")
-        _empty_log(driver)
+        busy = driver.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()[0]
     finally:
         connection.invalidate()
         connection.close()
-
-
-def _empty_log(driver: Any) -> None:
-    """Truncate SQLite's write-ahead log."""
-    busy = driver.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()[0]
     if busy:
         raise PhysionError(
             "the data are deleted, but another program reads the database and keeps the old bytes; "

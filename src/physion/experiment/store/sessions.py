@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from functools import cache
 from typing import Any, cast
 
 from sqlalchemy import Connection, Table, bindparam, select, update
-from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.dialects.sqlite import insert
 
 from physion.experiment.protocol import (
     ENDED,
@@ -131,6 +130,12 @@ class Courses:
         return session.scenario in under(self._study, session.condition).offered
 
 
+def new_session_of(values: Mapping[str, Any]) -> Session:
+    """Return the session of a row that is inserted with these columns and defaults elsewhere."""
+    defaults = {column.name: 0 if column.default else None for column in SESSION_COLUMNS}
+    return Session(**{name: values.get(name, default) for name, default in defaults.items()})
+
+
 def session_from_row(study: Study, row: Sequence[Any]) -> Session:
     """Return the session of a row of `SESSION_COLUMNS`, in a language that the study has now.
 
@@ -156,8 +161,7 @@ def stage_of(session: Session, course: Course) -> Stage:
     A block without familiarization has no page between practice and test.
     """
     if session.withdrawn_at is not None:
-        declined = session.consented_at is None and session.closed_at is None
-        return "declined" if declined else "withdrawn"
+        return "declined" if session.consented_at is None else "withdrawn"
     if session.finished_at is not None:
         return "done"
     if session.voided_at is not None:
@@ -185,16 +189,6 @@ def block_of(session: Session, course: Course) -> Block:
     return blocks[min(session.block, len(blocks) - 1)]
 
 
-def can_take_back(session: Session) -> bool:
-    """Return whether a participant who declined or stopped may still take part.
-
-    Only while nothing was answered, and the lab has not closed or voided the session.
-    """
-    begun = any(answered(session, phase) for phase in PHASES)
-    ended_by_lab = session.closed_at is not None or session.voided_at is not None
-    return session.withdrawn_at is not None and not begun and not ended_by_lab
-
-
 def answered(session: Session, phase: str) -> int:
     """Return the number of answered trials of a phase, which is the index of the next trial."""
     return session.answered_test if phase == "test" else session.answered_familiarization
@@ -206,7 +200,6 @@ def state_of(session: Session, course: Course) -> SessionState:
     return SessionState(
         stage=stage,
         ended=stage in ENDED,
-        places=list(course.stages) if session.kind == "preview" else [],
         trial=answered(session, stage) if stage in PHASES else None,
         trials=cast("Any", dict(course.trials)),
         comprehension_attempts=session.comprehension_attempts,
@@ -262,27 +255,7 @@ def mark_loaded(session: Session, course: Course) -> dict[str, Any]:
     return {"loaded_at_phase": stage, "loaded_at_trial": answered(session, stage)}
 
 
-def insert_or_skip(connection: Connection, table: Table) -> Any:
+def insert_or_skip(table: Table) -> Any:
     """Return an INSERT that skips rows which violate a UNIQUE constraint; see ``rowcount``."""
-    return _insert_or_skip(connection.dialect.name, table)
-
-
-@cache
-def _insert_or_skip(dialect: str, table: Table) -> Any:
-    """Return the statement of `insert_or_skip`, cached by dialect and table."""
-    insert = postgresql.insert if dialect == "postgresql" else sqlite.insert
     # Without the option the rowcount of an INSERT is unreliable.
     return insert(table).on_conflict_do_nothing().execution_options(preserve_rowcount=True)
-
-
-def storable(text: str) -> str:
-    """Return a text without NUL and unpaired surrogates, which PostgreSQL cannot store."""
-    return text.replace("\0", "").encode("utf-8", "replace").decode("utf-8")
-
-
-def storable_values(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Apply `storable` to the names and texts of a flat object."""
-    return {
-        storable(name): storable(value) if isinstance(value, str) else value
-        for name, value in values.items()
-    }

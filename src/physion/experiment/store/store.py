@@ -1,4 +1,4 @@
-"""Interface of the server to the database: one method per request of a participant."""
+"""The one interface of the server to the database: one method per request of a participant."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import asyncio
 import contextlib
 import json
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any, Literal, TypeVar
 
 from sqlalchemy import ColumnElement, Connection, Engine, func, insert, select, text, update
@@ -22,7 +23,6 @@ from physion.experiment.protocol import (
     Enter,
     Entered,
     Events,
-    Jump,
     PageDone,
     Phase,
     Refused,
@@ -39,7 +39,6 @@ from physion.experiment.store.answering import (
     FetchedMedia,
     check_page,
     encode_details,
-    jump,
     store_answer,
     store_showing,
     submit_page,
@@ -50,25 +49,20 @@ from physion.experiment.store.database import (
     SESSIONS,
     STUDIES,
     Writer,
-    connect_writer,
-    open_database,
+    create_database,
     server_lock,
-    sqlite_url,
-    upgrade,
 )
-from physion.experiment.store.entry import enter_session, identify_visitor
+from physion.experiment.store.entry import Visit, begin_session, enter_session, identify_visitor
 from physion.experiment.store.judging import Scores, percentile
 from physion.experiment.store.sessions import (
     Courses,
     Session,
-    can_take_back,
     change_session,
     insert_or_skip,
     mark_loaded,
     read_session,
     stage_of,
     state_of,
-    storable_values,
 )
 from physion.experiment.study.identity import Secrets, hash_token
 from physion.experiment.study.media import MediaKind, session_tag, sign_media
@@ -78,113 +72,10 @@ from physion.experiment.study.settings import Question, columns_of
 from physion.experiment.study.stimuli import ATTENTION, Stimulus
 from physion.experiment.study.study import STUDY_FILE, Study, under
 
-# Registration of each served version of the study folder in the database.
-
-
-def register(connection: Connection, study: Study, now: float) -> None:
-    """Store the current version of the study; refuse it if existing sessions could not continue.
-
-    Previews that cannot continue are ended.
-
-    Raises
-    ------
-    BadInputError
-        There are sessions (of people or simulated participants) with other stimuli, of a scenario
-        that the study no longer has, or with answers to another question of the same name.
-    """
-    other = SESSIONS.c.session.in_(
-        select(SESSIONS.c.session)
-        .join(STUDIES, STUDIES.c.digest == SESSIONS.c.study)
-        .where(STUDIES.c.stimuli_digest != study.stimuli_digest)
-    )
-    gone = SESSIONS.c.scenario.not_in(study.offered)
-    count = sum(_by_scenario(connection, other).values())
-    if count:
-        raise BadInputError(
-            f"{count} sessions were made with another stimuli.csv, other media or other blocks; "
-            "their orders of trials would change. Restore the old stimuli and settings, or create "
-            "a new study folder (or give another database) for the new ones"
-        )
-    for scenario, of_scenario in _by_scenario(connection, gone).items():
-        raise BadInputError(
-            f"{of_scenario} sessions are of the scenario {scenario}, which {STUDY_FILE} no longer "
-            f"has: put {scenario} back into scenarios (to stop recruiting for it, distribute only "
-            "links of the other scenarios), or create a new study folder (or give another "
-            "database) without it"
-        )
-    _check_conditions(connection, study)
-    _check_questions(connection, study)
-    # Previews are not data: those that cannot continue are ended.
-    ended = (other | gone) & SESSIONS.c.finished_at.is_(None) & SESSIONS.c.withdrawn_at.is_(None)
-    connection.execute(update(SESSIONS).where(ended).values(withdrawn_at=now, closed_at=now))
-    connection.execute(
-        insert_or_skip(connection, STUDIES),
-        {
-            "digest": study.digest,
-            "name": study.name,
-            "version": study.version,
-            "stimuli_digest": study.stimuli_digest,
-            "settings": _settings(study),
-            "first_served": now,
-        },
-    )
-
-
-def _check_conditions(connection: Connection, study: Study) -> None:
-    """Refuse a study that lacks the condition of a session."""
-    names = [condition.name for condition in study.conditions]
-    lost = SESSIONS.c.condition.is_not(None) & SESSIONS.c.condition.not_in(names)
-    found = select(SESSIONS.c.condition, func.count()).where(lost, SESSIONS.c.kind != "preview")
-    for name, count in connection.execute(found.group_by(SESSIONS.c.condition)):
-        raise BadInputError(
-            f"{count} sessions are of the condition {name}, which {STUDY_FILE} no longer has: put "
-            "it back, or create a new study folder (or give another database) without it"
-        )
-
-
-def _check_questions(connection: Connection, study: Study) -> None:
-    """Refuse a question that was of another kind, or had another scale, when it was answered."""
-    forms = {column: form for each in study.questions for column, form in _forms(vars(each))}
-    answered = select(SESSIONS.c.questions_study).where(SESSIONS.c.kind != "preview").distinct()
-    versions = select(STUDIES.c.settings).where(STUDIES.c.digest.in_(answered))
-    for (settings,) in connection.execute(versions):
-        for entry in settings.get("questions", ()):
-            for column, form in _forms(entry):
-                if forms.get(column, form) != form:
-                    raise BadInputError(
-                        f"the question {column} was answered in another form ({form[1]}); give "
-                        f"the changed question another name in {STUDY_FILE}"
-                    )
-
-
-def _forms(entry: Mapping[str, Any]) -> list[tuple[str, tuple[str, str, int]]]:
-    """Return the columns of a question, each with what its values depend on."""
-    question = Question(**{**entry, "options": tuple(entry["options"])})
-    steps = question.steps if question.kind == "scale" else 0
-    return [(column, (question.name, question.kind, steps)) for column in columns_of(question)]
-
-
-def _by_scenario(connection: Connection, which: ColumnElement[bool]) -> dict[str, int]:
-    """Count the sessions that are not previews, by scenario in alphabetical order."""
-    columns = SESSIONS.c
-    counts = select(columns.scenario, func.count()).where(which, columns.kind != "preview")
-    rows = connection.execute(counts.group_by(columns.scenario).order_by(columns.scenario))
-    return dict(rows.all())
-
-
-def _settings(study: Study) -> dict[str, Any]:
-    """Return settings and texts as JSON values, without stimuli, whose labels stay private."""
-    left_out = {"folder", "stimuli", "allowed_ids"}
-    shallow = {name: value for name, value in vars(study).items() if name not in left_out}
-    return json.loads(json.dumps(shallow, default=_plain))  # type: ignore[no-any-return]
-
-
-def _plain(value: Any) -> Any:
-    return dict(value) if hasattr(value, "items") else asdict(value)
-
-
 __all__ = ["Refused", "Store"]
 T = TypeVar("T")
+MAX_VISITS = 10_000
+"""Visitors kept in memory until they agree to the consent; the oldest are dropped first."""
 MAX_EVENTS = 2000
 """Number of events kept per session, so that nobody can fill the disk."""
 MAX_EVENT = 16 * 1024
@@ -204,25 +95,27 @@ class Store:
         self._courses = Courses(study)
         self._scores = Scores(study)
         self.fetched = FetchedMedia()
+        self._visits: dict[str, Visit] = {}
+        """Visitors who read the consent, by the hash of their token, in the order of entering."""
+        self._entered_at: deque[float] = deque(maxlen=MAX_VISITS)
         self._held = contextlib.ExitStack()
 
     @classmethod
-    def open(cls, study: Study, secrets: Secrets, url: str | None = None) -> Store:
-        """Open the study's database for writing; SQLite in the study folder if ``url`` is None.
+    def open(cls, study: Study, secrets: Secrets) -> Store:
+        """Open the study's database for writing; make it if it is missing.
 
         Raises
         ------
         PhysionError
             Another server uses the database.
         BadInputError
-            A newer version of this package wrote it, or it has sessions with other stimuli.
+            Another version of this package wrote it, or it has sessions with other stimuli.
         """
         with contextlib.ExitStack() as held:
-            engine = open_database(url or sqlite_url(study.folder))
+            held.enter_context(server_lock(study.folder))
+            engine = create_database(study.folder)
             held.callback(engine.dispose)
-            held.enter_context(server_lock(engine))
-            upgrade(engine)
-            writer = Writer(lambda: connect_writer(engine))
+            writer = Writer(engine)
             held.callback(writer.close)
             writer.submit(lambda connection: register(connection, study, time.time())).result()
             store = cls(study, secrets, engine, writer)
@@ -234,23 +127,40 @@ class Store:
         self._held.close()
 
     async def enter(self, enter: Enter, token: str = "") -> Entered:
-        """Begin or continue a session; ``token``: one of an earlier visit of the browser."""
+        """Continue a session, or show the consent to a new visitor, of whom nothing is stored.
+
+        ``token``: one of an earlier visit of the browser.
+        """
         visitor = identify_visitor(self.study, self.secrets, enter, token)
-        return await self._writer.run(
+        others = list(self._visits.values())
+        entered = await self._writer.run(
             lambda connection: enter_session(
-                connection, self.study, self.secrets, self._courses, visitor
+                connection, self.study, self.secrets, self._courses, visitor, others
             )
         )
+        if visitor.kind == "person":
+            self._entered_at.append(visitor.now)
+        session = entered.session if isinstance(entered, Visit) else entered
+        if isinstance(entered, Visit):
+            self._visits.pop(hash_token(token), None)  # an earlier visit of the same browser
+            self._visits[hash_token(visitor.token)] = entered
+            if len(self._visits) > MAX_VISITS:
+                self._visits.pop(next(iter(self._visits)))
+        return Entered(token=visitor.token, state=state_of(session, self._courses.of(session)))
+
+    def entries(self, seconds: float) -> int:
+        """Return how many people entered in the last seconds, whether they agreed or not."""
+        since = time.time() - seconds
+        return sum(at >= since for at in list(self._entered_at))
 
     async def state(self, token: str, load: bool = False) -> SessionState:
         """Return the state of a session; with ``load``, also count a load of the page."""
-        if not load:
+        if not load or hash_token(token) in self._visits:
             return await asyncio.to_thread(self._read, lambda c: self._read_state(c, token))
         now = time.time()
 
         def count(connection: Connection) -> SessionState:
-            session = read_session(connection, self.study, hash_token(token))
-            course = self._courses.of(session)
+            session, course = self._read_session(connection, token)
             if stage_of(session, course) not in ENDED:
                 marks = mark_loaded(session, course)
                 loads = session.loads + 1
@@ -276,6 +186,9 @@ class Store:
     async def page(self, token: str, done: PageDone) -> SessionState:
         """Store a submitted page and return the new state."""
         values, now = check_page(self.study, done), time.time()
+        visit = self._visits.get(hash_token(token))
+        if visit is not None:
+            return await self._decide(token, visit, done.page, values, now)
 
         def submit(connection: Connection) -> SessionState:
             session, course = self._read_session(connection, token)
@@ -284,23 +197,38 @@ class Store:
 
         return await self._writer.run(submit)
 
-    async def jump(self, token: str, to: Jump) -> SessionState:
-        """Move a preview to a page or trial."""
-        now = time.time()
-
-        def move(connection: Connection) -> SessionState:
-            session, course = self._read_session(connection, token)
-            return jump(connection, course, session, to, now)
-
-        return await self._writer.run(move)
+    async def _decide(
+        self, token: str, visit: Visit, page: str, values: Mapping[str, Any], now: float
+    ) -> SessionState:
+        """Store the session of a visitor who agrees to the consent; forget one who does not."""
+        session = visit.session
+        course = self._courses.of(session)
+        declines = page == "withdraw" or values.get("agreed") is False
+        if session.withdrawn_at is None and declines:
+            session = replace(session, participant="", browser=None, withdrawn_at=now)
+            source = visit.visitor.enter.source
+            nobody = replace(
+                visit.visitor, enter=Enter(source=source), participant="", raw_id=None, browser=""
+            )
+            self._visits[hash_token(token)] = Visit(nobody, session, {"source": source})
+        elif session.withdrawn_at is not None or page != "consent":
+            raise Refused("wrong_stage", "This page is not next.", state_of(session, course))
+        else:
+            language = values.get("language")
+            session = await self._writer.run(
+                lambda connection: begin_session(
+                    connection, self.study, self._courses, visit, language, now
+                )
+            )
+            self._visits.pop(hash_token(token), None)
+        return state_of(session, self._courses.of(session))
 
     async def answer(self, token: str, answer: Answer) -> AnswerStored:
         """Store one answer; repeating the request does not store it twice."""
-        details, token_hash, now = encode_details(answer), hash_token(token), time.time()
+        details, now = encode_details(answer), time.time()
 
         def store(connection: Connection) -> tuple[AnswerStored, str]:
-            session = read_session(connection, self.study, token_hash)
-            course = self._courses.of(session)
+            session, course = self._read_session(connection, token)
             study = under(self.study, session.condition)
             tag = session_tag(self.secrets, session.session)
             sent_at = self.fetched.sent_at(tag, session.started_at, answer.phase, answer.trial)
@@ -315,23 +243,28 @@ class Store:
 
     async def showing(self, token: str, showing: Showing) -> Shown:
         """Store that the next trial begins; repeating the request does not count it twice."""
-        token_hash, now = hash_token(token), time.time()
+        now = time.time()
 
         def store(connection: Connection) -> Shown:
-            session = read_session(connection, self.study, token_hash)
-            course = self._courses.of(session)
+            session, course = self._read_session(connection, token)
             return store_showing(connection, course, session, showing, now)
 
         return await self._writer.run(store)
 
     async def events(self, token: str, events: Events) -> Stored:
-        """Store events, up to MAX_EVENTS per session, unless the key of the batch is known."""
+        """Store events, up to MAX_EVENTS per session, unless the key of the batch is known.
+
+        Those before the consent are not stored.
+        """
         now = time.time()
         rows = [
             {"batch": events.key, "kind": event.kind, "at_ms": event.at_ms, "stored_at": now,
              "data": _check_event_data(event.data, index)}
             for index, event in enumerate(events.events)
         ]  # fmt: skip
+
+        if hash_token(token) in self._visits:
+            return Stored(stored=0)
 
         def store(connection: Connection) -> Stored:
             session, course = self._read_session(connection, token)
@@ -365,18 +298,20 @@ class Store:
             stage = stage_of(session, course)
             if stage not in ENDED:
                 raise Refused("wrong_stage", "This session goes on.", state_of(session, course))
-            of_session = select(SESSIONS.c.source).where(SESSIONS.c.session == session.session)
-            source = connection.execute(of_session).scalar_one()
+            visit = self._visits.get(hash_token(token))
+            if visit is not None:
+                source = str(visit.values["source"])
+            else:
+                of_session = SESSIONS.c.session == session.session
+                source = connection.scalars(select(SESSIONS.c.source).where(of_session)).one()
             ends = {"declined": self.study.declined, "withdrawn": self.study.stopped}
             end = ends.get(stage, self.study.screened_out)
-            return SessionEnd(
-                completion=ending_completion(end, source), can_take_back=can_take_back(session)
-            )
+            return SessionEnd(completion=ending_completion(end, source))
 
         return self._read(read)
 
     async def write(self, command: Callable[[Connection], T]) -> T:
-        """Run any command in the writer; see `Writer` for the rules that it must follow."""
+        """Run any command in the writer."""
         return await self._writer.run(command)
 
     def healthy(self) -> bool:
@@ -395,8 +330,12 @@ class Store:
             raise Refused("unavailable", "The server cannot reach its database.") from error
 
     def _read_session(self, connection: Connection, token: str) -> tuple[Session, Any]:
-        """Return the session of a token and its course."""
-        session = read_session(connection, self.study, hash_token(token))
+        """Return the session of a token and its course; of a visitor, the session as it will be."""
+        visit = self._visits.get(hash_token(token))
+        if visit is None:
+            session = read_session(connection, self.study, hash_token(token))
+        else:
+            session = visit.session
         return session, self._courses.of(session)
 
     def _read_state(self, connection: Connection, token: str) -> SessionState:
@@ -460,6 +399,108 @@ class Store:
         )
 
 
+def register(connection: Connection, study: Study, now: float) -> None:
+    """Store the current version of the study; refuse it if existing sessions could not continue.
+
+    Previews that cannot continue are ended.
+
+    Raises
+    ------
+    BadInputError
+        There are sessions (of people or simulated participants) with other stimuli, of a scenario
+        that the study no longer has, or with answers to another question of the same name.
+    """
+    other = SESSIONS.c.session.in_(
+        select(SESSIONS.c.session)
+        .join(STUDIES, STUDIES.c.digest == SESSIONS.c.study)
+        .where(STUDIES.c.stimuli_digest != study.stimuli_digest)
+    )
+    gone = SESSIONS.c.scenario.not_in(study.offered)
+    count = sum(_by_scenario(connection, other).values())
+    if count:
+        raise BadInputError(
+            f"{count} sessions were made with another stimuli.csv, other media or other blocks; "
+            "their orders of trials would change. Restore the old stimuli and settings, or create "
+            "a new study folder for the new ones"
+        )
+    for scenario, of_scenario in _by_scenario(connection, gone).items():
+        raise BadInputError(
+            f"{of_scenario} sessions are of the scenario {scenario}, which {STUDY_FILE} no longer "
+            f"has: put {scenario} back into scenarios (to stop recruiting for it, distribute only "
+            "links of the other scenarios), or create a new study folder without "
+            "it"
+        )
+    _check_conditions(connection, study)
+    _check_questions(connection, study)
+    # Previews are not data: those that cannot continue are ended.
+    ended = (other | gone) & SESSIONS.c.finished_at.is_(None) & SESSIONS.c.withdrawn_at.is_(None)
+    connection.execute(update(SESSIONS).where(ended).values(withdrawn_at=now, closed_at=now))
+    connection.execute(
+        insert_or_skip(STUDIES),
+        {
+            "digest": study.digest,
+            "name": study.name,
+            "version": study.version,
+            "stimuli_digest": study.stimuli_digest,
+            "settings": _settings(study),
+            "first_served": now,
+        },
+    )
+
+
+def _check_conditions(connection: Connection, study: Study) -> None:
+    """Refuse a study that lacks the condition of a session."""
+    names = [condition.name for condition in study.conditions]
+    lost = SESSIONS.c.condition.is_not(None) & SESSIONS.c.condition.not_in(names)
+    found = select(SESSIONS.c.condition, func.count()).where(lost, SESSIONS.c.kind != "preview")
+    for name, count in connection.execute(found.group_by(SESSIONS.c.condition)):
+        raise BadInputError(
+            f"{count} sessions are of the condition {name}, which {STUDY_FILE} no longer has: put "
+            "it back, or create a new study folder without it"
+        )
+
+
+def _check_questions(connection: Connection, study: Study) -> None:
+    """Refuse a question that was of another kind, or had another scale, when it was answered."""
+    forms = {column: form for each in study.questions for column, form in _forms(vars(each))}
+    answered = select(SESSIONS.c.questions_study).where(SESSIONS.c.kind != "preview").distinct()
+    versions = select(STUDIES.c.settings).where(STUDIES.c.digest.in_(answered))
+    for (settings,) in connection.execute(versions):
+        for entry in settings.get("questions", ()):
+            for column, form in _forms(entry):
+                if forms.get(column, form) != form:
+                    raise BadInputError(
+                        f"the question {column} was answered in another form ({form[1]}); give "
+                        f"the changed question another name in {STUDY_FILE}"
+                    )
+
+
+def _forms(entry: Mapping[str, Any]) -> list[tuple[str, tuple[str, str, int]]]:
+    """Return the columns of a question, each with what its values depend on."""
+    question = Question(**{**entry, "options": tuple(entry["options"])})
+    steps = question.steps if question.kind == "scale" else 0
+    return [(column, (question.name, question.kind, steps)) for column in columns_of(question)]
+
+
+def _by_scenario(connection: Connection, which: ColumnElement[bool]) -> dict[str, int]:
+    """Count the sessions that are not previews, by scenario in alphabetical order."""
+    columns = SESSIONS.c
+    counts = select(columns.scenario, func.count()).where(which, columns.kind != "preview")
+    rows = connection.execute(counts.group_by(columns.scenario).order_by(columns.scenario))
+    return dict(rows.all())
+
+
+def _settings(study: Study) -> dict[str, Any]:
+    """Return settings and texts as JSON values, without stimuli, whose labels stay private."""
+    left_out = {"folder", "stimuli", "allowed_ids"}
+    shallow = {name: value for name, value in vars(study).items() if name not in left_out}
+    return json.loads(json.dumps(shallow, default=_plain))  # type: ignore[no-any-return]
+
+
+def _plain(value: Any) -> Any:
+    return dict(value) if hasattr(value, "items") else asdict(value)
+
+
 def _instructed(stimulus: Stimulus) -> Literal["yes", "no"] | None:
     """Return which button an attention check says to press; None for other trials."""
     asked = instructed_response(stimulus.stimulus) if stimulus.phase == ATTENTION else None
@@ -467,11 +508,11 @@ def _instructed(stimulus: Stimulus) -> Literal["yes", "no"] | None:
 
 
 def _check_event_data(data: dict[str, Any], index: int) -> dict[str, Any]:
-    """Return the storable data of an event; raise `Refused` if they are invalid or too long."""
+    """Return the data of an event; raise `Refused` if they are invalid or too long."""
     try:
         size = len(json.dumps(data, allow_nan=False))
     except ValueError:
         raise Refused("bad_request", f"events.{index}.data: only plain JSON values") from None
     if size > MAX_EVENT:
         raise Refused("bad_request", f"events.{index}.data: at most {MAX_EVENT} characters")
-    return storable_values(data)
+    return data

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from typing import TYPE_CHECKING, Any, Literal, NoReturn, TypeVar, cast
 
 from fastapi import APIRouter
@@ -20,7 +21,6 @@ from physion.experiment.protocol import (
     Enter,
     Events,
     Health,
-    Jump,
     Message,
     PageDone,
     PublicStudy,
@@ -31,10 +31,8 @@ from physion.experiment.study.media import sign_media
 from physion.experiment.study.recruitment import RECRUITERS, ending_completion, is_mturk_preview
 from physion.experiment.study.stimuli import PHASES
 from physion.experiment.web.guards import (
-    ISSUED_TOKEN,
     Reply,
     describe_faults,
-    read_token,
     refuse,
 )
 
@@ -134,6 +132,8 @@ def _check_text(text: str) -> None:
             raise BadBodyError("the body has an unpaired surrogate") from error
 
 
+_BEARER = re.compile(rb"bearer ([A-Za-z0-9_-]{1,200})", re.IGNORECASE)
+"""A token of `identity.new_token`, without anything around it."""
 SHOWN: tuple[Literal["movie"], Literal["map"]] = ("movie", "map")
 
 
@@ -154,6 +154,7 @@ def public_study(study: Study, secrets: Secrets) -> PublicStudy:
         flash_hz=study.timing.flash_hz,
         break_every=study.timing.break_every,
         familiarization_feedback=study.familiarization_feedback,
+        hold_minutes=study.recruitment.hold_minutes,
         preload=study.preload,
         interrupted=cast("Literal['repeat', 'void']", study.plausibility.interrupted),
         comprehension_questions=[
@@ -200,8 +201,13 @@ def _example(study: Study, secrets: Secrets, scenario: str) -> TrialMedia:
 
 
 def token_of(request: Request) -> str:
-    """Return the bearer token of a request, or an empty string if there is none."""
-    return read_token(request.scope["headers"])
+    """Return the token of ``Authorization: Bearer TOKEN``, or an empty string.
+
+    Empty if there is no or more than one such header, or another value.
+    """
+    values = [value for name, value in request.scope["headers"] if name == b"authorization"]
+    match = _BEARER.fullmatch(values[0]) if len(values) == 1 else None
+    return match[1].decode("ascii") if match else ""
 
 
 def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
@@ -235,13 +241,11 @@ def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
 
     @router.post("/enter")
     async def post_enter(request: Request) -> Response:
-        """Begin or continue a session."""
+        """Continue a session, or show the consent to a new visitor."""
         enter = await read_message(request, Enter)
         if is_mturk_preview(enter):
             return refuse("not_yet", "Accept the task first.")
-        entered = await store.enter(enter, token_of(request))
-        request.scope["state"][ISSUED_TOKEN] = entered.token
-        return Reply(entered)
+        return Reply(await store.enter(enter, token_of(request)))
 
     @router.get("/session")
     async def get_session(request: Request) -> Response:
@@ -262,12 +266,6 @@ def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
         """Store a submitted page."""
         page = await read_message(request, PageDone)
         return Reply(await store.page(token_of(request), page))
-
-    @router.post("/jump")
-    async def post_jump(request: Request) -> Response:
-        """Move a preview to a page or trial."""
-        to = await read_message(request, Jump)
-        return Reply(await store.jump(token_of(request), to))
 
     @router.post("/showings")
     async def post_showing(request: Request) -> Response:

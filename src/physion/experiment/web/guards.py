@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import math
 import re
-import time
-from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
@@ -18,7 +15,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from physion.experiment.protocol import MAX_BODY, REFUSALS, Completion, Refusal, SessionState
 from physion.experiment.study.recruitment import MTURK_HOSTS
-from physion.experiment.web.rate_limits import RateLimits
 
 if TYPE_CHECKING:
     from physion.experiment.study.study import Study
@@ -33,23 +29,6 @@ MESSAGES = {
     "server_error": "An error occurred on the server; try again, or write to the experimenter.",
     "bad_request": "The request was not understood.",
 }
-
-
-# Read the bearer token of a request, in the same way for rate limits and for the endpoints.
-
-_BEARER = re.compile(rb"bearer ([A-Za-z0-9_-]{1,200})", re.IGNORECASE)
-"""A token of `identity.new_token`, without anything around it."""
-
-
-def read_token(headers: Iterable[tuple[bytes, bytes]]) -> str:
-    """Return the token of ``Authorization: Bearer TOKEN`` in the headers of an ASGI request.
-
-    Returns an empty string if there is no or more than one such header, or another value: if a
-    token could be written in two ways, the rate limits would count it as two tokens.
-    """
-    values = [value for name, value in headers if name == b"authorization"]
-    match = _BEARER.fullmatch(values[0]) if len(values) == 1 else None
-    return match[1].decode("ascii") if match else ""
 
 
 class Reply(Response):
@@ -174,8 +153,6 @@ log = logging.getLogger("physion.experiment")
 MAX_TARGET = 4096
 """Bytes of path and query."""
 MAX_HEADERS, MAX_HEADER_BYTES = 64, 16 * 1024
-ISSUED_TOKEN = "given_token"
-"""Key of the request's state under which the application stores a token that it issues."""
 BODY_SECONDS = 20.0
 """Time in which a body must arrive."""
 LINGER_BYTES, LINGER_SECONDS = 256 * 1024, 1.0
@@ -192,13 +169,12 @@ class Guards:
     def __init__(self, app: ASGIApp, study: Study) -> None:
         self._app = app
         self._headers = security_headers(study)
-        self._limits = RateLimits(study.limits)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
         elif scope["type"] == "http":
-            await _Exchange(self._app, self._headers, self._limits, scope, receive, send).run()
+            await _Exchange(self._app, self._headers, scope, receive, send).run()
         else:
             await send({"type": "websocket.close", "code": 1000})
 
@@ -206,14 +182,11 @@ class Guards:
 class _Exchange:
     """One request and its response."""
 
-    def __init__(self, app: ASGIApp, headers: list[tuple[bytes, bytes]], limits: RateLimits,
+    def __init__(self, app: ASGIApp, headers: list[tuple[bytes, bytes]],
                  scope: Scope, receive: Receive, send: Send) -> None:  # fmt: skip
-        self._app, self._extra, self._limits = app, headers, limits
+        self._app, self._extra = app, headers
         self._scope, self._receive, self._send = scope, receive, send
-        scope.setdefault("state", {})
-        self._address = scope["client"][0] if scope.get("client") else ""
         self._path: str = scope["path"]
-        self._token = read_token(scope["headers"])
         self._declared = 0
         self._deadline = 0.0
         self._taken = 0
@@ -223,7 +196,7 @@ class _Exchange:
 
     async def run(self) -> None:
         """Check the request, run the application and send its response or a refusal."""
-        refusal = self._read_headers() or self._check_rate()
+        refusal = self._read_headers()
         if refusal is not None:
             await self._refuse(refusal)
             return
@@ -261,15 +234,6 @@ class _Exchange:
             return refuse("too_large", "The address or the headers are too long.")
         return refuse("too_large") if self._declared > MAX_BODY else None
 
-    def _check_rate(self) -> Reply | None:
-        """Return a refusal if the request exceeds a rate limit."""
-        wait = self._limits.wait_time(
-            self._scope["method"], self._path, self._token, self._address, time.monotonic()
-        )
-        if wait <= 0:
-            return None
-        return refuse("too_many", headers={"retry-after": str(math.ceil(wait))})
-
     async def receive(self) -> Message:
         """Receive the next part of the body, within the limits on size and time."""
         if self._body_ended:
@@ -295,17 +259,8 @@ class _Exchange:
             return
         if message["type"] == "http.response.start":
             self._started = True
-            self._update_limits(message["status"])
             message = self._with_headers(message)
         await self._send(message)
-
-    def _update_limits(self, status: int) -> None:
-        """Tell the rate limits the status of the response and any issued token."""
-        now = time.monotonic()
-        self._limits.record_status(status, self._path, self._token, self._address, now)
-        issued = self._scope["state"].get(ISSUED_TOKEN)
-        if issued is not None:
-            self._limits.add_token(issued, now)
 
     def _with_headers(self, message: Message) -> Message:
         """Return the start of a response with the additional headers, and log it."""

@@ -1,1 +1,0 @@
-"""Access control of the experimenter's pages: logins, cookies and login attempts."""

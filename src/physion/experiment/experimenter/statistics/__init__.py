@@ -1,1 +1,0 @@
-"""Statistics of the experimenter's pages, computed in a separate process."""

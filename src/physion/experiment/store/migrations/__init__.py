@@ -1,1 +1,0 @@
-"""Alembic migrations of the tables, one file per version, applied when a study is served."""
