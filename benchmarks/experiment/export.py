@@ -37,8 +37,8 @@ from physion.experiment.store.database import (
     PARTICIPANTS,
     SESSIONS,
     STUDIES,
+    create_database,
     open_database,
-    upgrade,
 )
 from physion.experiment.study.stimuli import Stimulus
 from physion.experiment.study.study import Study
@@ -133,10 +133,9 @@ def answers_of(study: Study, sessions: list[dict[str, Any]]) -> Iterator[list[di
             yield rows
 
 
-def fill(study: Study, url: str, count: int) -> int:
+def fill(study: Study, count: int) -> int:
     """Make the database; bytes of details."""
-    engine = open_database(url)
-    upgrade(engine)
+    engine = create_database(study.folder)
     sessions, size = sessions_of(study, count), 0
     with engine.begin() as connection:
         connection.execute(insert(STUDIES), {
@@ -154,16 +153,13 @@ def fill(study: Study, url: str, count: int) -> int:
         for rows in answers_of(study, sessions):
             size += sum(len(row["details"]) for row in rows)
             connection.execute(insert(ANSWERS), rows)
-    if engine.dialect.name == "postgresql":
-        with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
-            connection.exec_driver_sql("VACUUM ANALYZE")
     engine.dispose()
     return size
 
 
-def measure(study: Study, url: str) -> dict[str, Any]:
+def measure(study: Study) -> dict[str, Any]:
     """Export once; seconds, greatest memory, rows and size of what was written."""
-    engine = open_database(url, must_exist=True)
+    engine = open_database(study.folder)
     start, cpu = time.perf_counter(), time.process_time()
     report = export_study(engine, study, study.folder / "export")
     wall, cpu = time.perf_counter() - start, time.process_time() - cpu
@@ -185,7 +181,7 @@ def as_markdown(found: dict[str, Any]) -> str:
         "# Export of a large study",
         "",
         f"{datetime.now(UTC):%Y-%m-%d}, {processor()}, {os.cpu_count()} cores, "
-        f"{found['database']}, `{found['command']}`",
+        f"`{found['command']}`",
         "",
         f"{found['sessions']:,} sessions, {found['rows']['trials']:,} answers, "
         f"{found['details_bytes'] / 1e9:.2f} GB of details. All layouts; on the disk at the end.",
@@ -205,36 +201,31 @@ def as_markdown(found: dict[str, Any]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sessions", type=int, default=10_000)
-    parser.add_argument("--database", help="URL of an empty PostgreSQL database")
     parser.add_argument("--folder", type=Path, help="an empty folder in which all stays")
     parser.add_argument("--write", action="store_true", help="write a page into results/")
     parser.add_argument("--measure", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.measure:
-        print(json.dumps(measure(study_of(arguments.folder), arguments.database)))
+        print(json.dumps(measure(study_of(arguments.folder))))
         return
     with tempfile.TemporaryDirectory() as temporary:
         folder = arguments.folder or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        url = arguments.database or f"sqlite:///{folder.resolve() / 'responses.sqlite'}"
-        size = fill(study_of(folder), url, arguments.sessions)
+        size = fill(study_of(folder), arguments.sessions)
         load = round(os.getloadavg()[0], 1)
-        words = [sys.executable, __file__, "--measure", "--folder", str(folder), "--database", url]
+        words = [sys.executable, __file__, "--measure", "--folder", str(folder)]
         done = subprocess.run(words, check=True, stdout=subprocess.PIPE)
         found = json.loads(done.stdout)
     options = "" if arguments.sessions == 10_000 else f" --sessions {arguments.sessions}"
-    options += " --database URL" if arguments.database else ""
-    kind = "PostgreSQL" if url.startswith("postgres") else "SQLite"
     found |= {
         "details_bytes": size,
-        "database": kind,
         "load_average": load,
         "command": f"python benchmarks/experiment/export.py{options} --write",
         "met": found["wall_s"] < AIM_S and found["memory_bytes"] < AIM_BYTES,
     }
     print(json.dumps(found, indent=2))
     if arguments.write:
-        name = "experiment_export" + ("_postgresql" if arguments.database else "")
+        name = "experiment_export"
         (RESULTS / f"{name}.md").write_text(as_markdown(found))
 
 

@@ -1,7 +1,7 @@
 """How many participants one server carries.
 
     python benchmarks/experiment/load.py [--write]
-        [--seconds 180] [--people 200] [--every 6] [--full 20] [--postgres URL] [--loads paced full]
+        [--seconds 180] [--people 200] [--every 6] [--full 20] [--loads paced media full]
 
 A study of 150 test trials is served by `physion experiment serve` in one process; this process
 plays the participants with a client made to cost little, on the same cores. Each load runs on a new
@@ -33,8 +33,6 @@ import tempfile
 import time
 import uuid
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -47,7 +45,7 @@ import uvloop
 from light_http import Connection, request
 from physion.compute.tasks import processor
 from physion.experiment.server_process import HOST, ServerProcess
-from physion.experiment.store.database import ANSWERS, SESSIONS, open_database, sqlite_url
+from physion.experiment.store.database import ANSWERS, SESSIONS, open_database
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Study
@@ -270,12 +268,11 @@ def cpu_seconds(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def check(study: Study, database: str | None, tally: Tally) -> int:
+def check(study: Study, tally: Tally) -> int:
     """Answers that are not as acknowledged: missing, altered, or never acknowledged."""
-    url = database or sqlite_url(study.folder)
     columns = (ANSWERS.c.key, SESSIONS.c.reference, ANSWERS.c.trial, ANSWERS.c.response,
                ANSWERS.c.rt_ms)  # fmt: skip
-    engine = open_database(url, must_exist=True)
+    engine = open_database(study.folder)
     with engine.connect() as connection:
         rows = connection.execute(sa.select(*columns).join(SESSIONS)).all()
     engine.dispose()
@@ -286,45 +283,21 @@ def check(study: Study, database: str | None, tally: Tally) -> int:
 
 def measure(name: str, options: argparse.Namespace, folder: Path) -> Row:
     """Make a study, serve it, load it, stop, and look everything up."""
-    from physion.experiment.study.study import Limits, Plausibility
+    from physion.experiment.study.study import Plausibility
     from support.experiment.tiny_study import make_tiny_study
 
-    fast = Limits(
-        requests_per_second=10_000,
-        burst=100_000,
-        sessions_per_minute=100_000,
-        sessions_at_once=100_000,
-    )
     # Every answer is checked, at a speed that the participants of a load can keep.
     checked = Plausibility(simulated_speed=1_000_000)
-    study = make_tiny_study(folder / name, test=TEST_TRIALS, limits=fast, plausibility=checked)
+    study = make_tiny_study(folder / name, test=TEST_TRIALS, plausibility=checked)
     words = [sys.executable]
     if options.profile:
         words += ["-m", "cProfile", "-o", str(options.profile)]
     word = make_pass(Secrets.load(study.folder), "simulated")
-    with new_database(options.postgres) as database:
-        command = (*words, "-m", "physion.cli.main")
-        with ServerProcess(study.folder, database, command=command) as server:
-            row = uvloop.run(play(name, server, word, options))
-        row.wrong = check(study, database, row.tally)
+    command = (*words, "-m", "physion.cli.main")
+    with ServerProcess(study.folder, command=command) as server:
+        row = uvloop.run(play(name, server, word, options))
+    row.wrong = check(study, row.tally)
     return row
-
-
-@contextmanager
-def new_database(server: str | None) -> Iterator[str | None]:
-    """A database of its own on a PostgreSQL server, dropped afterwards; None for SQLite."""
-    if server is None:
-        yield None
-        return
-    name = f"physion_load_{uuid.uuid4().hex[:12]}"
-    engine = open_database(server)
-    with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
-        connection.execute(sa.text(f"CREATE DATABASE {name}"))
-        try:
-            yield engine.url.set(database=name).render_as_string(hide_password=False)
-        finally:
-            connection.execute(sa.text(f"DROP DATABASE {name} WITH (FORCE)"))
-    engine.dispose()
 
 
 COLUMNS = ("load", "answers", "answers/s", "errors", "p50, ms", "p99, ms", "slowest, ms",
@@ -345,13 +318,10 @@ def table(rows: list[Row]) -> str:
 
 def report(rows: list[Row], options: argparse.Namespace) -> str:
     """What was found, as a page."""
-    kind = "PostgreSQL" if options.postgres else "SQLite"
-    # A URL may hold a password.
-    words = ["URL" if word == options.postgres else word for word in sys.argv]
     lines = [
-        f"# Load of the experiment's server, {kind}",
+        "# Load of the experiment's server",
         "",
-        f"`{' '.join(['python', *words])}`, {datetime.now(UTC):%Y-%m-%d}, "
+        f"`{' '.join(['python', *sys.argv])}`, {datetime.now(UTC):%Y-%m-%d}, "
         f"{processor()}, {os.cpu_count()} cores for server and clients together, "
         f"Python {platform.python_version()}, load average before {options.load_before:.1f}. "
         f"{options.people} participants, {TEST_TRIALS} test trials each; a synced write of 4 KiB "
@@ -398,7 +368,6 @@ def main() -> None:
     parser.add_argument("--people", type=int, default=200)
     parser.add_argument("--every", type=float, default=6, help="seconds between two answers")
     parser.add_argument("--loads", nargs="+", choices=LOADS, default=LOADS)
-    parser.add_argument("--postgres", help="URL of a PostgreSQL server that lets us make databases")
     parser.add_argument("--folder", type=Path, help="where studies are made, on the disk to test")
     parser.add_argument("--profile", type=Path, help="file for the server's profile")
     parser.add_argument("--write", action="store_true", help="keep the result in results/")
@@ -410,8 +379,7 @@ def main() -> None:
     text = report(rows, options)
     print(text)
     if options.write:
-        kind = "_postgres" if options.postgres else ""
-        (RESULTS / f"experiment_load{kind}.md").write_text(text)
+        (RESULTS / "experiment_load.md").write_text(text)
     failed = any(row.tally.failures or row.wrong for row in rows)
     sys.exit(1 if failed else 0)
 

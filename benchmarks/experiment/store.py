@@ -1,7 +1,7 @@
 """How fast the store alone keeps answers.
 
     python benchmarks/experiment/store.py
-        [--postgres URL] [--people 200] [--seconds 10] [--profile FILE]
+        [--people 200] [--seconds 10] [--profile FILE]
 
 No HTTP: so many participants as coroutines of one process, each storing its next answer as soon as
 the last one is on the disk. Commits are durable as when a study is served. Prints one JSON object:
@@ -87,7 +87,6 @@ async def _load(store: Store, word: str, people: int, seconds: float) -> list[fl
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--postgres")
     parser.add_argument("--people", type=int, default=200)
     parser.add_argument("--seconds", type=float, default=10)
     parser.add_argument("--profile", type=Path)
@@ -95,7 +94,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         study = make_study(Path(folder))
         secrets = Secrets.load(Path(folder))
-        store = Store.open(study, secrets, options.postgres)
+        store = Store.open(study, secrets)
         word = make_pass(secrets, "simulated")
         profile = cProfile.Profile()
         if options.profile:
@@ -106,11 +105,9 @@ def main() -> None:
         if options.profile:
             profile.disable()
             profile.dump_stats(options.profile)
-        database = store.engine.dialect.name
         store.close()
     p50, p99 = 1000 * np.quantile(waits, [0.5, 0.99])
     numbers = {
-        "database": database,
         "people": options.people,
         "answers": len(waits),
         "answers_per_s": round(len(waits) / wall),

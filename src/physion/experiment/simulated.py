@@ -359,6 +359,8 @@ class Participation:
             raise PhysionError("stopped: the server does not mark this session as simulated")
         self._browser.token = entered.token
         self._visit.reference = entered.state.reference
+        if entered.state.stage == "consent":
+            return entered.state
         answer = await self._browser.ask("GET", "/api/session?load=true")
         return wire.SessionState.model_validate_json(answer)
 
@@ -380,6 +382,9 @@ class Participation:
         try:
             answer = await self._browser.ask("POST", "/api/page", done)
         except RefusedError as refused:
+            if refused.code == "unknown_token" and state.stage == "consent":
+                # The server was started again and knows nobody who had not agreed.
+                return await self._enter(state.language)
             return state_after(refused)
         return wire.SessionState.model_validate_json(answer)
 

@@ -14,7 +14,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 import sqlalchemy as sa
 
-from physion.experiment.store.database import TOKENS, open_database, sqlite_url
+from physion.experiment.store.database import TOKENS, open_database
 from physion.experiment.study.study import Study
 from support.experiment.browser import SHORT, Visit, chromium, rows_of, served, signed_query
 
@@ -39,7 +39,7 @@ def to_the_test(visit: Visit, query: str) -> None:
 
 def forget_tokens(study: Study, session: str) -> None:
     """Delete all tokens, as if an older backup of the database had been restored."""
-    engine = open_database(sqlite_url(study.folder), must_exist=True)
+    engine = open_database(study.folder)
     try:
         with engine.begin() as connection:
             connection.execute(sa.delete(TOKENS).where(TOKENS.c.session == session))

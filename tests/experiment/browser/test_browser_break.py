@@ -13,7 +13,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 import sqlalchemy as sa
 
 from physion.experiment.server_process import ServerProcess
-from physion.experiment.store.database import ANSWERS, open_database, sqlite_url
+from physion.experiment.store.database import ANSWERS, open_database
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import STUDY_FILE, Study
@@ -108,7 +108,7 @@ def test_the_break_comes_after_25_trials_unless_the_study_says_otherwise(
 
 def preview_answers(study: Study) -> list[Any]:
     """Return the answers to test trials of the only session."""
-    engine = open_database(sqlite_url(study.folder), must_exist=True)
+    engine = open_database(study.folder)
     try:
         with engine.connect() as connection:
             return list(connection.execute(sa.select(ANSWERS).where(ANSWERS.c.phase == "test")))

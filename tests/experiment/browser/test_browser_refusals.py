@@ -14,7 +14,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 import sqlalchemy as sa
 
-from physion.experiment.store.database import RAW_IDS, SESSIONS, open_database, sqlite_url
+from physion.experiment.store.database import RAW_IDS, SESSIONS, open_database
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Recruitment, Study
@@ -35,7 +35,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Study, str]
 
 
 def stored(study: Study, table: sa.Table) -> list[Any]:
-    engine = open_database(sqlite_url(study.folder), must_exist=True)
+    engine = open_database(study.folder)
     try:
         with engine.connect() as connection:
             return list(connection.execute(sa.select(table)).all())

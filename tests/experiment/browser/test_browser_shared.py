@@ -11,7 +11,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 import sqlalchemy as sa
 
-from physion.experiment.store.database import PARTICIPANTS, SESSIONS, open_database, sqlite_url
+from physion.experiment.store.database import PARTICIPANTS, SESSIONS, open_database
 from physion.experiment.study.study import Recruitment, Study
 from support.experiment.browser import Visit, chromium, rows_of, served
 
@@ -41,7 +41,7 @@ def take_part(visit: Visit, query: str, answers: tuple[str, str]) -> None:
 
 
 def references(study: Study) -> list[str]:
-    engine = open_database(sqlite_url(study.folder), must_exist=True)
+    engine = open_database(study.folder)
     try:
         with engine.connect() as connection:
             people = connection.scalar(sa.select(sa.func.count()).select_from(PARTICIPANTS))

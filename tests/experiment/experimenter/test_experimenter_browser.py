@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import pytest
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.experiment.server_process import ServerProcess
-from physion.experiment.store.database import open_database, sqlite_url
+from physion.experiment.store.database import open_database
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Study
 from support.experiment.browser import chromium
@@ -35,7 +34,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Study, str]
 
 
 def add(study: Study, count: int, **settings: Any) -> list[str]:
-    engine = open_database(sqlite_url(study.folder), must_exist=True)
+    engine = open_database(study.folder)
     try:
         return insert_sessions(engine, study, Secrets.load(study.folder), count, **settings)
     finally:
@@ -82,50 +81,11 @@ def test_all_pages_are_whole(chromium: Any, site: tuple[Study, str], scheme: str
             ".map(e => e.innerText.slice(0, 80))"
         )
         assert cut == [], f"{place}: a table is wider than the window"
-        picture(page, f"{scheme}-{place.strip('/?').replace('/', '-')[:20] or 'overview'}")
+        picture(page, f"{scheme}-{place.strip('/?').replace('/', '-')[:20] or 'progress'}")
     # The icon of a page that is left at once is given up.
     assert [words for words in complaints if "ERR_ABORTED" not in words] == []
     paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
     assert paper == {"light": "rgb(255, 255, 255)", "dark": "rgb(21, 24, 29)"}[scheme]
-    context.close()
-
-
-def test_the_overview_refreshes_in_place(chromium: Any, site: tuple[Study, str]) -> None:
-    study, url = site
-    context = new_context(chromium)
-    page = context.new_page()
-    page.clock.install()
-    log_in(page, url)
-    page.wait_for_selector("text=Log out")
-    page.goto(f"{url}?kind=preview")
-    count = page.locator(".tabs [aria-current] .count")
-    assert count.inner_text() == "0"
-    page.evaluate("window.same = true")
-    add(study, 3, seed=99, kind="preview")
-    until = time.monotonic() + 600
-    while count.inner_text() == "0" and time.monotonic() < until:
-        page.clock.run_for(30_000)
-        page.wait_for_timeout(500)
-    assert count.inner_text() == "3"
-    assert page.evaluate("window.same"), "the page was not loaded anew"
-    context.clear_cookies()
-    page.clock.run_for(31_000)
-    page.wait_for_selector("#password")
-    context.close()
-
-
-def test_the_overview_refreshes_without_scripts(chromium: Any, site: tuple[Study, str]) -> None:
-    _, url = site
-    context = new_context(chromium, java_script_enabled=False)
-    page = context.new_page()
-    log_in(page, url)
-    page.wait_for_selector("text=Log out")
-    seconds, _, address = (
-        page.get_attribute("meta[http-equiv=refresh]", "content") or ""
-    ).partition(";url=")
-    assert seconds == "30"
-    page.goto(f"{url.removesuffix(BASE)}{address}")
-    assert page.locator("h1").inner_text() == "Overview"
     context.close()
 
 

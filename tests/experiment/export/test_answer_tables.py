@@ -9,10 +9,10 @@ import pandas as pd
 import pytest
 import sqlalchemy as sa
 from pandas.testing import assert_frame_equal
-from physion.experiment.experimenter.statistics.summaries import SummaryCache
 
 from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS, check_table
 from physion.core.errors import PhysionError, UnknownNameError
+from physion.experiment.experimenter.progress import Progress
 from physion.experiment.export import trial_rows
 from physion.experiment.export.answer_tables import read_tables, snapshot
 from physion.experiment.export.session_rows import (
@@ -24,7 +24,7 @@ from physion.experiment.export.session_rows import (
     read_sessions,
 )
 from physion.experiment.export.trial_rows import read_trials
-from physion.experiment.store.database import ANSWERS, SESSIONS, open_database, upgrade
+from physion.experiment.store.database import ANSWERS, SESSIONS, create_database
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Study
 from support.experiment.experimenter_rows import insert_sessions
@@ -40,10 +40,9 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
 
 
 @pytest.fixture
-def engine(study: Study, database_url: str) -> sa.Engine:
+def engine(study: Study, database: Path) -> sa.Engine:
     """Yield a database of people, simulated participants and previews, in every state."""
-    engine = open_database(database_url)
-    upgrade(engine)
+    engine = create_database(database)
     secrets = Secrets.load(study.folder)
     insert_sessions(engine, study, secrets, 40, now=NOW)
     insert_sessions(engine, study, secrets, 8, kind="simulated", seed=1, now=NOW)
@@ -130,18 +129,16 @@ def test_kinds_scenario_and_finished_can_be_chosen(engine: sa.Engine, study: Stu
         read_tables(engine, study, scenario="colide")
 
 
-def test_an_empty_study_has_empty_tables(study: Study, database_url: str) -> None:
-    engine = open_database(database_url)
-    upgrade(engine)
+def test_an_empty_study_has_empty_tables(study: Study, database: Path) -> None:
+    engine = create_database(database)
     trials, sessions = read_tables(engine, study)
     assert trials.empty and sessions.empty
     assert list(trials.columns) == [column.name for column in TRIAL_COLUMNS]
     assert_frame_equal(check_table(trials, TRIAL_COLUMNS, "trials"), trials)
 
 
-def test_cells_that_are_not_known_are_empty(study: Study, database_url: str) -> None:
-    engine = open_database(database_url)
-    upgrade(engine)
+def test_cells_that_are_not_known_are_empty(study: Study, database: Path) -> None:
+    engine = create_database(database)
     nothing = dict.fromkeys(("age", "gender", "education", "technical_problems", "feedback"))
     insert_sessions(engine, study, Secrets.load(study.folder), 1, ends=("finished",), now=NOW,
                     **nothing, device={})  # fmt: skip
@@ -182,9 +179,9 @@ def test_sessions_of_a_scenario_that_is_gone_are_left_out_by_name(
         count = (of_kind & (before["scenario"] == "drop")).sum()
         assert found.left_out[kind, said] == count > 0
     # The experimenter's pages go on.
-    summaries = SummaryCache(fewer, engine).refresh(NOW)
-    stages = {s.stage for s in summaries if s.facts["scenario"] == "drop"}
-    assert stages == {"done", "familiarization"}
+    lines, _ = Progress(fewer, engine).sessions("person")
+    stages = {line.stage for line in lines if line.row.scenario == "drop"}
+    assert stages == {"Finished", "Familiarization"}
 
 
 def test_what_is_written_meanwhile_is_not_seen(
@@ -220,20 +217,3 @@ def test_answers_to_stimuli_that_are_gone_are_named(engine: sa.Engine, study: St
     assert {name for part in parts for name in part.unknown} == {"gone"}
     assert sum(len(part.unknown) for part in parts) > 20
     assert all(part.counts.sum() == part.table.num_rows for part in parts)
-
-
-def test_both_databases_give_the_same(
-    study: Study, tmp_path: Path, fresh_postgres: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    tables = []
-    for url in (f"sqlite:///{tmp_path / 'one.sqlite'}", fresh_postgres):
-        engine = open_database(url)
-        upgrade(engine)
-        names = iter(f"{number:032x}" for number in range(100))
-        monkeypatch.setattr(
-            "support.experiment.experimenter_rows.new_session", lambda names=names: next(names)
-        )
-        insert_sessions(engine, study, Secrets.load(study.folder), 12, now=NOW + 1 / 3)
-        tables.append(read_tables(engine, study))
-    for one, other in zip(*tables, strict=True):
-        assert_frame_equal(one, other)

@@ -11,13 +11,11 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from physion.experiment.experimenter.overview import compute_overview
-from physion.experiment.experimenter.statistics.flagging import Flags, find_flags
-from physion.experiment.experimenter.statistics.summaries import SummaryCache
 
 from physion.analysis.check import check_responses
 from physion.analysis.people.exclusions import flag_sessions, read_expected
 from physion.analysis.people.results import read_any_responses
+from physion.experiment.experimenter.progress import Progress
 from physion.experiment.export.export_study import export_study
 from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.store import Store
@@ -77,9 +75,10 @@ def test_completeness_and_flags_are_judged_by_the_trials_of_each_session(
     flags = flag_sessions(responses, expected=expected).set_index("session")
     unfinished = [row.session for row in rows(store, SESSIONS) if row.finished_at is None]
     assert list(flags.index[flags["incomplete"]]) == unfinished
-    shown = find_flags(store.study, store.engine)["person"]
+    shown = Progress(store.study, store.engine).flags("person")
     assert not shown.problem
-    assert [name for name in shown.by_session if "incomplete" in shown.of(name)] == unfinished
+    found = [name for name, rules in shown.by_session.items() if "incomplete" in rules]
+    assert found == unfinished
 
 
 def test_a_bids_file_has_all_blocks_of_a_session(exported: tuple[Path, Store]) -> None:
@@ -93,21 +92,13 @@ def test_a_bids_file_has_all_blocks_of_a_session(exported: tuple[Path, Store]) -
     assert {"scenario", "block"} <= set(described)
 
 
-def test_the_overview_counts_sessions_and_the_stages_of_each_block(
-    exported: tuple[Path, Store],
-) -> None:
+def test_the_progress_counts_sessions_of_several_blocks(exported: tuple[Path, Store]) -> None:
     _, store = exported
-    summaries = SummaryCache(store.study, store.engine).refresh(2e9)
-    page = compute_overview(store.study, summaries, Flags("preregistered"), 2e9, "person")
-    (progress,) = page.progress
-    assert (progress.scenario, progress.counted) == (ALL_SCENARIOS, 4)
-    reached = {stage.name: stage.reached for stage in page.funnel}
-    assert reached["Test, block 1"] == 5 and reached["Page between blocks, block 1"] == 5
-    assert (
-        reached["Familiarization, block 2"] == 4 and "Page between blocks, block 2" not in reached
-    )
-    (performance,) = page.performance
-    assert performance.people == 4 and performance.accuracy == 0.5
+    progress = Progress(store.study, store.engine)
+    lines, _ = progress.sessions("person")
+    ((row,), by_condition) = progress.rows(lines)
+    assert (row.name, row.counted, row.accuracy, by_condition) == (ALL_SCENARIOS, 4, 0.5, [])
+    assert {line.stage for line in lines} == {"Finished", "Page between blocks, block 1"}
 
 
 def test_attention_checks_are_not_expected(tmp_path: Path) -> None:

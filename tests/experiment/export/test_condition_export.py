@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -11,15 +10,12 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from physion.experiment.experimenter.overview import compute_overview
-from physion.experiment.experimenter.statistics.flagging import Flags
-from physion.experiment.experimenter.statistics.summaries import SummaryCache
-
 from physion.analysis.people.effects import accuracy_by_background, background
 from physion.analysis.people.measures import accuracy_by_condition
 from physion.analysis.people.responses import keep_where
 from physion.analysis.people.results import read_any_responses
 from physion.core.errors import BadInputError, UnknownNameError
+from physion.experiment.experimenter.progress import Progress
 from physion.experiment.export.export_study import export_study
 from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.store import Store
@@ -69,16 +65,14 @@ def test_a_study_without_conditions_has_an_empty_column(tmp_path: Path) -> None:
     assert "condition" not in set(background(responses.sessions)["question"])
 
 
-def test_the_overview_counts_the_sessions_of_each_condition(exported: tuple[Path, Store]) -> None:
+def test_the_progress_counts_the_sessions_of_each_condition(exported: tuple[Path, Store]) -> None:
     _, store = exported
-    summaries = SummaryCache(store.study, store.engine).refresh(2e9)
-    found = compute_overview(store.study, summaries, Flags("preregistered"), 2e9, "person")
-    counts = {row.name: (row.counted, row.states["finished"]) for row in found.conditions}
+    progress = Progress(store.study, store.engine)
+    _, found = progress.rows(progress.sessions("person")[0])
+    counts = {row.name: (row.counted, row.states["finished"]) for row in found}
     assert counts == {"slow": (3, 3), "brief": (3, 3)}
-    assert sum(row.states["withdrawn"] for row in found.conditions) == 1
-    assert [row.accuracy for row in found.conditions] == [0.5, 0.5]
-    plain = replace(store.study, conditions=())
-    assert compute_overview(plain, [], Flags("preregistered"), 2e9, "person").conditions == ()
+    assert sum(row.states["withdrawn"] for row in found) == 1
+    assert [row.accuracy for row in found] == [0.5, 0.5]
 
 
 def test_the_analysis_compares_and_chooses_conditions(exported: tuple[Path, Store]) -> None:

@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
 import pytest
-from physion.experiment.experimenter.statistics.summaries import SummaryCache
 
 from physion.analysis.people.exclusions import flag_sessions, read_expected
 from physion.analysis.people.responses import read_responses
+from physion.experiment.experimenter.progress import Progress
 from physion.experiment.export.export_study import export_study
-from physion.experiment.protocol import Jump
 from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.orders import trial_order
-from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.stimuli import ATTENTION, Stimulus
 from physion.experiment.study.study import Attention, Study
-from support.experiment.store_walk import enter, give, rows, run, walk
+from support.experiment.store_walk import enter, give, open_store, rows, run, walk
 from support.experiment.tiny_study import make_tiny_study
 
 
@@ -34,8 +31,8 @@ def checked(tmp_path_factory: pytest.TempPathFactory) -> Study:
 
 
 @pytest.fixture
-def checked_store(checked: Study, database_url: str) -> Iterator[Store]:
-    opened = Store.open(checked, Secrets.load(checked.folder), database_url)
+def checked_store(checked: Study, database: Path) -> Iterator[Store]:
+    opened = open_store(checked, Secrets.load(checked.folder), database)
     yield opened
     opened.close()
 
@@ -112,19 +109,5 @@ def test_checks_are_no_trials_of_the_analysis(checked_store: Store, tmp_path: Pa
     assert sorted(failed) == [0, 3]
     sessions = pd.read_csv(out / "sessions.csv").set_index("session")
     assert sessions["attention_failed"].loc[failed.index].tolist() == (3 - failed).tolist()
-    cache = SummaryCache(study, store.engine)
-    for summary in cache.refresh(0.0):
-        answered = summary.answered
-        assert (answered.familiarization, answered.test, answered.attention) == (2, 4, 3)
-        assert answered.accuracy == 1.0
-
-
-def test_a_preview_answers_checks_again(checked: Study, tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path / 'a.sqlite'}"
-    store = Store.open(replace(checked, participants=5), Secrets.load(checked.folder), url)
-    link = {"pass": make_pass(Secrets.load(checked.folder), "preview")}
-    token = walk(store, enter(store, "Me", **link), "done")
-    run(store.jump(token, Jump(stage="test", trial=0)))
-    assert [row.phase for row in rows(store)] == ["familiarization"] * 2
-    walk(store, token, "done")
-    store.close()
+    lines, _ = Progress(study, store.engine).sessions("person")
+    assert [(line.trials, line.accuracy) for line in lines] == [(4, 1.0)] * len(lines) != []

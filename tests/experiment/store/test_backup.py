@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import shutil
 import sqlite3
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -17,7 +15,7 @@ from physion.experiment.store.lab import back_up
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Study
-from support.experiment.store_walk import enter, give, rows, walk
+from support.experiment.store_walk import enter, give, open_store, rows, walk
 from support.experiment.tiny_study import make_tiny_study
 
 
@@ -42,7 +40,7 @@ def test_a_backup_of_a_served_study_is_a_study(
     assert made.parent == served.folder / "backups"
     assert made.stat().st_mode & 0o077 == 0
     assert (made / "responses.sqlite").stat().st_mode & 0o077 == 0
-    again = Store.open(served, Secrets.load(made), f"sqlite:///{made / 'responses.sqlite'}")
+    again = open_store(served, Secrets.load(made), made)
     try:
         assert [(row.phase, row.trial) for row in rows(again, ANSWERS)] == [
             ("familiarization", 0), ("test", 0),
@@ -87,18 +85,3 @@ def test_what_is_no_study_or_was_never_served_is_named(served: Study, tmp_path: 
     with pytest.raises(BadInputError, match="has the study been served"):
         back_up(served.folder, tmp_path / "safe")
     assert not (tmp_path / "safe").exists()
-
-
-@pytest.mark.skipif(shutil.which("pg_dump") is None, reason="pg_dump is not installed")
-def test_a_backup_of_postgresql_can_be_listed(
-    served: Study, tmp_path: Path, fresh_postgres: str
-) -> None:
-    store = Store.open(served, Secrets.load(served.folder), fresh_postgres)
-    walk(store, enter(store, "Ada"), "done")
-    store.close()
-    made = back_up(served.folder, tmp_path / "safe", fresh_postgres)
-    listed = subprocess.run(
-        ["pg_restore", "--data-only", "--table=answers", "--file=-", made / "responses.dump"],
-        capture_output=True, text=True, check=True,
-    ).stdout  # fmt: skip
-    assert listed.count("_tiny_tes_") == 2

@@ -5,24 +5,25 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
-from alembic import command
-from sqlalchemy import text
 
 from physion.core.errors import BadInputError
-from physion.experiment.protocol import Jump, PageDone
-from physion.experiment.store.database import SESSIONS, _load_migrations, open_database
+from physion.experiment.protocol import PageDone
+from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.store import Store
-from physion.experiment.study.identity import Secrets, hash_token
+from physion.experiment.study.identity import Secrets
 from physion.experiment.study.media import read_media_path
 from physion.experiment.study.orders import block_scenarios, order_number, trial_order
-from physion.experiment.study.recruitment import links, make_pass
+from physion.experiment.study.recruitment import links
 from physion.experiment.study.study import ALL_SCENARIOS, Blocks, Study, load_study, write_settings
 from support.experiment.store_walk import (
     answer,
+    begin,
     enter,
     give,
+    open_store,
     page,
     refusal,
     request,
@@ -46,8 +47,8 @@ def blocks_study(tmp_path_factory: pytest.TempPathFactory) -> Study:
 
 
 @pytest.fixture
-def blocks_store(blocks_study: Study, database_url: str) -> Iterator[Store]:
-    opened = Store.open(blocks_study, Secrets.load(blocks_study.folder), database_url)
+def blocks_store(blocks_study: Study, database: Path) -> Iterator[Store]:
+    opened = open_store(blocks_study, Secrets.load(blocks_study.folder), database)
     yield opened
     opened.close()
 
@@ -55,10 +56,12 @@ def blocks_store(blocks_study: Study, database_url: str) -> Iterator[Store]:
 def test_a_session_has_practice_and_test_of_each_block(blocks_store: Store) -> None:
     store = blocks_store
     token = enter(store, "ada")
+    state = run(store.state(token))
+    seen = [(state.stage, state.trial, state.block, state.scenario)]
+    page(store, token, "consent")
     row = rows(store, SESSIONS)[0]
     assert row.scenario == ALL_SCENARIOS
     first, second = block_scenarios(store.study, ALL_SCENARIOS, row.order_seed)
-    seen: list[tuple[str, int | None, int, str]] = []
     while (state := run(store.state(token))).stage != "done":
         seen.append((state.stage, state.trial, state.block, state.scenario))
         if state.trial is None:
@@ -116,7 +119,7 @@ def test_orders_of_blocks_are_counterbalanced_and_given_back(blocks_store: Store
         counted = (r for r in rows(store, SESSIONS) if r.withdrawn_at is None)
         return Counter(order_number(store.study, r.order_seed) for r in counted)
 
-    tokens = [enter(store, f"person {index}") for index in range(6)]
+    tokens = [begin(store, f"person {index}") for index in range(6)]
     assert sorted(numbers().values()) == [3, 3]
     kept = order_number(store.study, rows(store, SESSIONS)[0].order_seed)
     others = [
@@ -125,8 +128,8 @@ def test_orders_of_blocks_are_counterbalanced_and_given_back(blocks_store: Store
     ]  # fmt: skip
     for token in others[:2]:
         page(store, walk(store, token, "instructions"), "withdraw")
-    enter(store, "a new person")
-    enter(store, "another one")
+    begin(store, "a new person")
+    begin(store, "another one")
     assert sorted(numbers().values()) == [3, 3], "places of those who stopped are filled again"
 
 
@@ -134,9 +137,9 @@ def test_prepared_orders_take_the_orders_of_blocks_in_turn(
     blocks_study: Study, tmp_path: object
 ) -> None:
     study = replace(blocks_study, orders=4)
-    store = Store.open(study, Secrets.load(study.folder), f"sqlite:///{tmp_path}/a.sqlite")
+    store = open_store(study, Secrets.load(study.folder), tmp_path / "a")
     for index in range(8):
-        enter(store, f"person {index}")
+        begin(store, f"person {index}")
     found = [(r.order_number, order_number(study, r.order_seed)) for r in rows(store, SESSIONS)]
     store.close()
     assert found == [(1, 0), (2, 1), (3, 0), (4, 1)] * 2
@@ -144,7 +147,7 @@ def test_prepared_orders_take_the_orders_of_blocks_in_turn(
 
 def test_places_are_counted_by_session(blocks_study: Study, tmp_path: object) -> None:
     study = replace(blocks_study, participants=2)
-    store = Store.open(study, Secrets.load(study.folder), f"sqlite:///{tmp_path}/a.sqlite")
+    store = open_store(study, Secrets.load(study.folder), tmp_path / "a")
     for person in ("ada", "bob"):
         walk(store, enter(store, person), "done")
     assert refusal(store.enter(request("cleo"))).code == "study_full"
@@ -161,82 +164,25 @@ def test_links_name_no_scenario(blocks_study: Study) -> None:
     assert next(link.address for link in found if link.name == "link") == "https://lab.example.org/"
 
 
-def test_a_preview_goes_to_any_part_of_any_block(blocks_store: Store) -> None:
-    store = blocks_store
-    token = enter(store, **{"pass": make_pass(store.secrets, "preview")})
-
-    def jump(stage: str, trial: int = 0) -> tuple[str, int | None, int]:
-        state = run(store.jump(token, Jump(stage=stage, trial=trial)))  # type: ignore[arg-type]
-        return state.stage, state.trial, state.block
-
-    assert jump("test", 3) == ("test", 3, 1)
-    assert jump("familiarization", 1) == ("familiarization", 1, 1)
-    assert jump("familiarization", 0) == ("familiarization", 0, 0)
-    assert jump("block", 0) == ("block", None, 0)
-    assert jump("ready", 1) == ("ready", None, 1)
-    assert jump("demographics") == ("demographics", None, 1)
-    assert jump("instructions") == ("instructions", None, 0)
-    assert refusal(store.jump(token, Jump(stage="block", trial=1))).code == "bad_request"
-    assert refusal(store.jump(token, Jump(stage="test", trial=4))).code == "bad_request"
-
-
 def test_a_study_with_sessions_keeps_its_blocks(blocks_study: Study, tmp_path: object) -> None:
-    url = f"sqlite:///{tmp_path}/a.sqlite"
+    url = tmp_path / "a"
     secrets = Secrets.load(blocks_study.folder)
-    store = Store.open(blocks_study, secrets, url)
-    enter(store, "ada")
+    store = open_store(blocks_study, secrets, url)
+    begin(store, "ada")
     store.close()
     try:
         write_settings(replace(blocks_study, blocks=replace(SEVERAL, trials=3)))
         with pytest.raises(BadInputError, match="other blocks"):
-            Store.open(load_study(blocks_study.folder), secrets, url)
+            open_store(load_study(blocks_study.folder), secrets, url)
     finally:
         write_settings(blocks_study)
 
 
 def test_only_the_first_block_may_have_practice(blocks_study: Study, tmp_path: object) -> None:
     study = replace(blocks_study, blocks=replace(SEVERAL, familiarization="first"))
-    store = Store.open(study, Secrets.load(study.folder), f"sqlite:///{tmp_path}/a.sqlite")
+    store = open_store(study, Secrets.load(study.folder), tmp_path / "a")
     token = walk(store, enter(store, "ada"), "block")
     state = page(store, token, "block", block=0)
     assert (state.stage, state.trial, state.block) == ("test", 2, 1)
     assert run(store.state(walk(store, token, "done"))).trials == {"familiarization": 1, "test": 4}
     store.close()
-
-
-def test_sessions_of_older_databases_have_one_block_and_no_condition(
-    blocks_study: Study, tmp_path: object
-) -> None:
-    """A session whose practice was done before the tables knew blocks goes on in the test."""
-    study = replace(blocks_study, blocks=Blocks())
-    url = f"sqlite:///{tmp_path}/a.sqlite"
-    engine = open_database(url)
-    config, _ = _load_migrations()
-    with engine.execution_options(physion_writes=True).begin() as connection:
-        config.attributes["connection"] = connection
-        command.upgrade(config, "0006")
-        values = {
-            "digest": study.digest, "stimuli": study.stimuli_digest, "token": hash_token("token"),
-        }  # fmt: skip
-        for statement in OLD_ROWS:
-            connection.execute(text(statement), values)
-    engine.dispose()
-    store = Store.open(study, Secrets.load(study.folder), url)
-    state = run(store.state("token"))
-    assert (state.stage, state.trial, state.block, state.condition) == ("test", 2, 0, "")
-    assert (state.scenario, len(state.blocks)) == ("drop", 1)
-    assert give(store, "token", 2).state.trial == 3
-    store.close()
-
-
-OLD_ROWS = (
-    "INSERT INTO studies VALUES (:digest, 'tiny', '1', :stimuli, '{}', 1.0)",
-    "INSERT INTO participants VALUES ('ada', 1.0)",
-    "INSERT INTO sessions (session, participant, scenario, kind, source, study, reference, "
-    "order_seed, order_number, buttons, language, started_at, consented_at, instructed_at, "
-    "ready_at, answered_familiarization, answered_test, loads, last_seen, device) VALUES "
-    "('one', 'ada', 'drop', 'person', 'link', :digest, 'AAAA-BBBB', 5, 0, 'yes-no', 'en', 1.0, "
-    "1.0, 1.0, 1.0, 1, 2, 1, 1.0, '{}')",
-    "INSERT INTO tokens VALUES (:token, 'one', 1.0)",
-)
-"""Rows of a session as version 6 stored them."""

@@ -10,16 +10,15 @@ import pandas as pd
 import pytest
 
 from physion.experiment.export.export_study import export_study
-from physion.experiment.protocol import Completion, Jump, PageDone
+from physion.experiment.protocol import Completion, PageDone
 from physion.experiment.store.answering import ATTEMPT
 from physion.experiment.store.database import EVENTS, SESSIONS
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Comprehension, EarlyEnd, Study
 from physion.experiment.web.api import public_study
 from support.experiment.own_questions import COMPREHENSION, COMPREHENSION_TEXTS, RIGHT, WRONG
-from support.experiment.store_walk import enter, page, refusal, request, rows, run, walk
+from support.experiment.store_walk import enter, open_store, page, refusal, request, rows, run, walk
 from support.experiment.tiny_study import make_tiny_study
 
 
@@ -34,8 +33,8 @@ def checking(tmp_path: Path) -> Study:
 
 
 @pytest.fixture
-def checking_store(checking: Study, database_url: str) -> Iterator[Store]:
-    opened = Store.open(checking, Secrets.load(checking.folder), database_url)
+def checking_store(checking: Study, database: Path) -> Iterator[Store]:
+    opened = open_store(checking, Secrets.load(checking.folder), database)
     yield opened
     opened.close()
 
@@ -69,12 +68,11 @@ def test_after_the_last_attempt_the_session_has_ended(checking_store: Store) -> 
     assert (state.stage, state.ended) == ("screened_out", True)
     ending = store.ending(token)
     assert ending.completion == Completion(code="screened", url="https://lab.example/out")
-    assert not ending.can_take_back
     (session,) = rows(store, SESSIONS)
     assert session.screened_out_by == "comprehension" and session.finished_at is None
     # The same person begins nothing else, and the place is free.
     for scenario in ("drop", "collide", None):
-        back = run(store.enter(request("Ada", scenario=scenario, take_back=True)))
+        back = run(store.enter(request("Ada", scenario=scenario)))
         assert back.state.stage == "screened_out"
     walk(store, enter(store, "Bo", scenario="drop"), "done")
 
@@ -98,13 +96,3 @@ def test_attempts_and_ends_are_exported(checking_store: Store, tmp_path: Path) -
     assert table["comprehension_attempts"].tolist() == [2, 1]
     assert table["screened_out"].fillna("").tolist() == ["comprehension", ""]
     assert (pd.read_csv(out / "events.csv")["kind"] == ATTEMPT).sum() == 3
-
-
-def test_a_preview_is_taken_back_from_the_end(checking_store: Store, checking: Study) -> None:
-    store = checking_store
-    link = {"pass": make_pass(Secrets.load(checking.folder), "preview"), "scenario": "drop"}
-    token = enter(store, "Me", **link)
-    for _ in range(2):
-        page(store, walk(store, token, "comprehension"), "comprehension", **WRONG)
-    state = run(store.jump(token, Jump(stage="comprehension")))
-    assert (state.stage, state.comprehension_attempts) == ("comprehension", 0)

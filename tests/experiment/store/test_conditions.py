@@ -23,7 +23,18 @@ from physion.experiment.study.recruitment import links, make_pass
 from physion.experiment.study.settings import Condition
 from physion.experiment.study.study import Blocks, Study, Timing, load_study, under, write_settings
 from physion.experiment.study.texts import TEXTS_FOLDER
-from support.experiment.store_walk import enter, give, page, refusal, request, rows, run, walk
+from support.experiment.store_walk import (
+    begin,
+    enter,
+    give,
+    open_store,
+    page,
+    refusal,
+    request,
+    rows,
+    run,
+    walk,
+)
 from support.experiment.tiny_study import make_tiny_study
 
 PLAIN = Condition("plain")
@@ -54,8 +65,8 @@ def groups(tmp_path_factory: pytest.TempPathFactory) -> Study:
 
 
 @pytest.fixture
-def groups_store(groups: Study, database_url: str) -> Iterator[Store]:
-    opened = Store.open(groups, Secrets.load(groups.folder), database_url)
+def groups_store(groups: Study, database: Path) -> Iterator[Store]:
+    opened = open_store(groups, Secrets.load(groups.folder), database)
     yield opened
     opened.close()
 
@@ -67,7 +78,7 @@ def conditions_of(store: Store) -> Counter[str]:
 
 def test_conditions_are_filled_equally_and_places_are_given_back(groups_store: Store) -> None:
     store = groups_store
-    tokens = [enter(store, f"person {index}") for index in range(9)]
+    tokens = [begin(store, f"person {index}") for index in range(9)]
     assert conditions_of(store) == {"plain": 3, "brief": 3, "other": 3}
     by_condition: dict[str, list[tuple[str, str]]] = {}
     for token, row in zip(tokens, rows(store, SESSIONS), strict=True):
@@ -76,22 +87,22 @@ def test_conditions_are_filled_equally_and_places_are_given_back(groups_store: S
         page(store, walk(store, token, "instructions"), "withdraw")
     run(store.write(lambda c: set_voided(c, by_condition["other"][0][1], True, 1.0)))
     for index in range(3):
-        enter(store, f"new {index}")
+        begin(store, f"new {index}")
     assert conditions_of(store) == {"plain": 3, "brief": 3, "other": 3}
     left = by_condition["plain"][0][1]
     gone = update(SESSIONS).where(SESSIONS.c.session == left).values(last_seen=1.0)
     run(store.write(lambda c: c.execute(gone)))
-    enter(store, "last")
+    begin(store, "last")
     assert conditions_of(store)["plain"] == 4, "nobody goes on with the session that was left"
 
 
 def test_ties_are_broken_by_seed(groups: Study, tmp_path: Path) -> None:
     first = []
-    for seed in range(12):
+    for seed in range(30):
         study = replace(groups, seed=seed)
-        url = f"sqlite:///{tmp_path}/{seed}.sqlite"
-        store = Store.open(study, Secrets.load(study.folder), url)
-        enter(store, "ada")
+        url = tmp_path / f"{seed}"
+        store = open_store(study, Secrets.load(study.folder), url)
+        begin(store, "ada")
         first += [row.condition for row in rows(store, SESSIONS)]
         store.close()
     assert len(set(first)) == 3
@@ -99,7 +110,7 @@ def test_ties_are_broken_by_seed(groups: Study, tmp_path: Path) -> None:
 
 def test_a_person_keeps_the_condition_in_further_sessions(groups: Study, tmp_path: Path) -> None:
     study = replace(groups, conditions=(PLAIN, BRIEF))
-    store = Store.open(study, Secrets.load(study.folder), f"sqlite:///{tmp_path}/a.sqlite")
+    store = open_store(study, Secrets.load(study.folder), tmp_path / "a")
     for person in ("ada", "bob", "cleo"):
         for _ in range(2):
             walk(store, enter(store, person), "done")
@@ -117,11 +128,12 @@ def link_to(store: Store, condition: str, kind: str = "study", **more: Any) -> E
 
 
 def test_a_signed_link_fixes_the_condition(
-    groups_store: Store, capsys: pytest.CaptureFixture[str]
+    groups_store: Store, groups: Study, capsys: pytest.CaptureFixture[str]
 ) -> None:
     store = groups_store
     for index in range(3):
-        run(store.enter(link_to(store, "brief", person=f"person {index}")))
+        token = run(store.enter(link_to(store, "brief", person=f"person {index}"))).token
+        page(store, token, "consent")
     assert conditions_of(store) == {"brief": 3}
     unsigned = request("eve", condition="plain")
     assert refusal(store.enter(unsigned)).code == "bad_link"
@@ -137,7 +149,7 @@ def test_a_signed_link_fixes_the_condition(
     fixed = [link for link in found if link.condition == "other"]
     assert {link.scenario for link in fixed} == {"drop"}
     assert all("condition=other&pass=" in link.address for link in fixed)
-    folder = str(store.study.folder)
+    folder = str(groups.folder)
     assert main(["experiment", "links", folder, "--base-url", "https://lab.example.org"]) == 0
     assert "  prolific, condition other: " in capsys.readouterr().out
 
@@ -210,10 +222,10 @@ def test_conditions_that_cannot_be_served_are_refused(
 
 
 def test_a_condition_with_sessions_cannot_be_removed(groups: Study, tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/a.sqlite"
+    url = tmp_path / "a"
     secrets = Secrets.load(groups.folder)
-    store = Store.open(groups, secrets, url)
-    run(store.enter(link_to(store, "brief")))
+    store = open_store(groups, secrets, url)
+    page(store, run(store.enter(link_to(store, "brief"))).token, "consent")
     store.close()
     with pytest.raises(BadInputError, match="condition brief"):
-        Store.open(replace(groups, conditions=(PLAIN, OTHER)), secrets, url)
+        open_store(replace(groups, conditions=(PLAIN, OTHER)), secrets, url)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,17 @@ from physion.experiment.store.lab import forget, forget_raw_ids, forget_sessions
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets, check_password, participant_hash
 from physion.experiment.study.study import Study
-from support.experiment.store_walk import enter, give, page, refusal, rows, run, walk
+from support.experiment.store_walk import (
+    begin,
+    enter,
+    give,
+    open_store,
+    page,
+    refusal,
+    rows,
+    run,
+    walk,
+)
 from support.experiment.tiny_study import PASSWORD
 
 
@@ -29,9 +40,8 @@ def fill(store: Store, count: int = 60) -> None:
     """Add people with ids and parameters, some of whom enter again, and other data."""
     for number in range(count):
         more = {"STUDY_ID": f"visit-first-{number:04d}"}
-        token = enter(store, raw_id(number), source="prolific", recruiter=more, scenario="drop")
+        token = begin(store, raw_id(number), source="prolific", recruiter=more, scenario="drop")
         if number % 5 == 0:
-            page(store, token, "consent")
             page(store, token, "withdraw")
     for number in range(1, count, 3):
         if number % 5:
@@ -44,42 +54,35 @@ def bytes_of(folder: Path) -> bytes:
 
 
 @pytest.fixture
-def database(tmp_path: Path, small_study: Study, small_secrets: Secrets) -> str:
-    from dataclasses import replace
-
-    url = f"sqlite:///{tmp_path / 'responses.sqlite'}"
-    store = Store.open(replace(small_study, participants=1000), small_secrets, url)
+def database(tmp_path: Path, small_study: Study, small_secrets: Secrets) -> Path:
+    store = open_store(replace(small_study, participants=1000), small_secrets, tmp_path)
     fill(store)
-    declined = enter(store, "did-not-agree-0001", source="sona", scenario="drop")
-    assert b"did-not-agree" in bytes_of(tmp_path)
-    page(store, declined, "consent", agreed=False)
     store.close()
     found = bytes_of(tmp_path)
-    assert b"did-not-agree" not in found
     assert b"5f1eada" in found and b"visit-first" in found and b"visit-again" in found
-    return url
+    return tmp_path
 
 
 def test_no_byte_of_the_ids_stays(
-    database: str, tmp_path: Path, small_study: Study, small_secrets: Secrets
+    database: Path, tmp_path: Path, small_study: Study, small_secrets: Secrets
 ) -> None:
     assert forget(database, None) == 60
     found = bytes_of(tmp_path)
     assert b"5f1eada" not in found and b"visit-" not in found
     assert forget(database, None) == 0
-    store = Store.open(small_study, small_secrets, database)
+    store = open_store(small_study, small_secrets, database)
     try:
-        assert len(rows(store, SESSIONS)) == 61 and rows(store, RAW_IDS) == []
+        assert len(rows(store, SESSIONS)) == 60 and rows(store, RAW_IDS) == []
         # People are still recognised by their hash.
         entered = enter(store, raw_id(1), source="prolific", scenario="drop")
-        assert len(rows(store, SESSIONS)) == 61
-        assert run(store.state(entered)).stage == "consent"
+        assert len(rows(store, SESSIONS)) == 60
+        assert run(store.state(entered)).stage == "instructions"
     finally:
         store.close()
 
 
 def test_single_participants_are_forgotten(
-    database: str, tmp_path: Path, small_secrets: Secrets
+    database: Path, tmp_path: Path, small_secrets: Secrets
 ) -> None:
     names = [participant_hash(small_secrets, "prolific", raw_id(number)) for number in (3, 4)]
     for wrong in ("0" * 32, "x", raw_id(3), "'; --", names[0].upper()):
@@ -93,9 +96,10 @@ def test_single_participants_are_forgotten(
 
 
 def test_ids_are_forgotten_while_the_study_is_served(
-    store: Store, small_secrets: Secrets, database_url: str
+    tmp_path: Path, small_study: Study, small_secrets: Secrets
 ) -> None:
-    tokens = [enter(store, raw_id(number), source="sona") for number in range(4)]
+    store = open_store(small_study, small_secrets, tmp_path)
+    tokens = [begin(store, raw_id(number), source="sona") for number in range(4)]
     walk(store, tokens[0], "test")
     first = participant_hash(small_secrets, "sona", raw_id(0))
     assert run(forget_raw_ids(store, [first])) == 1
@@ -103,16 +107,15 @@ def test_ids_are_forgotten_while_the_study_is_served(
     assert run(forget_raw_ids(store)) == 3
     assert rows(store, RAW_IDS) == []
     assert not give(store, tokens[0], 0).duplicate  # and the session continues
-    if database_url.startswith("sqlite"):
-        folder = Path(database_url.removeprefix("sqlite:///")).parent
-        assert b"5f1eada" not in bytes_of(folder)
+    assert b"5f1eada" not in bytes_of(tmp_path)
+    store.close()
 
 
 def test_a_served_study_and_a_busy_reader_are_named(
-    database: str, tmp_path: Path, small_study: Study, small_secrets: Secrets,
+    database: Path, tmp_path: Path, small_study: Study, small_secrets: Secrets,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    store = Store.open(small_study, small_secrets, database)
+    store = open_store(small_study, small_secrets, database)
     with pytest.raises(PhysionError, match="another"):
         forget(database, None)
     assert len(rows(store, RAW_IDS)) == 60
@@ -128,25 +131,13 @@ def test_a_served_study_and_a_busy_reader_are_named(
     assert b"5f1eada" not in bytes_of(tmp_path)
 
 
-def test_forget_on_postgresql(
-    fresh_postgres: str, small_study: Study, small_secrets: Secrets
-) -> None:
-    store = Store.open(small_study, small_secrets, fresh_postgres)
-    enter(store, raw_id(1), source="prolific")
-    store.close()
-    assert forget(fresh_postgres, None) == 1
-    store = Store.open(small_study, small_secrets, fresh_postgres)
-    assert rows(store, RAW_IDS) == [] and len(rows(store, SESSIONS)) == 1
-    store.close()
-
-
 def test_all_of_a_session_is_forgotten(
-    database_url: str, small_study: Study, small_secrets: Secrets
+    tmp_path: Path, small_study: Study, small_secrets: Secrets
 ) -> None:
-    store = Store.open(small_study, small_secrets, database_url)
+    store = open_store(small_study, small_secrets, tmp_path)
     seen = Device(user_agent="TellingBrowser")
     tokens = {
-        scenario: enter(store, raw_id(1), source="sona", scenario=scenario, device=seen)
+        scenario: begin(store, raw_id(1), source="sona", scenario=scenario, device=seen)
         for scenario in ("drop", "collide")
     }
     other = walk(store, enter(store, raw_id(2), source="sona", scenario="drop"), "demographics")
@@ -158,9 +149,9 @@ def test_all_of_a_session_is_forgotten(
     store.close()
 
     with pytest.raises(BadInputError, match="no sessions have the reference 'K7QF-29XM'"):
-        forget_sessions(database_url, [references["drop"], "k7qf-29xm"])
-    assert forget_sessions(database_url, [references["drop"].lower()]) == 1
-    store = Store.open(small_study, small_secrets, database_url)
+        forget_sessions(tmp_path, [references["drop"], "k7qf-29xm"])
+    assert forget_sessions(tmp_path, [references["drop"].lower()]) == 1
+    store = open_store(small_study, small_secrets, tmp_path)
     gone, kept = (
         next(row for row in rows(store, SESSIONS) if row.reference == references[scenario])
         for scenario in ("drop", "collide")
@@ -178,18 +169,17 @@ def test_all_of_a_session_is_forgotten(
     assert run(store.state(other)).stage == "demographics"
     store.close()
 
-    assert forget_sessions(database_url, [references["collide"], references["drop"]]) == 2
-    store = Store.open(small_study, small_secrets, database_url)
+    assert forget_sessions(tmp_path, [references["collide"], references["drop"]]) == 2
+    store = open_store(small_study, small_secrets, tmp_path)
     assert [row.raw_id for row in rows(store, RAW_IDS)] == [raw_id(2)]
     store.close()
-    if database_url.startswith("sqlite"):
-        found = bytes_of(Path(database_url.removeprefix("sqlite:///")).parent)
-        assert b"Telling" not in found and raw_id(1).encode() not in found
-        assert raw_id(2).encode() in found
+    found = bytes_of(tmp_path)
+    assert b"Telling" not in found and raw_id(1).encode() not in found
+    assert raw_id(2).encode() in found
 
 
 def test_the_verb_forgets_a_session(
-    database: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    database: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with sqlite3.connect(tmp_path / "responses.sqlite") as connection:
         (reference,) = connection.execute("SELECT reference FROM sessions LIMIT 1").fetchone()
@@ -202,7 +192,9 @@ def test_the_verb_forgets_a_session(
     assert main(["experiment", "forget", study, "--session", reference, "--all"]) == 2
 
 
-def test_the_verb_forget(database: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_verb_forget(
+    database: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     study = str(tmp_path)
     assert main(["experiment", "forget", study]) == 2
     assert main(["experiment", "forget", study, "--all", "--participant", "0" * 32]) == 2

@@ -23,7 +23,7 @@ from physion.experiment.study.settings import Question
 from physion.experiment.study.study import Study, load_study, write_settings
 from physion.experiment.study.texts import shipped_file
 from support.experiment.own_questions import OWN_ANSWERS, OWN_QUESTIONS, OWN_TEXTS
-from support.experiment.store_walk import enter, page, refusal, rows, run, walk
+from support.experiment.store_walk import begin, enter, open_store, page, refusal, rows, run, walk
 from support.experiment.tiny_study import make_tiny_study
 
 
@@ -36,8 +36,8 @@ def asking(tmp_path: Path) -> Study:
 
 
 @pytest.fixture
-def asking_store(asking: Study, database_url: str) -> Iterator[Store]:
-    opened = Store.open(asking, Secrets.load(asking.folder), database_url)
+def asking_store(asking: Study, database: Path) -> Iterator[Store]:
+    opened = open_store(asking, Secrets.load(asking.folder), database)
     yield opened
     opened.close()
 
@@ -93,26 +93,26 @@ def test_answers_are_exported_with_their_words(asking_store: Store, tmp_path: Pa
 
 
 def test_answers_are_forgotten(asking: Study, tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path / 'a.sqlite'}"
-    store = Store.open(asking, Secrets.load(asking.folder), url)
-    token = walk(store, enter(store, "Ada", scenario="drop"), "done")
+    url = tmp_path / "a"
+    store = open_store(asking, Secrets.load(asking.folder), url)
+    token = walk(store, begin(store, "Ada", scenario="drop"), "done")
     reference = run(store.state(token)).reference
     store.close()
-    assert b"I looked" in (tmp_path / "a.sqlite").read_bytes()
+    assert b"I looked" in (url / "responses.sqlite").read_bytes()
     forget_sessions(url, [reference])
-    assert b"I looked" not in (tmp_path / "a.sqlite").read_bytes()
-    store = Store.open(asking, Secrets.load(asking.folder), url)
+    assert b"I looked" not in (url / "responses.sqlite").read_bytes()
+    store = open_store(asking, Secrets.load(asking.folder), url)
     (session,) = rows(store, SESSIONS)
     assert (session.own_answers, session.questions_at) == (None, None)
     store.close()
 
 
 def test_an_answered_question_keeps_its_form(asking: Study, tmp_path: Path) -> None:
-    url, secrets = f"sqlite:///{tmp_path / 'a.sqlite'}", Secrets.load(asking.folder)
+    url, secrets = tmp_path / "a", Secrets.load(asking.folder)
 
     def serve_with(*questions: Question) -> Store:
         write_settings(replace(asking, questions=questions))
-        return Store.open(load_study(asking.folder), secrets, url)
+        return open_store(load_study(asking.folder), secrets, url)
 
     serve_with(replace(OWN_QUESTIONS[3], steps=7), *OWN_QUESTIONS[:3]).close()  # nobody answered
     store = serve_with(*OWN_QUESTIONS)

@@ -23,6 +23,7 @@ from support.experiment.store_walk import (
     answer,
     enter,
     give,
+    open_store,
     page,
     refusal,
     request,
@@ -62,7 +63,7 @@ def checked(
     study = replace(
         small_study, plausibility=Plausibility(), recruitment=Recruitment(link_code="C0DE")
     )
-    store = Store.open(study, small_secrets, f"sqlite:///{tmp_path / 'a.sqlite'}")
+    store = open_store(study, small_secrets, tmp_path / "a")
     yield store
     store.close()
 
@@ -233,9 +234,8 @@ def test_a_restart_of_the_server_makes_nobody_implausible(
     checked: Store, clock: Clock, small_secrets: Secrets
 ) -> None:
     ada = Person(checked, clock, "Ada").begin("test")
-    url = str(checked.engine.url)
     checked.close()
-    again = Store.open(checked.study, small_secrets, url)
+    again = Store.open(checked.study, small_secrets)
     ada.store = again
     for trial in range(4):
         ada.trial("test", trial, fetch=False)  # the browser has the media already
@@ -276,7 +276,7 @@ def test_simulated_people_are_faster_where_the_study_allows_it(
 ) -> None:
     for speed in (1, 1000):
         study = replace(small_study, plausibility=Plausibility(simulated_speed=speed))
-        store = Store.open(study, small_secrets, f"sqlite:///{tmp_path / f'{speed}.sqlite'}")
+        store = open_store(study, small_secrets, tmp_path / f"{speed}")
         word = {"pass": make_pass(small_secrets, "simulated")}
         robot, ada = (
             Person(store, clock, "Ada", **word).begin(),
@@ -296,17 +296,18 @@ def test_simulated_people_are_faster_where_the_study_allows_it(
 
 
 def test_a_place_is_given_back_after_a_time_without_an_answer(checked: Store, clock: Clock) -> None:
-    waiting = [Person(checked, clock, f"p{number}").begin() for number in range(3)]
-    assert refusal(checked.enter(request("late", scenario="drop"))).code == "study_full"
+    waiting = [Person(checked, clock, f"p{number}").begin("test") for number in range(3)]
+    assert refusal(checked.enter(request("late", scenario="drop"))).code == "held"
     # To load the page does not hold the place, to go on does.
     clock.wait(14 * 60)
     for person in waiting:
         run(checked.state(person.token, load=True))
-    waiting[0].trial("familiarization", 0)
-    assert refusal(checked.enter(request("late", scenario="drop"))).code == "study_full"
+    waiting[0].trial("test", 0)
+    assert refusal(checked.enter(request("late", scenario="drop"))).code == "held"
     clock.wait(2 * 60)
-    for name in ("late", "later"):
-        Person(checked, clock, name).begin()
-    assert refusal(checked.enter(request("latest", scenario="drop"))).code == "study_full"
+    late = [Person(checked, clock, name).begin() for name in ("late", "later")]
+    for person in late:
+        person.begin("test")
+    assert refusal(checked.enter(request("latest", scenario="drop"))).code == "held"
     # Who had begun can still finish.
-    waiting[1].trial("familiarization", 0)
+    waiting[1].trial("test", 0)

@@ -12,18 +12,18 @@ import pytest
 
 from physion.analysis.people.responses import read_responses
 from physion.experiment.export.export_study import export_study
-from physion.experiment.protocol import Completion, Jump, SessionState
+from physion.experiment.protocol import Completion, SessionState
 from physion.experiment.store.database import ANSWERS, PRACTICE_REPEATS, SESSIONS, SHOWINGS
 from physion.experiment.store.lab import forget_sessions
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.orders import trial_order
-from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Blocks, EarlyEnd, Practice, Study
 from support.experiment.store_walk import (
     answer,
     enter,
     give,
+    open_store,
     page,
     refusal,
     request,
@@ -48,8 +48,8 @@ def practising(tmp_path_factory: pytest.TempPathFactory) -> Study:
 
 
 @pytest.fixture
-def practice_store(practising: Study, database_url: str) -> Iterator[Store]:
-    opened = Store.open(practising, Secrets.load(practising.folder), database_url)
+def practice_store(practising: Study, database: Path) -> Iterator[Store]:
+    opened = open_store(practising, Secrets.load(practising.folder), database)
     yield opened
     opened.close()
 
@@ -102,7 +102,7 @@ def test_after_the_last_repeat_the_session_has_ended(practice_store: Store) -> N
 @pytest.mark.parametrize("repeats", [0, 2])
 def test_a_failed_practice_can_be_flagged(practising: Study, tmp_path: Path, repeats: int) -> None:
     study = replace(practising, practice=Practice(3, repeats, "flag"))
-    store = Store.open(study, Secrets.load(study.folder), f"sqlite:///{tmp_path / 'a.sqlite'}")
+    store = open_store(study, Secrets.load(study.folder), tmp_path / "a")
     token = walk(store, enter(store, "Ada", scenario="drop"), PHASE)
     for number in range(repeats + 1):
         state = practise(store, token, f"repeat{number}", "yes", "yes", "yes")
@@ -115,7 +115,7 @@ def test_a_failed_practice_can_be_flagged(practising: Study, tmp_path: Path, rep
 
 def test_each_block_has_its_practice(practising: Study, tmp_path: Path) -> None:
     study = replace(practising, blocks=Blocks(all_scenarios=True))
-    store = Store.open(study, Secrets.load(study.folder), f"sqlite:///{tmp_path / 'a.sqlite'}")
+    store = open_store(study, Secrets.load(study.folder), tmp_path / "a")
     token = enter(store, "Ada")
     for block, name in enumerate("ab"):
         walk(store, token, PHASE)
@@ -138,8 +138,8 @@ def test_each_block_has_its_practice(practising: Study, tmp_path: Path) -> None:
 
 def test_repeats_are_exported_and_forgotten(practising: Study, tmp_path: Path) -> None:
     study = replace(practising, practice=Practice(3, 1, "flag"))
-    secrets, url = Secrets.load(study.folder), f"sqlite:///{tmp_path / 'a.sqlite'}"
-    store = Store.open(study, secrets, url)
+    secrets, url = Secrets.load(study.folder), tmp_path / "a"
+    store = open_store(study, secrets, url)
     token = walk(store, enter(store, "Ada", scenario="drop"), PHASE)
     practise(store, token, "first", "yes", "no", "no")
     practise(store, token, "second", "no", "no", "no")
@@ -156,18 +156,8 @@ def test_repeats_are_exported_and_forgotten(practising: Study, tmp_path: Path) -
     assert (answers["phase"] == PHASE).sum() == 3
     store.close()
     forget_sessions(url, [reference])
-    store = Store.open(study, secrets, url)
+    store = open_store(study, secrets, url)
     assert rows(store, PRACTICE_REPEATS) == rows(store, ANSWERS) == rows(store, SHOWINGS) == []
     (session,) = rows(store, SESSIONS)
     assert (session.practice_repeats, session.failed_checks) == (0, None)
     store.close()
-
-
-def test_a_preview_forgets_repeats_when_it_jumps(practice_store: Store, practising: Study) -> None:
-    store = practice_store
-    link = {"pass": make_pass(Secrets.load(practising.folder), "preview"), "scenario": "drop"}
-    token = walk(store, enter(store, "Me", **link), PHASE)
-    practise(store, token, "first", "no", "no", "no")
-    state = run(store.jump(token, Jump(stage="familiarization")))
-    assert (state.trial, state.practice_repeats) == (0, 0)
-    assert rows(store, PRACTICE_REPEATS) == []

@@ -27,6 +27,7 @@ from support.experiment.store_walk import (
     answer,
     enter,
     give,
+    open_store,
     page,
     refusal,
     request,
@@ -70,7 +71,7 @@ def test_only_familiarization_gives_feedback(store: Store, small_study: Study) -
         assert stored.feedback.correct == ((response == "yes") == stimulus.label)
         assert stored.feedback.frames == 60
         found = read_media_path(store.study, store.secrets, stored.feedback.movie)
-        assert found == small_study.folder / stimulus.full
+        assert found == store.study.folder / stimulus.full
         # The same key with another response: the stored response counts.
         again = give(store, token, trial, "familiarization", response="no")
         assert again.duplicate and again.feedback == stored.feedback
@@ -124,8 +125,8 @@ def test_a_token_opens_only_its_session(store: Store) -> None:
     assert len({(row.session, row.trial) for row in rows(store) if row.phase == "test"}) == 2
 
 
-def test_details_are_bounded_plain_json(sqlite_store: Store) -> None:
-    token = walk(sqlite_store, enter(sqlite_store), "familiarization")
+def test_details_are_bounded_plain_json(store: Store) -> None:
+    token = walk(store, enter(store), "familiarization")
     deep: Any = []
     for _ in range(100_000):
         deep = [deep]
@@ -133,10 +134,10 @@ def test_details_are_bounded_plain_json(sqlite_store: Store) -> None:
            {"a": {1, 2}}, {"a": deep}]  # fmt: skip
     for details in bad:
         sent = Answer.model_construct(**{**dict(answer(0, "familiarization")), "details": details})
-        refused = refusal(sqlite_store.answer(token, sent))
+        refused = refusal(store.answer(token, sent))
         assert refused.code == "bad_request" and refused.message.startswith("details")
-    assert rows(sqlite_store) == []
-    give(sqlite_store, token, 0, "familiarization", details={"a": "\ud800", "b": "x" * 16_000})
+    assert rows(store) == []
+    give(store, token, 0, "familiarization", details={"a": "\ud800", "b": "x" * 16_000})
 
 
 def test_racing_tabs_make_one_row(store: Store) -> None:
@@ -187,7 +188,7 @@ class Machine:
     """State machine with one store for all examples; a database for each would take minutes."""
 
     def __init__(self, study: Study, secrets: Secrets, folder: Path) -> None:
-        self.store = Store.open(study, secrets, f"sqlite:///{folder / 'a.sqlite'}")
+        self.store = open_store(study, secrets, folder / "a")
 
     def session(self) -> str:
         with self.store.engine.begin() as connection:

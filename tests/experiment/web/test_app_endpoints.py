@@ -208,7 +208,7 @@ class TestSession:
         assert one.state()["reference"] != two.state()["reference"]
 
     def test_events(self, site: Served) -> None:
-        person = site.person()
+        person = site.person().walk("instructions")
         events = [{"kind": "hidden", "at_ms": 12.5, "data": {"why": "tab", "n": 2, "x": None}}]
         assert person.ask("POST", "/api/events", {"events": events}) == {"stored": 1}
 
@@ -221,6 +221,7 @@ class TestSession:
 
     def test_ids_are_stored_apart(self, site: Served) -> None:
         person = site.person(source="prolific", id="raw-id-1", recruiter={"STUDY_ID": "st"})
+        person.page("consent")
         with site.store.engine.connect() as connection:
             sessions = connection.execute(sa.select(SESSIONS)).all()
             raw = connection.execute(sa.select(RAW_IDS).where(RAW_IDS.c.raw_id == "raw-id-1")).one()

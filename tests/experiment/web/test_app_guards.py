@@ -1,11 +1,10 @@
-"""The middleware: limits on size and rate, headers, errors."""
+"""The middleware: limits on size, headers, errors."""
 
 from __future__ import annotations
 
 import contextlib
 import json
 import logging
-import re
 import socket
 import time
 from collections.abc import Iterator
@@ -16,7 +15,6 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from physion.experiment.web.rate_limits import Buckets, RateLimits, network_of
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request
@@ -25,12 +23,11 @@ from starlette.routing import Route
 from starlette.testclient import TestClient
 
 from physion.experiment.protocol import MAX_BODY
-from physion.experiment.study.study import Limits, Study
-from physion.experiment.web import connections, guards
+from physion.experiment.study.study import Study
+from physion.experiment.web import guards
 from physion.experiment.web.guards import Guards, content_policy
 from support.experiment.live_app import HOST, exchange, read_all, running
 
-TOKENS = {"good", "other"}
 SECRET = "a word of the request that no answer may hold"
 
 
@@ -48,11 +45,6 @@ async def _swallow(request: Request) -> Response:
 
 async def _fail(request: Request) -> Response:
     raise RuntimeError(SECRET)
-
-
-async def _session(request: Request) -> Response:
-    token = request.headers.get("authorization", "").removeprefix("Bearer ")
-    return PlainTextResponse("", 200 if token in TOKENS else 401)
 
 
 async def _own_headers(request: Request) -> Response:
@@ -77,8 +69,6 @@ def make_app(**settings: object) -> Starlette:
         Route("/swallow", _swallow, methods=["POST"]),
         Route("/fail", _fail, methods=["POST", "GET"]),
         Route("/own", _own_headers),
-        Route("/api/session", _session),
-        Route("/api/enter", _echo, methods=["POST"]),
     ]
     return Starlette(routes=routes, middleware=[Middleware(Guards, study=study)])
 
@@ -196,30 +186,6 @@ class TestHeads:
     def test_too_many_or_too_long_headers_are_refused(self, port: int, lines: list[str]) -> None:
         assert_refused(exchange(port, head("/echo", *lines, method="GET")), 413, "too_large")
 
-    def test_a_flood_of_headers_fills_no_memory(self, port: int) -> None:
-        trickle = Trickle(port, b"GET / HTTP/1.1\r\n", b"X-Flood: " + b"f" * 1000 + b"\r\n")
-        assert trickle.answer.startswith(b"HTTP/1.1 431")
-        assert trickle.sent < 9_000_000
-
-    def test_one_header_without_an_end_fills_no_memory(self, port: int) -> None:
-        trickle = Trickle(port, b"GET / HTTP/1.1\r\nX-Flood: ", b"f" * 10_000)
-        assert trickle.answer.startswith((b"HTTP/1.1 431", b"HTTP/1.1 400"))
-        assert trickle.sent < 9_000_000
-
-    def test_silent_connections_are_closed(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(connections, "HEAD_SECONDS", 1.0)
-        with running(make_app()) as port:
-            for start in (b"", b"GET /echo HT"):
-                with socket.create_connection((HOST, port), timeout=30) as connection:
-                    connection.sendall(start)
-                    assert connection.recv(10) == b""
-            # This does not end a running request or one that was answered.
-            with socket.create_connection((HOST, port), timeout=30) as connection:
-                for _ in range(2):
-                    connection.sendall(head("/echo", method="GET"))
-                    assert connection.recv(65536).startswith(b"HTTP/1.1 200")
-                    time.sleep(1.5)
-
     def test_websockets_are_refused(self, port: int) -> None:
         lines = ["Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13",
                  "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="]  # fmt: skip
@@ -280,74 +246,3 @@ class TestErrors:
         # The log has the traceback, but neither the participant nor the token.
         assert SECRET in caplog.text
         assert "prolific" not in caplog.text and "good" not in caplog.text
-
-
-class TestRates:
-    def test_a_bucket_refills_at_a_steady_rate(self) -> None:
-        buckets = Buckets(rate=2.0, burst=3.0)
-        assert [buckets.take("a", 0.0) for _ in range(4)] == [0.0, 0.0, 0.0, 0.5]
-        assert buckets.take("b", 0.0) == 0.0
-        assert buckets.take("a", 0.25) == pytest.approx(0.25)
-        assert buckets.take("a", 0.5) == 0.0
-        assert [buckets.take("a", 1000.0) for _ in range(4)][2:] == [0.0, 0.5]
-
-    def test_memory_is_bounded(self) -> None:
-        buckets = Buckets(rate=1.0, burst=1.0, most=100)
-        for number in range(1000):
-            buckets.take(str(number), float(number))
-        assert len(buckets) == 100
-        assert "999" in buckets and "899" not in buckets
-
-    def test_a_session_that_asks_too_fast_waits(self) -> None:
-        limits = Limits(requests_per_second=0.1, burst=5)
-        client = TestClient(make_app(limits=limits))
-
-        def ask(token: str) -> int:
-            headers = {"authorization": f"Bearer {token}"}
-            return client.get("/api/session", headers=headers).status_code
-
-        assert [ask("good") for _ in range(7)] == [200] * 5 + [429] * 2
-        assert ask("other") == 200
-        answer = client.get("/api/session", headers={"authorization": "Bearer good"})
-        assert 1 <= int(answer.headers["retry-after"]) <= 10
-        assert answer.json()["error"] == "too_many"
-        assert answer.headers["cache-control"] == "no-store"
-
-    def test_invented_tokens_fill_no_memory_and_are_slowed_down(self) -> None:
-        limits = RateLimits(Limits())
-        statuses = []
-        for number in range(200):
-            wait = limits.wait_time("GET", "/api/session", f"wrong{number}", "1.2.3.4", 0.0)
-            statuses.append(wait > 0)
-            if not wait:
-                limits.record_status(401, "/api/session", f"wrong{number}", "1.2.3.4", 0.0)
-        assert statuses.index(True) == 60 and all(statuses[60:])
-        assert len(limits._tokens) == 0
-        assert limits.wait_time("GET", "/api/session", "wrong", "5.6.7.8", 0.0) == 0
-        # Known tokens of the same address are not limited.
-        limits.record_status(200, "/api/session", "good", "1.2.3.4", 0.0)
-        assert limits.wait_time("GET", "/api/session", "good", "1.2.3.4", 0.0) == 0
-
-    def test_new_sessions_are_counted_by_address(self) -> None:
-        limits = Limits(sessions_per_minute=1, sessions_at_once=3)
-        client = TestClient(make_app(limits=limits), client=("9.9.9.9", 1))
-        assert [client.post("/api/enter").status_code for _ in range(4)] == [200] * 3 + [429]
-        assert client.get("/echo").status_code == 200
-
-    def test_a_refused_body_is_read_so_that_the_connection_stays_open(self) -> None:
-        limits = Limits(sessions_per_minute=1, sessions_at_once=1)
-        with running(make_app(limits=limits)) as port:
-            one = head("/api/enter", "Content-Length: 60000") + b"x" * 60000
-            answer = exchange(port, one, one, head("/echo", method="GET"))
-            assert re.findall(rb"HTTP/1.1 (\d+)", answer) == [b"200", b"429", b"200"]
-
-    @pytest.mark.parametrize(("address", "network"), [
-        ("1.2.3.4", "1.2.3.4"),
-        ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"),
-        ("::ffff:1.2.3.4", "1.2.3.4"),
-        ("fe80::1%eth0", "fe80::/64"),
-        ("no:address", "no:address"),
-        ("", ""),
-    ])  # fmt: skip
-    def test_a_household_of_ipv6_is_one_address(self, address: str, network: str) -> None:
-        assert network_of(address) == network

@@ -65,8 +65,8 @@ def test_people_enter_by_a_signed_link_only(tmp_path: Path) -> None:
         assert enter(site, 403)["error"] == "bad_link"
         found = {one.name: one.address for one in links(site.study, site.secrets, "http://x")}
         word = parse_qs(urlsplit(found["sona"]).query)["pass"][0]
-        state = enter(site, 200, source="sona", id="17", **{"pass": word})["state"]
-        assert state["kind"] == "person"
+        person = site.person(source="sona", id="17", **{"pass": word})
+        assert person.page("consent")["kind"] == "person"
         assert enter(site, 403, source="mturk", id="17", **{"pass": word})["error"] == "bad_link"
         # The study's key does not open the session in another browser.
         refused = enter(site, 403, source="sona", id="17", **{"pass": word})

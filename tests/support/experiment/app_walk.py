@@ -13,13 +13,9 @@ from starlette.testclient import TestClient
 from physion.experiment.app import build_app
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.study import Limits, Study
+from physion.experiment.study.study import Study
 from support.experiment.store_walk import OPTIONAL_PAGES, ORDER, PAGES, visit_of
 from support.experiment.tiny_study import make_tiny_study
-
-FAST = Limits(
-    requests_per_second=10_000, burst=100_000, sessions_per_minute=100_000, sessions_at_once=100_000
-)
 
 
 @dataclass
@@ -43,7 +39,7 @@ class Served:
 @contextlib.contextmanager
 def served(folder: Path, **settings: Any) -> Iterator[Served]:
     """Create a tiny study in ``folder`` and serve it."""
-    study = make_tiny_study(folder, **{"size": 64, "limits": FAST, **settings})
+    study = make_tiny_study(folder, **{"size": 64, **settings})
     secrets = Secrets.load(folder)
     store = Store.open(study, secrets)
     try:

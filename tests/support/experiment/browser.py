@@ -21,7 +21,7 @@ import pytest
 import sqlalchemy as sa
 
 from physion.experiment.server_process import ServerProcess
-from physion.experiment.store.database import ANSWERS, EVENTS, SESSIONS, open_database, sqlite_url
+from physion.experiment.store.database import ANSWERS, EVENTS, SESSIONS, open_database
 from physion.experiment.study.identity import Secrets, participant_hash
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Plausibility, Recruitment, Study, Timing
@@ -233,7 +233,7 @@ class Visit:
 def rows_of(study: Study, raw_id: str) -> tuple[Any, list[Any], list[Any]]:
     """Return session, ordered answers and events of the person with this ``?participant=`` id."""
     participant = participant_hash(Secrets.load(study.folder), "link", raw_id)
-    engine = open_database(sqlite_url(study.folder), must_exist=True)
+    engine = open_database(study.folder)
     try:
         with engine.connect() as connection:
             session = connection.execute(

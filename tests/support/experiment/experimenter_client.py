@@ -38,24 +38,19 @@ class Visitor(TestClient):
         data = fields | ({} if form_token is None else {"form_token": form_token})
         return self.post(f"{BASE}{path}", data=data, follow_redirects=False)
 
-    def log_in(self, password: str = PASSWORD, user: str = "experimenter") -> Any:
-        """Submit name and password on the login page."""
-        return self.submit("/login", self.token(), password=password, user=user)
-
-    def open_payments(self) -> Any:
-        """Submit the password once more and return the payments page."""
-        assert self.submit("/payments", self.token("/export"), password=PASSWORD).status_code == 303
-        return self.see("/payments")
+    def log_in(self, password: str = PASSWORD) -> Any:
+        """Submit the password on the login page."""
+        return self.submit("/login", self.token(), password=password)
 
 
 class Lab:
     """A tiny study, its store and its application."""
 
-    def __init__(self, folder: Path, url: str | None = None, **settings: Any) -> None:
+    def __init__(self, folder: Path, **settings: Any) -> None:
         settings = {"test": 6, "scenarios": TWO, "size": 64, "languages": ("en",)} | settings
         self.study: Study = make_tiny_study(folder, **settings)
         self.secrets = Secrets.load(folder)
-        self.store = Store.open(self.study, self.secrets, url)
+        self.store = Store.open(self.study, self.secrets)
         self.app = build_app(self.study, self.secrets, self.store)
         self._visitors = contextlib.ExitStack()
 
@@ -78,9 +73,9 @@ class Lab:
 
 
 @contextlib.contextmanager
-def lab(folder: Path, url: str | None = None, **settings: Any) -> Iterator[Lab]:
+def lab(folder: Path, **settings: Any) -> Iterator[Lab]:
     """Create a `Lab` and close it at the end."""
-    opened = Lab(folder, url, **settings)
+    opened = Lab(folder, **settings)
     try:
         yield opened
     finally:

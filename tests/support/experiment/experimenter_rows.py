@@ -26,7 +26,7 @@ BROWSERS = (
     "Mozilla/5.0 (Macintosh; Intel Mac OS X 10_15_7) AppleWebKit/605.1.15 (KHTML, like Gecko) "
     "Version/18.5 Safari/605.1.15",
 )
-ENDS = ("finished", "going", "left", "withdrawn", "declined")
+ENDS = ("finished", "going", "left", "withdrawn")
 
 
 def insert_sessions(
@@ -111,23 +111,20 @@ def _session(
     practice, test = (len(study.phase(scenario, phase)) for phase in ("familiarization", "test"))
     part = int(generator.integers(0, practice + test))
     answered = practice + test if end == "finished" else part
-    if end == "declined":
-        answered = 0
-    agreed = end != "declined"
-    ready = agreed and answered >= practice
+    ready = answered >= practice
     finished = started + float(generator.uniform(900, 2400)) if end == "finished" else None
     return {
         "session": new_session(), "participant": participant, "scenario": scenario, "kind": kind,
         "source": "prolific", "study": study.digest, "reference": new_reference(),
         "order_seed": int(generator.integers(2**62)), "order_number": 0, "buttons": "yes-no",
         "language": "en", "started_at": started,
-        "consent_version": "1" if agreed else None,
-        "consented_at": started + 20 if agreed else None,
-        "instructed_at": started + 60 if agreed else None,
+        "consent_version": "1",
+        "consented_at": started + 20,
+        "instructed_at": started + 60,
         "ready_at": started + 200 if ready else None,
         "demographics_at": finished and finished - 30,
         "finished_at": finished,
-        "withdrawn_at": started + 400 if end in ("withdrawn", "declined") else None,
+        "withdrawn_at": started + 400 if end == "withdrawn" else None,
         "answered_familiarization": min(answered, practice),
         "answered_test": max(0, answered - practice),
         "loads": 1, "loaded_at_phase": None, "loaded_at_trial": None,

@@ -11,15 +11,13 @@ from typing import Any
 
 import uvicorn
 
-from physion.experiment.web.connections import LimitedHeadProtocol
-
 HOST = "127.0.0.1"
 
 
 @contextlib.contextmanager
 def running(app: Any, **settings: Any) -> Iterator[int]:
     """Serve ``app`` with the package's server settings on a free port, and yield the port."""
-    given = {"http": LimitedHeadProtocol, "ws": "none", "lifespan": "off", "log_config": None,
+    given = {"ws": "none", "lifespan": "off", "log_config": None,
              "access_log": False, "server_header": False, "proxy_headers": False}  # fmt: skip
     server = uvicorn.Server(uvicorn.Config(app, **{**given, **settings}))
     with socket.create_server((HOST, 0)) as listening:

@@ -12,12 +12,12 @@ from typing import Any
 import sqlalchemy as sa
 
 from physion.experiment.server_process import ServerProcess
-from physion.experiment.store.database import ANSWERS, SESSIONS, open_database, sqlite_url
+from physion.experiment.store.database import ANSWERS, SESSIONS, open_database
 from physion.experiment.study.study import Study
 
 MOTHER = """
 import os, sys
-import alembic.command, tyro
+import sqlalchemy.dialects.sqlite, tyro
 import physion.cli.experiment.serve, physion.experiment.server
 from physion.cli.main import main
 while os.read(0, 1):
@@ -82,22 +82,22 @@ class QuickServer(ServerProcess):
             self._mother.stdout.close()
 
 
-def stored_sessions(study: Study, url: str | None = None) -> dict[str, Any]:
+def stored_sessions(study: Study) -> dict[str, Any]:
     """Return the rows of SESSIONS by the participant's reference."""
-    return {row.reference: row for row in _rows(study, url, sa.select(SESSIONS))}
+    return {row.reference: row for row in _rows(study, sa.select(SESSIONS))}
 
 
-def stored_answers(study: Study, url: str | None = None) -> dict[tuple[str, str, int], Any]:
+def stored_answers(study: Study) -> dict[tuple[str, str, int], Any]:
     """Return the rows of ANSWERS by reference, phase and trial."""
     query = sa.select(ANSWERS, SESSIONS.c.reference).join(SESSIONS)
-    rows = _rows(study, url, query)
+    rows = _rows(study, query)
     by_trial = {(row.reference, row.phase, row.trial): row for row in rows}
     assert len(by_trial) == len(rows)
     return by_trial
 
 
-def _rows(study: Study, url: str | None, query: sa.Select[Any]) -> list[Any]:
-    engine = open_database(url or sqlite_url(study.folder), must_exist=True)
+def _rows(study: Study, query: sa.Select[Any]) -> list[Any]:
+    engine = open_database(study.folder)
     try:
         with engine.connect() as connection:
             return list(connection.execute(query).all())

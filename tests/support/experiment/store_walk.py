@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 from collections.abc import Coroutine, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -63,6 +64,13 @@ def enter(store: Store, person: str | None = None, **more: Any) -> str:
     return run(store.enter(request(person, **more))).token
 
 
+def begin(store: Store, person: str | None = None, **more: Any) -> str:
+    """Enter and agree to the consent, so that the session is stored; return its token."""
+    token = enter(store, person, **more)
+    page(store, token, "consent")
+    return token
+
+
 def give(store: Store, token: str, trial: int, phase: Any = "test", **more: Any) -> AnswerStored:
     return run(store.answer(token, answer(trial, phase, **more)))
 
@@ -112,17 +120,23 @@ def small_secrets(small_study: Study) -> Secrets:
     return Secrets.load(small_study.folder)
 
 
-@pytest.fixture
-def store(small_study: Study, small_secrets: Secrets, database_url: str) -> Iterator[Store]:
-    """A store on an empty database, parametrised over both kinds."""
-    opened = Store.open(small_study, small_secrets, database_url)
-    yield opened
-    opened.close()
+def open_store(study: Study, secrets: Secrets, folder: Path) -> Store:
+    """Open a store whose database is in another folder than the study, made if it is missing."""
+    folder.mkdir(exist_ok=True)
+    return Store.open(replace(study, folder=folder), secrets)
 
 
 @pytest.fixture
-def sqlite_store(small_study: Study, small_secrets: Secrets, tmp_path: Path) -> Iterator[Store]:
-    """A store on an empty SQLite database, for tests that do not depend on the database."""
-    opened = Store.open(small_study, small_secrets, f"sqlite:///{tmp_path / 'a.sqlite'}")
+def database(tmp_path: Path) -> Path:
+    """Folder of the database of `store`."""
+    folder = tmp_path / "database"
+    folder.mkdir()
+    return folder
+
+
+@pytest.fixture
+def store(small_study: Study, small_secrets: Secrets, database: Path) -> Iterator[Store]:
+    """A store on an empty database."""
+    opened = open_store(small_study, small_secrets, database)
     yield opened
     opened.close()

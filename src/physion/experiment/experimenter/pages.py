@@ -33,13 +33,8 @@ from physion.experiment.experimenter.access import HEADERS, PATH, Access
 from physion.experiment.experimenter.payments import payment_csv, read_payments
 from physion.experiment.experimenter.progress import ALARM_ENTRIES, KINDS, STATES, Progress
 from physion.experiment.store.database import ANSWERS, SESSIONS
-from physion.experiment.store.lab import (
-    forget_raw_ids,
-    forget_session,
-    is_paused,
-    set_paused,
-    set_voided,
-)
+from physion.experiment.store.entry import is_paused
+from physion.experiment.store.lab import forget_raw_ids, forget_session, set_paused, set_voided
 from physion.experiment.store.sessions import ACTIVE_WITHIN
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.orders import instructed_response, stimuli_by_session

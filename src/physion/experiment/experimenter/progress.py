@@ -19,7 +19,7 @@ from typing import Any
 from sqlalchemy import Engine, select, text
 
 from physion.core.errors import PhysionError
-from physion.experiment.protocol import Block, Course, SessionTrials, label
+from physion.experiment.protocol import OF_BLOCK, Block, Course, SessionTrials, label
 from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.sessions import (
     ACTIVE_WITHIN,
@@ -188,7 +188,9 @@ class Progress:
                 counter["incomplete"] += incomplete or 0
                 if phase == "test":
                     counter["trials"], counter["correct"] = count, correct
-        flags, now = self.flags(kind if session is None or not rows else rows[0].kind), time.time()
+        if session is not None and not rows:
+            return [], Flags(self._study.exclusions)
+        flags, now = self.flags(rows[0].kind if session is not None else kind), time.time()
         lines = []
         for row in rows:
             state, counted = session_state(row, now), answers.get(row.session, Counter())
@@ -235,10 +237,9 @@ class Progress:
         ends = (columns.finished_at, columns.withdrawn_at, columns.voided_at)
         with self._lock:
             with self._engine.connect() as connection:
-                state = sorted(
-                    tuple(end is not None for end in row)
-                    for row in connection.execute(select(*ends).where(columns.kind != "preview"))
-                )
+                rows = connection.execute(select(*ends).where(columns.kind != "preview"))
+                state = Counter(tuple(end is not None for end in row) for row in rows)
+                state.pop((False, False, False), None)
             if state != self._flags_of and time.monotonic() >= self._flags_due:
                 self._flags, self._flags_of = _find_flags(self._study, self._engine), state
                 self._flags_due = time.monotonic() + FLAGS_SECONDS
@@ -250,9 +251,9 @@ class Progress:
         session = Session(**columns | {"withdrawn_at": None, "screened_out_at": None})
         known = self._courses.has(session)
         course = self._courses.of(session) if known else Course(self._stages, _UNKNOWN)
-        words = label(stage_of(session, course))
-        several = len(course.trials.blocks) > 1 and session.block
-        return f"{words}, block {session.block + 1}" if several else words
+        stage = stage_of(session, course)
+        several = len(course.trials.blocks) > 1 and stage in OF_BLOCK
+        return label(f"{stage} {session.block + 1}" if several else stage)
 
 
 def session_state(row: Any, now: float) -> str:

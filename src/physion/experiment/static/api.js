@@ -21,6 +21,7 @@ const CODES = new Set([
   "other_browser",
   "already_took_part",
   "study_full",
+  "held",
   "paused",
   "wrong_stage",
   "out_of_order",

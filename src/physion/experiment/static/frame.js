@@ -5,7 +5,6 @@
 
 import { hasBlocks, sessionProgress } from "./blocks.js";
 import { button, el } from "./dom.js";
-import { jumpControl } from "./jump.js";
 
 /** Stages in which there is nothing to stop: not begun yet, or finished. */
 const WITHOUT_STOP_BUTTON = ["consent", "done"];
@@ -25,7 +24,6 @@ export class Frame {
     /** @type {() => void} */
     this.onStop = () => {};
     /** @type {(to: {stage: string, trial: number}) => void} */
-    this.onJump = () => {};
     /** @type {(language: string) => void} */
     this.onLanguage = () => {};
     /** @type {import("./messages.js").SessionState|null} */
@@ -52,9 +50,6 @@ export class Frame {
     document.body.classList.toggle("in-trials", inTrials);
     byId("progress").hidden = !inTrials;
     const tools = [];
-    if (state.kind === "preview") {
-      tools.push(jumpControl(this.texts, state, (to) => this.onJump(to)));
-    }
     if (state.stage === "consent") tools.push(this.languageChooser());
     if (!state.ended && !WITHOUT_STOP_BUTTON.includes(state.stage)) {
       const stop = button(this.texts.t("stop.open"), () => this.onStop(), { class: "link" });

@@ -22,7 +22,6 @@ export interface Enter {
   scenario?: string;
   condition?: string;
   language?: string;
-  take_back?: boolean;
   pass?: string;
   device?: Device;
 }
@@ -43,7 +42,6 @@ export interface SessionSettings {
 export interface SessionState {
   stage: Stage;
   ended: boolean;
-  places: Stage[];
   trial: number | null;
   trials: Record<Phase, number>;
   comprehension_attempts: number;
@@ -151,7 +149,6 @@ export interface Completion {
 
 export interface SessionEnd {
   completion: Completion;
-  can_take_back: boolean;
 }
 
 export interface Result {
@@ -197,6 +194,7 @@ export interface PublicStudy {
   flash_hz: number;
   break_every: number;
   familiarization_feedback: boolean;
+  hold_minutes: number;
   preload: number;
   interrupted: "repeat" | "void";
   comprehension_questions: CheckedQuestion[];

@@ -23,8 +23,14 @@ from sqlalchemy import ColumnElement, Connection, and_, case, func, insert, or_,
 
 from physion.core.seeds import stable_hash
 from physion.experiment.protocol import Enter, Kind, Refused
-from physion.experiment.store.database import EVENTS, PARTICIPANTS, RAW_IDS, SESSIONS, TOKENS
-from physion.experiment.store.lab import is_paused
+from physion.experiment.store.database import (
+    EVENTS,
+    PARTICIPANTS,
+    PAUSES,
+    RAW_IDS,
+    SESSIONS,
+    TOKENS,
+)
 from physion.experiment.store.sessions import (
     ACTIVE_WITHIN,
     ENTERED_AGAIN,
@@ -255,7 +261,7 @@ def begin_session(
     seen = {"participant": visitor.participant, "first_seen": visitor.now}
     connection.execute(insert_or_skip(PARTICIPANTS), seen)
     connection.execute(insert(SESSIONS), values)
-    _keep(connection, visitor, visitor.session)
+    _keep(connection, visitor, visit.session.session)
     return new_session_of(values)
 
 
@@ -493,6 +499,12 @@ class _Places:
             "The study has all the participants that it needs. Thank you!",
             completion=ending_completion(study.full, self.visitor.enter.source),
         )
+
+
+def is_paused(connection: Connection) -> bool:
+    """Return whether recruitment is paused."""
+    going = select(PAUSES.c.paused_at).where(PAUSES.c.resumed_at.is_(None)).limit(1)
+    return connection.execute(going).first() is not None
 
 
 def live(kind: str) -> tuple[ColumnElement[bool], ...]:

@@ -37,6 +37,7 @@ from physion.experiment.store.database import (
     open_database,
     server_lock,
 )
+from physion.experiment.store.entry import is_paused
 from physion.experiment.study.identity import SECRET_FILE
 from physion.experiment.study.stimuli import MEDIA_FOLDER, STIMULI_FILE
 from physion.experiment.study.study import STUDY_FILE
@@ -56,12 +57,6 @@ _EMPTIED = dict.fromkeys((
       "practice_repeats": 0, "attention_failed": 0, "fast_answers": 0, "unfetched": 0,
       "replayed": 0, "loads": 0, "device": {}}  # fmt: skip
 """Column values that replace the data of a forgotten session."""
-
-
-def is_paused(connection: Connection) -> bool:
-    """Return whether recruitment is paused."""
-    going = select(PAUSES.c.paused_at).where(PAUSES.c.resumed_at.is_(None)).limit(1)
-    return connection.execute(going).first() is not None
 
 
 def set_paused(connection: Connection, paused: bool, now: float) -> bool:

@@ -142,11 +142,20 @@ class Store:
             self._entered_at.append(visitor.now)
         session = entered.session if isinstance(entered, Visit) else entered
         if isinstance(entered, Visit):
-            self._visits.pop(hash_token(token), None)  # an earlier visit of the same browser
+            entered = self._as_before(entered)
+            session = entered.session
             self._visits[hash_token(visitor.token)] = entered
             if len(self._visits) > MAX_VISITS:
                 self._visits.pop(next(iter(self._visits)))
         return Entered(token=visitor.token, state=state_of(session, self._courses.of(session)))
+
+    def _as_before(self, visit: Visit) -> Visit:
+        """Return the visit, with the session that the person was shown before if there is one."""
+        for each in self._visits.values():
+            same = each.visitor.participant == visit.visitor.participant
+            if same and visit.visitor.enter.scenario in (None, each.session.scenario):
+                return replace(each, visitor=visit.visitor)
+        return visit
 
     def entries(self, seconds: float) -> int:
         """Return how many people entered in the last seconds, whether they agreed or not."""
@@ -204,14 +213,17 @@ class Store:
         session = visit.session
         course = self._courses.of(session)
         declines = page == "withdraw" or values.get("agreed") is False
-        if session.withdrawn_at is None and declines:
+        if session.withdrawn_at is not None:
+            if not declines:
+                raise Refused("wrong_stage", "This page is not next.", state_of(session, course))
+        elif declines:
             session = replace(session, participant="", browser=None, withdrawn_at=now)
             source = visit.visitor.enter.source
             nobody = replace(
                 visit.visitor, enter=Enter(source=source), participant="", raw_id=None, browser=""
             )
             self._visits[hash_token(token)] = Visit(nobody, session, {"source": source})
-        elif session.withdrawn_at is not None or page != "consent":
+        elif page != "consent":
             raise Refused("wrong_stage", "This page is not next.", state_of(session, course))
         else:
             language = values.get("language")

@@ -16,7 +16,7 @@ from physion.experiment.export.conventions.bids import BEH_COLUMNS
 from physion.experiment.export.conventions.column_labels import unique_file_labels
 from physion.experiment.export.export_study import export_study
 from physion.experiment.export.spreadsheet import restore_cell
-from physion.experiment.store.database import PARTICIPANTS, SESSIONS, open_database, upgrade
+from physion.experiment.store.database import PARTICIPANTS, SESSIONS, create_database
 from physion.experiment.study.identity import Secrets
 from support.experiment.experimenter_rows import insert_sessions
 from support.experiment.tiny_study import make_tiny_study
@@ -30,8 +30,7 @@ Exported = tuple[Path, pd.DataFrame, pd.DataFrame]
 def make_export(folder: Path, scenarios: tuple[str, ...]) -> Exported:
     """An export with one participant in all scenarios, and one who is old and writes strangely."""
     study = make_tiny_study(folder, scenarios=scenarios, size=64)
-    engine = open_database(f"sqlite:///{folder / 'responses.sqlite'}")
-    upgrade(engine)
+    engine = create_database(folder)
     secrets = Secrets.load(folder)
     insert_sessions(engine, study, secrets, 12)
     insert_sessions(engine, study, secrets, 4, kind="simulated", seed=1, ends=("finished",))
