@@ -17,7 +17,6 @@ from physion.experiment.export import trial_rows
 from physion.experiment.export.answer_tables import read_tables, snapshot
 from physion.experiment.export.session_rows import (
     GONE_SCENARIO,
-    NO_CONSENT,
     PREVIEW,
     WITHDRAWN,
     SessionSelection,
@@ -104,9 +103,8 @@ def test_what_is_left_out_is_counted(engine: sa.Engine, study: Study) -> None:
     assert found.left_out["preview", PREVIEW] == 3
     for kind in ("person", "simulated"):
         of_kind = stored["kind"] == kind
-        assert found.left_out[kind, NO_CONSENT] == (of_kind & ~agreed).sum()
         assert found.left_out[kind, WITHDRAWN] == (of_kind & withdrew).sum()
-    assert found.left_out["person", NO_CONSENT] > 0 < found.left_out["person", WITHDRAWN]
+    assert found.left_out["person", WITHDRAWN] > 0
     kept = stored[own & agreed & ~withdrew]
     assert set(found.table.column("session").to_pylist()) == set(kept["session"])
     assert sum(found.states.values()) == len(kept)

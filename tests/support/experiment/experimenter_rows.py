@@ -26,7 +26,7 @@ BROWSERS = (
     "Mozilla/5.0 (Macintosh; Intel Mac OS X 10_15_7) AppleWebKit/605.1.15 (KHTML, like Gecko) "
     "Version/18.5 Safari/605.1.15",
 )
-ENDS = ("finished", "going", "left", "withdrawn")
+ENDS = ("finished", "going", "left", "withdrawn", "withdrawn")
 
 
 def insert_sessions(

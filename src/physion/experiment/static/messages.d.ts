@@ -80,11 +80,6 @@ export interface TrialList {
   trials: TrialMedia[];
 }
 
-export interface Jump {
-  stage: string;
-  trial?: number;
-}
-
 export interface Showing {
   key: string;
   phase: Phase;

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from typing import TYPE_CHECKING, Any, Literal, NoReturn, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, TypeVar
 
 from fastapi import APIRouter
 from pydantic import ValidationError
@@ -156,7 +156,7 @@ def public_study(study: Study, secrets: Secrets) -> PublicStudy:
         familiarization_feedback=study.familiarization_feedback,
         hold_minutes=study.recruitment.hold_minutes,
         preload=study.preload,
-        interrupted=cast("Literal['repeat', 'void']", study.plausibility.interrupted),
+        interrupted=study.plausibility.interrupted,
         comprehension_questions=[
             CheckedQuestion(name=each.name, options=list(each.options))
             for each in study.comprehension_questions
