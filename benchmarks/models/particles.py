@@ -49,7 +49,7 @@ from physion.analysis.tables import read_humans
 from physion.clips.batch import LAST_OBSERVED, Batch, Motion, cut_to_observed
 from physion.clips.clips import observed_source, whole_source
 from physion.compute.tasks import processor
-from physion.core.names import canonical_name
+from physion.core.names import SCENARIOS, canonical_name
 from physion.data.official import official
 from physion.models.build import build_untrained
 from physion.models.interface import can
@@ -81,7 +81,7 @@ FUTURES, SPREAD = 8, 0.1
 COLLIDE_STEPS = 2600
 TRANSFER_STEPS = 5000
 NAMES = ("dpi", "gns", "gns-ransac")
-RIGID = ("dominoes", "support", "collide", "contain", "drop", "link", "roll")
+RIGID = tuple(name for name in SCENARIOS if name != "drape")
 
 Rows = list[list[str]]
 

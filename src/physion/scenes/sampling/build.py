@@ -14,6 +14,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from physion.core.names import SCENARIOS
 from physion.core.registry import Registry
 from physion.core.seeds import child_generator, stable_hash
 from physion.scenes.looks import pick_material, random_color
@@ -38,20 +39,7 @@ class Scenario:
 
 
 scenarios: Registry[Scenario] = Registry(
-    "scenario",
-    {
-        name: f"physion.scenes.scenarios.{name}:sample"
-        for name in (
-            "dominoes",
-            "support",
-            "collide",
-            "contain",
-            "drop",
-            "link",
-            "roll",
-            "drape",
-        )
-    },
+    "scenario", {name: f"physion.scenes.scenarios.{name}:sample" for name in SCENARIOS}
 )
 
 

@@ -15,9 +15,8 @@ PRESET`` prints them.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -27,7 +26,7 @@ import numpy as np
 
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.seeds import named_seed
-from physion.core.settings import check_keys, shown
+from physion.core.settings import parse_toml, read_settings
 from physion.scenes.sampling.build import scenarios
 from physion.scenes.sampling.parameters import Quantity, check_params, check_together, read_params
 from physion.scenes.scene import Scene
@@ -35,8 +34,6 @@ from physion.scenes.scene import Scene
 DEFAULT, FAMILIARIZATION, DEBUG = "default", "familiarization", "debug"
 """Names of presets that every scenario of this package has besides the published ones."""
 Trials = Annotated[int, Quantity("", 0, 1_000_000)]
-_PRESET_KEYS = ("about", "based_on", "official", "seed", "published", "params")
-_FILE_KEYS = ("scenario", "shared", "presets")
 
 
 @dataclass(frozen=True)
@@ -132,59 +129,54 @@ def parse_presets(text: str, where: str, *, own: bool = True) -> Mapping[str, Pr
 
     With ``own`` (a file of the user) presets may be based on those that come with the scenario.
     """
-    try:
-        data = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise BadInputError(f"{where} is not TOML: {error}") from error
-    check_keys(data, _FILE_KEYS, where)
-    scenario = data.get("scenario")
-    if not isinstance(scenario, str):
-        raise BadInputError(f"{where} needs scenario = one of {scenarios.names()}")
-    kind = scenarios.get(scenario).params
-    common = _table(data, "shared", where)
-    shared = read_params(kind, common, f"{where}: shared")
-    known = load_presets(scenario) if own else {}
+    file = read_settings(_PresetFile, parse_toml(text, where), where)
+    kind = scenarios.get(file.scenario).params
+    shared = read_params(kind, file.shared, f"{where}: shared")
+    known = load_presets(file.scenario) if own else {}
     presets: dict[str, Preset] = {}
-    for name, entry in _table(data, "presets", where).items():
+    for name, entry in file.presets.items():
         here = f"{where}: preset {name!r}"
-        if not isinstance(entry, Mapping):
-            raise BadInputError(f"{here} must be a table")
-        check_keys(entry, _PRESET_KEYS, here)
         base = shared
-        if "based_on" in entry:
-            chosen = entry["based_on"]
-            if not isinstance(chosen, str):
-                raise BadInputError(f"{here}: based_on must name a preset, not {shown(chosen)}")
-            if chosen in presets:
-                base = presets[chosen].params
-            elif chosen in known:
-                base = read_params(kind, common, f"{where}: shared", known[chosen].params)
-            else:
-                raise BadInputError(
-                    f"{here}: based_on {chosen!r} is neither before it in {where} nor among the "
-                    f"presets of {scenario}"
-                )
-        params = read_params(kind, _table(entry, "params", here), here, base)
+        if entry.based_on in presets:
+            base = presets[entry.based_on].params
+        elif entry.based_on in known:
+            params = known[entry.based_on].params
+            base = read_params(kind, file.shared, f"{where}: shared", params)
+        elif entry.based_on is not None:
+            raise BadInputError(
+                f"{here}: based_on {entry.based_on!r} is neither before it in {where} nor among "
+                f"the presets of {file.scenario}"
+            )
+        params = read_params(kind, entry.params, here, base)
         check_together(params, here)
-        presets[name] = _preset(name, scenario, params, entry, here)
+        published = None
+        if entry.published is not None:
+            published = _published(entry.published, here)
+        presets[name] = Preset(
+            name, file.scenario, params, entry.about, entry.official, entry.seed, published
+        )
     return presets
 
 
-def _preset(name: str, scenario: str, params: Any, entry: Mapping[str, Any], here: str) -> Preset:
-    for key, kind in (("about", str), ("official", str), ("seed", int)):
-        if key in entry and type(entry[key]) is not kind:
-            wanted = "a text" if kind is str else "a whole number"
-            raise BadInputError(f"{here}: {key} must be {wanted}, not {shown(entry[key])}")
-    published = _published(_table(entry, "published", here), here) if "published" in entry else None
-    return Preset(
-        name,
-        scenario,
-        params,
-        entry.get("about", ""),
-        entry.get("official"),
-        entry.get("seed"),
-        published,
-    )
+@dataclass(frozen=True)
+class _PresetEntry:
+    """A preset as it is written in a file."""
+
+    about: str = ""
+    based_on: str | None = None
+    official: str | None = None
+    seed: int | None = None
+    published: Mapping[str, Any] | None = None
+    params: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _PresetFile:
+    """A file of presets as it is written."""
+
+    scenario: str
+    shared: Mapping[str, Any] = field(default_factory=dict)
+    presets: Mapping[str, _PresetEntry] = field(default_factory=dict)
 
 
 def _published(table: Mapping[str, Any], here: str) -> Published:
@@ -206,13 +198,6 @@ def _from_file(path: Path, name: str, scenario: str) -> Preset:
     if preset.scenario != scenario:
         raise BadInputError(f"{path} has presets of {preset.scenario}, not of {scenario}")
     return preset
-
-
-def _table(data: Mapping[str, Any], key: str, where: str) -> Mapping[str, Any]:
-    table = data.get(key, {})
-    if not isinstance(table, Mapping):
-        raise BadInputError(f"{where}: {key} must be a table")
-    return table
 
 
 def sample_scene(
