@@ -31,9 +31,9 @@ class Options:
     details: int = ViewerOptions.details
     """Number of these trials that have all passes and the scene in 3D."""
     scenario: str | None = None
-    """Show this scenario alone."""
+    """Show only this scenario."""
     split: str | None = None
-    """Show this split alone."""
+    """Show only this split."""
     predictions: tuple[str, ...] = ()
     """Models whose predictions are shown next to what is true, as particles in 3D, pictures, boxes
     or slots: names (physion ls models) or FILE.py:Class."""

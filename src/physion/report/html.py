@@ -138,9 +138,9 @@ Rows = Sequence[Sequence[str]]
 """Rows of cells; a cell is text, or what a macro made."""
 
 
-def details(title: str, content: str) -> Markup:
-    """Return a part that opens on a click."""
-    return Markup(MACROS.details(title, content))
+def details(title: str, content: str, opened: bool = False) -> Markup:
+    """Return a part that opens on a click, or that is open at first; nothing without content."""
+    return Markup(MACROS.details(title, content, opened)) if content else Markup()
 
 
 def heading(text: str) -> Markup:
@@ -224,8 +224,11 @@ def rows_table(rows: pd.DataFrame, columns: Sequence[PageColumn], caption: str =
     """Return a table of some columns of ``rows``, with reasons of undefined numbers listed below
     it.
 
-    Rows whose ``kind`` is baseline, if there is such a column, follow the others as a group.
+    Rows whose ``kind`` is baseline, if there is such a column, follow the others as a group. A
+    table without rows is left out.
     """
+    if rows.empty:
+        return Markup()
     cells = [[column.cell(row) for column in columns] for _, row in rows.iterrows()]
     is_baseline = [kind == "baseline" for kind in rows.get("kind", [""] * len(rows))]
     first, baselines = (

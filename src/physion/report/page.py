@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import pandas as pd
+
+from physion.analysis.comparison import Comparison
 from physion.analysis.people.results import PeopleResults
-from physion.analysis.tables import MEAN, in_order
+from physion.analysis.tables import MEAN, POOLED, in_order
 from physion.core.html import Markup, joined
 from physion.report import html, scores
 from physion.report import people as people_parts
@@ -103,7 +106,7 @@ def _summary(inputs: ReportInputs) -> Markup:
             f"{mean['people']:.0f} participants a stimulus."
         )
     else:
-        words.append("No answers of people were given: the models stand alone here.")
+        words.append("No answers of people were given: this page is about models only.")
     if inputs.people is not None:
         flags = inputs.people.tables["flags"]
         words.append(
@@ -115,10 +118,36 @@ def _summary(inputs: ReportInputs) -> Markup:
             f"In {len(comparison.changed)} of these stimuli the simulated outcome is not the "
             "official one; accuracy is given against both."
         )
+    words.append(_answer(comparison))
     given = f"{inputs_sentence(inputs)} {weights_sentence(inputs)}".strip()
     more = paragraph(given, "given") if given else Markup()
     warned = html.warnings(inputs.warnings, inputs.mark)
     return joined([warned, paragraph(" ".join(words), "lead"), more])
+
+
+def _answer(comparison: Comparison) -> str:
+    """Return which model is most accurate and which is most like people, as sentences.
+
+    Models that were shown the outcome are left out. Of few stimuli only pooled scores are known.
+    """
+    scores = comparison.all_scores
+    models = scores[(scores["kind"] == "model") & (scores["readout"] != "full")]
+    words = []
+    for name, text in (("accuracy", "Most accurate"), ("r", "Most like people")):
+        if name not in models or (name == "r" and not comparison.has_people):
+            continue
+        for which, over in ((MEAN, "mean over scenarios"), (POOLED, "all stimuli pooled")):
+            rows = models[models["scenario"] == which].dropna(subset=[name])
+            if len(rows):
+                best = rows.loc[rows[name].idxmax()]
+                value = "r " * (name == "r") + html.number(best[name])
+                other = {"accuracy": ("people", "human_accuracy"), "r": ("ceiling", "ceiling")}
+                label, column = other[name]
+                known = column in rows and pd.notna(best[column])
+                beyond = f"; {label} {html.number(best[column])}" if known else ""
+                words.append(f"{text}: {best['model']} ({value}{beyond}; {over}).")
+                break
+    return " ".join(words)
 
 
 def _figures(section: str, shown: Mapping[str, Markup], below: Mapping[str, Markup]) -> Markup:
@@ -201,12 +230,12 @@ def render_people_page(report: PeopleReport, pictures: Sequence[Picture], folder
     shown = joined(figure(picture) for picture in pictures)
     links = html.relative_links(report.movies, folder)
     sections = [
-        Section("People", people_parts.people_alone(people)),
+        Section("People", people_parts.people_only(people)),
         Section(
             BY_STIMULUS,
             shown + people_parts.fooled_by(people.tables["by_stimulus"], links),
         ),
-        Section("Sessions left out", people_parts.sessions_alone(people)),
+        Section("Sessions left out", people_parts.sessions_only(people)),
         Section("How this was made", html.definition_list(people_methods(report))),
         Section("What was left out", people_parts.dropped(people)),
     ]

@@ -74,12 +74,12 @@ def people(inputs: ReportInputs, shown: Mapping[str, str]) -> Markup:
     zones = Markup() if inputs.beside is None else _zones(inputs.beside.zones)
     on_predicted = averages(inputs.comparison)
     return joined([
-        people_alone(inputs.people, zones),
+        people_only(inputs.people, zones),
         details("People on the stimuli that any model predicts", on_predicted),
     ])  # fmt: skip
 
 
-def people_alone(people: PeopleResults, zones: str = "") -> Markup:
+def people_only(people: PeopleResults, zones: str = "") -> Markup:
     """Return the parts that need no predictions; ``zones``: table of what single people reach."""
     tables = people.tables
     return joined([
@@ -126,10 +126,16 @@ def _accuracy(tables: Mapping[str, pd.DataFrame]) -> Markup:
     ]
     words = (
         "Accuracy of people, flagged sessions left out: mean over people, interval by drawing "
-        "people; t against 0.5; consistency is the mean share of people who give a stimulus' "
+        "people; t against 0.5; consistency is the mean fraction of people who give a stimulus' "
         "more frequent answer"
     )
-    return rows_table(tables["by_scenario"], columns, words)
+    rows = tables["by_scenario"]
+    # Spread, test and zone are of the people of one scenario: the mean has none.
+    cells = [
+        ["" if row["scenario"] == MEAN and pd.isna(row[c.key]) else c.cell(row) for c in columns]
+        for _, row in rows.iterrows()
+    ]
+    return table([column.heading for column in columns], cells, words)
 
 
 _ALIKE = {
@@ -255,7 +261,7 @@ def _biases(tables: Mapping[str, pd.DataFrame]) -> Markup:
         PageColumn("question", "question", "text"),
         PageColumn("answer", "answer", "text"),
         PageColumn("sessions", "sessions", "count"),
-        PageColumn("share", "share", "percent"),
+        PageColumn("fraction", "share", "percent"),
     ]
     return (
         rows_table(tables["yes_bias"], yes, "Saying yes; a criterion below 0 leans to it")
@@ -344,7 +350,7 @@ def measures(inputs: ReportInputs) -> Markup:
 def _mean_pairs(pairs: pd.DataFrame) -> Markup:
     """Return kappa of every two models, mean over scenarios, as a matrix."""
     if pairs.empty:
-        return paragraph("One model alone makes no pair.")
+        return paragraph("One model makes no pair.")
     mean = pairs.groupby(["first", "second"], sort=False)["kappa"].mean()
     names = list(dict.fromkeys([*pairs["first"], *pairs["second"]]))
     marks = [chr(ord("A") + at) if at < 26 else str(at) for at in range(len(names))]
@@ -413,10 +419,10 @@ def sessions(inputs: ReportInputs) -> Markup:
     """Return which sessions were flagged, by which rule, and the effect of flagged sessions."""
     if inputs.people is None:
         return Markup()
-    return sessions_alone(inputs.people, _models_with_and_without(inputs))
+    return sessions_only(inputs.people, _models_with_and_without(inputs))
 
 
-def sessions_alone(people: PeopleResults, models: str = "") -> Markup:
+def sessions_only(people: PeopleResults, models: str = "") -> Markup:
     """Return the same without models; ``models``: their scores without and with these sessions."""
     result = people.tables
     parts = [paragraph(describe_rules(people.rules))]
@@ -436,8 +442,8 @@ def sessions_alone(people: PeopleResults, models: str = "") -> Markup:
         words = (
             "Effect of a flag on being right, over all sessions: logistic regression with an "
             "intercept for each scenario, standard errors clustered by participant. Low accuracy "
-            "is itself a reason to be flagged, so its effect, and that of “flagged”, is there by "
-            "construction"
+            "is itself a reason to be flagged, so its effect and the effect of “flagged” are there "
+            "by construction"
         )
         parts.append(rows_table(result["flag_effects"], columns, words))
     return joined(parts)
@@ -530,7 +536,7 @@ def describe_rules(rules: ExclusionRules) -> str:
     return (
         f"Rules “{rules.name}”: {'; '.join(words)}; not all trials answered; not the participant's "
         "first session. Rules flag; the main analysis leaves flagged sessions out, and the tables "
-        "below say what changes with them. Centres and standard deviations are those of the "
+        "below say what changes with them. Centres and standard deviations are taken over the "
         f"scenario's complete sessions (sd with {'n − 1' if rules.ddof else 'n'})."
     )
 

@@ -99,7 +99,7 @@ _BASELINES = (
 
 _BEYOND = (
     "Whoever predicts outcomes well resembles people, because people predict them well too. These "
-    "numbers take out that part: a model that resembles people by the outcome alone has 0. Kappa "
+    "numbers take out that part: a model that resembles people only by the outcome has 0. Kappa "
     "beyond the outcome supposes that half of the answers are yes, and is too low where most "
     "outcomes are alike; kappa within outcomes is right there too."
 )
@@ -111,7 +111,7 @@ def scores(comparison: Comparison) -> Markup:
     parts = [
         paragraph(_BASELINES) if comparison.has_people else Markup(),
         scores_table(comparison.all_scores, MEAN, plain, "Mean over scenarios"),
-        details("All stimuli pooled", scores_table(comparison.all_scores, POOLED, plain)),
+        _pooled(comparison, plain),
     ]
     if comparison.has_people:
         parts += [heading("Beyond the outcome"), paragraph(_BEYOND), *_beyond(comparison)]
@@ -119,11 +119,19 @@ def scores(comparison: Comparison) -> Markup:
     return joined(parts)
 
 
+def _pooled(comparison: Comparison, metrics: Sequence[Metric]) -> Markup:
+    """Return the pooled scores, which are open at first where few stimuli leave no mean."""
+    scores = comparison.all_scores
+    mean = scores[(scores["scenario"] == MEAN) & (scores["kind"] == "model")]
+    lacking = bool(mean[[metric.name for metric in metrics]].isna().all(axis=1).all())
+    return details("All stimuli pooled", scores_table(scores, POOLED, metrics), lacking)
+
+
 def _beyond(comparison: Comparison) -> list[Markup]:
     beyond = shown_metrics(comparison, beyond=True)
     tables = [
         scores_table(comparison.all_scores, MEAN, beyond, "Mean over scenarios"),
-        details("All stimuli pooled", scores_table(comparison.all_scores, POOLED, beyond)),
+        _pooled(comparison, beyond),
     ]
     for metric in score_metrics():
         if metric.name in BEYOND_OUTCOME:
@@ -261,8 +269,8 @@ def definitions(comparison: Comparison) -> Markup:
     meaning = {metric.heading: metric.definition for metric in chosen}
     meaning |= {
         "NaN": "undefined; the reason is below the table or shown on hovering",
-        "all, all-but, only": "a model's training: on all scenarios, on all but the tested one, on "
-        "the tested one alone; in the files the last two are “all but this” and “same”",
+        "all, all-but, only": "a model's training: on all scenarios, on all but the tested one, "
+        "only on the tested one",
     }
     return joined([heading("What the numbers mean"), definition_list(meaning)])
 
@@ -308,7 +316,8 @@ def _paired(rows: pd.DataFrame) -> Markup:
         "exact test of McNemar. r with the average person: permutation test that swaps the two "
         f"models stimulus by stimulus ({permutations_of(len(rows))} permutations), jackknife "
         "interval over stimuli. Correction over all pairs: by "
-        "Holm (chance of any false alarm) and by Benjamini and Hochberg (share of false alarms). "
+        "Holm (chance of any false alarm) and by Benjamini and Hochberg (fraction of false "
+        "alarms). "
         f"Of {counts['p_accuracy'][2]} pairs, {counts['p_accuracy'][0]} differ in accuracy by "
         f"Holm and {counts['p_accuracy'][1]} by Benjamini and Hochberg (5 %); of "
         f"{counts['p_r'][2]}, {counts['p_r'][0]} and {counts['p_r'][1]} in r."

@@ -1,4 +1,4 @@
-"""Choice of the stimuli that a page shows as movies; it depends on the tables alone."""
+"""Trials on a page: choice of those to show, cards, answers, a page for each stimulus."""
 
 from __future__ import annotations
 
@@ -305,7 +305,7 @@ def opening(inputs: ReportInputs, movies: PageMovies, links: Mapping[str, str]) 
 
 def _question(inputs: ReportInputs) -> str:
     who = "People and models" if inputs.comparison.has_people else "The models"
-    shown = ", and the movies go on to show it" if inputs.movies else ""
+    shown = ", and the movies continue to show it" if inputs.movies else ""
     return (
         f"{inputs.question} {who} answer from the first 1.5 seconds; the label says what "
         f"happened{shown}."

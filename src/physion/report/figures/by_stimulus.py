@@ -45,7 +45,7 @@ def scatter(inputs: ReportInputs) -> Plot | None:
         return None
     caption = (
         "P(contact) of each model (rows) against the fraction of people who say yes, by scenario; "
-        "one point a stimulus."
+        "one point for each stimulus."
     )
     if len(comparison.changed):
         caption += " Hollow: the simulated outcome is not the official one."
@@ -73,7 +73,7 @@ def scatter_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
         )
         for axis, model in zip(axes, models, strict=True):
             _squares(axis, table[table["model"] == model], scenarios, theme)
-        figure.supxlabel("share of people who say yes", fontsize=10)
+        figure.supxlabel("fraction of people who say yes", fontsize=10)
         figure.supylabel("P(contact) of the model", fontsize=10)
         if (table["label"] != table["simulated"]).any():
             legend(figure, _scatter_handles(theme), 2)
@@ -170,7 +170,7 @@ def calibration(inputs: ReportInputs) -> Plot:
         "that ends in contact, in ten bins with Wilson's 95 % intervals; the area of a point is "
         "proportional to its stimuli. The outcome is the official one. Dotted: calibrated. The "
         "Brier score is the mean squared difference of P(contact) and outcome: 0 is perfect, 0.25 "
-        "that of P = 0.5."
+        "the score of P = 0.5."
     )
     table = tables.calibration_table(inputs.comparison)
     return Plot("calibration", caption, table, calibration_figure)
@@ -206,7 +206,7 @@ def calibration_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
             axis.set_xticks([0, 0.5, 1])
             axis.set_yticks([0, 0.5, 1])
         figure.supxlabel("P(contact) of the model", fontsize=10)
-        figure.supylabel("share of stimuli with contact", fontsize=10)
+        figure.supylabel("fraction of stimuli with contact", fontsize=10)
     return figure
 
 
@@ -217,7 +217,7 @@ BINS = np.linspace(0, 1, 21)
 
 TAIL = (
     ("not below chance", 0),
-    ("below chance by the study's rule alone", 4),
+    ("below chance only by the study's rule", 4),
     ("below chance also when corrected", 5),
 )
 """Parts of these bars, and their positions in the palette."""
@@ -277,9 +277,11 @@ def difficulty_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
 def _tail_bars(axis: Axes, rows: pd.DataFrame, theme: Theme) -> None:
     """Draw stacked bars; those without height are not drawn."""
     corrected = rows["exact"].to_numpy(dtype=bool)
-    alone = rows["released"].to_numpy(dtype=bool) & ~corrected
+    released = rows["released"].to_numpy(dtype=bool) & ~corrected
     below = np.zeros(len(BINS) - 1)
-    for (_, index), subset in zip(TAIL, (~(alone | corrected), alone, corrected), strict=True):
+    for (_, index), subset in zip(
+        TAIL, (~(released | corrected), released, corrected), strict=True
+    ):
         count, _ = np.histogram(rows["accuracy"][subset], BINS)
         some = count > 0
         axis.bar(BINS[:-1][some], count[some], np.diff(BINS)[some], below[some], align="edge",

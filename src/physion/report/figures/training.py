@@ -32,8 +32,8 @@ from physion.report.html import number
 from physion.report.inputs import ReportInputs
 
 PROTOCOLS = (
-    "Training: all scenarios together (all), all but the tested one (all-but), the tested one "
-    "alone (only)."
+    "Training: all scenarios together (all), all but the tested one (all-but), only the "
+    "tested one (only)."
 )
 """Sentence of captions about the training protocols."""
 
@@ -131,7 +131,9 @@ def generalization(inputs: ReportInputs) -> Plot | None:
     if table.empty:
         return None
     people = inputs.comparison.has_people
-    base = "that of people on the same stimuli" if people else "0.5, the accuracy of guessing"
+    base = (
+        "the accuracy of people on the same stimuli" if people else "0.5, the accuracy of guessing"
+    )
     caption = f"Trained on (rows) and tested on (columns): accuracy less {base}. {PROTOCOLS}"
     return Plot("generalization", caption, table, generalization_figure)
 
@@ -165,7 +167,7 @@ def generalization_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
         figure.supxlabel("tested on", fontsize=10)
         figure.supylabel("trained on", fontsize=10)
         if image is not None:
-            base = "that of people" if table["people"].notna().any() else "0.5"
+            base = "people's" if table["people"].notna().any() else "0.5"
             figure.colorbar(image, ax=axes, label=f"accuracy less {base}", shrink=0.9)
     return figure
 

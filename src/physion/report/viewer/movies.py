@@ -90,8 +90,8 @@ def paint_depth(depth: NDArray[np.floating], near: float, far: float) -> Picture
     """Return depth (H, W) in metres as grey: bright at ``near``, dark at ``far`` and where
     undefined.
     """
-    share = 1.0 - np.clip((np.asarray(depth, np.float64) - near) / (far - near), 0.0, 1.0)
-    colors = colormaps["magma"](np.nan_to_num(share), bytes=True)
+    fraction = 1.0 - np.clip((np.asarray(depth, np.float64) - near) / (far - near), 0.0, 1.0)
+    colors = colormaps["magma"](np.nan_to_num(fraction), bytes=True)
     return np.ascontiguousarray(colors[..., :3])
 
 

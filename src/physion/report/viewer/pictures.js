@@ -1,5 +1,5 @@
 // Pictures that a model saw and imagined, at the frame of the time line: true frames with boxes over
-// them, imagined frames, and slots. They change at the frames of the model alone.
+// them, imagined frames, and slots. They change only at the frames of the model.
 
 /** Least width of a canvas, so that lines over a small picture are sharp. */
 const CANVAS_WIDTH = 256;

@@ -1,0 +1,2 @@
+// The bundle of vendor/three.min.js, for the check of types.
+declare const Three: any;
