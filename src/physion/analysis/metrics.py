@@ -8,9 +8,10 @@ shows how to add one.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from scipy import special
@@ -26,6 +27,7 @@ from physion.analysis.statistics.agreement import (
 from physion.core.registry import Registry
 
 Compute = Callable[[Sample], Array]
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ def register_metric(
     name: str,
     *,
     label: str,
-    definition: str,
+    definition: str = "",
     better: Literal["higher", "lower", "zero", ""],
     needs: Literal["outcome", "people", "participants"],
     heading: str = "",
@@ -101,19 +103,26 @@ def register_metric(
     in_measures: bool = False,
     by_participant: Compute | None = None,
     two_people: Compute | None = None,
-) -> Callable[[Compute], Compute]:
-    """Register the decorated function of a `Sample` as a metric; see `Metric` for the parameters.
+) -> Callable[[F], F]:
+    """Register the decorated function as a metric; see `Metric` for the parameters.
 
-    Tables list the metrics in the order in which they are registered.
+    The function takes a `Sample`, or three arrays: ``f(p_model, p_people, label)``, each over the
+    stimuli that model and people answered, and returns a number. It is then computed anew for every
+    set of weights, so that its intervals are those of all metrics. Without a ``definition`` the
+    first line of its docstring is the definition. Tables list the metrics in the order in which
+    they are registered.
     """
 
-    def add(compute: Compute) -> Compute:
+    def add(function: F) -> F:
+        simple = len(inspect.signature(function).parameters) == 3
+        compute = metric_of_arrays(function, needs) if simple else function
+        sentence = (inspect.getdoc(function) or "").partition("\n")[0]
         metric = Metric(
             name=name,
             compute=compute,
             label=label,
             heading=heading or label,
-            definition=definition,
+            definition=definition or sentence,
             better=better,
             needs=needs,
             resampled=resampled,
@@ -125,9 +134,30 @@ def register_metric(
             position=next(_count),
         )
         metrics.register(name)(metric)
-        return compute
+        return function
 
     return add
+
+
+def metric_of_arrays(function: Callable[..., Any], needs: str) -> Compute:
+    """Return a metric of a `Sample` from a function of P(contact), P(yes) and the outcome."""
+
+    def compute(sample: Sample) -> Array:
+        stimuli, people = sample.stimuli, sample.p_yes
+        rows = max(len(stimuli), len(people))
+        values = np.full((rows, len(sample.p_contact)), np.nan)
+        for row in range(rows):
+            p_yes = people[min(row, len(people) - 1)]
+            times = np.rint(stimuli[min(row, len(stimuli) - 1)]).astype(np.int64)
+            for model, p_contact in enumerate(sample.p_contact):
+                known = np.isfinite(p_contact) & (np.isfinite(p_yes) | (needs == "outcome"))
+                at = np.repeat(np.arange(len(times)), np.where(known, times, 0))
+                if len(at):
+                    label = sample.label[at].astype(bool)
+                    values[row, model] = function(p_contact[at], p_yes[at], label)
+        return values
+
+    return compute
 
 
 def all_metrics() -> list[Metric]:

@@ -19,7 +19,7 @@ from physion.analysis.people.measures import ScenarioAnswers
 from physion.analysis.people.results import PeopleResults
 from physion.analysis.scores import Models
 from physion.analysis.statistics.agreement import correctness, correlation_from_sums
-from physion.analysis.statistics.paired import benjamini_hochberg, compare_models, holm, swap_coins
+from physion.analysis.statistics.paired import compare_models, corrected_p, swap_coins
 from physion.analysis.statistics.regression import calibration_table
 from physion.analysis.tables import MEAN, POOLED, in_order
 from physion.core.errors import PhysionError
@@ -215,7 +215,9 @@ def paired_measures(
                 for i, j in combinations(range(len(pooled.names)), 2)
             ]
             table = pd.DataFrame(rows, columns=list(COLUMNS[2:9]))
-            table = table.assign(p_holm=holm(table["p"]), p_bh=benjamini_hochberg(table["p"]))
+            table = table.assign(
+                p_holm=corrected_p(table["p"], "holm"), p_bh=corrected_p(table["p"], "fdr_bh")
+            )
             parts.append(table.assign(scenario=group, measure=measure))
     table = pd.concat(parts, ignore_index=True)[list(COLUMNS)]
     return table[table["difference"].notna()].reset_index(drop=True)

@@ -59,12 +59,16 @@ class ExclusionError(BadInputError):
         Names of the rule and of the scenario.
     flagged, sessions
         Number of sessions that the rule leaves out, and of all sessions of the scenario.
+    listed
+        Whether the study's list of stimuli was given.
     """
 
-    def __init__(self, rule: str, scenario: str, flagged: int, sessions: int) -> None:
-        advice = (
-            "give the study's list of stimuli (--expected), or " if rule == "incomplete" else ""
-        )
+    def __init__(
+        self, rule: str, scenario: str, flagged: int, sessions: int, listed: bool = False
+    ) -> None:
+        advice = ""
+        if rule == "incomplete" and not listed:
+            advice = "give the study's list of stimuli (--expected), or "
         super().__init__(
             f"the exclusion rule {rule!r} leaves out {flagged} of {sessions} sessions of "
             f"{scenario}, more than a third: look at these sessions; {advice}confirm with "

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import pandas as pd
 
@@ -52,7 +52,7 @@ from physion.report.people import describe_attributes
 
 ZONE_FILE = "human_accuracy_by_scenario.csv"
 
-Predictions = Mapping[str, Mapping[str, float]] | pd.DataFrame | Path | str
+Predictions: TypeAlias = Mapping[str, Mapping[str, float]] | pd.DataFrame | Path | str
 """P(contact) by model and stimulus; a table of `physion.analysis.tables.PREDICTIONS`; or its CSV
 file."""
 
@@ -285,7 +285,7 @@ def compare(
                 "simulated participants are about responses: give those"
             )
         averages = _averages(rows, humans, labels, zone, dominoes)
-        methods = averages.methods
+        methods = dict(averages.methods)
         results = all_results(
             rows, averages.people, averages.labels, zone=averages.zone,
             zone_origin=averages.zone_origin, **settings,
@@ -303,8 +303,10 @@ def compare(
 
 def _rows(predictions: Predictions | Sequence[Predictions]) -> pd.DataFrame | None:
     """Return all predictions as one table with unique names of models; None if there is none."""
-    single = isinstance(predictions, Mapping | pd.DataFrame | Path | str)
-    given: Sequence[Predictions] = [predictions] if single else predictions  # type: ignore[list-item,assignment]
+    if isinstance(predictions, Mapping | pd.DataFrame | Path | str):
+        given: Sequence[Predictions] = [predictions]
+    else:
+        given = predictions
     tables = []
     for one in given:
         if isinstance(one, Mapping):

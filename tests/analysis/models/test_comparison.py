@@ -10,9 +10,11 @@ import pandas as pd
 import pytest
 
 from physion.analysis import Bootstrap, compare_scores, read_predictions
-from physion.analysis.compare import compare
+from physion.analysis.compare import all_results
 from physion.analysis.comparison import NO_LABEL, NOT_PREDICTED, NOT_SEEN
+from physion.analysis.metrics import metric_of_arrays, metrics
 from physion.analysis.people.responses import EXCLUDED, LEDGE
+from physion.analysis.sample import sample_of_rows
 from physion.analysis.tables import (
     MEAN,
     POOLED,
@@ -512,11 +514,31 @@ def test_official_people_as_a_model_reach_the_official_accuracies(official: Path
 def test_compare_computes_all_that_a_report_draws() -> None:
     people = humans()
     both = pd.concat([predictions(people), predictions(people, model="other", seed=5)])
-    found = compare(both, people, labels(people), bootstrap=QUICK)
+    found = all_results(both, people, labels(people), bootstrap=QUICK)
     direct = compare_scores(both, people, labels(people), bootstrap=QUICK)
     pd.testing.assert_frame_equal(found.comparison.scores, direct.scores)
     assert found.paired is not None and len(found.paired) == 1
     assert found.calibration is not None and len(found.calibration) == 2
     assert found.people is None and found.predictions is both
-    alone = compare(predictions(people), None, bootstrap=QUICK)
+    alone = all_results(predictions(people), None, bootstrap=QUICK)
     assert alone.paired is None and alone.comparison.people.empty
+
+
+# --- metrics of three arrays ---------------------------------------------------------------------
+
+
+def test_a_metric_of_arrays_equals_one_of_a_sample() -> None:
+    people = humans()
+    stimuli = compare_scores(predictions(people), people, labels(people), bootstrap=QUICK).stimuli
+    rows = stimuli[stimuli["scenario"] == "drop"].reset_index(drop=True)
+    rows["predicted"] = rows["predicted"].astype(float)
+    rows.loc[2, ["p_contact", "predicted"]] = np.nan
+    weights = np.vstack([np.ones(len(rows)), 1 - np.eye(len(rows)), 2 * np.eye(len(rows))[:1] + 1])
+    sample = sample_of_rows(rows, weights)
+    for name, function in (
+        ("rmsd", lambda p, q, _: np.sqrt(np.mean((p - q) ** 2))),
+        ("accuracy", lambda p, _, label: np.mean((p > 0.5) == label)),
+    ):
+        metric = metrics.get(name)
+        found = metric_of_arrays(function, metric.needs)(sample)
+        np.testing.assert_allclose(found, metric(sample), atol=1e-12)

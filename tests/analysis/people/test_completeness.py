@@ -117,8 +117,23 @@ def test_analysis_stops_unless_confirmed() -> None:
     some = replace(found, trials=cut)
     with pytest.raises(ExclusionError, match=r"'incomplete' leaves out 3 of 6 .*--expected"):
         analyse_people(some, bootstrap=QUICK)
+    listed = {"drop": frozenset(found.test["stimulus"])}
+    with pytest.raises(ExclusionError, match="'incomplete' leaves out 3 of 6") as error:
+        analyse_people(some, expected=listed, bootstrap=QUICK)
+    assert "--expected" not in str(error.value), "the list was given"
     results = analyse_people(some, accept_rules=["incomplete"], bootstrap=QUICK)
     assert results.tables["flags"]["incomplete"].sum() == 3
+
+
+def test_sessions_that_never_answered_do_not_count_in_the_third() -> None:
+    found = study(people=12, stimuli=10, scenarios=("drop",), slow_by_error=0.0)
+    calm = flag_sessions(found).assign(**dict.fromkeys(RULES, False))
+    silent = calm.index[:6]
+    calm.loc[silent, ["trials", "incomplete"]] = [0, True]
+    check_excluded(calm)
+    calm.loc[calm.index[6:9], "incomplete"] = True
+    with pytest.raises(ExclusionError, match="'incomplete' leaves out 3 of 6"):
+        check_excluded(calm)
 
 
 def test_the_list_is_found_beside_the_responses(tmp_path: Path) -> None:

@@ -20,8 +20,8 @@ from physion.analysis.people.measures import (
     mean_over_people,
     split_halves,
 )
-from physion.analysis.statistics.agreement import correlate_rows
-from physion.analysis.statistics.paired import benjamini_hochberg
+from physion.analysis.statistics.agreement import correlate_rows, pearson
+from physion.analysis.statistics.paired import corrected_p
 from physion.analysis.statistics.regression import clustered_logit
 from physion.analysis.tables import ATTRIBUTES, in_order, require_columns
 from physion.core.errors import BadInputError
@@ -280,7 +280,7 @@ def below_chance_level(by_stimulus: pd.DataFrame, level: float = 0.05) -> pd.Dat
     Hochberg over all rows given), ``exact`` (p_adjusted < ``level``).
     """
     p = below_chance_level_p(by_stimulus["accuracy"], by_stimulus["count"])
-    adjusted = benjamini_hochberg(p)
+    adjusted = corrected_p(p, "fdr_bh")
     return by_stimulus[["scenario", "stimulus", "accuracy", "count"]].assign(
         released=below_chance_level_released(by_stimulus["accuracy"], by_stimulus["count"]),
         p=p,
@@ -470,7 +470,7 @@ def _record(hypothesis: Hypothesis, name: str, rows: pd.DataFrame, level: float)
         return {**record, "reason": "the outcome does not vary"}
     of_scenario = used.groupby("scenario")["scenario"].transform("size").to_numpy(dtype=np.float64)
     record |= _slope(x, y, of_scenario, level)
-    record["r"] = float(np.corrcoef(x, y)[0, 1])
+    record["r"] = pearson(x, y)
     record["spearman"] = float(stats.spearmanr(x, y).statistic)
     record["as_predicted"] = _verdict(record, hypothesis.sign, level)
     record["reason"] = _confounded(hypothesis, used)

@@ -474,11 +474,13 @@ def flag_sessions(
 def large_exclusions(flags: pd.DataFrame) -> pd.DataFrame:
     """Return the rules that flag more than `MOST_EXCLUDED` of the sessions of a scenario.
 
-    Columns: ``scenario``, ``rule``, ``flagged``, ``sessions``.
+    Sessions without a single test answer (they consented and left) do not count: there is nothing
+    to leave out of them. Columns: ``scenario``, ``rule``, ``flagged``, ``sessions``.
     """
     rows = []
-    for scenario in in_order(flags["scenario"]):
-        part = flags[flags["scenario"] == scenario]
+    answered = flags[flags["trials"] > 0]
+    for scenario in in_order(answered["scenario"]):
+        part = answered[answered["scenario"] == scenario]
         counts = {rule: int(part[rule].sum()) for rule in RULES}
         rows += [
             (scenario, rule, count, len(part))
@@ -488,19 +490,22 @@ def large_exclusions(flags: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["scenario", "rule", "flagged", "sessions"])
 
 
-def check_excluded(flags: pd.DataFrame, accept_rules: Collection[str] = ()) -> None:
+def check_excluded(
+    flags: pd.DataFrame, accept_rules: Collection[str] = (), expected: Expected | None = None
+) -> None:
     """Refuse a rule that leaves out more than `MOST_EXCLUDED` of the sessions of a scenario.
 
     A rule that flags so many is more likely wrong for these data than the sessions are.
-    ``accept_rules``: rules that may. Raises `ExclusionError`, and `UnknownNameError` for a name in
-    ``accept_rules`` that is no rule.
+    ``accept_rules``: rules that may; ``expected``: the list of stimuli, if one was given. Raises
+    `ExclusionError`, and `UnknownNameError` for a name in ``accept_rules`` that is no rule.
     """
     for name in accept_rules:
         if name not in RULES:
             raise UnknownNameError("exclusion rule", name, RULES)
     for row in large_exclusions(flags).itertuples():
         if row.rule not in accept_rules:
-            raise ExclusionError(row.rule, row.scenario, row.flagged, row.sessions)
+            given = expected is not None
+            raise ExclusionError(row.rule, row.scenario, row.flagged, row.sessions, given)
 
 
 def describe_confirmed(flags: pd.DataFrame, accept_rules: Collection[str]) -> str:

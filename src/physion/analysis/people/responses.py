@@ -1,8 +1,8 @@
 """Answers of single participants: read, checked and cleaned; everything dropped is counted.
 
-`read_responses` reads the export of our experiment (`response_schema`); `official_responses` reads
-the raw columns of the original study. Both return `Responses`, the input of exclusions, of the
-analyses of people and of the comparison with models.
+`read_responses` reads the export of our experiment (`TRIAL_COLUMNS`, `SESSION_COLUMNS`);
+`read_official_responses` reads the raw columns of the original study. Both return `Responses`, the
+input of exclusions, of the analyses of people and of the comparison with models.
 """
 
 from __future__ import annotations
@@ -269,7 +269,7 @@ def read_responses(
     Parameters
     ----------
     trials, sessions
-        CSV or parquet files with the columns of `response_schema`.
+        CSV or parquet files with `TRIAL_COLUMNS` and `SESSION_COLUMNS`.
     known
         Names of the stimuli that may occur; None: any.
     unknown
@@ -329,10 +329,9 @@ def clean(
 ) -> Responses:
     """Return the responses of a table that `check_table` has typed; see `read_responses`.
 
-    Raises `BadInputError` for a session with two participants, or with two scenarios in one block
-    or without blocks, a stimulus with two
-    labels or in two scenarios, a ``correct`` that contradicts response and label, or a trial whose
-    session is not in ``sessions``.
+    Raises `BadInputError` for a session of two participants; a session with two scenarios in one
+    block, or without blocks; a stimulus with two labels or in two scenarios; a ``correct`` that
+    contradicts response and label; and a trial whose session is not in ``sessions``.
     """
     if trials.empty:
         raise BadInputError(f"{where} has no row")
@@ -388,8 +387,8 @@ def _sessions(trials: pd.DataFrame, given: pd.DataFrame | None, where: str) -> p
     wrong = (joined["participant"] != joined["participant_given"]) | np.array(absent, dtype=bool)
     if wrong.any():
         raise BadInputError(
-            f"{where}: session {joined.loc[wrong, 'session'].iloc[0]!r} is not, or is another one, "
-            "in the table of sessions"
+            f"{where}: session {joined.loc[wrong, 'session'].iloc[0]!r} is missing from the "
+            "sessions table, or differs there"
         )
     if "started_at" in given:
         began = pd.to_datetime(given["started_at"], errors="coerce", utc=True, format="ISO8601")

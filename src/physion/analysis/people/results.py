@@ -198,7 +198,7 @@ def analyse_people(
     draws = bootstrap or Bootstrap()
     check_expected(responses, expected)
     flags = flag_sessions(responses, rules, expected=expected)
-    check_excluded(flags, accept_rules)
+    check_excluded(flags, accept_rules, expected)
     shown = drop_unexpected(responses, expected).drop_void()
     shown = shown.drop_stimuli(exclude, exclude_ledge)
     kept, whole = _sets(shown, flags)

@@ -26,6 +26,7 @@ from physion.analysis.intervals import Bootstrap
 from physion.analysis.people.effects import below_chance_level
 from physion.analysis.people.measures import spearman_brown
 from physion.analysis.scores import released_zone
+from physion.analysis.statistics.agreement import correlation_from_sums
 from physion.analysis.tables import (
     MEAN,
     READOUTS,
@@ -739,11 +740,6 @@ def _correlation(
 
 def _weighted_r(x: Array, y: Array, weights: Array) -> Array:
     """Return Pearson's r over all cells (models, k) for each row of weights (b, models), (b,)."""
-    total = weights.sum(axis=1) * x.shape[1]
-    mean_x, mean_y = (weights @ values.sum(axis=1) / total for values in (x, y))
-    xy, xx, yy = (
-        weights @ (one * other).sum(axis=1) / total for one, other in ((x, y), (x, x), (y, y))
-    )
-    with np.errstate(divide="ignore", invalid="ignore"):
-        spread = np.sqrt((xx - mean_x**2) * (yy - mean_y**2))
-        return np.where(spread > 0, (xy - mean_x * mean_y) / spread, np.nan)
+    x, y = x - x.mean(), y - y.mean()
+    sums = (weights @ values.sum(axis=1) for values in (x, y, x * x, y * y, x * y))
+    return correlation_from_sums(weights.sum(axis=1) * x.shape[1], *sums)

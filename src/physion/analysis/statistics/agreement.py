@@ -1,4 +1,10 @@
-"""Pearson's r of many pairs at once, with gaps and with resampling weights."""
+"""Agreement of two sets of answers: Pearson's r, Cohen's kappa, noise ceilings.
+
+Functions of arrays over stimuli: ``x`` is a model's P(contact), ``y`` the fraction of people who
+say yes. What is undefined is NaN; nothing is clipped, rounded or corrected unless stated. Every
+correlation of the package is computed by `correlation_from_sums`, which the others call with the
+sums of one pair, of many pairs with gaps, or of resamples.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from physion.core.errors import BadInputError
-
-# Agreement of two sets of answers: functions of arrays over stimuli.
-#
-# Throughout, ``x`` is a model's P(contact) and ``y`` the fraction of people who say yes. What is
-# undefined is NaN; nothing is clipped, rounded or corrected unless stated.
 
 Array = npt.NDArray[np.float64]
 
@@ -26,13 +27,11 @@ FEWEST = 3
 def pearson(x: npt.ArrayLike, y: npt.ArrayLike) -> float:
     """Return Pearson's r of two arrays of shape (n,); NaN if either is constant or n < 3."""
     a, b = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
-    if len(a) < FEWEST:
+    if not len(a):
         return float("nan")
-    a, b = a - a.mean(), b - b.mean()
-    sd = np.sqrt(np.mean(a**2)), np.sqrt(np.mean(b**2))
-    if min(sd) < CONSTANT:
-        return float("nan")
-    return float(np.mean(a * b) / (sd[0] * sd[1]))
+    a, b = a - a.mean(), b - b.mean()  # sums of squares of what is not near 0 would be inexact
+    sums = (a.sum(), b.sum(), (a * a).sum(), (b * b).sum(), (a * b).sum())
+    return float(correlation_from_sums(np.float64(len(a)), *map(np.float64, sums)))
 
 
 def rmsd(x: npt.ArrayLike, y: npt.ArrayLike) -> float:
@@ -135,7 +134,7 @@ def correlate_rows(x: npt.ArrayLike, y: npt.ArrayLike) -> Array:
     """Return r of row k of ``x`` with row k of ``y``, both (k, stimuli), where both are known:
     (k,).
 
-    NaN if fewer than 3 are shared or one is constant, as in `agreement.pearson`.
+    NaN if fewer than 3 are shared or one is constant, as in `pearson`.
     """
     a, b = np.asarray(x, dtype=np.float64) - 0.5, np.asarray(y, dtype=np.float64) - 0.5
     shared = np.isfinite(a) & np.isfinite(b)
@@ -163,8 +162,16 @@ def correlate_resampled(x: npt.ArrayLike, y: npt.ArrayLike, weights: npt.ArrayLi
     )  # fmt: skip
 
 
-def correlation_from_sums(n: Array, x: Array, y: Array, xx: Array, yy: Array, xy: Array) -> Array:
+def correlation_from_sums(
+    n: npt.ArrayLike,
+    x: npt.ArrayLike,
+    y: npt.ArrayLike,
+    xx: npt.ArrayLike,
+    yy: npt.ArrayLike,
+    xy: npt.ArrayLike,
+) -> Array:
     """Return r from sums of values, their squares and products; centre the values near 0."""
+    n, x, y, xx, yy, xy = (np.asarray(sums, np.float64) for sums in (n, x, y, xx, yy, xy))
     with np.errstate(divide="ignore", invalid="ignore"):
         variance_x, variance_y = xx / n - (x / n) ** 2, yy / n - (y / n) ** 2
         defined = (n >= FEWEST) & (np.minimum(variance_x, variance_y) >= CONSTANT**2)
@@ -197,8 +204,10 @@ def correlation_within_groups(
                     for sums in groups], axis=0) / count
             for k, i, j in ((3, 1, 1), (4, 2, 2), (5, 1, 2))
         )  # fmt: skip
-        defined = (count - used >= FEWEST - 1) & (np.minimum(xx, yy) >= CONSTANT**2)
-        return np.asarray(xy / np.sqrt(np.where(defined, xx * yy, np.nan)))
+    # Deviations from the means of k groups are as many as n - k + 1 values with a mean of 0.
+    free = count - used + 1
+    zero = np.zeros_like(xx)
+    return correlation_from_sums(free, zero, zero, free * xx, free * yy, free * xy)
 
 
 # Cohen's kappa of many answer vectors at once: how much two agree beyond what chance gives.
@@ -269,11 +278,8 @@ def pairwise_correlation(answers: npt.ArrayLike) -> Array:
     zeros = np.where(given > 0, values, 0.0)
     n, both = given @ given.T, zeros @ zeros.T
     yes_first = zeros @ given.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        covariance = both / n - (yes_first / n) * (yes_first.T / n)
-        variance = (yes_first / n) * (1 - yes_first / n)
-        r = covariance / np.sqrt(variance * variance.T)
-    return np.where((n >= 3) & (variance > 0) & (variance.T > 0), r, np.nan)
+    # An answer of 0 or 1 is its own square.
+    return correlation_from_sums(n, yes_first, yes_first.T, yes_first, yes_first.T, both)
 
 
 def pair_values(matrix: Array) -> Array:

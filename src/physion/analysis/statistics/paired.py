@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -113,36 +114,21 @@ def _swapped_r(a: Array, b: Array, y: Array, swap: Array) -> Array:
 # --- corrections for many comparisons -----------------------------------------------------------
 
 
-def holm(p: npt.ArrayLike) -> Array:
-    """Return p values corrected by Holm's step-down method, which controls the family-wise error.
+def corrected_p(p: npt.ArrayLike, method: Literal["holm", "fdr_bh"]) -> Array:
+    """Return p values corrected for many tests; NaN stays NaN and is not counted as a test.
 
-    NaN stays NaN and is not counted as a test.
+    ``holm`` is Holm's step-down method, which controls the family-wise error; ``fdr_bh`` that of
+    Benjamini and Hochberg, which controls the false discovery rate.
     """
-    return _adjust(
-        p, lambda ordered: np.maximum.accumulate(ordered * np.arange(len(ordered), 0, -1))
-    )
+    from statsmodels.stats.multitest import multipletests  # half a second to import
 
-
-def benjamini_hochberg(p: npt.ArrayLike) -> Array:
-    """Return p values corrected by Benjamini and Hochberg, which controls the false discovery
-    rate.
-    """
-
-    def step_up(ordered: Array) -> Array:
-        scaled = ordered * len(ordered) / np.arange(1, len(ordered) + 1)
-        return np.minimum.accumulate(scaled[::-1])[::-1]
-
-    return _adjust(p, step_up)
-
-
-def _adjust(p: npt.ArrayLike, method: Callable[[Array], Array]) -> Array:
     values = np.asarray(p, dtype=np.float64)
-    known = np.flatnonzero(np.isfinite(values))
+    known = np.isfinite(values)
     if ((values[known] < 0) | (values[known] > 1)).any():
         raise BadInputError("p values must lie in 0..1")
-    order = known[np.argsort(values[known], kind="stable")]
     adjusted = np.full(values.shape, np.nan)
-    adjusted[order] = np.minimum(method(values[order]), 1.0)
+    if known.any():
+        adjusted[known] = multipletests(values[known], method=method)[1]
     return adjusted
 
 
@@ -222,8 +208,8 @@ def compare_models(
     columns += ["p_accuracy", "r_difference", "r_difference_low", "r_difference_high", "p_r"]
     table = pd.DataFrame(records, columns=[*columns, "reason"])
     for p in ("p_accuracy", "p_r"):
-        table[f"{p}_holm"] = holm(table[p])
-        table[f"{p}_bh"] = benjamini_hochberg(table[p])
+        table[f"{p}_holm"] = corrected_p(table[p], "holm")
+        table[f"{p}_bh"] = corrected_p(table[p], "fdr_bh")
     return table
 
 
