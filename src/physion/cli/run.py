@@ -44,7 +44,6 @@ OFFICIAL_MODELS = (
 """Models of a run on official scenes, in the order of the report."""
 SAMPLED_MODELS = ("frozen-encoder", "noisy-simulation")
 SIMULATIONS = ("noisy-simulation", "noisy-simulation-outcomes", "noisy-simulation-people")
-SHIPPED = ("gns", "gns-ransac", "dpi", "svg", "op3", "cswm", "rpin")
 TRAINING = {"steps": 300}
 """Settings of the training of models that learn; more steps take longer."""
 
@@ -142,7 +141,6 @@ def model_options(options: Options) -> dict[str, dict[str, Any]]:
         "pEffNetLite0-mlp": {"image_size": options.size},
         "pEffNetLite0-lstm": {"image_size": options.size},
         "frozen-encoder": {"encoder": "resnet18", "weights": "random"},
-        **{name: {"weights": "shipped"} for name in SHIPPED},
         **{name: {"samples": 20, "engine": options.engine} for name in SIMULATIONS},
     }
     known = {name: {**TRAINING, **presets.get(name, {})} for name in names}

@@ -196,7 +196,8 @@ class Cells:
                 # Weights that ship were trained on all scenarios.
                 anew = chosen if model.comes_trained(example) and not every_seed else []
                 once = Protocol.ALL in chosen or not anew
-                if once and (seed == first or every_seed):
+                untrained_network = can(example, "loss") and not ask(example, "trained")
+                if once and (seed == first or (every_seed and untrained_network)):
                     self.cells.append(Cell(model, None, seed))
                 self.cells += [
                     Cell(model, p, seed, untrained=True) for p in anew if p is not Protocol.ALL

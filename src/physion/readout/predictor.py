@@ -250,7 +250,7 @@ class Predictor:
             if way is Way.ANSWERS
             else decision_name(self.model, self.settings.decision),
             protocol=self._protocol.value if self._trainer is not None and self._protocol else "",
-            seed=str(self.seed) if self._trainer is not None else "",
+            seed=str(self.seed) if self._trainer is not None or self._untrained else "",
             c=decided.c,
             cv_accuracy=decided.cv_accuracy,
             fitted=decided.fitted,
@@ -260,8 +260,13 @@ class Predictor:
         )
 
     def _note(self, note: str) -> str:
-        untrained = self.settings.untrained and can(self.model, "loss")
-        return "; ".join(part for part in ("untrained" if untrained else "", note) if part)
+        return "; ".join(part for part in ("untrained" if self._untrained else "", note) if part)
+
+    @property
+    def _untrained(self) -> bool:
+        """Whether the model has weights that were never trained, since the user wants it so."""
+        learns = can(self.model, "loss") and not ask(self.model, "trained")
+        return self.settings.untrained and learns
 
     def _describe(self, fit: Sequence[str], labels: str) -> str:
         return describe_labels([labels == "recorded" and self._recorded[trial] for trial in fit])
