@@ -45,9 +45,9 @@ from physion.core.errors import PhysionError
 # Stages of a session: the one list of pages and phases, from which all others are derived.
 #
 # To add a page: add its stage to `Stage` and its row to `PAGES`, in the order of a session; its
-# column to `store.tables` with a migration, and to `store.sessions.Session`; its fields to
-# `store.sent_pages.FIELDS`; its rendering to ``PAGES`` in ``static/session.js``; and its label to
-# the table ``preview`` of the texts. `store.sessions.stages_of` says which studies have it.
+# column to `store.database.SESSIONS` (raise SCHEMA) and to `store.sessions.Session`; its fields to
+# `store.answering.FIELDS`; and its rendering to ``PAGES`` in ``static/session.js``.
+# `store.sessions.stages_of` says which studies have it.
 
 Phase = Literal["familiarization", "test"]
 Stage = Literal[

@@ -156,8 +156,8 @@ decided that the session does not count.
 ``attention_failed``: number of failed attention checks. ``practice_repeats``: how often the
 practice of the current block was repeated; ``failed_checks``: names of the lab's checks that flag
 the session, separated by commas; NULL without any.
-``browser``: keyed hash of the key of the browser that began the session, empty if it sent none,
-NULL in sessions of older versions. ``progressed_at``: time of the last page or answer.
+``browser``: keyed hash of the key of the browser that began the session, empty if it sent none.
+``progressed_at``: time of the last page or answer.
 ``next_from``: earliest time at which the next trial can have begun. ``fast_answers``,
 ``unfetched``, ``replayed``: number of answers that were too fast, whose media were not fetched, and
 whose movie was shown too often. ``implausible``: reasons, separated by commas, for which the

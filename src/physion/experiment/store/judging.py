@@ -1,8 +1,12 @@
-"""Tell sessions that no person can have made: answers before their movie, or without it.
+"""Judge sessions: plausibility, the practice criterion, and the scores of finished sessions.
 
+Implausible is a session that no person can have made: answers before their movie, or without it.
 A trial takes at least ``T = fixation cross + cue + movie``. With ``b`` the start of the cross, by
 the server's clock (`showings`), and ``f`` the time at which movie and map were asked for, an answer
 is possible from ``max(b + cross, f) + cue + movie``.
+
+A practice below the criterion is repeated, ends the session, or is flagged. The answers of a
+practice that is repeated are kept in PRACTICE_REPEATS, so that ANSWERS has one for each trial.
 """
 
 from __future__ import annotations
@@ -125,11 +129,6 @@ def reasons(study: Study, session: Session, finished_at: float | None = None) ->
     return ", ".join(reason for reason, true in zip(REASONS, found, strict=True) if true) or None
 
 
-# The practice criterion: practice is repeated, ends the session, or is flagged.
-#
-# The answers of a practice that is repeated are kept in PRACTICE_REPEATS, so that ANSWERS has one
-# answer for each trial: that of the last repeat.
-
 PRACTICE = "practice"
 """Name of this check in ``screened_out_by`` and ``failed_checks`` of a session."""
 
@@ -212,8 +211,6 @@ def _of(table: Any, session: Session, trials: range) -> tuple[Any, ...]:
         table.c.trial < trials.stop,
     )
 
-
-# Numbers of correct test answers, and their percentiles among the finished sessions.
 
 _CHUNK = 500
 _FINISHED = (

@@ -1,1 +1,1 @@
-"""HTTP layer of the server: API endpoints, request limits, headers, pages and media."""
+"""HTTP layer of the server: API endpoints, guards of requests, static files and media."""

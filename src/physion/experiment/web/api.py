@@ -1,4 +1,9 @@
-"""API endpoints: parse the request, call the store once, return its message."""
+"""API endpoints: parse the request, call the store once, return its message.
+
+Bodies are untrusted: apart from the types of the message, a body must be plain JSON with unique
+keys, without NaN or infinity, integers beyond 2**53, NUL and unpaired surrogates (which databases
+cannot store), and with at most `MAX_DEPTH` levels of nesting.
+"""
 
 from __future__ import annotations
 
@@ -42,12 +47,6 @@ if TYPE_CHECKING:
     from physion.experiment.study.settings import Question
     from physion.experiment.study.study import Study
 
-
-# Parse untrusted request bodies into messages of `physion.experiment.protocol`.
-#
-# Apart from the types of the message, a body must be plain JSON: unique keys, no NaN or infinity,
-# no integer beyond 2**53, no NUL and no unpaired surrogate (databases cannot store them), and at
-# most `MAX_DEPTH` levels of nesting.
 
 MAX_DEPTH = 8
 EXACT = 2**53

@@ -1,6 +1,8 @@
-"""Serve movies and maps without metadata that could reveal the stimulus.
+"""Serve movies and maps, and the static files of the pages.
 
-Responses have no ETag, file date, file name or ranges, so two movies differ only in their bytes.
+Responses with media have no ETag, file date, file name or ranges, so two movies differ only in
+their bytes. Static files are read once from the package and looked up by exact name, so no path of
+a client reaches the file system.
 """
 
 from __future__ import annotations
@@ -66,11 +68,6 @@ class MediaFiles:
             _, evicted = self._kept.popitem(last=False)
             self._size -= len(evicted)
 
-
-# Static files of the pages: read once from the package, then served from memory by exact name.
-#
-# Requests are looked up among the files found at startup, so no path of a client reaches the file
-# system.
 
 PACKAGE = Path(__file__).parents[1]
 MEDIA_TYPES = {

@@ -1,4 +1,8 @@
-"""Responses that refuse a request: the same body for all errors, without internal details."""
+"""Protect the application: limits on size and time, security headers, errors that reveal nothing.
+
+`Guards` is an ASGI middleware around the whole application. It wraps only `receive` and `send` and
+starts no task of its own. Rates and slow clients are the business of the reverse proxy in front.
+"""
 
 from __future__ import annotations
 
@@ -91,8 +95,6 @@ def _field_path(location: tuple[Any, ...]) -> str:
     return ".".join(parts) or "body"
 
 
-# Security headers of every response, such as the content security policy.
-
 NOT_NEEDED = ("accelerometer", "camera", "display-capture", "geolocation", "gyroscope", "hid",
               "magnetometer", "microphone", "midi", "payment", "serial", "usb",
               "xr-spatial-tracking")  # fmt: skip
@@ -143,10 +145,6 @@ def security_headers(study: Study) -> list[tuple[bytes, bytes]]:
 HTTPS_ONLY = (b"strict-transport-security", b"max-age=31536000")
 """Header added to responses over HTTPS."""
 
-
-# ASGI middleware: limits on size and rate, security headers, errors that reveal nothing.
-#
-# It wraps only `receive` and `send` and starts no task of its own.
 
 log = logging.getLogger("physion.experiment")
 
