@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fastapi import APIRouter, FastAPI
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from sqlalchemy import Engine, select
 from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
@@ -29,6 +28,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, RedirectResponse, Response
 
 from physion.core.errors import PhysionError
+from physion.core.html import environment
 from physion.experiment.experimenter.access import HEADERS, PATH, Access
 from physion.experiment.experimenter.payments import payment_csv, read_payments
 from physion.experiment.experimenter.progress import ALARM_ENTRIES, KINDS, STATES, Progress
@@ -101,10 +101,13 @@ class _Pages:
         self._progress = Progress(study, store.engine)
         self._files = read_page_files(Path(__file__).parent / "static")
         self._exporting = False
-        self._templates = _environment(
-            study=study, kinds=KINDS, states=STATES, path=PATH, forget_word=FORGET_WORD,
-            active_minutes=round(ACTIVE_WITHIN / 60), refresh_seconds=REFRESH_SECONDS,
-        )  # fmt: skip
+        self._templates = environment(__package__)
+        self._templates.filters.update({each.__name__: each for each in _FILTERS})
+        self._shared = {
+            "study": study, "kinds": KINDS, "states": STATES, "path": PATH,
+            "forget_word": FORGET_WORD, "active_minutes": round(ACTIVE_WITHIN / 60),
+            "refresh_seconds": REFRESH_SECONDS,
+        }  # fmt: skip
 
     def _read_secrets(self) -> Secrets:
         """Read the file again at each check, so that a new password takes effect at once."""
@@ -132,7 +135,7 @@ class _Pages:
 
     def _render_for(self, visit: str, template: str, status: int, **values: Any) -> Response:
         text = self._templates.get_template(template).render(
-            form_token=self.access.form_token(visit), now=time.time(), **values
+            form_token=self.access.form_token(visit), now=time.time(), **self._shared, **values
         )
         return Response(text, status, HEADERS, "text/html; charset=utf-8")
 
@@ -468,16 +471,4 @@ def yes_no(value: bool | None) -> str:
     return NONE if value is None else ("yes" if value else "no")
 
 
-def _environment(**shared: Any) -> Environment:
-    """Return the Jinja environment; everything is escaped, undefined names are errors."""
-    environment = Environment(
-        loader=PackageLoader(__package__, "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    filters = (date_time, percent, minutes, visible, or_dash, yes_no)
-    environment.filters.update({function.__name__: function for function in filters})
-    environment.globals.update(shared)
-    return environment
+_FILTERS = (date_time, percent, minutes, visible, or_dash, yes_no)
