@@ -1,9 +1,9 @@
 """Clips rendered on demand from motions: no file is read or written, and no movie encoded.
 
 Boxes are small (13 MB for 100,000 frames of 8 objects), but ids of pixels have to be rendered for
-them. They are kept by trial and frame.
-Most of the time goes into the preparation of a scene, so that a trial that is read a second time is
-rendered as a whole: later windows of it need no rendering for their boxes.
+them. They are kept by trial and frame. Most of the time goes into the preparation of a scene, so
+that a trial that is read a second time is rendered as a whole: later windows of it need no
+rendering for their boxes.
 """
 
 from __future__ import annotations

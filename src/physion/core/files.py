@@ -123,9 +123,11 @@ def folder_lock(folder: Path) -> Iterator[None]:
 def folder_for_writing(folder: Path) -> Iterator[None]:
     """Create ``folder`` if it is missing, and hold its lock while files are written into it.
 
-    Raises `BadInputError` in place of an `OSError` of the block, and `PhysionError` as
-    `folder_lock`.
+    Raises `BadInputError` for a file in place of a folder and for an `OSError` of the block, and
+    `PhysionError` as `folder_lock`.
     """
+    if folder.is_file():
+        raise BadInputError(f"{folder} is a file; give a folder to write into")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with folder_lock(folder):

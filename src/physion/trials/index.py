@@ -242,6 +242,8 @@ def read_index(folder: Path) -> pd.DataFrame:
     columns, types or names.
     """
     path = folder / INDEX
+    if folder.is_file():
+        raise BadInputError(f"{folder} is a file; give the folder of the dataset: {folder.parent}")
     if not folder.is_dir():
         raise BadInputError(f"dataset folder {folder} does not exist")
     if not path.is_file():

@@ -1,4 +1,4 @@
-"""Writing and reading of trial files: scene, motion, contacts, labels, and image passes on request.
+"""Trial files: scene, motion, contacts, labels, and image passes on request, in HDF5 with a seal.
 
 This module declares the arrays; docs/reference/trial-files.md describes the format. A file is built
 in memory and then written atomically: written directly, a full disk would crash the HDF5
@@ -156,8 +156,7 @@ class GuardedHdf5:
 # A trial file is an HDF5 file that begins with a 512-byte header (an HDF5 user block, which every
 # HDF5 reader skips) with the length and the SHA-256 of the file: the seal. Damage is found before
 # the HDF5 library, which may crash on it, reads anything. A file made to do harm can carry a valid
-# seal, so each field is checked as well before memory is allocated for it; see
-# `physion.trials.trial_file`.
+# seal, so each field is checked as well before memory is allocated for it.
 
 SCHEMA = 2
 """Version of the layout, raised when a reader of the old layout could misread the new one."""

@@ -1,4 +1,42 @@
-"""Export of a dataset in the folder layouts that published code reads (see `layouts`)."""
+"""Export of a dataset in the folder layouts that published code reads.
+
+A layout says which files a trial has, and where, and which lists a folder has.
+
+``official``
+    As the study published and generated its stimuli::
+
+        labels.csv                              as in PhysionTest-Core: <stimulus>_img, True/False
+        stimulus_names_and_labels.csv           as published; URLs are paths below the folder, and
+                                                the responses of people ("correct") are empty
+        Dominoes/maps/<stimulus>_map.png        PhysionTest-Core: the testing split
+        Dominoes/mp4s/<stimulus>_img.mp4        free colours
+        Dominoes/mp4s-redyellow/<config>-redyellow_0000_img.mp4
+        configurations/Dominoes/<config>/0000.hdf5      as the generator writes a configuration,
+                                        /0000_img.mp4   every split, in the trial's own look
+                                        /0000_map.png
+                                        /metadata.json
+                                        /trial_stats.json
+
+    ``configurations/Dominoes/`` is the ``local_stem`` of ``stimuli/generate_metadata.ipynb``.
+
+``physion-particles``
+    ``<split>/Dominoes/<stimulus>.hdf5``. ``training`` and ``testing`` are ``training_data_dir`` and
+    ``testing_data_dir`` of ``paths.yaml`` in htung0101/Physion-particles.
+
+``physopt``
+    ``physion_data/<part>/Dominoes/<stimulus>.hdf5`` for neuroailab/physopt-physics-benchmarking
+    with neuroailab/physics-models; the folder is the ``basedir``. Parts: ``pretraining_train`` and
+    ``pretraining_val`` (a tenth, by the hash of the name) in free colours from the training split,
+    ``readout_train_redyellow`` from readout, ``readout_test_redyellow`` from testing.
+
+``physion-evaluator``
+    ``physion_mp4s/train/<name>.mp4`` (readout split) and ``physion_mp4s/test`` (testing split) with
+    ``all_video_labels.json``, for neuroailab/physion_evaluator; the folder is its
+    ``data_root_path``. Names have the words by which it finds scenarios; it has no Drape.
+
+A trial called ``dominoes_testing_0007`` is number 0007 of the configuration ``dominoes_testing``.
+Scenario folders are capitalised, as in the published archives.
+"""
 
 from __future__ import annotations
 
@@ -110,49 +148,6 @@ def _csv(rows: list[Any]) -> bytes:
     csv.writer(buffer, lineterminator="\n").writerows(rows)
     return buffer.getvalue().encode()
 
-
-# Folder layouts that published code reads: which files a trial has in each, and where.
-#
-# ``official``
-#     As the study published and generated its stimuli::
-#
-#         labels.csv                              as in PhysionTest-Core: <stimulus>_img,
-#   True/False
-#         stimulus_names_and_labels.csv           as published; URLs are paths below the folder,
-#   and
-#                                                 the responses of people ("correct") are empty
-#         Dominoes/maps/<stimulus>_map.png        PhysionTest-Core: the testing split
-#         Dominoes/mp4s/<stimulus>_img.mp4        free colours
-#         Dominoes/mp4s-redyellow/<config>-redyellow_0000_img.mp4
-#         configurations/Dominoes/<config>/0000.hdf5      as the generator writes a configuration,
-#                                         /0000_img.mp4   every split, in the trial's own look
-#                                         /0000_map.png
-#                                         /metadata.json
-#                                         /trial_stats.json
-#
-#     ``configurations/Dominoes/`` is the ``local_stem`` of ``stimuli/generate_metadata.ipynb``.
-#
-# ``physion-particles``
-#     ``<split>/Dominoes/<stimulus>.hdf5``. ``training`` and ``testing`` are ``training_data_dir``
-#   and
-#     ``testing_data_dir`` of ``paths.yaml`` in htung0101/Physion-particles.
-#
-# ``physopt``
-#     ``physion_data/<part>/Dominoes/<stimulus>.hdf5`` for neuroailab/physopt-physics-benchmarking
-#     with neuroailab/physics-models; the folder is the ``basedir``. Parts: ``pretraining_train``
-#   and
-#     ``pretraining_val`` (a tenth, by the hash of the name) in free colours from the training
-#   split,
-#     ``readout_train_redyellow`` from readout, ``readout_test_redyellow`` from testing.
-#
-# ``physion-evaluator``
-#     ``physion_mp4s/train/<name>.mp4`` (readout split) and ``physion_mp4s/test`` (testing split)
-#   with
-#     ``all_video_labels.json``, for neuroailab/physion_evaluator; the folder is its
-#     ``data_root_path``. Names have the words by which it finds scenarios; it has no Drape.
-#
-# A trial called ``dominoes_testing_0007`` is number 0007 of the configuration
-# ``dominoes_testing``. Scenario folders are capitalised, as in the published archives.
 
 CORE_SPLIT = "testing"
 """Split that PhysionTest-Core consists of."""

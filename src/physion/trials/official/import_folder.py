@@ -7,7 +7,7 @@ Two kinds of folders are read, at any depth and mixed:
   and camera. Movies are those next to the file, or are made from the pictures in it.
 - Movies without HDF5 files, as in PhysionTest-Core (``mp4s/<stimulus>_img.mp4`` with ``maps``,
   ``mp4s-redyellow`` and ``labels.csv``) or in the folder of a configuration: movies, map and label.
-  They have no motion; see `physion.trials.official.import_folder`.
+  They have no motion: all poses are NaN.
 
 Versions with red agent and yellow patient keep ``-redyellow`` in their names.
 """
@@ -206,7 +206,8 @@ def import_official(
     if not re.fullmatch(SAFE_NAME, name):
         raise BadInputError(f"dataset name {name!r} cannot be a file name")
     if not folder.is_dir():
-        raise BadInputError(f"folder {folder} does not exist")
+        what = "is a file; give the folder that it is in" if folder.is_file() else "does not exist"
+        raise BadInputError(f"{folder} {what}")
     if (folder / INDEX).exists():
         raise BadInputError(
             f"{folder} is a dataset of this package already: there is nothing to import"

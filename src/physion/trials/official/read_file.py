@@ -1,4 +1,4 @@
-"""Safe reading of official HDF5 files.
+"""Reading of official HDF5 files: the fields, then objects, scene and motion.
 
 Files of different origin differ (docs/official-system.md, section 4): names may end with ``_cam0``,
 frames may be counted from 0 or 1, labels may be missing, physics arrays may be shorter than the

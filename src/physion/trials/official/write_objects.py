@@ -1,4 +1,4 @@
-"""Objects of a scene as listed in the official files: order, ids, names, sizes, meshes.
+"""Objects in official files: order, ids, sizes, meshes, cloth, contacts and particles.
 
 Object ids count from 1. The zone comes first, then a ramp, the target and the probe, because
 official readers find target and zone by their position; then all others in the order of the scene.
