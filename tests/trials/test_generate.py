@@ -1,9 +1,10 @@
-"""Generation of datasets: the folder stays consistent when runs are killed or trials fail."""
+"""Generation of datasets: plans, choices of scenes, kills, failures, other engines."""
 
 from __future__ import annotations
 
 import dataclasses
 import errno
+import json
 import os
 import random
 import shutil
@@ -17,14 +18,17 @@ from typing import Any
 
 import pytest
 
+import physion
 from physion.cli.output import print_report
 from physion.compute.local import LocalExecutor, SerialExecutor
 from physion.compute.run_tasks import RunReport
 from physion.core.errors import BadInputError, PhysionError, UnknownNameError
 from physion.core.files import folder_lock, write_atomic
+from physion.physics.engine import make_engine
 from physion.trials.dataset import Dataset
 from physion.trials.files import TrialPaths, find_trials
 from physion.trials.index import build_index, index_row
+from physion.trials.making import generate as module
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, TrialTask, plan_dataset, plan_scenes
 from physion.trials.making.verify import verify_dataset
@@ -513,3 +517,103 @@ def test_a_folder_of_another_version_is_not_resumed(
     monkeypatch.setattr("physion.trials.making.make.RENDERER", "physion-99")
     with pytest.raises(BadInputError, match=r"made_by"):
         run(tmp_path / "s", scenes_named("a", "b"))
+
+
+# `physion.generate`: plans, makes and opens a dataset, and says when trials are missing.
+
+
+def plan_of(monkeypatch: pytest.MonkeyPatch, folder: Path, *arguments: Any, **more: Any) -> Any:
+    """Return the tasks that a call would make, without making them."""
+    seen: list[Any] = []
+
+    def note(folder: Path, tasks: Any, settings: Any, **rest: Any) -> RunReport:
+        seen.append(tasks)
+        return RunReport([], [], {}, folder / "index")
+
+    monkeypatch.setattr(module, "make_trials", note)
+    monkeypatch.setattr(module, "GeneratedDataset", lambda folder, report: folder)
+    assert physion.generate(folder, *arguments, **more) == folder
+    return seen[0]
+
+
+def test_the_plan_is_that_of_the_command_line(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    assert plan_of(monkeypatch, tmp_path, "drop", 3) == plan_dataset(
+        "physion", ["drop"], {"testing": 3}
+    )
+    assert len(plan_of(monkeypatch, tmp_path, counts=2)) == 2 * 8, "all scenarios"
+    counts = {"training": 2, "readout": 1}
+    tasks = plan_of(monkeypatch, tmp_path, ("drop", "roll"), counts, name="mine")
+    assert tasks == plan_dataset("mine", ["drop", "roll"], counts)
+    assert plan_of(monkeypatch, tmp_path, "drop,roll", counts, name="mine") == tasks
+    tasks = plan_of(monkeypatch, tmp_path, "collide", 2, presets=["debug"])
+    assert {task.presets for task in tasks} == {("debug",)}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "message"),
+    [
+        (("dominos", 1), {}, "unknown scenario 'dominos'; closest: dominoes"),
+        (("drop", {"tests": 1}), {}, "unknown split 'tests'"),
+        (("drop", 0), {}, "1 or more"),
+        (("drop", {}), {}, "1 or more"),
+        (("all", 1), {"presets": ["debug"]}, "presets need one scenario"),
+        (("drop", 1), {"presets": ["no such"]}, "unknown preset of drop"),
+    ],
+)
+def test_wrong_arguments_are_told_before_a_folder_is_made(
+    arguments: tuple[Any, ...], options: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises((BadInputError, UnknownNameError), match=message):
+        physion.generate(tmp_path / "new", *arguments, **options)
+    assert not (tmp_path / "new").exists()
+
+
+def test_trials_that_fail_are_an_error_that_says_how_to_go_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def fail(folder: Path, tasks: Any, settings: GenerateSettings, **rest: Any) -> RunReport:
+        return RunReport(["a"], [], {"drop_testing_0001": "no scene fits"}, folder / "index")
+
+    monkeypatch.setattr(module, "make_trials", fail)
+    with pytest.raises(PhysionError, match=r"1 of 2 trials .*'drop_testing_0001': no scene fits"):
+        physion.generate(tmp_path, "drop", 2)
+
+
+# Trials made with an engine that is not the default one.
+
+
+MUJOCO = GenerateSettings(
+    width=32, height=32, jitters=1, min_visible=0.0, movies=False, engine="mujoco"
+)
+
+
+def test_trials_of_another_engine_are_verified_with_it(tmp_path: Path) -> None:
+    tasks = plan_dataset("tests", ["collide"], {"testing": 1})
+    report = make_trials(tmp_path, tasks, MUJOCO, executor=SerialExecutor())
+    assert not report.failed
+    (name,) = Dataset(tmp_path).index["engine"]
+    assert name == make_engine("mujoco").name
+    result = verify_dataset(tmp_path, again=-1)
+    assert result.faults == [] and result.other_versions == []
+
+
+def test_the_engine_is_stored_by_its_whole_name_alone(tmp_path: Path) -> None:
+    assert GenerateSettings(engine="mujoco").stored() == GenerateSettings().stored()
+    tasks = plan_dataset("tests", ["collide"], {"testing": 1})
+    make_trials(tmp_path, tasks, MUJOCO, executor=SerialExecutor(), make=lambda job: "")
+    stored = json.loads((tmp_path / "dataset.json").read_text())
+    assert stored["made_by"]["engine"] == make_engine("mujoco").name
+    with pytest.raises(BadInputError, match="made_by"):
+        make_trials(
+            tmp_path,
+            tasks,
+            GenerateSettings(width=32, height=32, jitters=1, min_visible=0.0, movies=False),
+            executor=SerialExecutor(),
+        )
+
+
+def test_unknown_engines_are_refused() -> None:
+    with pytest.raises(UnknownNameError, match="mujoco"):
+        GenerateSettings(engine="mujocco")

@@ -1,31 +1,59 @@
-"""Export to the official layouts, read by a small reader written like the official ones."""
+"""Export to the official layout: fields, axes, layouts and pushes."""
 
 from __future__ import annotations
 
+import colorsys
 import csv
 import gzip
 import io
 import json
+import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from PIL import Image
 
 from physion.cli import export as export_verb
 from physion.compute.local import SerialExecutor
 from physion.core.errors import BadInputError
+from physion.core.names import CONTROLLERS, guess_scenario, plain_name
 from physion.physics.cloth.simulate import ClothSettings
-from physion.rendering.camera import View
-from physion.scenes.scene import Body, Camera, Joint, Roles, Scene
+from physion.physics.engine import simulate
+from physion.rendering.camera import View, axes
+from physion.scenes.scene import Body, Camera, Joint, Push, Roles, Scene
 from physion.scenes.shapes.primitives import shape
+from physion.scenes.tdw.commands import quaternion_from_euler, vector
 from physion.trials.dataset import Dataset
+from physion.trials.files import encode_png
 from physion.trials.official.export_folder import export_official
-from physion.trials.official.names import CLOTH_DISTANCE
-from physion.trials.official.write_file import _of_stack
+from physion.trials.official.names import (
+    CLOTH_DISTANCE,
+    decode_depth,
+    decode_picture,
+    encode_depth,
+    encode_flow,
+    encode_normals,
+    from_official_camera,
+    from_official_rotation,
+    redyellow_name,
+    rotation_matrices,
+    segmentation_colors,
+    split_name,
+    swap_angular_velocity,
+    swap_axes,
+    to_official_camera,
+    to_official_euler,
+    to_official_rotation,
+)
+from physion.trials.official.write_file import _of_stack, _push
 from physion.trials.official.write_objects import OfficialObjects
 from physion.trials.trial_file import Trial
 from physion.trials.video import count_frames
@@ -478,3 +506,232 @@ def test_the_verb(
     assert said["made"] == [CLOTH] and Path(said["index"]).is_file()
     with pytest.raises(BadInputError, match="needs a folder"):
         export_verb.main(export_verb.Options(dataset))
+
+
+# The exported push point is the point at which the engine pushes.
+
+
+@pytest.mark.parametrize("shape", ["bowl", "pipe"])
+def test_a_hollow_body_pushed_at_the_exported_point_does_not_spin(shape: str) -> None:
+    """Without a point the impulse acts at the centre of mass: so must the exported point."""
+    body = Body("a", shape, (0.3, -0.2, 5.0), (0.4, 0.5, 0.6), (0.8, 0.6, 0, 0), mass=2.0)
+    zone = Body("zone", "cube", (9.0, 9.0, 0.0), (1, 1, 0.01), kinematic=True)
+    push = Push("a", (3.0, 1.0, 2.0))
+    camera = Camera((0, -3, 1))
+    scene = Scene("t", "collide", (body, zone), Roles("a", "zone"), camera, pushes=(push,))
+    path = simulate(scene, frames=3)
+    exported = _push(OfficialObjects(scene, path))["push_position"]
+    x, y, z = (float(value) for value in swap_axes(exported))
+    again = replace(scene, pushes=(replace(push, point=(x, y, z)),))
+    pushed = simulate(again, frames=3)
+    np.testing.assert_allclose(pushed.velocities, path.velocities, atol=1e-5)
+    # The point is stored in single precision; the centre of the drawn bowl would give far more.
+    assert np.abs(pushed.angular_velocities).max() < 1e-4
+
+
+# Conversion of axes: positions, rotations and cameras agree in both systems.
+
+
+numbers = st.floats(-100, 100, allow_subnormal=False)
+points = arrays(np.float64, 3, elements=numbers)
+quaternions = (
+    arrays(np.float64, 4, elements=st.floats(-1, 1))
+    .filter(lambda q: np.linalg.norm(q) > 0.1)
+    .map(lambda q: q / np.linalg.norm(q))
+)
+
+
+def turn_as_unity(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """What a reader of official files computes: the textbook formula on (x, y, z, w)."""
+    t = 2 * np.cross(q[:3], v)
+    return v + q[3] * t + np.cross(q[:3], t)
+
+
+@given(points)
+def test_points_and_spins_come_back(p: np.ndarray) -> None:
+    assert (swap_axes(swap_axes(p)) == p).all()
+    assert (swap_angular_velocity(swap_angular_velocity(p)) == p).all()
+    x, y, z = p
+    assert tuple(swap_axes(p)) == vector({"x": x, "y": y, "z": z})
+
+
+@given(quaternions)
+def test_rotations_come_back(q: np.ndarray) -> None:
+    assert (from_official_rotation(to_official_rotation(q)) == q).all()
+
+
+@given(quaternions, points)
+def test_turning_and_changing_axes_commute(q: np.ndarray, p: np.ndarray) -> None:
+    turned_then_swapped = swap_axes(rotation_matrices(q) @ p)
+    swapped_then_turned = turn_as_unity(to_official_rotation(q), swap_axes(p))
+    np.testing.assert_allclose(turned_then_swapped, swapped_then_turned, atol=1e-9)
+
+
+@given(points, points)
+def test_a_spinning_point_moves_the_same_way(spin: np.ndarray, arm: np.ndarray) -> None:
+    ours = swap_axes(np.cross(spin, arm))
+    np.testing.assert_allclose(
+        ours, np.cross(swap_angular_velocity(spin), swap_axes(arm)), atol=1e-9
+    )
+
+
+@settings(deadline=None)  # the first example imports the reader of logs
+@given(quaternions)
+def test_euler_angles_are_those_the_importer_of_logs_reads(q: np.ndarray) -> None:
+    x, y, z = to_official_euler(q)
+    back = np.array(quaternion_from_euler({"x": x, "y": y, "z": z}))
+    np.testing.assert_allclose(rotation_matrices(back), rotation_matrices(q), atol=1e-6)
+
+
+@pytest.mark.parametrize("pitch", [90.0, -90.0])
+def test_euler_angles_straight_up_and_down(pitch: float) -> None:
+    q = np.array(quaternion_from_euler({"x": pitch, "y": 30.0, "z": 20.0}))
+    x, y, z = to_official_euler(q)
+    back = np.array(quaternion_from_euler({"x": x, "y": y, "z": z}))
+    np.testing.assert_allclose(rotation_matrices(back), rotation_matrices(q), atol=1e-6)
+
+
+CAMERA = Camera((3.0, -1.0, 1.5), (0.2, 0.1, 0.4), math.radians(55))
+
+
+def test_official_matrices_show_points_where_our_camera_does() -> None:
+    world_to_camera, projection = to_official_camera(CAMERA, 80, 60)
+    p = np.random.default_rng(0).uniform(-1, 1, (20, 3))
+    clip = np.column_stack([swap_axes(p), np.ones(20)]) @ (projection @ world_to_camera).T
+    assert (clip[:, 3] > 0).all()
+    at = clip[:, :2] / clip[:, 3:]
+    seen, depth = View(CAMERA, 80, 60).project(p)
+    np.testing.assert_allclose((at[:, 0] + 1) / 2 * 80, seen[:, 0], atol=1e-9)
+    np.testing.assert_allclose((1 - at[:, 1]) / 2 * 60, seen[:, 1], atol=1e-9)
+    np.testing.assert_allclose(clip[:, 3], depth, atol=1e-9)
+
+
+def test_official_camera_matrix_is_left_handed_as_the_real_ones() -> None:
+    world_to_camera, projection = to_official_camera(CAMERA, 64, 64)
+    assert np.linalg.det(world_to_camera[:3, :3]) == pytest.approx(-1)
+    assert projection[1, 1] == pytest.approx(1.9209821)
+    assert projection[3, 2] == -1
+
+
+@given(points, points)
+def test_cameras_come_back(eye: np.ndarray, aim: np.ndarray) -> None:
+    if np.linalg.norm((eye - aim)[:2]) < 1:
+        return
+    camera = Camera(tuple(eye), tuple(aim))
+    matrices = [m.astype(np.float32).astype(float) for m in to_official_camera(camera, 64, 64)]
+    back, upright = from_official_camera(matrices[0], matrices[1], aim)
+    assert upright
+    np.testing.assert_allclose(back.position, eye, atol=2e-4)
+    np.testing.assert_allclose(back.target, aim, atol=2e-4)
+    assert (back.near, back.far) == (0.1, 100.0)
+    assert back.fov == pytest.approx(camera.fov, abs=1e-6)
+
+
+def test_a_tilted_camera_is_told_from_an_upright_one() -> None:
+    world_to_camera, projection = to_official_camera(CAMERA, 64, 64)
+    turn = np.eye(4)
+    turn[:2, :2] = [[0.8, -0.6], [0.6, 0.8]]
+    _, upright = from_official_camera(turn @ world_to_camera, projection, (0, 0, 0))
+    assert not upright
+
+
+@pytest.mark.parametrize("broken", [0, 1])
+def test_what_is_no_camera_is_refused(broken: int) -> None:
+    matrices = list(to_official_camera(CAMERA, 64, 64))
+    matrices[broken] = np.zeros((4, 4))
+    with pytest.raises(BadInputError):
+        from_official_camera(matrices[0], matrices[1], (0, 0, 0))
+
+
+# Official names, and encodings of pictures.
+
+
+def test_no_two_objects_share_a_channel() -> None:
+    colors = segmentation_colors(255)
+    assert colors.min() > 0
+    for channel in colors.T:
+        assert len(set(channel.tolist())) == 255
+    with pytest.raises(BadInputError, match="256 objects"):
+        segmentation_colors(256)
+
+
+@given(st.floats(0, 99.8))
+def test_depth_by_the_official_formula(metres: float) -> None:
+    packed = encode_depth(np.array([[metres], [1.0]])).astype(float)
+    # Bottom row first.
+    red, green, blue = packed[1, 0]
+    value = (red + green / 256 + blue / 65536) * (100 - 0.1) / 256
+    assert value == pytest.approx(metres, abs=6e-6)
+    assert decode_depth(encode_depth(np.array([[metres]])))[0, 0] == pytest.approx(value)
+
+
+def test_depth_of_nothing_is_far() -> None:
+    far = decode_depth(encode_depth(np.array([[np.inf, np.nan, 500.0]])))
+    np.testing.assert_allclose(far, 99.9, atol=1e-4)
+
+
+def test_pictures_are_lossless_and_jpeg_is_read() -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
+    assert (decode_picture(np.frombuffer(encode_png(picture), np.uint8)) == picture).all()
+    buffer = io.BytesIO()
+    Image.new("RGB", (8, 6), (200, 30, 30)).save(buffer, "jpeg")
+    jpeg = decode_picture(np.frombuffer(buffer.getvalue(), np.uint8))
+    assert jpeg.shape == (6, 8, 3) and abs(int(jpeg[3, 3, 0]) - 200) < 5
+
+
+@pytest.mark.parametrize("data", [b"", b"\x89PNG\r\n\x1a\n", b"GIF89a" + bytes(50)])
+def test_what_is_no_picture_is_refused(data: bytes) -> None:
+    with pytest.raises(BadInputError):
+        decode_picture(np.frombuffer(data, np.uint8))
+
+
+def test_a_huge_picture_is_refused_before_it_takes_memory() -> None:
+    buffer = io.BytesIO()
+    Image.new("1", (5000, 5000)).save(buffer, "png")
+    with pytest.raises(BadInputError, match="too large"):
+        decode_picture(np.frombuffer(buffer.getvalue(), np.uint8))
+
+
+def test_normals_are_relative_to_the_camera() -> None:
+    view = axes(Camera((0.0, -3.0, 0.0), (0.0, 0.0, 0.0)))
+    normals = np.array([[[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]])
+    assert encode_normals(normals, view)[0].tolist() == [
+        [255, 128, 128],
+        [128, 255, 128],
+        [128, 128, 255],
+    ]
+
+
+@given(st.floats(0, 1), st.floats(0, 2))
+def test_flow_is_a_colour_wheel(turn: float, size: float) -> None:
+    width = 50  # So that full brightness is one pixel a frame.
+    flow = np.zeros((1, width, 2))
+    flow[0, 0] = size * np.cos(2 * np.pi * turn), size * np.sin(2 * np.pi * turn)
+    color = encode_flow(flow)[0]
+    expected = np.array(colorsys.hsv_to_rgb(turn % 1.0, 1, min(size, 1))) * 255
+    np.testing.assert_allclose(color[0], expected, atol=1.01)
+    assert not color[1:].any()
+
+
+def test_names() -> None:
+    assert split_name("pilot_a_b_0007") == ("pilot_a_b", "0007")
+    assert split_name("tiny") == ("tiny", "0000")
+    assert redyellow_name("pilot_a_0007") == "pilot_a-redyellow_0007"
+    assert plain_name("pilot_a-redyellow_0007_img.mp4") == "pilot_a_0007"
+
+
+def test_every_published_stimulus_betrays_its_scenario(official: Path) -> None:
+    rows = csv.DictReader((official / "stimuli/stimulus_names_and_labels.csv").open())
+    count = 0
+    for row in rows:
+        assert guess_scenario(row["stim_ID"], "", ()) == row["scenario"]
+        assert redyellow_name(row["stim_ID"]).startswith(split_name(row["stim_ID"])[0])
+        count += 1
+    assert count == 1200
+
+
+def test_controllers_and_folders_tell_what_a_name_does_not() -> None:
+    for scenario, controller in CONTROLLERS.items():
+        assert guess_scenario("a_0001", controller, ()) == scenario
+    assert guess_scenario("a_0001", "", ("hdf5s", "Drape")) == "drape"
+    assert guess_scenario("a_0001", "None", ("dropbox", "controls")) is None
