@@ -119,4 +119,4 @@ def test_an_error_without_a_file_says_its_reason(
 
     monkeypatch.setattr(main_module, "_run_verb", failing)
     assert main_module.main(["ls"]) == 2
-    assert capsys.readouterr().err == "physion: Could not find/load shared object file\n"
+    assert capsys.readouterr().err == ("physion: OSError: Could not find/load shared object file\n")

@@ -351,7 +351,9 @@ def test_other_settings_and_foreign_folders_are_refused(finished: Path, tmp_path
 
 def test_folder_that_cannot_be_written_is_one_clear_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
-    for folder in (tmp_path / "file", tmp_path / "file" / "below", Path("/proc/physion")):
+    with pytest.raises(BadInputError, match="is a file; give a folder to write into"):
+        run(tmp_path / "file", scenes_named("a"))
+    for folder in (tmp_path / "file" / "below", Path("/proc/physion")):
         with pytest.raises(BadInputError, match="cannot write into"):
             run(folder, scenes_named("a"))
 

@@ -1,16 +1,14 @@
-"""Atomic writing of files, and locks on folders."""
+"""Files: atomic writing, locks of folders, digest files, and safe reading."""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import os
 import secrets
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from physion.core.errors import BadInputError, PhysionError
 
@@ -146,9 +144,9 @@ def _is_same_file(path: Path, descriptor: int) -> bool:
 
 # SHA-256 of files: how it is computed, stored in a digest file, and checked.
 #
-# Formats of this package hold their SHA-256 inside: trial files (`trials.schema`), JSON
-# (`physion.core.files`), features and checkpoints. For formats that other programs define (CSV,
-# parquet) it stands in a digest file ``NAME.sha256``, a line that ``sha256sum --check`` reads too.
+# A digest file ``NAME.sha256`` lies beside what people exchange or keep: the index, predictions,
+# weights, official data, shards. Its one line is what ``sha256sum --check`` reads. Trial files hold
+# their SHA-256 in their own header (`physion.trials.trial_file`).
 
 SUFFIX = ".sha256"
 """Ending of a digest file, after the whole name of its file."""
@@ -282,43 +280,3 @@ def read_ids(path: Path) -> frozenset[str]:
     if not ids:
         raise BadInputError(f"{path} has no id; write one a line")
     return ids
-
-
-# JSON files that contain a SHA-256 of their content, so that any change is detected.
-
-MAX_BYTES = 1 << 28
-"""Largest file that is read; the scenes chosen for 2000 trials take less than a thousandth."""
-_SEAL = "sha256"
-
-
-def write_sealed(path: Path, values: Mapping[str, Any]) -> None:
-    """Write ``values`` and their SHA-256 atomically; equal values give equal bytes.
-
-    ``values`` must not have a key ``sha256``.
-    """
-    write_atomic(path, _text(values).encode())
-
-
-def read_sealed(path: Path) -> dict[str, Any]:
-    """Read a file of `write_sealed`; `BadInputError` if it was changed since it was written."""
-    content = read_plain(path, MAX_BYTES, follow_links=True)
-    try:
-        text = content.decode()
-    except UnicodeDecodeError as error:
-        raise BadInputError(f"{path} cannot be read: {error}") from error
-    try:
-        values = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise BadInputError(f"{path} is not JSON: {error}") from error
-    if not isinstance(values, dict) or _SEAL not in values:
-        raise BadInputError(f"{path} is damaged: field 'sha256' is missing")
-    del values[_SEAL]
-    if _text(values) != text:
-        raise BadInputError(f"{path} was changed: its content does not match its field 'sha256'")
-    return values
-
-
-def _text(values: Mapping[str, Any]) -> str:
-    content = json.dumps(values, sort_keys=True, separators=(",", ":"))
-    seal = hashlib.sha256(content.encode()).hexdigest()
-    return json.dumps({**values, _SEAL: seal}, indent=1, sort_keys=True) + "\n"
