@@ -30,11 +30,13 @@ class Options:
         "physopt",
         "physion-evaluator",
         "webdataset",
+        "gltf",
         "card",
         "result-tables",
     ] = "official"
     """official: HDF5 files, movies and PhysionTest-Core folders of the study; physion-particles,
     physopt, physion-evaluator: folders that this published code reads; webdataset: tar shards;
+    gltf: one GLB file for each trial, with its motion, for Blender and other 3D programs;
     card: README with Croissant metadata and a table for each split; result-tables: predictions with
     the names of scenarios that the notebooks of the study use."""
     split: Literal["training", "readout", "testing", "familiarization"] | None = None
@@ -90,6 +92,8 @@ def main(options: Options) -> int:
         return _result_tables(options, options.out)
     if options.layout == "webdataset":
         return _webdataset(options, options.out)
+    if options.layout == "gltf":
+        return _gltf(options, options.out)
     return _official(options, options.out)
 
 
@@ -144,6 +148,21 @@ def _webdataset(options: Options, out: Path) -> int:
     done = f"{report.samples} trials in {counted(len(report.shards), 'shard')}"
     console.print(f"{done}: {report.manifest}", markup=False, soft_wrap=True)
     return 0
+
+
+def _gltf(options: Options, out: Path) -> int:
+    from physion.trials.share.gltf import export_gltf
+
+    with Stages() as stages:
+        made = export_gltf(
+            options.folder,
+            out,
+            split=options.split,
+            scenario=options.scenario,
+            verify=options.verify,
+            progress=stages,
+        )
+    return _print_paths(made, options.json)
 
 
 def _official(options: Options, out: Path) -> int:

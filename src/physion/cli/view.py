@@ -38,7 +38,7 @@ class Options:
     """Models whose predictions are shown next to what is true, as particles in 3D, pictures, boxes
     or slots: names (physion ls models) or FILE.py:Class."""
     option: tuple[str, ...] = ()
-    """Fields of the config of these models as NAME=VALUE, such as samples=4."""
+    """Options of these models as NAME=VALUE, such as samples=8."""
     verify: bool = True
     """Compare files with their SHA-256 in the index before they are used."""
     open: bool = False

@@ -103,7 +103,7 @@ def _summary(inputs: ReportInputs) -> Markup:
         mean = comparison.people.set_index("scenario").loc[MEAN]
         words.append(
             f"People: mean accuracy {mean['accuracy']:.3f} over scenarios, about "
-            f"{mean['people']:.0f} participants a stimulus."
+            f"{mean['people']:.0f} participants per stimulus."
         )
     else:
         words.append("No answers of people were given: this page is about models only.")

@@ -1,4 +1,4 @@
-"""Settings about participants and inputs of models as text, for the page."""
+"""Parts of the page about people: accuracy, agreement, biases, difficulty, sessions left out."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from physion.report.html import (
 )
 from physion.report.inputs import ReportInputs
 
-# Parts of the page about people: accuracy, agreement, biases, difficulty.
+# --- accuracy, agreement, biases, difficulty ----------------------------------------------------
 
 _NO_ZONE = "known only of scenarios of which all stimuli that single participants saw are predicted"
 
@@ -412,7 +412,7 @@ def fooled_by(rows: pd.DataFrame, links: Mapping[str, str]) -> Markup:
     return table(header, counts) + one_by_one
 
 
-# Parts of the page about sessions: which were flagged, and the effect of excluding them.
+# --- sessions: which were flagged, and the effect of leaving them out ---------------------------
 
 
 def sessions(inputs: ReportInputs) -> Markup:

@@ -1,4 +1,4 @@
-"""Sentences on what each model was given of a trial, and on the weights that it started from."""
+"""Parts of the page about models: what they were given, scores, tests, outcomes that differ."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _describe(given: str) -> str:
     return listed([INPUT_WORDS.get(name, name) for name in names])
 
 
-# Tables of scores, baselines below the models: scores, beyond the outcome, by scenario.
+# --- scores, with baselines below the models ----------------------------------------------------
 
 _SAME_EVENT = ("accuracy_simulated", "r_same")
 """Metrics that say something only where a simulated outcome is not the official one."""
@@ -177,7 +177,7 @@ def shown_metrics(comparison: Comparison, beyond: bool) -> list[Metric]:
 def scores_table(
     scores: pd.DataFrame, which: str, metrics: Sequence[Metric], caption: str = ""
 ) -> Markup:
-    """Return a table of scores: a row a model, the metrics, and after r its noise ceiling.
+    """Return a table of scores: one row per model, the metrics, and after r its noise ceiling.
 
     Parameters
     ----------
@@ -275,7 +275,7 @@ def definitions(comparison: Comparison) -> Markup:
     return joined([heading("What the numbers mean"), definition_list(meaning)])
 
 
-# Parts of the page with tests: models against each other, mixed models, calibration.
+# --- tests: models against each other, mixed models, calibration --------------------------------
 
 
 def tests(inputs: ReportInputs) -> Markup:
@@ -425,7 +425,7 @@ def _together(model: MixedTable) -> str:
 
 
 def calibration(inputs: ReportInputs) -> Markup:
-    """Brier score and its parts, a row a model."""
+    """Return the Brier score and its parts, one row per model."""
     rows = inputs.calibration
     if rows is None:
         return Markup()

@@ -149,7 +149,7 @@ def who_was_right(comparison: Comparison) -> pd.DataFrame:
     return sums.reset_index()
 
 
-# Cards of a page: a stimulus with its movie, its outcome, and the answers of people and models.
+# --- cards: a stimulus with its movie, its outcome, and all answers -----------------------------
 
 MOST_ANSWERS = 10
 """Largest number of models that a card shows at once; more of them open on a click."""
@@ -269,7 +269,7 @@ def probability(p: float) -> str:
     return "> 0.5" if p > 0.5 else "< 0.5"
 
 
-# Parts of the page that show trials: one of each scenario, and the largest disagreements.
+# --- sections: one trial of each scenario, and the largest disagreements ------------------------
 
 INDEX = "trials/index.html"
 """Address of the list of trial pages, relative to the report."""
@@ -369,7 +369,7 @@ def _grid(cards: list[Markup]) -> Markup:
     return Markup(_MACROS.cards(cards))
 
 
-# A page for each stimulus, and the list of them; written on demand next to the report.
+# --- a page for each stimulus, and their list, on demand ----------------------------------------
 
 FOLDER = "trials"
 """Name of the folder that holds one page for each stimulus; it lies next to ``report.html``."""

@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 import trimesh
 
+from physion.cli.main import main
 from physion.core.errors import BadInputError
 from physion.numerics.rotations import rotate_vectors
 from physion.physics.trajectory import Trajectory
 from physion.scenes.scene import GRAVITY, BodyEvent, Scene
 from physion.scenes.shapes.primitives import shape
-from physion.trials.share.gltf import motion_gltf, trial_gltf
+from physion.trials.dataset import Dataset
+from physion.trials.share.gltf import export_gltf, motion_gltf, trial_gltf
 from physion.trials.trial_file import Trial
 from support.viewer_dataset import FRAMES, PLANS, make_dataset, make_scene, make_trajectory
 
@@ -208,6 +210,20 @@ def test_a_trial_of_a_dataset_is_written_with_its_outcome(tmp_path: Any) -> None
         "baseColorFactor"
     ]
     assert red > 4 * max(green, blue) and alpha == 1, "the agent is red in the movie"
+
+
+def test_export_writes_one_file_for_each_trial(
+    tmp_path: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = make_dataset(tmp_path / "set", (BALL, SHEET))
+    command = ["export", str(folder), str(tmp_path / "out"), "--layout", "gltf"]
+    assert main([*command, "--scenario", "drape"]) == 0
+    (path,) = (tmp_path / "out").rglob("*.glb")
+    assert path == tmp_path / "out" / "testing" / "drape" / "drape_0.glb"
+    assert capsys.readouterr().out.split() == [str(path)]
+    assert path.read_bytes() == trial_gltf(Dataset(folder).trial("drape_0"))
+    with pytest.raises(BadInputError, match="no trial of split readout"):
+        export_gltf(folder, tmp_path / "none", split="readout")
 
 
 def test_a_cloth_without_all_vertices_is_refused() -> None:

@@ -1,1 +1,1 @@
-"""Figures of a report: one module each, in the folder of its section; see `registry`."""
+"""Figures of a report: one module for each section of the page; see `theme`."""

@@ -1,6 +1,7 @@
-"""Drawing of one measure by panel and model, with intervals, people and their zone.
+"""Figures by scenario: accuracy, r, kappa, error of imagined motion, a model against people.
 
-Shared by accuracy, correlation, kappa, the thirds of stimuli and the published results.
+`measure_figure` draws one measure by panel and model, with intervals, people and their zone; the
+thirds of stimuli and the published results use it too.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def measure_figure(table: pd.DataFrame, measure: str, theme: Theme = LIGHT) -> F
     """Draw one measure by scenario and model, with intervals, people as a line, their zone as a
     band.
 
-    ``table``: see `figure_tables.MEASURE_COLUMNS`. One panel a scenario and one for the mean; the
+    ``table``: see `figure_tables.MEASURE_COLUMNS`. One panel per scenario and one for the mean; the
     dotted line is chance. Baselines stand below the models, lighter and hollow.
     """
     names = list(table["panel"].unique())
@@ -172,7 +173,7 @@ def _measure_handles(
     return [*handles, Line2D([], [], color=theme.faint, linestyle=":", label="chance")]
 
 
-# Accuracy by scenario and model.
+# --- accuracy -----------------------------------------------------------------------------------
 
 
 @register_figure("accuracy", section=BY_SCENARIO, heading="Accuracy", order=10)
@@ -194,7 +195,7 @@ def draw(table: pd.DataFrame, theme: Theme) -> Figure:
     return measure_figure(table, "accuracy", theme)
 
 
-# Correlation of models with the average person, by scenario.
+# --- correlation with the average person --------------------------------------------------------
 
 
 @register_figure("r", section=BY_SCENARIO, heading="Correlation with the average person", order=20)
@@ -222,7 +223,7 @@ def draw_correlation(table: pd.DataFrame, theme: Theme) -> Figure:
     return measure_figure(table, "r", theme)
 
 
-# Agreement of models with single participants, by scenario.
+# --- agreement with single participants ---------------------------------------------------------
 
 
 @register_figure(
@@ -246,7 +247,7 @@ def draw_kappa(table: pd.DataFrame, theme: Theme) -> Figure:
     return measure_figure(table, "kappa", theme)
 
 
-# Error of imagined motion over time.
+# --- error of imagined motion over time ---------------------------------------------------------
 
 _DASHES = ("-", (0, (6, 1.5)), "-.", (0, (1, 1)))
 """Lines of models, so that they differ without colour."""
@@ -268,7 +269,7 @@ def rollout_error(inputs: ReportInputs) -> Plot | None:
 
 
 def draw_rollout_error(table: pd.DataFrame, theme: Theme) -> Figure:
-    """Draw curves with bands, one panel a scenario; ``table``: see `rollout_errors.COLUMNS`."""
+    """Draw curves with bands, one panel per scenario; ``table``: see `rollout_errors.COLUMNS`."""
     names = list(table["panel"].unique())
     models = list(table.loc[table["kind"] == "model", "model"].unique())
     lines: dict[str, dict[str, Any]] = {
@@ -299,14 +300,14 @@ def draw_rollout_error(table: pd.DataFrame, theme: Theme) -> Figure:
     return figure
 
 
-# Accuracy of one model against that of people, a point a scenario.
+# --- accuracy of one model against people, one point per scenario -------------------------------
 
 NEAR = (0.04, 0.015)
 """Differences of accuracy below which a name to the right of a point meets the next point."""
 
 
 def model_and_people_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
-    """Draw the accuracy of people against that of a model by scenario, with the diagonal.
+    """Draw the accuracy of people against the accuracy of a model by scenario, with the diagonal.
 
     ``table``: ``model``, ``scenario`` (with the mean, which is hollow), ``accuracy``, ``people``.
     """

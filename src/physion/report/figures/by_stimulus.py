@@ -1,4 +1,4 @@
-"""P(contact) of models against the fraction of people who say yes."""
+"""Figures by stimulus: models against people, thirds, calibration, difficulty, response times."""
 
 from __future__ import annotations
 
@@ -58,9 +58,9 @@ def scatter(inputs: ReportInputs) -> Plot | None:
 def scatter_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
     """Draw P(contact) of each model against the fraction of people who say yes, by stimulus.
 
-    ``table``: see `figure_tables.scatter_table`. A panel a model, in it a square a scenario, so
-    that no colour is needed; hollow points are stimuli whose simulated outcome is not the official
-    one.
+    ``table``: see `figure_tables.scatter_table`. One panel per model, in it one square per
+    scenario, so that no colour is needed; hollow points are stimuli whose simulated outcome is not
+    the official one.
     """
     models = list(table["model"].unique())
     scenarios = in_order(table["scenario"])
@@ -129,7 +129,7 @@ def _scatter_handles(theme: Theme) -> list[Line2D]:
     ]
 
 
-# Correlation with people within hard, chance and easy stimuli.
+# --- correlation within hard, chance and easy stimuli -------------------------------------------
 
 
 @register_figure("thirds", section=BY_STIMULUS, heading="Hard, chance and easy stimuli", order=70)
@@ -159,7 +159,7 @@ def draw(table: pd.DataFrame, theme: Theme) -> Figure:
     return measure_figure(table, "r", theme)
 
 
-# Calibration of P(contact).
+# --- calibration of P(contact) ------------------------------------------------------------------
 
 
 @register_figure("calibration", section=BY_STIMULUS, heading="Calibration of P(contact)", order=80)
@@ -177,7 +177,7 @@ def calibration(inputs: ReportInputs) -> Plot:
 
 
 def calibration_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
-    """Draw reliability curves: the fraction of contact by predicted P(contact); one panel a model.
+    """Draw reliability curves: the fraction of contact by P(contact), one panel per model.
 
     ``table``: see `figure_tables.calibration_table`. The area of a point is proportional to its
     stimuli.
@@ -210,7 +210,7 @@ def calibration_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
     return figure
 
 
-# Accuracy of people by stimulus, with the stimuli that mislead them.
+# --- accuracy of people, with the stimuli that mislead them -------------------------------------
 
 BINS = np.linspace(0, 1, 21)
 """Edges of the bars in the distribution of accuracy."""
@@ -298,7 +298,7 @@ def _tail_hatch(index: int) -> str:
     return {0: "", 4: HATCHES[1], 5: HATCHES[3]}[index]
 
 
-# Response times of people against their accuracy, by stimulus.
+# --- response times of people against their accuracy --------------------------------------------
 
 RESPONSE_TIME_CAPTION = (
     "Mean over people of the natural logarithm of their response times to a stimulus, against the "

@@ -1,4 +1,4 @@
-"""Appearance of figures: colours on light and dark pages, marks that need no colour, and the bytes.
+"""Appearance and registry of figures: colours, marks that need no colour, and the bytes.
 
 Colours are those of Okabe and Ito; every difference of colour is also one of hatch or marker. The
 bytes depend on the tables and on the version of matplotlib, not on the time or the process.
@@ -161,11 +161,11 @@ def style(theme: Theme) -> Any:
     }
 
 
-# Registry of the figures of a report, so that a new figure is one new file below this folder.
+# --- registry of figures ------------------------------------------------------------------------
 #
-# A figure is a function from `ReportInputs` to a `Plot`, decorated with `register_figure`. All
-# modules of this folder and its sub-folders are imported, and those that other packages name under
-# the entry points ``physion.figures``. ``docs/how-to/add-a-figure.md`` shows how to add one.
+# A figure is a function from `ReportInputs` to a `Plot`, decorated with `register_figure`. The
+# modules of this folder are imported, and those that other packages name under the entry points
+# ``physion.figures``. ``docs/how-to/add-a-figure.md`` shows how to add one.
 
 BY_SCENARIO = "By scenario"
 TRAINING = "Readout and training"

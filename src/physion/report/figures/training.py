@@ -1,6 +1,6 @@
-"""Drawing of a measure by model and condition, such as readout or training.
+"""Figures of readout and training: effects on accuracy, and generalisation between scenarios.
 
-Shared by the effects of readout and training and the published results.
+`grouped_figure` draws a measure by model and condition; the published results use it too.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def _group_handles(groups: Sequence[str], people: float, theme: Theme) -> list[L
     return handles
 
 
-# Effects of readout and training on accuracy.
+# --- effects on accuracy ------------------------------------------------------------------------
 
 
 @register_figure("effects", section=TRAINING, order=40)
@@ -119,7 +119,7 @@ def draw(table: pd.DataFrame, theme: Theme) -> Figure:
     return grouped_figure(table, "accuracy", 0.5, theme)
 
 
-# Accuracy by the scenario of training and the tested one.
+# --- accuracy by the scenario of training and the tested one ------------------------------------
 
 
 @register_figure("generalization", section=TRAINING, order=50)
@@ -139,7 +139,7 @@ def generalization(inputs: ReportInputs) -> Plot | None:
 
 
 def generalization_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
-    """Draw accuracy less that of people, trained on (rows) x tested on (columns); one panel a
+    """Draw accuracy less that of people, trained on (rows) x tested on (columns); one panel per
     model.
 
     ``table``: see `figure_tables.GENERALIZATION_COLUMNS`. Each cell contains its number, so that

@@ -1,4 +1,4 @@
-"""What a model saw and imagined of a trial, as the caller of the viewer gives it."""
+"""What a model saw and imagined of a trial, packed for the viewer: particles, pictures, slots."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def caption(imagined: ImaginedTrial, *, observed: bool = False) -> str:
     return f"{text}: {'; '.join(facts)}." if facts else f"{text}."
 
 
-# Imagined particles for the viewer: positions next to the true motion, in few bytes.
+# --- particles: positions next to the true motion, in few bytes ---------------------------------
 
 PARTICLES = 1500
 """Largest number of particles of a trial in the page."""
@@ -131,7 +131,7 @@ def _groups(things: NDArray[np.integer], scene: Scene) -> list[dict[str, Any]]:
     ]
 
 
-# Pictures that a model saw and imagined, for the viewer, with the true ones, in few bytes.
+# --- pictures that a model saw and imagined, with the true ones, in few bytes -------------------
 #
 # Pictures of one kind lie in a sheet, one WebP image. Rows are frames: first those that the model
 # saw, then those that it imagined.
@@ -379,7 +379,7 @@ def _scaled(picture: NDArray[np.uint8], height: int, width: int) -> NDArray[np.u
     return np.asarray(image)
 
 
-# What models imagined of a trial, as the record that the page's script shows.
+# --- the record of a trial ----------------------------------------------------------------------
 
 
 def pack_imagined(

@@ -1,4 +1,4 @@
-"""Image passes as pictures: depth, normals, ids and flow in colours."""
+"""Movies of the viewer: image passes in colours, small movies for the grid, all passes at once."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ NOWHERE: tuple[int, int, int] = (128, 128, 128)
 class Ranges:
     """Ends of the colour scales, the same for all frames of one trial.
 
-    ``near``, ``far``: metres, ``far`` above ``near``. ``flow``: pixels a frame, above zero.
+    ``near``, ``far``: metres, ``far`` above ``near``. ``flow``: pixels per frame, above zero.
     """
 
     near: float
@@ -144,7 +144,7 @@ def _bytes(values: NDArray[np.floating]) -> Picture:
     return np.asarray(np.rint(np.clip(np.nan_to_num(values), 0.0, 1.0) * 255), np.uint8)
 
 
-# Movies of the viewer: small ones for the grid, and one with all passes side by side.
+# --- movies -------------------------------------------------------------------------------------
 
 CRF = 25
 """Quality setting of x264 for small movies."""

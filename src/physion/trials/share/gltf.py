@@ -24,18 +24,22 @@ import math
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError
+from physion.core.files import write_atomic
 from physion.core.version import MADE_WITH
 from physion.physics.trajectory import Trajectory
 from physion.rendering.triangles import solid
 from physion.scenes.scene import FRAME_TIME, GRAVITY, Camera, Look, Scene
 from physion.scenes.shapes.primitives import shape
+from physion.trials.dataset import Dataset
 from physion.trials.trial_file import Trial
 
 CLOTH_KEYS = 60
@@ -68,6 +72,34 @@ def trial_gltf(trial: Trial, *, look: str | None = None) -> bytes:
         aspect=meta.width / meta.height,
         facts=facts,
     )
+
+
+def export_gltf(
+    folder: Path,
+    out: Path,
+    *,
+    split: str | None = None,
+    scenario: str | None = None,
+    verify: bool = True,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Write trials of a dataset as ``SPLIT/SCENARIO/TRIAL.glb`` below ``out``, and return them.
+
+    ``split``, ``scenario``: only these. ``verify``: whether trial files are compared with the
+    index. Raises `BadInputError` if no trial is chosen or one is damaged.
+    """
+    dataset = Dataset(folder, verify=verify)
+    trials = dataset.trials(split, scenario)
+    if not trials:
+        raise BadInputError(f"{folder} has no trial of split {split} and scenario {scenario}")
+    made = []
+    for name in tracked(trials, "glTF files", len(trials), progress):
+        trial = dataset.trial(name)
+        place = out / trial.metadata.split / trial.metadata.scenario
+        place.mkdir(parents=True, exist_ok=True)
+        write_atomic(place / f"{name}.glb", trial_gltf(trial))
+        made.append(place / f"{name}.glb")
+    return made
 
 
 def motion_gltf(
