@@ -67,7 +67,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "experiment serve": ("physion experiment serve study --port 8080",),
     "experiment links": ("physion experiment links study --source prolific",),
     "experiment simulate": ("physion experiment simulate study --participants 50",),
-    "experiment export": ("physion experiment export study --layout psych-ds",),
+    "experiment export": ("physion experiment export study --no-simulated",),
     "experiment password": ("physion experiment password study",),
     "experiment accounts": ("physion experiment accounts study --add grace --role analyst",),
     "experiment backup": ("physion experiment backup study --out backups",),

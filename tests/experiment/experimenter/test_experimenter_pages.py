@@ -28,8 +28,8 @@ from physion.experiment.experimenter import progress
 from physion.experiment.experimenter.pages import minutes, visible
 from physion.experiment.experimenter.payments import COLUMNS, bonus_of
 from physion.experiment.experimenter.progress import expected_end, session_state
-from physion.experiment.export.answer_tables import read_tables
 from physion.experiment.export.export_study import export_study
+from physion.experiment.export.tables import read_tables
 from physion.experiment.protocol import Enter
 from physion.experiment.store.database import ANSWERS, EVENTS, PAUSES, RAW_IDS, SESSIONS
 from physion.experiment.study.study import Bonus

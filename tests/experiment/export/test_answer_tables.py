@@ -13,16 +13,17 @@ from pandas.testing import assert_frame_equal
 from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS, check_table
 from physion.core.errors import PhysionError, UnknownNameError
 from physion.experiment.experimenter.progress import Progress
-from physion.experiment.export import trial_rows
-from physion.experiment.export.answer_tables import read_tables, snapshot
-from physion.experiment.export.session_rows import (
+from physion.experiment.export import tables as trial_rows
+from physion.experiment.export.tables import (
     GONE_SCENARIO,
     PREVIEW,
     WITHDRAWN,
     SessionSelection,
     read_sessions,
+    read_tables,
+    read_trials,
+    snapshot,
 )
-from physion.experiment.export.trial_rows import read_trials
 from physion.experiment.store.database import ANSWERS, SESSIONS, create_database
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Study

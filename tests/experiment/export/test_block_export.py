@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import json
 from pathlib import Path
 
 import pandas as pd
@@ -79,17 +77,6 @@ def test_completeness_and_flags_are_judged_by_the_trials_of_each_session(
     assert not shown.problem
     found = [name for name, rules in shown.by_session.items() if "incomplete" in rules]
     assert found == unfinished
-
-
-def test_a_bids_file_has_all_blocks_of_a_session(exported: tuple[Path, Store]) -> None:
-    out, _ = exported
-    files = sorted((out / "bids").glob("sub-*/beh/*_task-allscenarios_beh.tsv"))
-    assert len(files) == 5
-    with files[0].open(newline="") as file:
-        lines = list(csv.DictReader(file, delimiter="\t"))
-    assert {line["scenario"] for line in lines} <= {"collide", "drop"}
-    described = json.loads((out / "bids" / "task-allscenarios_beh.json").read_text())
-    assert {"scenario", "block"} <= set(described)
 
 
 def test_the_progress_counts_sessions_of_several_blocks(exported: tuple[Path, Store]) -> None:

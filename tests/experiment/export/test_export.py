@@ -19,11 +19,9 @@ from physion.cli.help import EXAMPLES
 from physion.cli.main import main
 from physion.core.errors import BadInputError, PhysionError
 from physion.experiment.export import export_study as export
-from physion.experiment.export import write_tables as export_tables
-from physion.experiment.export.answer_tables import read_tables
-from physion.experiment.export.export_study import GONE, NO_FILE, export_study
-from physion.experiment.export.spreadsheet import restore_cell
-from physion.experiment.export.write_tables import TABLES
+from physion.experiment.export.descriptions import restore_cell
+from physion.experiment.export.export_study import GONE, TABLES, export_study
+from physion.experiment.export.tables import read_tables
 from physion.experiment.store.database import (
     ANSWERS,
     RAW_IDS,
@@ -197,7 +195,6 @@ def test_what_was_left_out_is_said(small: sa.Engine, study: Study, tmp_path: Pat
     report = export_study(small, study, tmp_path / "out")
     counts = {(e["what"], e["kind"], e["reason"]): e["count"] for e in report.left_out}
     assert counts["answer", "any", GONE] == 2
-    assert counts["session", "any", NO_FILE] >= 1
     with small.connect() as connection:
         rows = connection.execute(sa.select(SESSIONS)).fetchall()
     agreed = [r for r in rows if r.kind == "person" and r.consented_at is not None]
@@ -247,15 +244,12 @@ def test_nothing_secret_is_exported(small: sa.Engine, study: Study, tmp_path: Pa
 
 
 def test_people_alone_and_one_scenario(small: sa.Engine, study: Study, tmp_path: Path) -> None:
-    report = export_study(
-        small, study, tmp_path / "out", simulated=False, scenario="drop", layout="psych-ds"
-    )
+    report = export_study(small, study, tmp_path / "out", simulated=False, scenario="drop")
     assert set(report.sessions) == {"person"}
     trials = pd.read_csv(tmp_path / "out" / "trials.csv")
     assert set(trials["scenario"]) == {"drop"} and not trials["simulated"].any()
     reasons = {entry["reason"] for entry in report.left_out}
     assert "simulated, which was not requested" in reasons
-    assert not (tmp_path / "out" / "bids").exists() and (tmp_path / "out" / "psych-ds").is_dir()
 
 
 def test_a_study_without_data_is_exported_all_the_same(study: Study, tmp_path: Path) -> None:
@@ -288,9 +282,9 @@ def test_a_failure_leaves_nothing_and_the_old_export(
     assert not list(tmp_path.glob("*out*"))
     export_study(small, study, out)
     before = contents(out)
-    for module, name in ((export, "write_manifest"), (export_tables, "read_trials")):
+    for name in ("write_manifest", "read_trials"):
         with monkeypatch.context() as broken:
-            broken.setattr(module, name, fails)
+            broken.setattr(export, name, fails)
             with pytest.raises(OSError, match="No space"):
                 export_study(small, study, out)
         assert contents(out) == before
@@ -303,7 +297,7 @@ def test_a_failure_while_writing_behind_is_not_lost(
     def fails(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(export.BidsWriter, "write", fails)
+    monkeypatch.setattr(export, "detail_table", fails)
     with pytest.raises(OSError, match="No space"):
         export_study(small, study, tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -316,10 +310,10 @@ def test_an_export_is_replaced_and_nothing_else(
     export_study(small, study, out, simulated=False)
     export_study(small, study, out)
     both = contents(out)
-    (out / "bids" / "notes.txt").write_text("mine")
+    (out / "psych-ds" / "notes.txt").write_text("mine")
     with pytest.raises(BadInputError, match="files were added"):
         export_study(small, study, out)
-    (out / "bids" / "notes.txt").unlink()
+    (out / "psych-ds" / "notes.txt").unlink()
     export_study(small, study, out)
     assert contents(out) == both
     (out / "export.json").write_text("{}")
@@ -346,7 +340,7 @@ def test_what_a_killed_export_left_is_cleared_away(
     export_study(small, study, out)
     whole = contents(out)
     out.rename(tmp_path / ".out.old")  # killed between the two renamings
-    (tmp_path / ".out.part" / "bids").mkdir(parents=True)
+    (tmp_path / ".out.part" / "psych-ds").mkdir(parents=True)
     (tmp_path / ".out.part" / "trials.csv").write_text("half a")
     export_study(small, study, out)
     assert contents(out) == whole

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from physion.analysis.people.responses import Column
 from physion.analysis.tables import read_csv
-from physion.experiment.export.spreadsheet import guard_cell, restore_cell
-from physion.experiment.export.table_writer import TableWriter
+from physion.experiment.export.descriptions import guard_cell, restore_cell
+from physion.experiment.export.export_study import TableWriter
 from physion.experiment.study.stimuli import LOOKS, NAME
 
 FORMULA = tuple("=+-@＝＋－＠")

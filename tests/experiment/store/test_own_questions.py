@@ -12,8 +12,8 @@ import pytest
 from sqlalchemy import inspect
 
 from physion.core.errors import BadInputError
+from physion.experiment.export.descriptions import restore_cell
 from physion.experiment.export.export_study import export_study
-from physion.experiment.export.spreadsheet import restore_cell
 from physion.experiment.protocol import PageDone
 from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.lab import forget_sessions
@@ -82,11 +82,6 @@ def test_answers_are_exported_with_their_words(asking_store: Store, tmp_path: Pa
     assert [column["name"] for column in described] == list(table.columns)
     (scale,) = (column for column in described if column["name"] == "confidence")
     assert scale["about"] == "How sure were you? (1: Not at all, 5: Very)" and scale["high"] == 5
-    bids = pd.read_csv(out / "bids" / "phenotype" / "questions.tsv", sep="\t")
-    assert list(bids.columns) == ["participant_id", "session_id", *columns]
-    assert set(bids["session_id"]) == {"ses-collide", "ses-drop"}
-    told = json.loads((out / "bids" / "phenotype" / "questions.json").read_text())
-    assert set(told) == {"MeasurementToolMetadata", *bids.columns}
     psych = json.loads((out / "psych-ds" / "dataset_description.json").read_text())
     assert set(columns) <= {each["name"] for each in psych["variableMeasured"]}
     assert len(list((out / "psych-ds" / "data").glob("*questions_data.csv"))) == 1

@@ -18,7 +18,6 @@ from physion.experiment.study.settings import (
     Bonus,
     Comprehension,
     EarlyEnd,
-    Limits,
     Plausibility,
     Practice,
     Recruitment,
@@ -112,9 +111,6 @@ STUDIES = st.builds(
     device_refused=EARLY_ENDS,
     full=EARLY_ENDS,
     bonus=st.builds(Bonus, st.floats(0, 10_000), st.floats(0, 1), st.floats(0, 1_000_000)),
-    limits=st.builds(
-        Limits, st.floats(0.1, 10_000), st.integers(1, 100_000), st.floats(0.1, 100_000)
-    ),
 )  # fmt: skip
 
 
@@ -179,7 +175,6 @@ REFUSED: dict[str, tuple[str, Any, str]] = {
     "slow motion": ("plausibility.simulated_speed", 0.5, "greater than or equal to 1"),
     "no code for MTurk": ("recruitment.mturk_code", "", "session"),
     "a tiny window": ("screen.min_width", 10, "greater than or equal to 320"),
-    "no requests": ("limits.requests_per_second", 0, "greater than or equal to 0.1"),
 }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Export the data of a study: CSV and parquet for the analysis, Psych-DS and BIDS.
+"""Export the data of a study: CSV and parquet for the analysis, Psych-DS.
 
 The server may be running; the export is a consistent snapshot.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import json as json_module
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
@@ -25,8 +25,6 @@ class Options:
     """Export only this scenario."""
     simulated: bool = True
     """Include simulated participants, marked as such."""
-    layout: Literal["both", "psych-ds", "bids"] = "both"
-    """Conventions to write besides the tables."""
     json: bool = False
     """Print the counts as one JSON object."""
 
@@ -50,7 +48,6 @@ def main(options: Options) -> int:
             options.out or options.study / "export",
             simulated=options.simulated,
             scenario=options.scenario,
-            layout=options.layout,
         )
     finally:
         engine.dispose()

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from sqlalchemy import Engine, func, select
 
 from physion.experiment.experimenter.progress import SessionLine
-from physion.experiment.export.spreadsheet import guard_cell
+from physion.experiment.export.descriptions import guard_cell
 from physion.experiment.store.database import RAW_IDS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import completion

@@ -318,8 +318,7 @@ def _find_flags(study: Study, engine: Engine) -> Mapping[str, Flags]:
     """Compute which sessions the study's exclusion rules flag, separately for each kind."""
     from physion.analysis.people.exclusions import RULE_SETS, RULES, flag_sessions
     from physion.analysis.people.responses import clean
-    from physion.experiment.export.answer_tables import read_tables
-    from physion.experiment.export.expected import expected_names
+    from physion.experiment.export.tables import expected_names, read_tables
 
     trials, sessions = read_tables(engine, study)
     with engine.connect() as connection:

@@ -1,1 +1,1 @@
-"""Export of the collected data: tables for the analysis, and the layouts Psych-DS and BIDS."""
+"""Export of the collected data: tables for the analysis, also as a Psych-DS dataset."""

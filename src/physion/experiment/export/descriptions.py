@@ -1,34 +1,155 @@
-"""The README files of an export, and the columns of its table of stimuli."""
+"""Descriptions of an export: README files, the Psych-DS dataset, and the rule for spreadsheets.
+
+Psych-DS (psych-ds.github.io): ``dataset_description.json`` is a schema.org ``Dataset`` whose
+``variableMeasured`` describes every column of every file; data files are called
+``keyword-value[_keyword-value...]_data.csv``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+import re
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from textwrap import fill
 from typing import Any, Literal
 
 from physion.analysis.people.responses import Column
-from physion.experiment.export.conventions.bids import TEXT_RULE
-from physion.experiment.export.spreadsheet import RULE
-from physion.experiment.study.stimuli import LOOKS, STIMULUS_PHASES
 from physion.experiment.study.study import Study
 
-STIMULI_COLUMNS: tuple[Column, ...] = (
-    Column("stimulus", "text", "Name, as in the trials"),
-    Column("scenario", "text", "Scenario, as in the trials"),
-    Column(
-        "phase",
-        "choice",
-        "Phase in which it is shown; attention: a check among the test trials",
-        choices=STIMULUS_PHASES,
-    ),
-    Column("place", "integer", "Position in familiarization, from 0; no order in the test", low=0),
-    Column("label", "flag", "Whether the agent touches the patient"),
-    Column("frames", "integer", "Number of frames of the observed movie", low=1),
-    Column("rate", "number", "Frames per second", unit="Hz", low=0),
-    Column("width", "integer", "Width of the movie", unit="px", low=1),
-    Column("height", "integer", "Height of the movie", unit="px", low=1),
-    Column("look", "choice", "Colours of the stimulus", choices=LOOKS),
+# --- labels of files and columns ---
+
+KIND_NAMES = {
+    "text": "text",
+    "integer": "whole number",
+    "number": "number",
+    "flag": "true or false",
+    "choice": "one of the given words",
+    "time": "moment in ISO 8601, UTC",
+}
+
+
+def file_label(name: str) -> str:
+    """Return the ASCII letters and digits of a name, or ``x`` if it has none."""
+    return re.sub(r"[^A-Za-z0-9]", "", name) or "x"
+
+
+def column_levels(column: Column) -> tuple[str, ...]:
+    """Return the allowed values of a flag or choice column; empty for other columns."""
+    return ("true", "false") if column.kind == "flag" else column.choices
+
+
+# --- Psych-DS ---
+
+VERSION = "Psych-DS 0.4.0"
+
+
+def write_psych_ds(
+    folder: Path,
+    tables: Mapping[str, tuple[Path, Sequence[Column]]],
+    *,
+    name: str,
+    description: str,
+    readme: str,
+    covers: tuple[str, str] | None,
+) -> list[Path]:
+    """Write a dataset into a new folder; return the paths of its data files.
+
+    Parameters
+    ----------
+    folder
+        Folder to create.
+    tables
+        CSV file (which is copied) and columns of each table, by table name.
+    name, description
+        Name and title of the study.
+    readme
+        Text of README.md.
+    covers
+        First and last time in the data (ISO 8601), if known.
+    """
+    data = folder / "data"
+    data.mkdir(parents=True)
+    paths = []
+    for table, (source, _) in tables.items():
+        paths.append(data / f"study-{file_label(name)}_description-{file_label(table)}_data.csv")
+        shutil.copyfile(source, paths[-1])
+    columns: dict[str, Column] = {}
+    for _, listed in tables.values():
+        for column in listed:
+            columns.setdefault(column.name, column)  # the first table has the full description
+    metadata: dict[str, Any] = {
+        "@context": "https://schema.org/",
+        "@type": "Dataset",
+        "name": name,
+        "description": description,
+        "schemaVersion": VERSION,
+        "keywords": ["intuitive physics", "human behavior", "response time"],
+        "variableMeasured": [variable(column) for column in columns.values()],
+    }
+    if covers is not None:
+        metadata["temporalCoverage"] = "/".join(covers)
+    text = json.dumps(metadata, indent=2, ensure_ascii=False)
+    (folder / "dataset_description.json").write_text(text + "\n", encoding="utf-8")
+    (folder / "README.md").write_text(readme, encoding="utf-8")
+    return paths
+
+
+def variable(column: Column) -> dict[str, Any]:
+    """Return the description of a column as a schema.org ``PropertyValue``."""
+    about = f"{column.about} ({KIND_NAMES[column.kind]})"
+    value: dict[str, Any] = {
+        "@type": "PropertyValue",
+        "name": column.name,
+        "description": about,
+    }
+    if column.unit:
+        value["unitText"] = column.unit
+    if column.low is not None:
+        value["minValue"] = column.low
+    if column.high is not None:
+        value["maxValue"] = column.high
+    if column_levels(column):
+        value["valueReference"] = list(column_levels(column))
+    return value
+
+
+# --- protection of free text against formulas in spreadsheets, and its reversal ---
+#
+# Quoting in CSV does not protect: a spreadsheet removes the quotes and then checks the first
+# character. If semicolons or tabs separate cells (as in many European locales), quotes in the
+# middle of a line have no effect, so a character after a semicolon, tab or line end can start a
+# cell too.
+
+GUARD = "'"
+RULE = (
+    "In CSV and TSV files, an apostrophe is inserted in text that a spreadsheet could interpret as "
+    "a formula: before =, +, -, @ and ' (also in their full-width forms) at the beginning of a "
+    "cell and after each semicolon, tab or line end in it (spaces, quotes and control characters "
+    "in between are skipped), and before a tab or line end at the beginning of a cell. Remove "
+    "this one apostrophe in the same positions to restore the text. Parquet files contain the "
+    "original text."
 )
+"""Description of the protection, for the data dictionary."""
+
+# Both directions find the same positions: the guard neither separates cells nor is it skipped.
+_BEGIN = r"(?:\A|[;\t\r\n])"
+_SKIPPED = '[ "\x00-\x08\x0b\x0c\x0e-\x1f\x7f\x85\xa0\u2028\u2029\u3000\ufeff]*'
+_FORMULA = "['=+\\-@\uff1d\uff0b\uff0d\uff20\uff07]"
+_UNGUARDED = re.compile(rf"{_BEGIN}{_SKIPPED}(?={_FORMULA})|\A(?=[\t\r\n])")
+_GUARDED = re.compile(rf"({_BEGIN}{_SKIPPED}){GUARD}")
+
+
+def guard_cell(text: str) -> str:
+    """Return ``text`` as a cell that spreadsheets display as text; see `RULE`."""
+    return _UNGUARDED.sub(rf"\g<0>{GUARD}", text)
+
+
+def restore_cell(cell: str) -> str:
+    """Return the original text of a cell made by `guard_cell`."""
+    return _GUARDED.sub(r"\1", cell)
+
 
 _TASK = """\
 Participants saw the first part of a movie, in whose first frame the agent was marked in red and the
@@ -67,7 +188,7 @@ _FILES = """\
 - `stimuli.csv`: the stimuli and their outcomes. `expected.csv`: the test stimuli by scenario.
 - `data_dictionary.json`: description of every column of every table.
 - `study.json`: settings and texts of each version of the study under which sessions ran.
-- `psych-ds/`, `bids/`: trials and sessions in these two conventions, if requested.
+- `psych-ds/`: the same tables as a Psych-DS dataset.
 - `export.json`: counts, and what was left out.
 
 A row of `trials` is identified by `session`, `phase` and `trial`. To compare them with models:
@@ -84,34 +205,27 @@ A Psych-DS dataset (psych-ds.github.io). A row of `..._description-trials_data.c
 `..._description-events_data.csv` by `session` and `number`. If the lab asks
 questions of its own, a row of `..._description-questions_data.csv` is identified by `session`."""
 
-_BIDS = """\
-A BIDS dataset of behaviour without recordings (bids.neuroimaging.io): one file per participant and
-scenario. Familiarization trials come first; `trial_type` distinguishes them from the test.
-Participants without any answer have no file and are not listed. `phenotype/questions.tsv`, if the
-lab asks questions of its own, has their answers."""
-
 
 def readme(
     study: Study,
-    layout: Literal["export", "psych-ds", "bids"],
+    layout: Literal["export", "psych-ds"],
     facts: Mapping[str, Any] | None = None,
 ) -> str:
-    """Return the README.md of the export, or of its Psych-DS or BIDS folder.
+    """Return the README.md of the export, or of its Psych-DS folder.
 
     ``facts``, if given, are the counts of `ExportReport.facts`, which are appended.
     """
     files = _FILES
     if study.blocks.all_scenarios:
         files = files.replace("the test stimuli by scenario", "the test stimuli of each session")
-    special = {"export": files, "psych-ds": _PSYCH_DS, "bids": _BIDS}[layout]
-    rule = RULE if layout != "bids" else f"{TEXT_RULE}. {RULE}"
+    special = files if layout == "export" else _PSYCH_DS
     parts = [
         f"# {study.title}",
         f"Study {study.name}, version {study.version}. Contact: {study.contact}",
         _TASK + _structure(study),
         special,
         _PEOPLE,
-        fill(rule, 100),
+        fill(RULE, 100),
     ]
     if facts is not None:
         parts.append("## Counts\n\n" + "\n".join(count_lines(facts, "- ")))

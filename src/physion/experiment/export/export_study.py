@@ -1,4 +1,4 @@
-"""Export of the data of a study as a folder of tables, also in the conventions Psych-DS and BIDS.
+"""Export of the data of a study as a folder of tables, also in the convention Psych-DS.
 
 ::
 
@@ -14,7 +14,7 @@
       stimuli.csv, expected.csv   the stimuli; the test stimuli of each scenario or session
       data_dictionary.json   description of every column of every table
       study.json             settings and texts of the study, without codes and keys
-      psych-ds/, bids/       the same data in two conventions
+      psych-ds/              the same data as a Psych-DS dataset
       export.json            counts, and what was left out; written last
 
 The same data and package version give byte-identical files, whatever the database.
@@ -22,41 +22,426 @@ The same data and package version give byte-identical files, whatever the databa
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import hashlib
 import io
 import json
-from collections.abc import Mapping, Sequence
+import os
+import shutil
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from types import TracebackType
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from pyarrow import csv as arrow_csv
 from sqlalchemy import Connection, Engine, select
 
-from physion.analysis.people.responses import Column, data_dictionary
+from physion.analysis.people.responses import (
+    SESSION_COLUMNS,
+    TRIAL_COLUMNS,
+    Column,
+    data_dictionary,
+)
+from physion.core.errors import BadInputError
+from physion.core.files import folder_lock, sync_folder
 from physion.core.version import __version__
-from physion.experiment.export.answer_tables import snapshot
-from physion.experiment.export.conventions.bids import BidsWriter
-from physion.experiment.export.conventions.psych_ds import write_psych_ds
-from physion.experiment.export.descriptions import STIMULI_COLUMNS, readme
-from physion.experiment.export.expected import expected_stimuli
-from physion.experiment.export.export_folder import atomic_folder, write_manifest
-from physion.experiment.export.iso_times import iso_times
-from physion.experiment.export.session_rows import (
+from physion.experiment.export.descriptions import (
+    RULE,
+    guard_cell,
+    readme,
+    write_psych_ds,
+)
+from physion.experiment.export.tables import (
+    ATTENTION_COLUMNS,
+    DETAIL_COLUMNS,
+    EVENT_COLUMNS,
     EXPORTED_KINDS,
+    KEYS,
+    REPEAT_COLUMNS,
+    STIMULI_COLUMNS,
     SessionSelection,
     SessionTable,
+    TrialBatch,
+    arrow_schema,
+    detail_table,
+    expected_stimuli,
+    iso_times,
+    question_columns,
+    read_attention,
+    read_events,
+    read_own_answers,
+    read_practice_repeats,
+    read_questions,
     read_sessions,
+    read_trials,
+    snapshot,
 )
-from physion.experiment.export.spreadsheet import RULE
-from physion.experiment.export.write_tables import WrittenTables, write_tables
 from physion.experiment.store.database import STUDIES
 from physion.experiment.study.study import EARLY_ENDS, Study
 
-Layout = Literal["both", "psych-ds", "bids"]
+# --- the folder: replaces an older export, and nothing else ---
+
+MANIFEST = "export.json"
+FORMAT = "physion experiment export"
+_SECRET = 0o700
+"""Mode of the folder: other users of the machine must not read the answers."""
+
+
+@contextlib.contextmanager
+def atomic_folder(out: Path) -> Iterator[Path]:
+    """Yield a temporary folder, which is renamed to ``out`` when everything is on disk.
+
+    The caller must finish with `write_manifest`. An existing ``out`` is replaced if it is empty or
+    an unchanged export; otherwise `BadInputError` is raised.
+    """
+    out = Path(os.path.abspath(out))  # noqa: PTH100 - resolve() would follow a link
+    out.parent.mkdir(parents=True, exist_ok=True)
+    part, old = (out.with_name(f".{out.name}.{ending}") for ending in ("part", "old"))
+    for path in (part, old):
+        if path.is_symlink() or (path.exists() and not path.is_dir()):
+            raise BadInputError(f"{path} is a link or not a folder; remove it")
+    part.mkdir(mode=_SECRET, exist_ok=True)
+    with folder_lock(part):
+        _tidy(out, old)
+        _refuse_others(out)
+        _empty(part)
+        try:
+            yield part
+            _sync_all(part)
+            _swap(part, out, old)
+        except BaseException:
+            shutil.rmtree(part, ignore_errors=True)
+            raise
+
+
+def write_manifest(folder: Path, facts: dict[str, Any]) -> None:
+    """Write `MANIFEST` with ``facts`` and a summary of the files; must be called last."""
+    manifest = {"format": FORMAT, **facts, **_contents(folder)}
+    text = json.dumps(manifest, indent=2, ensure_ascii=False)
+    (folder / MANIFEST).write_text(text + "\n", encoding="utf-8")
+
+
+def _contents(folder: Path) -> dict[str, Any]:
+    """Return the number of files and folders besides the manifest, and a hash of their names."""
+    names = []
+    for at, folders, files in os.walk(folder):
+        inside = Path(at).relative_to(folder)
+        names += [(inside / name).as_posix() for name in (*folders, *files)]
+    ours = sorted(name for name in names if name not in (MANIFEST, ".lock"))
+    hashed = hashlib.sha256("\n".join(ours).encode("utf-8", "surrogateescape")).hexdigest()
+    return {"entries": len(ours), "names_sha256": hashed}
+
+
+def _refuse_others(out: Path) -> None:
+    """Raise `BadInputError` if replacing ``out`` would delete anything but an export."""
+    if not out.is_symlink() and not out.exists():
+        return
+    if out.is_symlink() or not out.is_dir():
+        raise BadInputError(f"{out} is not a folder; choose another one with --out")
+    if not any(out.iterdir()):
+        return
+    try:
+        manifest = json.loads((out / MANIFEST).read_bytes())
+        ours = isinstance(manifest, dict) and manifest.get("format") == FORMAT
+    except (OSError, ValueError, RecursionError):
+        ours = False
+    if not ours:
+        raise BadInputError(f"{out} contains something else; choose another folder with --out")
+    if any(manifest.get(name) != value for name, value in _contents(out).items()):
+        raise BadInputError(
+            f"{out} is an export to which files were added, or of which some are missing; move "
+            "your files elsewhere, or choose another folder with --out"
+        )
+
+
+def _tidy(out: Path, old: Path) -> None:
+    """Restore or remove the old folder that an export left when killed during the swap."""
+    if not old.exists():
+        return
+    if out.exists():
+        shutil.rmtree(old)
+    else:
+        old.rename(out)
+
+
+def _empty(folder: Path) -> None:
+    """Delete the content of a folder except its lock."""
+    for entry in folder.iterdir():
+        if entry.name == ".lock":
+            continue
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.rmtree(entry)
+        else:
+            entry.unlink()
+
+
+def _sync_all(folder: Path) -> None:
+    """Flush all files to disk, with one system call, since 10,000 single ones would be slow."""
+    if hasattr(os, "sync"):
+        os.sync()
+        return
+    for path in folder.rglob("*"):  # pragma: no cover - Windows
+        if path.is_file():
+            with path.open("rb+") as file:
+                os.fsync(file.fileno())
+
+
+def _swap(part: Path, out: Path, old: Path) -> None:
+    """Rename ``part`` to ``out``; an existing ``out`` is moved to ``old`` and then deleted."""
+    (part / ".lock").unlink(missing_ok=True)
+    replaces = out.exists()
+    if replaces:
+        out.rename(old)
+    try:
+        part.rename(out)
+    except BaseException:
+        if replaces:
+            old.rename(out)
+        raise
+    sync_folder(out.parent)
+    if replaces:
+        shutil.rmtree(old)
+
+
+# --- one table as CSV and parquet; the same rows give the same bytes ---
+
+NAMES = frozenset({"participant", "session", "scenario", "condition", "stimulus", "kind"})
+"""Text columns that need no protection against formulas: their values are hashes or consist of
+letters, digits and ._+- and start with a letter or digit."""
+
+
+class TableWriter:
+    """Context manager that writes ``NAME.csv`` and ``NAME.parquet`` in a folder.
+
+    CSV: UTF-8 with a header and LF line ends; free text is protected by `guard_cell` and quoted
+    where needed. Parquet: Zstandard compression; empty cells are null.
+
+    Parameters
+    ----------
+    folder, name
+        Folder, and name of the files without ending.
+    columns
+        Columns of the table.
+    with_csv
+        Whether to write the CSV file too.
+    level
+        Compression level of the parquet file.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        name: str,
+        columns: Sequence[Column],
+        *,
+        with_csv: bool = True,
+        level: int = 3,
+    ) -> None:
+        self.csv = folder / f"{name}.csv"
+        self.rows = 0
+        self._texts = [c.name for c in columns if c.kind == "text" and c.name not in NAMES]
+        self._stack = contextlib.ExitStack()
+        schema = arrow_schema(columns)
+        with contextlib.ExitStack() as opened:
+            self._parquet = opened.enter_context(
+                pq.ParquetWriter(
+                    folder / f"{name}.parquet",
+                    schema,
+                    compression="zstd",
+                    compression_level=level,
+                    # No dictionary for free texts, which hardly ever repeat.
+                    use_dictionary=[c.name for c in columns if c.name not in self._texts],
+                )
+            )
+            self._csv = None
+            if with_csv:
+                file = opened.enter_context(self.csv.open("wb"))
+                file.write(",".join(column.name for column in columns).encode() + b"\n")
+                options = arrow_csv.WriteOptions(
+                    include_header=False, quoting_style="needed" if self._texts else "none"
+                )
+                writer = arrow_csv.CSVWriter(file, schema, write_options=options)
+                self._csv = opened.enter_context(writer)
+            self._stack = opened.pop_all()
+
+    def write(self, table: pa.Table) -> None:
+        """Append rows."""
+        self.rows += table.num_rows
+        self._parquet.write_table(table)
+        if self._csv is not None:
+            self._csv.write_table(self._guarded(table))
+
+    def _guarded(self, table: pa.Table) -> pa.Table:
+        """Return the table with its free texts protected by `guard_cell`."""
+        for name in self._texts:
+            cells = table.column(name).to_pylist()
+            guarded = [None if cell is None else guard_cell(cell) for cell in cells]
+            index = table.schema.get_field_index(name)
+            table = table.set_column(index, name, pa.array(guarded, pa.string()))
+        return table
+
+    def __enter__(self) -> TableWriter:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        self._stack.close()
+
+
+# --- all tables, in batches: one is written while the next one is read ---
+
+WAITING = 2
+"""Maximum number of batches waiting to be written, which bounds the memory."""
+TABLES = {
+    "trials": TRIAL_COLUMNS,
+    "sessions": SESSION_COLUMNS,
+    "events": EVENT_COLUMNS,
+    "trial_details": DETAIL_COLUMNS,
+    "stimuli": STIMULI_COLUMNS,
+}
+
+
+@dataclass(frozen=True)
+class WrittenTables:
+    """What was written.
+
+    Attributes
+    ----------
+    rows
+        Rows by table.
+    gone
+        Answers whose stimuli no longer exist.
+    until
+        Latest time in the data.
+    own
+        Answers to the lab's own questions with their columns; None if there are no questions.
+    described
+        Columns of each written table.
+    """
+
+    rows: dict[str, int]
+    gone: int
+    until: str | None
+    own: tuple[pa.Table, tuple[Column, ...]] | None
+    described: dict[str, tuple[Column, ...]]
+
+
+def write_tables(
+    folder: Path,
+    connection: Connection,
+    study: Study,
+    sessions: SessionTable,
+) -> WrittenTables:
+    """Write trials, sessions, questions, events and details in one pass over the answers.
+
+    Parameters
+    ----------
+    folder
+        Folder of the tables.
+    connection
+        Connection of `snapshot`.
+    study
+        The study.
+    sessions
+        The sessions to export.
+    """
+    gone = 0
+    latest = [_latest(sessions.table, column) for column in ("started_at", "finished_at")]
+    with ExitStack() as stack:
+        files = {
+            name: stack.enter_context(TableWriter(folder, name, TABLES[name]))
+            for name in ("trials", "sessions", "events")
+        }
+        details = stack.enter_context(
+            TableWriter(folder, "trial_details", DETAIL_COLUMNS, with_csv=False, level=1)
+        )
+
+        def write(part: TrialBatch) -> None:
+            files["trials"].write(part.table)
+            details.write(detail_table(part))
+
+        files["sessions"].write(sessions.table)
+        own = _write_own_answers(folder, connection, study, sessions)
+        for events in read_events(connection, sessions.table):
+            files["events"].write(events)
+        with _BackgroundWriter(write) as behind:
+            for part in read_trials(connection, study, sessions.table, details=True):
+                gone += len(part.unknown)
+                latest.append(_latest(part.table, "answered_at"))
+                behind(part)
+        rows = {name: file.rows for name, file in (*files.items(), ("trial_details", details))}
+    described = dict(TABLES)
+    if own is not None:
+        rows["questions"], described["questions"] = own[0].num_rows, own[1]
+    further = {
+        "practice_repeats": (read_practice_repeats, REPEAT_COLUMNS),
+        "attention_checks": (read_attention, ATTENTION_COLUMNS),
+    }
+    for name, (read, columns) in further.items():
+        table = read(connection, study, sessions.table)
+        if table.num_rows:
+            with TableWriter(folder, name, columns) as file:
+                file.write(table)
+            rows[name], described[name] = table.num_rows, columns
+    return WrittenTables(rows, gone, max(latest) or None, own, described)
+
+
+def _write_own_answers(
+    folder: Path, connection: Connection, study: Study, sessions: SessionTable
+) -> tuple[pa.Table, tuple[Column, ...]] | None:
+    """Write the table of the lab's own questions, if there are any; return it and its columns."""
+    questions = read_questions(connection, study)
+    if not questions:
+        return None
+    columns = (*KEYS, *question_columns(questions))
+    table = read_own_answers(connection, questions, sessions.table)
+    with TableWriter(folder, "questions", columns) as file:
+        file.write(table)
+    return table, columns
+
+
+def _latest(table: pa.Table, column: str) -> str:
+    """Return the latest time in a column, or an empty text."""
+    return str(pc.max(table.column(column)).as_py() or "")
+
+
+class _BackgroundWriter:
+    """Calls a function in order in a background thread, while this thread reads the next batch."""
+
+    def __init__(self, function: Callable[[TrialBatch], None]) -> None:
+        self._function = function
+        self._pool = ThreadPoolExecutor(1)
+        self._waiting: deque[Future[None]] = deque()
+
+    def __call__(self, part: TrialBatch) -> None:
+        self._waiting.append(self._pool.submit(self._function, part))
+        while len(self._waiting) > WAITING:
+            self._waiting.popleft().result()
+
+    def __enter__(self) -> _BackgroundWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._pool.shutdown(cancel_futures=kind is not None)
+        if kind is None:
+            for future in self._waiting:
+                future.result()
+
+
 GONE = "its stimulus is no longer in the study folder"
-NO_FILE = "no answer yet, so no file in bids/"
 _PSYCH_DS_TABLES = ("trials", "sessions", "events", "questions", "practice_repeats",
                     "attention_checks")  # fmt: skip
 _SECRET_SETTINGS = ("recruitment", *EARLY_ENDS, "folder", "stimuli")
@@ -103,7 +488,6 @@ def export_study(
     *,
     simulated: bool = True,
     scenario: str | None = None,
-    layout: Layout = "both",
 ) -> ExportReport:
     """Export one consistent snapshot of the data into the folder ``out``, completely or not at all.
 
@@ -121,8 +505,6 @@ def export_study(
         Whether to include simulated participants.
     scenario
         Export only this scenario.
-    layout
-        Conventions to write besides the tables.
 
     Raises
     ------
@@ -133,10 +515,7 @@ def export_study(
     with atomic_folder(out) as folder:
         with snapshot(engine) as connection:
             sessions = read_sessions(connection, study, SessionSelection(kinds, scenario))
-            bids = None
-            if layout != "psych-ds":
-                bids = BidsWriter(folder / "bids", study, sessions.table)
-            written = write_tables(folder, connection, study, sessions, bids)
+            written = write_tables(folder, connection, study, sessions)
             states = _states(connection, sessions)
             expected = expected_stimuli(connection, study, sessions)
         report = _report(out, sessions, written)
@@ -146,20 +525,12 @@ def export_study(
             name: data_dictionary(columns) for name, columns in written.described.items()
         }
         _write_json(folder / "data_dictionary.json", dictionary | {"spreadsheet_safety": RULE})
-        if bids is not None:
-            if written.own is not None:
-                bids.write_questions(*written.own)
-            without = bids.close(
-                name=study.title, readme=readme(study, "bids"), version=__version__
-            )
-            report = _with_left_out(report, "session", "any", NO_FILE, without)
-        if layout != "bids":
-            chosen = {
-                name: (folder / f"{name}.csv", columns)
-                for name, columns in written.described.items()
-                if name in _PSYCH_DS_TABLES
-            }
-            _write_psych_ds(folder, study, sessions, report.until, chosen)
+        chosen = {
+            name: (folder / f"{name}.csv", columns)
+            for name, columns in written.described.items()
+            if name in _PSYCH_DS_TABLES
+        }
+        _write_psych_ds(folder, study, sessions, report.until, chosen)
         (folder / "README.md").write_text(readme(study, "export", report.facts()), "utf-8")
         known = {"package": f"physion {__version__}", "name": study.name}
         write_manifest(folder, known | {"version": study.version} | report.facts())
@@ -167,7 +538,7 @@ def export_study(
 
 
 def _report(out: Path, sessions: SessionTable, written: WrittenTables) -> ExportReport:
-    """Return the report of the tables, before Psych-DS and BIDS."""
+    """Return the report of the tables, before Psych-DS."""
     kinds: dict[str, dict[str, int]] = {}
     for kind in EXPORTED_KINDS:
         states = {state: sessions.states[kind, state] for state in ("finished", "unfinished")}

@@ -308,20 +308,6 @@ class Bonus:
     """Largest bonus; 0: no limit."""
 
 
-@dataclass(frozen=True)
-class Limits:
-    """Rate limits; requests beyond them are refused for a while."""
-
-    requests_per_second: Annotated[float, Field(ge=0.1, le=10_000)] = 20.0
-    """Sustained rate of requests of one session."""
-    burst: Annotated[int, Field(ge=1, le=100_000)] = 100
-    """Burst of requests of one session."""
-    sessions_per_minute: Annotated[float, Field(ge=0.1, le=100_000)] = 60.0
-    """Sustained rate of new sessions from one IP address."""
-    sessions_at_once: Annotated[int, Field(ge=1, le=100_000)] = 200
-    """Burst of new sessions from one IP address, such as a class in one room."""
-
-
 # --- questions and conditions --------------------------------------------------------------------
 
 
@@ -459,7 +445,6 @@ class StudySettings:
     full: EarlyEnd = EarlyEnd()
     """For participants who come when the study is full."""
     bonus: Bonus = Bonus()
-    limits: Limits = Limits()
     comprehension_questions: Annotated[tuple[ComprehensionQuestion, ...], Field(max_length=50)] = ()
     """Questions about the instructions: one table [[comprehension_questions]] for each, with the
     keys below. Their texts are in texts/: [comprehension_question.NAME] with text, and

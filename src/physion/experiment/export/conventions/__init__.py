@@ -1,1 +1,0 @@
-"""Export in the layouts BIDS and Psych-DS."""

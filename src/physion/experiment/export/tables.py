@@ -1,0 +1,823 @@
+"""The tables of an export, read from the database: columns, and rows as Arrow tables.
+
+Columns of trials and sessions are those of `physion.analysis.people.responses`; the other tables
+describe theirs here. Sessions are sorted by start time; trials by session, then familiarization
+before test, in the order in which they were shown. Labels are read from the study folder. Sessions
+that are left out are counted by reason (`SessionTable.left_out`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, groupby
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+import pyarrow as pa
+from sqlalchemy import Connection, Engine, Float, Integer, case, cast, func, select
+from sqlalchemy.sql import ColumnElement
+
+from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS, Column
+from physion.core.errors import PhysionError, UnknownNameError
+from physion.core.names import canonical_name
+from physion.experiment.store.database import ANSWERS, EVENTS, PRACTICE_REPEATS, SESSIONS, STUDIES
+from physion.experiment.study.orders import (
+    block_scenarios,
+    instructed_response,
+    stimuli_by_session,
+    trial_order,
+)
+from physion.experiment.study.settings import Question, columns_of
+from physion.experiment.study.stimuli import ATTENTION, LOOKS, PHASES, STIMULUS_PHASES, Stimulus
+from physion.experiment.study.study import ALL_SCENARIOS, Study, under
+
+# --- columns as Arrow types and data frames ---
+
+ARROW_TYPES = {
+    "text": pa.string(),
+    "choice": pa.string(),
+    "time": pa.string(),
+    "integer": pa.int64(),
+    "number": pa.float64(),
+    "flag": pa.bool_(),
+}
+
+
+def arrow_schema(columns: Sequence[Column]) -> pa.Schema:
+    """Return the Arrow (and parquet) schema of the columns."""
+    return pa.schema([pa.field(column.name, ARROW_TYPES[column.kind]) for column in columns])
+
+
+def as_frame(table: pa.Table, columns: Sequence[Column]) -> pd.DataFrame:
+    """Convert an Arrow table to a data frame with the types of `response_schema.check_table`."""
+    nullable = {pa.int64(): pd.Int64Dtype(), pa.bool_(): pd.BooleanDtype()}
+    frame = table.to_pandas(types_mapper=nullable.get)
+    typed = {}
+    for column in columns:
+        values = frame[column.name]
+        if ARROW_TYPES[column.kind] == pa.string():
+            values = values.astype("str").fillna("")
+        elif column.kind == "flag" and not column.may_be_empty:
+            values = values.astype(bool)
+        typed[column.name] = values
+    return pd.DataFrame(typed)
+
+
+# --- answers to the lab's own questions: one row per session that sent them ---
+#
+# Columns are the questions of all versions of the study that were served; the latest texts
+# describe them. A question with any number of options has one column for each option.
+
+KEYS: tuple[Column, ...] = (
+    Column("participant", "text", "As in the sessions", required=True, may_be_empty=False),
+    Column("session", "text", "As in the sessions", required=True, may_be_empty=False),
+)
+
+
+def read_questions(
+    connection: Connection, study: Study
+) -> list[tuple[Question, Mapping[str, str]]]:
+    """Return the questions of all served versions and of now, each with its latest texts by key.
+
+    Options of earlier versions are kept.
+    """
+    rows = connection.execute(select(STUDIES.c.settings, STUDIES.c.first_served, STUDIES.c.digest))
+    asked = [
+        (Question(**{**entry, "options": tuple(entry["options"])}), settings)
+        for settings, *_ in sorted(rows, key=lambda row: (row.first_served, row.digest))
+        for entry in settings.get("questions", ())
+    ]
+    asked += [(question, vars(study)) for question in study.questions]
+    found: dict[str, tuple[Question, Mapping[str, str]]] = {}
+    for question, settings in asked:
+        texts = settings["texts"][settings["languages"][0]]
+        if question.name in found:
+            before, older_texts = found[question.name]
+            options = tuple(dict.fromkeys((*before.options, *question.options)))
+            question, texts = replace(question, options=options), {**older_texts, **texts}
+        found[question.name] = (question, texts)
+    return list(found.values())
+
+
+def question_columns(
+    questions: Sequence[tuple[Question, Mapping[str, str]]],
+) -> tuple[Column, ...]:
+    """Return the described columns of the answers to these questions."""
+    return tuple(column for question, texts in questions for column in _columns(question, texts))
+
+
+def _columns(question: Question, texts: Mapping[str, str]) -> list[Column]:
+    """Return the columns of one question, described by its texts."""
+    key = f"question.{question.name}"
+    words = " ".join(texts[f"{key}.text"].split())
+    labels = {option: texts[f"{key}.options.{option}"] for option in question.options}
+    match question.kind:
+        case "text":
+            return [Column(question.name, "text", words)]
+        case "scale":
+            ends = f"1: {texts[f'{key}.low']}, {question.steps}: {texts[f'{key}.high']}"
+            about = f"{words} ({ends})"
+            return [Column(question.name, "integer", about, low=1, high=question.steps)]
+        case "choice":
+            told = "; ".join(f"{option}: {label}" for option, label in labels.items())
+            about = f"{words} ({told})"
+            return [Column(question.name, "choice", about, choices=question.options)]
+    names = zip(columns_of(question), labels.values(), strict=True)
+    return [Column(name, "flag", f"{words} Was chosen: {label}") for name, label in names]
+
+
+def read_own_answers(
+    connection: Connection,
+    questions: Sequence[tuple[Question, Mapping[str, str]]],
+    sessions: pa.Table,
+) -> pa.Table:
+    """Return the table of answers of these exported sessions, in their order."""
+    columns = (*KEYS, *question_columns(questions))
+    query = select(SESSIONS.c.session, SESSIONS.c.own_answers)
+    rows = connection.execute(query.where(SESSIONS.c.questions_at.is_not(None)))
+    given: dict[str, Mapping[str, Any]] = {session: answers or {} for session, answers in rows}
+    values: dict[str, list[Any]] = {column.name: [] for column in columns}
+    pairs = (sessions.column(name).to_pylist() for name in ("participant", "session"))
+    for participant, session in zip(*pairs, strict=True):
+        if session not in given:
+            continue
+        values["participant"].append(participant)
+        values["session"].append(session)
+        for question, _ in questions:
+            for name, cell in _cells(question, given[session]).items():
+                values[name].append(cell)
+    arrays = [pa.array(values[column.name], ARROW_TYPES[column.kind]) for column in columns]
+    return pa.table(arrays, schema=arrow_schema(columns))
+
+
+def _cells(question: Question, answers: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the cells of one question by column; None where it was not asked or not answered."""
+    answer = answers.get(question.name)
+    if question.kind != "choices":
+        return {question.name: answer}
+    names = zip(columns_of(question), question.options, strict=True)
+    return {name: None if answer is None else option in answer for name, option in names}
+
+
+# --- arrays of times in ISO 8601 ---
+
+_FORM = "0000-00-00T00:00:00.000Z"
+_DAY_MS = 86_400_000
+
+
+def iso_times(seconds: npt.NDArray[np.float64]) -> pa.Array:
+    """Format Unix times as text such as ``2026-01-31T09:30:00.123Z``.
+
+    Digits are computed for the whole array at once, since the usual functions take a microsecond
+    or more per value.
+
+    Parameters
+    ----------
+    seconds
+        Seconds since 1970 (UTC), in the years 1000 to 9999; NaN for a missing time.
+
+    Returns
+    -------
+    pa.Array
+        Texts, truncated to milliseconds; null for NaN.
+    """
+    known = np.isfinite(seconds)
+    whole = np.floor(np.where(known, seconds, 0.0) * 1000).astype(np.int64)
+    days, rest = np.divmod(whole, _DAY_MS)
+    text = np.tile(np.frombuffer(_FORM.encode(), np.uint8), (len(whole), 1))
+    dates, which = np.unique(days, return_inverse=True)
+    spelt = np.datetime_as_string(dates.astype("datetime64[D]")).astype("S10")
+    text[:, :10] = spelt.view(np.uint8).reshape(-1, 10)[which]
+    for last, unit, base in ((12, 3_600_000, 24), (15, 60_000, 60), (18, 1000, 60), (22, 1, 1000)):
+        value = rest // unit % base
+        for digit in range(3 if base == 1000 else 2):
+            text[:, last - digit] = ord("0") + value // 10**digit % 10
+    offsets = np.arange(len(whole) + 1, dtype=np.int32) * len(_FORM)
+    buffers = [None, pa.py_buffer(offsets), pa.py_buffer(np.ascontiguousarray(text))]
+    times = pa.Array.from_buffers(pa.string(), len(whole), buffers)
+    if known.all():
+        return times
+    return times.take(pa.array(np.arange(len(whole)), mask=~known))
+
+
+EXPORTED_KINDS = ("person", "simulated")
+"""Kinds of sessions that can be exported; previews cannot."""
+PREVIEW = "preview by the experimenter"
+VOID = "the experimenter made the session void"
+WITHDRAWN = "the participant withdrew"
+UNFINISHED = "not finished, and only finished ones were requested"
+OTHER_KIND = "{kind}, which was not requested"
+GONE_SCENARIO = "of {scenario}, which study.toml no longer has: add it again to export them"
+OTHER_SCENARIO = "of a scenario that was not requested"
+_Row = Any
+"""A row of sessions with name and version of the study (its exact type would list all columns)."""
+
+
+@dataclass(frozen=True)
+class SessionSelection:
+    """Which sessions to export: kinds, one scenario (None: all), only finished ones or all."""
+
+    kinds: Sequence[str] = EXPORTED_KINDS
+    scenario: str | None = None
+    finished_only: bool = False
+
+
+@dataclass(frozen=True)
+class SessionTable:
+    """The exported sessions, and counts of those left out.
+
+    Attributes
+    ----------
+    table
+        One row per session; empty cells are null.
+    states
+        Number of sessions in the table by kind and ``finished`` or ``unfinished``.
+    left_out
+        Number of sessions left out, by kind and reason.
+    studies
+        Digests of the versions of the study under which the sessions of the table ran.
+    """
+
+    table: pa.Table
+    states: Counter[tuple[str, str]]
+    left_out: Counter[tuple[str, str]]
+    studies: tuple[str, ...]
+
+
+def read_sessions(
+    connection: Connection, study: Study, wanted: SessionSelection = SessionSelection()
+) -> SessionTable:
+    """Read the selected sessions, sorted by start time; count the others by reason."""
+    for kind in wanted.kinds:
+        if kind not in EXPORTED_KINDS:
+            raise UnknownNameError("kind of session", kind, EXPORTED_KINDS)
+    if wanted.scenario is not None and wanted.scenario not in study.offered:
+        raise UnknownNameError("scenario", wanted.scenario, study.offered)
+    query = select(*SESSIONS.c, STUDIES.c.name, STUDIES.c.version).join(
+        STUDIES, STUDIES.c.digest == SESSIONS.c.study
+    )
+    kept: list[_Row] = []
+    states: Counter[tuple[str, str]] = Counter()
+    left_out: Counter[tuple[str, str]] = Counter()
+    for row in connection.execute(query):
+        reason = _why_not(row, wanted, study)
+        if reason is not None:
+            left_out[row.kind, reason] += 1
+            continue
+        kept.append(row)
+        states[row.kind, "unfinished" if row.finished_at is None else "finished"] += 1
+    # Sorted here because databases differ in how they order text.
+    kept.sort(key=lambda row: (row.started_at, row.session))
+    digests = tuple(dict.fromkeys(row.study for row in kept))
+    return SessionTable(_session_table(kept, study), states, left_out, digests)
+
+
+def _why_not(row: _Row, wanted: SessionSelection, study: Study) -> str | None:
+    """Return the reason why a session is left out, or None if it is exported."""
+    if row.kind not in EXPORTED_KINDS:
+        return PREVIEW
+    if row.kind not in wanted.kinds:
+        return OTHER_KIND.format(kind=row.kind)
+    if wanted.scenario not in (None, row.scenario):
+        return OTHER_SCENARIO
+    if row.voided_at is not None:
+        return VOID
+    if row.withdrawn_at is not None:
+        return WITHDRAWN
+    if row.scenario not in study.offered:
+        return GONE_SCENARIO.format(scenario=row.scenario)
+    if wanted.finished_only and row.finished_at is None:
+        return UNFINISHED
+    return None
+
+
+def _session_table(rows: Sequence[_Row], study: Study) -> pa.Table:
+    """Return the exported table of these sessions."""
+    columns: dict[str, pa.Array] = {}
+    for column in SESSION_COLUMNS:
+        values = [_session_value(row, column.name, study) for row in rows]
+        if column.kind == "time":
+            columns[column.name] = iso_times(np.array(values, dtype=np.float64))
+        else:
+            columns[column.name] = pa.array(values, ARROW_TYPES[column.kind])
+    return pa.table(columns, arrow_schema(SESSION_COLUMNS))
+
+
+def _session_value(row: _Row, name: str, study: Study) -> Any:
+    """Return the value of one exported column; None for an empty cell."""
+    match name:
+        case "scenario":
+            variant = under(study, row.condition)
+            return " ".join(block_scenarios(variant, row.scenario, row.order_seed))
+        case "simulated":
+            return row.kind == "simulated"
+        case "study":
+            return f"{row.name} {row.version}"
+        case "screened_out":
+            return row.screened_out_by
+        case "recruited_by":
+            return row.source
+        case "user_agent" | "refresh_hz" | "screen_width" | "screen_height":
+            return row.device.get(name)
+        case "pixel_ratio" | "touch":
+            return row.device.get(name)
+    value = getattr(row, name)
+    return None if value == "" else value
+
+
+# --- answers, read in batches of sessions to bound the memory ---
+
+AT_ONCE = 200
+"""Number of sessions whose answers are fetched in one query."""
+
+
+@dataclass(frozen=True)
+class TrialBatch:
+    """Answers of consecutive sessions.
+
+    Attributes
+    ----------
+    sessions
+        Row numbers of these sessions in the table of sessions.
+    table
+        One row per answer.
+    counts
+        Number of rows of ``table`` for each session.
+    details
+        JSON text of each row, if requested.
+    unknown
+        Stimulus of each answer that was left out because the study folder no longer has it.
+    """
+
+    sessions: range
+    table: pa.Table
+    counts: npt.NDArray[np.int64]
+    details: pa.Array | None
+    unknown: tuple[str, ...]
+
+
+_INPUTS = ("mouse", "touch", "keyboard")
+_RESPONSES = ("no", "yes")
+_VOID = ("hidden", "dialog", "window")
+_ABSENT = -1.0
+"""Value of empty cells while numbers are fetched; real values are never negative."""
+
+
+def _index(column: Any, values: Sequence[str]) -> ColumnElement[int]:
+    """Return the SQL expression of the index of a cell in ``values``, -1 if it is not in them."""
+    return case({value: index for index, value in enumerate(values)}, value=column, else_=-1)
+
+
+def _or_absent(column: Any) -> ColumnElement[Any]:
+    """Return the SQL expression of a column with `_ABSENT` in place of NULL."""
+    return func.coalesce(column, _ABSENT if isinstance(column.type, Float) else int(_ABSENT))
+
+
+_NUMBERS: dict[str, Any] = {
+    "phase": _index(ANSWERS.c.phase, PHASES),
+    "trial": ANSWERS.c.trial,
+    "response": _index(ANSWERS.c.response, _RESPONSES),
+    "rt_ms": ANSWERS.c.rt_ms,
+    "input": _index(ANSWERS.c.input, _INPUTS),
+    "fixation_ms": _or_absent(ANSWERS.c.fixation_ms),
+    "cue_ms": _or_absent(ANSWERS.c.cue_ms),
+    "frames_expected": ANSWERS.c.frames_expected,
+    "frames_shown": _or_absent(ANSWERS.c.frames_shown),
+    "frames_dropped": _or_absent(ANSWERS.c.frames_dropped),
+    "movie_ms": _or_absent(ANSWERS.c.movie_ms),
+    "visibility_changes": _or_absent(ANSWERS.c.visibility_changes),
+    "window_width": _or_absent(ANSWERS.c.window_width),
+    "window_height": _or_absent(ANSWERS.c.window_height),
+    "break_ms": _or_absent(ANSWERS.c.break_ms),
+    "resumed": cast(ANSWERS.c.resumed, Integer),
+    "showings": _or_absent(ANSWERS.c.showings),
+    "void": _index(ANSWERS.c.void, _VOID),
+    "answered_at": ANSWERS.c.answered_at,
+}
+"""Columns of an answer that are fetched as numbers, several times faster than as text."""
+_CHOICES = {"phase": PHASES, "response": _RESPONSES, "input": _INPUTS, "void": _VOID}
+
+
+def read_trials(
+    connection: Connection, study: Study, sessions: pa.Table, *, details: bool = False
+) -> Iterator[TrialBatch]:
+    """Yield the answers of a batch of sessions at a time, in the order of ``sessions``.
+
+    Parameters
+    ----------
+    connection
+        Connection of `snapshot`.
+    study
+        The study, for the labels of its stimuli.
+    sessions
+        Table of `read_sessions`.
+    details
+        Whether to read the measured details of each trial too.
+    """
+    known = _Stimuli(study.stimuli)
+    names = sessions.column("session").to_pylist()
+    for first in range(0, len(names), AT_ONCE):
+        chosen = range(first, min(first + AT_ONCE, len(names)))
+        rows = _fetch(connection, [names[at] for at in chosen], details)
+        batch = sessions.slice(first, len(chosen)).combine_chunks()
+        yield _trials(chosen, batch, rows, known, details)
+
+
+def _fetch(connection: Connection, names: Sequence[str], details: bool) -> list[tuple[Any, ...]]:
+    """Fetch rows of session, stimulus, details (if requested) and `_NUMBERS`."""
+    texts = [ANSWERS.c.session, ANSWERS.c.stimulus, *([ANSWERS.c.details] if details else [])]
+    chosen = ANSWERS.c.session.in_(names), ANSWERS.c.phase.in_(PHASES)
+    query = select(*texts, *_NUMBERS.values()).where(*chosen)
+    text = query.compile(dialect=connection.dialect, compile_kwargs={"literal_binds": True})
+    # Plain rows of the driver: SQLAlchemy's row objects would double the time.
+    cursor = connection.connection.cursor()
+    try:
+        cursor.execute(str(text))
+        return list(cursor.fetchall())
+    finally:
+        cursor.close()
+
+
+class _Stimuli:
+    """Scenarios, names, labels and looks of all stimuli as arrays, and their indices by name."""
+
+    def __init__(self, stimuli: Sequence[Stimulus]) -> None:
+        self.indices = {(s.scenario, s.stimulus): index for index, s in enumerate(stimuli)}
+        self.scenarios = pa.array([s.scenario for s in stimuli], pa.string())
+        self.names = pa.array([s.stimulus for s in stimuli], pa.string())
+        self.labels = np.array([s.label for s in stimuli], dtype=bool)
+        self.looks = np.array([LOOKS.index(s.look) for s in stimuli], dtype=np.int64)
+
+    def find(self, blocks: Sequence[str], name: str) -> tuple[int, float]:
+        """Return the index of a stimulus of a session, -1 if it is unknown, and its block.
+
+        ``blocks``: the scenarios of the session. The block is `_ABSENT` if there is only one.
+        """
+        for number, scenario in enumerate(blocks):
+            index = self.indices.get((scenario, name), -1)
+            if index >= 0:
+                return index, number if len(blocks) > 1 else _ABSENT
+        return -1, _ABSENT
+
+
+def _trials(
+    chosen: range,
+    sessions: pa.Table,
+    rows: list[tuple[Any, ...]],
+    known: _Stimuli,
+    details: bool,
+) -> TrialBatch:
+    """Convert fetched rows to a table in the order shown; unknown stimuli are left out."""
+    texts = 3 if details else 2
+    ranks = {name: rank for rank, name in enumerate(sessions.column("session").to_pylist())}
+    blocks = [cell.split(" ") for cell in sessions.column("scenario").to_pylist()]
+    rank = np.array([ranks[row[0]] for row in rows], dtype=np.int64)
+    found = [known.find(blocks[ranks[row[0]]], row[1]) for row in rows]
+    stimulus, block = np.array(found, dtype=np.int64).reshape(-1, 2).T
+    unknown = tuple(rows[at][1] for at in np.flatnonzero(stimulus < 0))
+    flat = chain.from_iterable(row[texts:] for row in rows)
+    width = len(_NUMBERS)
+    numbers = np.fromiter(flat, np.float64, len(rows) * width).reshape(-1, width).T
+    values = dict(zip(_NUMBERS, numbers, strict=True))
+    values["block"] = block.astype(np.float64)
+    order = np.lexsort((values["trial"], values["phase"], block, rank))
+    order = order[stimulus[order] >= 0]
+    values = {name: column[order] for name, column in values.items()}
+    rank, stimulus = rank[order], stimulus[order]
+    return TrialBatch(
+        sessions=chosen,
+        table=_trial_table(sessions, rank, known, stimulus, values),
+        counts=np.bincount(rank, minlength=len(chosen)).astype(np.int64),
+        details=pa.array([rows[at][2] for at in order], pa.string()) if details else None,
+        unknown=unknown,
+    )
+
+
+def _trial_table(
+    sessions: pa.Table,
+    rank: npt.NDArray[np.int64],
+    known: _Stimuli,
+    stimulus: npt.NDArray[np.int64],
+    values: dict[str, npt.NDArray[np.float64]],
+) -> pa.Table:
+    """Return the table of trials from fetched numbers.
+
+    Parameters
+    ----------
+    sessions
+        Rows of the sessions of this batch.
+    rank
+        Index of the session of each answer.
+    known
+        The stimuli of the study.
+    stimulus
+        Index of the stimulus of each answer.
+    values
+        Columns of `_NUMBERS`, and ``block``.
+    """
+    of_session = sessions.select(["participant", "session", "simulated", "buttons", "condition"])
+    of_session = of_session.take(pa.array(rank))
+    label = known.labels[stimulus]
+    columns: dict[str, Any] = {name: of_session.column(name) for name in of_session.column_names}
+    columns |= {
+        "scenario": known.scenarios.take(pa.array(stimulus)),
+        "stimulus": known.names.take(pa.array(stimulus)),
+        "label": pa.array(label),
+        "correct": pa.array((values["response"] == _RESPONSES.index("yes")) == label),
+        "look": pa.array(LOOKS).take(pa.array(known.looks[stimulus])),
+        "answered_at": iso_times(values["answered_at"]),
+        "resumed": pa.array(values["resumed"] != 0),
+    }
+    for name, choices in _CHOICES.items():
+        indices = values[name].astype(np.int64)
+        columns[name] = pa.array(choices).take(pa.array(indices, mask=indices < 0))
+    for column in TRIAL_COLUMNS:
+        if column.name not in columns:
+            cells = values[column.name]
+            absent = None if column.name == "rt_ms" else cells == _ABSENT
+            typed = cells.astype(np.int64) if column.kind == "integer" else cells
+            columns[column.name] = pa.array(typed, mask=absent)
+    ordered = {column.name: columns[column.name] for column in TRIAL_COLUMNS}
+    return pa.table(ordered, arrow_schema(TRIAL_COLUMNS))
+
+
+# --- browser events, measured details of trials, and stimuli ---
+
+_SESSION = Column("session", "text", "As in the sessions", required=True, may_be_empty=False)
+
+STIMULI_COLUMNS: tuple[Column, ...] = (
+    Column("stimulus", "text", "Name, as in the trials"),
+    Column("scenario", "text", "Scenario, as in the trials"),
+    Column(
+        "phase",
+        "choice",
+        "Phase in which it is shown; attention: a check among the test trials",
+        choices=STIMULUS_PHASES,
+    ),
+    Column("place", "integer", "Position in familiarization, from 0; no order in the test", low=0),
+    Column("label", "flag", "Whether the agent touches the patient"),
+    Column("frames", "integer", "Number of frames of the observed movie", low=1),
+    Column("rate", "number", "Frames per second", unit="Hz", low=0),
+    Column("width", "integer", "Width of the movie", unit="px", low=1),
+    Column("height", "integer", "Height of the movie", unit="px", low=1),
+    Column("look", "choice", "Colours of the stimulus", choices=LOOKS),
+)
+"""Columns of ``stimuli``: one row per stimulus."""
+
+EVENT_COLUMNS: tuple[Column, ...] = (
+    _SESSION,
+    Column("number", "integer", "Index among the events of the session, from 0", low=0,
+           required=True, may_be_empty=False),
+    Column("kind", "text", "What happened: hidden, visible, offline, online, error, resized, ..."),
+    Column("at_ms", "number", "Time since the page was opened, by the browser's clock", unit="ms",
+           low=0),
+    Column("stored_at", "time", "Time when the server stored it"),
+    Column("data", "text", "Further data of the event, as a JSON object"),
+)  # fmt: skip
+"""Columns of ``events``: one row per event of a session."""
+
+DETAIL_COLUMNS: tuple[Column, ...] = (
+    _SESSION,
+    Column("phase", "choice", "As in the trials", choices=PHASES, required=True,
+           may_be_empty=False),
+    Column("trial", "integer", "As in the trials", low=0, required=True, may_be_empty=False),
+    Column(
+        "details", "text",
+        "JSON object of further measurements; times in ms from the start of the trial. flashes: "
+        "times at which the cue was switched on and off; frames: for each presented frame its "
+        "time, its index in the movie from 0, and the number of frames presented so far; play_ms: "
+        "time that the movie took to start; ended_ms, enabled_ms: times of the end of the movie "
+        "and of enabling the buttons; visibility: times at which the page was hidden or shown; "
+        "shown_width, shown_height: size of the movie in CSS pixels; attempts: number of times "
+        "the trial was started",
+    ),
+)  # fmt: skip
+"""Columns of ``trial_details``: one row per trial."""
+
+
+def read_events(connection: Connection, sessions: pa.Table) -> Iterator[pa.Table]:
+    """Yield tables of the events of some sessions at a time, in the order of ``sessions``."""
+    names = sessions.column("session").to_pylist()
+    for first in range(0, len(names), AT_ONCE):
+        chosen = names[first : first + AT_ONCE]
+        rank = {name: index for index, name in enumerate(chosen)}
+        rows = connection.execute(select(EVENTS).where(EVENTS.c.session.in_(chosen))).fetchall()
+        ordered = sorted(rows, key=lambda row: (rank[row.session], row.event))
+        numbers: list[int] = []
+        for _, group in groupby(ordered, key=lambda row: row.session):
+            numbers += range(len(list(group)))
+        yield _event_table(ordered, numbers)
+
+
+def _event_table(rows: list[Any], numbers: list[int]) -> pa.Table:
+    """Return the exported table of these events."""
+    stored_at = np.array([row.stored_at for row in rows], dtype=np.float64)
+    # Keys are sorted because databases may return them in another order.
+    data = [json.dumps(row.data, sort_keys=True, ensure_ascii=False) for row in rows]
+    columns = {
+        "session": pa.array([row.session for row in rows], pa.string()),
+        "number": pa.array(numbers, pa.int64()),
+        "kind": pa.array([row.kind for row in rows], pa.string()),
+        "at_ms": pa.array([row.at_ms for row in rows], pa.float64()),
+        "stored_at": iso_times(stored_at),
+        "data": pa.array(data, pa.string()),
+    }
+    return pa.table(columns, arrow_schema(EVENT_COLUMNS))
+
+
+def detail_table(trials: TrialBatch) -> pa.Table:
+    """Return the table of details of trials that were read with ``details=True``."""
+    keys = [trials.table.column(name) for name in ("session", "phase", "trial")]
+    return pa.table([*keys, trials.details], schema=arrow_schema(DETAIL_COLUMNS))
+
+
+# --- answers that are no trials of the analysis ---
+#
+# Attention checks, and practice trials that were repeated afterwards.
+
+_NAMES = ("participant", "session", "stimulus", "trial", "response", "label", "correct", "rt_ms",
+          "input", "frames_shown", "void", "answered_at")  # fmt: skip
+_AS_TRIALS = tuple(
+    replace(column, about=f"{column.about}; as in the trials")
+    for column in TRIAL_COLUMNS
+    if column.name in _NAMES
+)
+REPEAT_COLUMNS: tuple[Column, ...] = (
+    *_AS_TRIALS,
+    Column("repeat", "integer", "How often the practice of this block had been repeated before",
+           low=0, required=True, may_be_empty=False),
+)  # fmt: skip
+"""One row per answer to a practice trial that was repeated afterwards."""
+ATTENTION_COLUMNS: tuple[Column, ...] = (
+    *_AS_TRIALS,
+    Column("instructed", "flag", "The page said which button to press; label is True for yes",
+           required=True, may_be_empty=False),
+)  # fmt: skip
+"""One row per answer to an attention check."""
+
+
+def read_practice_repeats(connection: Connection, study: Study, sessions: pa.Table) -> pa.Table:
+    """Return the answers of these sessions to practice trials that were repeated afterwards."""
+    rows = connection.execute(select(PRACTICE_REPEATS).order_by(PRACTICE_REPEATS.c.repeat))
+    return _table(rows, study, sessions, REPEAT_COLUMNS)
+
+
+def read_attention(connection: Connection, study: Study, sessions: pa.Table) -> pa.Table:
+    """Return the answers of these sessions to attention checks."""
+    rows = connection.execute(select(ANSWERS).where(ANSWERS.c.phase == ATTENTION))
+    return _table(rows, study, sessions, ATTENTION_COLUMNS)
+
+
+def _table(
+    rows: Iterable[Any], study: Study, sessions: pa.Table, columns: Sequence[Column]
+) -> pa.Table:
+    """Return the exported table of these answers, in the order of the sessions.
+
+    Answers of other sessions, and to stimuli that the study no longer has, are left out.
+    """
+    names = ("session", "participant", "scenario")
+    keys = zip(*(sessions.column(name).to_pylist() for name in names), strict=True)
+    several = study.blocks.all_scenarios
+    places = {
+        session: (at, person, ALL_SCENARIOS if several else scenario)
+        for at, (session, person, scenario) in enumerate(keys)
+    }
+    labels = {key: each.label for key, each in stimuli_by_session(study).items()}
+    kept: list[tuple[tuple[int, int, int], dict[str, Any]]] = []
+    for row in rows:
+        if row.session not in places:
+            continue
+        at, person, scenario = places[row.session]
+        asked = instructed_response(row.stimulus) if row.phase == ATTENTION else None
+        label = labels.get((scenario, row.stimulus)) if asked is None else asked == "yes"
+        if label is None:
+            continue
+        repeat = getattr(row, "repeat", 0)
+        cells = row._asdict() | {
+            "participant": person,
+            "label": label,
+            "correct": (row.response == "yes") == label,
+            "instructed": asked is not None,
+        }
+        kept.append(((at, repeat, row.trial), cells))
+    kept.sort(key=lambda entry: entry[0])
+    arrays = []
+    for column in columns:
+        values = [cells[column.name] for _, cells in kept]
+        if column.kind == "time":
+            arrays.append(iso_times(np.array(values, dtype=np.float64)))
+        else:
+            arrays.append(pa.array(values, ARROW_TYPES[column.kind]))
+    return pa.table(arrays, schema=arrow_schema(columns))
+
+
+# --- the test stimuli that a complete session has answered: of its scenario or its blocks ---
+
+
+def expected_stimuli(
+    connection: Connection, study: Study, sessions: SessionTable
+) -> list[tuple[str, ...]]:
+    """Return the rows of ``expected.csv`` with their header: stimulus and scenario.
+
+    If sessions have several scenarios, each has rows of its own, with the column ``session``.
+    """
+    if not study.blocks.all_scenarios:
+        rows = [(s.stimulus, s.scenario) for s in study.stimuli if s.phase == "test"]
+        return [("stimulus", "scenario"), *rows]
+    seeds = _seeds(connection)
+    found: list[tuple[str, ...]] = [("stimulus", "scenario", "session")]
+    for session in sessions.table.column("session").to_pylist():
+        seed, condition = seeds[session]
+        order = trial_order(under(study, condition), ALL_SCENARIOS, seed)["test"]
+        found += [(s.stimulus, s.scenario, session) for s in order if s.phase == "test"]
+    return found
+
+
+def expected_names(connection: Connection, study: Study) -> dict[str, frozenset[str]]:
+    """Return the expected stimuli as the analysis takes them, by scenario or by session."""
+    if not study.blocks.all_scenarios:
+        return {name.lower(): _names(study.phase(name, "test")) for name in study.scenarios}
+    return {
+        session: _names(trial_order(under(study, condition), ALL_SCENARIOS, seed)["test"])
+        for session, (seed, condition) in _seeds(connection).items()
+    }
+
+
+def _names(stimuli: Sequence[Stimulus]) -> frozenset[str]:
+    """Return the names of test stimuli, without the attention checks among them."""
+    return frozenset(canonical_name(s.stimulus) for s in stimuli if s.phase == "test")
+
+
+def _seeds(connection: Connection) -> dict[str, tuple[int, str | None]]:
+    """Return seed and condition of the sessions that have several scenarios."""
+    columns = SESSIONS.c
+    chosen = select(columns.session, columns.order_seed, columns.condition)
+    rows = connection.execute(chosen.where(columns.scenario == ALL_SCENARIOS))
+    return {session: (seed, condition) for session, seed, condition in rows}
+
+
+# --- the data of a study as two data frames ---
+
+
+def read_tables(
+    engine: Engine,
+    study: Study,
+    *,
+    kinds: Sequence[str] = EXPORTED_KINDS,
+    scenario: str | None = None,
+    finished_only: bool = False,
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Read trials and sessions from one consistent snapshot of the database.
+
+    Sessions without consent and of participants who withdrew are left out.
+
+    Parameters
+    ----------
+    engine
+        The database.
+    study
+        The study, for the labels of its stimuli.
+    kinds
+        Kinds of sessions to include: ``person``, ``simulated`` or both.
+    scenario
+        Include only this scenario.
+    finished_only
+        Include only finished sessions.
+
+    Returns
+    -------
+    tuple of DataFrame
+        Trials and sessions, with the types of `response_schema.check_table`.
+
+    Raises
+    ------
+    PhysionError
+        There are answers to stimuli that the study folder no longer has.
+    """
+    with snapshot(engine) as connection:
+        sessions = read_sessions(
+            connection, study, SessionSelection(kinds, scenario, finished_only)
+        )
+        parts = list(read_trials(connection, study, sessions.table))
+    unknown = [name for part in parts for name in part.unknown]
+    if unknown:
+        raise PhysionError(
+            f"{len(unknown)} answers are to stimuli that {study.folder} no longer has, the first "
+            f"to {unknown[0]}; restore them in stimuli.csv"
+        )
+    empty = arrow_schema(TRIAL_COLUMNS).empty_table()
+    trials = pa.concat_tables([empty, *(part.table for part in parts)])
+    return as_frame(trials, TRIAL_COLUMNS), as_frame(sessions.table, SESSION_COLUMNS)
+
+
+@contextlib.contextmanager
+def snapshot(engine: Engine) -> Iterator[Connection]:
+    """Open a read connection that sees the database as of its first query, despite later writes."""
+    with engine.connect() as connection, connection.begin():
+        yield connection
