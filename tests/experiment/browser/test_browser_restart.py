@@ -1,10 +1,9 @@
-"""A server that is overloaded, or restarted with other settings, in a real browser."""
+"""A server that is restarted with other settings, in a real browser."""
 
 from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,27 +12,10 @@ import pytest
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.experiment.study.identity import SECRET_FILE
-from physion.experiment.study.study import Limits
 from support.experiment.browser import Visit, chromium, rows_of, served
 
 __all__ = ["chromium"]
 pytestmark = pytest.mark.slow
-
-
-def test_many_visitors_at_once_wait(chromium: Any, tmp_path: Path) -> None:
-    limits = replace(Limits(), sessions_per_minute=4.0, sessions_at_once=1)
-    with served(tmp_path, test=1, familiarization=1, limits=limits) as (study, server):
-        with Visit(chromium, server.url) as first, Visit(chromium, server.url, "crowd") as visit:
-            first.go("?participant=One")
-            first.heading("Taking part in this study")
-            visit.go("?participant=Two")
-            visit.heading("One moment, please")
-            visit.picture("waiting")
-            told = visit.page.locator("[role=timer]").inner_text()
-            assert re.fullmatch(r"It tries again in [1-9][0-9]? s\.", told)
-            assert visit.page.locator("#status").inner_text() == ""
-            visit.heading("Taking part in this study")
-        assert rows_of(study, "Two")[0].finished_at is None
 
 
 def test_movies_with_changed_urls(chromium: Any, tmp_path: Path) -> None:
