@@ -25,7 +25,12 @@ from physion.experiment.study.settings import (
 DOCS = Path(__file__).parents[3] / "docs"
 PAGE = "".join(
     (DOCS / name).read_text()
-    for name in ("tutorials/study.md", "how-to/run-a-study.md", "reference/study.md")
+    for name in (
+        "tutorials/study.md",
+        "how-to/run-a-study.md",
+        "reference/study.md",
+        "how-to/compare.md",
+    )
 )
 
 
