@@ -1,9 +1,9 @@
 """Checks of files before a comparison: every fault with its row.
 
 Rows are counted from 1 below the header. An *error* makes a comparison wrong or impossible; a
-*warning* should be looked at. Names alone do not identify test trials: 1184 of the 1200 official
-test names are also names of (other) readout trials. Leakage is therefore checked with an index of
-the dataset, a list of fitted stimuli, or a column ``split``.
+*warning* should be looked at. Names by themselves do not identify test trials: 1184 of the 1200
+official test names are also names of (other) readout trials. Leakage is therefore checked with an
+index of the dataset, a list of fitted stimuli, or a column ``split``.
 """
 
 from __future__ import annotations
@@ -427,11 +427,11 @@ def check_responses(
     Parameters
     ----------
     files, sessions
-        As for `results.read_any_responses`.
+        As for `read_any_responses`.
     labels
         Official outcomes, with which the labels of the responses must agree; None: not checked.
     expected
-        Stimuli that a session must have, as for `exclusions.flag_sessions`.
+        Stimuli that a session must have, as for `flag_sessions`.
     rules
         Exclusion rules, whose flags are counted.
 

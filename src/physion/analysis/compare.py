@@ -50,16 +50,16 @@ from physion.core.errors import BadInputError
 class PeopleComparison:
     """Tables that compare models with single participants.
 
-    - ``scores``: `measures.measure_table` of every scenario, then of their mean with equal
+    - ``scores``: `measure_table` of every scenario, then of their mean with equal
       weights (NaN if one of them is undefined), with ``kind`` (model or baseline; the computed
       baselines come last in each scenario), ``zone_low``, ``zone_high`` (of single participants)
       and ``in_zone`` (yes, no, or empty if either is undefined).
-    - ``zones``: `zones.human_zones` of every scenario, and for several scenarios also the paper's
-      band of r (`zones.released_r_zone`), whose scenario is the mean.
-    - ``pairs``: `model_people.model_pairs` of every scenario.
-    - ``tests``: `paired.compare_models` on the stimuli of all scenarios together;
-      ``measure_tests``: `paired_measures.paired_measures`.
-    - ``calibration``: `calibration.calibration_table`, likewise.
+    - ``zones``: `human_zones` of every scenario, and for several scenarios also the paper's
+      band of r (`released_r_zone`), whose scenario is the mean.
+    - ``pairs``: `model_pairs` of every scenario.
+    - ``tests``: `compare_models` on the stimuli of all scenarios together;
+      ``measure_tests``: `paired_measures`.
+    - ``calibration``: `calibration_table`, likewise.
     - ``dropped``: ``model``, ``scenario``, ``reason``, ``stimuli``.
     """
 
@@ -85,10 +85,10 @@ def compare_everywhere(
     Parameters
     ----------
     predictions
-        One row a model and stimulus with ``model``, ``stimulus`` (canonical name), ``p_contact``,
+        One row per model and stimulus with ``model``, ``stimulus`` (canonical name), ``p_contact``,
         ``predicted``. Predictions of stimuli that nobody saw are counted as dropped.
     test
-        Test rows of `participants.Responses`.
+        Test rows of `Responses`.
     bootstrap
         Level of the intervals, and draws of the tests.
     halves
@@ -152,14 +152,14 @@ def _with_zone(scores: pd.DataFrame, zones: pd.DataFrame) -> pd.DataFrame:
 class ComparisonResults:
     """Results of a comparison of models with people.
 
-    - ``comparison``: from `comparison.compare_scores`.
-    - ``predictions``: from `predictions.read_predictions`, for what needs readout and training.
+    - ``comparison``: from `compare_scores`.
+    - ``predictions``: from `read_predictions`, for what needs readout and training.
     - ``people``: results about single participants; None if only their averages are known.
-    - ``beside``: models and single participants, from `people_comparison.compare_everywhere`.
+    - ``beside``: models and single participants, from `compare_everywhere`.
     - ``comparison_all``: the comparison with all complete sessions, including flagged ones.
-    - ``paired``: from `model_tests.paired_tests`, all scenarios pooled; None for one model.
-    - ``paired_measures``: from `paired_measures.paired_measures`; None for one model or no people.
-    - ``calibration``: from `model_tests.calibration_scores`.
+    - ``paired``: from `paired_tests`, all scenarios pooled; None for one model.
+    - ``paired_measures``: from `paired_measures`; None for one model or no people.
+    - ``calibration``: from `calibration_scores`.
     - ``mixed``: from `mixed_fits`.
     - ``warnings``: what may make the results wrong, one sentence each.
     """
@@ -193,7 +193,7 @@ def all_results(
     Parameters
     ----------
     predictions
-        From `predictions.read_predictions`.
+        From `read_predictions`.
     humans, labels, zone, zone_origin
         Averages of people, recorded outcomes and the human zone, as in `compare_scores`.
     people

@@ -1,4 +1,10 @@
-"""Comparison of models with people: the selection of trials, and every table of results."""
+"""Models next to averages of people: which stimuli count, the scores, and what contradicts itself.
+
+`compare_scores` joins predictions, answers of people and outcomes, counts what is left out, and
+refuses or warns of tables that contradict each other: outcomes that are the wrong way round, or a
+table that was cut, give plausible numbers. `later_scores` gives the scores without the trials whose
+contact was already observed.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +22,7 @@ from physion.analysis.tables import check_predictions, in_order, name_models, wi
 from physion.core.errors import BadInputError
 from physion.core.names import canonical_name, is_ledge, scenario_of
 
-# Inputs of a comparison that contradict each other: errors where sure, else warnings.
-#
-# Outcomes that are the wrong way round, or a table that was cut, give plausible numbers. Every
-# check here compares two things that the tables say about the same stimuli.
+# Checks of tables that contradict each other: errors where sure, else warnings.
 
 SURE = 1e-3
 """Probability under chance below which outcomes that mostly differ are called opposite."""
@@ -31,7 +34,7 @@ BELOW_CHANCE = -4.0
 def check_probabilities(predictions: pd.DataFrame) -> list[str]:
     """Return a warning for each model whose predicted outcomes contradict its probabilities.
 
-    ``predictions``: from `predictions.read_predictions`. A P(contact) of 0.5 contradicts nothing.
+    ``predictions``: from `read_predictions`. A P(contact) of 0.5 contradicts nothing.
     Raises `BadInputError` for a model that contradicts itself in so many rows that chance is
     excluded (binomial test against one half, p < `SURE`) and whose P(contact) is larger where it
     predicts no contact: then the probability is that of no contact. A model with another threshold
@@ -65,7 +68,7 @@ def check_probabilities(predictions: pd.DataFrame) -> list[str]:
 def check_outcomes(stimuli: pd.DataFrame) -> list[str]:
     """Return a warning for each scenario whose official outcomes are mostly not those shown.
 
-    ``stimuli``: from `comparison.Comparison`. Raises `BadInputError` where so many differ that
+    ``stimuli``: from `Comparison`. Raises `BadInputError` where so many differ that
     chance is excluded (binomial test against one half, p < `SURE`): then the labels are opposite.
     """
     found = []
@@ -160,7 +163,7 @@ SETTING = "Contact in the observed part"
 def observed_contacts(predictions: pd.DataFrame) -> pd.Series:
     """Return by stimulus whether the contact was observed, for the stimuli for which it is known.
 
-    ``predictions``: from `predictions.name_models`; a model that knows suffices for all,
+    ``predictions``: from `name_models`; a model that knows suffices for all,
     and a contact that one simulation shows in the observed part counts for all.
     """
     known = predictions[predictions["observed_contact"].notna()]
@@ -173,7 +176,7 @@ def later_scores(stimuli: pd.DataFrame, level: float = 0.95) -> tuple[pd.DataFra
     Parameters
     ----------
     stimuli
-        As `comparison.Comparison.stimuli`. Trials of which it is not known whether the contact was
+        As `Comparison.stimuli`. Trials of which it is not known whether the contact was
         observed (``observed_contact`` is None) are left out too.
     level
         Level of the intervals.
@@ -220,10 +223,10 @@ class Comparison:
     - ``baselines``: the same of the baselines that need no predictions (`scores.COMPUTED`), on
       the stimuli that any model predicts; empty without people.
     - ``later``: the rows of both without the trials whose contact was observed, see
-      `observed_contact.later_scores`; empty if that is not known.
-    - ``people``: see `score_tables.people_table`, for the stimuli that any model predicts; empty
+      `later_scores`; empty if that is not known.
+    - ``people``: see `people_table`, for the stimuli that any model predicts; empty
       without people.
-    - ``stimuli``: one row a model and stimulus that both answered: ``model``, ``base_model``,
+    - ``stimuli``: one row per model and stimulus that both answered: ``model``, ``base_model``,
       ``readout``, ``scenario``, ``stimulus``, ``p_contact``, ``predicted``, ``label`` (official),
       ``simulated``, ``human_accuracy``, ``count``, ``p_yes``, ``gap`` (p_contact - p_yes),
       ``observed_contact`` (True, False, or None if it is not known).
@@ -287,12 +290,12 @@ def compare_scores(
     predictions
         Columns of `tables.PREDICTIONS`; ``outcome`` is that of the trial as the model was shown it.
     humans
-        Table from `responses.read_humans`, or None for the accuracies of the models alone.
+        Table from `read_humans`, or None for the accuracies of the models only.
     labels
         Official outcome by stimulus. For a stimulus without one ``recorded_outcome`` of the
         predictions counts and, without people, the simulated outcome.
     zone
-        Table from `responses.read_human_zone` or from the accuracies of single participants, with
+        Table from `read_human_zone` or from the accuracies of single participants, with
         ``scenario``, ``low`` and ``high``.
     zone_origin
         Source of the zone as text.

@@ -1,6 +1,6 @@
 """Tables of the figures: each figure draws exactly its table.
 
-Tables of scores (`MEASURE_COLUMNS`) have models, then baselines; the others have models alone.
+Tables of scores (`MEASURE_COLUMNS`) have models, then baselines; the others have models only.
 Each function returns one table, plain rows and columns, that is written next to the figure as CSV.
 """
 
@@ -57,8 +57,8 @@ def accuracy_table(comparison: Comparison) -> pd.DataFrame:
 def r_table(comparison: Comparison, zones: pd.DataFrame | None = None) -> pd.DataFrame:
     """Return Pearson's r with the average person; the dashed line is its noise ceiling.
 
-    Columns: `MEASURE_COLUMNS`. ``zones`` (`zones.human_zones`): the range of single participants
-    with the average of the others; in the mean the paper's band, as in `zones.released_r_zone`.
+    Columns: `MEASURE_COLUMNS`. ``zones`` (`human_zones`): the range of single participants
+    with the average of the others; in the mean the paper's band, as in `released_r_zone`.
     """
     people = comparison.people.set_index("scenario")[["ceiling"]].set_axis(["people"], axis=1)
     people = _with_zone(people, zones, "r", released=False)
@@ -154,7 +154,7 @@ def _measure(rows: pd.DataFrame, people: pd.DataFrame, people_is: str) -> pd.Dat
 
 
 def scatter_table(comparison: Comparison, models: Sequence[str]) -> pd.DataFrame:
-    """Return P(contact) and the fraction of yes, a row a model and stimulus, in the order of
+    """Return P(contact) and the fraction of yes, one row per model and stimulus, in the order of
     ``models``.
     """
     columns = ["model", "scenario", "stimulus", "p_yes", "p_contact", "label", "simulated"]
@@ -202,7 +202,7 @@ def thirds_table(
 
     `MEASURE_COLUMNS` and ``stimuli``, their number; a panel a third; all scenarios pooled,
     intervals about other stimuli of the third. With the ``answers`` of participants (``test`` of
-    `participants.Responses`) the dashed line is the r of halves of them with each other.
+    `Responses`) the dashed line is the r of halves of them with each other.
     """
     people = _halves_by_third(comparison, answers)
     stimuli = pd.concat([comparison.stimuli, baseline_stimuli(comparison.stimuli)])
@@ -267,7 +267,7 @@ def effects_table(
     """Return accuracy by readout and by training protocol, averaged over seeds, then over
     scenarios.
 
-    ``predictions``: from `predictions.read_predictions`. `GROUPED_COLUMNS`; the panel of readouts
+    ``predictions``: from `read_predictions`. `GROUPED_COLUMNS`; the panel of readouts
     has one training protocol (*all* if it occurs), that of trainings one readout. A panel is absent
     if no model has two conditions. Intervals are about other stimuli.
     """
@@ -349,7 +349,7 @@ def _effect(
 def generalization_table(comparison: Comparison, predictions: pd.DataFrame) -> pd.DataFrame:
     """Return accuracy less that of people, trained on x tested on; `GENERALIZATION_COLUMNS`.
 
-    Seeds are averaged; models of one training alone are left out. If no model was tested on another
+    Seeds are averaged; models of one training only are left out. If no model was tested on another
     scenario than it was trained on, the diagonal becomes one row `ONLY`. Without people the
     difference is to 0.5, the accuracy of guessing, and ``people`` is NaN.
     """

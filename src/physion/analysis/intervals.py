@@ -319,7 +319,7 @@ class Bootstrap:
     def weights(self, stratum: str, n: int) -> Array:
         """Return how often each of ``n`` stimuli or people is drawn: (resamples, n), rows sum to n.
 
-        It depends on the seed, the name of the stratum and n alone.
+        It depends on the seed, the name of the stratum and n only.
         """
         return _weights(self.resamples, self.seed, stratum, n)
 

@@ -1,9 +1,11 @@
-"""Registry of the metrics: the one definition of every number that compares a model with people.
+"""Metrics: the one definition of every number that compares a model with people, in one registry.
 
-A metric is one entry: a function of a `Sample`, decorated with `register_metric`. The tables of
-scores (`models.score_tables`), of measures (`models.model_people`) and the report ask this
-registry, so that a new metric appears in all of them. ``docs/how-to/add-a-metric.md``
-shows how to add one.
+A metric is one entry: a function that is decorated with `register_metric`, of three arrays or of a
+`Sample`. The tables of scores (`scores.score_table`), of measures with single participants
+(`scores.measure_table`) and the report ask this registry, so that a new metric appears in all of
+them. ``docs/how-to/add-a-metric.md`` shows how to add one. The order below is that of the tables:
+correct answers, signal detection, likeness to the average person, likeness beyond the outcome,
+likeness to single participants.
 """
 
 from __future__ import annotations
@@ -249,7 +251,7 @@ def difference(sample: Sample) -> Array:
     return (sample.sums.correct_people - sample.sums.human) / sample.sums.n_people
 
 
-# Metrics of a model with the average person: they need P(yes) by stimulus alone.
+# Metrics of a model with the average person: they need P(yes) by stimulus only.
 
 ROUNDING = 1e-12
 """Distance from 1 below which agreement by chance counts as 1."""

@@ -1,4 +1,9 @@
-"""Tests of models against each other, and calibration, on the stimuli of all scenarios together."""
+"""Tests of models against each other, calibration, and mixed models of answers and accuracies.
+
+Pairs of models are compared on the stimuli of all scenarios together: McNemar's test of accuracy
+and permutations of r (`paired_tests`), differences of every measure with intervals
+(`paired_measures`). `fits_of_people` and `fits_of_models` are the mixed models of the report.
+"""
 
 from __future__ import annotations
 
@@ -95,7 +100,7 @@ def pool_comparison(comparison: Comparison) -> PooledStimuli:
 def paired_tests(
     pooled: PooledStimuli, bootstrap: Bootstrap, permutations: int | None = None
 ) -> pd.DataFrame:
-    """Test every two models with `paired.compare_models`; empty for one model alone."""
+    """Test every two models with `compare_models`; empty for one model only."""
     pairs = len(pooled.names) * (len(pooled.names) - 1) // 2
     return compare_models(
         list(pooled.names),
@@ -109,7 +114,7 @@ def paired_tests(
 
 
 def calibration_scores(pooled: PooledStimuli) -> pd.DataFrame:
-    """Return `calibration.calibration_table` of every model against the official outcomes."""
+    """Return `calibration_table` of every model against the official outcomes."""
     return calibration_table(list(pooled.names), pooled.p_contact, pooled.label)
 
 
@@ -190,7 +195,7 @@ def paired_measures(
     Returns
     -------
     table
-        `COLUMNS`: one row a scenario (and `POOLED`), measure and pair on the stimuli that both
+        `COLUMNS`: one row per scenario (and `POOLED`), measure and pair on the stimuli that both
         predict: ``difference`` (first less second) with its jackknife interval over stimuli, the
         two-sided ``p`` of the permutation test, and ``p`` corrected over the pairs of the same
         scenario and measure. Empty without people or with one model.

@@ -83,7 +83,7 @@ def rollout_error_table(errors: pd.DataFrame, level: float = 0.95) -> pd.DataFra
         From `read_rollout_errors`.
     level
         Level of the intervals, which are symmetric in the logarithm of the mean error. Errors are
-        skewed, which `jackknife.degrees_of_freedom` takes into account.
+        skewed, which `degrees_of_freedom` takes into account.
     """
     models = list(dict.fromkeys(errors["model"]))
     scenarios = in_order(set(errors["scenario"]))

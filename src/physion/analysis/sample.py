@@ -222,7 +222,7 @@ def sample_of_rows(rows: pd.DataFrame, stimuli: Array) -> Sample:
     Parameters
     ----------
     rows
-        One row a stimulus with ``p_contact``, ``predicted``, ``label``, ``simulated``, and, NaN
+        One row per stimulus with ``p_contact``, ``predicted``, ``label``, ``simulated``, and, NaN
         without people, ``p_yes``, ``human_accuracy`` and ``count``.
     stimuli
         (b, s): weight of each stimulus.

@@ -1,4 +1,13 @@
-"""Tables of scores: one row a model and scenario, then their mean and the pooled stimuli."""
+"""Scores of models, of people and of baselines: tables with intervals, by scenario and overall.
+
+- `score_table`: every metric by stimulus, one row per model and scenario, then their mean and the
+  pooled stimuli; `people_table`: the people themselves.
+- `Models`, `models_of`: models and the single participants of a scenario as arrays.
+- `sampling_variances`: how much a measure varies with other people, other stimuli, or both.
+- baselines (`OUTCOME`, `MAJORITY`, `TWO_PEOPLE`): what a score is worth.
+- `measure_models`, `measure_table`: measures with single participants, and their intervals.
+- `human_zones`: the range of the same measures among people.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +55,7 @@ def score_table(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
     Parameters
     ----------
     stimuli
-        One row a model and stimulus, as `comparison.Comparison.stimuli`.
+        One row per model and stimulus, as `Comparison.stimuli`.
     level
         Level of the intervals, which are about other stimuli of the same number in each scenario,
         with the same people (`jackknife`).
@@ -55,7 +64,7 @@ def score_table(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
     -------
     For each ``model`` its scenarios, then `MEAN` and `POOLED`. Columns: ``model``, ``base_model``,
     ``readout``, ``scenario``; counts of ``stimuli`` and of ``changed`` ones, whose simulated
-    outcome is not the official one; every metric of `metrics.score_metrics` with ``_low`` and
+    outcome is not the official one; every metric of `score_metrics` with ``_low`` and
     ``_high``; ``ceiling`` of r and ``floor`` of the RMSD; ``reason``: why a score or an interval is
     NaN, or means less than it seems to (for example if all labels are of one class); else empty.
     """
@@ -75,7 +84,7 @@ def score_table(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
 def two_people_table(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
     """Return the scores of one person with another, with the columns of `score_table`.
 
-    ``stimuli`` has a row for each stimulus, whose predictions do not matter. Metrics that are not
+    ``stimuli`` has one row per stimulus, whose predictions do not matter. Metrics that are not
     defined for two people are NaN.
     """
     ordered = stimuli.sort_values("stimulus", kind="stable")
@@ -187,7 +196,7 @@ def people_table(
 ) -> pd.DataFrame:
     """Return the people by scenario and, in row `MEAN`, averaged over scenarios.
 
-    ``people`` has a row a stimulus, from `responses.with_labels`.
+    ``people`` has one row per stimulus, from `with_labels`.
 
     Columns: ``scenario``, ``stimuli``, ``people`` (median number a stimulus), ``base_rate``
     (fraction of stimuli with contact), ``yes`` (mean fraction who say yes), ``accuracy`` with
@@ -347,7 +356,7 @@ def model_pairs(models: Models, answers: ScenarioAnswers) -> pd.DataFrame:
 #
 # An interval is about the expected value of the measure with other people, or stimuli, of the same
 # number. The averages of people are noisy, which raises the RMSD and lowers r, in the value and in
-# its expectation alike; `agreement.ceiling` and `agreement.rmsd_floor` state how much.
+# its expectation alike; `ceiling` and `rmsd_floor` state how much.
 #
 # References
 # ----------
@@ -373,7 +382,7 @@ def sampling_variances(
     """Return the variance of measures over other people, stimuli, or both; each of shape (m,).
 
     - stimuli: jackknife over stimuli; people stay the same.
-    - people: jackknife over people, less its excess of second order (`jackknife.second_order`),
+    - people: jackknife over people, less its excess of second order (`second_order`),
       which may take at most half of it; stimuli stay the same.
     - both: the jackknife over stimuli contains the noise of single answers, since every stimulus
       has answers of its own, but not what a person does in all stimuli. The variance of that part
@@ -429,7 +438,7 @@ def _over_people(
 
 
 def _pairs(n: int) -> npt.NDArray[np.int_]:
-    """Return all pairs of n people, or `PAIRS` of them; none for two people alone."""
+    """Return all pairs of n people, or `PAIRS` of them; none for two people only."""
     pairs = np.stack(np.triu_indices(n, 1), axis=1)
     if n < 3:
         return pairs[:0]
@@ -541,7 +550,7 @@ def not_given(names: Iterable[str]) -> list[str]:
 def seen_stimuli(stimuli: pd.DataFrame) -> pd.DataFrame:
     """Return each stimulus that people answered once, as rows of `TWO_PEOPLE`.
 
-    ``stimuli`` and the result have the columns of `comparison.Comparison.stimuli`; the predictions
+    ``stimuli`` and the result have the columns of `Comparison.stimuli`; the predictions
     are the outcomes and mean nothing. It is empty without people.
     """
     seen = stimuli[stimuli["p_yes"].notna()].drop_duplicates("stimulus")
@@ -551,7 +560,7 @@ def seen_stimuli(stimuli: pd.DataFrame) -> pd.DataFrame:
 def baseline_stimuli(stimuli: pd.DataFrame) -> pd.DataFrame:
     """Return the answers of `OUTCOME` and `MAJORITY` to the stimuli that people answered.
 
-    ``stimuli`` and the result have the columns of `comparison.Comparison.stimuli`; the result is
+    ``stimuli`` and the result have the columns of `Comparison.stimuli`; the result is
     about each stimulus once, and P(contact) is 0 or 1. Without people, and for baselines whose
     predictions were given (`GIVEN_AS`), it has no rows.
     """
@@ -623,7 +632,7 @@ class Measured:
 
     - ``model``, ``scenario``; ``stimuli``: number of stimuli that the model predicts;
     - ``values[measure]``; ``reasons[measure]``: why the value is NaN;
-    - ``variances[what][measure]`` for each of `sample.RESAMPLED`, absent if the measure does not
+    - ``variances[what][measure]`` for each of `RESAMPLED`, absent if the measure does not
       depend on what is drawn;
     - ``by_participant[measure]`` (people,), for measures with a value for each participant.
     """
@@ -700,7 +709,7 @@ def _two_people(name: str, models: Models, answers: ScenarioAnswers, sample: Sam
 
 
 def measure_table(measured: Sequence[Measured], level: float = 0.95) -> pd.DataFrame:
-    """Return one row a model and measure.
+    """Return one row per model and measure.
 
     Columns: ``model``, ``scenario``, ``measure``, ``stimuli``, ``value``; ``low`` and ``high`` with
     ``_people``, ``_stimuli``, ``_both`` (interval by what is drawn, at this ``level``); for
@@ -808,7 +817,7 @@ def human_zones(answers: ScenarioAnswers, halves: Array | None = None) -> pd.Dat
     ``of`` names whose values they are: ``participants`` (each with the average of the others, or
     the mean kappa with the others: what a model must reach to be indistinguishable from a
     participant), ``pairs`` (kappa of two people, comparable to a model's kappa with single people)
-    and ``halves`` (r of two halves of the people; ``halves`` is from `people.split_halves`). A
+    and ``halves`` (r of two halves of the people; ``halves`` is from `split_halves`). A
     person answers 0 or 1 and no probability, which makes r and RMSD worse; halves are averages and
     reach better values.
     """

@@ -579,7 +579,7 @@ def _read_file(path: Path, scenario: str, redyellow: bool) -> pd.DataFrame:
 
 
 def _choose_look(table: pd.DataFrame, dominoes: DominoesLook, folder: Path) -> pd.DataFrame:
-    """Return one row a Dominoes stimulus: of one look, or of both weighted by their people."""
+    """Return one row per Dominoes stimulus: of one look, or of both weighted by their people."""
     in_dominoes = table["scenario"] == "dominoes"
     if dominoes == "pooled":
         total = table["accuracy"] * table["count"]
@@ -689,7 +689,7 @@ _ALWAYS_ONE_EACH = ("contain",)
 def attributes_from_names(stimuli: Iterable[str]) -> pd.DataFrame:
     """Return the attributes that official names contain, with `MISLABELLED` ones corrected.
 
-    One row a stimulus with `COLUMNS`. A name without scenery (``..._simple_box``) means none: 0.
+    One row per stimulus with `COLUMNS`. A name without scenery (``..._simple_box``) means none: 0.
     ``elements`` are NaN if the name contains none or, as in Link, a range. Raises `BadInputError`
     for a name of no official scenario.
     """

@@ -27,7 +27,7 @@ class ReportInputs(ComparisonResults):
     - ``question``: what people and models were asked, for the movies.
     - ``model_inputs``: what a model was given, by its name: values of the column *Inputs*.
     - ``model_weights``: which weights a model started from, by its name: of the column *Init*.
-    - ``rollout_errors``: from `rollout_errors.rollout_error_table`, or None.
+    - ``rollout_errors``: from `rollout_error_table`, or None.
     - ``movie_count``: largest number of disagreements that are shown as movies.
     - ``page_bytes``: size of the page up to which movies are added; what does not fit is left out.
     - ``trial_pages``: whether a page for each stimulus is written, to ``trials/``.

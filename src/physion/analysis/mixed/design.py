@@ -1,4 +1,6 @@
-"""Parser of formulas of mixed models: ``y ~ fixed effects + (1|group) + (1 + x|group)``.
+"""From the formula of a mixed model and a table to its arrays.
+
+Formula: ``y ~ fixed effects + (1|group) + (1 + x|group)``.
 
 Fixed effects are read by formulaic (numbers as they are, True as 1; text and categories against the
 first level): ``a + b``, ``a:b``, ``a * b``, ``C(a, Treatment("level"))``, ``C(a, Sum)``, ``log``,
@@ -9,6 +11,9 @@ slopes are ``(1 + x|g)``, correlated with the intercept, or ``(1 + x||g)``, wher
 the left side is uncorrelated with the others (also the columns of one category); the left side is
 read as fixed effects are, and ``(x|g)`` has an intercept too. Column names with blanks are quoted
 with backticks.
+
+The arrays refuse what cannot be fitted (constant columns, separation). Levels of crossed groupings
+are sorted so that their equations split into small dense blocks (`Groupings`).
 """
 
 from __future__ import annotations
@@ -180,7 +185,7 @@ class Group:
 
     @property
     def intercept_alone(self) -> bool:
-        """Whether the levels differ in their intercept alone."""
+        """Whether the levels differ in their intercept only."""
         return self.effects == (INTERCEPT,)
 
 
@@ -341,7 +346,7 @@ def _groups(term: RandomTerm, rows: pd.DataFrame) -> list[Group]:
 def _refuse_unknown_slopes(
     columns: Array, effects: Sequence[str], codes: npt.NDArray[np.int64], name: str
 ) -> None:
-    """Refuse slopes that no level determines, because its rows have one value alone."""
+    """Refuse slopes that no level determines, because its rows have one value only."""
     if not effects:
         raise BadInputError(f"no effect varies by {name!r}; write (1|{name})")
     _refuse_dependent(columns, effects, f"random effects of {name!r}")
@@ -666,7 +671,7 @@ def _separating(x: Array, y: Array) -> Array | None:
 # The parameters are the entries of L, column by column, for columns z that are made orthonormal
 # within a group of correlated effects: neither the origin nor the unit of a slope matters to the
 # search. The sign of a column of L does not matter, so that the likelihood is even in the last
-# diagonal entry of each group, which stands alone in its column.
+# diagonal entry of each group, which stands only in its column.
 
 
 class RandomEffects:

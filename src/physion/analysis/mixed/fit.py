@@ -1,4 +1,8 @@
-"""Exact solution of the equations of random intercepts by blocks, without a sparse solver.
+"""Fits of mixed models with crossed random effects: `fit_linear` and `fit_logistic`.
+
+In this order: the exact solution of the equations by blocks, a minimiser that proves its minimum,
+the restricted likelihood of linear models, logistic models (Laplace approximation), random slopes,
+and `fit_linear` with Satterthwaite's degrees of freedom.
 
 With random effects b = Lambda u, u standard normal, Lambda the diagonal matrix of standard
 deviations, every step needs H = I + Lambda Z'WZ Lambda. Its cost is (wide + narrow) * narrow^2

@@ -35,12 +35,12 @@ class JointTest:
 class MixedFit:
     """A fitted mixed model.
 
-    - ``table``: one row a fixed effect: ``term``, ``b``, ``se``, ``t`` (linear) or ``z``
+    - ``table``: one row per fixed effect: ``term``, ``b``, ``se``, ``t`` (linear) or ``z``
       (logistic), ``df`` (Satterthwaite; infinite for z), ``p`` (two-sided), ``low``, ``high``;
-    - ``random``: one row a random effect: ``group``, ``effect`` (``Intercept`` or the column of a
+    - ``random``: one row per random effect: ``group``, ``effect`` (``Intercept`` or the column of a
       slope), ``levels``, ``sd``; linear models end with the row ``residual`` (its levels are the
       rows of data);
-    - ``correlations``: one row a pair of correlated effects: ``group``, ``first``, ``second``,
+    - ``correlations``: one row per pair of correlated effects: ``group``, ``first``, ``second``,
       ``r`` (NaN if one does not vary);
     - ``log_likelihood``: restricted for linear models, so that it compares only models of the same
       fixed effects;

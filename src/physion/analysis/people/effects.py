@@ -1,4 +1,9 @@
-"""Biases and covariates of answers: response bias, side bias, practice, background."""
+"""What moves the answers of people: biases, practice, background, difficulty, the hypotheses.
+
+- response bias and side bias, learning over the trials, accuracy by background;
+- difficulty of stimuli: below chance, hard, at chance, easy;
+- `regress_hypotheses`: the four preregistered hypotheses about attributes of stimuli.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +41,7 @@ BACKGROUND = ("condition", "age", "gender", "education", "difficulty", "technica
 
 
 def yes_bias(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
-    """Test whether people say yes too often; one row a scenario.
+    """Test whether people say yes too often; one row per scenario.
 
     Columns: ``scenario``, ``people``, ``base_rate`` (fraction of stimuli with contact, weighted by
     answers), ``yes`` (fraction of yes), ``bias`` (yes - base_rate) with ``_low``, ``_high``,
@@ -96,7 +101,7 @@ def _mean_with_interval(
 
 
 def side_bias(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
-    """Test whether people press the left button too often; one row a scenario.
+    """Test whether people press the left button too often; one row per scenario.
 
     A person keeps one order of buttons, so side and answer are confounded within people but not
     between people. Columns: ``scenario``, ``yes_left``, ``yes_right`` (people with either order),
@@ -143,8 +148,8 @@ def _side_record(groups: dict[str, Array], scenario: str, draws: Bootstrap) -> d
 
 
 def learning(test: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
-    """Test whether people improve over the test trials, without feedback; one row a scenario, then
-    all.
+    """Test whether people improve over the test trials, without feedback; one row per scenario,
+    then all.
 
     Logistic regression of correctness on the position in the order, in units of 100 trials, with
     standard errors clustered by participant (`clustered_logit`); for all scenarios together with an
@@ -174,7 +179,7 @@ def learning(test: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
 
 
 def background(sessions: pd.DataFrame) -> pd.DataFrame:
-    """Count the answers to the questionnaire: one row a question and answer.
+    """Count the answers to the questionnaire: one row per question and answer.
 
     Columns: ``question``, ``answer`` (``(none)`` if not answered), ``sessions``, ``share``
     (fraction).
@@ -275,7 +280,7 @@ def below_chance_level(by_stimulus: pd.DataFrame, level: float = 0.05) -> pd.Dat
     """Find the stimuli that people get wrong more often than by guessing, by two rules.
 
     ``by_stimulus`` has ``stimulus``, ``scenario``, ``accuracy`` and ``count``, from
-    `people.accuracy_by_stimulus` or `responses.read_humans`. Added columns: ``released``
+    `accuracy_by_stimulus` or `read_humans`. Added columns: ``released``
     (`below_chance_level_released`), ``p`` (`below_chance_level_p`), ``p_adjusted`` (Benjamini and
     Hochberg over all rows given), ``exact`` (p_adjusted < ``level``).
     """
@@ -355,7 +360,7 @@ def _fractions(accuracy: npt.ArrayLike, count: npt.ArrayLike) -> tuple[Array, Ar
 
 # The four preregistered hypotheses: attributes that make stimuli hard, and slower answers to them.
 #
-# By stimulus, which needs only the table of `people.accuracy_by_stimulus` or of the official
+# By stimulus, which needs only the table of `accuracy_by_stimulus` or of the official
 # files: regression of a stimulus' accuracy (or log response time) on the attribute, with an
 # intercept for each scenario. By single answers: ``HYPOTHESES[...].formula`` on `answer_rows`, for
 # the mixed models.
@@ -409,7 +414,7 @@ COLUMNS = (
 
 
 def with_attributes(by_stimulus: pd.DataFrame, attributes: pd.DataFrame) -> pd.DataFrame:
-    """Return ``by_stimulus`` with the columns of `attributes.ATTRIBUTES`, NaN if unknown."""
+    """Return ``by_stimulus`` with the columns of `ATTRIBUTES`, NaN if unknown."""
     require_columns(by_stimulus, ["stimulus", "scenario", "accuracy"], "the table by stimulus")
     columns = ["stimulus", *ATTRIBUTES]
     return by_stimulus.merge(attributes[columns], on="stimulus", how="left", validate="one_to_one")

@@ -1,7 +1,7 @@
 """Exclusion rules: which sessions are flagged, by which rule, and with which effect.
 
-Rules flag sessions and do not drop them: `flag_sessions` returns one row a session and one column a
-rule, so that analyses can be done with and without flagged sessions, as preregistered. Rule sets
+Rules flag sessions and do not drop them: `flag_sessions` returns one row per session and one
+column per rule, so that analyses can be done with and without flagged sessions, as preregistered. Rule sets
 are values: `PREREGISTERED` follows the text of the preregistration, `OFFICIAL_CODE` the released
 code, which differs from it.
 """
@@ -202,7 +202,7 @@ def _longest_run(same: npt.NDArray[np.bool_]) -> int:
 
 
 def session_measures(responses: Responses, expected: Expected | None = None) -> pd.DataFrame:
-    """Return the measures for the rules, one row a session, in the order of ``responses.sessions``.
+    """Return the measures for the rules, one row per session, in order of ``sessions``.
 
     A session of several blocks is measured as a whole, over the answers in the order given.
 
@@ -301,7 +301,7 @@ class ExclusionRules:
     - ``alternation``: answers in a row that alternate, from which on a session is flagged.
     - ``alternation_phase``: count only alternations that begin with ``first``, the first answer of
       the scenario's table, as the released code did; None: either.
-    - ``familiarization_share``: share of right practice trials up to which it is flagged.
+    - ``familiarization_share``: fraction of right practice trials up to which it is flagged.
     - ``accuracy_sd``: standard deviations below the ``accuracy_centre`` of the scenario.
     - ``rt_sd``: standard deviations above the median of the participants' ``rt_summary`` of log
       response times.
@@ -445,7 +445,7 @@ def flag_sessions(
     *,
     expected: Expected | None = None,
 ) -> pd.DataFrame:
-    """Return one row a session: the measures, a bool for each of `RULES`, and ``flagged`` (any of
+    """Return one row per session: the measures, a bool for each of `RULES`, and ``flagged`` (any of
     them).
 
     ``expected``: the stimuli of a complete session, as in `session_measures`.
@@ -593,7 +593,7 @@ def flag_effect(
     """Estimate the effect of a session's flag on correctness, over all sessions.
 
     Logistic regression of every test answer on the flag and the scenario, with standard errors
-    clustered by participant. Columns are those of `clustered_logit`, for the term ``column`` alone;
+    clustered by participant. Columns are those of `clustered_logit`, for the term ``column`` only;
     NaN with a ``reason`` if all or no sessions are flagged. Low accuracy is itself a rule, so the
     effects of ``low_accuracy``, and of ``flagged`` if it flags any session, hold by construction;
     the ``reason`` then states it.

@@ -1,6 +1,6 @@
 """Accuracy of people and agreement among them: by stimulus, by participant, by scenario.
 
-All functions take the test rows of `participants.Responses` (``responses.test``) after exclusions.
+All functions take the test rows of `Responses` (``responses.test``) after exclusions.
 Intervals draw participants with replacement (`Bootstrap`, 1000 draws, seeded), as preregistered; a
 *zone* is the middle 95 % of single participants or pairs.
 """
@@ -90,7 +90,7 @@ def difference_of_pairs(yes: Array, weights: npt.ArrayLike | None = None) -> Arr
 
 
 def answers_of(test: pd.DataFrame, scenario: str) -> ScenarioAnswers:
-    """Return the answers to one scenario from the test rows of `participants.Responses`.
+    """Return the answers to one scenario from the test rows of `Responses`.
 
     Raises `BadInputError` if the scenario has no answer, or a session two answers to one stimulus.
     """
@@ -138,12 +138,12 @@ def draws_of_people(answers: ScenarioAnswers, bootstrap: Bootstrap) -> Array:
 
 
 def accuracy_by_stimulus(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
-    """Return one row a stimulus.
+    """Return one row per stimulus.
 
     Columns: ``scenario``, ``stimulus``, ``label``, ``count`` (people), ``accuracy`` with ``_low``,
     ``_high``, ``p_yes``, ``consistency`` (fraction of people who gave the more frequent answer,
     right or wrong: 0.5 to 1), ``mean_log_rt`` (mean over people of the natural logarithm of the
-    ms). They include the columns of `responses.with_labels`, so that the table can replace that
+    ms). They include the columns of `with_labels`, so that the table can replace that
     one.
     """
     draws = bootstrap or Bootstrap()
@@ -169,7 +169,7 @@ def accuracy_by_stimulus(test: pd.DataFrame, bootstrap: Bootstrap | None = None)
 
 
 def accuracy_by_participant(test: pd.DataFrame) -> pd.DataFrame:
-    """Return one row a session.
+    """Return one row per session.
 
     Columns: ``scenario``, ``session``, ``participant``, ``trials``, ``accuracy``, ``yes`` (fraction
     of yes), ``mean_log_rt``, ``median_rt_ms``.
@@ -188,7 +188,7 @@ def accuracy_by_participant(test: pd.DataFrame) -> pd.DataFrame:
 
 
 def accuracy_by_scenario(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
-    """Return one row a scenario and, in row `MEAN`, their mean with equal weights.
+    """Return one row per scenario and, in row `MEAN`, their mean with equal weights.
 
     Columns: ``scenario``, ``people``, ``stimuli``, ``accuracy`` (mean over people of their
     accuracy) with ``_low``, ``_high`` (interval of that mean), ``sd`` over people, ``t``, ``df``,
@@ -283,7 +283,7 @@ def _scenario_record(
 def agreement_by_scenario(
     test: pd.DataFrame, bootstrap: Bootstrap | None = None, halves: int = HALVES
 ) -> pd.DataFrame:
-    """Return how much people of one scenario agree, one row a scenario and measure.
+    """Return how much people of one scenario agree, one row per scenario and measure.
 
     ``measure``: ``kappa`` and ``correlation`` of all pairs of participants, ``split_half`` (r of
     the fractions of yes of two random halves) and ``spearman_brown`` (the same, each r corrected to
@@ -369,9 +369,9 @@ COLUMNS = ("scenario", "stimulus", "people", "difficulty", "item_rest", "reason"
 
 
 def item_statistics(test: pd.DataFrame) -> pd.DataFrame:
-    """Return one row a stimulus.
+    """Return one row per stimulus.
 
-    ``test``: test rows of `participants.Responses`. Columns: ``scenario``, ``stimulus``, ``people``
+    ``test``: test rows of `Responses`. Columns: ``scenario``, ``stimulus``, ``people``
     (who answered it), ``difficulty`` (fraction who are right, as item analysis names it: large is
     easy), ``item_rest`` (item-rest correlation: r over people of being right at this stimulus with
     the fraction of right answers at the other stimuli of the scenario that they answered),

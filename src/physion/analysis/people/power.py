@@ -98,7 +98,7 @@ def power_table(
     Returns
     -------
     table
-        `COLUMNS`: one row a size, with the fraction of studies that find the effect (a difference
+        `COLUMNS`: one row per size, with the fraction of studies that find the effect (a difference
         in the right direction whose interval excludes 0) and its 95 % interval (Wilson).
     """
     if min(*people, *stimuli) < 3 or repeats < 1 or not 0 < level < 1:

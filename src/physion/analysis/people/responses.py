@@ -32,7 +32,7 @@ from physion.core.names import OFFICIAL_SCENARIOS, canonical_name, is_ledge, sce
 
 # Schema of participant-level data, shared by the experiment's export and the analysis.
 #
-# Two tables make a study's data: one row a participant and trial (`TRIAL_COLUMNS`) and one row a
+# Two tables make a study's data: one row per participant and trial (`TRIAL_COLUMNS`) and one row a
 # session (`SESSION_COLUMNS`). The experiment exports exactly these columns and writes its data
 # dictionary with `data_dictionary`; the analysis refuses a file that violates them and names the
 # row.
@@ -118,7 +118,7 @@ TRIAL_COLUMNS: tuple[Column, ...] = (
     ),
     Column("condition", "text", "Between-subject condition of the session; empty: there is none"),
 )
-"""One row a participant and trial."""
+"""One row per participant and trial."""
 
 SESSION_COLUMNS: tuple[Column, ...] = (
     must("participant", "text", "As in the trials"),
@@ -168,7 +168,7 @@ SESSION_COLUMNS: tuple[Column, ...] = (
     Column("touch", "flag", "Does the device have a touch screen?"),
     Column("condition", "text", "Between-subject condition; empty: the study has none"),
 )  # fmt: skip
-"""One row a session; demographics are asked at its end, so that they are empty in broken ones."""
+"""One row per session; demographics are asked at its end, so that they are empty in broken ones."""
 
 
 Refuse = Literal["refuse", "drop"]
@@ -197,12 +197,12 @@ DROPPED_COLUMNS = ("step", "scenario", "reason", "sessions", "rows")
 class Responses:
     """Participant-level data of a study.
 
-    - ``trials``: one row a participant and trial, sorted by scenario, session, phase and trial.
+    - ``trials``: one row per participant and trial, sorted by scenario, session, phase and trial.
       Columns: ``participant``, ``session``, ``scenario`` (ours), ``stimulus`` (canonical name),
       ``phase`` (familiarization or test), ``trial`` (int), ``yes``, ``label`` and ``correct``
       (bool), ``rt_ms`` (from the moment of the buttons; NaN where not known), ``log_rt`` (natural
       logarithm of it; NaN where not above 0), and whatever else of `TRIAL_COLUMNS` was given.
-    - ``sessions``: one row a session (`SESSION_COLUMNS`, as far as given), in the order in which
+    - ``sessions``: one row per session (`SESSION_COLUMNS`, as far as given), in the order in which
       they began, or else in which they stand in the file. ``scenario`` is a `scenario_set`.
     - ``dropped``: what was left out: ``step``, ``scenario``, ``reason``, ``sessions`` (with at
       least one such row) and ``rows``.
@@ -557,7 +557,7 @@ def read_official_responses(
 
     The scenario of a file is ``scenario``, else that in its name, else that of its stimuli. A
     session is a ``gameID``; its participant is the Prolific id if there is one. ``rt_offset_ms`` is
-    subtracted from ``rt``. The other parameters are those of `participants.read_responses`.
+    subtracted from ``rt``. The other parameters are those of `read_responses`.
     """
     if not files:
         raise BadInputError("no file of responses was given")

@@ -72,14 +72,14 @@ class PeopleResults:
     ``whole``: those of all complete first sessions; ``rules``: the exclusion rules; ``tables``: by
     name, with the columns of the function in parentheses:
 
-    - ``flags`` (`exclusions.flag_sessions`), ``flag_counts``, ``flag_effects``;
-    - ``with_and_without``: `people.accuracy_by_scenario` without and with flagged sessions;
+    - ``flags`` (`flag_sessions`), ``flag_counts``, ``flag_effects``;
+    - ``with_and_without``: `accuracy_by_scenario` without and with flagged sessions;
     - ``participants``, ``by_scenario``, ``by_condition``, ``by_stimulus``
-      (`people.accuracy_by_...`), ``items`` (`items.item_statistics`);
-    - ``agreement``: agreement among people (`people.agreement_by_scenario`);
+      (`people.accuracy_by_...`), ``items`` (`item_statistics`);
+    - ``agreement``: agreement among people (`agreement_by_scenario`);
     - ``yes_bias``, ``side_bias``, ``learning``, ``background``, ``background_tests``;
     - ``attributes`` of the stimuli that people answered, and ``hypotheses``
-      (`hypotheses.regress_hypotheses`);
+      (`regress_hypotheses`);
     - ``left_out``: dropped answers, with their reasons.
 
     ``warnings``: what may make the results wrong, one sentence each; ``stimuli``: names of all
@@ -147,7 +147,7 @@ def read_attributes(path: Path) -> pd.DataFrame:
     """Read the attributes of one's own stimuli: a table (CSV or parquet), or a dataset or its
     index.
 
-    Columns: ``stimulus`` (or ``trial``), ``scenario``, any of `attributes.ATTRIBUTES`.
+    Columns: ``stimulus`` (or ``trial``), ``scenario``, any of `ATTRIBUTES`.
     """
     file = path / "index.parquet" if path.is_dir() else path
     table = read_table(file, ())
@@ -181,7 +181,7 @@ def analyse_people(
     accept_rules
         Rules that may leave out more than a third of a scenario's sessions.
     attributes
-        Attributes of one's own stimuli, from `attributes.attributes_from_table`; those of other
+        Attributes of one's own stimuli, from `attributes_from_table`; those of other
         stimuli come from official names.
     exclude, exclude_ledge
         Stimuli to exclude, and whether to exclude Roll's ledges.

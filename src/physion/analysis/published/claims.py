@@ -1,4 +1,4 @@
-"""Numbers of the paper's Results section, with the comparison behind each of them.
+"""The paper's claims in numbers, recomputed: regressions of the Results section, and the summary.
 
 The printed numbers come from linear mixed models of the accuracies in the released table, fitted in
 R with lmerTest. Which rows and terms each model had follows from the released notebook and from the
@@ -315,7 +315,7 @@ SINGLE_FILE = "_seed_0_1_2"
 CHANCE = 0.5
 
 ESTIMATES = ("b", "se", "t", "df", "p", "rows")
-"""Slope (share of correct answers), its standard error, t = b / se, Satterthwaite's degrees of
+"""Slope (fraction of correct answers), its standard error, t = b / se, Satterthwaite's degrees of
 freedom, two-sided p, rows fitted."""
 
 FITS = ("run", "once", "asked")

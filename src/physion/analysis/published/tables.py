@@ -3,9 +3,12 @@
 A row of the released tables is one *run*: a model with a seed, a training protocol and a readout,
 tested on one scenario. Two properties matter for averages:
 
-- readout ``D`` exists for SVG and RPIN alone and repeats readout ``C`` (*observed*) to the last
+- readout ``D`` exists for SVG and RPIN only and repeats readout ``C`` (*observed*) to the last
   digit, so that an average over all rows counts *observed* twice for these two;
 - SVG has four runs of three seeds: seed 1 is in two result files, with different numbers.
+
+After the reader: the published accuracies next to what readers expect, the panels of the main
+figure, statements about people, and the supplementary figures.
 """
 
 from __future__ import annotations
@@ -59,7 +62,7 @@ PRETRAINED = ("pVGG-mlp", "pVGG-lstm", "pDEIT-mlp", "pDEIT-lstm")
 PARTICLES = ("GNS", "GNS-R", "DPI")
 
 FIRST_SEED = ("SVG", "RPIN")
-"""Models with several seeds, of which the paper's main figure shows seed 0 alone."""
+"""Models with several seeds, of which the paper's main figure shows seed 0 only."""
 
 OBSERVED_AGAIN = "observed (second copy)"
 """Readout ``D`` of the released tables."""
@@ -88,15 +91,15 @@ _RUN = re.compile(r"_readout_[A-D]_(?P<file>.*)$")
 class PublishedTables:
     """Released results as tables with the names of the paper.
 
-    - ``runs``: one row a run and scenario: ``scenario``, ``model``, ``readout``, ``training``,
+    - ``runs``: one row per run and scenario: ``scenario``, ``model``, ``readout``, ``training``,
       ``seed`` (int), ``file`` (name of the result file), ``encoder`` (the architecture in the
       table), ``accuracy`` (0 to 1), ``kappa_low``, ``kappa``, ``kappa_high`` (2.5th, 50th, 97.5th
       percentile over participants of Cohen's kappa), ``kappa_stimuli``;
-    - ``people``: one row a scenario: ``accuracy`` with ``accuracy_low``, ``accuracy_high``
+    - ``people``: one row per scenario: ``accuracy`` with ``accuracy_low``, ``accuracy_high``
       (bootstrap over participants), ``zone_low``, ``zone_high`` (2.5th and 97.5th percentile of
       participants), ``kappa_low``, ``kappa``, ``kappa_high`` (percentiles over pairs), ``half_r``,
       ``half_r_low``, ``half_r_high`` (r of random halves of the people);
-    - ``stimuli``: from `responses.read_humans`;
+    - ``stimuli``: from `read_humans`;
     - ``dropped``: ``table``, ``reason``, ``rows``: rows of one table that the other lacks.
     """
 
@@ -112,7 +115,7 @@ class PublishedTables:
 
     @property
     def first_seeds(self) -> pd.DataFrame:
-        """`distinct` with seed 0 alone of `FIRST_SEED`, as the paper's main figure has them: one
+        """`distinct` with seed 0 only of `FIRST_SEED`, as the paper's main figure has them: one
         row a model, scenario, training and readout.
         """
         runs = self.distinct
@@ -494,7 +497,7 @@ def panel_e(tables: PublishedTables, bootstrap: Bootstrap | None = None) -> pd.D
 
 
 def _measure(tables: PublishedTables, measure: str, draws: Bootstrap) -> pd.DataFrame:
-    """Return one row a model and scenario, then its mean over scenarios.
+    """Return one row per model and scenario, then its mean over scenarios.
 
     Columns: ``model``, ``scenario``, the measure with ``low`` and ``high`` (of the mean: bootstrap
     over scenarios; of a kappa: percentiles over participants; else NaN), ``people`` (their value)
@@ -552,15 +555,15 @@ THIRDS = ((0.0, 1 / 3, "hard", 0.10), (1 / 3, 2 / 3, "chance", 0.22), (2 / 3, 1.
 
 
 def people_by_scenario(tables: PublishedTables, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
-    """Return one row a scenario, then the mean over scenarios.
+    """Return one row per scenario, then the mean over scenarios.
 
     Columns: those of `PublishedTables.people`; ``half_r_full`` (split-half r corrected by Spearman
     and Brown to all of the people: 2 r / (1 + r); the released numbers are not corrected);
     ``stimuli`` and ``participants`` of the tables by stimulus, ``accuracy_by_stimulus`` (their
     mean; a laxer exclusion than ``accuracy``), ``below_chance`` (stimuli on which p + 1.96 sqrt(p
     (1 - p) / n) < 0.5). In the row of the mean ``zone_low`` and ``zone_high``, likewise of kappa,
-    are the paper's grey bands (`zones.released_zone`), and so are ``half_r_low`` and
-    ``half_r_high`` for r (as `zones.released_r_zone`).
+    are the paper's grey bands (`released_zone`), and so are ``half_r_low`` and
+    ``half_r_high`` for r (as `released_r_zone`).
     """
     draws = bootstrap or Bootstrap()
     stimuli = tables.stimuli
@@ -690,7 +693,7 @@ def accuracy_and_kappa(tables: PublishedTables, bootstrap: Bootstrap | None = No
 
     Columns: ``over`` (what the points are), ``models``, ``points``, ``r`` (Pearson) with
     ``r_low`` and ``r_high`` (percentile bootstrap that draws models with all of their scenarios).
-    The rows: means of all models, and of vision models alone; cells of model and scenario; and r
+    The rows: means of all models, and of vision models only; cells of model and scenario; and r
     within a scenario, averaged over scenarios, which no difference between scenarios can cause.
     """
     draws = bootstrap or Bootstrap()

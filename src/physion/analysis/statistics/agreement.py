@@ -48,7 +48,7 @@ def sampling_variance(y: npt.ArrayLike, count: npt.ArrayLike) -> Array:
 
     It is y(1 - y) / (count - 1), the unbiased estimate for independent answers, NaN for one person.
     A fraction of 0 or 1 gives 0, so it can be too small for single stimuli, but not in the mean
-    over stimuli, for which alone it is used.
+    over stimuli, for which only it is used.
     """
     fraction, people = np.asarray(y, dtype=np.float64), np.asarray(count, dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -100,7 +100,7 @@ def ceiling(y: npt.ArrayLike, count: npt.ArrayLike) -> float:
 def rmsd_floor(y: npt.ArrayLike, count: npt.ArrayLike) -> float:
     """Return the expected RMSD of a model that knows the true fractions of yes.
 
-    The root of the mean `sampling_variance`; NaN without stimuli or with one person alone.
+    The root of the mean `sampling_variance`; NaN without stimuli or with one person only.
     """
     noise = sampling_variance(y, count)
     return float(np.sqrt(np.mean(noise))) if len(noise) else float("nan")
@@ -214,7 +214,7 @@ def correlation_within_groups(
 #
 # Answers are arrays of shape (raters, stimuli) that hold 1 (yes), 0 (no) or NaN (not answered). A
 # pair is compared on the stimuli that both answered, and its chance agreement comes from their
-# shares of yes on these. Kappa is (observed - chance) / (1 - chance): 1 for equal answers, 0 for
+# fractions of yes on these. Kappa is (observed - chance) / (1 - chance): 1 for equal answers, 0 for
 # what two independent raters would have, below 0 for less than that. It is NaN where chance
 # agreement is 1 (both always give the same one answer) or where no stimulus is shared.
 

@@ -145,7 +145,7 @@ def compare_models(
     strata: Sequence[str] | None = None,
     permutations: int = 2000,
 ) -> pd.DataFrame:
-    """Test every two models on the same stimuli; one row a pair.
+    """Test every two models on the same stimuli; one row per pair.
 
     Parameters
     ----------

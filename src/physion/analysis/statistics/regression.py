@@ -1,4 +1,8 @@
-"""Calibration of P(contact): Brier score, its decomposition, and the reliability curve."""
+"""Calibration of probabilities, and logistic regression with standard errors by participant.
+
+- Calibration of P(contact): Brier score, its decomposition, and the reliability curve.
+- `clustered_logit`: logistic regression of answers with standard errors clustered by participant.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +43,7 @@ class Decomposition:
       variance of P within bins less twice its covariance with the outcome); 0 if every bin has one
       value;
     - ``skill``: 1 - brier / uncertainty, above 0 if the model is better than the base rate; NaN for
-      one outcome alone;
+      one outcome only;
     - ``calibration_error``: mean distance (not squared) of fraction and mean P, weighted by bin
       size.
     """
@@ -179,7 +183,7 @@ def clustered_logit(
     cluster: str = "participant",
     level: float = 0.95,
 ) -> pd.DataFrame:
-    """Fit a logistic regression of a bool column on numeric ones; one row a term.
+    """Fit a logistic regression of a bool column on numeric ones; one row per term.
 
     Parameters
     ----------
