@@ -1,9 +1,9 @@
 """Exclusion rules: which sessions are flagged, by which rule, and with which effect.
 
 Rules flag sessions and do not drop them: `flag_sessions` returns one row per session and one
-column per rule, so that analyses can be done with and without flagged sessions, as preregistered. Rule sets
-are values: `PREREGISTERED` follows the text of the preregistration, `OFFICIAL_CODE` the released
-code, which differs from it.
+column per rule, so that analyses can be done with and without flagged sessions, as preregistered.
+Rule sets are values: `PREREGISTERED` follows the text of the preregistration, `OFFICIAL_CODE` the
+released code, which differs from it.
 """
 
 from __future__ import annotations
