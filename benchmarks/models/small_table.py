@@ -1,4 +1,4 @@
-"""Accuracies of all small models on own trials, with the anchors, as one table.
+"""Accuracies of all small models on own trials, with the baselines, as one table.
 
     OMP_NUM_THREADS=1 python benchmarks/models/small_table.py FOLDER --write
 
@@ -9,7 +9,7 @@ evaluates on them under the protocol *all*
 - particle models whose weights come with the package, on the same tested trials without movies:
   they have no readout;
 - EfficientNet-Lite0 of ImageNet, whose dynamics are trained here, and fine-tuned for 200 steps;
-- anchors.
+- baselines.
 
 The same command continues a run that was interrupted, and does nothing again. The processor time of
 every part, also that of interrupted runs, is kept in FOLDER and printed with the table. With
@@ -39,7 +39,7 @@ COUNTS = {"training": 200, "readout": 200, "testing": 60}
 SIZE = ["--width", "64", "--height", "64", "--jitters", "0"]
 VISION = "svg,op3,cswm,rpin"
 FROZEN = "pEffNetLite0-mlp,pEffNetLite0-lstm"
-ANCHORS = (
+BASELINES = (
     "state-classifier,constant-motion,already-touched,blob-centroids,copy-last-frame,outcome,chance"
 )
 MOVIES, STATES = "movies", "states"
@@ -47,7 +47,7 @@ MOVIES, STATES = "movies", "states"
 PARTS: dict[str, tuple[str, ...]] = {
     "vision models": (VISION, MOVIES),
     "particle models": ("dpi,gns,gns-ransac", STATES),
-    "anchors": (ANCHORS, MOVIES),
+    "baselines": (BASELINES, MOVIES),
     "frozen encoders": (FROZEN, MOVIES),
     "fine-tuned encoders": (FROZEN, MOVIES, "--option", "fine_tuned=true", "steps=200"),
 }

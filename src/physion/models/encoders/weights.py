@@ -107,7 +107,7 @@ def read_state_dict(path: Path) -> dict[str, Tensor]:
         # The error of torch advises to switch off `weights_only`, which would execute the file.
         raise BadInputError(
             f"{path} is refused: it holds more than plain tensors, or is no file of torch; save "
-            "the state dict alone, best as .safetensors"
+            "only the state dict, best as .safetensors"
         ) from error
     except SafetensorError as error:
         raise BadInputError(
@@ -576,7 +576,7 @@ def _create(name: str, image_size: int, *, tag: str = "") -> nn.Module:
 
 @contextlib.contextmanager
 def offline_without_network() -> Iterator[None]:
-    """Use the local cache alone without a network; the hub would retry for most of a minute."""
+    """Use only the local cache without a network; the hub would retry for most of a minute."""
     host = urlsplit(hub.ENDPOINT).hostname or ""
     proxied = any(name.lower().endswith("s_proxy") for name in os.environ)
     before = hub.HF_HUB_OFFLINE

@@ -1,13 +1,13 @@
-"""Accuracy of the anchors on the official scenes.
+"""Accuracy of the baselines on the official scenes.
 
-    python benchmarks/models/anchors.py OFFICIAL/scenes
+    python benchmarks/models/baselines.py OFFICIAL/scenes
 
 Simulates the observed part of every official scene and predicts the recorded outcome, one scenario
 at a time, fitted on the other trials of the scenario: those of other configurations
 (leave-one-configuration-out), and those of the other four of five random folds. Blob centroids are
-read by the logistic reader from seven frames rendered at 64 px in red and yellow, under *observed*;
-the threshold of constant motion is fitted by the gap reader. Nothing is cached: simulating takes a
-quarter of a minute. ``--write`` puts the table into benchmarks/results/anchors.md.
+read by the decision logistic from seven frames rendered at 64 px in red and yellow, under *observed*;
+the threshold of constant motion is fitted by the decision gap. Nothing is cached: simulating takes a
+quarter of a minute. ``--write`` puts the table into benchmarks/results/baselines.md.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ Predict = Callable[[Sequence[int], Sequence[int]], NDArray[np.float64]]
 
 
 def main() -> None:
-    """Measure every anchor on every scenario and print the table."""
+    """Measure every baseline on every scenario and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scenes", type=Path)
     parser.add_argument("--write", action="store_true")
@@ -68,7 +68,7 @@ def main() -> None:
     text = "\n".join(lines(trials, accuracies, spent)) + "\n"
     print(text)
     if options.write:
-        (RESULTS / "anchors.md").write_text(text)
+        (RESULTS / "baselines.md").write_text(text)
 
 
 def simulate(trials: Sequence[ImportedTrial]) -> list[Motion]:
@@ -114,7 +114,7 @@ def base_rate(motions: Sequence[Motion], labels: Labels) -> Predict:
 
 
 def fitted(name: str) -> Callable[[Sequence[Motion], Labels], Predict]:
-    """Return what fits an anchor on the fit trials."""
+    """Return what fits a baseline on the fit trials."""
 
     def prepare(motions: Sequence[Motion], labels: Labels) -> Predict:
         model: Any = build_model(name)
@@ -177,9 +177,9 @@ def lines(
     """Yield the lines of the table."""
     counts = {s: sum(trial.scene.scenario == s for trial in trials) for s in SCENARIOS}
     present = [scenario for scenario in SCENARIOS if counts[scenario]]
-    yield "# Anchors on the official scenes"
+    yield "# Baselines on the official scenes"
     yield (
-        f"`python benchmarks/models/anchors.py OFFICIAL/scenes --write`, {datetime.date.today()}, "
+        f"`python benchmarks/models/baselines.py OFFICIAL/scenes --write`, {datetime.date.today()}, "
         f"{processor_and_cores()}. Accuracy for the recorded outcome of {len(trials)} scenes "
         f"without duplicates, with whole configurations held out / in {FOLDS} random folds; the "
         "standard error of a scenario is about "
@@ -188,7 +188,7 @@ def lines(
     )
     yield ""
     rigid = [scenario for scenario in present if scenario != "drape"]
-    yield f"| anchor | {' | '.join(f'{s} ({counts[s]})' for s in present)} | mean of rigid ones |"
+    yield f"| baseline | {' | '.join(f'{s} ({counts[s]})' for s in present)} | mean of rigid ones |"
     yield "|---" * (len(present) + 2) + "|"
     for name, by_scenario in accuracies.items():
         mean = np.mean([by_scenario[scenario] for scenario in rigid], axis=0)
