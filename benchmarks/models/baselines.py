@@ -4,10 +4,10 @@
 
 Simulates the observed part of every official scene and predicts the recorded outcome, one scenario
 at a time, fitted on the other trials of the scenario: those of other configurations
-(leave-one-configuration-out), and those of the other four of five random folds. Blob centroids are
-read by the decision logistic from seven frames rendered at 64 px in red and yellow, under *observed*;
-the threshold of constant motion is fitted by the decision gap. Nothing is cached: simulating takes a
-quarter of a minute. ``--write`` puts the table into benchmarks/results/baselines.md.
+(leave-one-configuration-out), and those of the other four of five random folds. A logistic
+regression decides from blob centroids of seven frames rendered at 64 px in red and yellow, under
+*observed*; the threshold of constant motion is fitted to the gap. Nothing is cached: simulating
+takes a quarter of a minute. ``--write`` puts the table into benchmarks/results/baselines.md.
 """
 
 from __future__ import annotations
@@ -179,8 +179,8 @@ def lines(
     present = [scenario for scenario in SCENARIOS if counts[scenario]]
     yield "# Baselines on the official scenes"
     yield (
-        f"`python benchmarks/models/baselines.py OFFICIAL/scenes --write`, {datetime.date.today()}, "
-        f"{processor_and_cores()}. Accuracy for the recorded outcome of {len(trials)} scenes "
+        "`python benchmarks/models/baselines.py OFFICIAL/scenes --write`, "
+        f"{datetime.date.today()}, {processor_and_cores()}. Accuracy for the recorded outcome of {len(trials)} scenes "
         f"without duplicates, with whole configurations held out / in {FOLDS} random folds; the "
         "standard error of a scenario is about "
         f"{math.sqrt(0.2 * len(present) / len(trials)):.2f}. Engine: "

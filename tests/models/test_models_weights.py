@@ -106,7 +106,7 @@ def test_malicious_pickle_is_refused_and_never_run(how: str, tmp_path: Path) -> 
 def test_a_refused_pickle_is_not_advised_to_be_run(tmp_path: Path) -> None:
     path = tmp_path / "weights.pth"
     torch.save({"x": _Evil(tmp_path / "pwned")}, path)
-    with pytest.raises(BadInputError, match="save the state dict alone") as error:
+    with pytest.raises(BadInputError, match="save only the state dict") as error:
         read_state_dict(path)
     assert "weights_only" not in str(error.value)
 

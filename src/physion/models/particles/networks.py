@@ -1,4 +1,6 @@
-"""Inputs of the networks: what nodes, edges and objects know of their motion.
+"""Scenes as graphs, and the graph networks of the particle models.
+
+Inputs of the networks are what nodes, edges and objects know of their motion.
 
 All of it is relative: positions of particles count from the centre of their object, from one
 another and from the floor, so that a shift of a scene along the floor changes nothing.

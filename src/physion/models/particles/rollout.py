@@ -1,4 +1,7 @@
-"""Motion of several scenes step by step, each until it rests or its time is over."""
+"""What surrounds the networks: rollouts, windows for training, and the smallest distance.
+
+Several scenes are moved step by step, each until it rests or its time is over.
+"""
 
 from __future__ import annotations
 
