@@ -180,9 +180,9 @@ def lines(
     yield "# Baselines on the official scenes"
     yield (
         "`python benchmarks/models/baselines.py OFFICIAL/scenes --write`, "
-        f"{datetime.date.today()}, {processor_and_cores()}. Accuracy for the recorded outcome of {len(trials)} scenes "
-        f"without duplicates, with whole configurations held out / in {FOLDS} random folds; the "
-        "standard error of a scenario is about "
+        f"{datetime.date.today()}, {processor_and_cores()}. Accuracy for the recorded outcome of "
+        f"{len(trials)} scenes without duplicates, with whole configurations held out / in {FOLDS} "
+        "random folds; the standard error of a scenario is about "
         f"{math.sqrt(0.2 * len(present) / len(trials)):.2f}. Engine: "
         f"{make_engine(DEFAULT_ENGINE).name}."
     )

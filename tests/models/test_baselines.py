@@ -1,0 +1,761 @@
+"""Baselines: what holds for all, and each of them; settings, no torch, no leak."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from physion.clips.batch import Batch, Motion
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.names import scenario_of
+from physion.models import build_model
+from physion.models.baselines.answers import read_people
+from physion.models.baselines.motion import BLOCK, FAR, NAMES, TOLERANCE, minimise, state_features
+from physion.models.baselines.pixels import BlobCentroids, CopyLastFrame, color_masks
+from physion.models.interface import Model, can
+from physion.physics.cloth.simulate import ClothSettings
+from physion.physics.cloth.solver import CLOTH_CONTACT_GAP
+from physion.rendering.renderer import Renderer
+from physion.scenes.looks import in_look
+from physion.scenes.scene import Body, BodyEvent, Camera, Cloth, Roles, Scene, Vec3
+from support.crossing_bodies import batch_of, crossing, replace_future, some_crossings
+from support.rendered_scenes import resting
+
+PEOPLE = {f"crossing_1_{row:04d}": row / 60 for row in range(60)}
+OTHERS: dict[str, dict[str, Any]] = {
+    "outcome": {"outcomes": {"a": True}},
+    "majority-of-people": {"humans": {"a": 0.3}},
+    "state-classifier": {"trees": 7},
+    "already-touched": {"margin": 0.02},
+    "constant-motion": {"frames": 20},
+    "blob-centroids": {"image_size": 48},
+    "copy-last-frame": {"image_size": 16},
+}
+"""Every baseline, with options that are not the default."""
+
+
+def fitted(name: str, fit: Batch, labels: np.ndarray) -> Any:
+    """Return the baseline, fitted if it can be."""
+    options = {"majority-of-people": {"humans": PEOPLE}, "state-classifier": {"trees": 20}}
+    model = build_model(name, **options.get(name, {}))
+    return model.fit(fit, labels, 3) if can(model, "fit") else model
+
+
+def answers(model: Any, batch: Batch) -> np.ndarray:
+    """Return what the model says about a batch, by its method."""
+    if can(model, "imagine"):
+        return np.asarray(model.imagine(batch, 2, 0).gap)
+    return np.asarray(model.predict(batch))
+
+
+def seen_by(name: str) -> tuple[Any, Batch]:
+    """Return a fitted baseline and motions that it was not fitted to; some have touched."""
+    fit, labels = some_crossings(60, 0)
+    test, _ = some_crossings(59, 1)
+    touching = crossing(name="crossing_1_0059", touch=(30,), agent=(1.0, 2.0, 0.0))
+    return fitted(name, fit, labels), batch_of([*(test.state or ()), touching])
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_digest_and_provenance_follow_the_settings(name: str) -> None:
+    model, other = build_model(name), build_model(name, **OTHERS[name])
+    assert isinstance(model, Model)
+    assert model.digest() == build_model(name).digest() != other.digest()
+    assert int(model.digest(), 16) >= 0 and len(model.digest()) == 64
+    assert model.provenance().model == name and model.provenance().init == "none"
+    with pytest.raises(UnknownNameError, match=f"option of model {name}"):
+        build_model(name, sampels=1)
+
+
+def test_digests_of_different_baselines_differ() -> None:
+    assert len({build_model(name).digest() for name in OTHERS}) == len(OTHERS)
+
+
+def test_baselines_that_look_at_no_trial_say_so() -> None:
+    stated = {name: build_model(name).provenance().inputs for name in [*OTHERS, "chance"]}
+    assert {name: words for name, words in stated.items() if words} == {
+        "outcome": "outcomes", "majority-of-people": "answers of people", "chance": "base rate",
+    }  # fmt: skip
+
+
+def test_only_the_outcome_is_shown_outcomes() -> None:
+    assert [name for name in OTHERS if can(build_model(name), "with_outcomes")] == ["outcome"]
+
+
+@pytest.mark.parametrize(
+    ("name", "protocol"),
+    [("outcome", "full"), ("majority-of-people", "observed"),
+     ("state-classifier", "observed"), ("already-touched", "observed")],
+)  # fmt: skip
+def test_answers_are_given_under_their_protocol(name: str, protocol: str) -> None:
+    model = build_model(name)
+    assert any(can(model, what) for what in ("predict", "fit")) and model.answers == protocol
+
+
+@pytest.mark.parametrize("name", [n for n in OTHERS if not can(build_model(n), "encode")])
+def test_an_answer_depends_on_its_own_trial_alone(name: str) -> None:
+    model, batch = seen_by(name)
+    together = answers(model, batch)
+    assert len(np.unique(together)) > 1 or name == "outcome"
+    order = np.random.default_rng(2).permutation(len(batch))
+    assert answers(model, batch.select(order)).tobytes() == together[order].tobytes()
+    alone = np.concatenate([answers(model, batch.select([row])) for row in range(len(batch))])
+    assert alone.tobytes() == together.tobytes()
+
+
+@pytest.mark.parametrize(
+    "name", ["majority-of-people", "state-classifier", "already-touched", "constant-motion"]
+)
+def test_noise_after_the_observed_part_changes_no_answer(name: str) -> None:
+    fit, labels = some_crossings(60, 0)
+    model, batch = seen_by(name)
+    noisy = batch_of([replace_future(motion) for motion in batch.state or ()])
+    assert answers(model, noisy).tobytes() == answers(model, batch).tobytes()
+    # Nor does noise in the trials of the fit.
+    refit = fitted(name, batch_of([replace_future(m, 1) for m in fit.state or ()]), labels)
+    assert answers(refit, batch).tobytes() == answers(model, batch).tobytes()
+
+
+def test_the_noise_of_these_tests_would_be_noticed() -> None:
+    _, batch = seen_by("outcome")
+    noisy = batch_of([replace_future(motion) for motion in batch.state or ()])
+    assert answers(build_model("outcome"), noisy).mean() == 1
+    assert answers(build_model("outcome"), batch).mean() < 0.1
+
+
+@pytest.mark.parametrize(
+    "name", ["outcome", "state-classifier", "already-touched", "constant-motion"]
+)
+def test_trials_without_motion_are_named(name: str) -> None:
+    model, batch = seen_by(name)
+    movie = crossing(name="movie_0001", agent=(float("nan"), 0.0, 0.0))
+    with pytest.raises(BadInputError, match="'movie_0001' was imported without motion"):
+        answers(model, batch_of([crossing(name="crossing_1_0000"), movie]))
+    with pytest.raises(BadInputError, match=f"{name} needs motions"):
+        answers(model, Batch(("a",), batch.frames[:1], batch.valid[:1]))
+
+
+@pytest.mark.parametrize("name", ["state-classifier", "already-touched", "constant-motion"])
+def test_trials_that_end_in_the_observed_part_are_refused(name: str) -> None:
+    model, _ = seen_by(name)
+    with pytest.raises(BadInputError, match="'short' has 44 frames, fewer than"):
+        answers(model, batch_of([crossing(name="short", frames=44)]))
+
+
+def test_baselines_run_without_torch() -> None:
+    code = f"""
+import sys
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("torch", "timm", "lightning_fabric", "av", "hdf5plugin"):
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+sys.meta_path.insert(0, Absent())
+from physion.models import build_model
+for name in {list(OTHERS)}:
+    build_model(name)
+print("built")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout == "built\n", done.stderr
+
+
+# Constant motion on scenes whose gaps are known in closed form.
+
+
+def gap(motion: Motion, **options: Any) -> float:
+    """Return the gap that the model imagines."""
+    rollout = build_model("constant-motion", **options).imagine(batch_of([motion]), 1, 0)
+    assert rollout.contact.tolist() == [[bool(rollout.gap[0, 0] <= 0)]]
+    return float(rollout.gap[0, 0])
+
+
+def test_gap_after_the_time_that_is_looked_ahead() -> None:
+    # Unit cubes, centres 5 m apart, approaching at 2 m/s.
+    assert gap(crossing(), frames=106) == pytest.approx(5 - 1 - 2 * 1.06, abs=TOLERANCE)
+    assert gap(crossing(), frames=199) == pytest.approx(0.02, abs=TOLERANCE)
+    assert gap(crossing(), frames=201) == 0
+
+
+@pytest.mark.parametrize(
+    ("start", "expected"),
+    [((0.0, 1.5, 0.0), 0.5), ((0.0, 0.9, 0.0), 0.0), ((0.0, 1.3, 1.4), 0.5)],
+)
+def test_gap_when_cubes_pass_each_other(start: Vec3, expected: float) -> None:
+    motion = crossing(agent=start, velocity=(8.0, 0.0, 0.0), patient=(5.0, 0.0, 0.0))
+    assert gap(motion) == pytest.approx(expected, abs=TOLERANCE)
+
+
+def test_balls_on_a_collision_course_touch_and_others_miss_by_the_known_gap() -> None:
+    def passing(sideways: float) -> float:
+        return gap(crossing(shape="sphere", agent=(0.0, sideways, 0.0), velocity=(8.0, 0.0, 0.0)))
+
+    assert passing(0.0) == passing(0.7) == 0
+    # The hull of a ball lies inside it, by at most r (1 - cos(pi / 16)) = .0096 m.
+    assert 1.4 - 1 - TOLERANCE <= passing(1.4) <= 1.4 - 1 + 2 * 0.0096 + TOLERANCE
+
+
+def test_bodies_that_part_have_their_gap_now() -> None:
+    motion = crossing(velocity=(-2.0, 0.0, 0.0), patient=(1.75, 0.0, 0.0))
+    assert gap(motion) == pytest.approx(0.75, abs=TOLERANCE)
+
+
+@pytest.mark.parametrize("height", [0.0, 0.8])
+def test_spinning_bodies_sweep_with_their_corners(height: float) -> None:
+    # Bars of 2 x .2 x .2 m: the corners of the spinning one pass the long side of the other.
+    motion = crossing(
+        scale=(2.0, 0.2, 0.2), velocity=(0.0, 0.0, 0.0), spin=(0.0, 0.0, 3.0),
+        patient=(0.0, 1.6, height),
+    )  # fmt: skip
+    sideways, above = 1.6 - 0.1 - math.hypot(1, 0.1), max(height - 0.2, 0.0)
+    assert gap(motion) == pytest.approx(math.hypot(sideways, above), abs=TOLERANCE)
+
+
+def test_bodies_spin_about_their_centre_of_mass() -> None:
+    # A cube of 1 m spins about x, and stays where it is; its pivot is at its bottom.
+    motion = crossing(
+        velocity=(0.0, 0.0, 0.0), spin=(5.0, 0.0, 0.0), patient=(0.0, 0.0, 3.0), scale=(1, 1, 1)
+    )
+    assert gap(motion) == pytest.approx(3 - 0.5 - math.sqrt(0.5), abs=TOLERANCE)
+
+
+def test_fast_bodies_do_not_jump_over_thin_ones() -> None:
+    thin = (0.01, 1.0, 1.0)
+    motion = crossing(scale=thin, velocity=(97.0, 0.0, 0.0), patient=(5.3, 0.0, 0.0))
+    assert gap(motion) == 0
+
+
+def test_nothing_but_the_velocity_counts() -> None:
+    """A body in the air does not fall, and a wall in between stops nothing."""
+    bodies = (
+        Body("agent", "cube", (0, 0, 4)),
+        Body("patient", "cube", (3, 0, 0)),
+        Body("wall", "cube", (1.5, 0, 0), (0.1, 9.0, 9.0), kinematic=True),
+    )
+    still = crossing(agent=(0.0, 0.0, 4.0), velocity=(0.0, 0.0, 0.0), bodies=bodies)
+    assert gap(still) == pytest.approx(math.hypot(2, 3), abs=TOLERANCE)
+    moving = crossing(agent=(0.0, 0.0, 0.0), velocity=(4.0, 0.0, 0.0), bodies=bodies)
+    assert gap(moving) == 0
+
+
+def test_a_contact_that_was_seen_is_a_touch() -> None:
+    assert gap(crossing(touch=(10,))) == 0
+    assert gap(crossing(touch=(45,))) > 0
+
+
+def test_gaps_are_finite_where_there_is_nothing_to_touch() -> None:
+    assert gap(crossing(patient=(50.0, 0.0, 0.0))) == FAR
+    events = (BodyEvent(50, "patient", "appear"),)
+    assert gap(crossing(patient=(1.2, 0.0, 0.0), events=events)) == FAR
+    sheets = (Cloth("one", (0, 0, 1), resolution=2), Cloth("two", (0, 0, 1), resolution=2))
+    assert gap(crossing(cloths=sheets, roles=Roles("one", "two"))) == FAR
+
+
+def falling_sheet(speed: float, roles: Roles) -> Motion:
+    """Return a level sheet 2 m above the top of a cube, falling with ``speed`` in m/s."""
+    sheet = Cloth("sheet", (5, 0, 3), resolution=21)
+    motion = crossing(cloths=(sheet,), roles=roles, velocity=(0.0, 0.0, 0.0))
+    steps = np.linspace(-1, 1, 21)
+    x, y = np.meshgrid(steps + 5, steps, indexing="ij")
+    vertices = np.zeros((60, 441, 3), np.float32)
+    vertices[..., 0], vertices[..., 1] = x.ravel(), y.ravel()
+    vertices[..., 2] = 3 - speed * 0.01 * (np.arange(60)[:, None] - 44)
+    return Motion(motion.scene, replace(motion.trajectory, cloth_vertices=vertices))
+
+
+@pytest.mark.parametrize("roles", [Roles("sheet", "patient"), Roles("patient", "sheet")])
+def test_cloth_touches_by_the_rule_of_the_label(roles: Roles) -> None:
+    settings = ClothSettings()
+    thickness = settings.rest_distance + CLOTH_CONTACT_GAP
+    # The particles of a cube end within a spacing of its top.
+    inside = settings.particle_spacing
+    still = gap(falling_sheet(0.0, roles))
+    assert 2 - thickness <= still <= 2 - thickness + inside
+    # From one sheet to the next all else is equal: a second at 1 m/s is 1 m less.
+    assert still - gap(falling_sheet(1.0, roles), frames=100) == pytest.approx(1, abs=2e-3)
+    assert gap(falling_sheet(2.0, roles), frames=100) == 0
+
+
+def test_samples_are_equal_and_the_seed_is_not_used() -> None:
+    batch = batch_of([crossing(), crossing(agent=(1.0, 0.0, 0.0))])
+    rollout = build_model("constant-motion").imagine(batch, 3, 0)
+    assert rollout.gap.shape == rollout.contact.shape == (2, 3)
+    assert (rollout.gap == rollout.gap[:, :1]).all() and rollout.gap[0, 0] != rollout.gap[1, 0]
+    assert rollout.gap.dtype == np.float64 and rollout.contact.dtype == np.bool_
+    assert (build_model("constant-motion").imagine(batch, 3, 1).gap == rollout.gap).all()
+
+
+def test_minimum_of_a_function_is_found_between_frames() -> None:
+    assert minimise(lambda t: abs(t - 0.0237) + 0.1, 1, 10) == pytest.approx(0.1, abs=TOLERANCE)
+    # As steep as the bound allows, between two frames.
+    assert minimise(lambda t: abs(100 * t - 5.5), 100, 10) == pytest.approx(0, abs=TOLERANCE)
+    parabola = minimise(lambda t: 3 * (t - 0.055) ** 2 + 0.2, 1, 10)
+    assert parabola == pytest.approx(0.2, abs=TOLERANCE)
+
+
+def test_search_ends_at_a_touch() -> None:
+    times: list[float] = []
+
+    def value(seconds: float) -> float:
+        times.append(seconds)
+        return 0.05 - seconds
+
+    assert minimise(value, 1000, 10) < 0
+    assert len(times) == 11
+
+
+@pytest.mark.parametrize("frames", [0, -1])
+def test_at_least_one_frame_is_looked_ahead(frames: int) -> None:
+    with pytest.raises(BadInputError, match="frames must be at least 1"):
+        build_model("constant-motion", frames=frames)
+
+
+# Features of the state at frame 44, and trees that are fitted on them.
+
+
+def named(motion: Motion) -> dict[str, float]:
+    """Return the features of a motion by name."""
+    return dict(zip(NAMES, state_features(motion).tolist(), strict=True))
+
+
+def block(role: str, values: dict[str, float]) -> list[float]:
+    """Return the features of one role."""
+    return [values[f"{role} {name}"] for name in BLOCK]
+
+
+def test_features_are_those_of_frame_44() -> None:
+    motion = crossing(
+        agent=(1.0, 2.0, 3.0), velocity=(4.0, 0.0, -1.0), spin=(0.1, 0.2, 0.3),
+        patient=(5.0, 2.0, 0.0), scale=(0.5, 1.0, 2.0),
+    )  # fmt: skip
+    values = named(motion)
+    # Centres lie half a height above the pivots.
+    expected = [1, 0, 1, 2, 4, 1, 0, 0, 0, 4, 0, -1, 0.1, 0.2, 0.3, 0.5, 1, 2]
+    assert block("agent", values) == pytest.approx(expected)
+    assert block("patient", values)[2:5] == pytest.approx([5, 2, 1])
+    assert block("probe", values) == [0] * len(BLOCK), "this scene has no probe"
+    between = [values[f"agent to patient {n}"] for n in ("dx", "dy", "dz", "dvx", "dvy", "dvz")]
+    assert between == pytest.approx([4, 0, -3, -4, 0, 1])
+    assert values["agent to patient distance"] == pytest.approx(5)
+
+
+def test_equal_rotations_have_equal_features_and_move_the_centre() -> None:
+    motion = crossing(agent=(0.0, 0.0, 0.0), scale=(1.0, 1.0, 2.0))
+    rotations = np.array(motion.trajectory.rotations)
+    rotations[:, 0] = (np.sqrt(0.5), np.sqrt(0.5), 0, 0)  # about x: up becomes -y
+    turned = Motion(motion.scene, replace(motion.trajectory, rotations=rotations))
+    other = Motion(motion.scene, replace(motion.trajectory, rotations=-rotations))
+    assert state_features(turned).tolist() == state_features(other).tolist()
+    values = named(turned)
+    assert [values[f"agent {axis}"] for axis in "xyz"] == pytest.approx([0, -1, 0], abs=1e-6)
+    assert values["agent qw"] == pytest.approx(np.sqrt(0.5))
+
+
+def test_probe_is_a_body_of_its_own() -> None:
+    bodies = (Body("agent", "cube", (0, 0, 0)), Body("patient", "cube", (2, 0, 0)))
+    motion = crossing(
+        bodies=(*bodies, Body("ball", "sphere", (0, -3, 0))),
+        roles=Roles("agent", "patient", "ball"),
+    )
+    values = named(motion)
+    assert block("probe", values)[:5] == pytest.approx([1, 0, 0, -3, 0.5])
+    assert values["probe to patient distance"] == pytest.approx(np.sqrt(13))
+
+
+def test_absent_bodies_give_zeros() -> None:
+    events = (BodyEvent(50, "patient", "appear"),)
+    values = named(crossing(events=events))
+    assert block("patient", values) == [0] * len(BLOCK)
+    assert values["agent to patient distance"] == 0 and values["agent present"] == 1
+    vanished = named(crossing(events=(BodyEvent(44, "agent", "vanish"),)))
+    assert vanished["agent present"] == 0 and vanished["patient present"] == 1
+    later = named(crossing(events=(BodyEvent(45, "agent", "vanish"),)))
+    assert later["agent present"] == 1
+
+
+def test_a_cloth_is_the_mean_of_its_vertices() -> None:
+    sheets = (Cloth("first", (0, 0, 2), resolution=3), Cloth("sheet", (0, 0, 2), resolution=2))
+    motion = crossing(cloths=sheets, roles=Roles("sheet", "patient"))
+    vertices = np.zeros((60, 13, 3), np.float32)
+    vertices[:, 9:, 0] = (0, 1, 2, 5)
+    vertices[:, 9:, 2] = 2 - 0.03 * np.arange(60)[:, None]
+    vertices[:, :9] = 77
+    values = named(Motion(motion.scene, replace(motion.trajectory, cloth_vertices=vertices)))
+    expected = [1, 1, 2, 0, 2 - 0.03 * 44, 1, 0, 0, 0, 0, 0, -3, 0, 0, 0, 2, 2, 0]
+    assert block("agent", values) == pytest.approx(expected, abs=1e-4)
+
+
+def accuracy(fit_labels: np.ndarray, test_labels: np.ndarray) -> float:
+    """Return the accuracy on 200 trials after a fit on 200 others with given labels."""
+    fit, _ = some_crossings(200, 10)
+    test, _ = some_crossings(200, 11)
+    predicted = build_model("state-classifier", trees=50).fit(fit, fit_labels, 0).predict(test)
+    assert ((predicted >= 0) & (predicted <= 1)).all()
+    return float(np.mean((predicted > 0.5) == test_labels))
+
+
+def test_trees_learn_what_the_state_tells_and_nothing_from_permuted_outcomes() -> None:
+    fit_labels, test_labels = some_crossings(200, 10)[1], some_crossings(200, 11)[1]
+    assert accuracy(fit_labels, test_labels) > 0.9
+    # With all outcomes permuted, the right answers of 10 x 200 trials are Binomial(2000, 1/2).
+    rng = np.random.default_rng(5)
+    means = [accuracy(rng.permutation(fit_labels), rng.permutation(test_labels)) for _ in range(10)]
+    assert abs(np.mean(means) - 0.5) < 4 * np.sqrt(0.25 / 2000)
+    assert all(abs(mean - 0.5) < 4 * np.sqrt(0.25 / 200) for mean in means)
+
+
+def test_order_of_the_fitted_trials_does_not_matter_and_the_seed_does() -> None:
+    fit, labels = some_crossings(50, 12)
+    order = np.random.default_rng(0).permutation(50)
+    model = build_model("state-classifier", trees=10)
+    first = model.fit(fit, labels, 1)
+    same = model.fit(fit.select(order), labels[order], 1)
+    other = model.fit(fit, labels, 2)
+    assert first.digest() == same.digest() != other.digest()
+    assert first.predict(fit).tobytes() == same.predict(fit).tobytes()
+
+
+@pytest.mark.parametrize("only", [False, True])
+def test_one_outcome_alone_is_predicted_again(only: bool) -> None:
+    fit, _ = some_crossings(10, 13)
+    model = build_model("state-classifier", trees=3).fit(fit, np.full(10, only), 0)
+    assert model.predict(fit).tolist() == [float(only)] * 10
+    assert model.predict(fit.select([])).shape == (0,)
+
+
+def test_wrong_input_is_refused() -> None:
+    fit, labels = some_crossings(10, 13)
+    with pytest.raises(BadInputError, match="9 labels for 10 trials"):
+        build_model("state-classifier").fit(fit, labels[:9], 0)
+    with pytest.raises(BadInputError, match="0 labels for 0 trials"):
+        build_model("state-classifier").fit(fit.select([]), labels[:0], 0)
+    with pytest.raises(BadInputError, match="trees and leaf"):
+        build_model("state-classifier", trees=0)
+
+
+def test_a_batch_of_one_motion_is_a_batch() -> None:
+    fit, labels = some_crossings(20, 14)
+    model = build_model("state-classifier", trees=5).fit(fit, labels, 0)
+    assert model.predict(batch_of([crossing()])).shape == (1,)
+
+
+# Baselines that see pictures: coloured blobs, and a copy of the last frame.
+
+RED, YELLOW = (255, 0, 0), (255, 255, 0)
+SIZE = 64
+
+
+def clips(rgb: np.ndarray) -> Batch:
+    """Return pictures (B, T, H, W, 3) as a batch."""
+    frames = np.tile(np.arange(rgb.shape[1]) * 6, (len(rgb), 1))
+    names = tuple(f"trial_{row}" for row in range(len(rgb)))
+    return Batch(names, frames, np.ones(frames.shape, np.bool_), rgb=rgb)
+
+
+def noise(*shape: int, seed: int = 0) -> np.ndarray:
+    """Return random pictures of a shape (B, T, size, size, 3)."""
+    return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
+
+
+def draw_disc(picture: np.ndarray, x: int, y: int, radius: float, color: tuple[int, ...]) -> int:
+    """Draw a disc centred on a pixel; return how many pixels it has."""
+    rows, columns = np.mgrid[: len(picture), : len(picture)]
+    inside = (rows - y) ** 2 + (columns - x) ** 2 <= radius**2
+    picture[inside] = color
+    return int(inside.sum())
+
+
+def test_centroids_and_areas_of_discs_are_exact() -> None:
+    picture = np.full((SIZE, SIZE, 3), 120, np.uint8)
+    red = draw_disc(picture, 12, 40, 6, RED)
+    yellow = draw_disc(picture, 45, 20, 9.5, YELLOW)
+    features = build_model("blob-centroids").encode(clips(picture[None, None]))
+    expected = [12.5 / 64, 40.5 / 64, red / 64**2, 45.5 / 64, 20.5 / 64, yellow / 64**2]
+    assert features.dtype == np.float32 and features.shape == (1, 1, 6)
+    assert features[0, 0] == pytest.approx(expected, abs=1e-7)
+
+
+def test_blobs_that_are_not_seen_are_in_the_middle_without_area() -> None:
+    gray = np.full((1, 1, SIZE, SIZE, 3), 90, np.uint8)
+    assert build_model("blob-centroids").encode(clips(gray)).tolist() == [
+        [[0.5, 0.5, 0, 0.5, 0.5, 0]]
+    ]
+
+
+@pytest.mark.parametrize(
+    ("color", "red", "yellow"),
+    [
+        ((158, 27, 29), True, False),
+        ((220, 30, 100), True, False),
+        ((215, 208, 15), False, True),
+        ((140, 160, 20), False, True),
+        ((255, 128, 0), False, False),  # orange
+        ((60, 200, 40), False, False),
+        ((40, 60, 220), False, False),
+        ((230, 230, 230), False, False),
+        ((0, 0, 0), False, False),
+        ((160, 100, 90), False, False),  # pale
+        ((60, 5, 5), False, False),  # dark
+        ((200, 0, 220), False, False),  # magenta
+    ],
+)
+def test_colours_that_count(color: tuple[int, int, int], red: bool, yellow: bool) -> None:
+    masks = color_masks(np.array([color], np.uint8))
+    assert [bool(mask[0]) for mask in masks] == [red, yellow]
+
+
+def test_blobs_of_a_rendered_scene_are_agent_and_patient() -> None:
+    bodies = (
+        Body("agent", "sphere", (-0.6, 0.3, 0.0), (0.6, 0.6, 0.6)),
+        Body("patient", "cube", (0.6, -0.4, 0.0), (0.6, 0.6, 0.6)),
+        Body("other", "cone", (0.0, 0.9, 0.0), (0.4, 0.4, 0.4)),
+    )
+    camera = Camera((3.0, 0.5, 1.2), (0.0, 0.0, 0.3))
+    scene = Scene("pair", "collide", bodies, Roles("agent", "patient"), camera)
+    frame = Renderer(in_look(scene, "redyellow"), resting(scene), SIZE, SIZE).render(
+        0, ("color", "ids")
+    )
+    assert frame.color is not None and frame.ids is not None
+    features = build_model("blob-centroids").encode(clips(frame.color[None, None]))[0, 0]
+    for place, number in ((0, 1), (3, 2)):
+        rows, columns = np.nonzero(frame.ids == number)
+        middle = [(columns.mean() + 0.5) / SIZE, (rows.mean() + 0.5) / SIZE]
+        assert features[place : place + 2] == pytest.approx(middle, abs=1 / SIZE)
+        assert features[place + 2] == pytest.approx(len(rows) / SIZE**2, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    "model", [build_model("blob-centroids"), build_model("copy-last-frame")], ids=["blobs", "copy"]
+)
+def test_features_of_a_frame_depend_on_it_alone(model: object) -> None:
+    assert isinstance(model, BlobCentroids | CopyLastFrame)
+    size = model.spec.image_size
+    rgb = noise(4, 9, size, size, 3)
+    features = model.encode(clips(rgb))
+    assert np.ptp(features) > 0 and model.spec.framewise
+    # Parts of clips, other clips beside them, and noise in later frames change nothing.
+    assert model.encode(clips(rgb[1:2, 3:5])).tobytes() == features[1:2, 3:5].tobytes()
+    later = rgb.copy()
+    later[:, 7:] = noise(4, 2, size, size, 3, seed=1)
+    assert model.encode(clips(later))[:, :7].tobytes() == features[:, :7].tobytes()
+    assert model.encode(clips(later)).tobytes() != features.tobytes()
+
+
+def test_pixels_are_the_features_of_a_copy() -> None:
+    rgb = noise(2, 7, 32, 32, 3)
+    features = build_model("copy-last-frame").encode(clips(rgb))
+    assert features.shape == (2, 7, 32 * 32 * 3) and features.dtype == np.float32
+    assert features[1, 2] == pytest.approx(rgb[1, 2].ravel() / 255)
+
+
+@pytest.mark.parametrize("stored", [False, True])
+def test_the_last_context_frame_is_imagined(stored: bool) -> None:
+    model, rgb = build_model("copy-last-frame"), noise(2, 7, 32, 32, 3)
+    features = model.encode(clips(rgb))
+    context = clips(rgb)
+    if stored:
+        context = Batch(context.trials, context.frames, context.valid, features=features)
+    rollout = model.imagine(context, 2, 0)
+    assert rollout.features.shape == (2, 2, 18, 32 * 32 * 3)
+    assert (rollout.features == features[:, None, -1:]).all()
+    assert ("rgb" in rollout.shown) == (not stored)
+    if not stored:
+        assert rollout.shown["rgb"].shape == (2, 2, 18, 32, 32, 3)
+        assert (rollout.shown["rgb"] == rgb[:, None, -1:]).all()
+
+
+@pytest.mark.parametrize(
+    "model", [build_model("blob-centroids"), build_model("copy-last-frame")], ids=["blobs", "copy"]
+)
+def test_other_pictures_are_refused(model: object) -> None:
+    assert isinstance(model, BlobCentroids | CopyLastFrame)
+    with pytest.raises(BadInputError, match=r"pictures \(input rgb\) of .*\(48, 48, 3\)"):
+        model.encode(clips(noise(1, 1, 48, 48, 3)))
+    batch = clips(noise(1, 1, 48, 48, 3))
+    with pytest.raises(BadInputError, match="not none"):
+        model.encode(Batch(batch.trials, batch.frames, batch.valid))
+
+
+# Baselines that know the outcome, what people answered, or whether the contact was seen.
+
+DOMINOES = "pilot_dominoes_1mid_boxroom"
+
+
+def write_humans(folder: Path, rows: str, labels: str | None) -> Path:
+    """Write an official folder of people's answers, with outcomes in the folder next to it."""
+    humans = folder / "humans"
+    humans.mkdir()
+    (humans / "human_accuracy-dominoes_pilot-production_1_testing.csv").write_text(rows)
+    if labels is not None:
+        (folder / "stimuli").mkdir()
+        (folder / "stimuli" / "stimulus_names_and_labels.csv").write_text(labels)
+    return humans
+
+
+def test_outcome_is_that_of_the_whole_motion() -> None:
+    batch = batch_of([crossing(touch=(50,)), crossing(), crossing(touch=(3, 4))])
+    assert build_model("outcome").predict(batch).tolist() == [1, 0, 1]
+
+
+def test_known_outcomes_replace_simulated_ones() -> None:
+    names = ("known_img.mp4", "known", "pilot-redyellow_0001", "simulated")
+    batch = batch_of([crossing(name=name, touch=(50,)) for name in names])
+    model = build_model("outcome", outcomes={"known": False, "pilot_0001": False})
+    assert model.predict(batch).tolist() == [0, 0, 0, 1]
+    shown = model.with_outcomes({"known": True, "simulated": False})
+    assert shown.predict(batch).tolist() == [0, 0, 0, 0], "the outcomes of the option come first"
+    assert model.predict(batch).tolist() == [0, 0, 0, 1], "the model stays as it is"
+    assert shown.digest() != model.digest()
+
+
+def test_known_outcomes_need_no_motion() -> None:
+    batch = batch_of([crossing(name="movie", agent=(float("nan"), 0.0, 0.0))])
+    assert build_model("outcome", outcomes={"movie": True}).predict(batch).tolist() == [1]
+
+
+def test_outcome_refuses_the_observed_part_of_an_unknown_trial() -> None:
+    with pytest.raises(BadInputError, match="'cut': outcome needs the whole motion"):
+        build_model("outcome").predict(batch_of([crossing(name="cut", frames=45)]))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"a": "yes"}, "outcome.a must be true or false"),
+        ({"a": True, "a.mp4": False}, "'a' is there"),
+    ],
+)
+def test_wrong_outcomes_are_refused(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(BadInputError, match=message):
+        build_model("outcome", outcomes=wrong)
+
+
+def test_people_answer_as_the_mapping_says() -> None:
+    model = build_model("majority-of-people", humans={"a": 0.25, "b_img.mp4": 1})
+    batch = batch_of([crossing(name=name) for name in ("b", "a-redyellow", "b")])
+    assert model.predict(batch).tolist() == [1, 0.25, 1]
+
+
+def test_stimuli_that_nobody_answered_are_counted() -> None:
+    batch = batch_of([crossing(name=name) for name in ("a", "b", "c")])
+    with pytest.raises(BadInputError, match=r"answers of people to 2 of 3 stimuli.* 'b'"):
+        build_model("majority-of-people", humans={"a": 0.25}).predict(batch)
+    with pytest.raises(BadInputError, match=r"no answers at all.*option humans"):
+        build_model("majority-of-people").predict(batch)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        *((value, "not a fraction from 0 to 1") for value in (1.5, -0.1)),
+        *((value, "humans") for value in (float("nan"), "many", None)),
+    ],
+)
+def test_fractions_lie_between_0_and_1(wrong: Any, says: str) -> None:
+    with pytest.raises(BadInputError, match=says):
+        build_model("majority-of-people", humans={"a": wrong})
+
+
+def test_correct_answers_become_yes_by_the_outcome(tmp_path: Path) -> None:
+    rows = f"stim_ID,correct,c\n{DOMINOES}_0001,0.9,10\n{DOMINOES}_0002,0.75,8\n"
+    rows += f"{DOMINOES}-redyellow_0001,0.1,9\n"
+    labels = f"stim_ID,label\n{DOMINOES}_0001,True\n{DOMINOES}_0002_img,False\n"
+    people = read_people(write_humans(tmp_path, rows, labels))
+    assert people == {f"{DOMINOES}_0001": 0.9, f"{DOMINOES}_0002": 0.25}
+
+
+def test_a_table_of_fractions_is_read(tmp_path: Path) -> None:
+    table = tmp_path / "people.csv"
+    table.write_text("\ufeffstimulus,n,p_yes\na,7,0.5\nb_img.mp4,9,1\n", "utf-8")
+    assert read_people(table) == {"a": 0.5, "b": 1.0}
+    model = build_model("majority-of-people", humans=str(table))
+    assert model.digest() == build_model("majority-of-people", humans={"a": 0.5, "b": 1.0}).digest()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("name,p_yes\na,0.5\n", "lacks the column 'stimulus'"),
+        ("stim_ID,c\na,5\n", "lacks the column 'correct'"),
+        ("stimulus,p_yes\na,0.5\na.mp4,0.5\n", "line 3: stimulus 'a' occurs twice"),
+        ("stimulus,p_yes\na,1.5\n", "line 2: '1.5' is not a fraction"),
+        ("stimulus,p_yes\na\n", "line 2: fewer values than columns"),
+        ("stim_ID,correct\na,0.5\n", "line 2: the outcome of 'a'"),
+        ("", "lacks the column 'stimulus'"),
+    ],
+)
+def test_damaged_tables_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    table = tmp_path / "people.csv"
+    table.write_text(text)
+    with pytest.raises(BadInputError, match=message):
+        read_people(table)
+
+
+def test_missing_tables_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="holds no human_accuracy"):
+        read_people(tmp_path)
+    with pytest.raises(BadInputError, match=r"none\.csv: people's answers cannot be read"):
+        read_people(tmp_path / "none.csv")
+    (tmp_path / "binary.csv").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(BadInputError, match="cannot be read"):
+        read_people(tmp_path / "binary.csv")
+    with pytest.raises(BadInputError, match="label 'perhaps' is not true or false"):
+        read_people(write_humans(tmp_path, "stim_ID,correct\n", "stim_ID,label\na,perhaps\n"))
+
+
+def test_official_people_have_the_known_accuracy(official: Path) -> None:
+    """The majority is right for .808 of the stimuli of a scenario; r with the outcome is .683."""
+    people = read_people(official / "humans")
+    labels = {}
+    for line in (official / "stimuli" / "stimulus_names_and_labels.csv").read_text().splitlines():
+        cells = line.split(",")
+        labels[cells[0].replace("-redyellow", "")] = cells[-1] == "True"
+    known = sorted(people)
+    p_yes = np.array([people[name] for name in known])
+    outcomes = np.array([labels[name] for name in known])
+    assert len(known) == 1144
+    assert np.corrcoef(p_yes, outcomes)[0, 1] == pytest.approx(0.683, abs=0.001)
+    scenarios = np.array([scenario_of(name) for name in known])
+    right = ((p_yes > 0.5) == outcomes) | (p_yes == 0.5)
+    means = [right[scenarios == scenario].mean() for scenario in set(scenarios)]
+    assert len(means) == 8 and np.mean(means) == pytest.approx(0.808, abs=0.005)
+
+
+def test_base_rate_is_that_of_trials_that_had_not_touched() -> None:
+    seen, later = crossing(touch=(44,)), crossing(touch=(45,))
+    fit = batch_of([seen, seen, later, later, later, later])
+    labels = np.array([True, True, True, False, False, False])
+    model = build_model("already-touched", margin=0.05).fit(fit, labels, 0)
+    assert model.predict(batch_of([later, seen])).tolist() == [0.25, 0.95]
+
+
+@pytest.mark.parametrize(("labels", "rate"), [([], 0.5), ([False], 0.01), ([True], 0.99)])
+def test_base_rate_stays_within_the_margin(labels: list[bool], rate: float) -> None:
+    model = build_model("already-touched").fit(
+        batch_of([crossing()] * len(labels)), np.array(labels, bool), 0
+    )
+    assert model.predict(batch_of([crossing()])).tolist() == [rate]
+
+
+def test_permuted_outcomes_leave_the_base_rate() -> None:
+    fit, labels = some_crossings(80, 4)
+    permuted = np.random.default_rng(0).permutation(labels)
+    predicted = build_model("already-touched").fit(fit, permuted, 0).predict(fit)
+    assert np.unique(predicted) == pytest.approx(labels.mean())
+
+
+@pytest.mark.parametrize("margin", [-0.1, 0.5, float("nan")])
+def test_wrong_margins_are_refused(margin: float) -> None:
+    with pytest.raises(BadInputError, match="margin"):
+        build_model("already-touched", margin=margin)
+
+
+def test_labels_must_fit_the_trials() -> None:
+    with pytest.raises(BadInputError, match="2 labels for 1 trials"):
+        build_model("already-touched").fit(batch_of([crossing()]), np.array([True, False]), 0)
