@@ -25,8 +25,6 @@ digests of the weights and the tables of ``results/particles.md`` and ``results/
 from __future__ import annotations
 
 import argparse
-import hashlib
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -39,17 +37,16 @@ from physion.compute.tasks import processor
 from physion.models.build import build_untrained
 from physion.models.checkpoint import (
     BUILT_AS,
-    DIGESTS,
-    FOLDER,
     load_tensors,
     read_checkpoint,
+    shipped_digests,
     tensors_of,
     write_checkpoint,
 )
 from physion.models.particles.simulator import ParticleSimulator
 from physion.training.train import calibrate
 
-SHIPPED = Path(__file__).parents[2] / "src/physion/models/checkpoints" / FOLDER
+SHIPPED = Path(__file__).parents[2] / "src/physion/data/weights"
 RESULTS = Path(__file__).parents[1] / "results"
 TRIALS = {
     "states": "`python benchmarks/models/particles.py data FOLDER`",
@@ -107,7 +104,7 @@ def ship(trained: Path, name: str, particles: Path | None) -> None:
         card += "\nThe weights are rounded to float16.\n"
     SHIPPED.mkdir(exist_ok=True)
     metadata = {**metadata, BUILT_AS: model.built_as()}
-    write_checkpoint(SHIPPED / f"{name}.safetensors", stored, metadata)
+    write_checkpoint(SHIPPED / f"{name}.safetensors", stored, metadata, kept=True)
     (SHIPPED / f"{name}.md").write_text(card)
     print(name, (SHIPPED / f"{name}.safetensors").stat().st_size, "bytes")
 
@@ -120,7 +117,7 @@ def fit_distances(model: Any, dataset: Dataset, training: Any) -> None:
 
 def write_scores() -> None:
     """Append the digest and the tables of every shipped model to its card, in place of earlier."""
-    digests = json.loads((SHIPPED / DIGESTS).read_text())
+    digests = shipped_digests()
     tables = [
         *tables_of((RESULTS / "particles.md").read_text(), "| model | scenario |"),
         *tables_of((RESULTS / "vision_models.md").read_text(), "| model | metric |"),
@@ -169,11 +166,6 @@ def main() -> None:
     if not chosen.scores:
         for name in chosen.only:
             ship(chosen.trained, name, chosen.particles)
-        digests = {
-            path.stem: hashlib.sha256(path.read_bytes()).hexdigest()
-            for path in sorted(SHIPPED.glob("*.safetensors"))
-        }
-        (SHIPPED / DIGESTS).write_text(json.dumps(digests, indent=2) + "\n")
     write_scores()
 
 

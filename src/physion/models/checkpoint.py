@@ -1,7 +1,7 @@
-"""Checkpoints: one safetensors file, written atomically, with metadata as JSON in its header.
+"""Weights of models in safetensors files, with metadata as JSON in their headers.
 
-Only safetensors and JSON are read, so that no code in a file can be executed. The metadata hold the
-SHA-256 of all tensors and of the metadata themselves, which is verified when a file is read.
+Only safetensors and JSON are read, so that no code in a file can be executed. Weights that are kept
+have a digest file beside them (`core.files`); checkpoints of a training that goes on have none.
 """
 
 from __future__ import annotations
@@ -21,7 +21,14 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from physion.core.errors import BadInputError
-from physion.core.files import file_sha256, write_atomic
+from physion.core.files import (
+    SUFFIX,
+    check_digest,
+    file_sha256,
+    has_digest,
+    write_atomic,
+    write_with_digest,
+)
 from physion.core.version import __version__
 from physion.models.interface import RANDOM, SHIPPED, ask
 
@@ -55,17 +62,20 @@ def versions() -> dict[str, str]:
 
 
 def write_checkpoint(
-    path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]
+    path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any], *, kept: bool = False
 ) -> None:
-    """Write tensors and metadata, JSON values, to a file that is replaced atomically."""
+    """Write tensors and metadata, JSON values, to a file that is replaced atomically.
+
+    ``kept``: whether a digest file is written beside it, for weights that people keep or exchange.
+    """
     copies = {
         name: value.detach().to("cpu", copy=True).contiguous() for name, value in tensors.items()
     }
     content = {**metadata, "version": _VERSION}
-    content["sha256"] = _digest(copies, content)
     path.parent.mkdir(parents=True, exist_ok=True)
     # One key only: safetensors stores several in a random order.
-    write_atomic(path, save(copies, {_METADATA: json.dumps(content, sort_keys=True)}))
+    data = save(copies, {_METADATA: json.dumps(content, sort_keys=True)})
+    (write_with_digest if kept else write_atomic)(path, data)
 
 
 def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -74,27 +84,29 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     Raises
     ------
     DamagedFileError
-        If it cannot be read, its SHA-256 is wrong, or `write_checkpoint` did not write it.
+        If it cannot be read, is not what its digest file says, or `write_checkpoint` did not write
+        it.
     BadInputError
         If another version of this package wrote it.
     """
     try:
+        if has_digest(path):
+            check_digest(path, path.read_bytes(), "get it again")
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
             names = list(file.keys())
             tensors = {name: file.get_tensor(name) for name in names} if header else {}
+    except BadInputError as error:
+        raise DamagedFileError(str(error)) from error
     except (SafetensorError, OSError, ValueError) as error:
         raise DamagedFileError(f"checkpoint {path} cannot be read ({error})") from error
     if _METADATA not in header:
         raise DamagedFileError(f"{path} is a safetensors file, but not a checkpoint of physion")
     try:
         metadata = json.loads(header[_METADATA])
-        stored = metadata.pop("sha256")
         known = metadata["version"] == _VERSION
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DamagedFileError(f"checkpoint {path} cannot be read: damaged metadata") from error
-    if stored != _digest(tensors, metadata):
-        raise DamagedFileError(f"checkpoint {path} is damaged: its SHA-256 is wrong")
     if not known:
         raise BadInputError(
             f"checkpoint {path} has version {metadata['version']}, not {_VERSION}; read it with "
@@ -182,16 +194,6 @@ def describe_tensors(tensors: Mapping[str, Tensor], model: nn.Module) -> str:
     return _listed(_compare_tensors(_with_prefix(tensors, _MODEL), model.state_dict()))
 
 
-def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of metadata, and of names, types, shapes and values of tensors."""
-    sha = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
-    for name in sorted(tensors):
-        value = tensors[name]
-        sha.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
-        sha.update(value.reshape(-1).view(torch.uint8).numpy().data)
-    return sha.hexdigest()
-
-
 def _with_prefix(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
 
@@ -241,14 +243,14 @@ FOLDER = "physion.data.weights"
 """Name of the folder with the weights that are installed with the package."""
 BUILT_AS = "built_as"
 """Metadata of weights: what the method of this name said of the model that was trained."""
-DIGESTS = "sha256.json"
-"""File with the SHA-256 of every shipped file by the name of the model."""
 
 
 def shipped_digests() -> dict[str, str]:
-    """Return the SHA-256 of the shipped weights by model."""
-    text = (files(FOLDER) / DIGESTS).read_text()
-    return {str(name): str(value) for name, value in json.loads(text).items()}
+    """Return the SHA-256 of the shipped weights by model, from their digest files."""
+    ending = f".safetensors{SUFFIX}"
+    found = [file for file in files(FOLDER).iterdir() if file.name.endswith(ending)]
+    texts = {file.name.removesuffix(ending): file.read_text() for file in found}
+    return {name: texts[name].partition(" ")[0] for name in sorted(texts)}
 
 
 def load_named(model: Any, weights: str) -> None:
@@ -293,13 +295,10 @@ def load_shipped(model: nn.Module, name: str) -> str:
             f"no weights are shipped for {name}, {known}; train it with physion train"
         )
     with as_file(files(FOLDER) / f"{name}.safetensors") as path:
-        found = file_sha256(path) if path.is_file() else "no file"
-        if found != digests[name]:
-            raise DamagedFileError(
-                f"the weights {path} that come with the package are damaged or changed; install "
-                "the package again"
-            )
-        _load(path, model)
+        try:
+            _load(path, model)
+        except DamagedFileError as error:
+            raise DamagedFileError(f"{error}; install the package again") from error
     return f"shipped:{digests[name][:12]}"
 
 

@@ -420,7 +420,7 @@ class TrainingFolder:
     def finish(self, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any], card: str) -> None:
         """Write the trained model and its card, and delete the checkpoints."""
         write_atomic(self.path / CARD, card.encode())
-        write_checkpoint(self.path / WEIGHTS, tensors, metadata)
+        write_checkpoint(self.path / WEIGHTS, tensors, metadata, kept=True)
         self.remove_checkpoints()
 
     def remove_checkpoints(self) -> None:

@@ -518,7 +518,7 @@ def test_weights_of_a_file_are_loaded_and_named(tmp_path: Path) -> None:
 
     source = model_of("dpi", seed=3)
     path = tmp_path / "model.safetensors"
-    write_checkpoint(path, tensors_of(source), {"built_as": source.built_as()})
+    write_checkpoint(path, tensors_of(source), {"built_as": source.built_as()}, kept=True)
     loaded = model_of("dpi", weights=str(path))
     assert loaded.trained and loaded.decision == "touch" and loaded.init.startswith("local:")
     assert loaded.digest() == source.digest() != model_of("dpi").digest()
