@@ -41,13 +41,12 @@ class TorchModel(nn.Module, Model):
         return Provenance(type(self).__name__, self.init, versions=f"torch {torch.__version__}")
 
     def digest(self) -> str:
-        """Return the SHA-256 of the source of the class, its spec, and its weights as they are.
+        """Return the SHA-256 of the source of the class, spec, settings, and weights as they are.
 
         Add to it what else determines the results, such as code in other files.
         """
-        return digest_of(
-            [source_of(type(self)), repr(self.spec), torch.__version__], self.state_dict().items()
-        )
+        parts = [source_of(type(self)), repr(self.spec), repr(self.settings), torch.__version__]
+        return digest_of(parts, self.state_dict().items())
 
     @property
     def device(self) -> torch.device:
