@@ -172,8 +172,8 @@ def test_trials_without_movies_are_rendered(tmp_path: Path) -> None:
     assert one.seen["rgb"].std() > 10 and one.true["rgb"].std() > 10
 
 
-def test_particle_models_are_called_untrained(folder: Path) -> None:
-    imagined = imagine_with(Dataset(folder), ["dpi"], {"samples": 1})(["drop_0", "drape_0"])
+def test_the_weights_of_particle_models_are_named(folder: Path) -> None:
+    imagined = imagine_with(Dataset(folder), ["dpi"], {"weights": "random"})(["drop_0", "drape_0"])
     for trial, name, agent in (("drop_0", "ball", 0), ("drape_0", "sheet", 2)):
         (one,) = imagined[trial]
         assert one.model == "dpi-small" and one.weights == "untrained, weights random"
@@ -190,7 +190,7 @@ def test_the_verb_puts_them_into_the_page(folder: Path, file: Path, tmp_path: Pa
     (text,) = re.findall(r'id="detail-0">(.*?)</script>', out.read_text())
     first, second = json.loads(text)["imagined"]
     assert first["caption"].startswith("standstill (no weights): P(contact) 0.50 from 4 futures")
-    assert second["caption"].startswith("dpi-small (untrained, weights random): P(contact) ")
+    assert second["caption"].startswith("dpi-small (weights shipped:")
 
 
 @pytest.mark.parametrize(
