@@ -68,12 +68,6 @@ def read_json(
     return read_settings(kind, parse_json(_text(path), where or str(path), error), where, error)
 
 
-def read_toml(path: Path, kind: type[T], where: str = "") -> T:
-    """Read a TOML file as ``kind`` (see `read_settings`); ``where`` names it in errors."""
-    where = where or str(path)
-    return read_settings(kind, parse_toml(_text(path), where), where)
-
-
 def parse_json(text: str, where: str, error: type[BadInputError] = BadInputError) -> Any:
     """Parse JSON; raise ``error`` if it is broken, repeats a key or is nested too deeply."""
 

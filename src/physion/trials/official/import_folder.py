@@ -15,7 +15,6 @@ Versions with red agent and yellow patient keep ``-redyellow`` in their names.
 from __future__ import annotations
 
 import csv
-import json
 import re
 from collections import Counter
 from collections.abc import Iterator
@@ -32,6 +31,7 @@ from physion.compute.tasks import Executor, Progress
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import folder_for_writing, remove_leftovers
 from physion.core.names import FOLDERS, guess_scenario, plain_name
+from physion.core.settings import parse_json
 from physion.core.version import __version__
 from physion.physics.labels import Labels, label_contact
 from physion.physics.trajectory import Contacts, Trajectory
@@ -332,8 +332,9 @@ class _FolderLists:
         if folder not in self._metadata:
             self._metadata[folder] = {}
             try:
-                rows = json.loads(_read_list(folder / "metadata.json") or "[]")
-            except ValueError:
+                path = folder / "metadata.json"
+                rows = parse_json(_read_list(path) or "[]", str(path))
+            except BadInputError:
                 rows = []
             for row in rows if isinstance(rows, list) else []:
                 if isinstance(row, dict) and isinstance(row.get("stimulus_name"), str):
