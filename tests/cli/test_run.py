@@ -90,8 +90,9 @@ def test_command_logs_against_people(
     assert main(command) == 0
     *table, last = capsys.readouterr().out.splitlines()
     assert re.match(r"report, made in \d+ min \d+ s: ", last)
-    assert table[0].split()[:3] == ["row", "stimuli", "accuracy"] and "chance" in table[1]
-    assert "r with people" in table[0]
+    (header,) = (line for line in table if line.startswith("model "))
+    assert "accuracy" in header and "r with people" in header
+    assert any(line.startswith("chance") for line in table)
     assert main([*command, "--json"]) == 0
     scores = pd.DataFrame(json.loads(capsys.readouterr().out)["scores"])
     assert scores["human_accuracy"].notna().any()
