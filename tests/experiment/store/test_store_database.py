@@ -165,6 +165,24 @@ def test_refusals_and_faults_roll_back_only_their_own_command(engine: Engine) ->
     writer.close()
 
 
+def test_waiting_commands_share_a_commit(engine: Engine) -> None:
+    commits, reached, go_on = [], threading.Event(), threading.Event()
+    event.listen(engine, "commit", lambda connection: commits.append(1))
+
+    def gate(connection: Connection) -> None:
+        reached.set()
+        assert go_on.wait(30)
+
+    writer = Writer(engine)
+    writer.submit(gate)
+    assert reached.wait(30)
+    futures = [writer.submit(put(number)) for number in range(100)]
+    go_on.set()
+    assert [future.result(30) for future in futures] == list(range(100))
+    assert len(commits) == 2
+    writer.close()
+
+
 def test_waiting_commands_are_written_before_the_writer_closes(engine: Engine) -> None:
     writer = Writer(engine)
     futures = [writer.submit(put(number)) for number in range(50)]

@@ -13,9 +13,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, TypeVar
 
 from sqlalchemy import (
@@ -267,6 +269,8 @@ SCHEMA = 1
 """Version of the tables above; raise it with every change of them."""
 BUSY_MS = 10_000
 """Time in milliseconds that SQLite waits for a lock of another process, such as a backup."""
+MAX_GROUP = 256
+"""Commands in one transaction."""
 _WRITES = "physion_writes"
 T = TypeVar("T")
 Command = Callable[[Connection], T]
@@ -376,22 +380,27 @@ def server_lock(folder: Path) -> Iterator[None]:
 
 
 class Writer:
-    """One thread that runs commands one after the other, each in a transaction of its own.
+    """One thread that runs commands; those that wait while the disk syncs share a transaction.
 
     A command is a function of the connection. It is acknowledged after the commit; whatever it
-    raises rolls back all that it wrote.
+    raises rolls back all that it wrote, and nothing else.
     """
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine.execution_options(**{_WRITES: True})
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="writer")
+        self._queue: SimpleQueue[tuple[Command[Any], Future[Any]] | None] = SimpleQueue()
+        self._closed, self._lock = False, threading.Lock()
+        self._thread = threading.Thread(target=self._work, name="writer", daemon=True)
+        self._thread.start()
 
     def submit(self, command: Command[T]) -> Future[T]:
         """Queue a command; the returned future is done once its effects are committed."""
-        try:
-            return self._thread.submit(self._write, command)
-        except RuntimeError as error:
-            raise Refused("unavailable", "The server is stopping; try again soon.") from error
+        future: Future[T] = Future()
+        with self._lock:  # no command may be queued after the end mark
+            if self._closed:
+                raise Refused("unavailable", "The server is stopping; try again soon.")
+            self._queue.put((command, future))
+        return future
 
     async def run(self, command: Command[T]) -> T:
         """Run a command and await its result."""
@@ -399,14 +408,49 @@ class Writer:
 
     def close(self) -> None:
         """Run all waiting commands, then stop the thread. Later commands are refused."""
-        self._thread.shutdown()
+        with self._lock:
+            if not self._closed:
+                self._queue.put(None)
+            self._closed = True
+        self._thread.join()
 
-    def _write(self, command: Command[T]) -> T:
-        """Run one command in a transaction."""
+    def _work(self) -> None:
+        """Write groups of commands until the writer is closed."""
+        going = True
+        while going:
+            taken = [self._queue.get()]
+            while len(taken) < MAX_GROUP and not self._queue.empty():
+                taken.append(self._queue.get())
+            going = None not in taken
+            self._write([item for item in taken if item and item[1].set_running_or_notify_cancel()])
+
+    def _write(self, group: list[tuple[Command[Any], Future[Any]]]) -> None:
+        """Run commands in one transaction, each in a savepoint, and acknowledge them."""
+        outcomes: list[tuple[Any, Exception | None]] = []
         try:
             with self._engine.begin() as connection:
-                return command(connection)
+                outcomes += [_run(connection, command) for command, _ in group]
         except OperationalError as error:  # a full disk, or a lock of another program
-            raise Refused(
+            refusal = Refused(
                 "unavailable", "The server cannot write into its database; try again soon."
-            ) from error
+            )
+            refusal.__cause__ = error
+            outcomes = [(None, refusal)] * len(group)
+        except Exception as error:
+            outcomes = [(None, error)] * len(group)
+        for (_, future), (value, failed) in zip(group, outcomes, strict=True):
+            if failed is None:
+                future.set_result(value)
+            else:
+                future.set_exception(failed)
+
+
+def _run(connection: Connection, command: Command[Any]) -> tuple[Any, Exception | None]:
+    """Return the result of a command and None, or None and the error that rolled it back."""
+    try:
+        with connection.begin_nested():
+            return command(connection), None
+    except OperationalError:
+        raise
+    except Exception as error:
+        return None, error
