@@ -19,7 +19,9 @@ MOTHER = """
 import os, sys
 import sqlalchemy.dialects.sqlite, tyro
 import physion.cli.experiment.serve, physion.experiment.server
+from physion.experiment.experimenter.progress import load_analysis
 from physion.cli.main import main
+load_analysis()
 while os.read(0, 1):
     child = os.fork()
     if child == 0:

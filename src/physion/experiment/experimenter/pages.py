@@ -12,6 +12,7 @@ import logging
 import math
 import shutil
 import tempfile
+import threading
 import time
 import unicodedata
 import zipfile
@@ -31,7 +32,13 @@ from physion.core.errors import PhysionError
 from physion.core.html import environment
 from physion.experiment.experimenter.access import HEADERS, PATH, Access
 from physion.experiment.experimenter.payments import payment_csv, read_payments
-from physion.experiment.experimenter.progress import ALARM_ENTRIES, KINDS, STATES, Progress
+from physion.experiment.experimenter.progress import (
+    ALARM_ENTRIES,
+    KINDS,
+    STATES,
+    Progress,
+    load_analysis,
+)
 from physion.experiment.store.database import ANSWERS, SESSIONS
 from physion.experiment.store.entry import is_paused
 from physion.experiment.store.lab import forget_raw_ids, forget_session, set_paused, set_voided
@@ -60,6 +67,7 @@ def build_router(study: Study, secrets: Secrets, store: Store) -> APIRouter:
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        threading.Thread(target=load_analysis, daemon=True).start()
         yield
         pages.access.stop()
 

@@ -240,6 +240,8 @@ class Progress:
                 rows = connection.execute(select(*ends).where(columns.kind != "preview"))
                 state = Counter(tuple(end is not None for end in row) for row in rows)
                 state.pop((False, False, False), None)
+            if not state:  # nobody is at the end
+                return Flags(self._study.exclusions, {}, time.time())
             if state != self._flags_of and time.monotonic() >= self._flags_due:
                 self._flags, self._flags_of = _find_flags(self._study, self._engine), state
                 self._flags_due = time.monotonic() + FLAGS_SECONDS
@@ -312,6 +314,13 @@ def expected_end(finished: Sequence[float], wanted: int, now: float) -> float | 
     if missing <= 0 or len(recent) < MIN_RATE_SESSIONS or now <= recent[0]:
         return None
     return now + missing * (now - recent[0]) / (len(recent) - 1)
+
+
+def load_analysis() -> None:
+    """Import what the flags need: done when the server starts, since it takes a second."""
+    import physion.analysis.people.exclusions
+    import physion.analysis.people.responses
+    import physion.experiment.export.answer_tables  # noqa: F401
 
 
 def _find_flags(study: Study, engine: Engine) -> Mapping[str, Flags]:
