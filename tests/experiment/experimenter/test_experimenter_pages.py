@@ -32,6 +32,7 @@ from physion.experiment.export.export_study import export_study
 from physion.experiment.export.tables import read_tables
 from physion.experiment.protocol import Enter
 from physion.experiment.store.database import ANSWERS, EVENTS, PAUSES, RAW_IDS, SESSIONS
+from physion.experiment.store.lab import set_voided
 from physion.experiment.study.study import Bonus
 from support.experiment.experimenter_client import TWO, Lab, Visitor, lab
 from support.experiment.experimenter_rows import insert_sessions
@@ -228,6 +229,9 @@ def test_flags_are_found_anew_only_when_a_session_has_ended(
 ) -> None:
     monkeypatch.setattr(progress, "FLAGS_SECONDS", 0.0)
     found, _ = small
+    walk(found.store, begin(found.store, "First"), "done")
+    (done,) = rows(found.store, SESSIONS)
+    run(found.store.write(lambda connection: set_voided(connection, done.session, True, 1.0)))
     numbers = progress.Progress(found.study, found.store.engine)
     first = numbers.flags("person")
     token = walk(found.store, begin(found.store, "Ada"), "feedback")
