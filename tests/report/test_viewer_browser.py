@@ -237,6 +237,13 @@ def test_keys_alone_are_enough(browser: Browser, page: Path) -> None:
     assert browser.ask("document.activeElement.querySelector('b').textContent") == "drop_0"
 
 
+def test_a_telephone_shows_a_trial_without_scrolling_sideways(browser: Browser, page: Path) -> None:
+    browser.open(page, "#trial=drop_0", size=(400, 900))
+    browser.until("document.getElementById('scene3d')?.dataset.ready === 'yes'")
+    assert browser.ask("document.getElementById('detail').scrollWidth") <= 400
+    assert browser.complaints() == []
+
+
 @pytest.mark.parametrize("dark", [False, True])
 def test_small_screens_hold_everything_in_both_themes(
     browser: Browser, page: Path, dark: bool
