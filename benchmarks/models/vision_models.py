@@ -3,7 +3,6 @@
     OMP_NUM_THREADS=1 python benchmarks/models/vision_models.py speed --write  # seconds a clip
     python benchmarks/models/vision_models.py learn FOLDER --write  # after trainings
     python benchmarks/models/vision_models.py shipped FOLDER --write  # shipped weights
-    OMP_NUM_THREADS=1 python benchmarks/models/vision_models.py boxes FOLDER --write  # steps/s
 
 ``speed`` times a training step (forward and backward) and the features of a clip, with what is
 imagined, on random pictures with moving boxes; of frozen encoders, which have random weights here,
@@ -30,10 +29,6 @@ trained to the best trivial one, which is to be above 1 for C-SWM and below 1 fo
 
 ``shipped`` prints the same for the weights that come with the package, without training.
 
-``boxes`` trains RPIN (small) on the same trials and prints the steps a second of processor time,
-reading and rendering included: with boxes that are rendered for every window, with those of earlier
-windows kept, and with all of them kept from the start.
-
 With --write a section of ``results/vision_models.md`` is replaced; ``learn`` has one for every
 choice of models.
 """
@@ -58,10 +53,6 @@ import torch
 from physion import Dataset, build_model
 from physion.clips.batch import Batch, Spec
 from physion.clips.clips import whole_source
-from physion.clips.movies import MovieReader, movie_files
-from physion.clips.rendered import MOST_BYTES, MotionRenderer
-from physion.clips.source import ObservedBatches, TrialReaders, WholeBatches
-from physion.clips.states import TrialMotions
 from physion.compute.tasks import processor
 from physion.core.seeds import generator, stable_hash
 from physion.models.build import build_untrained
@@ -105,8 +96,6 @@ TESTED_CLIPS = 20
 """Clips of a batch of testing trials, whose states are ranked together."""
 LATEST_START = 40
 """Last frame at which a tested clip starts; later most objects rest."""
-BOX_STEPS = 100
-"""Steps of the trainings with and without kept boxes."""
 
 Rows = Iterator[list[str]]
 
@@ -300,46 +289,6 @@ def moving_errors(model: Any, batch: Batch) -> tuple[float, float, float]:
     return 1000 * float(own), 1000 * float(copied), 1000 * float(empty)
 
 
-def boxes(folder: Path, steps: int) -> Rows:
-    """Yield which boxes are kept, steps a second, and their ratio to those without kept boxes."""
-    dataset = Dataset(folder, verify=False)
-    trials = dataset.trials("training")
-    motions = TrialMotions(dataset.files("trial_file"), observed=False)
-    lengths = {trial: len(motions[trial].trajectory) for trial in trials}
-    first = 0.0
-    for kept, most_bytes in (("none", 0), ("of earlier windows", MOST_BYTES), ("all", MOST_BYTES)):
-        model: Any = build_untrained("rpin")
-        renderer = MotionRenderer(
-            motions,
-            ["boxes"],
-            model.spec.image_size,
-            model.spec.objects,
-            dict.fromkeys(trials, "redyellow"),
-            most_bytes,
-        )
-        for trial, length in lengths.items():
-            # One frame compiles and reads what every line needs.
-            renderer.read(trial, np.arange(length if kept == "all" else 1))
-        movies = movie_files(dataset, observed=False)
-        pictures = MovieReader(movies, model.spec.image_size)
-        readers = TrialReaders(lengths, [pictures, renderer])
-        source = WholeBatches(ObservedBatches(model.spec, readers), readers)
-        start = time.process_time()
-        train_model(
-            model,
-            source,
-            trials,
-            settings=dataclasses.replace(model.training_settings, steps=steps, held_out=0.0),
-            seed=0,
-            name="all",
-            folder=None,
-            accelerator="cpu",
-        )
-        rate = steps / (time.process_time() - start)
-        first = first or rate
-        yield [kept, str(steps), f"{rate:.2f}", f"{rate / first:.2f}"]
-
-
 def table(head: list[str], rows: Rows) -> str:
     """Return a Markdown table; print its rows as they come."""
     lines = [head, ["---"] * len(head)]
@@ -361,7 +310,7 @@ def write_section(title: str, text: str) -> None:
 def main() -> None:
     """Run one part."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("part", choices=("speed", "learn", "shipped", "boxes"))
+    parser.add_argument("part", choices=("speed", "learn", "shipped"))
     parser.add_argument("folder", nargs="?", type=Path)
     parser.add_argument("--models", nargs="+", default=(), choices=sorted({*METRICS, *ENCODERS}))
     parser.add_argument("--steps", type=int, default=0, help="0: those of the model")
@@ -392,14 +341,10 @@ def main() -> None:
         head += ["ratio", "training, s"]
         title = f"What {', '.join(models)} learned of new clips"
         rows = learn(options.folder, models, options.steps, options.seeds)
-    elif options.part == "shipped":
+    else:
         head = ["model", "metric", "trained", "untrained", "trivial", "empty scene"]
         title = "Shipped weights on new clips"
         rows = shipped(options.folder, models)
-    else:
-        head = ["boxes kept", "steps", "steps a second", "ratio"]
-        title = "Training steps of RPIN a second"
-        rows = boxes(options.folder, options.steps or BOX_STEPS)
     text = table(head, rows)
     print(text)
     if options.write:

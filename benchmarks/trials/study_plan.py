@@ -38,7 +38,6 @@ from typing import Any
 import torch
 
 import physion
-from physion.clips.rendered import MOST_BYTES
 from physion.compute.tasks import processor
 from physion.readout.folds import Protocol, TrainingSet, training_sets
 from physion.training.windows import VALIDATION_CLIPS
@@ -103,16 +102,7 @@ class Study:
         clips = model.steps * model.batch
         compute = clips * model.step + validated * model.validate
         compute += min(model.calibration_trials, trials) * model.imagine
-        new = (model.read_window_new - model.read_window) * self.rendered(model, trials)
-        return compute, (clips + validated) * (model.read_window + new)
-
-    def rendered(self, model: ModelTimes, trials: int) -> float:
-        """Return the fraction of the boxes of training trials that memory does not hold."""
-        if not model.boxes:
-            return 0.0
-        frames = [splits["training"]["frames"] for splits in self.generation.values()]
-        size = trials * sum(frames) / len(frames) * (16 * model.boxes + 1)
-        return max(0.0, 1 - MOST_BYTES / size)
+        return compute, (clips + validated) * model.read_window_new
 
     def tasks(self, machine: Machine) -> Iterator[Task]:
         """Yield all tasks of the study."""

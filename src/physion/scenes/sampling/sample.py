@@ -137,12 +137,14 @@ def parse_presets(text: str, where: str, *, own: bool = True) -> Mapping[str, Pr
     for name, entry in file.presets.items():
         here = f"{where}: preset {name!r}"
         base = shared
-        if entry.based_on in presets:
+        if entry.based_on is None:
+            pass
+        elif entry.based_on in presets:
             base = presets[entry.based_on].params
         elif entry.based_on in known:
             params = known[entry.based_on].params
             base = read_params(kind, file.shared, f"{where}: shared", params)
-        elif entry.based_on is not None:
+        else:
             raise BadInputError(
                 f"{here}: based_on {entry.based_on!r} is neither before it in {where} nor among "
                 f"the presets of {file.scenario}"
