@@ -320,7 +320,7 @@ def load_analysis() -> None:
     """Import what the flags need: done when the server starts, since it takes a second."""
     import physion.analysis.people.exclusions
     import physion.analysis.people.responses
-    import physion.experiment.export.answer_tables  # noqa: F401
+    import physion.experiment.export.tables  # noqa: F401
 
 
 def _find_flags(study: Study, engine: Engine) -> Mapping[str, Flags]:
