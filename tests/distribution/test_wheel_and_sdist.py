@@ -42,6 +42,7 @@ LICENSES = {
     "src/physion/data/official_study/LICENSE.official.txt",
     "src/physion/experiment/static/vendor/LICENSE.bundled.txt",
     "src/physion/experiment/static/vendor/LICENSE.jspsych.txt",
+    "src/physion/report/viewer/vendor/LICENSE.three.txt",
 }
 
 
