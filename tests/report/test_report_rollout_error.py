@@ -85,7 +85,7 @@ def test_compare_draws_the_errors_that_it_is_given(tmp_path: Path) -> None:
     )
     errors.to_csv(tmp_path / "e.csv", index=False)
     arguments = ["compare", str(tmp_path / "p.csv"), "--resamples", "20"]
-    arguments += ["--out", str(tmp_path / "report"), "--rollout-error"]
+    arguments += ["--out", str(tmp_path / "report"), "--rollout-errors"]
     assert main([*arguments, str(tmp_path / "e.csv")]) == 0
     drawn = pd.read_csv(tmp_path / "report" / "figures" / "rollout_error.csv")
     assert drawn["value"].tolist() == pytest.approx([0.15, 0.4])

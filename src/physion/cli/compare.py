@@ -65,7 +65,7 @@ class Options:
     """Elements, distractors, occluders of the stimuli: a table (CSV, parquet) or a dataset; if not
     given, by official names."""
     rollout_errors: tuple[Path, ...] = ()
-    """Files of evaluate --rollout-errors: a figure of the errors of imagined motion over time."""
+    """Files of evaluate --rollout-error: a figure of the errors of imagined motion over time."""
     exclude: Path | None = None
     """File of stimuli to exclude, one per line."""
     fitted: Path | None = None
