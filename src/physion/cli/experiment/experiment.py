@@ -12,8 +12,6 @@
 
 `physion experiment password DIR`: set a new password for the experimenter's pages.
 
-`physion experiment accounts DIR`: list, add, change and remove accounts of several experimenters.
-
 `physion experiment backup DIR`: copy the database, settings and texts while the study is served.
 
 `physion experiment forget DIR`: delete recruiters' ids, or all data of a session.
@@ -40,7 +38,6 @@ SUBVERBS = {
     "simulate": "physion.cli.experiment.simulate",
     "links": "physion.cli.experiment.links",
     "password": "physion.cli.experiment.password",
-    "accounts": "physion.cli.experiment.accounts",
     "backup": "physion.cli.experiment.backup",
     "forget": "physion.cli.experiment.forget",
     "power": "physion.cli.experiment.power",
@@ -55,7 +52,7 @@ class Options:
     """Options of ``physion experiment`` without a sub-verb."""
 
     words: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """One of init, serve, links, simulate, export, password, accounts, backup, forget, power."""
+    """One of init, serve, links, simulate, export, password, backup, forget, power."""
 
 
 def main(options: Options) -> int:

@@ -20,7 +20,7 @@ export function declineQuestion({ texts }) {
 /** Render the question whether to stop; ends with {stop}. @param {Context} context */
 export function stopQuestion({ texts, study, state }) {
   const { t } = bound(texts);
-  const text = t(state.answered ? "stop.text" : "stop.text_unanswered", { contact: study.contact });
+  const text = t("stop.text", { contact: study.contact });
   const reference = t("common.reference", { reference: state.reference });
   const parts = [el("p", { class: "small" }, reference)];
   return question(t, "stop", text, parts, (stop) => ({ stop }));
@@ -54,25 +54,25 @@ function question(t, name, text, parts, answerOf) {
  * Render the page of a session that ended early, with the texts of its stage.
  * @param {Context} context
  * @param {import("./messages.js").SessionEnd} ending
- * @param {(() => void)|null} takeBack Takes part after all; null if the page cannot.
  * @returns {(page: HTMLElement) => void}
  */
-export function endedPage({ texts, study, state, another }, ending, takeBack) {
+export function endedPage({ texts, study, state, another, address }, { completion }) {
   const { t } = bound(texts);
-  const { completion, can_take_back } = ending;
   const told = completion.code || completion.url;
+  const declined = state.stage === "declined"; // nothing was stored
+  const takePart = () => window.location.replace(address);
   const changed = () => {
-    const control = takeBack && button(t("ended.take_back"), takeBack, { class: "button quiet" });
-    return el("p", { class: "apart" }, t(takeBack ? "ended.mind_changed" : "ended.open_link"), " ", control);
+    const control = button(t("ended.take_back"), takePart, { class: "button quiet" });
+    return el("p", { class: "apart" }, t("ended.mind_changed"), " ", control);
   };
+  const reference = t("common.reference", { reference: state.reference });
   return (page) => {
     page.append(
       el("h1", {}, t(`${state.stage}.title`)),
       ...paragraphs(t(`${state.stage}.text`, study)),
       ...(told ? [] : [el("p", {}, t("ended.return_submission"))]),
       ...completionParts(completion, t, "ended.go_hint"),
-      ...(can_take_back ? [changed()] : []),
-      el("p", { class: "small" }, t("common.reference", { reference: state.reference })),
+      declined ? changed() : el("p", { class: "small" }, reference),
     );
     if (!another) return;
     const next = button(t("common.another_person"), another, { class: "button quiet" });

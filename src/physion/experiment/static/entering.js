@@ -36,7 +36,7 @@ export async function enter({ api, texts, study, log, frame }, arrival) {
     const state = await resume(api, own, arrival.enter.scenario);
     if (state) {
       log.add("loaded", { ...device });
-      hideAddress(api.token);
+      if (state.stage !== "consent") hideAddress(api.token);
       return state;
     }
   }
@@ -48,8 +48,10 @@ export async function enter({ api, texts, study, log, frame }, arrival) {
     const entered = await api.post("/api/enter", message, { onBusy, token: own?.token });
     api.token = entered.token;
     remember({ token: entered.token, who, link: linkOf(arrival) });
-    hideAddress(api.token);
-    return await api.get("/api/session?load=true");
+    const state = await api.get("/api/session?load=true");
+    // Before consent the server stores nothing: a reload must find the person by the address.
+    if (state.stage !== "consent") hideAddress(api.token);
+    return state;
   } catch (error) {
     if (error.code !== "already_took_part" || !own) throw error;
     // People can see their result again in the browser in which they took part.
@@ -57,29 +59,6 @@ export async function enter({ api, texts, study, log, frame }, arrival) {
     if (state?.stage !== "done") throw error;
     return state;
   }
-}
-
-/**
- * Return the function that takes up a session again that was declined or stopped, or null if the
- * page was reloaded and no longer knows the participant's id.
- * @param {import("./session.js").Basis} basis
- * @param {Arrival} arrival
- * @returns {((scenario?: string) => Promise<SessionState>)|null}
- */
-export function takingBack(basis, arrival) {
-  if (!arrival.named && !cameWithoutId()) return null;
-  return async (scenario) => {
-    const { api, study, texts } = basis;
-    const who = await whoOf(arrival.enter);
-    const device = await measureDevice();
-    const message = { ...arrival.enter, scenario, device, take_back: true };
-    message.language = texts.language;
-    if (who === null || message.id) message.visit = visitKey(study, who);
-    const entered = await api.post("/api/enter", message);
-    api.token = entered.token;
-    remember({ token: entered.token, who, link: linkOf(arrival) });
-    return entered.state;
-  };
 }
 
 /**
@@ -131,8 +110,11 @@ function linkOf({ enter, language }) {
   return query && `?${query}`;
 }
 
-/** Remove the query from the URL, unless a reload would need it to find the session again. */
-function hideAddress(token) {
+/**
+ * Remove the query from the URL, unless a reload would need it to find the session again.
+ * @param {string} token
+ */
+export function hideAddress(token) {
   if (!isFoundAgain(token)) return;
   window.history.replaceState(null, "", window.location.pathname);
 }

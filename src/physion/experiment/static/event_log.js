@@ -1,6 +1,6 @@
 /**
- * Log of other events in the browser (hidden, offline, errors, ...), sent in batches. Nothing waits
- * for it; a lost event is not a loss of the study's data.
+ * Log of other events in the browser (hidden, offline, errors, ...), sent in batches after consent.
+ * Nothing waits for it; a lost event is not a loss of the study's data.
  * @module event_log
  */
 
@@ -18,6 +18,7 @@ export class EventLog {
   /** The batch that is sent next. @type {import("./messages.js").Events|null} */
   #batch = null;
   #sending = false;
+  #consented = false;
 
   /** @param {import("./api.js").Api} api */
   constructor(api) {
@@ -64,9 +65,20 @@ export class EventLog {
     if (this.#events.length > MOST_KEPT) this.#events.shift();
   }
 
-  /** Send all events if a session has been entered; on failure keep them for the next time. */
+  /** Begin to send, since the participant has given consent. */
+  begin() {
+    this.#consented = true;
+  }
+
+  /** Drop all events, since the participant has declined. */
+  drop() {
+    this.#events = [];
+    this.#batch = null;
+  }
+
+  /** Send all events if consent was given; on failure keep them for the next time. */
   async send() {
-    if (this.#sending || !this.api.token) return;
+    if (this.#sending || !this.#consented || !this.api.token) return;
     this.#sending = true;
     try {
       while (this.#next()) await this.#sendBatch(this.#batch);
@@ -79,7 +91,7 @@ export class EventLog {
 
   /** Send all batches at once because the page is being left. */
   leave() {
-    if (!this.api.token) return;
+    if (!this.#consented || !this.api.token) return;
     while (this.#next()) {
       const batch = this.#batch;
       this.#sent(batch);

@@ -7,7 +7,7 @@ import { AnswerQueue } from "./answer_queue.js";
 import { Api, Refused } from "./api.js";
 import { readArrival } from "./arrival.js";
 import { completionParts } from "./completion.js";
-import { anotherPerson, cameWithoutId, enter, takingBack } from "./entering.js";
+import { anotherPerson, cameWithoutId, enter } from "./entering.js";
 import { EventLog } from "./event_log.js";
 import { Frame } from "./frame.js";
 import { deviceProblem } from "./gate.js";
@@ -73,10 +73,9 @@ async function takePart(basis, arrival) {
     if (!chosen) await setLanguage(basis, state.language);
     basis.setLanguage = (language) => setLanguage(basis, language);
     basis.another = cameWithoutId() ? anotherPerson(basis.study, arrival) : null;
-    basis.takeBack = takingBack(basis, arrival);
+    if (state.stage !== "consent") log.begin();
     session = new Session(basis, queue);
     frame.onStop = () => session.askToStop();
-    frame.onJump = (to) => session.jump(to);
     frame.onLanguage = (language) => changeLanguage(basis, session, language);
     await session.run(state);
   } catch (error) {
@@ -140,8 +139,8 @@ function showMessage({ texts, frame }, name, action = null) {
 function refuse(basis, name, { message = "", completion = null, another = null } = {}) {
   const { texts, frame, study, address } = basis;
   const known = texts.has(`refusal.${name}`);
-  const size = { width: study.min_width, height: study.min_height };
-  const reason = known ? texts.t(`refusal.${name}`, size) : texts.t("refusal.other", { message });
+  const values = { width: study.min_width, height: study.min_height, minutes: study.hold_minutes };
+  const reason = known ? texts.t(`refusal.${name}`, values) : texts.t("refusal.other", { message });
   const text = `${reason}\n\n${texts.t("refusal.contact", study)}`;
   const reload = { label: texts.t("refusal.again"), run: () => window.location.reload() };
   // The URL by which the participant came identifies the person again.

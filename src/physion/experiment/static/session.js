@@ -6,10 +6,11 @@
  */
 
 import { Refused } from "./api.js";
-import { blockPage, currentBlock, hasBlocks } from "./blocks.js";
+import { blockPage, currentBlock } from "./blocks.js";
 import { comprehensionPage } from "./comprehension_page.js";
 import { consentPage } from "./consent_page.js";
 import { ask } from "./dialog.js";
+import { hideAddress } from "./entering.js";
 import { endedPage, stopQuestion } from "./ending_pages.js";
 import { demographicsPage, feedbackPage } from "./forms.js";
 import { leaveFullscreen } from "./fullscreen.js";
@@ -18,7 +19,7 @@ import { PageTrial, patiently, showPage } from "./page_trial.js";
 import * as pages from "./pages.js";
 import { PredictionTrial } from "./prediction_trial.js";
 import { newKey } from "./random_key.js";
-import { dueFeedback, forgetFeedback, rememberFeedback } from "./remembered.js";
+import { dueFeedback, forgetFeedback, forgetSession, rememberFeedback } from "./remembered.js";
 import { questionPage } from "./question_page.js";
 import { resultPage } from "./result_page.js";
 import { announce, newShowing } from "./showings.js";
@@ -36,7 +37,8 @@ const PAGES = {
 };
 
 /** Refusals after which no session of this page can go on. */
-const FINAL = ["unknown_token", "bad_link", "id_needed", "already_took_part", "study_full", "paused"];
+const FINAL = ["unknown_token", "bad_link", "id_needed", "already_took_part", "study_full", "held",
+  "paused"];
 
 /** @typedef {import("./messages.js").SessionState} SessionState */
 
@@ -51,8 +53,6 @@ const FINAL = ["unknown_token", "bad_link", "id_needed", "already_took_part", "s
  * @property {string} address The URL by which the participant came.
  * @property {(language: string) => Promise<void>} [setLanguage] Changes the language.
  * @property {(() => void)|null} [another] Starts the study for another person; null if it cannot.
- * @property {((scenario?: string) => Promise<SessionState>)|null} [takeBack] Takes up a session again that was
- *   declined or stopped; null if the participant is not known any more.
  */
 
 /** Raised when the running part of the timeline is left for another state. */
@@ -68,8 +68,6 @@ export class Session {
   /** Closes the question whether to stop, while it is open. @type {AbortController|null} */
   #question = null;
   #withdraws = false;
-  /** Where a preview goes next. @type {{stage: string, trial: number}|null} */
-  #target = null;
   /**
    * The running trial with its last showing, and how often the question was opened during it.
    * @type {{phase: string|null, trial: number|null, asked: number,
@@ -108,12 +106,6 @@ export class Session {
     this.#closed = true;
     this.#question?.abort();
     this.queue.close();
-    this.#leave();
-  }
-
-  /** Go to any page or trial of a preview. @param {{stage: string, trial: number}} to */
-  jump(to) {
-    this.#target = to;
     this.#leave();
   }
 
@@ -190,7 +182,6 @@ export class Session {
     if (this.queue.length > 0) showPage(this.basis.frame.main, this.#waiting());
     await this.queue.empty();
     if (this.#withdraws) return this.#withdraw();
-    if (this.#target) return this.#jump();
     const known = this.#refused?.state ?? refused?.state;
     this.#refused = null;
     const request = (path) => this.#patiently(api.get(path));
@@ -198,15 +189,6 @@ export class Session {
     // A trial that was seen already is marked in its answer, as after a reload.
     const seen = this.#shown.has(`${state.stage} ${state.trial}`);
     return seen ? request("/api/session?load=true") : state;
-  }
-
-  /** Go to the target. @returns {Promise<SessionState>} */
-  #jump() {
-    const target = this.#target;
-    this.#target = null;
-    this.#shown.clear();
-    forgetFeedback();
-    return this.#patiently(this.basis.api.post("/api/jump", target));
   }
 
   /** Withdraw from the study. @returns {Promise<SessionState>} */
@@ -255,7 +237,20 @@ export class Session {
     const stored = pages.storedPage(this.context, render, store);
     await this.#timeline([{ type: PageTrial, render: stored }]);
     if (outcome.error) throw outcome.error;
+    if (page === "consent") this.#decided(outcome);
     return outcome;
+  }
+
+  /** Keep or forget what belongs to the person, as the consent says. @param {SessionState} state */
+  #decided(state) {
+    const { api, log } = this.basis;
+    if (state.stage === "declined") {
+      log.drop();
+      forgetSession();
+      return;
+    }
+    log.begin();
+    hideAddress(api.token);
   }
 
   /** Await a promise, with a page meanwhile if it takes long. */
@@ -362,24 +357,19 @@ export class Session {
     return jsPsych.data.get().values();
   }
 
-  /**
-   * Show that the session was declined or stopped, until the participant takes part after all.
-   * @returns {Promise<SessionState>} The state after that.
-   */
+  /** Show that the session was declined or has ended early. @returns {Promise<never>} */
   async #ended() {
     this.#question?.abort();
-    const { api, frame, takeBack } = this.basis;
+    const { api, frame } = this.basis;
     const { signal } = this.#part;
     const ending = await this.#patiently(api.get("/api/ending", { signal }));
-    return new Promise((resolve, reject) => {
-      const scenario = hasBlocks(this.state) ? undefined : this.state.scenario;
-      const retake = takeBack && (() => takeBack(scenario).then(resolve, reject));
-      showPage(frame.main, endedPage(this.context, ending, retake));
+    showPage(frame.main, endedPage(this.context, ending));
+    return new Promise((_, reject) => {
       signal.addEventListener("abort", () => reject(signal.reason));
     });
   }
 
-  /** Show the result, until a preview goes elsewhere. @returns {Promise<never>} */
+  /** Show the result. @returns {Promise<never>} */
   async #end() {
     this.#question?.abort();
     const { api, frame } = this.basis;

@@ -1,4 +1,4 @@
-"""Secret keys of a study, and what is derived from them: id hashes, tokens, signatures; accounts.
+"""Secret keys of a study, and what is derived from them: id hashes, tokens, signatures.
 
 All secrets are in ``secret.json`` of the study folder, which only its owner may read. Without this
 file the server can neither recognise returning participants nor verify signed links.
@@ -10,17 +10,14 @@ import hashlib
 import hmac
 import json
 import os
-import re
 import stat
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
-from functools import cache
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from secrets import token_hex, token_urlsafe
-from typing import Any, Literal
 
 from physion.core.errors import BadInputError
 from physion.core.files import read_plain, write_atomic
+from physion.core.settings import parse_json, read_settings
 
 SECRET_FILE = "secret.json"
 VERSION = 1
@@ -28,44 +25,13 @@ KEY_BYTES = 32
 MIN_PASSWORD = 8
 MAX_PASSWORD = 1000
 MAX_BYTES = 50_000
-MAX_ACCOUNTS = 100
-FIRST_ACCOUNT = "experimenter"
-"""Name of the account that every study has: an owner, whose password init prints."""
 REFERENCE_LETTERS = "23456789ABCDEFGHJKLMNPQRSTUVWXYZ"
 """32 letters and digits without look-alikes (no 0, O, 1, I)."""
 
 
-Permission = Literal["progress", "sessions", "recruitment", "payments", "export", "manage", "log"]
-"""What the experimenter's pages allow: see the overview; see sessions and their answers; pause
-recruitment; see ids, codes and payments; export; void and delete; see the log."""
-
-ROLES: Mapping[str, frozenset[Permission]] = {
-    "owner": frozenset(
-        ("progress", "sessions", "recruitment", "payments", "export", "manage", "log")
-    ),
-    "recruiter": frozenset(("progress", "recruitment", "payments")),
-    "analyst": frozenset(("progress", "sessions", "export")),
-    "viewer": frozenset(("progress", "sessions")),
-}
-"""Permissions of each role."""
-
-
-@dataclass(frozen=True)
-class Account:
-    """Account of an experimenter; ``password_hash`` is an argon2id hash."""
-
-    name: str
-    role: str
-    password_hash: str = field(repr=False)
-
-    def may(self, permission: Permission) -> bool:
-        """Return whether the account's role has this permission."""
-        return permission in ROLES[self.role]
-
-
 @dataclass(frozen=True)
 class Secrets:
-    """Secret keys of a study, and the accounts of its experimenters.
+    """Secret keys of a study, and the password of the experimenter's pages.
 
     Attributes
     ----------
@@ -74,25 +40,12 @@ class Secrets:
     link_key
         HMAC key for signatures of links, media URLs and forms.
     password_hash
-        argon2id hash of the password of the first account. Empty if it was removed or none was set.
-    others
-        Further accounts.
+        argon2id hash of the password. Empty if none was set: then nobody can log in.
     """
 
     hash_key: bytes = field(repr=False)
     link_key: bytes = field(repr=False)
     password_hash: str = field(default="", repr=False)
-    others: tuple[Account, ...] = ()
-
-    @property
-    def accounts(self) -> tuple[Account, ...]:
-        """All accounts; without any, nobody can log in."""
-        first = Account(FIRST_ACCOUNT, "owner", self.password_hash)
-        return (first, *self.others) if self.password_hash else self.others
-
-    def account(self, name: str) -> Account | None:
-        """Return the account of this name, or None."""
-        return next((account for account in self.accounts if account.name == name), None)
 
     @classmethod
     def create(cls, folder: Path, password: str | None = None) -> Secrets:
@@ -125,44 +78,38 @@ class Secrets:
 
 def write_secrets(folder: Path, secrets: Secrets) -> None:
     """Write the secrets file of a study folder, readable by its owner only."""
-    content: dict[str, Any] = {
+    content = {
         "version": VERSION,
         "hash_key": secrets.hash_key.hex(),
         "link_key": secrets.link_key.hex(),
         "password_hash": secrets.password_hash,
     }
-    if secrets.others:
-        content["accounts"] = [asdict(account) for account in secrets.others]
     encoded = (json.dumps(content, indent=1) + "\n").encode()
     write_atomic(folder / SECRET_FILE, encoded, mode=0o600)
+
+
+@dataclass(frozen=True)
+class _SecretFile:
+    """The content of the secrets file; keys in hexadecimal digits."""
+
+    version: int
+    hash_key: str
+    link_key: str
+    password_hash: str
 
 
 def _parse(path: Path, content: bytes) -> Secrets:
     """Parse and check the content of the secrets file."""
     try:
-        values: Any = json.loads(content)
-        if values["version"] != VERSION:
-            raise BadInputError(f"{path} has version {values['version']!r}, not {VERSION}")
-        keys = [bytes.fromhex(values[name]) for name in ("hash_key", "link_key")]
-        password_hash = values["password_hash"]
-        others = tuple(Account(**account) for account in values.get("accounts", ()))
-        good = all(len(key) == KEY_BYTES for key in keys) and isinstance(password_hash, str)
-        good = good and all(
-            account.role in ROLES and is_account_name(account.name) and account.password_hash
-            for account in others
-        )
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        values = read_settings(_SecretFile, parse_json(content.decode(), str(path)), str(path))
+        keys = [bytes.fromhex(key) for key in (values.hash_key, values.link_key)]
+    except (ValueError, BadInputError) as error:
         raise BadInputError(f"{path} is damaged; restore it from a backup") from error
-    if not good:
+    if values.version != VERSION:
+        raise BadInputError(f"{path} has version {values.version!r}, not {VERSION}")
+    if any(len(key) != KEY_BYTES for key in keys):
         raise BadInputError(f"{path} is damaged; restore it from a backup")
-    return Secrets(keys[0], keys[1], password_hash, others)
-
-
-def is_account_name(name: str) -> bool:
-    """Return whether a name can be that of an account: 1 to 40 letters, digits, ``.``, ``-``, ``_``
-    and ``@``.
-    """
-    return re.fullmatch(r"[\w.@-]{1,40}", name) is not None
+    return Secrets(keys[0], keys[1], values.password_hash)
 
 
 def participant_hash(secrets: Secrets, source: str, raw_id: str) -> str:
@@ -208,36 +155,23 @@ def check_signature(secrets: Secrets, signature: str, *parts: str) -> bool:
 
 
 def set_password(folder: Path, password: str) -> Secrets:
-    """Set a new password of the first account; keys and other accounts are kept."""
+    """Set a new password; keys are kept."""
     secrets = replace(Secrets.load(folder), password_hash=hash_password(password))
     write_secrets(folder, secrets)
     return secrets
 
 
-def check_password(secrets: Secrets, password: str, name: str = FIRST_ACCOUNT) -> bool:
-    """Return whether this is the password of an account (deliberately slow, about 50 ms).
-
-    For a name without an account it takes as long, so that names cannot be found out.
-    """
+def check_password(secrets: Secrets, password: str) -> bool:
+    """Return whether this is the password (deliberately slow, about 50 ms)."""
     from argon2 import PasswordHasher
     from argon2.exceptions import InvalidHashError, VerificationError
 
     if len(password) > MAX_PASSWORD:
         return False
-    account = secrets.account(name)
     try:
-        right = PasswordHasher().verify(
-            _nobodys_hash() if account is None else account.password_hash, password
-        )
+        return PasswordHasher().verify(secrets.password_hash, password)
     except (VerificationError, InvalidHashError, UnicodeEncodeError):
         return False
-    return right and account is not None
-
-
-@cache
-def _nobodys_hash() -> str:
-    """Return the hash of a random password that nobody knows."""
-    return hash_password(token_urlsafe(32))
 
 
 def hash_password(password: str) -> str:
