@@ -209,7 +209,7 @@ def test_contradictions_are_refused(tables: tuple[pd.DataFrame, pd.DataFrame]) -
         as_responses(labels)
     with pytest.raises(BadInputError, match="two participants"):
         as_responses(trials.assign(participant=["a"] * 5 + ["b"] * (len(trials) - 5)))
-    with pytest.raises(BadInputError, match="table of sessions"):
+    with pytest.raises(BadInputError, match="missing from the sessions table"):
         as_responses(trials, sessions.iloc[1:])
     with pytest.raises(BadInputError, match="stands in two rows"):
         as_responses(trials, pd.concat([sessions, sessions]))

@@ -103,7 +103,7 @@ def test_two_scenarios_without_blocks_are_still_an_error() -> None:
     with pytest.raises(BadInputError, match="two scenarios"):
         clean(without)
     other = sessions_of(range(1, 2)).assign(scenario="collide drop")
-    with pytest.raises(BadInputError, match="table of sessions"):
+    with pytest.raises(BadInputError, match="missing from the sessions table"):
         clean(table(rows), other)
 
 

@@ -65,7 +65,7 @@ def test_studies_that_cannot_be_are_refused(fractions: pd.DataFrame) -> None:
 
 
 def test_the_verb_draws_the_stimuli_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["compare", "power", "--people", "20", "--stimuli", "30", "60", "--repeats", "5"]
+    command = ["experiment", "power", "--people", "20", "--stimuli", "30", "60", "--repeats", "5"]
     assert main([*command, "--effect", "0.3", "--scenario", "drop", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
     assert [row["stimuli"] for row in rows] == [30, 60] and 0 <= rows[0]["power"] <= 1
