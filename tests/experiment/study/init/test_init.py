@@ -323,12 +323,12 @@ def test_bad_commands_are_one_line_and_leave_nothing(
 def test_the_verb_alone_says_which_words_there_are(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["experiment"]) == 2
     out = capsys.readouterr().out
-    assert all(f"physion experiment {word} DIR" in out for word in SUBVERBS)
+    assert all(f"physion experiment {word}" in out for word in SUBVERBS)
     assert main(["experiment", "srve"]) == 2
     assert "closest: serve" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("word", list(SUBVERBS))
+@pytest.mark.parametrize("word", [word for word in SUBVERBS if word != "power"])
 def test_a_missing_extra_is_said_in_one_line(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
