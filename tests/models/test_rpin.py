@@ -14,8 +14,8 @@ from physion.models.rpin import (
     UNIT,
     Backbone,
     Dynamics,
-    Imagined,
     Interaction,
+    RolledOut,
     Rpin,
     RpinSettings,
     Targets,
@@ -225,7 +225,7 @@ def test_the_published_loss_of_given_values() -> None:
     last = torch.tensor([50.0, 30.0, 10.0, 10.0]).view(1, 1, 1, 4) / size
     true = torch.tensor([52.0, 33.0, 10.0, 10.0]).view(1, 1, 1, 4) / size
     decoded = torch.tensor([3.0, 5.0, 55.0, 37.0]).view(1, 1, 1, 4)
-    imagined = Imagined(true, true, decoded)
+    imagined = RolledOut(true, true, decoded)
     targets = Targets(true, torch.ones(1, 1, 1, dtype=torch.bool))
     assert model._published(imagined, last, targets).item() == pytest.approx(525, rel=1e-4)
 

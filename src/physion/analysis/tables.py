@@ -481,7 +481,7 @@ def name_models(predictions: pd.DataFrame) -> pd.DataFrame:
 
 
 def _without_decimals(values: pd.Series) -> pd.Series:
-    """Return text without the decimals that pandas adds to seeds, and empty for words for none."""
+    """Return text without the decimals that pandas adds to seeds, and an empty text for none."""
     words = values.str.replace(r"^(\d+)\.0$", r"\1", regex=True)
     return words.replace({"nan": "", "None": ""})
 

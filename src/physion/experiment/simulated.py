@@ -245,7 +245,7 @@ class Acknowledged:
 
 
 @dataclass
-class Visit:
+class SimulatedVisit:
     """Record of one simulated participant: what happened and what was answered."""
 
     number: int
@@ -301,7 +301,9 @@ class SimulationPlan:
 class Participation:
     """A simulated person's session, from its current state to its end."""
 
-    def __init__(self, study: Study, secrets: Secrets, plan: SimulationPlan, visit: Visit) -> None:
+    def __init__(
+        self, study: Study, secrets: Secrets, plan: SimulationPlan, visit: SimulatedVisit
+    ) -> None:
         self._study, self._secrets, self._plan, self._visit = study, secrets, plan, visit
         self._person = SimulatedPerson(plan.seed, visit.number)
 
@@ -518,8 +520,8 @@ async def simulate(
     study: Study,
     secrets: Secrets,
     plan: SimulationPlan,
-    visited: Callable[[Visit], None] = lambda visit: None,
-) -> list[Visit]:
+    visited: Callable[[SimulatedVisit], None] = lambda visit: None,
+) -> list[SimulatedVisit]:
     """Run the simulated participants and return what happened to each.
 
     The same seed gives the same people: on a second run, those who had finished are left as they
@@ -544,14 +546,14 @@ async def simulate(
     if plan.scenario is not None and plan.scenario not in study.offered:
         raise UnknownNameError("scenario", plan.scenario, study.offered)
     scenarios = study.offered if plan.scenario is None else (plan.scenario,)
-    visits = [Visit(n, scenarios[n % len(scenarios)]) for n in range(plan.participants)]
+    visits = [SimulatedVisit(n, scenarios[n % len(scenarios)]) for n in range(plan.participants)]
     slots = asyncio.Semaphore(plan.at_once)
     limits = httpx2.Limits(max_connections=plan.at_once, max_keepalive_connections=plan.at_once)
     async with httpx2.AsyncClient(
         base_url=plan.url, timeout=30.0, limits=limits, trust_env=False
     ) as client:
 
-        async def run_one(visit: Visit) -> None:
+        async def run_one(visit: SimulatedVisit) -> None:
             async with slots:
                 await Participation(study, secrets, plan, visit).run(client)
             visited(visit)

@@ -400,7 +400,7 @@ _LEAST_SIZE = 1e-3
 """Least width and height of an imagined box."""
 
 
-class Imagined(NamedTuple):
+class RolledOut(NamedTuple):
     """Prediction of S steps: states (B, S, K, C, p, p), boxes and decoded values (B, S, K, 4)."""
 
     states: Tensor
@@ -498,7 +498,7 @@ class Rpin(VisionModel):
         before = torch.cat([boxes[:, -1:], predicted[:, :-1]], 1)
         change = (predicted - before)[..., :2]
         decoded = torch.cat([change, predicted[..., :2]], -1) * self.settings.image_size
-        imagined = Imagined(predicted, predicted, decoded)
+        imagined = RolledOut(predicted, predicted, decoded)
         return self._published(imagined, boxes[:, -1:], targets)
 
     def center_errors(self, batch: Batch) -> tuple[Tensor, Tensor]:
@@ -524,7 +524,7 @@ class Rpin(VisionModel):
 
         return error(imagined), error(constant_velocity(boxes, steps))
 
-    def _roll_out(self, states: Tensor, boxes: Tensor, steps: int) -> Imagined:
+    def _roll_out(self, states: Tensor, boxes: Tensor, steps: int) -> RolledOut:
         """Predict ``steps`` steps from states and boxes of h frames."""
         present = is_present(boxes[:, -1])
         rows: list[tuple[Tensor, Tensor, Tensor]] = []
@@ -534,7 +534,7 @@ class Rpin(VisionModel):
             states = torch.cat([states[:, 1:], state[:, None]], 1)
             boxes = torch.cat([boxes[:, 1:], box[:, None]], 1)
             rows.append((state, box, decoded))
-        return Imagined(*(torch.stack(part, 1) for part in zip(*rows, strict=True)))
+        return RolledOut(*(torch.stack(part, 1) for part in zip(*rows, strict=True)))
 
     def _decoded_box(self, box: Tensor, decoded: Tensor) -> Tensor:
         """Return the next box (B, K, 4) from the last one and what was decoded."""
@@ -550,7 +550,7 @@ class Rpin(VisionModel):
         ).sum(-1)
         return _mean(apart, targets.counted)
 
-    def _published(self, imagined: Imagined, last: Tensor, targets: Targets) -> Tensor:
+    def _published(self, imagined: RolledOut, last: Tensor, targets: Targets) -> Tensor:
         """Return the published loss; ``last`` are the last known boxes (B, 1, K, 4)."""
         settings = self.settings
         true = targets.boxes[..., :2] * settings.image_size

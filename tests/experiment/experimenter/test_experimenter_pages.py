@@ -232,7 +232,7 @@ def test_flags_are_found_anew_only_when_a_session_has_ended(
     walk(found.store, begin(found.store, "First"), "done")
     (done,) = rows(found.store, SESSIONS)
     run(found.store.write(lambda connection: set_voided(connection, done.session, True, 1.0)))
-    numbers = progress.Progress(found.study, found.store.engine)
+    numbers = progress.StudyProgress(found.study, found.store.engine)
     first = numbers.flags("person")
     token = walk(found.store, begin(found.store, "Ada"), "feedback")
     assert numbers.flags("person") is first

@@ -12,7 +12,7 @@ from pandas.testing import assert_frame_equal
 
 from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS, check_table
 from physion.core.errors import PhysionError, UnknownNameError
-from physion.experiment.experimenter.progress import Progress
+from physion.experiment.experimenter.progress import StudyProgress
 from physion.experiment.export import tables as trial_rows
 from physion.experiment.export.tables import (
     GONE_SCENARIO,
@@ -178,7 +178,7 @@ def test_sessions_of_a_scenario_that_is_gone_are_left_out_by_name(
         count = (of_kind & (before["scenario"] == "drop")).sum()
         assert found.left_out[kind, said] == count > 0
     # The experimenter's pages go on.
-    lines, _ = Progress(fewer, engine).sessions("person")
+    lines, _ = StudyProgress(fewer, engine).sessions("person")
     stages = {line.stage for line in lines if line.row.scenario == "drop"}
     assert stages == {"Finished", "Familiarization"}
 

@@ -13,7 +13,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 from physion.analysis.check import check_responses
 from physion.analysis.people.exclusions import flag_sessions, read_expected
 from physion.analysis.people.results import read_any_responses
-from physion.experiment.experimenter.progress import Progress
+from physion.experiment.experimenter.progress import StudyProgress
 from physion.experiment.export.export_study import export_study
 from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.store import Store
@@ -73,7 +73,7 @@ def test_completeness_and_flags_are_judged_by_the_trials_of_each_session(
     flags = flag_sessions(responses, expected=expected).set_index("session")
     unfinished = [row.session for row in rows(store, SESSIONS) if row.finished_at is None]
     assert list(flags.index[flags["incomplete"]]) == unfinished
-    shown = Progress(store.study, store.engine).flags("person")
+    shown = StudyProgress(store.study, store.engine).flags("person")
     assert not shown.problem
     found = [name for name, rules in shown.by_session.items() if "incomplete" in rules]
     assert found == unfinished
@@ -81,7 +81,7 @@ def test_completeness_and_flags_are_judged_by_the_trials_of_each_session(
 
 def test_the_progress_counts_sessions_of_several_blocks(exported: tuple[Path, Store]) -> None:
     _, store = exported
-    progress = Progress(store.study, store.engine)
+    progress = StudyProgress(store.study, store.engine)
     lines, _ = progress.sessions("person")
     ((row,), by_condition) = progress.rows(lines)
     assert (row.name, row.counted, row.accuracy, by_condition) == (ALL_SCENARIOS, 4, 0.5, [])

@@ -15,7 +15,7 @@ from physion.analysis.people.measures import accuracy_by_condition
 from physion.analysis.people.responses import keep_where
 from physion.analysis.people.results import read_any_responses
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.experiment.experimenter.progress import Progress
+from physion.experiment.experimenter.progress import StudyProgress
 from physion.experiment.export.export_study import export_study
 from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.store import Store
@@ -67,7 +67,7 @@ def test_a_study_without_conditions_has_an_empty_column(tmp_path: Path) -> None:
 
 def test_the_progress_counts_the_sessions_of_each_condition(exported: tuple[Path, Store]) -> None:
     _, store = exported
-    progress = Progress(store.study, store.engine)
+    progress = StudyProgress(store.study, store.engine)
     _, found = progress.rows(progress.sessions("person")[0])
     counts = {row.name: (row.counted, row.states["finished"]) for row in found}
     assert counts == {"slow": (3, 3), "brief": (3, 3)}

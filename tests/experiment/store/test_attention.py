@@ -10,7 +10,7 @@ import pytest
 
 from physion.analysis.people.exclusions import flag_sessions, read_expected
 from physion.analysis.people.responses import read_responses
-from physion.experiment.experimenter.progress import Progress
+from physion.experiment.experimenter.progress import StudyProgress
 from physion.experiment.export.export_study import export_study
 from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.store import Store
@@ -109,5 +109,5 @@ def test_checks_are_no_trials_of_the_analysis(checked_store: Store, tmp_path: Pa
     assert sorted(failed) == [0, 3]
     sessions = pd.read_csv(out / "sessions.csv").set_index("session")
     assert sessions["attention_failed"].loc[failed.index].tolist() == (3 - failed).tolist()
-    lines, _ = Progress(study, store.engine).sessions("person")
+    lines, _ = StudyProgress(study, store.engine).sessions("person")
     assert [(line.trials, line.accuracy) for line in lines] == [(4, 1.0)] * len(lines) != []

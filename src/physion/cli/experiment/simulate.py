@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 if TYPE_CHECKING:
-    from physion.experiment.simulated import SimulationPlan, Visit
+    from physion.experiment.simulated import SimulatedVisit, SimulationPlan
     from physion.experiment.study.study import Study
 
 
@@ -93,7 +93,7 @@ def _tell_duration(study: Study, options: Options) -> None:
         )
 
 
-def summary(study: Study, plan: SimulationPlan, visits: list[Visit]) -> dict[str, Any]:
+def summary(study: Study, plan: SimulationPlan, visits: list[SimulatedVisit]) -> dict[str, Any]:
     """Return counts of outcomes, answers and repeated requests, mean accuracy, failure reasons."""
     right = [visit.result.accuracy for visit in visits if visit.result is not None]
     return {
@@ -140,7 +140,7 @@ def _progress(options: Options) -> Iterator[Any]:
     with Stages() as stages:
         done = 0
 
-        def visited(visit: Visit) -> None:
+        def visited(visit: SimulatedVisit) -> None:
             nonlocal done
             done += 1
             stages("participants", done, options.participants)

@@ -36,7 +36,7 @@ from physion.experiment.experimenter.progress import (
     ALARM_ENTRIES,
     KINDS,
     STATES,
-    Progress,
+    StudyProgress,
     load_analysis,
 )
 from physion.experiment.store.database import ANSWERS, SESSIONS
@@ -106,7 +106,7 @@ class _Pages:
         self._study, self._secrets, self._store = study, secrets, store
         self._engine: Engine = store.engine
         self.access = Access(self._read_secrets)
-        self._progress = Progress(study, store.engine)
+        self._progress = StudyProgress(study, store.engine)
         self._files = read_page_files(Path(__file__).parent / "static")
         self._exporting = False
         self._templates = environment(__package__)

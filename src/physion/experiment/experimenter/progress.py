@@ -158,7 +158,7 @@ class ProgressRow:
         return min(100.0, 100.0 * self.counted / self.wanted) if self.wanted else 0.0
 
 
-class Progress:
+class StudyProgress:
     """Reads the numbers of a study; its methods are called in threads."""
 
     def __init__(self, study: Study, engine: Engine) -> None:
