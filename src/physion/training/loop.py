@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from physion.clips.batch import Batch
 from physion.clips.movies import background
 from physion.core.errors import BadInputError, PhysionError
-from physion.core.files import remove_leftovers, write_atomic
+from physion.core.files import has_digest, remove_leftovers, write_atomic
 from physion.core.seeds import stable_hash
 from physion.models.build import describe_raised, is_out_of_memory
 from physion.models.checkpoint import (
@@ -386,8 +386,12 @@ class TrainingFolder:
         self._damaged: list[Path] = []
 
     def finished(self) -> CheckpointContent | None:
-        """Return the trained model, if there is one."""
-        return self._read(WEIGHTS)
+        """Return the trained model, if there is one.
+
+        Weights without a digest file are those of a process that was killed before it had written
+        all; its checkpoints are still there.
+        """
+        return self._read(WEIGHTS) if has_digest(self.path / WEIGHTS) else None
 
     def resumable(self) -> CheckpointContent | None:
         """Return the newest whole checkpoint, if there is one.
