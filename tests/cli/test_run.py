@@ -36,8 +36,8 @@ def test_sampled_scenes_to_report(tmp_path: Path, capsys: pytest.CaptureFixture[
     answer = json.loads(capsys.readouterr().out)
     page = Path(answer["report"])
     assert page.is_file() and "<html" in page.read_text()
-    agents = {row["model"] for row in answer["scores"]}
-    assert agents == {"random-resnet18-mlp", "noisy-simulation"}
+    models = {row["base_model"] for row in answer["scores"] if row["kind"] == "model"}
+    assert models == {"random-resnet18-mlp", "noisy-simulation"}
     index = pd.read_parquet(tmp_path / "trials" / "index.parquet")
     assert dict(index.groupby("split").size()) == {"readout": 12, "testing": 6}
     first = digests(tmp_path)
@@ -54,8 +54,8 @@ def test_the_first_command_compares_models_with_people(
     assert main(command) == 0
     answer = json.loads(capsys.readouterr().out)
     scores = pd.DataFrame(answer["scores"])
-    assert {"noisy-simulation", "state-classifier", "chance"} <= set(scores["model"])
-    rows = scores[(scores["scenario"] == "pooled") & (scores["model"] == "noisy-simulation")]
+    assert {"noisy-simulation", "state-classifier", "chance"} <= set(scores["base_model"])
+    rows = scores[(scores["scenario"] == "pooled") & (scores["base_model"] == "noisy-simulation")]
     assert rows["stimuli"].item() >= 14  # two a scenario; Roll trials with a ledge may be left out
     assert 0.5 < rows["human_accuracy"].item() < 1
     stimuli = pd.read_csv(Path(answer["report"]).parent / "tables" / "stimuli.csv")
