@@ -15,7 +15,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 from physion.cli.main import main
 from physion.core.errors import UnknownNameError
 from physion.experiment.server_process import ServerProcess
-from physion.experiment.simulated import SimulatedPerson, SimulationPlan, Visit, simulate
+from physion.experiment.simulated import SimulatedPerson, SimulatedVisit, SimulationPlan, simulate
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.stimuli import Stimulus
 from physion.experiment.study.study import Plausibility, Study
@@ -80,7 +80,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
 
 
 @pytest.fixture(scope="module")
-def served(study: Study) -> tuple[ServerProcess, list[Visit], list[Visit]]:
+def served(study: Study) -> tuple[ServerProcess, list[SimulatedVisit], list[SimulatedVisit]]:
     """Run two simulations on one server: some people leave, then they come back."""
     plan = SimulationPlan(url="", participants=8, dropouts=0.5, seed=5)
     secrets = Secrets.load(study.folder)
@@ -92,7 +92,7 @@ def served(study: Study) -> tuple[ServerProcess, list[Visit], list[Visit]]:
 
 
 def test_people_finish_or_leave_and_come_back(
-    served: tuple[ServerProcess, list[Visit], list[Visit]],
+    served: tuple[ServerProcess, list[SimulatedVisit], list[SimulatedVisit]],
 ) -> None:
     _, first, second = served
     assert {visit.outcome for visit in first} == {"done", "left"}
@@ -106,7 +106,7 @@ def test_people_finish_or_leave_and_come_back(
 
 
 def test_simulated_is_written_in_the_data_for_good(
-    study: Study, served: tuple[ServerProcess, list[Visit], list[Visit]]
+    study: Study, served: tuple[ServerProcess, list[SimulatedVisit], list[SimulatedVisit]]
 ) -> None:
     _, first, second = served
     sessions = stored_sessions(study)
@@ -133,7 +133,7 @@ def test_simulated_is_written_in_the_data_for_good(
 @pytest.mark.parametrize("with_sessions", [False, True])
 def test_models_are_not_compared_with_simulated_participants_alone(
     study: Study,
-    served: tuple[ServerProcess, list[Visit], list[Visit]],
+    served: tuple[ServerProcess, list[SimulatedVisit], list[SimulatedVisit]],
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     with_sessions: bool,

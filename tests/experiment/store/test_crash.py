@@ -20,7 +20,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 import sqlalchemy as sa
 
-from physion.experiment.simulated import SimulationPlan, Visit, simulate
+from physion.experiment.simulated import SimulatedVisit, SimulationPlan, simulate
 from physion.experiment.store.database import open_database
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Study
@@ -40,7 +40,7 @@ class Load:
         self._study, self._secrets = study, Secrets.load(study.folder)
         self._url, self._people = url, people
         self._stopping = threading.Event()
-        self.waves: list[list[Visit]] = []
+        self.waves: list[list[SimulatedVisit]] = []
         self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), daemon=True)
         self.error: BaseException | None = None
 
@@ -75,7 +75,7 @@ class Load:
             raise self.error
 
     @property
-    def visits(self) -> list[Visit]:
+    def visits(self) -> list[SimulatedVisit]:
         """The visits of all waves."""
         return [visit for wave in self.waves for visit in wave]
 
@@ -93,7 +93,7 @@ def kill_again_and_again(server: QuickServer, kills: int, seed: int) -> None:
         server.start()
 
 
-def check(study: Study, visits: list[Visit]) -> None:
+def check(study: Study, visits: list[SimulatedVisit]) -> None:
     """Check that all acknowledged answers are stored unaltered and all sessions are complete."""
     assert {visit.outcome for visit in visits} == {"done"}, [
         visit for visit in visits if visit.outcome != "done"

@@ -13,10 +13,12 @@ import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from textwrap import fill
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from physion.analysis.people.responses import Column
 from physion.experiment.study.study import Study
+
+if TYPE_CHECKING:
+    from physion.analysis.people.responses import Column
 
 # --- labels of files and columns ---
 

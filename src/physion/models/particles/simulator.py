@@ -679,5 +679,5 @@ def gns_ransac(settings: ParticleSettings) -> ParticleSimulator:
 
 
 def dpi(settings: ParticleSettings) -> ParticleSimulator:
-    """Build a DPI-Net."""
+    """Build DPI-Net, a graph network that passes messages through roots of objects."""
     return ParticleSimulator(settings)
