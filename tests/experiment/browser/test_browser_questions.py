@@ -9,8 +9,6 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from physion.experiment.study.identity import Secrets
-from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.settings import Question
 from support.experiment.browser import Visit, chromium, rows_of, served
 from support.experiment.own_questions import OWN_ANSWERS, OWN_QUESTIONS, OWN_TEXTS
@@ -71,12 +69,3 @@ def test_own_questions_are_asked_and_stored(chromium: Any, tmp_path: Path) -> No
             "devices": ["phone", "computer"],
             "fun": None,
         }
-        # The page is in the list of a preview, which the server gives.
-        visit.go(f"?pass={make_pass(Secrets.load(study.folder), 'preview')}")
-        places = page.locator("#jump-stage option")
-        places.first.wait_for(state="attached")
-        named = [place.get_attribute("value") for place in places.all()]
-        assert "questions" in named and "demographics" not in named
-        page.select_option("#jump-stage", "questions")
-        page.get_by_role("button", name="Go there").click()
-        visit.heading("Some more questions")
