@@ -313,22 +313,6 @@ def test_stopping_for_good(chromium: Any, site: tuple[Study, str]) -> None:
     assert len(answers) == 1
 
 
-def test_declining_the_consent(chromium: Any, site: tuple[Study, str]) -> None:
-    study, url = site
-    with Visit(chromium, url) as visit:
-        visit.go("?participant=Decline")
-        visit.page.select_option("#language", "de")
-        visit.heading("Teilnahme an dieser Studie")
-        visit.page.get_by_text("Ich möchte nicht teilnehmen").click()
-        visit.heading("Möchten Sie wirklich nicht teilnehmen?")
-        visit.page.get_by_role("button", name="Ich nehme nicht teil").click()
-        visit.heading("Sie nehmen nicht teil")
-        assert visit.unexpected() == []
-    session, answers, _ = rows_of(study, "Decline")
-    assert session.withdrawn_at is not None and session.consented_at is None
-    assert answers == []
-
-
 def test_recruiters(chromium: Any, site: tuple[Study, str]) -> None:
     """Prolific's ids are stored apart and removed from the URL; the result links back."""
     study, url = site
