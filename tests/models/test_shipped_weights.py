@@ -133,7 +133,7 @@ def test_weights_predict_motion(name: str, motions: list[Motion]) -> None:
         ]
         errors, constant = (
             np.mean([row[column] for row in rows])
-            for column in ("Error", "Constant Velocity Error")
+            for column in ("error", "constant_velocity_error")
         )
         return float(errors / constant)
 

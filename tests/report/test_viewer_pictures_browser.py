@@ -69,7 +69,7 @@ def test_every_vision_model_is_shown(
     found: dict[str, Sequence[ImaginedTrial]] = {}
 
     def imagine(trials: Sequence[str]) -> dict[str, Sequence[ImaginedTrial]]:
-        found.update(imagine_with(Dataset(folder), [name], {})(trials))
+        found.update(imagine_with(Dataset(folder), [name], {"weights": "random"})(trials))
         return found
 
     options = ViewerOptions(details=1, card_size=32, pass_size=32, stride=6)

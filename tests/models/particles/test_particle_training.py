@@ -92,7 +92,7 @@ def result(dataset: Dataset) -> Result:
     errors = []
     for motion, ((particles, poses),) in zip(motions, futures, strict=True):
         rows = motion_error(motion, particles, poses, model.spec.stride, HORIZON)
-        errors.append(rows.iloc[-1][["Error", "Constant Velocity Error"]])
+        errors.append(rows.iloc[-1][["error", "constant_velocity_error"]])
     error, constant = np.mean(np.array(errors, float), axis=0)
     return Result(gaps, float(error), float(constant))
 
