@@ -59,10 +59,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "physion compare --check predictions.csv --humans official",
         "physion compare --published --out runs/published",
     ),
-    "experiment": ("physion experiment init study --trials trials",),
+    "experiment": ("physion experiment init study --trials trials --contact ada@example.org",),
     "experiment init": (
-        "physion experiment init study --trials trials --test 80 --languages en",
-        "physion experiment init study --scenes official --scenario drop",
+        "physion experiment init study --trials trials --contact ada@example.org --test 80",
+        "physion experiment init study --scenes official --contact ada@example.org",
     ),
     "experiment serve": ("physion experiment serve study --port 8080",),
     "experiment links": ("physion experiment links study --source prolific",),
