@@ -147,7 +147,7 @@ def test_slots_tell_the_next_state_from_the_present_and_from_others(
     clips: dict[tuple[str, str], Batch], seed: int
 ) -> None:
     """The candidates are 100 states: five of each of 20 clips."""
-    model: Any = build_model("cswm", seed=seed)
+    model: Any = build_model("cswm", seed=seed, weights="random")
     held_out = early_windows(model, clips["cswm", "testing"])
     model.eval()
     before = loss_of(model, held_out)
@@ -168,7 +168,7 @@ def test_boxes_are_nearer_than_at_constant_velocity(
     clips: dict[tuple[str, str], Batch], seed: int
 ) -> None:
     """The untrained network, whose loss is larger, predicts that nothing moves."""
-    model: Any = build_model("rpin", seed=seed)
+    model: Any = build_model("rpin", seed=seed, weights="random")
     held_out = early_windows(model, clips["rpin", "testing"])
     model.eval()
     before = loss_of(model, held_out)
