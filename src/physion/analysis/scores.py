@@ -539,7 +539,7 @@ def kind_of(name: str) -> Kind:
 
 
 def not_given(names: Iterable[str]) -> list[str]:
-    """Return those of `OUTCOME` and `MAJORITY` of which no predictions were given.
+    """Return the baselines among `OUTCOME` and `MAJORITY` without predictions.
 
     ``names``: names of everything of which there are predictions.
     """

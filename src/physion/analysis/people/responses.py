@@ -173,7 +173,7 @@ SESSION_COLUMNS: tuple[Column, ...] = (
 
 Refuse = Literal["refuse", "drop"]
 Participants = Literal["people", "simulated", "all"]
-"""Whose sessions are kept: those of people, of simulated participants, or of both."""
+"""Whose sessions are kept: of people, of simulated participants, or of both."""
 
 NO_ANSWER = "no answer was given"
 COPY = "exact copy of another row"
@@ -397,7 +397,7 @@ def _sessions(trials: pd.DataFrame, given: pd.DataFrame | None, where: str) -> p
 
 
 def _unexplained_scenarios(trials: pd.DataFrame) -> pd.DataFrame:
-    """Return rows of sessions with two scenarios that are not, one each, those of their blocks."""
+    """Return rows of sessions with two scenarios whose blocks do not have one scenario each."""
     pairs = trials.assign(block=trials.get("block", pd.NA))
     pairs = pairs[["session", "block", "scenario"]].drop_duplicates()
     several = pairs[pairs.groupby("session")["scenario"].transform("nunique") > 1]
