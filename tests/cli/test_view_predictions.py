@@ -198,7 +198,7 @@ def test_the_verb_puts_them_into_the_page(folder: Path, file: Path, tmp_path: Pa
     [
         (
             ["--predictions", "{}:Silent"],
-            "nothing that can be shown: .* features or outcomes alone",
+            "nothing that can be shown: .* only features or outcomes",
         ),
         (["--predictions", "{}:Uneven"], r"slots as float32 \(1, 4, 4, 2, 3\), expected"),
         (

@@ -1,4 +1,4 @@
-"""Features and imagined futures: those of the model, stored once, made again where damaged."""
+"""Features and imagined futures are the model's, stored once, made again where damaged."""
 
 from __future__ import annotations
 
@@ -367,7 +367,8 @@ def test_features_of_another_shape_or_type_are_refused(give: Any, got: str) -> N
 def test_features_of_unequal_trials_are_refused() -> None:
     sizes = iter([12, 12, 6])
     model = Numpy(lambda x: flat(x)[..., : next(sizes)])
-    with pytest.raises(BadInputError, match=r"'link_1' are .3, 6., those of 'roll_1' .3, 12."):
+    shapes = r"'link_1' have shape .3, 6., but 'roll_1' has .3, 12."
+    with pytest.raises(BadInputError, match=shapes):
         FeatureStore(None, batch=2).encoded(model, Movies(), TRIALS, "context")
 
 

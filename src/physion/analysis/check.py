@@ -357,7 +357,7 @@ def _leak(message: str, row: int, stimulus: pd.Series) -> Fault:
 
 
 def _twins(stimulus: pd.Series, index: pd.DataFrame) -> list[Fault]:
-    """Find test trials whose scene or motion equals that of a trial of another split."""
+    """Find test trials whose scene or motion also occurs in another split."""
     faults = []
     seen = index["trial"].map(canonical_name).isin(set(stimulus))
     testing = index[index["split"].isin(TESTING) & seen]

@@ -210,7 +210,7 @@ def all_results(
     Raises
     ------
     BadInputError
-        For ``people`` beside averages, and as `compare_scores`.
+        For ``people`` together with averages, and as `compare_scores`.
     UnknownNameError
         For a name in ``exclude`` that no table contains.
     """

@@ -37,7 +37,7 @@ def check_probabilities(predictions: pd.DataFrame) -> list[str]:
     ``predictions``: from `read_predictions`. A P(contact) of 0.5 contradicts nothing.
     Raises `BadInputError` for a model that contradicts itself in so many rows that chance is
     excluded (binomial test against one half, p < `SURE`) and whose P(contact) is larger where it
-    predicts no contact: then the probability is that of no contact. A model with another threshold
+    predicts no contact: then it is the probability of no contact. A model with another threshold
     than 0.5 is only warned of.
     """
     found = []
@@ -59,9 +59,7 @@ def check_probabilities(predictions: pd.DataFrame) -> list[str]:
                 f"{what}; p_contact must be the probability of a contact, and True in predicted "
                 "must mean a contact"
             )
-        found.append(
-            f"{what}: accuracy and kappa are those of the outcome, r and RMSD of the probability"
-        )
+        found.append(f"{what}: accuracy and kappa use the outcome, r and RMSD the probability")
     return found
 
 
@@ -79,7 +77,7 @@ def check_outcomes(stimuli: pd.DataFrame) -> list[str]:
         if 2 * differ <= len(rows):
             continue
         what = (
-            f"{scenario}: the official outcome is not that of the trial shown to the models "
+            f"{scenario}: the official outcome differs from the trial shown to the models "
             f"(outcome) in {differ} of {len(rows)} stimuli"
         )
         if stats.binom.sf(differ - 1, len(rows), 0.5) < SURE:
@@ -94,8 +92,8 @@ def check_outcomes(stimuli: pd.DataFrame) -> list[str]:
 def check_accuracy(stimuli: pd.DataFrame) -> list[str]:
     """Return a warning for each model that is right far less often than by guessing.
 
-    Its accuracy a is compared with that of independent answers with the same fraction of yes,
-    e = p q + (1 - p)(1 - q) for fractions p of contacts and q of answers yes:
+    Its accuracy a is compared with the accuracy of independent answers with the same fraction of
+    yes, e = p q + (1 - p)(1 - q) for fractions p of contacts and q of answers yes:
     z = (a - e) / sqrt(e (1 - e) / n) below `BELOW_CHANCE`.
     """
     found = []
@@ -288,7 +286,7 @@ def compare_scores(
     Parameters
     ----------
     predictions
-        Columns of `tables.PREDICTIONS`; ``outcome`` is that of the trial as the model was shown it.
+        Columns of `tables.PREDICTIONS`; ``outcome``: of the trial as the model was shown it.
     humans
         Table from `read_humans`, or None for the accuracies of the models only.
     labels
@@ -488,7 +486,7 @@ def _settings(
     }
     if has_people:
         words["Ceiling of r"] = (
-            "expected r of a model that knows the true share of yes: square root of the "
+            "expected r of a model that knows the true fraction of yes: square root of the "
             "reliability that binomial sampling noise leaves, from accuracy and number of people"
         )
     return words

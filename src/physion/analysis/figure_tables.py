@@ -268,8 +268,8 @@ def effects_table(
     scenarios.
 
     ``predictions``: from `read_predictions`. `GROUPED_COLUMNS`; the panel of readouts
-    has one training protocol (*all* if it occurs), that of trainings one readout. A panel is absent
-    if no model has two conditions. Intervals are about other stimuli.
+    has one training protocol (*all* if it occurs), the panel of trainings one readout. A panel is
+    absent if no model has two conditions. Intervals are about other stimuli.
     """
     rows = _with_training(comparison, predictions)
     if len(rows.drop_duplicates(["readout", "training"])) < 2:
@@ -347,7 +347,7 @@ def _effect(
 
 
 def generalization_table(comparison: Comparison, predictions: pd.DataFrame) -> pd.DataFrame:
-    """Return accuracy less that of people, trained on x tested on; `GENERALIZATION_COLUMNS`.
+    """Return accuracy minus people's accuracy, trained on x tested on; `GENERALIZATION_COLUMNS`.
 
     Seeds are averaged; models of one training only are left out. If no model was tested on another
     scenario than it was trained on, the diagonal becomes one row `ONLY`. Without people the

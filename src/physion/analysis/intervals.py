@@ -160,7 +160,7 @@ def jackknife(
 
 
 def variance_of_mean(values: Array, *, counts: bool = False) -> Variance:
-    """Return the variance of the mean of values (n, ...), which is that of the jackknife.
+    """Return the jackknife variance of the mean of values (n, ...).
 
     NaN are left out; the result is NaN for fewer than two values. ``counts``: the values are 0 or
     1, as in `jackknife`.

@@ -3,7 +3,7 @@
 A metric is one entry: a function that is decorated with `register_metric`, of three arrays or of a
 `Sample`. The tables of scores (`scores.score_table`), of measures with single participants
 (`scores.measure_table`) and the report ask this registry, so that a new metric appears in all of
-them. ``docs/how-to/add-a-metric.md`` shows how to add one. The order below is that of the tables:
+them. ``docs/how-to/add-a-metric.md`` shows how to add one. The tables have the order below:
 correct answers, signal detection, likeness to the average person, likeness beyond the outcome,
 likeness to single participants.
 """
@@ -110,7 +110,7 @@ def register_metric(
 
     The function takes a `Sample`, or three arrays: ``f(p_model, p_people, label)``, each over the
     stimuli that model and people answered, and returns a number. It is then computed anew for every
-    set of weights, so that its intervals are those of all metrics. Without a ``definition`` the
+    set of weights, so that its intervals are made as for all metrics. Without a ``definition`` the
     first line of its docstring is the definition. Tables list the metrics in the order in which
     they are registered.
     """
@@ -240,14 +240,14 @@ def human_accuracy(sample: Sample) -> Array:
     "difference",
     label="accuracy less people's",
     heading="difference",
-    definition="accuracy less that of people on the same stimuli",
+    definition="accuracy minus people's accuracy on the same stimuli",
     better="higher",
     needs="people",
     in_scores=True,
     in_measures=True,
 )
 def difference(sample: Sample) -> Array:
-    """Return the accuracy of the model minus that of people on the same stimuli."""
+    """Return the model's accuracy minus people's accuracy on the same stimuli."""
     return (sample.sums.correct_people - sample.sums.human) / sample.sums.n_people
 
 
@@ -333,7 +333,7 @@ def _kappa_of_two_people(sample: Sample) -> Array:
     "kappa_from_averages",
     label="kappa, from averages",
     heading="kappa",
-    definition="Cohen's kappa with a person drawn anew for each stimulus, from P(yes) alone",
+    definition="Cohen's kappa with a person drawn anew for each stimulus, from P(yes) only",
     better="higher",
     scale="correlation",
     needs="people",
@@ -453,7 +453,7 @@ def _beyond_of_two_people(sample: Sample) -> Array:
     "kappa_beyond_outcome",
     label="kappa beyond the outcome",
     definition="kappa from averages less (2a − 1)(2h − 1), what a model of accuracy a has if its "
-    "errors are independent of those of people of accuracy h",
+    "errors are independent of the errors of people of accuracy h",
     better="higher",
     needs="people",
     in_scores=True,

@@ -18,7 +18,7 @@ from physion.analysis.tables import MEAN, Column, check_table, in_order, must, r
 from physion.core.errors import BadInputError
 
 CONSTANT_VELOCITY = "constant velocity"
-"""Name of the baseline: objects go on as they moved in the last observed step."""
+"""Name of the baseline: objects keep moving as they did in the last observed step."""
 ERRORS: tuple[Column, ...] = (
     must("model", "text", "Name of the model", also=("Model",)),
     must("scenario", "text", "Scenario of the trial", also=("Scenario",)),
@@ -74,7 +74,7 @@ def read_rollout_errors(paths: Sequence[Path]) -> pd.DataFrame:
 def rollout_error_table(errors: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
     """Return mean errors with intervals; `COLUMNS`.
 
-    The baseline is that of the first model, since the step of a model decides its last velocity. A
+    The baseline belongs to the first model, since the step of a model decides its last velocity. A
     panel `MEAN` with the mean over scenarios follows if there are several.
 
     Parameters

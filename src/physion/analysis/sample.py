@@ -30,7 +30,7 @@ RESAMPLED: tuple[Resampled, ...] = ("people", "stimuli", "both")
 class Sums(NamedTuple):
     """Weighted sums over stimuli, each of shape (b, m): b sets of weights, m models.
 
-    - ``n``, ``correct``, ``correct_shown``: stimuli that the model predicts, those of them where
+    - ``n``, ``correct``, ``correct_shown``: stimuli that the model predicts, how many of them where
       its answer equals the official outcome, and the outcome of the trial that it was shown;
     - ``n_people``, ``correct_people``: the first two for the stimuli that people answered as well;
       the sums below are over these stimuli;
@@ -65,7 +65,8 @@ class Sample:
 
     - ``p_contact``, ``predicted`` (m, s): P(contact) in 0..1, and the predicted outcome 1 or 0;
       NaN where a model does not predict the stimulus;
-    - ``label``, ``shown`` (s,): the official outcome, and that of the trial the model was shown;
+    - ``label``, ``shown`` (s,): the official outcome, and the outcome of the trial the model was
+      shown;
     - ``p_yes``, ``human_accuracy`` (b, s) or (1, s): fraction of people who say yes, and who are
       right; NaN where nobody answered;
     - ``differ`` (b, s) or (1, s): fraction of pairs of different people who answer differently; NaN

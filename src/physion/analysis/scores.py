@@ -593,7 +593,7 @@ def baseline_scores(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
 
 
 def with_kind(scores: pd.DataFrame, names: str = "model") -> pd.DataFrame:
-    """Return a table with the column ``kind`` after that of the names of models."""
+    """Return a table with the column ``kind`` after the column of the names of models."""
     table = scores.copy()
     kinds = [kind_of(str(name)) for name in scores[names]]
     table.insert(list(table.columns).index(names) + 1, "kind", kinds)

@@ -1,9 +1,9 @@
 """Tables from outside: predictions, answers of people, outcomes, attributes of stimuli.
 
 A table is described by its `Column` values: meaning, allowed values, and other headers under which
-the column may come, such as those of the official files. `check_table` reads any table by such a
-description and refuses the first cell that breaks it, with file, row and column. Inside the package
-all columns have the names of the description.
+the column may come, such as the headers of the official files. `check_table` reads any table by
+such a description and refuses the first cell that breaks it, with file, row and column. Inside the
+package all columns have the names of the description.
 """
 
 from __future__ import annotations
@@ -349,7 +349,7 @@ PREDICTIONS: tuple[Column, ...] = (
         high=1,
         also=("Predicted Prob_true", "probability", "p"),
     ),
-    Column("model", "text", "Name of the model; absent: that of the file", may_be_empty=False,
+    Column("model", "text", "Name of the model; absent: the name of the file", may_be_empty=False,
            also=("Model",)),
     Column("readout", "text", "What the readout saw", also=("Readout Type",)),
     Column("scenario", "text", "Scenario of the trial", also=("Readout Test Data",)),
@@ -376,7 +376,7 @@ PREDICTIONS: tuple[Column, ...] = (
     Column("readout_training_dataset", "text", "", also=("Readout Train Data",)),
 )  # fmt: skip
 """One row per model and stimulus. Needed are ``stimulus`` and ``p_contact`` only; the other headers
-in ``also`` are those of the official files."""
+in ``also`` come from the official files."""
 
 DATASETS = ("encoder_pretraining_dataset", "encoder_training_dataset", "protocol",
             "readout_training_dataset")  # fmt: skip
@@ -590,7 +590,7 @@ def _choose_look(table: pd.DataFrame, dominoes: DominoesLook, folder: Path) -> p
     wanted = table["redyellow"] == (dominoes == "redyellow")
     if in_dominoes.any() and not (in_dominoes & wanted).any():
         other = "redyellow" if dominoes == "plain" else "plain"
-        raise BadInputError(f"{folder} has Dominoes of the look {other!r} alone; ask for that")
+        raise BadInputError(f"{folder} has Dominoes of the look {other!r} only; ask for that")
     return table[~in_dominoes | wanted].drop(columns="redyellow")
 
 
@@ -598,7 +598,7 @@ LABELS: tuple[Column, ...] = (
     must("stimulus", "text", "Name of the trial", also=("stim_ID",)),
     must("contact", "flag", "Do agent and patient touch?", also=("label", "outcome")),
 )
-"""One row per stimulus; the other headers are those of the official file."""
+"""One row per stimulus; the other headers come from the official file."""
 
 
 def read_labels(path: Path) -> dict[str, bool]:
@@ -659,12 +659,12 @@ def with_labels(humans: pd.DataFrame, labels: Mapping[str, bool]) -> pd.DataFram
 # Attributes of stimuli: how many elements, distractors and occluders a scene contains.
 #
 # Two sources, each named in the column ``source``: the official names of stimuli, which contain
-# the counts, and any table with the columns, such as that of one's own stimuli. A table has
+# the counts, and any table with the columns, such as a table of one's own stimuli. A table has
 # precedence over names (`better_attributes`); names that are known to be wrong are corrected
 # (`MISLABELLED`). What a source does not contain is NaN.
 
 ATTRIBUTES = ("elements", "distractors", "occluders")
-"""``elements``: objects that the physics is about beside probe, agent and zone: dominoes between
+"""``elements``: objects that the physics is about besides probe, agent and zone: dominoes between
 the first and the last, blocks of the tower, links. ``distractors``, ``occluders``: objects that
 take no part, behind the scene and in front of it."""
 

@@ -137,7 +137,7 @@ def measure(scenario: str, count: int) -> BenchRow:
 
 
 def _mean_ms(render: Callable[[int], object], frames: range) -> float:
-    """Return the mean processor time of a frame in milliseconds, without that of the first call."""
+    """Return the mean processor time of a frame in milliseconds, without the first call."""
     render(frames[0])
     started = time.process_time()
     for frame in frames:

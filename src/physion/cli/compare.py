@@ -37,19 +37,20 @@ class Options:
     predictions: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """Files of predictions; none with --responses: a report about people."""
     humans: Path | None = None
-    """Answers of people by stimulus: official (those of the package), or a folder with
+    """Answers of people by stimulus: official (shipped with the package), or a folder with
     human_accuracy-*.csv."""
     responses: tuple[Path, ...] = ()
     """Answers of single participants, in place of --humans: our export or the study's raw files."""
     labels: Path | None = None
-    """Outcomes: official, or a table (stimulus, contact); if not given, those of the people."""
+    """Outcomes: official, or a table (stimulus, contact); default: as in the people's table."""
     sessions: Path | None = None
     """Table of sessions of our export: demographics, order of sessions."""
     rules: str = "preregistered"
     """Exclusion rules: preregistered or official-code."""
     expected: Path | None = None
     """Table of the stimuli (stimulus) that each session, or each scenario, must have; if not given,
-    expected.csv beside the responses, else those that half of the scenario's sessions answered."""
+    expected.csv next to the responses, else the stimuli that half of the scenario's sessions
+    answered."""
     accept_rules: tuple[str, ...] = ()
     """Exclusion rules that may leave out more than a third of a scenario's sessions: streak,
     alternation, familiarization, low_accuracy, slow, incomplete, repeated."""
@@ -224,7 +225,7 @@ def _print_checked(checked: Checked) -> None:
 
 
 def _published(options: Options) -> int:
-    """Print the published numbers next to those of the released tables; write a page if asked."""
+    """Print the published numbers next to ours; write a page if asked."""
     from physion.analysis.published.claims import published_results
     from physion.data.official import PACKAGED, find_official
     from physion.report.published import build_published_report, published_numbers

@@ -82,7 +82,7 @@ def _version(package: str) -> str | None:
 
 
 def requirements() -> dict[str, list[str]]:
-    """Return the packages that each extra needs; those of the core have the name ``""``."""
+    """Return the packages that each extra needs; packages of the core have the name ``""``."""
     found: dict[str, list[str]] = {"": []}
     for line in importlib.metadata.requires(DISTRIBUTION) or ():
         needed, _, condition = line.partition(";")

@@ -31,7 +31,7 @@ class Options:
     name: str = "imported"
     """Name of the dataset."""
     split: Literal["training", "readout", "testing", "familiarization"] | None = None
-    """Split of the trials; default: that of metadata.json beside the files, else testing."""
+    """Split of the trials; default: as in metadata.json next to the files, else testing."""
     scenario: str | None = None
     """Scenario of all files; default: inferred from their names."""
     workers: int = os.cpu_count() or 1

@@ -44,7 +44,7 @@ DESCRIBED: Mapping[str, Callable[[], Registry[Any]]] = {
     "engines": lambda: engines,
     "executors": lambda: executors,
 }
-"""Lists that are printed with a line for each name, when they are asked for alone."""
+"""Lists that are printed with a line for each name, when only they are asked for."""
 
 
 def _decisions() -> Registry[Any]:

@@ -88,7 +88,7 @@ class Options:
     json: Path | None = None
     """Write the table, all trials and all failures to this file."""
     scenario: str | None = None
-    """Replay this scenario alone."""
+    """Replay only this scenario."""
     limit: int | None = None
     """Replay only the first trials of each scenario, this many."""
     jitter: float = 1.0

@@ -53,7 +53,7 @@ class Options:
     """Options of ``physion run``."""
 
     scenes: Path = Path(PACKAGED)
-    """Official scenes: those of the package (official), a folder made by import, or one with
+    """Official scenes: official (shipped with the package), a folder made by import, or one with
     command logs."""
     humans: Path | None = None
     """Answers of people to these scenes: official, or a folder with human_accuracy-*.csv. Default:

@@ -40,7 +40,7 @@ class Options:
     seed: int = 0
     """First seed: of initial weights, folds and batches."""
     out: Path = Path("runs/models")
-    """Folder for trainings and features, that of physion evaluate."""
+    """Folder for trainings and features, as for physion evaluate."""
     option: tuple[str, ...] = ()
     """Settings of the models or of their training as NAME=VALUE, such as size=paper steps=500
     batch=16 learning_rate=1e-3; of one of several models as MODEL:NAME=VALUE."""

@@ -32,7 +32,7 @@ SCENERY_ID, AGENT_ID, PATIENT_ID, FIRST_OTHER_ID = 0, 1, 2, 3
 
 @dataclass(frozen=True, slots=True)
 class Spec:
-    """What a model asks for. Frames are those of the motion, 0.01 s apart, one a movie frame.
+    """What a model asks for. Frames are frames of the motion, 0.01 s apart, one per movie frame.
 
     - ``inputs``: any of `INPUTS`.
     - ``image_size``: pixels per side; pictures are scaled to it.
@@ -44,10 +44,10 @@ class Spec:
     - ``context_at``: where the context lies: ``start`` (0, s, 2 s, ...) or ``end`` (..., 44 - s,
       44).
     - ``objects``: rows of ``Batch.boxes``.
-    - ``framewise``: whether the features of a frame depend on that frame alone, so that a clip can
+    - ``framewise``: whether the features of a frame depend on that frame only, so that a clip can
       be encoded in parts.
 
-    The defaults are those of the released frozen-encoder models: frames 0, 6, ..., 36 of the 45
+    The defaults are as in the released frozen-encoder models: frames 0, 6, ..., 36 of the 45
     observed ones, and 42, 48, ..., 144 after them.
     """
 
@@ -137,7 +137,7 @@ class Batch:
     - ``boxes`` (B, T, K, 4) float32: left, top, right, bottom of what is visible of object id
       1..K, from 0 to 1 of width and height; NaN for an object that is not seen.
     - ``camera`` (B, 2, 4, 4) float64: view matrix (world to camera) and projection matrix.
-    - ``state``: motions (B); their frames are not those of ``frames`` but all from 0 on.
+    - ``state``: motions (B); they have all frames from 0 on, not only ``frames``.
     - ``features`` (B, T, D) float32: of a frozen encoder, for models whose ``diet`` is features.
     """
 
@@ -217,7 +217,7 @@ class Rollout:
     - ``contact`` (B, S) bool: whether they touch, of simulators that report contacts.
     - ``shown``: what the model imagined, for ``physion view``: rgb (B, S, future, H, W, 3) uint8,
       boxes (B, S, future, K, 4), masks (B, S, future, K, H, W) in 0..1, slots (B, S, future, K, D),
-      whose K D values are those of the features, particles (B, S, F, P, 3) float32 in metres with
+      whose K D values are the features, particles (B, S, F, P, 3) float32 in metres with
       ``things`` (B, P) int64, the index of each one's object in `Scene.names`, both NaN and -1
       where a trial has fewer. Rows follow the context at the stride of the `Spec`. Also masks of
       the frames of the context, context_masks (B, T, K, H, W).

@@ -125,7 +125,7 @@ def clips(
 ) -> Clips:
     """Return clips, one for each trial, which torch's ``DataLoader`` takes as they are.
 
-    The words are those of `physion.clips.batch.Spec`; its defaults are those of the study.
+    The parameters are fields of `physion.clips.batch.Spec`, with the study as default.
 
     Parameters
     ----------

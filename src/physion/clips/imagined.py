@@ -33,8 +33,8 @@ class ImaginedTrial:
       ``particles`` (F, P, 3) in metres, with ``things`` (P,), the index in `Scene.names` of the
       object of each; ``rgb`` (F, H, W, 3) uint8; ``boxes`` (F, K, 4) in 0..1, NaN for none;
       ``masks`` (F, K, h, w) in 0..1; and ``slots`` (F, K, D), values of K slots.
-    - ``seen_frames`` (T,), ``seen``: the frames that the model saw, before those of ``frames``, and
-      what it saw or made of them: ``rgb``, ``boxes``, ``masks`` and ``slots``.
+    - ``seen_frames`` (T,), ``seen``: the frames that the model saw, before ``frames``, and what it
+      saw or made of them: ``rgb``, ``boxes``, ``masks`` and ``slots``.
     - ``true``: what was to be imagined in ``frames``: ``rgb``, and ``slots`` that the model finds
       in it.
     - ``probability``: P(contact). ``gap``: smallest distance of agent and patient in the future

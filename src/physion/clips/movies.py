@@ -65,7 +65,7 @@ def movie_files(
     dataset
         The dataset.
     observed
-        Whether the movies of the observed part are meant, and not those of the whole trials.
+        Whether the movies of the observed part are meant, not of the whole trials.
     look
         Colours: ``redyellow`` or ``free``, by default each trial's own.
     """

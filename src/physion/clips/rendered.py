@@ -35,7 +35,7 @@ from physion.scenes.looks import in_look
 from physion.scenes.scene import Scene
 
 _PASS = {"rgb": "color", "ids": "ids", "depth": "depth"}
-"""Pass of the renderer by input of a `Spec`; boxes are those of the ids."""
+"""Pass of the renderer by input of a `Spec`; boxes come from the ids."""
 _MOST_OBJECTS = 255
 """Largest id of an object in ``Batch.ids``."""
 

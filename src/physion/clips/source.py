@@ -146,10 +146,10 @@ class ObservedSource:
 
 
 class WholeSource(ObservedSource):
-    """Source of whole trials, which are read by ``readers``; the context is that of ``observed``.
+    """Source of whole trials, which are read by ``readers``; the context comes from ``observed``.
 
     Movies of the observed part and of the whole trial are encoded apart, so the first frames of
-    `whole` differ from those of `context` by the rounding of the encoder.
+    `whole` differ from `context` by the rounding of the encoder.
     """
 
     def __init__(self, observed: ObservedSource, readers: TrialReaders) -> None:

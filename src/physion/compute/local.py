@@ -254,7 +254,7 @@ class _Worker:
         """End the process: let it finish if it is idle, kill it if it runs a task."""
         self.pipe.close()
         idle = self.ready and self.job is None
-        # A lost process is ending by itself; its exit code says why, that of a kill would not.
+        # A lost process is ending by itself; its exit code says why; after a kill it would not.
         self.process.join(_EXIT_SECONDS if idle or (self.lost and not self._late) else 0)
         if self.process.is_alive():
             self.process.kill()

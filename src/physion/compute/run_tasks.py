@@ -63,7 +63,7 @@ def run_tasks(
     progress: Progress | None = None,
     on_outcome: Callable[[TaskOutcome[R]], None] | None = None,
 ) -> tuple[dict[str, R], dict[str, str]]:
-    """Run ``function`` on every task; an error in one task is recorded and the others go on.
+    """Run ``function`` on every task; an error in one task is recorded and the others continue.
 
     Parameters
     ----------

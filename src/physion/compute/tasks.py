@@ -86,7 +86,8 @@ class Executor(Protocol):
 def workers_kept(executor: Executor) -> AbstractContextManager[object]:
     """Return a context in which an executor keeps its processes from one `map` to the next.
 
-    That of an executor that has none, such as one that runs tasks as jobs of a cluster, is empty.
+    The context of an executor without processes, such as one that runs tasks as jobs of a cluster,
+    is empty.
     """
     return executor if isinstance(executor, AbstractContextManager) else nullcontext()
 
@@ -189,7 +190,7 @@ def _printing_into(path: Path) -> Iterator[None]:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
     try:
-        # Other objects may stand in the place of the streams, such as those of a test.
+        # Other objects may stand in the place of the streams, such as in a test.
         with (
             os.fdopen(os.dup(1), "w", encoding="utf-8") as out,
             contextlib.redirect_stdout(out),

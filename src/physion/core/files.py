@@ -57,7 +57,7 @@ def write_atomic(path: Path, data: bytes, mode: int = 0o644) -> None:
     except BaseException as error:
         part.unlink(missing_ok=True)
         if isinstance(error, OSError):
-            # That of a failed write names no file, that of others the temporary one.
+            # The error of a failed write names no file, other errors the temporary one.
             error.filename, error.filename2 = str(path), None
         raise
     sync_folder(path.parent)
@@ -144,7 +144,7 @@ def _is_same_file(path: Path, descriptor: int) -> bool:
 
 # SHA-256 of files: how it is computed, stored in a digest file, and checked.
 #
-# A digest file ``NAME.sha256`` lies beside what people exchange or keep: the index, predictions,
+# A digest file ``NAME.sha256`` lies next to what people exchange or keep: the index, predictions,
 # weights, official data, shards. Its one line is what ``sha256sum --check`` reads. Trial files hold
 # their SHA-256 in their own header (`physion.trials.trial_file`).
 

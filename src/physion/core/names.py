@@ -1,4 +1,4 @@
-"""Names of scenarios and stimuli: the one table of our names and those of the official files.
+"""Names of scenarios and stimuli: the one table of our names and the official ones.
 
 It lies below every other package, so that reading trials, importing official files, the experiment
 and the analysis recognise a scenario by the same names.
@@ -108,7 +108,7 @@ def is_ledge(stimulus: str) -> bool:
 def guess_scenario(stimulus: str, controller: str, folders: Sequence[str]) -> str | None:
     """Return the scenario of any official trial, or None if nothing tells it.
 
-    Unlike `scenario_of`, which knows the test stimuli alone, this looks for a word in the name of
+    Unlike `scenario_of`, which knows only the test stimuli, this looks for a word in the name of
     the stimulus, then at the controller of its metadata, then at the names of its folders.
     """
     for word, scenario in _WORDS.items():

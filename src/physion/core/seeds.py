@@ -19,7 +19,7 @@ def stable_hash(*parts: str | int) -> int:
 def trial_seed(
     dataset: str | int, scenario: str, split: str, index: int, attempt: int = 0
 ) -> np.random.SeedSequence:
-    """Return the seed of one trial, a function of the trial's name alone.
+    """Return the seed of one trial, a function of the trial's name only.
 
     Parameters
     ----------

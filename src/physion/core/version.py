@@ -15,7 +15,7 @@ MADE_WITH = f"physion {__version__}"
 # Golden digests: hashes that one known trial of each scenario must have on every machine.
 #
 # `physion.trials.making.reproduce` computes them; `golden_digests.json` in this folder stores
-# those of this version. A short hash of them is part of the version strings of engine and
+# the digests of this version. A short hash of them is part of the version strings of engine and
 # renderer, which every trial stores: engines or renderers of one version string made the same
 # golden trials.
 

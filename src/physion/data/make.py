@@ -1,7 +1,7 @@
 """Making of a folder of official data from a checkout of the original study's files.
 
 Files are found by their names, wherever they lie in the checkout, so that the public repository,
-the archive of command logs beside it, and folders arranged by hand are all read.
+the archive of command logs next to it, and folders arranged by hand are all read.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def make_official(checkout: Path, folder: Path) -> MadeData:
     if not people:
         raise BadInputError(
             f"{checkout} holds no {_PEOPLE}: it is no checkout of the original study; "
-            "command logs alone are read with: physion run --scenes DIR"
+            "only command logs are read with: physion run --scenes DIR"
         )
     trials, notes = _trials(checkout)
     labels = _labels(_distinct(found(_LISTS), checkout))

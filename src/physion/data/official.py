@@ -9,7 +9,7 @@ A folder of official data has these files. `physion.data.make` writes it; one is
 - ``model_bounds.json``: bounds of the models of the simulator's library.
 - ``SOURCE.md``, ``LICENSE.official.txt``.
 
-Beside each is its digest file (`physion.core.files`).
+Next to each is its digest file (`physion.core.files`).
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class OfficialData:
         )
 
     def trial_set(self, scenario: str | None = None, limit: int | None = None) -> TrialSet:
-        """Return the trials as `physion.scenes.tdw.read_logs.read_scenes` returns those of logs."""
+        """Return the trials as `physion.scenes.tdw.read_logs.read_scenes` does for logs."""
         chosen = [t for t in self.trials if scenario in (None, t.scene.scenario)]
         if limit is not None:
             counts: dict[str, int] = {}
@@ -106,7 +106,7 @@ def official(folder: Path | str | None = None) -> OfficialData:
     Parameters
     ----------
     folder
-        By default, and for ``official`` where there is no such folder, that of the package.
+        By default, and for ``official`` where there is no such folder, the folder of the package.
 
     Returns
     -------

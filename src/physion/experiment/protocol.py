@@ -1,7 +1,7 @@
 """Types of the messages between browser and server: one bounded pydantic model per message.
 
 All bodies are JSON, at most 64 KiB. A participant's requests carry ``Authorization: Bearer TOKEN``
-with the token of `Entered`; the token alone identifies the session, so no request names one. Client
+with the token of `Entered`; the token identifies the session, so no request names one. Client
 times are milliseconds of the browser's monotonic clock.
 
 ============================  =========================  ==========================================
@@ -283,7 +283,7 @@ class BlockTrials(Message):
 
 
 class SessionSettings(Message):
-    """Settings of the study in the condition of the session, in place of those of `PublicStudy`."""
+    """Settings of the study in the session's condition, instead of `PublicStudy`."""
 
     cue_ms: int
     flash_hz: float
@@ -555,7 +555,7 @@ class PublicStudy(Message):
     """Number of test trials between two breaks; 0: no breaks."""
     familiarization_feedback: bool
     hold_minutes: int
-    """Minutes after which people who are told that all places are taken may come back."""
+    """Minutes after which people who find all places taken may come back."""
     preload: int
     """Number of trials whose media are loaded ahead."""
     interrupted: Literal["repeat", "void"]  # see `Plausibility`

@@ -1,7 +1,7 @@
 """Weights of models in safetensors files, with metadata as JSON in their headers.
 
 Only safetensors and JSON are read, so that no code in a file can be executed. Weights that are kept
-have a digest file beside them (`core.files`); checkpoints of a training that goes on have none.
+have a digest file next to them (`core.files`); checkpoints of an unfinished training have none.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def write_checkpoint(
 ) -> None:
     """Write tensors and metadata, JSON values, to a file that is replaced atomically.
 
-    ``kept``: whether a digest file is written beside it, for weights that people keep or exchange.
+    ``kept``: whether a digest file is written next to it, for weights that people keep or exchange.
     """
     copies = {
         name: value.detach().to("cpu", copy=True).contiguous() for name, value in tensors.items()
@@ -125,7 +125,7 @@ def is_checkpoint(path: Path) -> bool:
 
 
 def tensors_of(model: nn.Module, optimizer: Optimizer | None = None) -> dict[str, Tensor]:
-    """Return the tensors of a model, and those of an optimiser, by the names in a checkpoint."""
+    """Return the tensors of a model and of an optimiser, by the names in a checkpoint."""
     tensors = {_MODEL + name: value for name, value in model.state_dict().items()}
     if optimizer is not None:
         for index, values in optimizer.state_dict()["state"].items():
@@ -141,7 +141,7 @@ def load_tensors(
 ) -> None:
     """Load tensors of the file ``path`` into a model, and into an optimiser.
 
-    Raises `BadInputError`, and changes nothing, for those of another network; the message names
+    Raises `BadInputError`, and changes nothing, for weights of another network; the message names
     the tensors that differ.
     """
     weights = _with_prefix(tensors, _MODEL)
@@ -190,7 +190,7 @@ def check_same(
 
 
 def describe_tensors(tensors: Mapping[str, Tensor], model: nn.Module) -> str:
-    """Return which weights of a checkpoint differ from those of a model, as text; "" if none."""
+    """Return which weights of a checkpoint differ from a model's, as text; "" if none."""
     return _listed(_compare_tensors(_with_prefix(tensors, _MODEL), model.state_dict()))
 
 
@@ -237,7 +237,7 @@ def _shown(values: Mapping[str, Any], key: str) -> str:
     return text if len(text) <= 20 else text[:16] + "..."
 
 
-# Weights of models that this package trained: those that come with it, and those of a user.
+# Weights of models that this package trained: weights that ship, and weights of a user.
 
 FOLDER = "physion.data.weights"
 """Name of the folder with the weights that are installed with the package."""

@@ -45,7 +45,7 @@ class ExtractorModel(TorchModel):
         if not isinstance(extractor, nn.Module):
             raise BadInputError(
                 f"model {self._name!r} has transform and extract_features, but is no torch Module, "
-                "so that its weights cannot be told apart; derive it from torch.nn.Module"
+                "so that its weights cannot be identified; derive it from torch.nn.Module"
             )
         self.extractor: Any = extractor
         transform, gap, self._least = _settings(extractor, self._name)

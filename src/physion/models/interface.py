@@ -110,9 +110,9 @@ class ModelSettings:
 
     @classmethod
     def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the defaults of the model of this name that differ from those of the fields.
+        """Return the defaults of the model of this name that differ from the fields' defaults.
 
-        ``options`` are those that the user gave, such as the size.
+        ``options``: what the user gave, such as the size.
         """
         return {}
 
@@ -120,7 +120,7 @@ class ModelSettings:
 Sizes = Mapping[str, Mapping[str, Any]]
 """By size, the settings that differ from the defaults of the fields."""
 RANDOM, SHIPPED = "random", "shipped"
-"""Weights that are no path of a file: those to be trained, and those of the package."""
+"""Weights that are no path of a file: to be trained, or shipped with the package."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,7 +189,7 @@ class Model:
     settings
         All that a user can set, a dataclass; None for a model without options.
     samples, seed
-        Futures of a trial, and the seed of their random numbers; None: that of the evaluation.
+        Futures of a trial, and the seed of their random numbers; None: the evaluation's seed.
     knobs
         Values among which the decision chooses, by the name of an argument of `imagine`, such as a
         level of noise.
@@ -309,7 +309,7 @@ class Model:
     def encoder_digest(self) -> str:
         """Return the hexadecimal SHA-256 of all that determines the features of `encode`.
 
-        It differs from `digest` where some weights, such as those of dynamics, do not matter.
+        It differs from `digest` where some weights, such as the dynamics' weights, do not matter.
         """
         return self.digest()
 

@@ -168,7 +168,7 @@ class NoisySimulation(Model):
     def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
         """Simulate every trial ``samples`` times; ``contact`` says whether agent and patient touch.
 
-        ``scale`` is the only knob; by default it is that of the settings. The noise of a sample is
+        ``scale`` is the only knob; by default as in the settings. The noise of a sample is
         a function of ``seed``, the trial's name and the number of the sample.
         """
         scale = knobs.get("scale", self.settings.scale)

@@ -7,7 +7,7 @@ Tensors (B clips, T frames, h = ``settings.history``, K objects, states of C x p
 - features (B, T, K (C p p + 4)): state and box of each object, one object after the other. They
   are zeros for an object that no frame of the clip shows.
 
-The boxes are those of the ids, as in the published experiments: the model is supervised by them.
+The boxes come from the ids, as in the published experiments: the model is supervised by them.
 The published code encodes no boxes apart from the regions; here the box and its last change are
 part of the state (`Dynamics`).
 
@@ -168,7 +168,7 @@ def last_changes(boxes: Tensor) -> Tensor:
 
 
 def constant_velocity(known: Tensor, steps: int) -> Tensor:
-    """Return boxes (B, steps, K, 4) that go on as the last two of known ones (B, T, K, 4).
+    """Return boxes (B, steps, K, 4) that move on as the last two of known ones (B, T, K, 4).
 
     With a single known box they stay where they are.
     """
@@ -490,7 +490,7 @@ class Rpin(VisionModel):
         return {"loss": self._published(imagined, boxes[:, -1:], targets)}
 
     def baseline(self, batch: Batch) -> Tensor:
-        """Return the loss of boxes that go on at constant velocity."""
+        """Return the loss of boxes that move on at constant velocity."""
         boxes, targets = self._task(batch)
         predicted = constant_velocity(boxes, targets.boxes.shape[1])
         if self.settings.outputs == "boxes":

@@ -205,7 +205,7 @@ class Decoder(nn.Module):
         initialize(self)
 
     def forward(self, codes: Tensor, skips: Sequence[Tensor]) -> Tensor:
-        """Return pictures; ``skips`` are ordered as those of `Encoder`."""
+        """Return pictures; ``skips`` are ordered as the `Encoder` returns them."""
         values = self.first(codes[:, :, None, None])
         for stage, skip in zip(self.stages, reversed(skips), strict=True):
             values = stage(torch.cat([self.enlarge(values), skip], 1))
@@ -344,7 +344,7 @@ class Svg(PictureModel):
 
         Training: ``loss``, ``error`` (the first term), ``kl``. A validation is of what the model
         imagines without seeing it: ``loss`` is the squared error of moving pixels of the frames
-        after the observed ones (`physion.models.vision`), ``error`` that of all pixels, and
+        after the observed ones (`physion.models.vision`), ``error`` the error of all pixels, and
         ``objective`` the loss of the training.
         """
         pictures = window_pictures(batch, self.spec, self.name, self.window)

@@ -79,9 +79,9 @@ def digest_of(settings: Any, weights: Iterable[tuple[str, Tensor]] = ()) -> str:
 def source_of(kind: type) -> str:
     """Return the source text of the modules of a class and of those that it is derived from.
 
-    Modules of torch and of this package do not count, except that of the class itself. For a class
-    without a file, as in a notebook, it is the compiled code. The text is read once: a file may be
-    edited while its classes, as they were, are at work.
+    Modules of torch and of this package do not count, except the module of the class itself. For a
+    class without a file, as in a notebook, it is the compiled code. The text is read once: a file
+    may be edited while its classes, as they were, are at work.
     """
     if kind in _sources:
         return _sources[kind]

@@ -2,7 +2,7 @@
 
 It takes the same hulls, masses, materials and pushes as `physion.physics.rigid`, so that outcomes
 on which both engines agree do not depend on how contacts are solved. MuJoCo's contacts are damped
-springs with one coefficient of friction; those of the official simulator are hard.
+springs with one coefficient of friction; contacts of the official simulator are hard.
 
 The same scene gives the same bytes in every process: MuJoCo runs in one thread.
 """
@@ -402,7 +402,7 @@ class MujocoRun:
         )
 
     def _read_bodies(self) -> None:
-        """Set poses and velocities of all bodies that move from those of their actors."""
+        """Set poses and velocities of all moving bodies from their actors."""
         actors = self.actors
         poses, speeds = self.data.qpos.reshape(-1, 7), self.data.qvel.reshape(-1, 6)
         moving = np.flatnonzero(actors.actor_of < actors.count)

@@ -25,7 +25,7 @@ from physion.scenes.shapes.meshes import Mesh
 from physion.scenes.shapes.primitives import shape
 
 SPACING, CLOTH_SPACING = 0.05, 0.035
-"""Metres between particles, and those of scenes with cloth (docs/official-system.md, section 6)."""
+"""Metres between particles, and in scenes with cloth (docs/official-system.md, section 6)."""
 LIMIT = 3000
 """Largest number of particles of one object (docs/official-system.md, section 6)."""
 FINE = 4
@@ -117,9 +117,9 @@ def particles_over_time(
     scene, trajectory
         Bodies, and their motion.
     spacing : float, optional
-        Metres; by default that of the original study (`default_spacing`).
+        Metres; by default as in the original study (`default_spacing`).
     frames : sequence of int, optional
-        Frames to return; by default all. `BadInputError` for others than those of the trajectory.
+        Frames to return; by default all. `BadInputError` for frames outside the trajectory.
     limit : int or None
         See `sample_particles`.
     """

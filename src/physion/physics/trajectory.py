@@ -153,8 +153,8 @@ def summarise_contacts(
 ) -> Contacts:
     """Return one contact for each touching pair and frame: its deepest point, its whole impulse.
 
-    ``frame`` (R,), ``pair`` (R, 2) and ``row`` (R, 8) are those of
-    `physion.physics.rigid.step.History`; body ``floor`` is the floor.
+    ``frame`` (R,), ``pair`` (R, 2) and ``row`` (R, 8) as in `physion.physics.rigid.step.History`;
+    body ``floor`` is the floor.
     """
     if not len(frame):
         return Contacts.empty()

@@ -39,7 +39,7 @@ class ChosenModel:
     """Model of an evaluation or training, and the options that a user sets.
 
     - ``model``: its name, or the model itself. ``options``: fields of its settings.
-    - ``training``: fields of `TrainingSettings` that replace those of the model.
+    - ``training``: fields of `TrainingSettings` that replace the model's.
     """
 
     model: str | Model
@@ -52,7 +52,7 @@ class ChosenModel:
         return self.model if isinstance(self.model, str) else self.model.provenance().model
 
     def build(self, seed: int, *, untrained: bool = False) -> Any:
-        """Return the model; ``seed`` is that of its initial weights if it has one.
+        """Return the model; ``seed``: of its initial weights if it has one.
 
         With ``untrained``, a model whose weights ship starts from random ones.
         """
@@ -90,7 +90,7 @@ def choose_models(models: Models, options: Mapping[str, Any] | None = None) -> l
     ------
     BadInputError
         If there is no model, an option has a wrong type, or a model that is built gets options that
-        are not those of a training.
+        do not belong to a training.
     """
     own: Mapping[Any, Mapping[str, Any]] = models if isinstance(models, Mapping) else {}
     listed = [models] if isinstance(models, str) or hasattr(models, "provenance") else list(models)

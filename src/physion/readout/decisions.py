@@ -86,14 +86,14 @@ class FeatureDecision(Protocol):
     """Decision on features.
 
     ``labels``: outcomes that it is fitted on: ``simulated``, of the trials as they were made, or
-    ``recorded``, which prefers those of the official recording.
+    ``recorded``, which prefers the outcomes of the official recording.
     """
 
     input: Literal["features"]
     labels: Literal["simulated", "recorded"]
 
     def decide(self, fit: Sequence[Any], labels: Booleans, test: Sequence[Any]) -> Decided:
-        """Fit on the parts of the features of n trials and decide on those of m other ones.
+        """Fit on the parts of the features of n trials and decide on the features of m other ones.
 
         Every part is an array (n, T, D) or stored features; parts are joined in time.
         """
@@ -109,7 +109,7 @@ class RolloutDecision(Protocol):
     def decide(
         self, fit: Mapping[Knobs, Outcomes], labels: Booleans, test: Mapping[Knobs, Outcomes]
     ) -> Decided:
-        """Fit on the outcomes of n trials at all knobs, and decide on those of m other trials."""
+        """Fit on the outcomes of n trials at all knobs, and decide on m other trials."""
         ...
 
 
@@ -136,7 +136,7 @@ decisions: Registry[DecisionFactory] = Registry(
 class GapDecision:
     """Threshold on the gap, in metres, that is right for most of the fit trials.
 
-    P(contact) is that of `fraction_of_futures`, where a gap of at most the threshold is a contact.
+    P(contact) as in `fraction_of_futures`, where a gap of at most the threshold is a contact.
     Thresholds that are right equally often leave the one that is
     closest to 0; without fit trials it is 0.
     """

@@ -147,7 +147,7 @@ def evaluate(
         ``training/``. A table whose inputs are the same is not made again.
     protocols
         Scenarios that train a model: ``all``, ``all-but`` the tested one, or ``only`` the tested
-        one. A model that is not trained is evaluated once. Weights that ship are those of ``all``;
+        one. A model that is not trained is evaluated once. Weights that ship belong to ``all``;
         under the other protocols such a model is trained from random weights.
     scenario
         Tested scenario, under all-but and only; by default all of them.

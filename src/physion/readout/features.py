@@ -204,7 +204,7 @@ class StoredFeatures:
         for trial, shape in zip(self.trials, shapes, strict=True):
             if shape != shapes[0]:
                 raise BadInputError(
-                    f"features of trial {trial!r} are {shape}, those of {self.trials[0]!r} "
+                    f"features of trial {trial!r} have shape {shape}, but {self.trials[0]!r} has "
                     f"{shapes[0]}; a model must give equal shapes for all trials"
                 )
         self._steps, self._size = shapes[0] if shapes else (0, 0)

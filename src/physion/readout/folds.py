@@ -153,7 +153,7 @@ def plan_folds(index: pd.DataFrame, protocol: Protocol, folds: int, seed: int) -
 def training_folds(index: pd.DataFrame, protocol: Protocol, folds: int, seed: int) -> list[Fold]:
     """Return the folds that an evaluation of a dataset would train on.
 
-    They are those of `plan_folds`. A dataset without testing trials has no scenario to predict: its
+    They come from `plan_folds`. A dataset without testing trials has no scenario to predict: its
     folds train on the split training, or readout where there is none.
 
     Raises
@@ -200,7 +200,7 @@ def assign_folds(table: pd.DataFrame, folds: int, seed: int) -> Mapping[str, int
     """Return the fold (0 to folds - 1) of each trial, balanced by scenario and label.
 
     Trials with equal digests get the same fold. The result depends on seed, digests and labels
-    alone, not on the order of rows.
+    only, not on the order of rows.
     """
     assigned: dict[str, int] = {}
     for _, rows in table.groupby("scenario", sort=True):

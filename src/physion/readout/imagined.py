@@ -48,7 +48,7 @@ def imagine_with(
     ----------
     dataset
         The dataset. Models imagine from its observed part; the true pictures that the viewer shows
-        beside are of whole trials.
+        next to them are of whole trials.
     names
         Names of models; ``options`` are fields of the config of every one.
     progress
@@ -178,7 +178,7 @@ def _shown_arrays(
     """Return the arrays (B, F, ...) of the first future that can be shown, and F."""
     known = [name for name in SHOWABLE if name in rollout.shown]
     if not known:
-        gave = ", ".join(sorted(rollout.shown)) or "features or outcomes alone"
+        gave = ", ".join(sorted(rollout.shown)) or "only features or outcomes"
         raise BadInputError(
             f"model {model_name(model)!r} imagines nothing that can be shown: the viewer shows "
             f"{', '.join(SHOWABLE)}, and it gave {gave}"
@@ -238,7 +238,7 @@ def _as_slots(model: Model, features: Arrays, slots: Arrays) -> Arrays:
     if features.shape[2] != count * size:
         raise BadInputError(
             f"model {model_name(model)!r}: imagine gave {count} slots of {size} values, and encode "
-            f"features of {features.shape[2]} values, which must be those of all slots"
+            f"features of {features.shape[2]} values, which must be the values of all slots"
         )
     return features.reshape(*features.shape[:2], count, size)
 

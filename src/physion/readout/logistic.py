@@ -1,6 +1,6 @@
 """L2 logistic regression on few trials with very many features, solved exactly.
 
-The objective is that of scikit-learn:
+The objective is scikit-learn's:
 
     C * sum(log(1 + exp(-y f))) + |w|^2 / 2,    f = w . x + b,  y in {-1, 1},  b not penalised.
 
@@ -287,7 +287,7 @@ def fit_readout(
         are joined in time. They set the mean and standard deviation by which all features are
         standardised; a constant feature is ignored.
     labels
-        Contact or not (n,). If all are equal, nothing is fitted and the probability is that of
+        Contact or not (n,). If all are equal, nothing is fitted and the probability follows
         Laplace's rule of succession. If a label occurs fewer than twice there is no
         cross-validation, and C is the middle of the grid.
     test

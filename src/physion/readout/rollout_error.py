@@ -1,4 +1,4 @@
-"""Error of imagined motion over time, next to that of going on at constant velocity.
+"""Error of imagined motion over time, next to the error of moving on at constant velocity.
 
 For a trial, object i with centre c_i, and a step of s frames, k steps after frame 44:
 

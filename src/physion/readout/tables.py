@@ -29,9 +29,9 @@ COLUMNS = (
   all, all-but or only; it and ``seed`` are empty for a model that was not trained.
 - ``init``: initial weights of the model. ``inputs``: what the model was given of a trial: names of
   `clips.batch.INPUTS` with commas, ``outcomes``, ``answers of people``, or ``base rate`` (nothing).
-- ``p_contact``: P(contact). ``outcome``: that of the trial as it was shown; ``recorded_outcome``:
-  that of the official recording, empty where there is none; ``observed_contact``: whether agent
-  and patient touched in the observed part already.
+- ``p_contact``: P(contact). ``outcome``: of the trial as it was shown; ``recorded_outcome``: of the
+  official recording, empty where there is none; ``observed_contact``: whether agent and patient
+  touched in the observed part already.
 - ``decision``: what turned features or rollouts into probabilities. ``readout_c``, ``noise_scale``
   and ``gap_threshold`` (metres): what it fitted.
 - ``train_accuracy``, ``test_accuracy``: means over all folds of a protocol, readout and scenario.

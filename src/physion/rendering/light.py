@@ -78,7 +78,7 @@ def _mapped_region(scene: Scene) -> tuple[F64, float]:
     """Return centre on the ground and half size in metres of the region of the depth maps.
 
     It holds all objects that start within `MAP_REACH` of the point that the camera looks at. It
-    depends on the scene alone, so that no frame depends on other frames.
+    depends on the scene only, so that no frame depends on other frames.
     """
     objects = [(*body.position[:2], max(body.scale)) for body in scene.bodies]
     objects += [(*cloth.position[:2], max(cloth.size)) for cloth in scene.cloths]

@@ -156,7 +156,7 @@ class Renderer:
 
     @property
     def triangles(self) -> int:
-        """Number of triangles, including those of the room."""
+        """Number of triangles, including the room."""
         return len(self._assembly.faces)
 
     def _check_trajectory(self) -> None:
@@ -357,7 +357,7 @@ def render_frames(
 def role_map(ids: NDArray[np.integer], scene: Scene) -> NDArray[np.uint8]:
     """Return a picture (H, W, 4) uint8 with the agent in red and the patient in yellow.
 
-    ``ids`` (H, W) are those of a `Frame`. Everything else is transparent: alpha is 0.
+    ``ids`` (H, W) as in a `Frame`. Everything else is transparent: alpha is 0.
     """
     colors = np.zeros((len(scene.names()) + 1, 4), np.uint8)
     colors[scene.index(scene.roles.agent) + 1] = AGENT_COLOR

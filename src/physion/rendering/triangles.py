@@ -476,7 +476,7 @@ def _sheet_normals(vertices: F64) -> F32:
     """Return the corner normals (T, 3, 3) of a square sheet with these vertices (V, 3).
 
     The normal of a vertex is the mean of its triangles' normals, weighted by area: the sum of
-    their cross products. The triangles are those of `sheet`: all to the left of the diagonals,
+    their cross products. The triangles are ordered as in `sheet`: all to the left of the diagonals,
     then all others.
     """
     side = math.isqrt(len(vertices))

@@ -124,7 +124,7 @@ class CompareResult:
             Folder for ``report.html``, ``report.json``, ``tables/`` and ``figures/``.
         **page
             Fields of `physion.report.ReportInputs` such as ``movies``, ``trial_pages``, ``title``
-            and ``methods``, which are added to those of the comparison.
+            and ``methods``, which are added to the comparison's.
 
         Raises
         ------
@@ -188,23 +188,23 @@ def compare(
         columns ``stimulus`` and ``p_contact`` only; `physion.analysis.tables.PREDICTIONS` has the
         others. None: an analysis of the people in ``responses``.
     humans
-        Averages of people: ``official`` for those of the package, a folder of
+        Averages of people: ``official`` for the shipped ones, a folder of
         ``human_accuracy-*.csv``, or a table with ``stimulus``, ``scenario``, ``accuracy`` and
         ``count``.
     responses
         Answers of single participants in place of ``humans``: the file of our export, or the
         study's raw files.
     labels
-        Outcome by stimulus, its table (``stimulus``, ``contact``), or ``official``. None: those of
-        the people; for stimuli without one ``recorded_outcome`` of the predictions.
+        Outcome by stimulus, its table (``stimulus``, ``contact``), or ``official``. None: as in the
+        people's table; for stimuli without one ``recorded_outcome`` of the predictions.
     sessions
         Table of sessions of our export, with ``responses``.
     rules
         Name of the exclusion rules: ``preregistered`` or ``official-code``.
     expected
         Stimuli that a session must have, by scenario or by session, or their table. None:
-        ``expected.csv`` beside the responses, else those that half of the scenario's sessions
-        answered.
+        ``expected.csv`` next to the responses, else the stimuli that half of the scenario's
+        sessions answered.
     accept_rules
         Exclusion rules that may leave out more than a third of a scenario's sessions.
     simulated
@@ -221,7 +221,7 @@ def compare(
     dominoes
         Which people count for Dominoes in ``humans``.
     zone
-        Official table of participants' percentiles; None: looked for beside ``humans``.
+        Official table of participants' percentiles; None: looked for next to ``humans``.
     rollout_errors
         Files of ``physion evaluate --rollout-error``, for a figure of them.
     resamples, seed
@@ -380,7 +380,7 @@ def read_averages(
 ) -> tuple[pd.DataFrame, dict[str, bool] | None, str, Path | None]:
     """Return answers of people by stimulus, the outcomes with their source, and a file of zones.
 
-    ``humans`` and ``labels`` are those of `compare`. The outcomes are None if none are known, and
+    ``humans`` and ``labels`` as in `compare`. The outcomes are None if none are known, and
     the file is None if there is none.
     """
     known, origin = read_outcomes(labels), "those recorded with the trials"
@@ -402,7 +402,7 @@ def read_averages(
 
 
 def read_outcomes(labels: str | Path | Mapping[str, bool] | None) -> dict[str, bool] | None:
-    """Return outcomes by stimulus from a table, or those of the study for ``official``."""
+    """Return outcomes by stimulus from a table, or the study's for ``official``."""
     if labels is None or isinstance(labels, Mapping):
         return None if labels is None else dict(labels)
     data = find_official(labels)

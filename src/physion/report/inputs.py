@@ -21,8 +21,8 @@ class ReportInputs(ComparisonResults):
     """Results of a comparison with the settings of the page.
 
     - ``title``: the heading.
-    - ``methods``: settings made outside the analysis, as text; those of `EXPECTED_METHODS` that
-      are absent are printed as not stated.
+    - ``methods``: settings made outside the analysis, as text; absent ones of `EXPECTED_METHODS`
+      are printed as not stated.
     - ``movies``: file by stimulus (mp4, webm, gif, png or jpg); other files are ignored.
     - ``question``: what people and models were asked, for the movies.
     - ``model_inputs``: what a model was given, by its name: values of the column *Inputs*.

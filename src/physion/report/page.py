@@ -75,7 +75,7 @@ _FRAME_BYTES = 50_000
 def _with_trials(
     inputs: ReportInputs, sections: Sequence[Section], movies: PageMovies, links: Mapping[str, str]
 ) -> list[Section]:
-    """Return the sections, after that of the opening trials and with the disagreements."""
+    """Return the sections after the opening trials, with the disagreements."""
     first = Section(OPENING, opening(inputs, movies, links))
     shows = Section(DISAGREE, gaps(inputs, movies, links))
     return [first, *(shows if one.title == DISAGREE else one for one in sections)]

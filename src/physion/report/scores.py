@@ -160,9 +160,9 @@ def _later(comparison: Comparison) -> Markup:
 def shown_metrics(comparison: Comparison, beyond: bool) -> list[Metric]:
     """Return the metrics of a table that say something about this comparison.
 
-    ``beyond``: those beyond the outcome with those of likeness, or all others. Without people those
-    that need them are left out, and those about simulated outcomes if all simulated outcomes are
-    the official ones.
+    ``beyond``: with the measures of likeness also the measures beyond the outcome, or all others.
+    Without people the measures that need them are left out, and those about simulated outcomes if
+    all simulated outcomes are the official ones.
     """
     names = (*_LIKENESS, *BEYOND_OUTCOME)
     return [

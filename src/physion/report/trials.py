@@ -186,7 +186,8 @@ def card(rows: pd.DataFrame, movie: Markup, links: Mapping[str, str], named: str
 
 
 def pick_readouts(rows: pd.DataFrame, named: str = "") -> pd.DataFrame:
-    """Return the rows of one readout of each model: that of ``named``, else by `READOUT_ORDER`.
+    """Return the rows of one readout of each model: the readout in ``named``, else by
+    `READOUT_ORDER`.
 
     Readouts that were shown the outcome (*full*) are left out where another one is there.
     """

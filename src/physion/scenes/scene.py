@@ -1,9 +1,9 @@
 """Description of a trial, independent of engine and renderer: bodies, cloth, pushes, camera, roles.
 
 Units are metres, kilograms, seconds and radians; z is up, axes are right-handed, quaternions are
-(w, x, y, z) of unit length. A body's position is that of its pivot: for every primitive the centre
-of its bottom face. All classes are frozen dataclasses; a `Scene` is written to JSON and read back
-without loss.
+(w, x, y, z) of unit length. A body's position is the position of its pivot: for every primitive the
+centre of its bottom face. All classes are frozen dataclasses; a `Scene` is written to JSON and read
+back without loss.
 """
 
 from __future__ import annotations
@@ -130,10 +130,10 @@ class BodyEvent:
     - ``kind``: ``appear``: the body is absent before ``frame``; ``vanish``: it is absent from
       ``frame`` on; ``move``: it is put at a pose. It starts from its pose at rest.
     - ``position`` (metres, of the pivot), ``rotation``: the new pose; None keeps the present one,
-      which is that of `Body` for a body that appears first.
+      which is the pose in `Body` for a body that appears first.
 
-    An absent body touches nothing, is not drawn and rests at its pose: before it appears at that of
-    `Body`, after it vanished at its last one. Joints hold between bodies that are there.
+    An absent body touches nothing, is not drawn and rests: before it appears at the pose in `Body`,
+    after it vanished at its last pose. Joints hold between bodies that are there.
     """
 
     frame: int

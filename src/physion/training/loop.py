@@ -157,7 +157,7 @@ def learning_rate(settings: TrainingSettings, step: int, factor: float = 1.0) ->
     - k >= w, ``cosine``: r (1 + cos(pi (k - w) / (n - w))) / 2, which would be 0 at step n,
     - k >= w, otherwise: r.
 
-    It is multiplied by ``factor``, that of `Plateau`.
+    It is multiplied by ``factor`` of `Plateau`.
     """
     rate = settings.learning_rate * factor
     if step < settings.warmup:
@@ -172,7 +172,7 @@ def learning_rate(settings: TrainingSettings, step: int, factor: float = 1.0) ->
 class Plateau:
     """Factor of the learning rate that falls when the validation loss stops falling.
 
-    The rule is that of torch's ``ReduceLROnPlateau``: after more than ``patience`` validations in
+    The rule is torch's ``ReduceLROnPlateau``: after more than ``patience`` validations in
     a row that are not lower than the best one by a ten-thousandth, the rate is lowered.
     """
 
@@ -265,7 +265,7 @@ class MetricsLog:
     folder
         Folder of the training, which exists.
     step
-        Number of steps of the checkpoint from which training goes on; 0 for a new training.
+        Number of steps of the checkpoint from which training continues; 0 for a new training.
     """
 
     def __init__(self, folder: Path, step: int) -> None:
@@ -368,7 +368,7 @@ class TrainingFolder:
     """Files of one training.
 
     While it runs there are two checkpoints, so that one remains if the other is damaged. When it
-    is done, the weights alone are written, without the state of the optimiser, and the checkpoints
+    is done, only the weights are written, without the state of the optimiser, and the checkpoints
     are deleted.
 
     Parameters
@@ -388,7 +388,7 @@ class TrainingFolder:
     def finished(self) -> CheckpointContent | None:
         """Return the trained model, if there is one.
 
-        Weights without a digest file are those of a process that was killed before it had written
+        Weights without a digest file come from a process that was killed before it had written
         all; its checkpoints are still there.
         """
         return self._read(WEIGHTS) if has_digest(self.path / WEIGHTS) else None
@@ -404,7 +404,7 @@ class TrainingFolder:
             check_same(found.path, "version", found.metadata["versions"], versions())
         if self._damaged:
             start = f"step {found.metadata['step']}" if found is not None else "the beginning"
-            self.notes.append(f"training goes on from {start}")
+            self.notes.append(f"training continues from {start}")
         return found
 
     def clean(self) -> None:
@@ -661,7 +661,7 @@ class TrainingLoop:
         )
 
     def _validate(self, log: MetricsLog | None, last: bool) -> None:
-        """Compute the loss of held-out trials; after the last step also that of the baseline."""
+        """Compute the loss of held-out trials; after the last step also the baseline's loss."""
         model, state, windows = self._model, self.state, self._data.held_out
         assert windows is not None
         requests = validation_requests(windows, self._settings.batch, self._seed)

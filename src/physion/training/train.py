@@ -129,7 +129,7 @@ class TrainedModel:
     - ``model``, ``seed``: what was trained. ``name``: of the set of trials. ``folder``: its files,
       None if nothing is kept.
     - ``loss``: mean of the last ``log_every`` steps. ``validation``: of held-out trials, and
-      ``baseline`` that of a predictor that has learnt nothing; NaN if there is none.
+      ``baseline`` of a predictor that has learnt nothing; NaN if there is none.
     - ``config_hash``: of everything that determines the weights.
     - ``loaded``: whether it was there already. ``notes``: files that were found damaged.
     """
@@ -181,7 +181,7 @@ def train_model(
     folder
         Folder of all trainings, in which ``<model>-<name>-<hash>`` is created; None keeps nothing.
     settings
-        Optimiser and schedule; those of the model by default.
+        Optimiser and schedule; by default the model's.
     features
         Returns features (n, T, D) of whole clips, for models whose diet is features.
     accelerator

@@ -105,7 +105,7 @@ class Dataset:
 
     @cached_property
     def observed(self) -> ObservedDataset:
-        """Access to the observed movies alone, for code that must not see the outcome."""
+        """Access to the observed movies only, for code that must not see the outcome."""
         return ObservedDataset(self.folder, self.index, verify=self.verify)
 
     def paths(self, trial: str) -> TrialPaths:
@@ -173,7 +173,7 @@ def indexed_file(
 ) -> IndexedFile | None:
     """Return the file of a trial by its column of the index; None if the trial has no such file.
 
-    ``row`` is the trial's row of the index. The path is that of the layout, since one in the index
+    ``row`` is the trial's row of the index. The path follows the layout, since one in the index
     could lead out of the folder.
     """
     sha256 = row.get(f"{column}_sha256")

@@ -40,10 +40,10 @@ MAX_FILE_BYTES = 1 << 33
 FILES: Mapping[str, str] = {
     "trial_file": "scene, motion, contacts, label, first-frame ids (HDF5); contains the future",
     "movie": "all frames (MP4); contains the future",
-    "observed_movie": "the observed frames alone (MP4)",
+    "observed_movie": "only the observed frames (MP4)",
     "map": "agent in red and patient in yellow in the first frame (PNG)",
     "free_movie": "all frames in free colours (MP4); contains the future",
-    "free_observed_movie": "the observed frames alone in free colours (MP4)",
+    "free_observed_movie": "only the observed frames, in free colours (MP4)",
 }
 """Files that a trial can have, by the names of their columns, with their content."""
 
@@ -72,7 +72,7 @@ class TrialPaths:
 
     @property
     def observed_movie(self) -> Path:
-        """Movie of the observed frames alone (MP4)."""
+        """Movie of only the observed frames (MP4)."""
         return self._named("_observed.mp4")
 
     @property
@@ -87,7 +87,7 @@ class TrialPaths:
 
     @property
     def free_observed_movie(self) -> Path:
-        """Movie of the observed frames alone in free colours (MP4)."""
+        """Movie of only the observed frames, in free colours (MP4)."""
         return self._named("_free_observed.mp4")
 
     def all(self, movies: bool = True, free: bool = False) -> dict[str, Path]:
@@ -193,7 +193,7 @@ def encode_png(picture: NDArray[np.uint8], compress_level: int = 6) -> bytes:
 def same_picture(one: bytes, other: bytes) -> bool:
     """Return whether two PNG files differ at most in how their pixels are compressed.
 
-    All chunks except those of the compressed pixels must be equal, so that a file with a damaged
+    All chunks except the compressed pixels must be equal, so that a file with a damaged
     header or end is another one.
     """
     first, second = _uncompressed_chunks(one), _uncompressed_chunks(other)
@@ -207,7 +207,7 @@ def same_picture(one: bytes, other: bytes) -> bool:
 
 
 def _uncompressed_chunks(data: bytes) -> list[bytes] | None:
-    """Return all chunks of a PNG file but those of its pixels; None if one is damaged."""
+    """Return all chunks of a PNG file except its pixels; None if one is damaged."""
     chunks, place = [data[:8]], 8
     while place < len(data):
         end = place + 12 + int.from_bytes(data[place : place + 4], "big")
@@ -245,7 +245,7 @@ class Metadata:
     Parameters
     ----------
     trial, dataset, scenario, split
-        Names; that of the trial is unique in the dataset.
+        Names; the trial's is unique in the dataset.
     index
         Position in the split of the scenario, from 0.
     preset

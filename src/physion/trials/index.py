@@ -89,7 +89,7 @@ slashes; path, size and SHA-256 are missing if the trial has no such file."""
 COLUMNS = {name: column.dtype for name, column in INDEX_COLUMNS.items()}
 """Pandas types by column, in the stored order."""
 MAX_BYTES = 1 << 30
-"""Largest index that is read; that of a million trials has about 300 MB."""
+"""Largest index that is read; an index of a million trials has about 300 MB."""
 _AGAIN = "run the command that made the dataset again, which makes its index again"
 _KINDS: dict[str, tuple[str, tuple[Callable[[Any], bool], ...]]] = {
     "string": ("text", (pa.types.is_string, pa.types.is_large_string)),
@@ -205,7 +205,7 @@ def describe_mixed_versions(table: pd.DataFrame) -> str:
     if len(counts) < 2:
         return ""
     listed = ", ".join(f"{count} by {package}" for package, count in counts.items())
-    return f"the trials were made by several versions: {listed}; a new folder has those of one"
+    return f"the trials were made by several versions: {listed}; make a new folder"
 
 
 def same_value(one: Any, other: Any) -> bool:

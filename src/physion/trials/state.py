@@ -1,6 +1,6 @@
 """State of a trial: the physical quantities that the original study offers for every stimulus.
 
-Every function takes an open `Trial` and computes one quantity from the trial file alone. Units are
+Every function takes an open `Trial` and computes one quantity from the trial file only. Units are
 metres, kilograms, seconds and radians; axes are right-handed with z up; quaternions are
 (w, x, y, z). In shapes, F counts frames, N all objects in the order of `Scene.names` (rigid bodies,
 then cloths), and B rigid bodies. Frame f shows the time f * `FRAME_TIME`.
@@ -98,8 +98,8 @@ class ThingMesh:
 def centroids(trial: Trial) -> Floats:
     """Return the centres of mass (F, N, 3) in metres, world coordinates.
 
-    The centre of a body is that of its collision hulls, whose velocity is `RigidVelocities.linear`;
-    the centre of a cloth is the mean of its vertices.
+    The centre of a body is the centre of its collision hulls, whose velocity is
+    `RigidVelocities.linear`; the centre of a cloth is the mean of its vertices.
     """
     scene, motion = trial.scene, trial.trajectory
     masses = [
@@ -213,8 +213,8 @@ def object_table(trial: Trial, look: str | None = None) -> pd.DataFrame:
     Columns: name, kind (``body`` or ``cloth``), shape, scale_x, scale_y, scale_z (factors; a
     cloth's sides in metres), red, green, blue (sRGB, 0..1), texture, mass (kg), static_friction,
     dynamic_friction, restitution (NaN for cloth: the solver has its own), kinematic, scenery, role
-    (``agent``, ``patient``, ``probe``, joined by ``+``, or empty). Colours are those of ``look``,
-    by default the one that the trial's movies show.
+    (``agent``, ``patient``, ``probe``, joined by ``+``, or empty). Colours as in ``look``, by
+    default the one that the trial's movies show.
     """
     scene = trial.shown(look)
     roles = {"agent": scene.roles.agent, "patient": scene.roles.patient, "probe": scene.roles.probe}

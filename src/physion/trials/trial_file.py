@@ -399,8 +399,8 @@ class FieldReader(GuardedHdf5):
 def mesh_of(thing: Body | Cloth) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Return vertices (V, 3) in metres and triangles (T, 3) of the surface of an object.
 
-    Vertices of a body are those of its shape at unit scale, of a cloth those of the undeformed
-    sheet about its centre. Triangles are counter-clockwise as seen from outside.
+    Vertices of a body belong to its shape at unit scale, of a cloth to the undeformed sheet about
+    its centre. Triangles are counter-clockwise as seen from outside.
     """
     if isinstance(thing, Cloth):
         flat = sheet_vertices(thing) - np.asarray(thing.position)

@@ -1,7 +1,7 @@
 """Writing and reading of movies: H.264 in MP4.
 
 The full movie and the observed movie of a trial are encoded separately: the observed one from its
-own frames alone, so that the look-ahead of the encoder cannot carry over information of later
+own frames only, so that the look-ahead of the encoder cannot carry over information of later
 frames.
 """
 

@@ -298,7 +298,7 @@ def test_the_effect_of_a_flag_is_found_and_its_interval_allows_for_people() -> N
     one = flags["session"] == flags["session"].iloc[0]
     single = flag_effect(responses, flags.assign(slow=one), "slow")
     assert np.isfinite(single["b"].iloc[0]) and np.isnan(single["low"].iloc[0])
-    assert single["reason"].tolist() == ["one participant alone determines it"]
+    assert single["reason"].tolist() == ["a single participant determines it"]
     other = flag_effect(responses, flags.assign(low_accuracy=False, flagged=worse), "flagged")
     assert other["reason"].tolist() == [""]
     with pytest.raises(BadInputError, match="no rule"):

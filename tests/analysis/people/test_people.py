@@ -426,7 +426,7 @@ def test_confounded_and_constant_attributes_say_so() -> None:
     stimuli = stimuli_table(1, 0.0)
     together = regress_hypotheses(stimuli.assign(distractors=stimuli["occluders"]))
     chosen = together["hypothesis"].isin(["H2", "H3"])
-    assert together.loc[chosen, "reason"].str.contains("not to be told apart").all()
+    assert together.loc[chosen, "reason"].str.contains("cannot be distinguished").all()
     constant = regress_hypotheses(stimuli.assign(occluders=1.0)).set_index("hypothesis")
     assert constant.loc["H3", "reason"].str.contains("does not vary").all()
     silent = regress_hypotheses(stimuli.drop(columns="mean_log_rt")).set_index("hypothesis")

@@ -258,7 +258,7 @@ def test_kappa_follows_accuracy(results: PublishedResults) -> None:
     table = results.tables["accuracy_kappa"].set_index("over")
     for over, rows in (
         ("means of models over scenarios", cells[mean]),
-        ("the same, vision models alone", cells[mean & ~cells["model"].isin(PARTICLES)]),
+        ("the same, vision models only", cells[mean & ~cells["model"].isin(PARTICLES)]),
         ("cells of model and scenario", cells[~mean]),
     ):
         row = table.loc[over]

@@ -214,7 +214,7 @@ WATCH_TROUBLE = """() => {
 
 
 def test_answers_that_are_too_early_are_sent_again(chromium: Any, tmp_path: Path) -> None:
-    """After the time that the server says; the participant notices nothing and goes on."""
+    """After the time that the server says; the participant notices nothing and continues."""
     timing = replace(SHORT, cue_ms=2000)
     with (
         served(tmp_path, test=2, familiarization=1, timing=timing) as (study, server),

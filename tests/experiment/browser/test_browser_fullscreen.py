@@ -32,7 +32,7 @@ def test_full_screen_is_offered_until_it_is_declined(chromium: Any, tmp_path: Pa
         visit.begin_test()
         visit.answer("yes")
         visit.page.evaluate("document.exitFullscreen()")
-        visit.answer("no")  # the trial goes on
+        visit.answer("no")  # the trial continues
         visit.heading("About you")
         assert not visit.page.evaluate(is_full)
         visit.page.reload()  # sends the events

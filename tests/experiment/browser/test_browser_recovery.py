@@ -227,7 +227,7 @@ def test_the_second_tab_takes_over(chromium: Any, site: tuple[Study, str]) -> No
         first, visit.page = visit.page, visit.open_tab()
         visit.go()
         visit.page.get_by_text("Trial 2 of 4").wait_for()
-        first.get_by_text("The study goes on in another tab").wait_for()
+        first.get_by_text("The study continues in another tab").wait_for()
         assert first.locator(".answer").count() == 0
         visit.answer("no")
         visit.page.get_by_text("Trial 3 of 4").wait_for()
@@ -235,7 +235,7 @@ def test_the_second_tab_takes_over(chromium: Any, site: tuple[Study, str]) -> No
         visit.page.bring_to_front()
         visit.picture("first")
         visit.main_button().click()  # continue here
-        second.get_by_text("The study goes on in another tab").wait_for()
+        second.get_by_text("The study continues in another tab").wait_for()
         visit.page.get_by_text("Trial 3 of 4").wait_for()
         visit.answer("no")
         visit.answer("yes")

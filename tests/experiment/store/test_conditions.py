@@ -93,7 +93,7 @@ def test_conditions_are_filled_equally_and_places_are_given_back(groups_store: S
     gone = update(SESSIONS).where(SESSIONS.c.session == left).values(last_seen=1.0)
     run(store.write(lambda c: c.execute(gone)))
     begin(store, "last")
-    assert conditions_of(store)["plain"] == 4, "nobody goes on with the session that was left"
+    assert conditions_of(store)["plain"] == 4, "nobody continues the session that was left"
 
 
 def test_ties_are_broken_by_seed(groups: Study, tmp_path: Path) -> None:

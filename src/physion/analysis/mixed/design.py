@@ -329,7 +329,7 @@ def _groups(term: RandomTerm, rows: pd.DataFrame) -> list[Group]:
         labels = labels + ":" + part
     codes, levels = pd.factorize(labels, sort=True)
     if len(levels) < 2:
-        raise BadInputError(f"the group {name!r} has one level alone: it cannot vary; leave it out")
+        raise BadInputError(f"the group {name!r} has only one level: it cannot vary; leave it out")
     codes, labels = codes.astype(np.int64), tuple(map(str, levels))
     columns = np.ones((len(rows), 1))
     effects: tuple[str, ...] = (INTERCEPT,)

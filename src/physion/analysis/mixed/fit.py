@@ -270,7 +270,7 @@ class Solution:
 class LinearModel:
     """Restricted likelihood of one design.
 
-    Parameters are those of `RandomEffects`, in units of the residual standard deviation. Fixed
+    Parameters as in `RandomEffects`, in units of the residual standard deviation. Fixed
     effects are orthonormal (p columns), and their least-squares part is subtracted from y, so that
     neither large means nor units of columns cost precision.
     """
@@ -385,13 +385,13 @@ class LinearModel:
 # them; its last results are in benchmarks/results/mixed.json. mixedlm and interlace-lme agree with
 # this module and take one minute and three; GPBoost is fast, but stops early and gives standard
 # errors of the fixed effects up to 65 % too small; lme-python's coefficients differ by 0.2 of a
-# standard error, as those of lme4 with nAGQ = 0 would; statsmodels has Bayesian approximations
+# standard error, as lme4's with nAGQ = 0 would; statsmodels has Bayesian approximations
 # only, which do not finish in 300 s; bambi samples; pymer4 needs R.
 #
 # The marginal likelihood of the fixed effects and standard deviations is, as in glmmTMB and
-# lme4::glmer(nAGQ = 1), that of the normal distribution around the mode of the random effects. Its
-# gradient is exact and includes the change of the mode and of the curvature. Standard errors come
-# from the whole Hessian, so that they contain the uncertainty of the variances.
+# lme4::glmer(nAGQ = 1), the integral of the normal distribution around the mode of the random
+# effects. Its gradient is exact and includes the change of the mode and of the curvature. Standard
+# errors come from the whole Hessian, so that they contain the uncertainty of the variances.
 
 AT_MODE = 1e-17
 """Decrease of the objective by a Newton step below which the mode of the random effects is found.
@@ -406,7 +406,7 @@ def fit_logistic(formula: str, data: pd.DataFrame, level: float = 0.95) -> Mixed
     (1|stimulus)``.
 
     The response is a column of True/False or 0/1; `mixed.formula` lists what formulas may contain.
-    The table has Wald tests: statistic z, df infinite. ``level`` is that of the intervals.
+    The table has Wald tests: statistic z, df infinite. ``level``: of the intervals.
 
     Rows with a missing value are left out, counted in ``missing`` and named in ``warnings``. Raises
     `BadInputError` for unknown columns, a response of one class, a group of one level, fixed
@@ -460,7 +460,7 @@ def _notes(design: Design, roots: Sequence[Array]) -> list[str]:
 class LogisticModel:
     """Negative Laplace log-likelihood of one design, with its gradient.
 
-    Parameters: coefficients of the orthonormal fixed effects (p,), then those of `RandomEffects`:
+    Parameters: coefficients of the orthonormal fixed effects (p,), then of `RandomEffects`:
     standard deviations, if there are no slopes. Random effects are u of unit variance, by slot;
     each search starts at the last mode.
     """
@@ -648,7 +648,7 @@ def fit_linear(formula: str, data: pd.DataFrame, level: float = 0.95) -> MixedFi
 
     The response is numeric, or True/False for the linear probability models of the paper
     (``model_correct ~ ...``). The table has t tests with Satterthwaite's degrees of freedom.
-    ``level`` is that of the intervals.
+    ``level``: of the intervals.
 
     Rows with a missing value are left out, counted in ``missing`` and named in ``warnings``. Raises
     `BadInputError` for unknown columns, a constant response, a group of one level or with a level

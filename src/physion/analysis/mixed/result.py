@@ -121,12 +121,12 @@ def _short(value: float) -> str:
 
 
 def effect_name(group: str, effect: str) -> str:
-    """Return the name of a random effect: an intercept has that of its group."""
+    """Return the name of a random effect: an intercept has its group's name."""
     return f"{group}: {effect}" if effect not in (INTERCEPT, "") else group
 
 
 def _combine(each: Sequence[float]) -> float:
-    """Return the second degree of freedom of F from those of its independent parts (as
+    """Return the second degree of freedom of F from its independent parts (as
     lmerTest).
     """
     df = np.asarray(each, dtype=np.float64)
@@ -210,7 +210,7 @@ def _names(group: Group) -> list[str]:
 
 
 def _random_tables(design: Design, roots: Sequence[Array]) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return standard deviations of all random effects, and correlations of those of a group."""
+    """Return standard deviations of all random effects, and correlations within each group."""
     spreads, pairs = [], []
     for group, root in zip(design.groups, roots, strict=True):
         sd = np.sqrt((root**2).sum(axis=1))
@@ -242,7 +242,7 @@ def _warnings(design: Design, singular: Sequence[bool], converged: bool) -> list
     if zero:
         found.append(
             f"boundary (singular) fit: the variance of {' and '.join(zero)} is estimated as zero; "
-            "the standard errors are those of the model without it"
+            "the standard errors belong to the model without it"
         )
     found += [
         f"boundary (singular) fit: the effects {' and '.join(group.effects)} of {group.name} are "

@@ -83,7 +83,7 @@ def _signal_detection(answers: ScenarioAnswers) -> tuple[Array, Array, str]:
     undefined = (of_hits == 0) | (of_alarms == 0)
     d_prime = np.where(undefined, np.nan, z_hit - z_alarm)
     criterion = np.where(undefined, np.nan, -(z_hit + z_alarm) / 2)
-    reason = "d' and criterion: stimuli of one outcome alone" if undefined.any() else ""
+    reason = "d' and criterion: stimuli of only one outcome" if undefined.any() else ""
     return d_prime, criterion, reason
 
 
@@ -263,7 +263,7 @@ def below_chance_level_released(
 ) -> npt.NDArray[np.bool_]:
     """Return whether accuracy + 1.96 standard errors is below 0.5: the study's rule.
 
-    The standard error is that of the normal approximation at the observed fraction, which is 0 for
+    The standard error is the normal approximation at the observed fraction, which is 0 for
     a fraction of 0; there is no correction for testing 150 stimuli.
     """
     p, n = _fractions(accuracy, count)
@@ -521,5 +521,5 @@ def _confounded(hypothesis: Hypothesis, rows: pd.DataFrame) -> str:
         return ""
     both = rows[list(pair)].dropna()
     if len(both) and (both["distractors"] == both["occluders"]).all():
-        return "as many occluders as distractors in every stimulus: not to be told apart"
+        return "as many occluders as distractors in every stimulus: cannot be distinguished"
     return ""

@@ -91,7 +91,7 @@ def expected_by_session(
 ) -> dict[str, frozenset[str]]:
     """Return the stimuli that each session must have answered.
 
-    Those of the list of the session, else of its scenarios, else `stimuli_of_most`; none for a
+    The list of the session, else of its scenarios, else `stimuli_of_most`; none for a
     scenario without either.
     """
     given = dict(expected or {})
@@ -217,7 +217,7 @@ def session_measures(responses: Responses, expected: Expected | None = None) -> 
     test = responses.test
     if test.empty:
         raise BadInputError(
-            f"{len(responses.sessions)} session(s) hold practice alone and no test answer: "
+            f"{len(responses.sessions)} session(s) hold only practice and no test answer: "
             "give responses with test trials"
         )
     wanted = expected_by_session(responses, expected)
@@ -383,7 +383,7 @@ def flag_familiarization(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Se
 
 
 def flag_low_accuracy(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
-    """Flag an accuracy far below that of the scenario's sessions."""
+    """Flag an accuracy far below the other sessions of the scenario."""
     if rules.accuracy_sd is None:
         return pd.Series(False, index=measures.index)
     base = _reference(measures, "accuracy", rules.accuracy_centre, rules.ddof)
@@ -391,7 +391,7 @@ def flag_low_accuracy(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Serie
 
 
 def flag_slow(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
-    """Flag log response times far above those of the scenario's sessions."""
+    """Flag log response times far above the other sessions of the scenario."""
     if rules.rt_sd is None:
         return pd.Series(False, index=measures.index)
     column = f"{rules.rt_summary}_log_rt"
@@ -417,7 +417,7 @@ def flag_repeated(measures: pd.DataFrame) -> pd.Series:
 def flag_from_server(responses: Responses, measures: pd.DataFrame, column: str) -> pd.Series:
     """Flag what the experiment's server found: a reason or a number above 0 in a column.
 
-    Sessions without the column, such as those of the original study, are not flagged.
+    Sessions without the column, such as in the original study, are not flagged.
     """
     if column not in responses.sessions:
         return pd.Series(False, index=measures.index)
@@ -451,8 +451,7 @@ def flag_sessions(
     ``expected``: the stimuli of a complete session, as in `session_measures`.
 
     Flag before stimuli are dropped: rules about sequences need all answers. Centres and standard
-    deviations are those of the scenario's complete sessions, whether another rule flags them or
-    not.
+    deviations come from the scenario's complete sessions, whether another rule flags them or not.
     """
     measures = session_measures(responses, expected)
     flags = {
@@ -593,7 +592,7 @@ def flag_effect(
     """Estimate the effect of a session's flag on correctness, over all sessions.
 
     Logistic regression of every test answer on the flag and the scenario, with standard errors
-    clustered by participant. Columns are those of `clustered_logit`, for the term ``column`` only;
+    clustered by participant. Columns as in `clustered_logit`, for the term ``column`` only;
     NaN with a ``reason`` if all or no sessions are flagged. Low accuracy is itself a rule, so the
     effects of ``low_accuracy``, and of ``flagged`` if it flags any session, hold by construction;
     the ``reason`` then states it.

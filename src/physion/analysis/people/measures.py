@@ -214,7 +214,7 @@ def accuracy_by_scenario(test: pd.DataFrame, bootstrap: Bootstrap | None = None)
         "stimuli": int(table["stimuli"].sum()), "accuracy": table["accuracy"].mean(),
         "accuracy_low": low, "accuracy_high": high,
         "consistency": table["consistency"].mean(),
-        "reason": "zone, sd and t: of each scenario alone" if joint
+        "reason": "zone, sd and t: within each scenario" if joint
         else "zone, sd and t: people of different scenarios are not one sample",
     }  # fmt: skip
     return pd.concat([table, pd.DataFrame([mean])], ignore_index=True)
@@ -253,7 +253,7 @@ def _scenario_record(
     n = len(by_person)
     low, high = draws.interval(resampled) if n > 1 else (np.nan, np.nan)
     sd = float(np.std(by_person, ddof=1)) if n > 1 else np.nan
-    reasons = ["one person alone: no interval, no zone"] if n == 1 else []
+    reasons = ["only one person: no interval, no zone"] if n == 1 else []
     if sd == 0:
         reasons.append("all people have the same accuracy: t is undefined")
     t = (float(np.mean(by_person)) - 0.5) / (sd / np.sqrt(n)) if sd > 0 else np.nan
@@ -318,7 +318,7 @@ def _spread(scenario: str, measure: str, values: Array) -> dict[str, Any]:
     if len(known) < len(values):
         reasons.append(f"{len(values) - len(known)} undefined (constant answers) and left out")
     if not len(values):
-        reasons.append("one person alone makes no pair")
+        reasons.append("one person makes no pair")
     return {
         "scenario": scenario,
         "measure": measure,

@@ -1,8 +1,8 @@
 """Power of a planned study: how often an effect of a given size is found, by simulation.
 
 The fractions of yes of stimuli that people have answered are drawn with replacement as the stimuli
-of the planned study. A person's log odds of yes at a stimulus are those of its fraction plus a
-leaning of the person. Two questions can be asked:
+of the planned study. A person's log odds of yes at a stimulus are the log odds of its fraction plus
+a leaning of the person. Two questions can be asked:
 
 - *models*: do two models differ in r with the average person? The effect is the difference of
   their expected r with the true fractions of yes. Test: jackknife interval of the difference over
@@ -42,7 +42,7 @@ class PlannedEffect:
 
     - ``question``: `QUESTIONS`; ``effect``: the size of the difference, above 0;
     - ``base``: expected r of the worse model (*models*); with *groups* the accuracy of the first
-      group is that of the stimuli, and ``base`` is not used;
+      group comes from the stimuli, and ``base`` is not used;
     - ``alike``: r of the two models given the fractions of yes (*models*): the more alike, the
       easier a difference is found;
     - ``person_sd``: standard deviation of persons in log odds: of leaning to yes (*models*) and of

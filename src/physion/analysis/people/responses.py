@@ -555,9 +555,9 @@ def read_official_responses(
 ) -> Responses:
     """Read responses from the raw files of the study, test and familiarization together.
 
-    The scenario of a file is ``scenario``, else that in its name, else that of its stimuli. A
+    The scenario of a file is ``scenario``, else as in its name, else as in its stimuli. A
     session is a ``gameID``; its participant is the Prolific id if there is one. ``rt_offset_ms`` is
-    subtracted from ``rt``. The other parameters are those of `read_responses`.
+    subtracted from ``rt``. The other parameters: see `read_responses`.
     """
     if not files:
         raise BadInputError("no file of responses was given")

@@ -69,8 +69,8 @@ class PeopleResults:
     """Results about the people of a study.
 
     ``kept``: the responses of the main analysis, without flagged sessions and excluded stimuli;
-    ``whole``: those of all complete first sessions; ``rules``: the exclusion rules; ``tables``: by
-    name, with the columns of the function in parentheses:
+    ``whole``: the responses of all complete first sessions; ``rules``: the exclusion rules;
+    ``tables``: by name, with the columns of the function in parentheses:
 
     - ``flags`` (`flag_sessions`), ``flag_counts``, ``flag_effects``;
     - ``with_and_without``: `accuracy_by_scenario` without and with flagged sessions;
@@ -127,7 +127,7 @@ def read_any_responses(
         raise BadInputError(f"{official[0]} has the study's raw columns and the other files do not")
     if official:
         if participants == "simulated":
-            raise BadInputError("the study's raw files hold people alone: leave out --simulated")
+            raise BadInputError("the study's raw files hold only people: leave out --simulated")
         if sessions is not None:
             raise BadInputError("the study's raw files hold their sessions; give no table of them")
         return read_official_responses(files)
@@ -181,8 +181,8 @@ def analyse_people(
     accept_rules
         Rules that may leave out more than a third of a scenario's sessions.
     attributes
-        Attributes of one's own stimuli, from `attributes_from_table`; those of other
-        stimuli come from official names.
+        Attributes of one's own stimuli, from `attributes_from_table`; attributes of other stimuli
+        come from official names.
     exclude, exclude_ledge
         Stimuli to exclude, and whether to exclude Roll's ledges.
     bootstrap
@@ -231,7 +231,7 @@ def analyse_people(
 
 
 def _sets(shown: Responses, flags: pd.DataFrame) -> tuple[Responses, Responses]:
-    """Return the responses without flagged sessions, and those of all complete first sessions."""
+    """Return the responses without flagged sessions, and of all complete first sessions."""
     whole = set(flags.loc[~flags["incomplete"] & ~flags["repeated"], "session"])
     return (
         without_flagged(shown, flags),

@@ -5,7 +5,7 @@ R with lmerTest. Which rows and terms each model had follows from the released n
 numbers themselves, which are reproduced to the printed digit:
 
 - an earlier state of the table held most runs *twice* (1728 rows of readouts A, B, C; the released
-  one has 1008): all but those of the particle models and of the second file of SVG. Some printed
+  one has 1008): all but the runs of the particle models and of the second file of SVG. Some printed
   numbers were made from that state, which increases t by up to the square root of two;
 - several sentences have the number of another comparison: see `Claim.differs`.
 """
@@ -133,7 +133,7 @@ CLAIMS = (
             readouts=("observed+simulated",),
         ),
         differs="not in the paper: under this readout no difference is shown; in panel D, with "
-        "seed 0 of SVG alone, OP3 is the more accurate one under observed+simulated and observed",
+        "only seed 0 of SVG, OP3 is the more accurate one under observed+simulated and observed",
     ),
     Claim(
         "RPIN and CSWM",
@@ -179,7 +179,7 @@ CLAIMS = (
         ),
         rows="twice",
         asked=Contrast("pVGG against CSWM and RPIN", (*PVGG, "CSWM", "RPIN"), high=PVGG),
-        differs="rows twice and no term for the readout; with readout observed+simulated alone "
+        differs="rows twice and no term for the readout; with readout observed+simulated only "
         "the difference has the other sign (see the row below)",
     ),
     Claim(
@@ -202,7 +202,7 @@ CLAIMS = (
         {"b": "0.067", "t": "16.5", "p": "<1e-15"},
         Contrast(
             "models whose column “Visual encoder architecture” says Transformer (pDEIT and, by "
-            "mistake, pVGG) against those of which it says ConvNet (SVG alone)",
+            "mistake, pVGG) against the models that it calls ConvNet (only SVG)",
             ("SVG", *PRETRAINED),
             column="encoder",
             high=("Transformer",),

@@ -55,7 +55,7 @@ MODELS = {
     "GNS-ransac": "GNS-R",
     "DPI": "DPI",
 }
-"""The names of the released tables and those of the paper, in the order of the paper."""
+"""The names in the released tables and in the paper, in the order of the paper."""
 
 END_TO_END = ("SVG", "OP3", "CSWM", "RPIN")
 PRETRAINED = ("pVGG-mlp", "pVGG-lstm", "pDEIT-mlp", "pDEIT-lstm")
@@ -70,10 +70,10 @@ OBSERVED_AGAIN = "observed (second copy)"
 READOUT_NAMES = {**READOUTS, "D": OBSERVED_AGAIN}
 
 TRAININGS = {"all": "all", "all_but_this": "all-but", "same": "only"}
-"""The words of the released tables for the training protocols, and those of the paper."""
+"""The words of the released tables for the training protocols, and the words of the paper."""
 
 STIMULI, LEDGES = 150, 56
-"""Stimuli of a scenario that people saw, and those of Roll with a ledge, which are not released."""
+"""Stimuli per scenario that people saw; stimuli of Roll with a ledge (not released)."""
 
 _KEY = ["scenario", "ModelID"]
 _FACTS = (
@@ -345,7 +345,8 @@ def paper_intervals(
     The released notebook calls ``tidyboot_mean`` on the table grouped by model and scenario, which
     resamples the rows of the whole table, ungrouped, with one row of people a scenario, and then
     averages each group. So the number of rows of a value differs between draws, and the intervals
-    are wider than those of drawing its own rows. A draw without a row of the value is left out.
+    are wider than intervals from drawing its own rows. A draw without a row of the value is left
+    out.
     """
     draws = bootstrap or Bootstrap()
     runs = tables.runs
@@ -423,7 +424,7 @@ def describe_averages(tables: PublishedTables) -> str:
         "every readout (full, observed+simulated, observed), every training protocol (all, "
         "all-but, only) and every run. Readout full sees the whole movie, so the published values "
         f"mix detection into prediction. Rows averaged by model: {per_model}; {few} have the three "
-        "training protocols alone. "
+        "training protocols. "
     )
     if copies:
         twice = " and ".join(
@@ -438,7 +439,7 @@ def describe_averages(tables: PublishedTables) -> str:
         if number > 1:
             words += f"Seed {seed} of {model} stands in {number} result files, with other numbers. "
     return words + (
-        "Beside it stands the cell that a reader expects: trained on all scenarios, readout "
+        "Next to it stands the cell that a reader expects: trained on all scenarios, readout "
         "observed+simulated, the mean of the seeds."
     )
 
@@ -454,7 +455,7 @@ def describe_averages(tables: PublishedTables) -> str:
 READOUT_ORDER = ("observed", "observed+simulated", "full")
 
 SELECTION = (
-    "All panels show seed 0 alone of SVG and RPIN, as the released code selects. Panels A and C: "
+    "All panels show only seed 0 of SVG and RPIN, as the released code selects. Panels A and C: "
     "training all, readout observed+simulated. Panel D: training all; particle models have one "
     "readout. Panel E: readout observed+simulated. Intervals of a mean are a "
     "bootstrap over the scenario values, seeded (the released code drew without a seed). “Zone” "
@@ -551,13 +552,13 @@ def _mean(values: pd.Series, measure: str, draws: Bootstrap) -> dict[str, float]
 RECRUITED = 800
 PEOPLE_EXCLUDED = 112
 THIRDS = ((0.0, 1 / 3, "hard", 0.10), (1 / 3, 2 / 3, "chance", 0.22), (2 / 3, 1.0, "easy", 0.68))
-"""Accuracy of people from, to, the paper's word for such stimuli, and the share that it prints."""
+"""Accuracy of people from, to; the paper's word for such stimuli; its printed fraction."""
 
 
 def people_by_scenario(tables: PublishedTables, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
     """Return one row per scenario, then the mean over scenarios.
 
-    Columns: those of `PublishedTables.people`; ``half_r_full`` (split-half r corrected by Spearman
+    Columns as in `PublishedTables.people`; ``half_r_full`` (split-half r corrected by Spearman
     and Brown to all of the people: 2 r / (1 + r); the released numbers are not corrected);
     ``stimuli`` and ``participants`` of the tables by stimulus, ``accuracy_by_stimulus`` (their
     mean; a laxer exclusion than ``accuracy``), ``below_chance`` (stimuli on which p + 1.96 sqrt(p
@@ -662,7 +663,7 @@ NOT_MADE = {
     "and single answers of people for their halves",
     "S4": "accuracy of DPI and people by stimulus needs a prediction of DPI for each stimulus",
     "S5": "models trained on one scenario and tested on another: the released rows of training "
-    "“only” are tested on the scenario of their training alone",
+    "“only” are tested only on the scenario of their training",
 }
 """Figures that the released tables do not determine, and the reason."""
 
@@ -713,7 +714,7 @@ def accuracy_and_kappa(tables: PublishedTables, bootstrap: Bootstrap | None = No
     records = []
     for over, x, y in (
         ("means of models over scenarios", accuracy.mean(axis=1), kappa.mean(axis=1)),
-        ("the same, vision models alone", accuracy[vision].mean(axis=1),
+        ("the same, vision models only", accuracy[vision].mean(axis=1),
          kappa[vision].mean(axis=1)),
         ("cells of model and scenario", accuracy, kappa),
     ):  # fmt: skip

@@ -65,7 +65,7 @@ def pair_difference(y: npt.ArrayLike, count: npt.ArrayLike) -> Array:
 
 
 def reliability(y: npt.ArrayLike, count: npt.ArrayLike, people: float | None = None) -> float:
-    """Return the expected r of the average of these people with that of as many others.
+    """Return the expected r of the average of these people with the average of as many others.
 
     Per-stimulus tables contain no single answers and thus no split halves; instead the variance
     over stimuli is split into the binomial one (`sampling_variance`) and the rest: reliability =

@@ -117,8 +117,8 @@ def _swapped_r(a: Array, b: Array, y: Array, swap: Array) -> Array:
 def corrected_p(p: npt.ArrayLike, method: Literal["holm", "fdr_bh"]) -> Array:
     """Return p values corrected for many tests; NaN stays NaN and is not counted as a test.
 
-    ``holm`` is Holm's step-down method, which controls the family-wise error; ``fdr_bh`` that of
-    Benjamini and Hochberg, which controls the false discovery rate.
+    ``holm`` is Holm's step-down method, which controls the family-wise error; ``fdr_bh`` the method
+    of Benjamini and Hochberg, which controls the false discovery rate.
     """
     from statsmodels.stats.multitest import multipletests  # half a second to import
 

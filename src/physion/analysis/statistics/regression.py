@@ -171,7 +171,7 @@ def check_probabilities(p: npt.ArrayLike, gaps: bool = False) -> None:
 # 672-683: with weights.
 
 COLUMNS = ("term", "b", "se", "t", "df", "p", "low", "high", "rows", "clusters", "reason")
-ALONE = "one participant alone determines it"
+ALONE = "a single participant determines it"
 
 
 def clustered_logit(
@@ -261,7 +261,8 @@ def clustered_errors(
 
     makes the sum of squares of these changes an unbiased estimate of the variance if rows are
     independent. It is then a quadratic form in e with the matrix B, whose expectation is tr B and
-    whose variance is 2 tr B^2; that of a chi-square with (tr B)^2 / tr B^2 degrees of freedom.
+    whose variance is 2 tr B^2; these are the moments of a chi-square with (tr B)^2 / tr B^2 degrees
+    of freedom.
     """
     fitted = special.expit(design @ b)
     root_weight = np.sqrt(fitted * (1 - fitted))
@@ -325,9 +326,9 @@ def _why_not(
     if constant:
         return f"{', '.join(constant)} is the same in all rows"
     if clusters < 2:
-        return "one participant alone"
+        return "only one participant"
     if np.linalg.matrix_rank(design) < design.shape[1]:
-        return "the terms cannot be told apart"
+        return "the terms cannot be distinguished"
     return ""
 
 

@@ -31,8 +31,8 @@ class Options:
     trials: Path | None = None
     """Dataset from which testing and familiarization trials are drawn."""
     scenes: Path | None = None
-    """Instead of --trials: official scenes, which are rendered first: those of the package
-    (official), a folder made by physion import, or one with command logs."""
+    """Instead of --trials: official scenes, which are rendered first: official (shipped with the
+    package), a folder made by physion import, or one with command logs."""
     rendered: Path | None = None
     """Folder of the trials that --scenes makes; existing ones are kept. Default: next to the study,
     with -trials after its name."""

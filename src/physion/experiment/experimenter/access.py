@@ -48,7 +48,7 @@ HEADERS = {
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
 }
-"""Headers of every page; stricter than those of the participants' pages, which recruiters embed."""
+"""Headers of every page; stricter than on the participants' pages, which recruiters embed."""
 
 
 @dataclass

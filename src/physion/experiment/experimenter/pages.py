@@ -230,7 +230,7 @@ class _Pages:
         return _redirect("")
 
     async def sessions(self, request: Request) -> Response:
-        """Show the sessions, all or those of one scenario, state or flag."""
+        """Show the sessions, all, or of one scenario, state or flag."""
         query = request.query_params
         kind, scenario, state = _kind(request), query.get("scenario", ""), query.get("state", "")
         flag = query.get("flag", "")[:40]

@@ -44,7 +44,7 @@ STATES = {
 }
 """States of a session and their labels. Participants who dropped out may still continue."""
 RATE_SESSIONS, MIN_RATE_SESSIONS, RATE_WINDOW = 20, 3, 86_400.0
-"""The current rate is that of the last 20 sessions, at least 3, that finished within a day."""
+"""The current rate: of the last 20 sessions, at least 3, that finished within a day."""
 FLAGS_SECONDS = 10.0
 """Least time in seconds between two computations of the flags."""
 ALARM_ENTRIES = 30
@@ -291,7 +291,7 @@ def _row(name: str, wanted: int, part: Sequence[SessionLine], now: float) -> Pro
 def expected_end(finished: Sequence[float], wanted: int, now: float) -> float | None:
     """Estimate when ``wanted`` sessions will have finished, from the current rate.
 
-    The rate is that of the last `RATE_SESSIONS` sessions. It includes the time since the last
+    The rate: of the last `RATE_SESSIONS` sessions. It includes the time since the last
     one, so it decreases while nobody finishes. With n recent sessions, the first at time t, the
     result is ``now + missing * (now - t) / (n - 1)``.
 

@@ -1,6 +1,6 @@
 """The tables of an export, read from the database: columns, and rows as Arrow tables.
 
-Columns of trials and sessions are those of `physion.analysis.people.responses`; the other tables
+Columns of trials and sessions as in `physion.analysis.people.responses`; the other tables
 describe theirs here. Sessions are sorted by start time; trials by session, then familiarization
 before test, in the order in which they were shown. Labels are read from the study folder. Sessions
 that are left out are counted by reason (`SessionTable.left_out`).

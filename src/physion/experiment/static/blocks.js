@@ -34,7 +34,7 @@ export function sessionProgress(state, phase, trial) {
 }
 
 /**
- * Render the page between two blocks; ends when the participant goes on.
+ * Render the page between two blocks; ends when the participant continues.
  * @param {import("./pages.js").Context} context
  * @returns {import("./pages.js").Render}
  */

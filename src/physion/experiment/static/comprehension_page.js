@@ -1,5 +1,5 @@
 /**
- * The questions about the instructions. Whether an answer is right, the server alone knows.
+ * The questions about the instructions. Only the server knows whether an answer is right.
  * @module comprehension_page
  */
 

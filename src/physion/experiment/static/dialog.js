@@ -1,5 +1,5 @@
 /**
- * A modal question. The page below goes on running but takes no input.
+ * A modal question. The page below keeps running but takes no input.
  * @module dialog
  */
 

@@ -27,7 +27,7 @@ export function stopQuestion({ texts, study, state }) {
 }
 
 /**
- * Render a question whose main button goes on with the study and whose other button ends it.
+ * Render a question whose main button continues the study and whose other button ends it.
  * @param {(key: string) => string} t
  * @param {string} name Table of the texts `title`, `confirm` and `go_on`.
  * @param {string} text

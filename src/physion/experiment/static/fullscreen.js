@@ -6,7 +6,7 @@
 import { button, el, paragraphs } from "./dom.js";
 import { bound } from "./texts.js";
 
-/** Whether the participant goes on without full screen, so that it is not offered again. */
+/** Whether the participant continues without full screen, so that it is not offered again. */
 let without = false;
 
 /**
@@ -20,8 +20,8 @@ export function offersFullscreen(study) {
 }
 
 /**
- * Render the page that switches to full screen; browsers demand a press of a button for it. Who
- * cannot or does not want to goes on without.
+ * Render the page that switches to full screen; browsers demand a press of a button for it. Who *
+ * cannot or does not want to continues without.
  * @param {import("./pages.js").Context} context
  * @returns {import("./pages.js").Render}
  */

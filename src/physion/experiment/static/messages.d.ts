@@ -1,4 +1,4 @@
-// Types of the messages of physion/experiment/protocol.py, for the type check alone.
+// Types of the messages of physion/experiment/protocol.py, for the type check only.
 
 export type Phase = "familiarization" | "test";
 /** A name of the list in protocol/stages.py. */

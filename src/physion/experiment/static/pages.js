@@ -116,7 +116,7 @@ export function repeatPage({ texts, study, state }) {
 }
 
 /**
- * Render the break before a test trial; ends when the participant goes on.
+ * Render the break before a test trial; ends when the participant continues.
  * @param {Context} context
  * @param {number} answered Number of test trials before the break.
  * @returns {Render}

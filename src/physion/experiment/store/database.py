@@ -380,7 +380,7 @@ def server_lock(folder: Path) -> Iterator[None]:
 
 
 class Writer:
-    """One thread that runs commands; those that wait while the disk syncs share a transaction.
+    """One thread that runs commands; commands that wait while the disk syncs share a transaction.
 
     A command is a function of the connection. It is acknowledged after the commit; whatever it
     raises rolls back all that it wrote, and nothing else.

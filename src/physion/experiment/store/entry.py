@@ -7,7 +7,7 @@ is forgotten, and may open the link again.
 
 Condition, scenario and order are those that the fewest sessions have, visitors who still read the
 consent included. A place of the study is taken by a finished session, and held by one that has come
-through the practice and still goes on.
+through the practice and still runs.
 """
 
 from __future__ import annotations
@@ -298,7 +298,7 @@ def _known_session(
 def _keep(connection: Connection, visitor: Visitor, session: str) -> None:
     """Store the visitor's token of a session, and the raw id for payment.
 
-    The recruiter's parameters are those of the latest visit.
+    The recruiter's parameters come from the latest visit.
     """
     token = {"token_hash": hash_token(visitor.token), "session": session, "made": visitor.now}
     connection.execute(insert_or_skip(TOKENS), token)
@@ -399,7 +399,7 @@ class _Count:
     begun
         Finished and active ones.
     taken
-        Places: plausible sessions that are finished, or held by people who go on.
+        Places: plausible sessions that are finished, or held by people who continue.
     finished
         Plausible finished ones.
     """
@@ -539,9 +539,9 @@ def _choose_course(
 ) -> tuple[Study, str]:
     """Return the study under the condition of a new session, and its scenario.
 
-    The condition is that of the person's earlier sessions, else the one that the link fixes, else
-    the one with the fewest sessions among those that have a place left in a wanted scenario. If the
-    link names a scenario, only sessions of this scenario count.
+    The condition is taken from the person's earlier sessions, else the one that the link fixes,
+    else the one with the fewest sessions among those that have a place left in a wanted scenario.
+    If the link names a scenario, only sessions of this scenario count.
 
     Parameters
     ----------
@@ -615,7 +615,7 @@ def _assign_order(
 def _least_used_blocks(connection: Connection, study: Study, places: _Places) -> int:
     """Return the index of the order of blocks with the fewest sessions; equal ones by seed.
 
-    Sessions that ended early, or that nobody goes on with, give their place back.
+    Sessions that ended early, or that nobody continues, give their place back.
     """
     count, columns, visitor = len(block_orders(len(study.scenarios))), SESSIONS.c, places.visitor
     index = columns.order_seed % count

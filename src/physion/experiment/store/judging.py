@@ -112,7 +112,7 @@ def judged(study: Study, session: Session, answer: Answer, shown: Presentation) 
 def reasons(study: Study, session: Session, finished_at: float | None = None) -> str | None:
     """Return why a session is no person's, as stored in ``implausible``; None for a preview.
 
-    ``finished_at``: when it ended, to judge its duration; None while it goes on.
+    ``finished_at``: when it ended, to judge its duration; None while it runs.
     """
     if session.kind == "preview":
         return None
@@ -245,8 +245,8 @@ class Scores:
     def of(self, connection: Connection, session: Session) -> dict[str, int]:
         """Return the number of correct answers of each finished session like ``session``.
 
-        Those of its scenario, condition and kind. Sessions with other than the current stimuli are
-        left out, and implausible ones except ``session`` itself.
+        Sessions of its scenario, condition and kind. Sessions with other than the current stimuli
+        are left out, and implausible ones except ``session`` itself.
         """
         values = {"of_scenario": session.scenario, "of_kind": session.kind,
                   "of_condition": session.condition or "", "of_stimuli": self._stimuli,

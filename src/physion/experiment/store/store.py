@@ -309,7 +309,7 @@ class Store:
             session, course = self._read_session(connection, token)
             stage = stage_of(session, course)
             if stage not in ENDED:
-                raise Refused("wrong_stage", "This session goes on.", state_of(session, course))
+                raise Refused("wrong_stage", "This session continues.", state_of(session, course))
             visit = self._visits.get(hash_token(token))
             if visit is not None:
                 source = str(visit.values["source"])

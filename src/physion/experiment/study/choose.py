@@ -321,7 +321,7 @@ def read_list(path: Path) -> list[ListedStimulus]:
         label = _LABELS.get(str(row[LABEL]).strip().lower())
         if not is_name(name):
             raise BadInputError(
-                f"{path}, row {number}: {ID} must be letters, digits and ._+- alone, not "
+                f"{path}, row {number}: {ID} must be letters, digits and ._+- only, not "
                 f"{name[:100]!r}"
             )
         if label is None:
@@ -350,14 +350,14 @@ def _scenario(path: Path, number: int, row: Mapping[str, Any]) -> str:
     given = str(row.get(SCENARIO) or "").strip()
     if given and not is_name(given):
         raise BadInputError(
-            f"{path}, row {number}: {SCENARIO} must be letters, digits and ._+- alone, not "
+            f"{path}, row {number}: {SCENARIO} must be letters, digits and ._+- only, not "
             f"{given[:100]!r}"
         )
     return given
 
 
 def _frames(path: Path, number: int, row: Mapping[str, Any]) -> int:
-    """Return the number of observed frames of a row; that of the official study if not given."""
+    """Return the number of observed frames of a row; as in the official study if not given."""
     given = str(row.get(FRAMES) or "").strip()
     if not given:
         return OBSERVED_FRAMES
@@ -369,7 +369,7 @@ def _frames(path: Path, number: int, row: Mapping[str, Any]) -> int:
 
 
 def list_scenario(path: Path, rows: Iterable[ListedStimulus]) -> str:
-    """Return the scenario of a list: that of its rows, else of its stimulus names or file name."""
+    """Return the scenario of a list: as in its rows, else as in its stimulus names or file name."""
     rows = list(rows)
     named = {row.scenario for row in rows}
     if len(named) > 1:
@@ -486,8 +486,8 @@ def _official_lists_source(
 
 # Selection of official scenes for a study with people, before their trials are rendered.
 #
-# Test trials are scenes that people of the original study saw. Familiarization trials are those of
-# the study where the data hold any, else scenes that nobody saw and whose physics no test trial
+# Test trials are scenes that people of the original study saw. Familiarization trials are the ones
+# of the study where the data hold any, else scenes that nobody saw and whose physics no test trial
 # has. Only scenes are taken whose simulation has the recorded outcome: the movie that participants
 # see ends as the original one did, and their answers can be compared with those of the study.
 # Agent and patient must be visible in the first frame, where the map marks them.

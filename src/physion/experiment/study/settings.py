@@ -3,9 +3,9 @@
 Each field below is one key. `core.settings` checks the values strictly when the file is read; the
 texts below the fields are the comments in the file and the table of settings in the documentation.
 
-The lab's own questions are tables ``[[questions]]``, those of the comprehension check tables
-``[[comprehension_questions]]``, between-subject conditions tables ``[[conditions]]``. Their texts
-are in the file of each language (see `texts`).
+The lab's own questions are tables ``[[questions]]``, the questions of the comprehension check
+tables ``[[comprehension_questions]]``, between-subject conditions tables ``[[conditions]]``. Their
+texts are in the file of each language (see `texts`).
 """
 
 from __future__ import annotations

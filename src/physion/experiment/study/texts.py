@@ -9,7 +9,7 @@ Some texts may be absent: ``study.title``, in place of the title of ``study.toml
 ``scenario.NAME.KEY`` and ``condition.NAME.KEY``, in place of the text ``KEY`` in the sessions of
 one scenario or condition (the condition comes first). The texts of
 a study's own questions (`questions.Question.text_keys`) are needed in each language. A file
-``consent-LANGUAGE.pdf`` beside the texts is the consent form as a file.
+``consent-LANGUAGE.pdf`` next to the texts is the consent form as a file.
 """
 
 from __future__ import annotations

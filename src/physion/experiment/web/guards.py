@@ -59,7 +59,7 @@ def refuse(code: str, message: str = "", state: SessionState | None = None, stat
     state
         SessionState of the session, if the client can continue from it.
     status
-        HTTP status in place of that of the code; 0 for none.
+        HTTP status in place of the code's; 0 for none.
     headers
         Additional headers.
     completion

@@ -77,7 +77,7 @@ class OutcomeSettings(ModelSettings):
     """Settings of `Outcome`.
 
     - ``outcomes``: whether agent and patient touch, by name of the stimulus, for instance as the
-      official files record it. Names are those of `physion.core.names.canonical_name`.
+      official files record it. Names as given by `physion.core.names.canonical_name`.
     """
 
     outcomes: dict[str, bool] | None = None
@@ -86,11 +86,11 @@ class OutcomeSettings(ModelSettings):
 class Outcome(Baseline):
     """Model that answers 1 if agent and patient touch, else 0.
 
-    The outcome is the known one of a stimulus (`OutcomeSettings`, `with_outcomes`), else that of
-    its whole motion. Accuracy is 1 by construction; its likeness to people is that of a perfect
-    simulator. The protocol is ``full``: it sees everything. The evaluator gives it the outcomes of
-    the dataset, which only a baseline may have: its predictions say something about outcomes and
-    people, and nothing about a model.
+    The outcome is the known one of a stimulus (`OutcomeSettings`, `with_outcomes`), else the
+    outcome of its whole motion. Accuracy is 1 by construction; its likeness to people is what a
+    perfect simulator has. The protocol is ``full``: it sees everything. The evaluator gives it the
+    outcomes of the dataset, which only a baseline may have: its predictions say something about
+    outcomes and people, and nothing about a model.
     """
 
     name = "outcome"
@@ -172,9 +172,9 @@ def read_people(path: Path) -> dict[str, float]:
 
     - A CSV file with the columns ``stimulus`` and ``p_yes``.
     - An official CSV file with the columns ``stim_ID`` and ``correct``, or a folder of such files
-      called ``human_accuracy-<scenario>_pilot-*.csv``. The fraction of correct answers becomes
-      that of yes by the outcome, from `LABELS_FILE` in or next to the folder. Stimuli whose names
-      contain ``-redyellow``, an earlier look of Dominoes, are left out as in the paper.
+      called ``human_accuracy-<scenario>_pilot-*.csv``. The fraction of correct answers becomes the
+      fraction of yes by the outcome, from `LABELS_FILE` in or next to the folder. Stimuli whose
+      names contain ``-redyellow``, an earlier look of Dominoes, are left out as in the paper.
 
     Raises `BadInputError` for a path without such a table, a missing column, a value outside 0..1,
     a stimulus that occurs twice, and one without an outcome.
@@ -280,8 +280,9 @@ class MajorityOfPeopleSettings(ModelSettings):
 class MajorityOfPeople(Baseline):
     """Model whose P(contact) is the fraction of people who answered yes.
 
-    Its yes or no is that of the majority: no model that gives one answer to a stimulus can agree
-    with single people more often. It answers under ``observed``, because that is what people saw.
+    Its yes or no is the answer of the majority: no model that gives one answer to a stimulus can
+    agree with single people more often. It answers under ``observed``, because that is what people
+    saw.
     """
 
     name = "majority-of-people"

@@ -43,7 +43,7 @@ class PixelSettings(ModelSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class CopyLastFrameSettings(PixelSettings):
-    """Settings of `CopyLastFrame`, those of `PixelSettings`."""
+    """Settings of `CopyLastFrame`."""
 
     image_size: int = 32
 
@@ -52,7 +52,7 @@ class CopyLastFrame(Baseline):
     """Model whose features are pixels and that imagines that nothing changes.
 
     Features: red, green and blue in 0..1 of all pixels, row by row. The imagined features repeat
-    those of the last context frame. A model that predicts pixels must predict better than this.
+    the last context frame. A model that predicts pixels must predict better than this.
     """
 
     name = "copy-last-frame"
@@ -91,7 +91,7 @@ def pictures(batch: Batch, size: int, model: str) -> NDArray[np.uint8]:
     Raises `BadInputError` for a batch without pictures or with others.
     """
     if batch.rgb is None or batch.rgb.shape[2:] != (size, size, 3):
-        held = "none" if batch.rgb is None else f"those of shape {batch.rgb.shape[2:]}"
+        held = "none" if batch.rgb is None else f"pictures of shape {batch.rgb.shape[2:]}"
         raise BadInputError(f"{model} needs pictures (input rgb) of {size} x {size}, not {held}")
     return np.asarray(batch.rgb)
 
@@ -112,7 +112,7 @@ FEATURES = ("red x", "red y", "red area", "yellow x", "yellow y", "yellow area")
 
 @dataclass(frozen=True, kw_only=True)
 class BlobCentroidsSettings(PixelSettings):
-    """Settings of `BlobCentroids`, those of `PixelSettings`."""
+    """Settings of `BlobCentroids`."""
 
     image_size: int = 64
 

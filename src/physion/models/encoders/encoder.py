@@ -43,7 +43,7 @@ from physion.models.interface import Diet, ModelSettings, TrainingSettings
 from physion.models.torch_model import TorchModel, digest_of, initial_weights
 from physion.models.vision import normalized_pictures
 
-# Networks that predict the next feature from those of the context: (B, c, D) to (B, D).
+# Networks that predict the next feature from the features of the context: (B, c, D) to (B, D).
 #
 # B clips, c = ``context`` frames, D features of one frame; all float32. Source:
 # docs/official-system.md, section 5.3.
@@ -94,9 +94,9 @@ def make_dynamics(
 
 # Settings of models with an image encoder, and the sizes in which each family exists.
 #
-# The features of the paper's models come from VGG-19 and DeiT base, those of the released code
-# from VGG-16 with batch normalisation and DeiT base (docs/official-system.md, section 5.3). The
-# released code also has a model with DINO ViT-S/16. For the other families ``paper`` means 224
+# The features of the paper's models come from VGG-19 and DeiT base, the features of the released
+# code from VGG-16 with batch normalisation and DeiT base (docs/official-system.md, section 5.3).
+# The released code also has a model with DINO ViT-S/16. For the other families ``paper`` means 224
 # pixels and the dynamics of the paper.
 
 SMALL = "small"
@@ -481,7 +481,7 @@ class FineTunedEncoder(EncoderModel):
         return functional.mse_loss(windows[:, -1], target)
 
     def encoder_digest(self) -> str:
-        """Return the key of stored features: that of the frozen encoder, and the weights now."""
+        """Return the key of stored features: the frozen encoder's key, and the weights now."""
         return digest_of(super().encoder_digest(), self.encoder.state_dict().items())
 
     @torch.no_grad()
@@ -537,7 +537,7 @@ class FrozenEncoder(EncoderModel):
 def before_training(settings: EncoderSettings) -> tuple[EncoderSettings, Path | None]:
     """Return the settings of a model before its training, and the file with its trained weights.
 
-    ``weights`` and ``seed`` are those of the training if ``settings.weights`` is one; otherwise the
+    ``weights`` and ``seed`` belong to the training if ``settings.weights`` is one; otherwise the
     settings are returned as they are, with None.
 
     Raises

@@ -199,7 +199,7 @@ def create_video_encoder(family: VideoFamily, settings: VideoSettings) -> tuple[
     Raises
     ------
     BadInputError
-        If the weights cannot be had or are those of another network; the message names tensors
+        If the weights cannot be had or belong to another network; the message names tensors
         that differ.
     """
     with initial_weights("video encoder", family.name, settings.seed):

@@ -131,7 +131,7 @@ def load_fitting(
     where: str,
     name: str,
 ) -> None:
-    """Load ``state`` into ``network``; its tensors must be those of the network.
+    """Load ``state`` into ``network``; its tensors must fit the network.
 
     Counters of batches, which only training uses, may be missing.
 
@@ -255,7 +255,7 @@ class WeightsPackage:
         found = weights_sha256(path)
         if found != self.sha256:
             raise BadInputError(
-                f"{path} was changed: its SHA-256 is {found[:12]}..., that of package {self.name} "
+                f"{path} was changed: its SHA-256 is {found[:12]}..., package {self.name} "
                 f"is {self.sha256[:12]}...; {self._again}"
             )
         return read_state_dict(path)
@@ -392,7 +392,7 @@ class EncoderWeights:
 
     @property
     def tag(self) -> str:
-        """The tag of timm's weights; empty for those of another source, and for ``imagenet``."""
+        """The tag of timm's weights; empty for weights of another source, and for ``imagenet``."""
         return self.source.removeprefix(TIMM) if self.source.startswith(TIMM) else ""
 
     @property
@@ -530,7 +530,7 @@ def _check_belongs(name: str, package: WeightsPackage) -> None:
 def _tag(name: str, weights: EncoderWeights) -> str:
     """Return the tag of timm's weights that are wanted, empty for weights of another source.
 
-    Raises `BadInputError` if timm has none, or if its first ones are not those of ImageNet
+    Raises `BadInputError` if timm has none, or if its first ones are not for ImageNet
     classification but ``imagenet`` is wanted.
     """
     if not weights.downloaded:

@@ -33,7 +33,7 @@ F64 = NDArray[np.float64]
 _FINE = 3
 """Candidates per distance of neighbouring points."""
 _KEPT = 8192
-"""Shapes whose points are kept, about 5 kB each: several models ask for those of all trials in
+"""Shapes whose points are kept, about 5 kB each: several models ask for the points of all trials in
 turn."""
 
 
@@ -208,7 +208,7 @@ class SceneParticles:
 
     @property
     def loose(self) -> NDArray[np.bool_]:
-        """Which particles (P,) move on their own: those of cloths."""
+        """Which particles (P,) move on their own: the particles of cloths."""
         return np.asarray(self.kinds[self.owners] == CLOTH)
 
 

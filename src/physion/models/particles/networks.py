@@ -9,8 +9,8 @@ With the last two states of an object, centre c and rotation R, its velocity and
 
     v = c1 - c0,    w = log(R1 R0^T)
 
-and if it goes on like this (*drift*), a particle at offset r from its centre moves in the next step
-by
+and if it moves on like this (*drift*), a particle at offset r from its centre moves in the next
+step by
 
     u = v + (exp(w) - 1) r
 
@@ -207,10 +207,10 @@ class Drift:
 class Graph:
     """Inputs of a network, float32: N nodes, E edges, K objects.
 
-    Nodes are the particles of all objects that can move, and those of kinematic bodies that have
-    an edge: the others would change nothing. For DPI-Net, whose bodies move as wholes, they are
-    the particles of cloths, and of bodies only those that have an edge or, if the body can move,
-    come nearer to the floor than the radius in the step.
+    Nodes are the particles of all objects that can move, and the particles of kinematic bodies that
+    have an edge: the others would change nothing. For DPI-Net, whose bodies move as wholes, they
+    are the particles of cloths, and of bodies only those that have an edge or, if the body can
+    move, come nearer to the floor than the radius in the step.
 
     - ``particles``: P. ``rows`` (N,): particle of each node. ``owners`` (N,): its object.
     - ``receivers``, ``senders`` (E,): nodes.
@@ -290,7 +290,7 @@ def make_graph(
     swept : bool
         Whether particles that come within the radius during the step are neighbours too.
     near_only : bool
-        Whether the graph is that of DPI-Net, which leaves out particles far from everything.
+        Whether the graph is DPI-Net's, which leaves out particles far from everything.
     """
     moves = drift.moves if swept else torch.zeros_like(drift.moves)
     on_cpu = moves.device.type == "cpu"
@@ -412,9 +412,9 @@ def _moments(layout: SceneLayout, offsets: Tensor) -> Tensor:
 #
 #     m_ij  = f(h_i, h_j, e_ij),     h_i <- h_i + g(h_i, sum_j m_ij)
 #
-# `ObjectNetwork` (DPI-Net): in addition every object has a node, which receives from those of its
-# particles that are in the graph (0 if none is) and gives to them in every round (Li et al. 2019).
-# How the particles of an object are spread is one of its inputs.
+# `ObjectNetwork` (DPI-Net): in addition every object has a node, which receives from the nodes of
+# its particles that are in the graph (0 if none is) and gives to them in every round (Li et al.
+# 2019). How the particles of an object are spread is one of its inputs.
 #
 #     H_o <- H_o + G(H_o, mean_i q_i, max_i q_i),  q_i = q(h_i, sum_j m_ij)
 #     h_i <- h_i + g(h_i, sum_j m_ij, H_o)

@@ -1,8 +1,8 @@
 """Learned simulators of particles: GNS, GNS-RANSAC and DPI-Net.
 
 Of every object a simulator knows the last two poses, of a cloth the last two positions of its
-particles. If it goes on as it moved, a particle at x moves by u (`networks`). The network predicts
-what is added to this motion:
+particles. If it keeps moving as it did, a particle at x moves by u (`networks`). The network
+predicts what is added to this motion:
 
 - GNS: a change a of the displacement of every particle, x' = x + u + a. Bodies are kept rigid by
   the rigid motion that fits the x' of their particles best; GNS-RANSAC fits only those particles
@@ -213,7 +213,7 @@ _PAPER_TRAINING = replace(
 
 
 def training_of(settings: ParticleSettings) -> TrainingSettings:
-    """Return optimiser and schedule; those of the small size made the shipped weights."""
+    """Return optimiser and schedule; the small size's made the shipped weights."""
     if settings.size != "small":
         return _PAPER_TRAINING
     small = _SMALL_TRAINING
@@ -301,7 +301,7 @@ def smallest_gaps(
     settings
         Settings of the search for the smallest distance.
     first
-        Row of the motions from which they count, that of frame 44.
+        Row of the motions from which they count, frame 44.
     touch
         Distances (2,) at which two bodies, and a cloth and a body, touch, metres.
     """
@@ -564,7 +564,8 @@ class ParticleSimulator(TorchModel):
         goal = drift.positions + drift.moves + changes
         with torch.no_grad():
             rotations, centers = self._fit(layout, goal, robust=robust)
-            # Fewer than three particles determine no rotation: such a body goes on as it turned.
+            # Fewer than three particles determine no rotation: such a body keeps rotating as it
+            # did.
             few = (_counts(layout) < 3)[:, None, None]
             spun = rotation_from_vector(drift.spin) @ now.rotations
             rotations = torch.where(few, spun, rotations)

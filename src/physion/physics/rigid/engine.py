@@ -87,7 +87,7 @@ def simulate_rigid(
 
 
 def _last_state(part: Trajectory, frame: int) -> State:
-    """Return the last state of a stretch, which is that of ``frame`` of the trial."""
+    """Return the last state of a stretch, which is ``frame`` of the trial."""
     return replace(part.state(len(part) - 1), frame=frame)
 
 
@@ -166,7 +166,7 @@ class RigidEngine:
     """Simulator of rigid bodies, and of cloth that falls on them.
 
     Rigid bodies are moved first, by `simulate_rigid`; cloths then follow in
-    `physion.physics.cloth.simulate`, without acting back on them. ``threads`` limits those of
+    `physion.physics.cloth.simulate`, without acting back on them. ``threads`` limits the threads of
     `simulate_many`, by default to ``OMP_NUM_THREADS`` or the number of processor cores.
     """
 
@@ -184,7 +184,7 @@ class RigidEngine:
     def name(self) -> str:
         """``physion-<version>.<digest>.<settings>.<cloth settings>``.
 
-        The digest is that of the golden motions: engines of the same name move scenes alike.
+        The digest covers the golden motions: engines of the same name move scenes alike.
         """
         tags = f"{self.settings.tag()}.{self.cloth.tag()}"
         return f"physion-{VERSION}.{version_digest('motion')}.{tags}"

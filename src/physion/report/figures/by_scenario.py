@@ -50,7 +50,7 @@ BASELINE_MARKER = "d"
 """Mark of baselines; no readout has it."""
 
 RELEASED_ZONES = (SCENARIO_ZONE, HALVES_ZONE)
-"""Names of zones; those of the paper are hatched, as they say nothing about participants."""
+"""Names of zones; the paper's are hatched, as they say nothing about participants."""
 
 BAND = (
     " Hatched, in the mean over scenarios: the band of the paper, a bootstrap over the scenario "
@@ -135,7 +135,7 @@ def _dots(
 
 
 def _mark(kind: str, kinds: dict[str, tuple[str, str]], theme: Theme) -> dict[str, Any]:
-    """Return the properties of a mark; those of baselines are hollow."""
+    """Return the properties of a mark; marks of baselines are hollow."""
     colour, marker = kinds[kind]
     properties = {"marker": marker, "color": colour, "markersize": 5.5, "markeredgewidth": 0.6}
     if kind == BASELINE:

@@ -34,7 +34,7 @@ from physion.report.html import number
 from physion.report.inputs import ReportInputs
 
 SQUARE = 1.16
-"""Distance from the left edge of one scenario's square to that of the next; a square is 1 wide."""
+"""Distance between the left edges of two scenarios' squares; a square is 1 wide."""
 
 
 @register_figure("scatter", section=BY_STIMULUS, heading="Models against people", order=60)

@@ -1,6 +1,6 @@
 """Appearance and registry of figures: colours, marks that need no colour, and the bytes.
 
-Colours are those of Okabe and Ito; every difference of colour is also one of hatch or marker. The
+The colours come from Okabe and Ito; every difference of colour is also one of hatch or marker. The
 bytes depend on the tables and on the version of matplotlib, not on the time or the process.
 """
 

@@ -139,7 +139,7 @@ def generalization(inputs: ReportInputs) -> Plot | None:
 
 
 def generalization_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
-    """Draw accuracy less that of people, trained on (rows) x tested on (columns); one panel per
+    """Draw accuracy minus people's accuracy, trained on (rows) x tested on (columns); one panel per
     model.
 
     ``table``: see `figure_tables.GENERALIZATION_COLUMNS`. Each cell contains its number, so that

@@ -231,7 +231,7 @@ def pack_pictures(imagined: ImaginedTrial, trial: str, length: int) -> dict[str,
 
 
 def _checked(arrays: Arrays, count: int, where: str) -> dict[str, NDArray[Any]]:
-    """Return those of ``PICTURES``, each of ``count`` rows; raise for other shapes."""
+    """Return the arrays named in ``PICTURES``, each of ``count`` rows; raise for other shapes."""
     found = {name: np.asarray(arrays[name]) for name in PICTURES if name in arrays}
     for name, values in found.items():
         fits = values.ndim == _AXES[name] and len(values) == count and values.size

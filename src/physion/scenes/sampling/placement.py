@@ -1,8 +1,8 @@
 """Placement of the camera, of scenery, and of the bodies, zones and pushes of all scenarios.
 
-Scenery are distractors behind and occluders in front of the bodies. The rules are those of the
-official generator (docs/official-system.md, sections 2.4 and 2.5), with one addition: a camera that
-does not see agent and patient is drawn again.
+Scenery are distractors behind and occluders in front of the bodies. The rules follow the official
+generator (docs/official-system.md, sections 2.4 and 2.5), with one addition: a camera that does not
+see agent and patient is drawn again.
 """
 
 from __future__ import annotations
@@ -236,7 +236,7 @@ def _first_free(
         if not any(_footprints_overlap(body, other) for other in placed):
             return body
     raise BadSceneError(
-        f"no room for {drawn.name} beside {placed[-1].name}: use fewer or smaller props, or "
+        f"no room for {drawn.name} next to {placed[-1].name}: use fewer or smaller props, or "
         "increase the spacing of the scenery"
     )
 

@@ -9,7 +9,7 @@ in TOML files:
   the preset that it changes (an earlier one of the file, or one that comes with the scenario).
   Published configurations also have ``official`` (name), ``seed`` and ``published`` (results).
 
-Keys and units of parameters are those of the scenario's parameters; ``physion ls presets SCENARIO
+Keys and units of parameters as in the scenario's parameters; ``physion ls presets SCENARIO
 PRESET`` prints them.
 """
 
@@ -218,7 +218,7 @@ def sample_scene(
     seed
         Number of the scene, or the seed of a trial from `physion.core.seeds.trial_seed`.
     params
-        Parameters of the scenario; by default those of ``preset``, or else the scenario's own.
+        Parameters of the scenario; by default as in ``preset``, or else the scenario's own.
     preset
         Name of a preset (``physion ls presets SCENARIO``), or ``FILE.toml:NAME``.
 

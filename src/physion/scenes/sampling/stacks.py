@@ -158,8 +158,8 @@ UNIT_VOLUME = 0.125
 SMALLEST = 0.05
 """Smallest side of a body in a stack with a gradient, metres. Officially there is no limit."""
 ATTACHMENT_MASS_FACTORS = {"cylinder": math.pi / 4, "cone": math.pi / 12}
-"""Mass of an attachment relative to that of its bounding box. In the official command logs the mass
-of every other body is that of its bounding box, whatever its shape."""
+"""Mass of an attachment relative to a solid bounding box. In the official command logs the mass
+of every other body is the mass of its bounding box, whatever its shape."""
 CONE_RISE = 0.25
 """Bodies on a cone start higher by this factor times the cone's diagonal over its height."""
 OPEN_BELOW = ("pipe", "torus")
@@ -173,8 +173,8 @@ PLAIN = BodyRule()
 class StackRule:
     """How a stack of bodies is drawn (docs/official-system.md, 3.2).
 
-    - ``member``: rule of each body. Its ``mass`` is that of a cube with sides of 0.5 m; the mass of
-      the body is proportional to the product of its scales.
+    - ``member``: rule of each body. Its ``mass`` is the mass of a cube with sides of 0.5 m; the
+      mass of the body is proportional to the product of its scales.
     - ``count``: number of bodies. ``gradient``: metres by which each is smaller than the one below.
     - ``jitter``: largest displacement along x and y, as a fraction of the scale.
     """
@@ -200,7 +200,7 @@ class StandRule:
     - ``joined``: base, attachment and cap are connected rigidly.
     - ``capped``: a second body drawn by ``base`` is on top of the attachment.
 
-    Masses are those of a cube with sides of 0.5 m, as in `StackRule`. The scale of a prop is a
+    Masses are for a cube with sides of 0.5 m, as in `StackRule`. The scale of a prop is a
     multiple of its natural size.
     """
 
@@ -235,7 +235,7 @@ class Stand:
 def set_mass_by_volume(body: Body, factor: float = 1.0) -> Body:
     """Return the body with a mass proportional to its volume, at least `LEAST_MASS`.
 
-    ``body.mass`` is that of a cube of `UNIT_VOLUME`; the result is multiplied by ``factor``.
+    ``body.mass`` is the mass of a cube of `UNIT_VOLUME`; the result is multiplied by ``factor``.
     """
     mass = body.mass * math.prod(body.scale) / UNIT_VOLUME * factor
     return replace(body, mass=max(mass, LEAST_MASS))

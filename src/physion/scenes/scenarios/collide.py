@@ -42,10 +42,10 @@ SCENERY = SceneryRule(
 class CollideParameters:
     """Parameters of the scenario collide (docs/official-system.md, 2.1, 3.0 and 3.3).
 
-    Defaults are those of the official class, except the heading of the push: the class has 20
+    Defaults follow the official class, except the heading of the push: the class has 20
     degrees, at which most pushes miss; all published configurations have 8 or less.
 
-    - ``length``: metres from probe to target, and from the scene's centre to that of the zone.
+    - ``length``: metres from probe to target, and from the scene's centre to the zone's centre.
     - ``zone_jitter``: largest displacement of the zone along y, metres. ``lift``: height of the
       probe above the floor at the start, metres.
     - ``push.point_jitter``: 0.5 in the published configurations, which is mostly outside the

@@ -53,7 +53,7 @@ class ContainParameters:
     - ``stack``: the objects in or on it, from below. ``choice``: indices of those that may be the
       agent (0 is the lowest), all equally likely.
 
-    Masses of stand and stack are those of a cube with sides of 0.5 m (`StackRule`), and a quarter
+    Masses of stand and stack are for a cube with sides of 0.5 m (`StackRule`), and a quarter
     of it for the stack.
     """
 

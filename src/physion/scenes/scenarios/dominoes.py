@@ -48,7 +48,7 @@ class DominoesParameters:
     """Parameters of the scenario dominoes (docs/official-system.md, 2.1, 3.0 and 3.1).
 
     Defaults are the official configuration `pilot_dominoes_2mid_J025R30`, in which every second
-    trial ends in contact; those of the official class are the preset `default_boxroom`.
+    trial ends in contact; the defaults of the official class are the preset `default_boxroom`.
 
     - ``length``: metres from probe to target. ``middles``: number of dominoes between them.
     - ``spacing_jitter``: largest relative change of each distance along the row; changes add up.

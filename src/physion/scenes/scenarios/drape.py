@@ -285,7 +285,7 @@ def _draw_zone(
 
 
 def _draw_apart(name: str, others: Sequence[Body], draw: Callable[[], Body]) -> Body:
-    """Draw a body until its footprint overlaps none of those of ``others``.
+    """Draw a body until its footprint overlaps none of ``others``.
 
     In the official scenes they may overlap, and are pushed apart while they settle.
     """

@@ -75,7 +75,7 @@ SCENERY = SceneryRule()
 class DropParameters:
     """Parameters of the scenario drop (docs/official-system.md, 2.1, 3.0 and 3.5).
 
-    Defaults are those of the official `simple` configurations, except ``even_turn``. Masses are the
+    Defaults follow the official `simple` configurations, except ``even_turn``. Masses are the
     values that had an effect: the official mass arguments had none.
 
     - ``dropped``: the falling object. ``lower``: the object below, on the floor or on the zone.

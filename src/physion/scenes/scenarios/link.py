@@ -58,7 +58,7 @@ class LinkParameters:
     - ``stack``: the rings, from below. ``choice``: indices of those that may be the agent (0 is
       the lowest), all equally likely.
 
-    Masses of stand and rings are those of a cube with sides of 0.5 m (`StackRule`), and a quarter
+    Masses of stand and rings are for a cube with sides of 0.5 m (`StackRule`), and a quarter
     of it for the rings. Below a cap the rings start lower than in the official scenes, where they
     may start inside it.
     """

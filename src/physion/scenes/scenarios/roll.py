@@ -74,11 +74,11 @@ CAMERA, SCENERY = CameraRule(), SceneryRule()
 class RampRule:
     """Template in which the target is released above a slippery ramp that ends before the zone.
 
-    - ``length``: metres from the scene's centre to that of the zone; the pivot of the ramp is at
+    - ``length``: metres from the scene's centre to the zone's centre; the pivot of the ramp is at
       x = -length / 2.
     - ``shapes``, ``scale``, ``friction``, ``mass``, ``textures``: of the ramp. ``lift``: height of
       the ramp above the floor, metres; officially the thickness of the zone.
-    - ``start``: horizontal distance from the ramp's pivot to that of the target, up the slope,
+    - ``start``: horizontal distance from the ramp's pivot to the target's pivot, up the slope,
       metres (measured in official scenes).
     - ``drop``: height of the target's pivot above the ramp's top, metres. A rotated target that
       would start inside the ramp is raised.
@@ -101,7 +101,7 @@ class RampRule:
 class LedgeRule:
     """Template in which the target is pushed at its base over a low round ledge towards the zone.
 
-    - ``length``: metres from the scene's centre to that of the zone; the target is at
+    - ``length``: metres from the scene's centre to the zone's centre; the target is at
       x = -length / 2.
     - ``shapes``, ``scale``, ``center``, ``friction``, ``mass``, ``textures``: of the ledge. The
       official ledge is a sphere scaled to a length of 100 m, half of it below the floor; the half
@@ -139,7 +139,7 @@ class RollParameters:
     """Parameters of the scenario roll (docs/official-system.md, 2.1, 3.0 and 3.7).
 
     ``template`` is one of `TEMPLATES`, or several of which one is drawn; only the rule of that name
-    is used. Defaults are those of the published configurations, except ``ramp.lift`` (0.01 there)
+    is used. Defaults follow the published configurations, except ``ramp.lift`` (0.01 there)
     and ``collision.push.point_jitter`` (0.5 there, mostly outside the probe).
     """
 
@@ -233,7 +233,7 @@ def _sample_ledge(params: RollParameters, seed: np.random.SeedSequence) -> Scene
         roles=Roles("target", "zone", "target"),
         max_frames=MAX_FRAMES,
         pushes=(push,),
-        around=(zone, target),  # the ledge goes on behind and before all scenery
+        around=(zone, target),  # the ledge extends behind and before all scenery
     )
 
 

@@ -61,7 +61,7 @@ class SupportParameters:
     - ``length``: metres; the probe starts at x = -length / 2, the tower is at the centre.
     - ``stack``: the blocks of the tower, from below. ``cap``: the object on top, the agent.
 
-    Masses of blocks and cap are those of a cube with sides of 0.5 m (`StackRule`).
+    Masses of blocks and cap are for a cube with sides of 0.5 m (`StackRule`).
     """
 
     length: Length = 2.0

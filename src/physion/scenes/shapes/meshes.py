@@ -121,7 +121,7 @@ def box(center: ArrayLike, half: ArrayLike) -> Mesh:
 
 
 def merge(meshes: Iterable[Mesh], smooth: float | None = None) -> Mesh:
-    """Join closed meshes, which may overlap. The crease angle is by default that of the first."""
+    """Join closed meshes, which may overlap. The crease angle is by default as in the first."""
     parts = list(meshes)
     starts = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
     faces = [part.faces + start for part, start in zip(parts, starts, strict=True)]
@@ -154,7 +154,7 @@ def solid_moments(triangles: Points) -> tuple[float, Points, Points]:
 def solid_properties(mesh: Mesh) -> tuple[float, Points]:
     """Return the volume and the centroid (3,) of the solid inside a closed mesh.
 
-    The mass properties of bodies are those of their collision pieces: see
+    The mass properties of bodies come from their collision pieces: see
     `physion.physics.rigid.bodies`.
     """
     volume, first, _ = solid_moments(mesh.vertices[mesh.faces])

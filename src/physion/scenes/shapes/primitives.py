@@ -1,6 +1,6 @@
 """Registry of shapes, and the primitives: their meshes and collision pieces.
 
-Sizes are those of the official model records (docs/official-system.md, section 1.2), with their
+Sizes follow the official model records (docs/official-system.md, section 1.2), with their
 axes (x, y up, z) converted to ours (x, z, y up). The pivot is the centre of the bottom face, so
 that a shape stands on z = 0. A record gives bounds and a "volume", which is not the volume of the
 solid but, as far as can be checked, the sum of the volumes of the bounding boxes of the convex
@@ -90,7 +90,7 @@ _MODELS = {
     "vase_beaker": "vase_02 vase_05 vase_laura_deko_vase_set",
     "vase_bottle": "vase_01 vase_03 vase_06",
 }
-"""Models of the published trials that resemble another prop more than that of their category."""
+"""Models of the published trials that resemble a prop of another category more."""
 _PROP_OF_MODEL = {
     model: PREFIX + prop for prop, models in _MODELS.items() for model in models.split()
 }
@@ -243,7 +243,7 @@ DUMBBELL_HEAD, DUMBBELL_BAR = 0.375, 0.1206
 length. Official dumbbells come to rest on four sides and on their ends, so the heads are cubes;
 boxes of these sizes have the recorded volume of 0.8873."""
 RAMP_FOOT, RAMP_DEPTH = 1.629, 2.0
-"""Distance of a ramp's pivot from its foot, and its width. The recorded lengths are those of slopes
+"""Distance of a ramp's pivot from its foot, and its width. The recorded lengths belong to slopes
 of 30 and 60 per cent and a platform of 1.61. In the records the foot is at +x, but objects that
 come to rest in front of official ramps show that it is at -x."""
 BOWL_SEGMENTS = 24
@@ -257,9 +257,9 @@ class ConvexPiece:
 
     - ``center``, ``half``: centre and half sizes in the shape's coordinates. For a sphere ``half``
       is three times the radius, for a cylinder (axis z) its two radii and half its height, for
-      ``convex`` those of the bounding box.
+      ``convex`` of the bounding box.
     - ``vertices`` (K, 3): corners in the shape's coordinates, for ``convex`` only.
-    - ``rotation`` (3, 3): from the axes of the piece to those of the shape.
+    - ``rotation`` (3, 3): from the axes of the piece to the axes of the shape.
     """
 
     kind: Literal["box", "sphere", "cylinder", "convex"]

@@ -45,7 +45,7 @@ class PropPart:
     """One closed solid of a prop.
 
     - ``mesh``: its mesh, metres. ``pieces``: corners (K, 3) of its convex collision pieces.
-    - ``look``: its look, None for that of the body.
+    - ``look``: its look, None for the body's look.
     - ``patches``: masks (F,) of triangles with looks of their own; a later one takes precedence.
     """
 

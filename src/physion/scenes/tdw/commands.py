@@ -309,7 +309,7 @@ class CommandReader:
         self.notes: list[str] = []
 
     def read(self, setup: list[Command], frames: list[tuple[int, list[Command]]]) -> None:
-        """Execute the set-up commands, then those of every frame: (line number, commands)."""
+        """Execute the set-up commands, then each frame's: (line number, commands)."""
         for command in setup:
             self._execute(command, "the set-up before the first trial")
         for frame, (line, commands) in enumerate(frames[_start(frames) : _count_frames(frames)]):

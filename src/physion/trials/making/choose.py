@@ -53,8 +53,7 @@ def wanted_contact(task: TrialTask) -> bool | None:
     """Return the outcome that a slot requires; None if any outcome will do.
 
     Slots come in pairs, one with contact and one without, in pseudo-random order. The number of a
-    trial alone does not reveal its outcome, but the outcome of one trial of a pair reveals that of
-    the other.
+    trial does not reveal its outcome, but the outcome of one trial of a pair reveals the other's.
     """
     if task.split not in BALANCED:
         return None
@@ -137,7 +136,7 @@ def robustness(
 ) -> float:
     """Return the fraction of ``runs`` simulations with noise `JITTER` that end as ``contact``.
 
-    ``seed`` is that of the trial; without ``engine`` the default one is used.
+    ``seed``: of the trial; without ``engine`` the default one is used.
     """
     moved = [
         jitter_scene(scene, JITTER, child_generator(seed, f"robustness {run}"))

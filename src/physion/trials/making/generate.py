@@ -61,7 +61,7 @@ def make_trials(
 ) -> RunReport:
     """Make all trials of ``tasks`` that are missing in ``folder``, then the index.
 
-    If a trial fails, its traceback is written to ``failures/`` and the others go on. Trials of
+    If a trial fails, its traceback is written to ``failures/`` and the others continue. Trials of
     other tasks in the folder are not changed and stay in the index.
 
     Parameters
@@ -71,7 +71,8 @@ def make_trials(
     tasks
         Trials to make, all of one dataset.
     settings
-        How to choose, render and store trials; must be those of earlier runs in the folder.
+        How to choose, render and store trials; must equal the settings of earlier runs in the
+        folder.
     executor
         Where to run; by default one process per core.
     progress
@@ -216,7 +217,7 @@ def _update_index(folder: Path, made: set[str]) -> tuple[pd.DataFrame, dict[str,
 def _fix_settings(
     folder: Path, dataset: str, settings: GenerateSettings, tasks: Sequence[TrialTask]
 ) -> None:
-    """Write the settings of the folder, or check that they are those of earlier runs.
+    """Write the settings of the folder, or check that they equal the settings of earlier runs.
 
     Each split of a scenario must keep the presets, with all their values, of its first run.
     """
@@ -326,7 +327,7 @@ def generate(
     Returns
     -------
     dataset
-        All trials of the folder, including those of earlier calls. Its ``report`` says which were
+        All trials of the folder, including trials of earlier calls. Its ``report`` says which were
         made and kept.
 
     Raises

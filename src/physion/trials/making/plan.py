@@ -218,8 +218,7 @@ def plan_dataset(
     counts
         Trials per scenario, by split.
     presets
-        Names of presets by scenario, which the trials take in turn; by default those of
-        `default_presets`.
+        Names of presets by scenario, which the trials take in turn; by default `default_presets`.
 
     Raises
     ------

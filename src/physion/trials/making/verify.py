@@ -68,7 +68,7 @@ def verify_dataset(
     """Check a dataset against its index and for consistency, and make some trials again.
 
     Checked are: every file against its SHA-256 in the index, the index against the trial files,
-    labels against contacts, lengths of movies against those of trials, a few frames of each movie
+    labels against contacts, lengths of movies against lengths of trials, a few frames of each movie
     against the rendered state, trajectories against their digests, and that no two sampled trials
     have the same physics.
 
@@ -79,7 +79,7 @@ def verify_dataset(
     again
         Number of trials (-1: all) that are also sampled, simulated and rendered again. Scene,
         motion, map and movies must be identical under the same versions of engine and renderer.
-        Which trials depends on their names alone.
+        Which trials depends on their names only.
     repair
         Delete the trial files of trials with faults, so that the command that made the dataset
         makes these trials again.
@@ -139,7 +139,7 @@ def _check_folder(folder: Path, table: pd.DataFrame) -> list[str]:
     # Bytes are comparable only if the same version of the parquet library wrote them.
     content, expected = path.read_bytes(), index_bytes(table)
     if content != expected and _writer(content) == _writer(expected):
-        faults.append(f"{path}: its bytes are not those of the table that it contains")
+        faults.append(f"{path}: its bytes differ from the table that it contains")
     listed = {folder / str(name) for file in FILES for name in table[file].dropna()}
     unknown = {path for path in folder.glob("*/*/*") if path.is_file()} - listed
     faults += [
@@ -217,12 +217,12 @@ def _check_trial(paths: TrialPaths, trial: Trial) -> list[str]:
     if trial.geometry is not None:
         wanted = geometry_arrays(trial.scene, meta.width, meta.height)
         faults += [
-            f"{paths.trial_file}: field {path!r} is not that of the scene"
+            f"{paths.trial_file}: field {path!r} is not as in the scene"
             for path, array in trial.geometry.items()
             if not np.array_equal(array, wanted[path])
         ]
     if meta.imported:
-        return faults  # labels and movies are those of another simulator
+        return faults  # labels and movies come from another simulator
     labels = label_contact(trial.scene, trial.trajectory)
     for name in ("contact", "first_frame", "observed", "min_distance"):
         computed, stored = getattr(labels, name), getattr(trial.labels, name)
@@ -234,7 +234,7 @@ def _check_trial(paths: TrialPaths, trial: Trial) -> list[str]:
 
 
 def _check_movies(paths: TrialPaths, trial: Trial, result: Verification) -> None:
-    """Add movies that do not show the state of their trial; those of other renderers may not."""
+    """Add movies that do not show the state of their trial; movies of other renderers may not."""
     from physion.trials.making.make import RENDERER, foreign_movies
 
     if trial.metadata.renderer != "imported":
@@ -337,7 +337,7 @@ def _sample_again(paths: TrialPaths, trial: Trial, settings: Mapping[str, Any]) 
     return faults
 
 
-# Comparison of two datasets that should be equal, such as those of two machines or versions.
+# Comparison of two datasets that should be equal, such as from two machines or versions.
 
 _VERSIONS = ("engine", "renderer", "package")
 _LABELS = ("contact", "first_frame", "observed_contact", "min_distance", "robust")
@@ -349,7 +349,7 @@ class DatasetComparison:
     """What differs between two datasets, one line per finding.
 
     - ``same``: number of trials of both sets that have the same scene, motion, labels and files.
-    - ``only_first``, ``only_second``: names of the trials of one set alone.
+    - ``only_first``, ``only_second``: names of the trials in only one set.
     - ``versions``: engines, renderers or packages that made one set and not the other.
     - ``differences``: one line for each trial that differs.
     """
@@ -372,7 +372,7 @@ def compare_datasets(
     """Compare the trials of two datasets by name.
 
     Scenes, motions, labels and files are compared by the digests in both indices; `verify_dataset`
-    tells whether the files are those of the index. Trial files are read only where motions differ.
+    tells whether the files are as in the index. Trial files are read only where motions differ.
     Files that hold the same values in other bytes, for example by another compression, count as
     different. A trial file stores the version of the package that made it: if that version differs
     and nothing else does, the trials are the same.

@@ -386,7 +386,7 @@ def export_trial(job: ExportJob) -> str:
     if not np.isfinite(trial.trajectory.positions).all() and "state" in _kinds(job):
         raise BadInputError(
             f"the motion of trial {job.paths.trial!r} is unknown (it was imported from a movie "
-            "alone), and official files require it"
+            "only), and official files require it"
         )
     made = {name: _content(job, trial, content) for name, content in job.files.items()}
     for name, data in made.items():
@@ -428,7 +428,7 @@ def _label(trial: Trial) -> dict[str, Any]:
 
 
 def _movie(job: ExportJob, trial: Trial, look: str) -> bytes:
-    """Return the movie of the trial in a look: that of the index if there is one, else rendered."""
+    """Return the movie of the trial in a look: as in the index if there is one, else rendered."""
     meta = trial.metadata
     column = "movie" if look == meta.look else "free_movie" if look == "free" else None
     if column is not None and column in job.stored:

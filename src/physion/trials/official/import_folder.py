@@ -184,7 +184,7 @@ def import_official(
         Folder to read, and folder of the dataset to write into.
     name, split
         Dataset and split of the trials; by default ``imported``, and the split in metadata.json
-        beside the files, otherwise ``testing``.
+        next to the files, otherwise ``testing``.
     scenario
         Scenario of trials whose scenario cannot be found from their names.
     executor
@@ -527,7 +527,7 @@ def import_state(job: ImportJob) -> tuple[str, ...]:
 def _labels(
     job: ImportJob, scene: Scene, trajectory: Trajectory, labelled: NDArray[np.bool_] | None
 ) -> Labels:
-    """Return the labels stored in the file, else those of metadata.json, else of its contacts."""
+    """Return the labels stored in the file, else as in metadata.json, else from its contacts."""
     labels = label_contact(scene, trajectory)
     if labelled is None and job.contact is None:
         return labels

@@ -3,7 +3,7 @@
 The published movies have no tag for the coding of their colours; players, and ffmpeg which made
 them, assume ITU-R BT.601 for movies of this size. Movies of this package are BT.709 and tagged so,
 and its readers rely on it. Therefore a movie with this tag is copied byte by byte, and any other is
-encoded again. The observed part is always encoded from its own frames alone.
+encoded again. The observed part is always encoded from its own frames only.
 """
 
 from __future__ import annotations

@@ -133,7 +133,7 @@ def encode_flow(flow: NDArray[np.floating[Any]]) -> Bytes:
     return colors
 
 
-# Conversion of arrays between the axes of this package and those of the official files.
+# Conversion of arrays between the axes of this package and of the official files.
 #
 # This package: z up, right-handed, quaternions (w, x, y, z). Official files (Unity): y up,
 # left-handed, quaternions (x, y, z, w). A point (x, y, z) here is (x, z, y) there. Swapping two
@@ -145,7 +145,7 @@ Floats = NDArray[np.float64]
 SWAP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 """Matrix (3, 3) that converts a point from either system to the other."""
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Matrix from camera axes here (right, down, forward) to those of Unity (right, up, backward)."""
+"""Matrix from camera axes here (right, down, forward) to Unity's axes (right, up, backward)."""
 _UPRIGHT = 1e-3
 """Largest vertical component of a camera's right axis that counts as a rounding error."""
 
@@ -234,7 +234,7 @@ def from_official_camera(
     Raises
     ------
     BadInputError
-        If the matrices are not those of a perspective camera.
+        If the matrices do not belong to a perspective camera.
     """
     rotation = world_to_camera[:3, :3]
     if not np.isfinite(world_to_camera).all() or not np.allclose(
@@ -243,7 +243,7 @@ def from_official_camera(
         raise BadInputError("the camera matrix is not a rotation with a translation")
     scale, a, b = projection[1, 1], projection[2, 2], projection[2, 3]
     if not np.isfinite(projection).all() or scale <= 0 or a in (1.0, -1.0):
-        raise BadInputError("the projection matrix is not that of a perspective camera")
+        raise BadInputError("the projection matrix does not belong to a perspective camera")
     eye = swap_axes(-rotation.T @ world_to_camera[:3, 3])
     forward, right = swap_axes(-rotation[2]), swap_axes(rotation[0])
     distance = max(float((np.asarray(look_at) - eye) @ forward), 0.1)

@@ -75,7 +75,7 @@ _FILTERS = {
 class OfficialFile(GuardedHdf5, AbstractContextManager["OfficialFile"]):
     """Reader of one official HDF5 file, for use in a ``with`` statement.
 
-    Paths are those of the file, such as ``static/mass`` or ``frames/0000/objects/positions``.
+    Paths are paths in the file, such as ``static/mass`` or ``frames/0000/objects/positions``.
     """
 
     def __init__(self, file: h5py.File, where: str) -> None:
@@ -214,7 +214,7 @@ class OfficialFile(GuardedHdf5, AbstractContextManager["OfficialFile"]):
             self._total += self._sizes[path]
         if self._total > MAX_FILE_BYTES:
             limit = f"more than {MAX_FILE_BYTES} bytes of memory"
-            raise self.bad(path, f"is one array too many: those of the file take {limit}")
+            raise self.bad(path, f"is one array too many: the arrays of the file take {limit}")
 
 
 # Reading of the objects in official files: ids, models, sizes, poses, roles and physics.
@@ -334,7 +334,7 @@ class ObjectReader:
         return f"{self.models[index]}_{self.ids[index]}"
 
     def offsets(self) -> Floats:
-        """Return the vectors (N, 3) from official pivots to those of the bodies, in body axes."""
+        """Return the vectors (N, 3) from official to our pivots, in body axes."""
         found = np.zeros((len(self.ids), 3))
         for index in self.bodies:
             if self.models[index] not in shapes:
@@ -612,7 +612,7 @@ def _substitute_prop(model: str) -> str:
 
 # Motion of an official file (poses, contacts, cloth), read as a `Trajectory`.
 #
-# In official files the number of contact points differs from that of pairs
+# In official files the number of contact points differs from the number of pairs
 # (docs/official-system.md, section 4.2). If the numbers are equal, points are assigned in order,
 # as this package exports them; otherwise each pair gets the point that is nearest to both of its
 # bounding boxes.

@@ -1,6 +1,6 @@
 """Export of one trial as an official HDF5 file: static group, frames, and additional fields.
 
-Names, shapes and encodings are those of docs/official-system.md, section 4, with gzip alone.
+Names, shapes and encodings follow docs/official-system.md, section 4, with gzip only.
 All static arrays have one entry per object (in the originals, masses and frictions lack scenery
 and so do not align with the other arrays). Ids and counts are int64, measures float32. What the
 official layout does not provide is stored under ``physion/``: the scene, labels and metadata as
@@ -182,7 +182,7 @@ class FrameWriter:
             self._particles.write(group, frame)
 
     def _put(self, group: Any, name: str, values: NDArray[Any]) -> None:
-        """Write an array, or link that of the last frame if it has the same bytes.
+        """Write an array, or link the array of the last frame if it has the same bytes.
 
         A link takes a fourth of the time. Objects rest, the camera always does, labels hardly ever
         change.

@@ -83,7 +83,7 @@ class OfficialObjects:
 
     @cached_property
     def poses(self) -> tuple[Floats, Floats]:
-        """Positions (F, N, 3) and rotations (F, N, 4); a cloth's position is that of its centre."""
+        """Positions (F, N, 3) and rotations (F, N, 4); a cloth's position is its centre."""
         t = self.trajectory
         frames, bodies = t.positions.shape[:2]
         count = bodies + len(self.scene.cloths)

@@ -1,7 +1,7 @@
 """Facts about a dataset, and its machine-readable metadata: Croissant 1.0 (JSON-LD).
 
 Every statement is computed from the index, read from the settings of the dataset, or true of all
-datasets that this package makes. Terms are those of the specifications of Croissant and of its
+datasets that this package makes. Terms follow the specifications of Croissant and of its
 vocabulary for responsible AI (docs.mlcommons.org/croissant). The JSON-LD context is included in the
 file, so that reading it requires no network access.
 """
@@ -208,7 +208,7 @@ class PublicationTerms:
     published
         Day of publication, ``YYYY-MM-DD``.
     license
-        Identifier of spdx.org; by default that of this package and of the official command logs.
+        Identifier of spdx.org; by default as for this package and of the official command logs.
     version
         Version of the dataset, three numbers with dots.
     creator
@@ -271,7 +271,7 @@ def responsible(facts: DatasetFacts) -> dict[str, Any]:
             "judge the same movies.",
             "Not intended for decisions about real objects: nothing was measured on real objects.",
         ],
-        "rai:dataSocialImpact": "None is known beyond that of research on physical prediction.",
+        "rai:dataSocialImpact": "None is known beyond research on physical prediction.",
         "rai:personalSensitiveInformation": [
             "None. All pictures are rendered from synthetic scenes; no person was filmed, and no "
             "responses of people are part of the dataset."

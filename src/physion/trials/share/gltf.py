@@ -1,7 +1,7 @@
 """A trial as one binary glTF 2.0 file (GLB): meshes, colours, camera, and motion as an animation.
 
 Blender, browsers and most 3D programs read it. All nodes hang below the node ``world``, which turns
-the coordinates of the package (metres, z upwards) into those of glTF (y upwards):
+the coordinates of the package (metres, z upwards) into the coordinates of glTF (y upwards):
 
 - each body is a node with its mesh at unit scale, its scale, and, if it moves, its translation and
   rotation at every frame; while it is absent its scale is 0;
@@ -55,7 +55,7 @@ _TO_Y_UP = [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
 
 
 def trial_gltf(trial: Trial, *, look: str | None = None) -> bytes:
-    """Return a trial as a GLB file; ``look``: colours, by default those of its movie."""
+    """Return a trial as a GLB file; ``look``: colours, by default as in its movie."""
     meta, labels = trial.metadata, trial.labels
     facts = {
         "trial": meta.trial,

@@ -2,7 +2,7 @@
 
 The notebooks select scenarios as ``collision``, ``containment``, ``clothiness``, ``linking``,
 ``rollingsliding`` and ``towers`` (``change_names`` in ``physion/metrics.py`` of physics-models).
-The columns are those of docs/official-system.md, section 5.5.
+The columns follow docs/official-system.md, section 5.5.
 """
 
 from __future__ import annotations

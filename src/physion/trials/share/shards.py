@@ -5,14 +5,14 @@ first dot. Keys are trial names with dots replaced by underscores. Information t
 use and information about the outcome are in separate files:
 
 - ``json``: name, scenario, look, picture size, length of the observed part.
-- ``observed.mp4``, ``free_observed.mp4``: the observed frames alone, in the trial's look and free.
+- ``observed.mp4``, ``free_observed.mp4``: only the observed frames, in the trial's look and free.
 - ``map.png``: agent and patient in the first frame.
 - ``outcome.json``: label, length, seed and all other columns of the index: the answer.
 - ``full.mp4``, ``free_full.mp4``, ``trial.hdf5``: the future. The last is the trial's ``.h5``
   file; webdataset takes an extension ``h5`` for a picture (``IMAGE_EXTENSIONS`` in its
   ``autodecode.py``) and fails at it with ``decode("pil")``.
 
-Equal datasets and options give equal bytes. Beside each shard is its digest file.
+Equal datasets and options give equal bytes. Next to each shard is its digest file.
 """
 
 from __future__ import annotations
@@ -237,7 +237,7 @@ def _samples(folder: Path, table: pd.DataFrame, parts: Sequence[str]) -> list[_S
 def _sample(folder: Path, key: str, row: Mapping[str, Any], parts: Sequence[str]) -> _Sample:
     paths = TrialPaths(folder, row["split"], row["scenario"], row["trial"])
     files = {
-        # Paths in the index could point outside the folder; those of the layout cannot.
+        # Paths in the index could point outside the folder; paths of the layout cannot.
         part: (getattr(paths, column), int(row[f"{column}_bytes"]), str(row[f"{column}_sha256"]))
         for part, column in FILE_PARTS.items()
         if part in parts and not pd.isna(row[column])
