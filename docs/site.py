@@ -106,7 +106,7 @@ def help_text(*words: str) -> str:
     from physion.cli.main import main
 
     out = io.StringIO()
-    # The width of the help text is that of the terminal.
+    # The width of the help text is the terminal's.
     before, os.environ["COLUMNS"] = os.environ.get("COLUMNS"), "96"
     try:
         with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):

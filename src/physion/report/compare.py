@@ -59,7 +59,7 @@ file."""
 _LOOKS = {
     "plain": "those who saw free colours with flashing overlays, as in the paper",
     "redyellow": "those who saw a red agent and a yellow patient",
-    "pooled": "those of both looks, weighted by their number",
+    "pooled": "people of both looks, weighted by their number",
 }
 
 
@@ -396,7 +396,7 @@ def read_averages(
         if file is not None:
             known, origin = read_labels(file), file.name
         elif data is not None:
-            known, origin = dict(data.labels), "those of the study"
+            known, origin = dict(data.labels), "the study's outcomes"
     zone = find_next_to(folder, "results", ZONE_FILE)
     return read_humans(folder, dominoes), known, origin, zone
 
