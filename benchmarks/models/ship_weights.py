@@ -53,7 +53,7 @@ TRIALS = {
     "clips": "`physion generate MOVIES --split training --count 200 --name small --width 64 "
     "--height 64 --jitters 0`",
 }
-"""Command that made the trials of a training, by the diet of the model."""
+"""Command that made the trials of a training, by what the model learns from."""
 SOURCES = {
     "dpi-small": "dpi-small",
     "gns-small": "gns-small",
@@ -97,7 +97,7 @@ def ship(trained: Path, name: str, particles: Path | None) -> None:
             "of this model.\n"
         )
     card += f"\n## Hardware\n{processor()}, one thread\n"
-    card += f"\n## Trials\nMade by {TRIALS[model.diet]}.\n"
+    card += f"\n## Trials\nMade by {TRIALS[model.learns_from]}.\n"
     stored = tensors_of(model)
     if name in HALF:
         stored = {k: v.half() if v.dtype == torch.float32 else v for k, v in stored.items()}

@@ -239,7 +239,7 @@ def tested_clips(model: Any, source: Any, trials: list[str]) -> list[Batch]:
         raise SystemExit(f"learn needs {TESTED_CLIPS} testing trials or more")
     chosen = [slice(start, start + TESTED_CLIPS) for start in groups]
     clips = [source.window(trials[part], starts[part], model.window).to("cpu") for part in chosen]
-    if model.diet != "features":
+    if model.learns_from != "features":
         return clips
     return [dataclasses.replace(batch, features=model.encode(batch)) for batch in clips]
 

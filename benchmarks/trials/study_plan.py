@@ -152,7 +152,7 @@ class Study:
             else:
                 made = [*names[scenario, "readout"], *names[scenario, "testing"]]
                 compute += model.encode_context + model.encode_whole
-                read += model.read_context * (model.diet == "clips") + model.read_whole
+                read += model.read_context * (model.learns_from == "clips") + model.read_whole
             name = f"{training} on {scenario}"
             yield machine.task(
                 name, EVALUATIONS, TESTED * compute, TESTED * read, [training, *made], False

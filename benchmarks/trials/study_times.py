@@ -69,7 +69,7 @@ class ModelTimes:
     """Facts about a model and its seconds for one clip or trial; see the module."""
 
     name: str
-    diet: str
+    learns_from: str
     encoder: str
     boxes: int
     steps: int
@@ -159,7 +159,7 @@ def measure_model(name: str, dataset: Dataset) -> ModelTimes:
     windows, reading = read_times(model, dataset, evaluated["feature_size"])
     return ModelTimes(
         name=name,
-        diet=model.diet,
+        learns_from=model.learns_from,
         encoder=getattr(model.settings, "encoder", ""),
         boxes=model.spec.objects if "boxes" in model.spec.inputs else 0,
         steps=model.training_settings.steps,
@@ -178,7 +178,7 @@ def measure_model(name: str, dataset: Dataset) -> ModelTimes:
 def read_times(model: Any, dataset: Dataset, features: int) -> tuple[Windows, dict[str, float]]:
     """Return the windows of the trials, and the seconds to read one: again, and a new one."""
     trials = tuple(dataset.trials("training"))
-    if model.diet == "features":
+    if model.learns_from == "features":
         shape = (len(trials), model.spec.total, features)
         values = generator("study times").normal(size=shape).astype(np.float32)
         rows, lengths = np.arange(len(trials)), [model.spec.all_frames()[-1] + 1] * len(trials)

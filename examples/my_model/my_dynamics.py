@@ -11,7 +11,7 @@ from physion.models.interface import TrainingSettings
 class MyDynamics(MyEncoder):
     """`MyEncoder` with a linear layer that predicts how its features change."""
 
-    diet = "features"  # trained on what `encode` gives; "clips" would be trained on pictures
+    learns_from = "features"  # trained on what `encode` gives; "clips" would be trained on pictures
     window = 3  # frames of a training clip
     training_settings = TrainingSettings(steps=200, batch=16, learning_rate=1e-3)
 
@@ -27,7 +27,7 @@ class MyDynamics(MyEncoder):
         first, second, third = batch.features.unbind(1)
         return {"loss": (self.following(first, second) - third).pow(2).mean()}
 
-    def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
+    def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
         """Return imagined features (B, samples, future, D); all samples are equal."""
         seen = list(context.features.unbind(1))
         for _ in range(self.spec.future):

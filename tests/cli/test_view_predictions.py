@@ -27,7 +27,7 @@ from physion.models import Provenance, Rollout, Spec
 
 class Standstill:
     spec = Spec(inputs=("state",), stride=3, context=15, future=0, context_at="end")
-    reader, samples, seed, knobs = "touch", 4, 0, {}
+    reader, samples, seed, arguments = "touch", 4, 0, {}
     dtype = np.float32
 
     def provenance(self):
@@ -36,8 +36,8 @@ class Standstill:
     def digest(self):
         return "0" * 64
 
-    def imagine(self, context, samples, seed, **knobs):
-        assert knobs == {"show": 1.0}
+    def imagine(self, context, samples, seed, **arguments):
+        assert arguments == {"show": 1.0}
         places = [motion.trajectory.positions[44] for motion in context.state]
         assert all(len(motion.trajectory) == 45 for motion in context.state)
         most = max(len(place) for place in places)
@@ -55,19 +55,19 @@ class Rough(Standstill):
 
 
 class Greedy(Standstill):
-    def imagine(self, context, samples, seed, **knobs):
+    def imagine(self, context, samples, seed, **arguments):
         if len(context) > 1:
             raise MemoryError
-        return super().imagine(context, samples, seed, **knobs)
+        return super().imagine(context, samples, seed, **arguments)
 
 
 class Silent(Standstill):
-    def imagine(self, context, samples, seed, **knobs):
+    def imagine(self, context, samples, seed, **arguments):
         return Rollout(gap=np.zeros((len(context), samples)))
 
 
 class Uneven(Standstill):
-    def imagine(self, context, samples, seed, **knobs):
+    def imagine(self, context, samples, seed, **arguments):
         boxes = np.zeros((len(context), samples, 5, 2, 4), np.float32)
         slots = np.zeros((len(context), samples, 4, 2, 3), np.float32)
         return Rollout(shown={"boxes": boxes, "slots": slots})

@@ -336,8 +336,8 @@ def test_seed_and_scale_of_the_rollouts_are_those_of_the_call() -> None:
     truth = StraightEngine().simulate(trial)
     batch = context(trial, truth)
 
-    def contacts(seed: int, **knobs: float) -> list[bool]:
-        found: list[bool] = model().imagine(batch, 30, seed, **knobs).contact[0].tolist()
+    def contacts(seed: int, **arguments: float) -> list[bool]:
+        found: list[bool] = model().imagine(batch, 30, seed, **arguments).contact[0].tolist()
         return found
 
     assert contacts(0) == contacts(0) == contacts(0, scale=1.0)
@@ -488,8 +488,8 @@ def test_fitted_levels_have_digests_of_their_own(monkeypatch: pytest.MonkeyPatch
 
 
 def test_nothing_is_fitted_to_the_trials_at_hand() -> None:
-    assert build_model("noisy-simulation-people").knobs == {"scale": (1.0,)}
-    assert build_model("noisy-simulation").knobs == {"scale": (0.5, 1.0, 2.0)}
+    assert build_model("noisy-simulation-people").arguments == {"scale": (1.0,)}
+    assert build_model("noisy-simulation").arguments == {"scale": (0.5, 1.0, 2.0)}
 
 
 def test_levels_are_fitted_or_given() -> None:

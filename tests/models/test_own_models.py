@@ -119,8 +119,8 @@ class Model:
 ENCODES = "    def encode(self, batch):\n        clips, steps = batch.rgb.shape[:2]\n        "
 PREDICTS = '    answers = "observed"\n    def predict(self, batch):\n        '
 IMAGINES = (
-    '    decision = "gap"\n    samples, seed, knobs = 2, 0, {}\n'
-    "    def imagine(self, context, samples, seed, **knobs):\n"
+    '    decision = "gap"\n    samples, seed, arguments = 2, 0, {}\n'
+    "    def imagine(self, context, samples, seed, **arguments):\n"
     "        clips = len(context)\n        "
 )
 ZEROS = "np.zeros((clips, steps, 3), np.float32)"

@@ -155,7 +155,7 @@ def test_a_model_overfits_one_batch(name: str, count: int) -> None:
     trivial predictor of RPIN; the others are compared with theirs."""
     model = model_of(name, **tiny_encoder(name))
     batch = squares(4, model.window, model.spec)
-    if model.diet == "features":
+    if model.learns_from == "features":
         batch = with_arrays(batch, features=model.encode(batch))
     model.prepare(batch)
     losses = steps(model, batch, count)

@@ -11,21 +11,21 @@ from physion.readout.decisions import (
     NoiseDecision,
     best_threshold,
     decisions,
-    fit_knobs,
+    fit_arguments,
     log_likelihood,
 )
-from physion.readout.features import Knobs, Outcomes, all_knobs
+from physion.readout.features import Arguments, Outcomes, all_arguments
 from physion.readout.logistic import LogisticSettings
 
-NO_KNOBS: Knobs = ()
+NO_ARGUMENTS: Arguments = ()
 
 
-def knobs(scale: float) -> Knobs:
+def arguments(scale: float) -> Arguments:
     return (("scale", scale),)
 
 
-def gaps(*rows: list[float]) -> dict[Knobs, Outcomes]:
-    return {NO_KNOBS: Outcomes(None, np.array(rows, np.float64))}
+def gaps(*rows: list[float]) -> dict[Arguments, Outcomes]:
+    return {NO_ARGUMENTS: Outcomes(None, np.array(rows, np.float64))}
 
 
 @pytest.mark.parametrize("name", decisions.names())
@@ -37,9 +37,9 @@ def test_every_decision_says_what_it_needs(name: str) -> None:
     )
 
 
-def test_all_combinations_of_knobs_are_tried_in_the_order_of_their_names() -> None:
-    assert all_knobs({}) == [()]
-    assert all_knobs({"b": (1, 2), "a": (3,)}) == [
+def test_all_combinations_of_arguments_are_tried_in_the_order_of_their_names() -> None:
+    assert all_arguments({}) == [()]
+    assert all_arguments({"b": (1, 2), "a": (3,)}) == [
         (("a", 3.0), ("b", 1.0)),
         (("a", 3.0), ("b", 2.0)),
     ]
@@ -48,18 +48,18 @@ def test_all_combinations_of_knobs_are_tried_in_the_order_of_their_names() -> No
 def test_the_scale_is_the_one_under_which_outcomes_are_likeliest() -> None:
     outcomes = np.array([True, True, False, True])
     fractions = {
-        knobs(0.5): np.array([1.0, 0, 1, 0]),
-        knobs(1.0): np.array([0.9, 0.8, 0.3, 0.9]),
-        knobs(2.0): np.full(4, 0.5),
+        arguments(0.5): np.array([1.0, 0, 1, 0]),
+        arguments(1.0): np.array([0.9, 0.8, 0.3, 0.9]),
+        arguments(2.0): np.full(4, 0.5),
     }
     samples = dict.fromkeys(fractions, 20)
-    assert fit_knobs(fractions, samples, outcomes) == knobs(1.0)
-    only = {knobs(2.0): fractions[knobs(2.0)]}
-    assert fit_knobs(only, samples, outcomes) == knobs(2.0)
+    assert fit_arguments(fractions, samples, outcomes) == arguments(1.0)
+    only = {arguments(2.0): fractions[arguments(2.0)]}
+    assert fit_arguments(only, samples, outcomes) == arguments(2.0)
     nothing = {k: v[:0] for k, v in fractions.items()}
-    assert fit_knobs(nothing, samples, outcomes[:0]) == knobs(1.0), "the middle one"
-    equal = {knobs(s): np.full(4, 0.5) for s in (2.0, 0.5, 1.0)}
-    assert fit_knobs(equal, samples, outcomes) == knobs(0.5), "the smallest of equal ones"
+    assert fit_arguments(nothing, samples, outcomes[:0]) == arguments(1.0), "the middle one"
+    equal = {arguments(s): np.full(4, 0.5) for s in (2.0, 0.5, 1.0)}
+    assert fit_arguments(equal, samples, outcomes) == arguments(0.5), "the smallest of equal ones"
 
 
 def test_the_likelihood_of_certain_answers_is_finite() -> None:
@@ -72,8 +72,8 @@ def test_noise_gives_the_fractions_of_the_chosen_level() -> None:
     sure = Outcomes(np.array([[True, True], [False, False]]), None)
     wrong = Outcomes(np.array([[False, False], [True, True]]), None)
     tested = Outcomes(np.array([[True, False]]), None)
-    fit = {knobs(1.0): sure, knobs(2.0): wrong}
-    test = {knobs(1.0): tested, knobs(2.0): wrong}
+    fit = {arguments(1.0): sure, arguments(2.0): wrong}
+    test = {arguments(1.0): tested, arguments(2.0): wrong}
     decided = NoiseDecision().decide(fit, np.array([True, False]), test)
     assert decided.probability.tolist() == [0.5] and decided.train_accuracy == 1.0
     assert decided.fitted == {"scale": 1.0}
@@ -99,6 +99,6 @@ def test_gaps_of_several_samples_give_probabilities() -> None:
 
 
 def test_contacts_alone_have_no_threshold() -> None:
-    contacts = {NO_KNOBS: Outcomes(np.array([[True]]), None)}
+    contacts = {NO_ARGUMENTS: Outcomes(np.array([[True]]), None)}
     with pytest.raises(BadInputError, match="use the decision 'noise'"):
         GapDecision().decide(contacts, np.array([True]), contacts)

@@ -106,8 +106,8 @@ class Network(nn.Module):
         assert isinstance(batch.rgb, torch.Tensor) and torch.is_inference_mode_enabled()
         return self.dropout(self.layer(batch.rgb.flatten(2).float() / 255))
 
-    def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
-        last = self.dynamics(context.features[:, -1]) * knobs.get("scale", 1.0)
+    def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
+        last = self.dynamics(context.features[:, -1]) * arguments.get("scale", 1.0)
         steps = torch.arange(1, SPEC.future + 1)[:, None]
         futures = torch.stack([last[:, None] * steps + sample for sample in range(samples)], 1)
         return Rollout(features=futures, gap=futures.mean((2, 3)).double())
@@ -215,11 +215,11 @@ class Apart(Network):
 def test_dynamics_change_what_is_imagined_and_not_what_is_encoded(tmp_path: Path) -> None:
     model, movies, store = Apart(), Movies(), FeatureStore(tmp_path, batch=2)
 
-    def imagined(**knobs: float) -> tuple[Any, Any]:
+    def imagined(**arguments: float) -> tuple[Any, Any]:
         context = store.encoded(model, movies, TRIALS, "context")
         (found,) = store.imagined(
             model, movies, TRIALS[1:], samples=3, seed=0, context=context,
-            knobs={name: (value,) for name, value in knobs.items()},
+            arguments={name: (value,) for name, value in arguments.items()},
         ).values()  # fmt: skip
         return found.features(), found.outcomes()
 
@@ -407,7 +407,7 @@ class Dreamer(Numpy):
 def test_wrong_rollouts_are_refused(given: Any, message: str) -> None:
     with pytest.raises(BadInputError) as caught:
         FeatureStore(None, batch=5).imagined(
-            Dreamer(**given), Movies(), TRIALS, samples=2, seed=0, knobs={}
+            Dreamer(**given), Movies(), TRIALS, samples=2, seed=0, arguments={}
         )
     assert message in str(caught.value)
 
@@ -416,12 +416,12 @@ def test_outcomes_alone_are_stored_too(tmp_path: Path) -> None:
     contact = np.array([[True, False]] * 5)
     model, movies, store = Dreamer(contact=contact), Movies(), FeatureStore(tmp_path, batch=5)
     for _ in range(2):
-        found = store.imagined(model, movies, TRIALS, samples=2, seed=0, knobs={})[()]
+        found = store.imagined(model, movies, TRIALS, samples=2, seed=0, arguments={})[()]
         outcomes = found.outcomes()
         assert found.features() is None and outcomes.gap is None
         assert outcomes.contact.dtype == bool and (outcomes.contact == contact).all()
     assert len(movies.read) == 1
-    store.imagined(model, movies, TRIALS, samples=2, seed=1, knobs={})
+    store.imagined(model, movies, TRIALS, samples=2, seed=1, arguments={})
     assert len(movies.read) == 2
 
 
@@ -468,7 +468,7 @@ def test_memory_used_up_by_imagining_names_the_setting_to_lower() -> None:
     for batch, advice in ((3, "lower --encoder-batch, now 3"), (1, "size of the model, or fewer")):
         store = FeatureStore(None, batch=batch)
         with pytest.raises(OutOfMemoryError, match=f"imagine ran out of memory .* {advice}"):
-            store.imagined(Vivid(), Movies(), TRIALS, samples=2, seed=0, knobs={})
+            store.imagined(Vivid(), Movies(), TRIALS, samples=2, seed=0, arguments={})
 
 
 def test_what_a_model_raises_names_model_method_and_line() -> None:
@@ -528,7 +528,7 @@ def test_progress_counts_what_is_computed(tmp_path: Path) -> None:
 def test_no_trial_has_no_feature(tmp_path: Path) -> None:
     store = FeatureStore(tmp_path)
     assert store.encoded(Numpy(), Movies(), [], "context").array().size == 0
-    found = store.imagined(Dreamer(), Movies(), [], samples=1, seed=0, knobs={})[()]
+    found = store.imagined(Dreamer(), Movies(), [], samples=1, seed=0, arguments={})[()]
     assert found.trials == () and len(found.outcomes().touches()) == 0
 
 
@@ -576,12 +576,12 @@ class Counts:
     def provenance(self) -> Any:
         return SimpleNamespace(model="counts")
 
-    def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
+    def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
         self.sizes.append(len(context))
         if any(trial.startswith("odd") for trial in context.trials):
             raise BadInputError("an odd trial")
         gaps = np.array([[float(len(trial))] * samples for trial in context.trials])
-        return Rollout(gap=gaps * knobs.get("factor", 1.0))
+        return Rollout(gap=gaps * arguments.get("factor", 1.0))
 
 
 def test_trials_that_fail_cost_no_other_trial() -> None:
@@ -589,7 +589,7 @@ def test_trials_that_fail_cost_no_other_trial() -> None:
     store, model = FeatureStore(None), Counts()
     source: Any = Source(names)
     found = store.imagined(
-        model, source, names, samples=1, seed=0, knobs={"factor": (1.0, 2.0)}, together=3
+        model, source, names, samples=1, seed=0, arguments={"factor": (1.0, 2.0)}, together=3
     )
     for factor in (1, 2):
         imagined = found[(("factor", float(factor)),)]
@@ -622,7 +622,7 @@ def test_particle_models_imagine_the_same_in_processes() -> None:
     assert model.trials_together > 1
     found = [
         FeatureStore(None, executor=executor).imagined(
-            model, source, names, samples=1, seed=0, knobs={}, together=2
+            model, source, names, samples=1, seed=0, arguments={}, together=2
         )[()]
         for executor in (SerialExecutor(), LocalExecutor(2))
     ]

@@ -20,7 +20,7 @@ SIX = TrainingSettings(
 class Imagining(NextBrightness):
     """Network that encodes and imagines; ``seed`` draws its initial weights."""
 
-    samples, knobs = 1, {}
+    samples, arguments = 1, {}
     decision = "logistic"
 
     def __init__(self, seed: int = 0, hidden: int = 4) -> None:
@@ -31,7 +31,7 @@ class Imagining(NextBrightness):
             for weight in self.net.parameters():
                 weight.copy_(torch.randn(weight.shape, generator=generator) / 10)
 
-    def imagine(self, context: Batch, samples: int, seed: int, **knobs: Any) -> Rollout:
+    def imagine(self, context: Batch, samples: int, seed: int, **arguments: Any) -> Rollout:
         last = context.features[:, -1]
         steps = torch.arange(1, self.spec.future + 1, device=last.device)[None, :, None]
         slope = self.net(context.features[:, :3, 0])[:, None]

@@ -1,4 +1,4 @@
-"""Tiny models that learn, one per diet, and a source of moving values that needs no file."""
+"""Tiny models that learn, one per input, and a source of moving values that needs no file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from physion.clips.batch import Batch, Motion, Spec, clip_frames
 from physion.clips.source import Part
 from physion.core.errors import UnknownNameError
-from physion.models.interface import Diet, TrainingSettings
+from physion.models.interface import LearnsFrom, TrainingSettings
 from physion.models.torch_model import TorchModel
 from support.clip_source import ClipSource
 from support.hand_made import make_scene, make_trajectory
@@ -88,16 +88,16 @@ class NextBrightness(TorchModel):
 
     def __init__(
         self,
-        diet: Diet = "clips",
+        learns_from: LearnsFrom = "clips",
         dropout: float = 0.0,
         settings: TrainingSettings = QUICK,
         hidden: int = 8,
     ) -> None:
         super().__init__()
-        self.diet: Diet = diet
-        self.spec = replace(SPEC, inputs=("state",)) if diet == "states" else SPEC
+        self.learns_from: LearnsFrom = learns_from
+        self.spec = replace(SPEC, inputs=("state",)) if learns_from == "states" else SPEC
         self.window, self.training_settings = 4, settings
-        inputs = {"clips": 3, "features": 6, "states": 3}[diet]
+        inputs = {"clips": 3, "features": 6, "states": 3}[learns_from]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             self.net = nn.Sequential(
@@ -123,7 +123,7 @@ class NextBrightness(TorchModel):
         return self._brightness(batch)[..., None]
 
     def _pair(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        if self.diet == "features":
+        if self.learns_from == "features":
             values = batch.features - self.center
             return values[:, :3].flatten(1), values[:, 3, 1]
         values = self._brightness(batch) - self.center

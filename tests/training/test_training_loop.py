@@ -62,7 +62,7 @@ def run(
     **options: Any,
 ) -> TrainedModel:
     source = source if source is not None else MovingValues(spec=model.spec)
-    features = source.features if model.diet == "features" else None
+    features = source.features if model.learns_from == "features" else None
     options = {"seed": 0, "name": "all", "fabric": CPU, **options}
     return train_model(
         model, source, source.trials, settings=settings, features=features, folder=folder, **options
@@ -75,29 +75,34 @@ def files_of(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
-@pytest.mark.parametrize("diet", ["clips", "features", "states"])
-def test_a_model_learns_from_every_diet(diet: Any) -> None:
-    first = run(NextBrightness(diet), settings=replace(QUICK, steps=1, learning_rate=1e-9))
-    model = NextBrightness(diet)
+@pytest.mark.parametrize("learns_from", ["clips", "features", "states"])
+def test_a_model_learns_from_every_input(learns_from: Any) -> None:
+    first = run(NextBrightness(learns_from), settings=replace(QUICK, steps=1, learning_rate=1e-9))
+    model = NextBrightness(learns_from)
     result = run(model, settings=replace(QUICK, steps=200))
     assert result.loss < 0.2 * first.loss
     assert result.validation < 0.5 * result.baseline
     assert not model.training and result.steps == 200 and not result.loaded
 
 
-@pytest.mark.parametrize("diet", ["clips", "features"])
+@pytest.mark.parametrize("learns_from", ["clips", "features"])
 @pytest.mark.parametrize("settings", [QUICK, ALL_AT_ONCE, PLATEAU], ids=["adam", "all", "plateau"])
 def test_resumed_training_is_the_uninterrupted_one_to_the_bit(
-    diet: Any, settings: TrainingSettings, tmp_path: Path
+    learns_from: Any, settings: TrainingSettings, tmp_path: Path
 ) -> None:
     settings = replace(settings, log_every=4)  # checkpoints lie inside of intervals
-    whole = NextBrightness(diet, dropout=0.2)
+    whole = NextBrightness(learns_from, dropout=0.2)
     run(whole, tmp_path / "whole", settings)
     for step in (7, 25, 39):
         with pytest.raises(Killed):
-            run(NextBrightness(diet, 0.2), tmp_path / "parts", settings, progress=kill_at(step))
+            run(
+                NextBrightness(learns_from, 0.2),
+                tmp_path / "parts",
+                settings,
+                progress=kill_at(step),
+            )
         torch.rand(3)  # the state of torch's generator does not matter
-    model = NextBrightness(diet, 0.2)
+    model = NextBrightness(learns_from, 0.2)
     result = run(model, tmp_path / "parts", settings)
     assert equal_weights(model, whole) and result.notes == ()
     assert files_of(tmp_path / "parts") == files_of(tmp_path / "whole")
@@ -179,12 +184,12 @@ def test_held_out_trials_are_not_trained_on() -> None:
 
 
 def test_models_see_a_sample_of_clips_or_all_features_before_training() -> None:
-    for diet, count in (("clips", 64), ("features", 90)):
-        model = NextBrightness(diet)  # type: ignore[arg-type]
+    for learns_from, count in (("clips", 64), ("features", 90)):
+        model = NextBrightness(learns_from)  # type: ignore[arg-type]
         run(model, source=MovingValues(count=100), settings=replace(QUICK, steps=1))
         (sample,) = model.prepared
         assert len(sample) == count == len(set(sample.trials))
-        assert sample.frames.shape[1] == (4 if diet == "clips" else 8)
+        assert sample.frames.shape[1] == (4 if learns_from == "clips" else 8)
 
 
 def test_frames_of_feature_windows_are_those_of_the_features() -> None:

@@ -138,7 +138,7 @@ class Batch:
       1..K, from 0 to 1 of width and height; NaN for an object that is not seen.
     - ``camera`` (B, 2, 4, 4) float64: view matrix (world to camera) and projection matrix.
     - ``state``: motions (B); they have all frames from 0 on, not only ``frames``.
-    - ``features`` (B, T, D) float32: of a frozen encoder, for models whose ``diet`` is features.
+    - ``features`` (B, T, D) float32: of a frozen encoder, if ``learns_from`` is features.
     """
 
     trials: tuple[str, ...]

@@ -345,10 +345,10 @@ class Cswm(VisionModel):
         before = states[:, :1].expand(-1, self.settings.stacked - 1, -1)
         return torch.cat([before, states], 1)
 
-    def imagine(self, context: Batch, samples: int, seed: int, **knobs: Any) -> Rollout:
+    def imagine(self, context: Batch, samples: int, seed: int, **arguments: Any) -> Rollout:
         """Roll the transition out from the end of the context.
 
-        It is deterministic: all samples are equal, and ``seed`` has no effect. With the knob
+        It is deterministic: all samples are equal, and ``seed`` has no effect. With the argument
         ``show`` above 0, ``shown`` holds the imagined states under ``slots`` (B, S, future, K, D),
         and under ``context_masks`` the maps (B, T, K, h, w) of the context.
         """
@@ -360,7 +360,7 @@ class Cswm(VisionModel):
             states = torch.cat([states[:, 1:], self._predicted(states)], 1)
             imagined.append(states[:, -1].flatten(1))
         future = torch.stack(imagined, 1)[:, None].expand(-1, samples, -1, -1)
-        if knobs.get("show", 0) <= 0:
+        if arguments.get("show", 0) <= 0:
             return Rollout(features=future)
         maps = self.maps(context)
         before = maps[:, :1].expand(-1, self.settings.stacked - 1, -1, -1, -1)

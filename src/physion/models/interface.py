@@ -172,7 +172,7 @@ class SizedSettings(ModelSettings):
                 raise BadInputError(f"{self.model}: {name} must be at least {least}, not {value}")
 
 
-Diet = Literal["clips", "features", "states"]
+LearnsFrom = Literal["clips", "features", "states"]
 
 
 class Model:
@@ -190,7 +190,7 @@ class Model:
         All that a user can set, a dataclass; None for a model without options.
     samples, seed
         Futures of a trial, and the seed of their random numbers; None: the evaluation's seed.
-    knobs
+    arguments
         Values among which the decision chooses, by the name of an argument of `imagine`, such as a
         level of noise.
     answers
@@ -198,7 +198,7 @@ class Model:
         ``full`` for a model that is shown the outcome.
     trained
         Whether the weights are pretrained, so that training is skipped.
-    diet
+    learns_from
         What a model with a `loss` is trained on: ``clips`` (what `Spec` asks for), ``features`` (of
         its own `encode`), or ``states`` (whole motions).
     window
@@ -213,10 +213,10 @@ class Model:
     settings: Any = None
     samples: int = 1
     seed: int | None = None
-    knobs: Mapping[str, tuple[float, ...]] = MappingProxyType({})
+    arguments: Mapping[str, tuple[float, ...]] = MappingProxyType({})
     answers: str = ""
     trained: bool = False
-    diet: Diet = "clips"
+    learns_from: LearnsFrom = "clips"
     window: int = 0
     training_settings: TrainingSettings = TrainingSettings()
     calibration_trials: int = 0
@@ -239,11 +239,11 @@ class Model:
         """
         raise NotImplementedError
 
-    def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
+    def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
         """Return ``samples`` futures of every clip.
 
-        ``seed`` and the names of the trials determine all random numbers. ``knobs`` are values that
-        a decision fits. If the model encodes, ``context.features`` holds the features of the
+        ``seed`` and the names of the trials determine all random numbers. ``arguments`` are
+        values that a decision fits. If the model encodes, ``context.features`` holds the features of the
         context.
         """
         raise NotImplementedError

@@ -149,7 +149,7 @@ class NoisySimulation(Model):
         self.settings = settings
         self.spec = Spec(inputs=("state",), context_at="end", stride=1, context=1, future=0)
         self.samples, self.seed = settings.samples, settings.seed
-        self.knobs = {"scale": settings.scales}
+        self.arguments = {"scale": settings.scales}
         self._given = engine
         self._built: Engine | None = None
 
@@ -165,13 +165,13 @@ class NoisySimulation(Model):
         fitted = self.settings.fitted_to
         return fitted_levels(fitted, scene) if fitted else self.settings
 
-    def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
+    def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
         """Simulate every trial ``samples`` times; ``contact`` says whether agent and patient touch.
 
-        ``scale`` is the only knob; by default as in the settings. The noise of a sample is
+        ``scale`` is the only argument; by default as in the settings. The noise of a sample is
         a function of ``seed``, the trial's name and the number of the sample.
         """
-        scale = knobs.get("scale", self.settings.scale)
+        scale = arguments.get("scale", self.settings.scale)
         assert context.state is not None, "the spec asks for states"
         found = [
             simulate_contacts(

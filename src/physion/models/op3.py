@@ -603,10 +603,10 @@ class Op3(PictureModel):
         """Return the states of the slots (B, T, K R) after each frame was seen."""
         return self._watch(normalized_pictures(batch, self.spec, self.name))[0]
 
-    def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
+    def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
         """Return the states (B, S, future, K R) of ``samples`` futures; no frame of them is seen.
 
-        They follow from ``seed`` and the name of the trial only. With the knob ``show`` above 0,
+        They follow from ``seed`` and the trial's name only. With the argument ``show`` above 0,
         ``shown`` holds pictures, ``rgb`` (B, S, future, H, W, 3) uint8, and ``masks``
         (B, S, future, K, H, W) float32, and under ``context_masks`` the masks of the frames that
         were seen (B, T, K, H, W).
@@ -616,7 +616,7 @@ class Op3(PictureModel):
         settings, clips = self.settings, len(context)
         shape = (samples, settings.future + 1, settings.slots, settings.stochastic)
         noise = self.imagined_noise(context.trials, seed, shape).to(slots.mean)
-        shows = knobs.get("show", 0) > 0
+        shows = arguments.get("show", 0) > 0
         features, shown, found = [], [], []
         with torch.no_grad():
             if shows:

@@ -454,7 +454,7 @@ class Rpin(VisionModel):
         states = self._states(batch, boxes)
         return torch.cat([states.flatten(3), boxes], -1).flatten(2)
 
-    def imagine(self, context: Batch, samples: int, seed: int, **knobs: Any) -> Rollout:
+    def imagine(self, context: Batch, samples: int, seed: int, **arguments: Any) -> Rollout:
         """Predict states and boxes from the last h frames of the context.
 
         The prediction is deterministic: all samples are equal, and ``seed`` has no effect.

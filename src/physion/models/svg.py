@@ -319,10 +319,10 @@ class Svg(PictureModel):
         return codes.float().view(*pictures.shape[:2], -1)
 
     @torch.no_grad()
-    def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
+    def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
         """Return the predicted codes (B, S, future, g) of ``samples`` futures.
 
-        They follow from ``seed`` and the name of the trial only. With the knob ``show`` above 0,
+        They follow from ``seed`` and the trial's name only. With the argument ``show`` above 0,
         ``shown`` holds the pictures under ``rgb`` (B, S, future, H, W, 3), uint8.
         """
         pictures = context_pictures(context, self.spec, self.name)
@@ -334,7 +334,7 @@ class Svg(PictureModel):
             value.view(len(context), samples, *value.shape[1:])
             for value in (imagined.codes.float(), imagined.pictures)
         )
-        if knobs.get("show", 0) <= 0:
+        if arguments.get("show", 0) <= 0:
             return Rollout(features=codes)
         rgb = (shown.movedim(3, -1) * 255).round().to(torch.uint8)
         return Rollout(features=codes, shown={"rgb": rgb})

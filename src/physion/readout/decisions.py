@@ -27,7 +27,7 @@ from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.registry import Registry
 from physion.models.noisy_simulation import best_threshold
 from physion.numerics.elementary import log
-from physion.readout.features import Knobs, Outcomes
+from physion.readout.features import Arguments, Outcomes
 from physion.readout.logistic import LogisticSettings, fit_readout
 
 Booleans = NDArray[np.bool_]
@@ -101,15 +101,18 @@ class FeatureDecision(Protocol):
 
 
 class RolloutDecision(Protocol):
-    """Decision on imagined gaps or contacts, for one or several values of the knobs."""
+    """Decision on imagined gaps or contacts, for one or several sets of arguments."""
 
     input: Literal["rollouts"]
     labels: Literal["simulated", "recorded"]
 
     def decide(
-        self, fit: Mapping[Knobs, Outcomes], labels: Booleans, test: Mapping[Knobs, Outcomes]
+        self,
+        fit: Mapping[Arguments, Outcomes],
+        labels: Booleans,
+        test: Mapping[Arguments, Outcomes],
     ) -> Decided:
-        """Fit on the outcomes of n trials at all knobs, and decide on m other trials."""
+        """Fit on the outcomes of n trials with every set of arguments, and decide on m other trials."""
         ...
 
 
@@ -147,13 +150,13 @@ class GapDecision:
 
     def decide(
         self,
-        fit: Mapping[Knobs, Outcomes],
+        fit: Mapping[Arguments, Outcomes],
         labels: NDArray[np.bool_],
-        test: Mapping[Knobs, Outcomes],
+        test: Mapping[Arguments, Outcomes],
     ) -> Decided:
         """Fit the threshold on the gaps (n, S) of the fit trials and apply it to the others."""
-        (knobs,) = fit
-        near, tested = fit[knobs].gap, test[knobs].gap
+        (arguments,) = fit
+        near, tested = fit[arguments].gap, test[arguments].gap
         if near is None or tested is None:
             raise BadInputError(
                 "the decision 'gap' needs distances, but the model gives contacts only; "
@@ -165,7 +168,7 @@ class GapDecision:
         return Decided(
             fraction_of_futures(tested <= threshold),
             accuracy,
-            fitted={**dict(knobs), "gap": threshold},
+            fitted={**dict(arguments), "gap": threshold},
         )
 
 
@@ -182,21 +185,21 @@ class TouchDecision:
 
     def decide(
         self,
-        fit: Mapping[Knobs, Outcomes],
+        fit: Mapping[Arguments, Outcomes],
         labels: NDArray[np.bool_],
-        test: Mapping[Knobs, Outcomes],
+        test: Mapping[Arguments, Outcomes],
     ) -> Decided:
         """Decide on the futures of the tested trials; the fit trials only give the accuracy."""
-        (knobs,) = test
-        known = fraction_of_futures(fit[knobs].touches()) > 0.5
+        (arguments,) = test
+        known = fraction_of_futures(fit[arguments].touches()) > 0.5
         accuracy = float(np.mean(known == labels)) if len(labels) else float("nan")
-        probability = fraction_of_futures(test[knobs].touches())
-        return Decided(probability, accuracy, fitted=dict(knobs))
+        probability = fraction_of_futures(test[arguments].touches())
+        return Decided(probability, accuracy, fitted=dict(arguments))
 
 
 @dataclass(frozen=True)
 class NoiseDecision:
-    """Fraction of simulations with a contact, at the knobs with the highest likelihood.
+    """Fraction of simulations with a contact, at the arguments with the highest likelihood.
 
     It is fitted on recorded outcomes where there are any: compared with the outcomes of its own
     engine, a simulation would always fit best without noise.
@@ -208,14 +211,14 @@ class NoiseDecision:
 
     def decide(
         self,
-        fit: Mapping[Knobs, Outcomes],
+        fit: Mapping[Arguments, Outcomes],
         labels: NDArray[np.bool_],
-        test: Mapping[Knobs, Outcomes],
+        test: Mapping[Arguments, Outcomes],
     ) -> Decided:
-        """Choose the knobs on the fit trials and return the fractions of the others."""
-        fractions = {knobs: outcomes.fractions() for knobs, outcomes in fit.items()}
-        samples = {knobs: outcomes.samples for knobs, outcomes in test.items()}
-        chosen = fit_knobs(fractions, samples, labels)
+        """Choose the arguments on the fit trials and return the fractions of the others."""
+        fractions = {arguments: outcomes.fractions() for arguments, outcomes in fit.items()}
+        samples = {arguments: outcomes.samples for arguments, outcomes in test.items()}
+        chosen = fit_arguments(fractions, samples, labels)
         accuracy = np.mean((fractions[chosen] > 0.5) == labels) if len(labels) else float("nan")
         return Decided(test[chosen].fractions(), float(accuracy), fitted=dict(chosen))
 
@@ -233,17 +236,17 @@ def log_likelihood(fractions: NDArray[Any], samples: int, outcomes: NDArray[Any]
     return math.fsum(log(np.where(np.asarray(outcomes, bool), p, 1.0 - p))) / len(p)
 
 
-def fit_knobs(
-    fractions: Mapping[Knobs, NDArray[Any]],
-    samples: Mapping[Knobs, int],
+def fit_arguments(
+    fractions: Mapping[Arguments, NDArray[Any]],
+    samples: Mapping[Arguments, int],
     outcomes: NDArray[np.bool_],
-) -> Knobs:
-    """Return the knobs with the highest likelihood of ``outcomes``; among equals the smallest.
+) -> Arguments:
+    """Return the arguments with the highest likelihood of ``outcomes``; among equals the smallest.
 
     Parameters
     ----------
     fractions
-        For each value of the knobs the fractions (n,) of simulations with a contact.
+        For each set of arguments the fractions (n,) of simulations with a contact.
     samples
         Simulations per trial, for each value.
     outcomes

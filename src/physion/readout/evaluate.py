@@ -222,7 +222,7 @@ def _is_trained(model: Any, settings: EvaluationSettings) -> bool:
         return False
     # What is trained on features predicts features, which the other readouts do not need.
     needed = not settings.readouts or Readout.OBSERVED_SIMULATED.value in settings.readouts
-    return ask(model, "diet") != "features" or needed
+    return ask(model, "learns_from") != "features" or needed
 
 
 @dataclass(frozen=True)

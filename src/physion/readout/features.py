@@ -272,10 +272,10 @@ def encode_clips(model: Model, batch: Batch) -> list[Arrays]:
 
 
 def imagine_clips(
-    model: Model, batch: Batch, samples: int, seed: int, knobs: Mapping[str, float]
+    model: Model, batch: Batch, samples: int, seed: int, arguments: Mapping[str, float]
 ) -> list[Arrays]:
     """Return features (S * future, D), gap (S) and contact (S) of every clip, if given."""
-    rollout = call_model(model, "imagine", batch, samples, seed, **knobs)
+    rollout = call_model(model, "imagine", batch, samples, seed, **arguments)
     if not isinstance(rollout, Rollout):
         raise BadInputError(
             f"model {model_name(model)!r}: imagine gave {type(rollout).__name__}, expected Rollout"
@@ -313,8 +313,8 @@ def _split(arrays: Mapping[str, NDArray[Any]], clips: int) -> list[Arrays]:
 
 # Imagined futures of trials.
 
-Knobs = tuple[tuple[str, float], ...]
-"""Values of the knobs of a model, sorted by name."""
+Arguments = tuple[tuple[str, float], ...]
+"""Arguments of `imagine` and their values, sorted by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,7 +347,7 @@ class Outcomes:
 
 @dataclass(frozen=True, eq=False)
 class Imagined:
-    """What a model imagined of n trials at one value of the knobs."""
+    """What a model imagined of n trials with one set of arguments."""
 
     model: str
     rows: Mapping[str, FeatureArrays]
@@ -378,10 +378,10 @@ class Imagined:
         return Outcomes(contact, gap)
 
 
-def all_knobs(knobs: Mapping[str, Sequence[float]]) -> list[Knobs]:
-    """Return every combination of the values of ``knobs``; one empty one without knobs."""
-    names = sorted(knobs)
-    values = [[float(value) for value in knobs[name]] for name in names]
+def all_arguments(arguments: Mapping[str, Sequence[float]]) -> list[Arguments]:
+    """Return every combination of the values of ``arguments``; one empty one without arguments."""
+    names = sorted(arguments)
+    values = [[float(value) for value in arguments[name]] for name in names]
     return [tuple(zip(names, chosen, strict=True)) for chosen in itertools.product(*values)]
 
 
@@ -479,12 +479,12 @@ class FeatureStore:
         *,
         samples: int,
         seed: int,
-        knobs: Mapping[str, Sequence[float]],
+        arguments: Mapping[str, Sequence[float]],
         context: StoredFeatures | None = None,
         together: int = 0,
         progress: Progress | None = None,
-    ) -> dict[Knobs, Imagined]:
-        """Return what ``model.imagine`` gives for the observed part of ``trials``, at all knobs.
+    ) -> dict[Arguments, Imagined]:
+        """Return what the model imagines of ``trials`` with every set of arguments.
 
         Parameters
         ----------
@@ -494,7 +494,7 @@ class FeatureStore:
             Source of the context.
         trials
             Names of trials.
-        samples, seed, knobs
+        samples, seed, arguments
             Number of futures S, seed and settings for ``model.imagine``.
         context
             Features of the context of at least ``trials``, for a model that also encodes.
@@ -511,18 +511,18 @@ class FeatureStore:
             reason.
         """
         place = {trial: row for row, trial in enumerate(context.trials if context else ())}
-        found: dict[Knobs, Imagined] = {}
-        works: dict[Knobs, _Work] = {}
-        for value in all_knobs(knobs):
+        found: dict[Arguments, Imagined] = {}
+        works: dict[Arguments, _Work] = {}
+        for value in all_arguments(arguments):
 
-            def compute(group: tuple[str, ...], value: Knobs = value) -> list[Arrays]:
+            def compute(group: tuple[str, ...], value: Arguments = value) -> list[Arrays]:
                 batch = _read_clips(source.context, group)
                 if context is not None:
                     features = context.select([place[trial] for trial in group]).array()
                     batch = dataclasses.replace(batch, features=features)
                 return imagine_clips(model, batch, samples, seed, dict(value))
 
-            settings = json.dumps({"samples": samples, "seed": seed, "knobs": dict(value)})
+            settings = json.dumps({"samples": samples, "seed": seed, "arguments": dict(value)})
             works[value] = _Work(
                 IMAGINED, model.digest, compute, model_name(model), IMAGINED, settings
             )
@@ -579,16 +579,16 @@ class FeatureStore:
 
     def _rows_of_processes(
         self,
-        works: Mapping[Knobs, _Work],
+        works: Mapping[Arguments, _Work],
         request: _Request,
         source: ObservedSource,
         trials: Sequence[str],
         together: int,
         progress: Progress | None,
-    ) -> dict[Knobs, dict[str, FeatureArrays]]:
-        """Return the arrays of every trial at all knobs, computed by the executor."""
+    ) -> dict[Arguments, dict[str, FeatureArrays]]:
+        """Return the arrays of every trial with all arguments, computed by the executor."""
         digest = _ask_digest(next(iter(works.values())))
-        paths: dict[Knobs, dict[str, Path | None]] = {value: {} for value in works}
+        paths: dict[Arguments, dict[str, Path | None]] = {value: {} for value in works}
         for trial in dict.fromkeys(trials):
             try:
                 key = source.key(trial, "context")
@@ -606,9 +606,9 @@ class FeatureStore:
                 if group not in read:
                     read[group] = list(self._contexts(source, group))
                 for context in read[group]:
-                    knobs = " ".join(f"{knob}={level:g}" for knob, level in value)
-                    name = f"{context.trials[0]} {knobs}".strip()
-                    requests[name] = dataclasses.replace(request, context=context, knobs=value)
+                    arguments = " ".join(f"{argument}={level:g}" for argument, level in value)
+                    name = f"{context.trials[0]} {arguments}".strip()
+                    requests[name] = dataclasses.replace(request, context=context, arguments=value)
         done, total = 0, sum(len(asked.trials) for asked in requests.values())
         for outcome in self._executor.map(_imagine_request, requests):
             asked = requests[outcome.key]
@@ -617,7 +617,7 @@ class FeatureStore:
                 if isinstance(made, str):
                     self.problems[trial] = made
                 else:
-                    found[asked.knobs][trial] = _write(paths[asked.knobs][trial], made)
+                    found[asked.arguments][trial] = _write(paths[asked.arguments][trial], made)
                 done += 1
                 if progress is not None:
                     progress("rollouts", done, total)
@@ -645,7 +645,7 @@ class FeatureStore:
 
 @dataclass(frozen=True, eq=False)
 class _Request:
-    """Trials at one value of the knobs: what a worker process needs.
+    """Trials with one set of arguments: what a worker process needs.
 
     ``files`` comes before ``model``, whose class may stand in one of them.
     """
@@ -655,7 +655,7 @@ class _Request:
     context: Batch | None
     samples: int
     seed: int
-    knobs: Knobs
+    arguments: Arguments
 
     @property
     def trials(self) -> tuple[str, ...]:
@@ -671,8 +671,8 @@ def _imagine_request(request: _Request) -> list[Arrays | str]:
     context = request.context
     assert context is not None, "set for every group of trials"
     try:
-        knobs = dict(request.knobs)
-        return [*imagine_clips(request.model, context, request.samples, request.seed, knobs)]
+        arguments = dict(request.arguments)
+        return [*imagine_clips(request.model, context, request.samples, request.seed, arguments)]
     except PhysionError as error:
         if len(context) == 1:
             return [" ".join(str(error).split())]

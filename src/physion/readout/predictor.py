@@ -24,7 +24,7 @@ from physion.readout.decisions import (
     RolloutDecision,
     decisions,
 )
-from physion.readout.features import FeatureStore, Imagined, Knobs, StoredFeatures
+from physion.readout.features import Arguments, FeatureStore, Imagined, StoredFeatures
 from physion.readout.folds import Fold, Protocol, ScenarioSplit
 from physion.readout.logistic import LogisticSettings
 from physion.readout.model_calls import call_model, check_finite, is_network, to_array
@@ -296,15 +296,15 @@ class Predictor:
         context = self._store.encoded(self.model, self._observed, trials, "context", self.progress)
         if readout is Readout.OBSERVED:
             return [context]
-        samples, seed, knobs = self._rollout_settings()
-        first = {name: values[:1] for name, values in knobs.items()}
+        samples, seed, arguments = self._rollout_settings()
+        first = {name: values[:1] for name, values in arguments.items()}
         (imagined,) = self._store.imagined(
             self.model,
             self._observed,
             trials,
             samples=samples,
             seed=seed,
-            knobs=first,
+            arguments=first,
             context=context,
             progress=self.progress,
         ).values()
@@ -318,12 +318,12 @@ class Predictor:
 
     def _rollout_settings(self) -> tuple[int, int, Mapping[str, tuple[float, ...]]]:
         model = self.model
-        samples, seed, knobs = (ask(model, name) for name in ("samples", "seed", "knobs"))
-        return samples, self.seed if seed is None else seed, knobs
+        samples, seed, arguments = (ask(model, name) for name in ("samples", "seed", "arguments"))
+        return samples, self.seed if seed is None else seed, arguments
 
-    def _imagined(self, trials: Sequence[str]) -> dict[Knobs, Imagined]:
-        """Return what could be imagined of the trials, at all knobs."""
-        samples, seed, knobs = self._rollout_settings()
+    def _imagined(self, trials: Sequence[str]) -> dict[Arguments, Imagined]:
+        """Return what could be imagined of the trials, with all arguments."""
+        samples, seed, arguments = self._rollout_settings()
         model = self.model
         shared = ask(model, "trials_together")
         return self._store.imagined(
@@ -332,7 +332,7 @@ class Predictor:
             trials,
             samples=samples,
             seed=seed,
-            knobs=knobs,
+            arguments=arguments,
             # A network stays in this process, unless it says otherwise.
             together=shared if is_network(model) else max(shared, 1),
             progress=self.progress,
@@ -352,8 +352,8 @@ class Predictor:
         if not test:
             return Decided(np.empty(0), _UNKNOWN), fit, test, decision.labels
         labels = self._labels(fit, decision.labels)
-        near = {knobs: imagined.outcomes(fit) for knobs, imagined in found.items()}
-        tested = {knobs: imagined.outcomes(test) for knobs, imagined in found.items()}
+        near = {arguments: imagined.outcomes(fit) for arguments, imagined in found.items()}
+        tested = {arguments: imagined.outcomes(test) for arguments, imagined in found.items()}
         return decision.decide(near, labels, tested), fit, test, decision.labels
 
     def _answer(

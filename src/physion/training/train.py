@@ -183,7 +183,7 @@ def train_model(
     settings
         Optimiser and schedule; by default the model's.
     features
-        Returns features (n, T, D) of whole clips, for models whose diet is features.
+        Returns features (n, T, D) of whole clips, for models that learn from features.
     accelerator
         Lightning's name of the device: auto, cpu, cuda, ...
     fabric
@@ -280,7 +280,9 @@ def training_inputs(
     chosen = dataclasses.asdict(settings)
     return {
         "model": model.digest(),
-        "features": ask(model, "encoder_digest")() if ask(model, "diet") == "features" else "",
+        "features": ask(model, "encoder_digest")()
+        if ask(model, "learns_from") == "features"
+        else "",
         "trials": keys.hexdigest(),
         "settings": {
             name: list(value) if isinstance(value, tuple) else value
@@ -288,7 +290,7 @@ def training_inputs(
             if name not in _NOT_HASHED
         },
         "seed": seed,
-        "diet": ask(model, "diet"),
+        "learns_from": ask(model, "learns_from"),
         "window": ask(model, "window") or model.spec.total,
     }
 
@@ -315,7 +317,7 @@ def _windows(
 ) -> TrainingData:
     rows, held = hold_out(len(trials), settings.held_out, seed)
     window = ask(model, "window") or model.spec.total
-    if ask(model, "diet") != "features":
+    if ask(model, "learns_from") != "features":
         chosen, rest = (tuple(trials[row] for row in part) for part in (rows, held))
         chooses = model if can(model, "start_probabilities") else None
         training = ClipWindows(source, chosen, window, chooses)

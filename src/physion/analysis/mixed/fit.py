@@ -659,8 +659,8 @@ def fit_linear(formula: str, data: pd.DataFrame, level: float = 0.95) -> MixedFi
     for group in design.groups:
         if group.levels * len(group.effects) >= len(design.y):
             raise BadInputError(
-                f"{group.name!r} has as many levels as there are rows: its variance cannot be
-                estimated " "from the residual one"
+                f"{group.name!r} has as many levels as there are rows: its variance "
+                "cannot be estimated from the residual one"
                 if len(group.effects) == 1
                 else f"{group.name!r} has as many random effects as there are rows"
             )

@@ -554,8 +554,8 @@ class ConstantMotion(Baseline):
             inputs=("state",), stride=1, context=1, future=settings.frames, context_at="end"
         )
 
-    def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
-        """Return gaps and contacts (B, samples); nothing is random and there are no knobs."""
+    def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
+        """Return gaps and contacts (B, samples); nothing is random; ``arguments`` are not used."""
         pairs = zip(motions(context, self.name), context.trials, strict=True)
         gaps = np.array([self._gap(observed_motion(motion, trial)) for motion, trial in pairs])
         repeated = np.repeat(gaps.reshape(-1, 1), samples, axis=1)

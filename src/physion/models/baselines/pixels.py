@@ -67,7 +67,7 @@ class CopyLastFrame(Baseline):
         rgb = pictures(batch, self.spec.image_size, self.name)
         return np.divide(rgb.reshape(*rgb.shape[:2], -1), 255, dtype=np.float32)
 
-    def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
+    def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
         """Return the last frame's features, repeated; all ``samples`` are equal.
 
         With pictures in ``context``, ``shown`` holds them under ``rgb``.

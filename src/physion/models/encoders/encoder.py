@@ -39,7 +39,7 @@ from physion.models.encoders.weights import (
     feature_size,
     input_statistics,
 )
-from physion.models.interface import Diet, ModelSettings, TrainingSettings
+from physion.models.interface import LearnsFrom, ModelSettings, TrainingSettings
 from physion.models.torch_model import TorchModel, digest_of, initial_weights
 from physion.models.vision import normalized_pictures
 
@@ -296,7 +296,7 @@ class EncoderModel(TorchModel):
         features: Tensor = network(pictures.flatten(0, 1))
         return features.float().view(*pictures.shape[:2], -1)
 
-    def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
+    def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
         """Roll the dynamics out from ``context.features`` (B, c, D).
 
         The dynamics are deterministic: all samples are equal, and ``seed`` has no effect. Unlike
@@ -433,7 +433,7 @@ class EncoderModel(TorchModel):
 class FineTunedEncoder(EncoderModel):
     """Encoder that is trained with the dynamics; its weights are saved with theirs."""
 
-    diet: Diet = "clips"
+    learns_from: LearnsFrom = "clips"
     suffix = "fine-tuned"
     encoder_task = "L2 on latent, distillation of the initial encoder"
 
@@ -497,7 +497,7 @@ class FineTunedEncoder(EncoderModel):
 class FrozenEncoder(EncoderModel):
     """Frozen encoder with dynamics. The encoder is no parameter and is loaded at first use."""
 
-    diet: Diet = "features"
+    learns_from: LearnsFrom = "features"
 
     def __init__(self, settings: EncoderSettings, training: TrainingSettings) -> None:
         super().__init__(settings, training)

@@ -43,7 +43,7 @@ from physion.core.errors import BadInputError
 from physion.core.seeds import generator
 from physion.models.baselines.motion import FAR
 from physion.models.checkpoint import load_named
-from physion.models.interface import RANDOM, Diet, SizedSettings, Sizes, TrainingSettings
+from physion.models.interface import RANDOM, LearnsFrom, SizedSettings, Sizes, TrainingSettings
 from physion.models.noisy_simulation import best_threshold
 from physion.models.particles.bodies import (
     CLOTH,
@@ -367,7 +367,7 @@ class ParticleSimulator(TorchModel):
     a cloth and a body. It is fitted after training (`calibrate`) and stored with the weights.
     """
 
-    diet: Diet = "states"
+    learns_from: LearnsFrom = "states"
     calibration_trials = 256
     touch: Tensor
 
@@ -492,11 +492,11 @@ class ParticleSimulator(TorchModel):
             self.touch[row] = best_threshold(gaps[which], labels[which])
 
     @torch.no_grad()
-    def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
+    def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
         """Return the smallest gap (B, S) of agent and patient, less the fitted ``touch``.
 
         It counts steps that are imagined and the time between them; see `gaps` for a contact that
-        was observed. With the knob ``show`` above 0, ``shown`` holds the imagined particles
+        was observed. With the argument ``show`` above 0, ``shown`` holds the imagined particles
         (B, S, F, P, 3) and the object of each, ``things`` (B, P), its index in `Scene.names`; NaN
         and -1 where a trial has fewer frames or particles than another. The frames are 44 + s,
         44 + 2 s, ... with the stride s.
@@ -504,7 +504,7 @@ class ParticleSimulator(TorchModel):
         if context.state is None:
             raise BadInputError("a particle model imagines from motions, which the batch lacks")
         futures = self.futures(context.state, samples, seed)
-        shown = shown_particles(futures, self.spec.context) if knobs.get("show", 0) > 0 else {}
+        shown = shown_particles(futures, self.spec.context) if arguments.get("show", 0) > 0 else {}
         return Rollout(gap=self.gaps(context.state, futures), shown=shown)
 
     @torch.no_grad()
