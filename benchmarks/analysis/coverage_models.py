@@ -88,7 +88,7 @@ def of_stimuli(coverage: Coverage, size: Size, repeats: int) -> None:
         if wanted[1]:
             _easy(coverage, size, study)
         bin_ = reliability_curve(study.p_contact[1], study.label).iloc[8]
-        coverage.add(bin_name, "stimuli", size, bin_["share"], bin_["low"], bin_["high"])
+        coverage.add(bin_name, "stimuli", size, bin_["fraction"], bin_["low"], bin_["high"])
 
 
 def _differences(coverage: Coverage, size: Size, study: Study) -> None:

@@ -140,7 +140,7 @@ def test_calibration_is_the_share_of_contact_in_each_bin(make_comparison: Maker)
     own = comparison.stimuli[comparison.stimuli["model"] == comparison.names[0]]
     first = table[(table["model"] == comparison.names[0]) & (table["from"] == 0.5)].iloc[0]
     inside = own[(own["p_contact"] >= 0.5) & (own["p_contact"] < 0.6)]
-    assert first["stimuli"] == len(inside) and first["share"] == inside["label"].mean()
+    assert first["stimuli"] == len(inside) and first["fraction"] == inside["label"].mean()
     assert first["brier"] == pytest.approx(((own["p_contact"] - own["label"]) ** 2).mean())
 
 

@@ -243,8 +243,8 @@ class Model:
         """Return ``samples`` futures of every clip.
 
         ``seed`` and the names of the trials determine all random numbers. ``arguments`` are
-        values that a decision fits. If the model encodes, ``context.features`` holds the features of the
-        context.
+        values that a decision fits. If the model encodes, ``context.features`` holds the
+        features of the context.
         """
         raise NotImplementedError
 

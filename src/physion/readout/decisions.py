@@ -112,7 +112,7 @@ class RolloutDecision(Protocol):
         labels: Booleans,
         test: Mapping[Arguments, Outcomes],
     ) -> Decided:
-        """Fit on the outcomes of n trials with every set of arguments, and decide on m other trials."""
+        """Fit on the outcomes of n trials with each set of arguments; decide on m others."""
         ...
 
 

@@ -261,7 +261,7 @@ def _biases(tables: Mapping[str, pd.DataFrame]) -> Markup:
         PageColumn("question", "question", "text"),
         PageColumn("answer", "answer", "text"),
         PageColumn("sessions", "sessions", "count"),
-        PageColumn("fraction", "share", "percent"),
+        PageColumn("fraction", "fraction", "percent"),
     ]
     return (
         rows_table(tables["yes_bias"], yes, "Saying yes; a criterion below 0 leans to it")

@@ -278,11 +278,10 @@ def training_inputs(
     for trial in trials:
         keys.update(f"{trial} {source.key(trial, 'whole')}\n".encode())
     chosen = dataclasses.asdict(settings)
+    learns_from = ask(model, "learns_from")
     return {
         "model": model.digest(),
-        "features": ask(model, "encoder_digest")()
-        if ask(model, "learns_from") == "features"
-        else "",
+        "features": ask(model, "encoder_digest")() if learns_from == "features" else "",
         "trials": keys.hexdigest(),
         "settings": {
             name: list(value) if isinstance(value, tuple) else value
@@ -290,7 +289,7 @@ def training_inputs(
             if name not in _NOT_HASHED
         },
         "seed": seed,
-        "learns_from": ask(model, "learns_from"),
+        "learns_from": learns_from,
         "window": ask(model, "window") or model.spec.total,
     }
 

@@ -525,9 +525,9 @@ def test_the_parts_of_the_brier_score_add_up(pair: tuple[Array, Array], bins: in
     curve = reliability_curve(p, label, bins)
     assert curve["stimuli"].sum() == len(p) and len(curve) == bins
     full = curve[curve["stimuli"] > 0]
-    assert full["share"].between(full["low"] - 1e-12, full["high"] + 1e-12).all()
+    assert full["fraction"].between(full["low"] - 1e-12, full["high"] + 1e-12).all()
     assert full["mean_p"].between(full["from"] - 1e-9, full["to"] + 1e-9).all()
-    gap = np.sum(full["stimuli"] / len(p) * (full["mean_p"] - full["share"]).abs())
+    gap = np.sum(full["stimuli"] / len(p) * (full["mean_p"] - full["fraction"]).abs())
     assert found.calibration_error == pytest.approx(gap, abs=1e-12)
 
 

@@ -181,8 +181,8 @@ def learning(test: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
 def background(sessions: pd.DataFrame) -> pd.DataFrame:
     """Count the answers to the questionnaire: one row per question and answer.
 
-    Columns: ``question``, ``answer`` (``(none)`` if not answered), ``sessions``, ``share``
-    (fraction).
+    Columns: ``question``, ``answer`` (``(none)`` if not answered), ``sessions``,
+    ``fraction``.
     """
     parts = []
     for column in _asked(sessions):
@@ -196,11 +196,11 @@ def background(sessions: pd.DataFrame) -> pd.DataFrame:
                     "question": column,
                     "answer": [str(value) for value in counts.index],
                     "sessions": counts.to_numpy(),
-                    "share": counts.to_numpy() / max(len(sessions), 1),
+                    "fraction": counts.to_numpy() / max(len(sessions), 1),
                 }
             )
         )
-    columns = ["question", "answer", "sessions", "share"]
+    columns = ["question", "answer", "sessions", "fraction"]
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
 
 

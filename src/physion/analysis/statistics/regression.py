@@ -91,7 +91,7 @@ def reliability_curve(
 ) -> pd.DataFrame:
     """Return one row for each bin of equal width in 0..1, including empty ones.
 
-    Columns: ``from``, ``to`` (the last bin includes 1), ``stimuli``, ``mean_p``, ``share``
+    Columns: ``from``, ``to`` (the last bin includes 1), ``stimuli``, ``mean_p``, ``fraction``
     (fraction of stimuli with contact) with ``low``, ``high`` (Wilson's interval); NaN in empty
     bins.
     """
@@ -113,7 +113,7 @@ def reliability_curve(
             "to": edges[1:],
             "stimuli": n.astype(int),
             "mean_p": mean_p,
-            "share": fraction,
+            "fraction": fraction,
             "low": centre - half,
             "high": centre + half,
         }

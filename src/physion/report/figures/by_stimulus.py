@@ -193,9 +193,9 @@ def calibration_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
             axis.plot([0, 1], [0, 1], color=theme.faint, linewidth=1, linestyle=":")
             axis.vlines(rows["mean_p"], rows["low"], rows["high"], color=theme.palette[0],
                         linewidth=1.1)  # fmt: skip
-            axis.plot(rows["mean_p"], rows["share"], color=theme.palette[0], linewidth=0.8)
+            axis.plot(rows["mean_p"], rows["fraction"], color=theme.palette[0], linewidth=0.8)
             fraction = rows["stimuli"] / rows["stimuli"].sum()
-            axis.scatter(rows["mean_p"], rows["share"], s=8 + 160 * fraction, zorder=3,
+            axis.scatter(rows["mean_p"], rows["fraction"], s=8 + 160 * fraction, zorder=3,
                          color=theme.palette[0], edgecolors=theme.ink, linewidths=0.6)  # fmt: skip
             words = label(model, 30 if columns == 5 else 44)
             brier = table.loc[table["model"] == model, "brier"].iloc[0]
