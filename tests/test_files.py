@@ -26,7 +26,7 @@ from physion.core.files import (
 )
 
 
-def test_a_file_has_its_digest_beside_it(tmp_path: Path) -> None:
+def test_a_file_has_its_digest_next_to_it(tmp_path: Path) -> None:
     path = tmp_path / "t.csv"
     assert not is_whole(path) and not has_digest(path)
     write_with_digest(path, b"a,b\n1,2\n")

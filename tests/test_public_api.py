@@ -113,6 +113,6 @@ def test_examples_in_docstrings_are_true(name: str) -> None:
         assert runner.run(test).failed == 0, name
 
 
-def test_the_version_is_that_of_the_distribution() -> None:
+def test_the_version_matches_the_distribution() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert project["version"] == physion.__version__

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+import io
 import re
+import tokenize
 from collections import Counter
 from functools import cache
 from pathlib import Path
@@ -16,6 +18,13 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 FOLDERS = sorted({path.relative_to(PACKAGE).parts[0] for path in SOURCES})
 GLOSSARY = ROOT / "docs" / "glossary.md"
 OFFICIAL = ROOT / "docs" / "official-system.md"
+TEXT_FILES = {".py", ".toml", ".html", ".js", ".ts"}
+ALLOWED_TEXTS = (
+    "not told whether you were right",  # said to participants
+    "imported: movie alone",  # stored in trial files
+    "black handle and knob",
+)
+"""Texts with a banned word that stay."""
 
 
 def table_rows(heading: str) -> list[list[str]]:
@@ -31,11 +40,12 @@ def terms(cells: list[str]) -> frozenset[str]:
 
 
 @cache
-def banned_words() -> tuple[frozenset[str], frozenset[str]]:
-    """Return the words banned from names, and those from first lines of docstrings."""
+def banned_words() -> tuple[frozenset[str], frozenset[str], frozenset[str]]:
+    """Return the words banned from names, from first lines of docstrings and from all texts."""
     rows = table_rows("Say this, not that")
-    in_names, in_docstrings = ([row[k] for row in rows if len(row) > k] for k in (2, 3))
-    return terms(in_names), terms(in_docstrings)
+    lists = ([row[k] for row in rows if len(row) > k] for k in (2, 3, 4))
+    in_names, in_first_lines, in_texts = (terms(cells) for cells in lists)
+    return in_names, in_first_lines, in_texts
 
 
 @cache
@@ -57,7 +67,7 @@ def name_parts(name: str) -> set[str]:
 
 def find_banned(tree: ast.AST) -> list[str]:
     """Return banned words of defined names and of first docstring lines, with their line."""
-    in_names, in_docstrings = banned_words()
+    in_names, in_docstrings, _ = banned_words()
     defined = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
     hits = []
     for node in ast.walk(tree):
@@ -83,14 +93,102 @@ def test_names_and_first_lines_hold_no_banned_word(folder: str) -> None:
     assert not hits, "see docs/glossary.md\n" + "\n".join(hits)
 
 
-def test_the_search_finds_banned_words() -> None:
+def texts_of(path: Path) -> list[tuple[int, str]]:
+    """Return strings and comments of Python code, or the whole of another file, with their lines.
+
+    What is between backquotes is a name and left out. Comments of successive lines are one text.
+    """
+    if path.suffix != ".py":
+        return [(1, re.sub(r"`+[^`\n]*`+", "``", path.read_text()))]
+    texts: list[tuple[int, str]] = []
+    comment = ""
+    for token in tokenize.generate_tokens(io.StringIO(path.read_text()).readline):
+        if token.type == tokenize.COMMENT:
+            comment += token.string.lstrip("#:") + "\n"
+        elif token.type == tokenize.STRING:
+            texts.append((token.start[0], re.sub(r"`+[^`]*`+", "``", token.string)))
+        elif comment and token.type not in (tokenize.NL, tokenize.NEWLINE):
+            texts.append(
+                (token.start[0] - comment.count("\n"), re.sub(r"`+[^`]*`+", "``", comment))
+            )
+            comment = ""
+    return texts
+
+
+def has_kernels(path: Path) -> bool:
+    """Return whether a file holds compiled functions, which a new docstring would compile anew."""
+    return (
+        path.suffix == ".py"
+        and re.search("numba|numerics.kernel import", path.read_text()) is not None
+    )
+
+
+def find_in_texts(path: Path) -> list[str]:
+    """Return the words of a file that are banned from all texts, with their lines."""
+    words = sorted(banned_words()[2])
+    banned = re.compile(rf"\b(?:{'|'.join(word for word in words)})\b", re.I)
+    hits = []
+    for line, text in texts_of(path):
+        joined = re.sub(r"\s+", " ", text)
+        for allowed in ALLOWED_TEXTS:
+            joined = joined.replace(allowed, "-" * len(allowed))
+        hits += [
+            f"line {line} on: {joined[max(0, match.start() - 30) : match.end() + 30]!r}"
+            for match in banned.finditer(joined)
+        ]
+    return hits
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_texts_of_the_package_hold_no_banned_word(folder: str) -> None:
+    hits = [
+        f"{path.relative_to(ROOT)}, {hit}"
+        for path in sorted((PACKAGE / folder).rglob("*") if (PACKAGE / folder).is_dir() else [])
+        if path.suffix in TEXT_FILES and not {"vendor", "data"} & set(path.parts)
+        if not has_kernels(path)
+        for hit in find_in_texts(path)
+    ]
+    assert not hits, "see docs/glossary.md\n" + "\n".join(hits)
+
+
+def test_pages_of_the_documentation_hold_no_banned_word() -> None:
+    pages = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    hits = [
+        f"{page.relative_to(ROOT)}, {hit}"
+        for page in pages
+        if page not in (GLOSSARY, OFFICIAL) and page.parent.name != "results"
+        for hit in find_in_texts(page)
+    ]
+    assert not hits, "see docs/glossary.md\n" + "\n".join(hits)
+
+
+def test_names_of_tests_hold_no_banned_word() -> None:
+    banned = re.compile(
+        "|".join(rf"_{word.replace(' ', '_')}(?=_|$)" for word in banned_words()[2])
+    )
+    hits = [
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in sorted((ROOT / "tests").rglob("test_*.py"))
+        for name in re.findall(r"^ *def (test_\w+)", path.read_text(), re.MULTILINE)
+        if banned.search(name)
+    ]
+    assert not hits, "see docs/glossary.md\n" + "\n".join(hits)
+
+
+def test_the_search_finds_banned_words(tmp_path: Path) -> None:
     assert len(banned_words()[0]) > 10 and "share of" in banned_words()[1]
     code = 'def fit_share(rng, chance):\n    """Say it in words."""\n\nclass RoundTrip: pass\n'
     assert len(find_banned(ast.parse(code))) == 4
     assert not find_banned(ast.parse('def background(surround):\n    """Draw."""\n'))
+    file = tmp_path / "code.py"
+    file.write_text('"""Return that\n    of ``told``."""\nx = f"it is told"  # those\n# of them\n')
+    assert len(find_in_texts(file)) == 3
+    page = tmp_path / "page.md"
+    page.write_text("The page that offers `told` and lists those\nof others.")
+    assert len(find_in_texts(page)) == 1
 
 
-def test_a_banned_word_is_allowed_in_a_term_alone() -> None:
+def test_a_banned_word_is_allowed_in_a_whole_term() -> None:
     assert all(set(term.split()) & banned_words()[0] for term in allowed_terms())
     names = (
         "below_chance_level",

@@ -15,7 +15,7 @@ from physion.cli import output
         ((0, 50), 5, []),
     ],
 )
-def test_long_work_is_told_in_lines(
+def test_long_work_is_reported_in_lines(
     done: tuple[int, ...],
     seconds: float,
     told: list[str],

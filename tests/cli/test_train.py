@@ -230,7 +230,7 @@ def test_predictions_without_a_trial_to_fit_are_named(
 
 
 @pytest.mark.slow
-def test_what_is_interrupted_goes_on_and_a_second_run_trains_nothing(
+def test_what_is_interrupted_continues_and_a_second_run_trains_nothing(
     dots: Dataset, tmp_path: Path
 ) -> None:
     model = f"{cell_models.__file__}:Slow"

@@ -217,7 +217,7 @@ def test_keys_follow_the_movie_and_what_the_spec_reads(made: Dataset, copy: Data
     assert observed_source(copy, SPEC).key(RIGID, "context") != key
 
 
-def test_the_context_of_whole_trials_is_that_of_the_observed_source(made: Dataset) -> None:
+def test_the_context_of_whole_trials_matches_the_observed_source(made: Dataset) -> None:
     observed, whole = observed_source(made, SPEC), whole_source(made, SPEC)
     assert observed.key(RIGID, "context") == whole.key(RIGID, "context")
     np.testing.assert_array_equal(observed.context([RIGID]).rgb, whole.context([RIGID]).rgb)

@@ -54,7 +54,7 @@ def test_rendered_pictures_are_those_that_the_movies_were_encoded_from(
         assert encode_movie(source.context([trial]).rgb[0]) == observed.read_bytes()
 
 
-def test_inputs_are_those_of_the_renderer(motions: dict[str, Motion]) -> None:
+def test_inputs_match_the_renderer(motions: dict[str, Motion]) -> None:
     source = RenderedSource(motions, SPEC, observed=False)
     batch = source.whole([RIGID, CLOTH])
     assert batch.frames.tolist() == [[0, 7, 14, 21, 28, 35, 42]] * 2

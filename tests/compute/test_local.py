@@ -72,7 +72,7 @@ def test_nothing_to_do_ends_at_once(executor: Executor) -> None:
 
 
 @pytest.mark.parametrize("executor", [SerialExecutor(), LocalExecutor(1)])
-def test_an_exception_fails_its_task_alone_and_is_not_tried_again(executor: Executor) -> None:
+def test_an_exception_fails_only_its_task_and_is_not_tried_again(executor: Executor) -> None:
     outcomes = {o.key: o for o in executor.map(fail_on_three, numbers(1, 2, 3, 4))}
     bad = outcomes.pop("task 3")
     assert bad.error == "three is not liked" and bad.tries == 1
@@ -139,7 +139,7 @@ def test_a_function_that_kept_processes_cannot_load_is_reported() -> None:
             list(executor.map(Unloadable(), numbers(1)))
 
 
-def test_exit_code_of_a_worker_is_told() -> None:
+def test_exit_code_of_a_worker_is_reported() -> None:
     (outcome,) = LocalExecutor(1, tries=1).map(leave, {"a": 7})
     assert outcome.error == "the worker process ended with exit code 7"
 
@@ -223,7 +223,7 @@ def test_ctrl_c_while_a_worker_imports_prints_no_traceback(tmp_path: Path) -> No
     assert (program.returncode, errors) == (130, "")
 
 
-def test_a_script_without_a_main_guard_is_told_so(tmp_path: Path) -> None:
+def test_a_script_without_a_main_guard_is_refused_with_the_reason(tmp_path: Path) -> None:
     script = tmp_path / "careless.py"
     script.write_text(
         "from physion.compute.local import LocalExecutor\n"

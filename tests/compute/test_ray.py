@@ -98,7 +98,7 @@ def test_every_task_has_one_outcome_and_a_log(tmp_path: Path) -> None:
     assert list(RayExecutor().map(square, {})) == []
 
 
-def test_an_exception_fails_its_task_alone_and_is_not_tried_again() -> None:
+def test_an_exception_fails_only_its_task_and_is_not_tried_again() -> None:
     outcomes = {o.key: o for o in RayExecutor().map(fail_on_three, numbers(1, 2, 3, 4))}
     bad = outcomes.pop("task 3")
     assert bad.error == "three is not liked" and bad.tries == 1 and "fail_on_three" in bad.traceback

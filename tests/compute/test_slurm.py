@@ -45,7 +45,7 @@ def test_every_task_has_one_outcome_and_a_log(tmp_path: Path, states: Path) -> N
 
 
 @pytest.mark.slow
-def test_an_exception_fails_its_task_alone(tmp_path: Path, states: Path) -> None:
+def test_an_exception_fails_only_its_task(tmp_path: Path, states: Path) -> None:
     executor = make(tmp_path, per_job=2)
     outcomes = {o.key: o for o in executor.map(fail_on_three, numbers(1, 2, 3, 4))}
     bad = outcomes.pop("task 3")

@@ -100,7 +100,7 @@ def test_answers_are_given_under_their_protocol(name: str, protocol: str) -> Non
 
 
 @pytest.mark.parametrize("name", [n for n in OTHERS if not can(build_model(n), "encode")])
-def test_an_answer_depends_on_its_own_trial_alone(name: str) -> None:
+def test_an_answer_depends_only_on_its_own_trial(name: str) -> None:
     model, batch = seen_by(name)
     together = answers(model, batch)
     assert len(np.unique(together)) > 1 or name == "outcome"
@@ -329,7 +329,7 @@ def block(role: str, values: dict[str, float]) -> list[float]:
     return [values[f"{role} {name}"] for name in BLOCK]
 
 
-def test_features_are_those_of_frame_44() -> None:
+def test_features_match_frame_44() -> None:
     motion = crossing(
         agent=(1.0, 2.0, 3.0), velocity=(4.0, 0.0, -1.0), spin=(0.1, 0.2, 0.3),
         patient=(5.0, 2.0, 0.0), scale=(0.5, 1.0, 2.0),
@@ -422,7 +422,7 @@ def test_order_of_the_fitted_trials_does_not_matter_and_the_seed_does() -> None:
 
 
 @pytest.mark.parametrize("only", [False, True])
-def test_one_outcome_alone_is_predicted_again(only: bool) -> None:
+def test_a_single_outcome_is_predicted_again(only: bool) -> None:
     fit, _ = some_crossings(10, 13)
     model = build_model("state-classifier", trees=3).fit(fit, np.full(10, only), 0)
     assert model.predict(fit).tolist() == [float(only)] * 10
@@ -533,7 +533,7 @@ def test_blobs_of_a_rendered_scene_are_agent_and_patient() -> None:
 @pytest.mark.parametrize(
     "model", [build_model("blob-centroids"), build_model("copy-last-frame")], ids=["blobs", "copy"]
 )
-def test_features_of_a_frame_depend_on_it_alone(model: object) -> None:
+def test_features_of_a_frame_depend_only_on_it(model: object) -> None:
     assert isinstance(model, BlobCentroids | CopyLastFrame)
     size = model.spec.image_size
     rgb = noise(4, 9, size, size, 3)
@@ -598,7 +598,7 @@ def write_humans(folder: Path, rows: str, labels: str | None) -> Path:
     return humans
 
 
-def test_outcome_is_that_of_the_whole_motion() -> None:
+def test_outcome_matches_the_whole_motion() -> None:
     batch = batch_of([crossing(touch=(50,)), crossing(), crossing(touch=(3, 4))])
     assert build_model("outcome").predict(batch).tolist() == [1, 0, 1]
 
@@ -727,7 +727,7 @@ def test_official_people_have_the_known_accuracy(official: Path) -> None:
     assert len(means) == 8 and np.mean(means) == pytest.approx(0.808, abs=0.005)
 
 
-def test_base_rate_is_that_of_trials_that_had_not_touched() -> None:
+def test_base_rate_matches_trials_that_had_not_touched() -> None:
     seen, later = crossing(touch=(44,)), crossing(touch=(45,))
     fit = batch_of([seen, seen, later, later, later, later])
     labels = np.array([True, True, True, False, False, False])

@@ -108,7 +108,7 @@ def test_any_changed_bit_of_a_file_is_noticed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damaged", [(CHECKPOINT,), (CHECKPOINT, PREVIOUS)])
-def test_training_goes_on_from_the_previous_checkpoint_or_afresh(
+def test_training_continues_from_the_previous_checkpoint_or_afresh(
     damaged: tuple[str, ...], tmp_path: Path
 ) -> None:
     _, expected = run(tmp_path / "whole")

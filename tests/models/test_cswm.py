@@ -84,7 +84,7 @@ def test_loss_of_all_pairs_of_given_states() -> None:
     assert all_pairs_loss(states[:, :1], 0.5, 9.0).item() == pytest.approx(1.0, abs=1e-6)
 
 
-def test_the_loss_of_all_pairs_is_that_of_the_pairs_one_by_one() -> None:
+def test_the_loss_of_all_pairs_matches_the_pairs_one_by_one() -> None:
     torch.manual_seed(0)
     states = 0.3 * torch.randn(3, 4, 5, 2)
     within, between = [], []
@@ -135,7 +135,7 @@ def test_ranks_of_given_states() -> None:
     assert result.reciprocal == pytest.approx((1 + 1 / 3 + 1 + 1 / 1.5) / 4)
 
 
-def test_ranks_of_a_collapsed_model_are_those_of_guessing() -> None:
+def test_ranks_of_a_collapsed_model_match_guessing() -> None:
     ranks = rank_next_states(torch.zeros(5, 3), torch.arange(5), torch.zeros(100, 3))
     assert ranks.tolist() == [50.5] * 5
 

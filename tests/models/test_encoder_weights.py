@@ -59,7 +59,7 @@ def trained() -> nn.Module:
     return model.eval()
 
 
-def test_random_encoders_depend_on_their_seed_alone(picture: Tensor) -> None:
+def test_random_encoders_depend_only_on_their_seed(picture: Tensor) -> None:
     torch.manual_seed(1)
     first = create_encoder(NAME, SIZE, EncoderWeights("random", 3))(picture)
     torch.manual_seed(2)

@@ -60,7 +60,7 @@ def test_family_and_size_stand_in_the_name(family: str, size: str) -> None:
     assert random.encoder_pretraining_task == random.encoder_pretraining_dataset == ""
 
 
-def test_encoders_are_those_of_the_paper_and_of_the_released_code() -> None:
+def test_encoders_match_the_paper_and_of_the_released_code() -> None:
     expected = {
         ("pVGG-mlp", "paper"): ("vgg19", 4096),
         ("pVGG-mlp", "released"): ("vgg16_bn", 4096),
@@ -88,7 +88,7 @@ def test_another_encoder_does_not_bear_the_name_of_the_family(tmp_path: Path) ->
     assert own.model == "pDINO-mlp-small" and own.init.startswith("local:")
 
 
-def test_unknown_sizes_list_those_of_the_family() -> None:
+def test_unknown_sizes_list_the_sizes_of_the_family() -> None:
     with pytest.raises(BadInputError, match="pEffNetLite0-mlp has the sizes small, paper, not"):
         build_model("pEffNetLite0-mlp", size="released")
 
@@ -369,7 +369,7 @@ def test_no_gradient_passes_through_the_target() -> None:
     assert not all(torch.allclose(a, b, atol=1e-5) for a, b in zip(own, open_, strict=True))
 
 
-def test_before_training_the_loss_is_that_of_the_frozen_encoder() -> None:
+def test_before_training_the_loss_matches_the_frozen_encoder() -> None:
     """Residual dynamics add nothing at first, so that it is that of repeating the last feature."""
     model, batch = fine_tuned(), clips()
     model.prepare(batch)

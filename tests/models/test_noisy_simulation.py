@@ -159,7 +159,7 @@ def test_nothing_after_the_observed_part_can_change_the_answer() -> None:
     assert fraction(model(), trial, shorter) == expected
 
 
-def test_it_goes_on_from_the_last_observed_frame_under_the_trials_own_ending() -> None:
+def test_it_continues_from_the_last_observed_frame_under_the_trials_own_ending() -> None:
     trial = scene(0.5)
     engine = StraightEngine()
     truth = engine.simulate(trial)
@@ -199,7 +199,7 @@ def test_joined_bodies_move_together_and_a_cloth_moves_whole() -> None:
     assert not np.isclose(cloth[0, :2], moved[0, :2]).any()
 
 
-def test_noise_of_the_pose_is_that_of_bodies_in_the_air() -> None:
+def test_noise_of_the_pose_matches_bodies_in_the_air() -> None:
     trial = scene()
     question = cut_trial(trial, StraightEngine().simulate(trial))
     config = NoisySimulationSettings(
@@ -292,7 +292,7 @@ def test_noise_at_contacts_acts_where_bodies_meet() -> None:
     assert found[1] == simulate_contacts(question, noisy, 1.0, 24, 0, engine)
 
 
-def test_noise_depends_on_seed_trial_and_sample_alone() -> None:
+def test_noise_depends_only_on_seed_trial_and_sample() -> None:
     truth = StraightEngine().simulate(scene())
 
     def state(seed: int, name: str, sample: int) -> list[float]:
@@ -307,7 +307,7 @@ def test_noise_depends_on_seed_trial_and_sample_alone() -> None:
     )
 
 
-def test_noise_is_that_of_the_platform_independent_functions() -> None:
+def test_noise_matches_the_platform_independent_functions() -> None:
     trial = scene()
     question = cut_trial(trial, StraightEngine().simulate(trial))
     config = NoisySimulationSettings(position=0.1, velocity=0.3, mass=0.2)
@@ -331,7 +331,7 @@ def test_the_digest_follows_all_that_decides_a_simulation(monkeypatch: pytest.Mo
     assert model().digest() != before
 
 
-def test_seed_and_scale_of_the_rollouts_are_those_of_the_call() -> None:
+def test_seed_and_scale_of_the_rollouts_match_the_call() -> None:
     trial = scene(0.5)
     truth = StraightEngine().simulate(trial)
     batch = context(trial, truth)

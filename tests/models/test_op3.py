@@ -56,7 +56,7 @@ def random_decoded(clips: int = 2, slots: int = 3, size: int = 4) -> Decoded:
     return Decoded(colors, 2 * torch.randn(clips, slots, 1, size, size, generator=generator))
 
 
-def test_likelihood_is_that_of_a_mixture() -> None:
+def test_likelihood_matches_a_mixture() -> None:
     decoded = random_decoded()
     pictures = torch.rand(2, 3, 4, 4, generator=torch.Generator().manual_seed(1))
     found = log_likelihood(decoded, pictures, 0.2, "gaussian")
@@ -68,7 +68,7 @@ def test_likelihood_is_that_of_a_mixture() -> None:
     assert torch.allclose(found.pixels, mixture.log_prob(pictures.permute(0, 2, 3, 1)), atol=1e-4)
 
 
-def test_released_likelihood_is_that_of_the_published_code() -> None:
+def test_released_likelihood_matches_the_published_code() -> None:
     """Far from all colours it is the logarithm of 1e-12."""
     decoded = random_decoded()
     pictures = torch.rand(2, 3, 4, 4, generator=torch.Generator().manual_seed(1))
@@ -113,7 +113,7 @@ def test_what_the_refinement_sees() -> None:
 
 
 @pytest.mark.parametrize("kernel", [3, 5])
-def test_the_broadcast_convolution_is_that_of_broadcast_images(kernel: int) -> None:
+def test_the_broadcast_convolution_matches_broadcast_images(kernel: int) -> None:
     torch.manual_seed(0)
     layer = BroadcastConv(7, 4, kernel)
     values = torch.randn(3, 7)
@@ -254,7 +254,7 @@ def test_futures_follow_from_seed_and_name_of_the_trial() -> None:
     assert torch.allclose(masks.sum(3), torch.ones(3, 3, 3, 16, 16), atol=1e-5)
 
 
-def test_masks_of_seen_frames_are_those_of_their_refined_slots() -> None:
+def test_masks_of_seen_frames_match_their_refined_slots() -> None:
     model = tiny()
     context = context_of(model, 2)
     shown = model.imagine(context, 3, 7, show=1.0).shown

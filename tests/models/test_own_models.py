@@ -213,13 +213,13 @@ def test_the_command_line_says_it_in_one_line(
         ),
     ],
 )
-def test_what_cannot_be_built_is_told(text: str, message: str, tmp_path: Path) -> None:
+def test_what_cannot_be_built_is_reported(text: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "model.py").write_text(text)
     with pytest.raises(PhysionError, match=message):
         physion.build_model(f"{tmp_path / 'model.py'}:Model")
 
 
-def test_files_and_names_that_are_not_there_are_told(tmp_path: Path) -> None:
+def test_files_and_names_that_are_not_there_are_reported(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="there is no file"):
         physion.build_model(f"{tmp_path / 'none.py'}:Model")
     (tmp_path / "model.py").write_text("class Model: pass")
@@ -361,7 +361,7 @@ def test_the_digest_of_an_extractor_follows_source_weights_and_gap(
         ("change, self.gap", "change, 'slow'", "expected a transform, the gap"),
     ],
 )
-def test_a_wrong_extractor_is_told_when_it_is_built(
+def test_a_wrong_extractor_is_reported_when_it_is_built(
     old: str, new: str, message: str, extractor: str, tmp_path: Path
 ) -> None:
     text = EXTRACTOR.replace(old, new)

@@ -140,7 +140,7 @@ def test_a_frame_is_decoded_with_the_activations_of_a_seen_one(skip: Any, rows: 
     assert all(torch.allclose(seen, inner[:, last], atol=1e-4) for seen in decoder.seen[1:])
 
 
-def test_the_loss_is_that_of_the_equations() -> None:
+def test_the_loss_matches_the_equations() -> None:
     """With a gray decoder the error is known, and the weight of the divergence is beta."""
     model = tiny(beta=0.5, motion=0.0)
     batch = squares(2, model.window, model.spec)
@@ -228,7 +228,7 @@ def test_futures_follow_from_seed_and_name_of_the_trial() -> None:
 
 
 @pytest.mark.parametrize("skip", ["last", "before"])
-def test_a_future_is_that_of_the_equations(skip: Any) -> None:
+def test_a_future_matches_the_equations(skip: Any) -> None:
     """Step by step, with z at the means: the variances are close to 0."""
     model = tiny(skip=skip)
     with torch.no_grad():

@@ -377,7 +377,7 @@ def test_errors_are_means_of_squares_over_what_counts() -> None:
     assert future_error(still[:, 2:] + 1, still, valid).moving == 0, "nothing moves"
 
 
-def test_divergence_of_gaussians_is_that_of_torch() -> None:
+def test_divergence_of_gaussians_matches_torch() -> None:
     torch.manual_seed(0)
     mean, scale, of_mean, of_scale = torch.randn(4, 5, 7).unbind(0)
     one = Independent(Normal(mean, (scale / 2).exp()), 1)

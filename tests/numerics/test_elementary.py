@@ -25,7 +25,7 @@ CASES: dict[str, tuple[Any, tuple[float, float], float]] = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_values_are_those_of_the_c_library_to_a_few_units_in_the_last_place(name: str) -> None:
+def test_values_match_the_c_library_to_a_few_units_in_the_last_place(name: str) -> None:
     reference, (low, high), tolerance = CASES[name]
     function = getattr(elementary, name)
     values = np.random.default_rng(1).uniform(low, high, 4000)

@@ -206,7 +206,7 @@ def test_stopping_at_contact_gives_the_same_label_and_the_same_start(name: str) 
 
 
 @BOTH
-def test_many_scenes_are_simulated_as_each_alone(name: str) -> None:
+def test_many_scenes_are_simulated_as_each_by_itself(name: str) -> None:
     scenes = [
         heap(),
         scene_of(Body("a", "cube", (0, 0, 1.0), (0.3, 0.3, 0.3), (0.9, 0.3, 0.3, 0.1))),
@@ -282,7 +282,7 @@ def test_engines_are_known_by_name() -> None:
         make_engine("mujocco")
 
 
-def test_mujoco_is_loaded_by_its_engine_alone() -> None:
+def test_mujoco_is_loaded_only_by_its_engine() -> None:
     code = (
         "import sys, physion.physics.engine, physion.physics.replay; print('mujoco' in sys.modules)"
     )
@@ -366,7 +366,7 @@ def test_a_trial_does_not_end_before_its_last_event(name: str) -> None:
 
 
 @BOTH
-def test_going_on_from_a_state_takes_later_events_alone(name: str) -> None:
+def test_continuing_from_a_state_takes_only_later_events(name: str) -> None:
     box = Body("a", "cube", (0, 0, 3.0), (0.2, 0.2, 0.2))
     move, gone = BodyEvent(10, "a", "move", (2.0, 0.0, 5.0)), BodyEvent(30, "a", "vanish")
     scene = scene_of(box, events=(move, gone))

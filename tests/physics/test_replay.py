@@ -113,7 +113,7 @@ def test_a_trial_is_replayed_with_jitter_and_compared_with_its_record(engine: st
 
 
 @given(st.lists(st.booleans(), min_size=2, max_size=12))
-def test_pair_agreement_is_the_share_of_equal_pairs(outcomes: list[bool]) -> None:
+def test_pair_agreement_is_the_fraction_of_equal_pairs(outcomes: list[bool]) -> None:
     pairs = [a == b for i, a in enumerate(outcomes) for b in outcomes[:i]]
     assert pair_agreement(np.array(outcomes)) == pytest.approx(np.mean(pairs))
 

@@ -217,7 +217,7 @@ def test_weights_that_ship_are_the_default_and_trainings_start_from_random_ones(
 
 
 @pytest.mark.slow
-def test_cells_on_an_executor_are_those_of_this_process(dots: Dataset, tmp_path: Path) -> None:
+def test_cells_on_an_executor_match_this_process(dots: Dataset, tmp_path: Path) -> None:
     given: dict[str, Any] = {"seed": 3, "settings": CPU}
     trained = physion.train(
         [FAILS, IMAGINING], dots, tmp_path / "cells", executor=Elsewhere(LocalExecutor(2)), **given

@@ -98,7 +98,7 @@ def test_gaps_of_several_samples_give_probabilities() -> None:
     assert one.fitted["gap"] == pytest.approx(0.35)
 
 
-def test_contacts_alone_have_no_threshold() -> None:
+def test_only_contacts_have_no_threshold() -> None:
     contacts = {NO_ARGUMENTS: Outcomes(np.array([[True]]), None)}
     with pytest.raises(BadInputError, match="use the decision 'noise'"):
         GapDecision().decide(contacts, np.array([True]), contacts)

@@ -140,7 +140,7 @@ def files(folder: Path) -> list[Path]:
 
 @pytest.mark.parametrize("kind", [Network, Numpy])
 @pytest.mark.parametrize("part", ["context", "later", "whole"])
-def test_features_are_those_of_the_model_and_are_computed_once(
+def test_features_match_the_model_and_are_computed_once(
     tmp_path: Path, kind: Any, part: Any
 ) -> None:
     model, movies = kind(), Movies()
@@ -412,7 +412,7 @@ def test_wrong_rollouts_are_refused(given: Any, message: str) -> None:
     assert message in str(caught.value)
 
 
-def test_outcomes_alone_are_stored_too(tmp_path: Path) -> None:
+def test_only_outcomes_are_stored_too(tmp_path: Path) -> None:
     contact = np.array([[True, False]] * 5)
     model, movies, store = Dreamer(contact=contact), Movies(), FeatureStore(tmp_path, batch=5)
     for _ in range(2):

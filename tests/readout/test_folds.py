@@ -104,7 +104,7 @@ def test_nothing_to_test_and_impossible_plans_are_refused() -> None:
 
 @pytest.mark.parametrize("protocol", list(Protocol))
 @pytest.mark.parametrize("counts", [{"training": 3, "readout": 4, "testing": 5}, {"testing": 10}])
-def test_trainings_are_those_of_an_evaluation(protocol: Protocol, counts: dict[str, int]) -> None:
+def test_trainings_match_an_evaluation(protocol: Protocol, counts: dict[str, int]) -> None:
     table = index(counts)
     assert training_folds(table, protocol, 5, 3) == plan_folds(table, protocol, 5, 3)
 

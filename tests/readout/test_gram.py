@@ -58,7 +58,7 @@ def test_stored_features_are_read_in_any_piece(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("block", [1, 7, 1024])
-def test_a_gram_matrix_is_that_of_standardised_features(
+def test_a_gram_matrix_matches_standardised_features(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block: int
 ) -> None:
     monkeypatch.setattr("physion.readout.logistic._COLUMNS", block)
@@ -94,7 +94,7 @@ def test_fits_are_standardised_apart_and_rows_count_through_tables(
 
 
 @pytest.mark.parametrize("released", [False, True])
-def test_a_readout_of_files_is_that_of_arrays(tmp_path: Path, released: bool) -> None:
+def test_a_readout_of_files_matches_arrays(tmp_path: Path, released: bool) -> None:
     context, imagined = features_of(50, 3, 40), features_of(50, 2, 40, seed=1)
     labels = context[:, 0, 0] + imagined[:, 1, 3] > np.median(context[:, 0, 0])
     flat = np.concatenate([context, imagined], axis=1).reshape(50, -1)

@@ -87,7 +87,7 @@ def test_the_copy_is_poisoned_where_it_should_be(made: Dataset, poisoned: Datase
         with_poisoned_futures(made, poisoned.folder)
 
 
-def test_motions_continue_like_those_of_another_trial(tmp_path: Path) -> None:
+def test_motions_continue_like_another_trial(tmp_path: Path) -> None:
     """The trials have different lengths; clips of the copy can be read, and their boxes."""
     made = make_late_motions(tmp_path / "data", {"testing": 4}, more=3)
     exchanged = with_exchanged_futures(made, tmp_path / "exchanged", motions=True)

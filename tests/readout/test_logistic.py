@@ -33,7 +33,7 @@ def problem(n: int, d: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize(("n", "d"), [(60, 20), (80, 2000)])
-def test_the_solution_is_that_of_converged_scikit_learn(n: int, d: int) -> None:
+def test_the_solution_matches_converged_scikit_learn(n: int, d: int) -> None:
     features, labels = problem(n, d)
     kernel = gram(features, np.arange(n))
     weights, intercepts = solve_path(kernel, labels, C_GRID)
@@ -85,7 +85,7 @@ def test_weak_penalties_are_solved_exactly() -> None:
         assert answers == pytest.approx(expected, abs=1e-8), f"C = {c}"
 
 
-def test_the_whole_readout_is_that_of_a_converged_grid_search() -> None:
+def test_the_whole_readout_matches_a_converged_grid_search() -> None:
     features, labels = problem(70, 300, seed=2)
     train, test, answers = features[:50], features[50:], labels[:50]
     grid = tuple(float(c) for c in np.logspace(-6, 2, 9))
@@ -174,14 +174,14 @@ def test_no_trial_to_fit_is_a_coin() -> None:
 
 
 @pytest.mark.parametrize("released", [False, True])
-def test_constant_features_say_the_share_of_contacts(released: bool) -> None:
+def test_constant_features_say_the_fraction_of_contacts(released: bool) -> None:
     labels = np.array([True] * 6 + [False] * 4)
     config = LogisticSettings(released=released)
     fitted = fit_readout(np.full((10, 3), 7.7), labels, np.full((2, 3), 7.7), config)
     assert fitted.probability == pytest.approx([0.6, 0.6], abs=1e-3)
 
 
-def test_a_constant_feature_beside_others_counts_nothing() -> None:
+def test_a_constant_feature_next_to_others_counts_nothing() -> None:
     features, labels = problem(40, 10)
     more = np.column_stack([features, np.full(40, 0.1)])
     plain, added = (fit_readout(x[:30], labels[:30], x[30:]) for x in (features, more))

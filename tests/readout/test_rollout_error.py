@@ -141,7 +141,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return Dataset(make_dataset(tmp_path_factory.mktemp("data") / "set"))
 
 
-def test_errors_of_a_dataset_come_from_the_observed_part_alone(dataset: Dataset) -> None:
+def test_errors_of_a_dataset_come_only_from_the_observed_part(dataset: Dataset) -> None:
     model = Standstill()
     table = rollout_error(dataset, model, ["drop_0", "drape_0"], horizon=15)
     assert tuple(table.columns) == COLUMNS and len(table) == 10
@@ -165,7 +165,7 @@ def test_what_cannot_have_an_error_is_refused(dataset: Dataset) -> None:
         evaluate("constant-motion", dataset, "nowhere", rollout_errors=True)
 
 
-def test_evaluate_writes_them_beside_the_predictions(dataset: Dataset, tmp_path: Path) -> None:
+def test_evaluate_writes_them_next_to_the_predictions(dataset: Dataset, tmp_path: Path) -> None:
     config = EvaluationSettings(untrained=True, folds=2, accelerator="cpu")
     without = evaluate("dpi", dataset, tmp_path, settings=config)
     assert without.evaluated[0].rollout_errors is None

@@ -130,7 +130,7 @@ def fitted_scale(shelf: Any, model: Any, folder: Path) -> tuple[float, np.ndarra
 
 
 @pytest.mark.parametrize("column", ["contact", "recorded_contact"])
-def test_the_noise_is_fitted_on_readout_trials_alone(tmp_path: Path, column: str) -> None:
+def test_the_noise_is_fitted_only_on_readout_trials(tmp_path: Path, column: str) -> None:
     """The fit uses recorded outcomes, or simulated ones where there is no record."""
     shelf: Any = Shelf()
     shelf.index["recorded_contact"] = pd.array([pd.NA] * len(shelf.index), "boolean")
@@ -240,7 +240,7 @@ class Oracle:
         return np.array(found if self.answer is None else [self.answer] * len(found))
 
 
-def test_other_state_models_are_shown_the_observed_part_alone(tmp_path: Path) -> None:
+def test_other_state_models_are_shown_only_the_observed_part(tmp_path: Path) -> None:
     shelf: Any = Shelf()
     assert shelf.index["contact"].any()
     oracle = Oracle()

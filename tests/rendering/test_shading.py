@@ -240,7 +240,7 @@ def flat_map(depth: float) -> DepthMap:
 
 
 @pytest.mark.parametrize("kept", [0, 1])
-def test_shadow_takes_its_fraction_of_the_direct_light_alone(kept: int) -> None:
+def test_shadow_takes_its_fraction_only_of_the_direct_light(kept: int) -> None:
     """Also where the shading of static surfaces is read (``kept`` 1) instead of made."""
     light = light_from(ambient=0.8, shadow_strength=0.75, background=(1.0, 2.0, 3.0))
     inputs, ids = plane(0.0, light, material_of())

@@ -79,7 +79,7 @@ def test_baselines_stand_below_the_models_lighter_and_hollow(make_comparison: Ma
     assert next(iter(thirds["model"].unique())) == model
 
 
-def test_figures_of_single_answers_show_models_alone(make_comparison: Maker) -> None:
+def test_figures_of_single_answers_show_only_models(make_comparison: Maker) -> None:
     comparison = make_comparison(model="constant-motion")
     model = ["encoder · observed+simulated"]
     assert list(figure_tables.calibration_table(comparison)["model"].unique()) == model
@@ -134,7 +134,7 @@ def test_bars_hold_every_stimulus_and_mark_the_tail() -> None:
     assert tail == {0.0, 0.1, 0.4}
 
 
-def test_calibration_is_the_share_of_contact_in_each_bin(make_comparison: Maker) -> None:
+def test_calibration_is_the_fraction_of_contact_in_each_bin(make_comparison: Maker) -> None:
     comparison = make_comparison()
     table = figure_tables.calibration_table(comparison)
     own = comparison.stimuli[comparison.stimuli["model"] == comparison.names[0]]
@@ -205,7 +205,7 @@ def test_effects_hold_the_accuracy_of_each_training(make_comparison: Maker) -> N
     assert ((table["low"] < table["value"]) & (table["value"] < table["high"])).all()
 
 
-def test_one_condition_alone_makes_no_figure(make_comparison: Maker) -> None:
+def test_one_condition_makes_no_figure(make_comparison: Maker) -> None:
     comparison, predictions = trained(make_comparison, ["all", "all"])
     assert figure_tables.effects_table(comparison, predictions).empty
     assert figure_tables.generalization_table(comparison, predictions).empty

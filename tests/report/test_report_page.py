@@ -172,9 +172,7 @@ def test_contents_lead_to_every_section(make_comparison: Maker) -> None:
 
 
 @pytest.mark.slow
-def test_numbers_for_machines_are_those_of_the_tables(
-    make_comparison: Maker, tmp_path: Path
-) -> None:
+def test_numbers_for_machines_match_the_tables(make_comparison: Maker, tmp_path: Path) -> None:
     comparison = make_comparison(constant=True)
     build_report(ReportInputs(comparison), tmp_path)
     values = json.loads((tmp_path / "report.json").read_text())

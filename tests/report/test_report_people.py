@@ -136,7 +136,7 @@ def test_band_of_the_paper_bears_its_name(report: Path) -> None:
     assert mean["zone_high"].iloc[0] == pytest.approx(halves["high"].mean())
 
 
-def test_tests_and_mixed_models_are_told(report: Path) -> None:
+def test_tests_and_mixed_models_are_reported(report: Path) -> None:
     text = text_of(report)
     assert "test of McNemar" in text and "Holm" in text
     assert "correct ~ scenario + (1|participant) + (1|stimulus)" in text
@@ -288,7 +288,7 @@ def test_permutations_let_holm_find_something() -> None:
         assert pairs / (1 + permutations_of(pairs)) < 0.05
 
 
-def test_people_alone(report: Path, tmp_path: Path) -> None:
+def test_only_people(report: Path, tmp_path: Path) -> None:
     responses().to_csv(tmp_path / "responses.csv", index=False)
     pages = [
         compare(responses=tmp_path / "responses.csv", resamples=60).report(tmp_path / name)
@@ -310,7 +310,7 @@ def test_people_alone(report: Path, tmp_path: Path) -> None:
     assert numbers["people_by_scenario"] and "comparison" not in numbers
 
 
-def test_a_rehearsal_with_people_alone_is_marked(
+def test_a_rehearsal_with_only_people_is_marked(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "responses.csv"
@@ -326,7 +326,7 @@ def test_a_rehearsal_with_people_alone_is_marked(
     assert f"closest: {STEMS['drop']}_00" in error and error.count("\n") == 1
 
 
-def test_people_alone_have_no_results_of_models(tmp_path: Path) -> None:
+def test_only_people_have_no_results_of_models(tmp_path: Path) -> None:
     responses().to_csv(tmp_path / "responses.csv", index=False)
     with pytest.raises(BadInputError, match="about predictions"):
         compare(responses=tmp_path / "responses.csv").report(tmp_path / "out", trial_pages=True)

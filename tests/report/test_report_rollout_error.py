@@ -36,7 +36,7 @@ def table() -> pd.DataFrame:
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
-def test_curves_and_bands_are_those_of_the_table() -> None:
+def test_curves_and_bands_match_the_table() -> None:
     figure = draw(table(), LIGHT)
     drop, mean = figure.axes[:2]
     assert drop.get_title("left") == "drop" and mean.get_title("left") == "mean over scenarios"
@@ -54,7 +54,7 @@ def test_curves_and_bands_are_those_of_the_table() -> None:
     assert names == ["one", "two", CONSTANT_VELOCITY]
 
 
-def test_bytes_depend_on_the_table_alone() -> None:
+def test_bytes_depend_only_on_the_table() -> None:
     for theme in (LIGHT, DARK):
         first, second = (figure_bytes(draw(table(), theme), "svg") for _ in range(2))
         assert first == second

@@ -95,7 +95,7 @@ def test_page_holds_every_trial_with_its_label(page: Page) -> None:
     assert page.blocks["title"] == "by-hand"
 
 
-def test_movies_are_those_of_the_trials(page: Page, tmp_path: Path) -> None:
+def test_movies_match_the_trials(page: Page, tmp_path: Path) -> None:
     movie = page.json("movie-1")
     assert (movie["width"], movie["height"], movie["stride"], movie["rate"]) == (32, 32, 1, 30)
     path = tmp_path / "m.mp4"
@@ -345,7 +345,7 @@ def test_points_come_back_to_half_a_step() -> None:
     assert _points(pack_grid(np.zeros((0, 3)))).shape == (0, 3)
 
 
-def test_paths_and_touch_points_are_those_of_the_trial(dataset: Path) -> None:
+def test_paths_and_touch_points_match_the_trial(dataset: Path) -> None:
     trial = Dataset(dataset).trial("drop_0")
     (path,) = (_unpack(text, "<f4") for text in viewer_facts.paths(trial).values())
     centres = trial.trajectory.positions[:, 0] + [0, 0, 0.25]  # the pivot of a sphere is its foot

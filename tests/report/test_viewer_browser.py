@@ -206,7 +206,7 @@ def test_time_line_marks_observed_part_and_every_contact(browser: Browser, page:
     assert "45 observed frames" in words and "touch in: 20–21, 30." in words
 
 
-def test_keys_alone_are_enough(browser: Browser, page: Path) -> None:
+def test_the_keyboard_is_enough(browser: Browser, page: Path) -> None:
     browser.open(page)
     browser.ask("document.querySelector('.card').focus()")
     browser.key("Enter", 13, "\r")

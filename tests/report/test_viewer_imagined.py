@@ -133,7 +133,7 @@ def test_the_caption_says_what_is_known() -> None:
     assert "P(contact) 0.25 from 8 futures; smallest gap of the one shown 0.500 m" in text
 
 
-def test_detailed_trials_alone_are_imagined_once(tmp_path: Path) -> None:
+def test_only_detailed_trials_are_imagined_once(tmp_path: Path) -> None:
     folder = make_dataset(tmp_path / "set", PLANS[:3])
     asked = []
 

@@ -103,7 +103,7 @@ def test_masks_are_coloured_over_the_picture_in_grey() -> None:
     assert np.abs(first[:, :6].mean(axis=(0, 1)) - second[:, 10:].mean(axis=(0, 1))).max() > 20
 
 
-def test_masks_of_seen_frames_may_be_smaller_and_alone() -> None:
+def test_masks_of_seen_frames_may_be_smaller_and_without_others() -> None:
     masks = np.full((3, 5, 4, 4), 0.5, np.float32)
     slots = np.zeros((4, 5, 3), np.float32)
     seen = {"rgb": greys(SEEN), "masks": masks, "slots": np.zeros((3, 5, 3), np.float32)}

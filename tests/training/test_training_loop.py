@@ -153,7 +153,7 @@ def test_a_resumed_training_reads_only_the_batches_that_are_left(tmp_path: Path)
     assert sorted(sources[1].read) == sorted(sources[0].read[21:])
 
 
-def test_batches_depend_on_seed_and_step_alone() -> None:
+def test_batches_depend_only_on_seed_and_step() -> None:
     read = []
     for seed in (0, 0, 1):
         source = MovingValues()
@@ -192,7 +192,7 @@ def test_models_see_a_sample_of_clips_or_all_features_before_training() -> None:
         assert sample.frames.shape[1] == (4 if learns_from == "clips" else 8)
 
 
-def test_frames_of_feature_windows_are_those_of_the_features() -> None:
+def test_frames_of_feature_windows_match_the_features() -> None:
     class Checked(NextBrightness):
         def loss(self, batch: Batch) -> dict[str, Tensor]:
             rows = zip(batch.trials, batch.frames.numpy(), batch.features.numpy(), strict=True)

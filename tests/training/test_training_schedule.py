@@ -28,7 +28,7 @@ def test_the_cosine_goes_from_the_base_rate_to_zero() -> None:
 
 
 @pytest.mark.parametrize("patience", [0, 1, 3])
-def test_the_plateau_follows_that_of_torch(patience: int) -> None:
+def test_the_plateau_follows_torch(patience: int) -> None:
     settings = TrainingSettings(
         schedule="plateau", plateau_patience=patience, plateau_factor=0.8, learning_rate=1.0
     )

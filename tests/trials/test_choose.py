@@ -180,7 +180,7 @@ def test_no_draw_says_why() -> None:
         choosing.MAX_TRIES = original
 
 
-def test_a_dataset_of_states_alone(tmp_path: Path) -> None:
+def test_a_dataset_of_only_states(tmp_path: Path) -> None:
     settings = GenerateSettings(width=64, height=64, movies=False, jitters=2, playback="real")
     tasks = slots("readout", 2)
     report = make_trials(tmp_path / "d", tasks, settings, executor=SerialExecutor())

@@ -138,7 +138,7 @@ def test_workers_and_order_do_not_matter(workers: int, finished: Path, tmp_path:
     assert tree_digest(tmp_path / "s") == tree_digest(finished)
 
 
-def test_a_failing_trial_is_told_and_the_others_go_on(tmp_path: Path) -> None:
+def test_a_failing_trial_is_reported_and_the_others_continue(tmp_path: Path) -> None:
     report = run(tmp_path / "s", scenes_named("a", "bad", "c"))
     assert report.exit_code == 1 and report.made == ["a", "c"]
     assert report.failed == {"bad": "bad cannot be made"}
@@ -538,9 +538,7 @@ def plan_of(monkeypatch: pytest.MonkeyPatch, folder: Path, *arguments: Any, **mo
     return seen[0]
 
 
-def test_the_plan_is_that_of_the_command_line(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_plan_matches_the_command_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert plan_of(monkeypatch, tmp_path, "drop", 3) == plan_dataset(
         "physion", ["drop"], {"testing": 3}
     )
@@ -564,7 +562,7 @@ def test_the_plan_is_that_of_the_command_line(
         (("drop", 1), {"presets": ["no such"]}, "unknown preset of drop"),
     ],
 )
-def test_wrong_arguments_are_told_before_a_folder_is_made(
+def test_wrong_arguments_are_refused_before_a_folder_is_made(
     arguments: tuple[Any, ...], options: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises((BadInputError, UnknownNameError), match=message):
@@ -601,7 +599,7 @@ def test_trials_of_another_engine_are_verified_with_it(tmp_path: Path) -> None:
     assert result.faults == [] and result.other_versions == []
 
 
-def test_the_engine_is_stored_by_its_whole_name_alone(tmp_path: Path) -> None:
+def test_the_engine_is_stored_only_by_its_whole_name(tmp_path: Path) -> None:
     assert GenerateSettings(engine="mujoco").stored() == GenerateSettings().stored()
     tasks = plan_dataset("tests", ["collide"], {"testing": 1})
     make_trials(tmp_path, tasks, MUJOCO, executor=SerialExecutor(), make=lambda job: "")

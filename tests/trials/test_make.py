@@ -42,7 +42,7 @@ def job(tmp_path_factory: pytest.TempPathFactory) -> GenerateJob:
     return job
 
 
-def test_state_and_labels_are_those_of_the_scene(job: GenerateJob) -> None:
+def test_state_and_labels_match_the_scene(job: GenerateJob) -> None:
     trial = Trial.open(job.paths.trial_file)
     again = simulate(trial.scene)
     assert again.digest() == trial.trajectory.digest() == trial.metadata.digest
@@ -104,7 +104,7 @@ def test_looks_change_colours_and_nothing_else(job: GenerateJob, tmp_path: Path)
     assert (red.render(0).color[agent] != other.render(0).color[agent]).any()  # type: ignore[index]
 
 
-def test_state_alone_is_small_and_passes_are_only_kept_when_asked_for(
+def test_only_the_state_is_small_and_passes_are_only_kept_when_asked_for(
     job: GenerateJob, tmp_path: Path
 ) -> None:
     bare = GenerateJob(TASK, tmp_path, GenerateSettings(width=64, height=64, look="redyellow"))

@@ -168,7 +168,7 @@ def effective_settings(names: Sequence[str]) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("scenario", sorted(scenarios.names()))
-def test_trials_are_those_of_this_version(scenario: str) -> None:
+def test_trials_match_this_version(scenario: str) -> None:
     """Raise the engine's version with a change that moves a scene: see `reproduce`."""
     assert trial_digests(scenario) == golden_digests()[scenario]
 

@@ -107,7 +107,7 @@ def test_centres_of_mass_move_as_fast_as_the_engine_says(collision: Trial) -> No
     assert error(state.poses(collision).positions) > 0.2, "the ball rolls, and its pivot with it"
 
 
-def test_centres_of_mass_are_those_of_solids(collision: Trial) -> None:
+def test_centres_of_mass_match_solids(collision: Trial) -> None:
     first = state.centroids(collision)[0]
     np.testing.assert_allclose(first[0], [0.5, 0.0, 0.25], atol=1e-3)
     np.testing.assert_allclose(first[1], [-0.5, 0.0, 0.15], atol=1e-3)
@@ -219,7 +219,7 @@ def test_the_object_table_says_what_everything_is(collision: Trial) -> None:
     assert table["scenery"].tolist() == [False, False, False, True]
 
 
-def test_colours_are_those_of_the_look(collision: Trial) -> None:
+def test_colours_match_the_look(collision: Trial) -> None:
     def color(look: str | None) -> tuple[float, ...]:
         row = state.object_table(collision, look).set_index("name").loc["ball"]
         return tuple(row[["red", "green", "blue"]])
@@ -298,7 +298,7 @@ def test_scenario_parameters_are_a_copy(collision: Trial) -> None:
     assert state.scenario_parameters(collision)["list"] == [1, {"a": None}]
 
 
-def test_cloths_are_told_apart() -> None:
+def test_cloths_are_distinguished() -> None:
     parts = make_parts()
     scene = parts.scene
     two = dataclasses.replace(

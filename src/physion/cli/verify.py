@@ -75,10 +75,10 @@ def _print_comparison(compared: DatasetComparison, folder: Path, against: Path) 
     for place, names in ((folder, compared.only_first), (against, compared.only_second)):
         lines += [f"{name}: only in {place}" for name in names]
     lines += compared.differences
-    alone = len(compared.only_first) + len(compared.only_second)
+    single = len(compared.only_first) + len(compared.only_second)
     lines.append(
         f"{folder} against {against}: {compared.same} trials are the same, "
-        f"{len(compared.differences)} differ, {alone} are only in one of them"
+        f"{len(compared.differences)} differ, {single} are only in one of them"
     )
     for line in lines:
         console.print(line, markup=False, soft_wrap=True)

@@ -161,8 +161,8 @@ def file_sha256(path: Path) -> str:
 def write_with_digest(path: Path, content: bytes) -> None:
     """Write ``content`` to ``path``, and its digest file, each atomically.
 
-    A process that is killed in between leaves a file without digest file, never one with that
-    of another content.
+    A process that is killed in between leaves a file without digest file, never one with another
+    content's digest file.
     """
     digest = digest_path(path)
     digest.unlink(missing_ok=True)

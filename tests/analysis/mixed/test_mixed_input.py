@@ -148,7 +148,7 @@ def test_people_who_never_vary_are_warned_of() -> None:
     assert any("answer almost all alike" in warning for warning in fitted.warnings)
 
 
-def test_one_row_a_level_is_warned_of_or_refused(table: pd.DataFrame) -> None:
+def test_one_row_per_level_is_warned_of_or_refused(table: pd.DataFrame) -> None:
     table = table.assign(row=np.arange(len(table)))
     with pytest.raises(BadInputError, match="as many levels as there are rows"):
         fit_linear("log_rt ~ elements + (1|row)", table)

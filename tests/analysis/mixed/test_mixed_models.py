@@ -38,9 +38,7 @@ def indicators(groupings: Groupings) -> np.ndarray:
     seed=st.integers(0, 2**32 - 1),
     parts=st.integers(1, 3),
 )
-def test_the_equations_are_those_of_the_dense_matrices(
-    sizes: list[int], seed: int, parts: int
-) -> None:
+def test_the_equations_match_the_dense_matrices(sizes: list[int], seed: int, parts: int) -> None:
     """Whatever the groupings, linked or not: log|H|, H^-1, and their uses."""
     draw = np.random.default_rng(seed)
     n = 60
@@ -129,7 +127,7 @@ def test_logistic_gradient_where_a_deviation_is_zero_or_turned_round() -> None:
     assert slope[2] == pytest.approx(-gradient[2], abs=1e-6)
 
 
-def test_restricted_likelihood_is_that_of_the_marginal_covariance() -> None:
+def test_restricted_likelihood_matches_the_marginal_covariance() -> None:
     design = build_design(f"log_rt ~ elements + scenario + {CROSSED}", answers(3))
     model = LinearModel(design)
     ratios = np.array([0.6, 1.4])

@@ -119,7 +119,7 @@ def test_linear_models_agree_with_lmertest(name: str) -> None:
 @pytest.mark.parametrize(
     "name", ["times nested", "times alike", "models", "readouts", "inside", "published models"]
 )
-def test_joint_tests_are_those_of_anova(name: str) -> None:
+def test_joint_tests_match_anova(name: str) -> None:
     fitted, numbers = fit(name), stored(name, "lme4")
     terms = list(numbers["joint F"].index)
     assert terms == [term for term in fitted.terms if term != "Intercept"]

@@ -136,7 +136,7 @@ def test_one_group_agrees_with_statsmodels() -> None:
     assert list(fitted.random["effect"]) == ["Intercept", "x", ""]
 
 
-def test_degrees_of_freedom_are_those_of_the_persons_own_slopes() -> None:
+def test_degrees_of_freedom_match_the_persons_own_slopes() -> None:
     """Balanced: the mean slope has the t test of the slopes of each person, people - 1."""
     people, times = 14, np.arange(8.0)
     draw = np.random.default_rng(5)

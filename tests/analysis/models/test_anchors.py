@@ -68,7 +68,7 @@ def row_of(table: pd.DataFrame, model: str, scenario: str = MEAN) -> pd.Series:
 # --- closed forms --------------------------------------------------------------------------------
 
 
-def test_the_outcome_is_right_and_its_kappa_that_of_the_table_of_answers() -> None:
+def test_the_outcome_is_right_and_its_kappa_matches_the_table_of_answers() -> None:
     people, truth = humans(), np.array(list(LABELS.values()), dtype=float)
     row = row_of(compared().baselines, OUTCOME, POOLED)
     right = people["accuracy"].to_numpy()
@@ -153,7 +153,7 @@ def test_people_who_all_agree_have_an_r_of_one() -> None:
     assert row["r"] == pytest.approx(1)
 
 
-def test_one_person_alone_makes_no_pair() -> None:
+def test_one_person_makes_no_pair() -> None:
     people = humans(np.arange(24) % 3 / 2, count=1)
     row = row_of(compared(people=people).baselines, TWO_PEOPLE)
     assert row[["kappa_from_averages", "r"]].isna().all() and np.isfinite(row["accuracy"])
@@ -199,7 +199,7 @@ def test_people_themselves_are_wholly_beyond_the_outcome() -> None:
     assert row["kappa_beyond_outcome"] > 0.1 and row["kappa_within_outcomes"] > 0.1
 
 
-def test_partial_r_is_that_of_the_textbook() -> None:
+def test_partial_r_matches_the_textbook() -> None:
     people, truth = humans(), np.array(list(LABELS.values()), dtype=float)
     given = predictions()
     row = row_of(compared(given).scores, "m · observed", POOLED)
@@ -211,7 +211,7 @@ def test_partial_r_is_that_of_the_textbook() -> None:
     assert row["r_beyond_outcome_low"] < expected < row["r_beyond_outcome_high"]
 
 
-def test_of_one_outcome_alone_partial_r_is_r() -> None:
+def test_of_a_single_outcome_partial_r_is_r() -> None:
     always = dict.fromkeys(LABELS, True)
     given = predictions(**{"Actual Outcome": True})
     scores = compare_scores(given, humans(), always, bootstrap=QUICK).scores
@@ -309,7 +309,7 @@ def observed() -> Array:
     return np.array([k % 6 == 0 for k in range(len(NAMES))])
 
 
-def test_scores_without_observed_contacts_are_those_of_the_other_stimuli() -> None:
+def test_scores_without_observed_contacts_match_the_other_stimuli() -> None:
     given = predictions(**{"Observed Contact": observed()})
     found = compared(given)
     rest = compare_scores(

@@ -79,7 +79,7 @@ def score(table: pd.DataFrame, model: str, scenario: str) -> pd.Series:
 # --- scores ------------------------------------------------------------------------------------
 
 
-def test_scores_are_those_of_the_joined_rows() -> None:
+def test_scores_match_the_joined_rows() -> None:
     people = humans()
     given = predictions(people)
     found = compare_scores(given, people, labels(people), bootstrap=QUICK)
@@ -173,7 +173,7 @@ def test_the_order_of_rows_changes_nothing_but_their_order() -> None:
     pd.testing.assert_frame_equal(plain.people, mixed.people)
 
 
-def test_a_model_scores_the_same_alone_and_beside_others() -> None:
+def test_a_model_scores_the_same_with_and_without_others() -> None:
     people = humans()
     both = pd.concat([predictions(people), predictions(people.iloc[::2], "half", seed=2)])
     together = compare_scores(both, people, labels(people), bootstrap=QUICK).scores
@@ -290,7 +290,7 @@ def test_ledges_can_be_kept() -> None:
     assert "roll" not in set(left.scores["scenario"])
 
 
-def test_without_people_the_models_stand_alone() -> None:
+def test_without_people_there_are_only_models() -> None:
     people = humans()
     found = compare_scores(predictions(people), None, bootstrap=QUICK)
     row = score(found.scores, "m · observed", "drop")
@@ -314,7 +314,7 @@ def test_recorded_outcomes_stand_in_for_labels() -> None:
     assert counts(compare_scores(given, people, bootstrap=QUICK).dropped)["", NO_LABEL] == 1
 
 
-def test_the_zone_is_for_whole_scenarios_alone() -> None:
+def test_the_zone_is_only_for_whole_scenarios() -> None:
     people = humans()
     zone = pd.DataFrame({"scenario": ["collide", "drop"], "low": 0.6, "high": 0.8})
     given = predictions(people.iloc[:-1])

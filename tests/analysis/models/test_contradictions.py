@@ -52,7 +52,7 @@ def test_consistent_tables_give_no_warning() -> None:
     assert warnings_of(half) == ()
 
 
-def test_an_outcome_against_its_probability_is_told() -> None:
+def test_an_outcome_against_its_probability_is_reported() -> None:
     table = predictions()
     table.loc[[4, 9], "Predicted Prob_true"] = 1 - table.loc[[4, 9], "Predicted Prob_true"]
     (warning,) = warnings_of(table)
@@ -80,7 +80,7 @@ def test_opposite_labels_are_refused() -> None:
     assert warnings_of(predictions(), few) == ()
 
 
-def test_answers_far_below_guessing_are_told() -> None:
+def test_answers_far_below_guessing_are_reported() -> None:
     (warning,) = warnings_of(predictions(2))
     assert "right in 7% of 30 stimuli" in warning
     # Always no is wrong for half of the stimuli, which is what guessing gives.
@@ -88,13 +88,13 @@ def test_answers_far_below_guessing_are_told() -> None:
     assert warnings_of(never) == ()
 
 
-def test_missing_labels_of_predicted_stimuli_are_told() -> None:
+def test_missing_labels_of_predicted_stimuli_are_reported() -> None:
     known = dict(list(LABELS.items())[:25])
     (warning,) = warnings_of(predictions(), known)
     assert "drop: 5 of 30 stimuli" in warning and f"{STEM}_0025" in warning
 
 
-def test_people_that_lack_stimuli_with_a_label_are_told() -> None:
+def test_people_that_lack_stimuli_with_a_label_are_reported() -> None:
     assert check_coverage(humans(), LABELS) == []
     more = {**LABELS, f"{STEM}_0099": True, "pilot_towers_nb2_x_0001": True}
     (warning,) = check_coverage(humans(), more)
@@ -137,7 +137,7 @@ def cut_study(official: Path, folder: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_a_cut_official_table_is_told_on_page_and_terminal(
+def test_a_cut_official_table_is_reported_on_page_and_terminal(
     official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     people = cut_study(official, tmp_path)

@@ -142,7 +142,7 @@ def test_every_measure_is_what_it_says(models: Models, answers: ScenarioAnswers)
     assert undefined["reason"].str.contains("P\\(contact\\) is constant").all()
 
 
-def test_intervals_are_those_of_leaving_out_people_or_stimuli(
+def test_intervals_match_leaving_out_people_or_stimuli(
     models: Models, answers: ScenarioAnswers
 ) -> None:
     table = measures(models, answers).set_index(["model", "measure"])
@@ -394,7 +394,7 @@ def test_thirds_are_parted_at_their_edges() -> None:
     assert np.isnan(found[6])
 
 
-def test_r_within_thirds_is_that_of_their_stimuli(answers: ScenarioAnswers, models: Models) -> None:
+def test_r_within_thirds_matches_their_stimuli(answers: ScenarioAnswers, models: Models) -> None:
     table = r_by_third(models.p_contact, answers.yes, answers.label, halves=30)
     shares = answers.p_yes()
     third = difficulty_third(np.where(answers.label == 1, shares, 1 - shares)).to_numpy()
@@ -415,7 +415,7 @@ bits = st.integers(1, 40).flatmap(
 
 @settings(deadline=None)
 @given(bits)
-def test_mcnemar_is_that_of_statsmodels(pair: Array) -> None:
+def test_mcnemar_matches_statsmodels(pair: Array) -> None:
     a, b = pair
     found = mcnemar_exact(a, b)
     table = [[np.sum((a == 1) & (b == 1)), found.only_first],
@@ -454,7 +454,7 @@ def test_permutations_keep_their_level_and_find_a_difference() -> None:
     assert np.isnan(r_permutation_p(np.full(100, 0.5), far, y))
 
 
-def test_permutations_are_those_of_swapping_by_hand() -> None:
+def test_permutations_match_swapping_by_hand() -> None:
     generator = np.random.default_rng(4)
     y, a, b = generator.random((3, 15))
     found = r_permutation_p(a, b, y, permutations=50, seed=2)
@@ -531,7 +531,7 @@ def test_the_parts_of_the_brier_score_add_up(pair: tuple[Array, Array], bins: in
     assert found.calibration_error == pytest.approx(gap, abs=1e-12)
 
 
-def test_brier_is_that_of_scikit_learn_and_knows_calibrated_forecasts() -> None:
+def test_brier_matches_scikit_learn_and_knows_calibrated_forecasts() -> None:
     generator = np.random.default_rng(0)
     p = generator.random(20_000)
     label = (generator.random(20_000) < p).astype(float)

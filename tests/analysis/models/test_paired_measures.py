@@ -20,7 +20,7 @@ def pooled(p: np.ndarray, seed: int = 0, scenarios: int = 2) -> PooledStimuli:
     return PooledStimuli(names, p, correct, label, rng.random(n), scenario)
 
 
-def test_differences_are_those_of_the_measures() -> None:
+def test_differences_match_the_measures() -> None:
     p = np.random.default_rng(1).random((3, 60))
     p[2, :5] = np.nan
     given = pooled(p)

@@ -136,7 +136,7 @@ def test_sessions_that_never_answered_do_not_count_in_the_third() -> None:
         check_excluded(calm)
 
 
-def test_the_list_is_found_beside_the_responses(tmp_path: Path) -> None:
+def test_the_list_is_found_next_to_the_responses(tmp_path: Path) -> None:
     responses = [tmp_path / "trials.csv"]
     assert find_expected(responses) is None
     (tmp_path / "expected.csv").write_text(

@@ -250,7 +250,7 @@ def test_missing_response_times_are_counted() -> None:
     assert table["rows"].sum() == flag_sessions(some)["no_log_rt"].sum()
 
 
-def test_practice_alone_is_refused() -> None:
+def test_only_practice_is_refused() -> None:
     trials, sessions = simulate_study(people=3, stimuli=4, scenarios=("roll",))
     practice = trials[trials["phase"] == "familiarization"]
     with pytest.raises(BadInputError, match="no test answer"):
@@ -324,7 +324,7 @@ def test_clustered_errors_are_wider_where_people_differ_and_cover_the_truth() ->
     assert 88 <= held <= 100
 
 
-def test_clustered_errors_of_two_groups_are_those_of_the_means_of_people() -> None:
+def test_clustered_errors_of_two_groups_match_the_means_of_people() -> None:
     """Two groups of people with equally many answers each: Welch's test of their means."""
     generator = np.random.default_rng(3)
     sizes, answers = (5, 12), 30

@@ -88,7 +88,7 @@ def test_the_summary_is_about_the_same_stimuli_and_fewer_people(
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
-def test_binomial_reliability_is_that_of_the_official_split_halves(
+def test_binomial_reliability_matches_the_official_split_halves(
     people: pd.DataFrame, official: Path, scenario: str
 ) -> None:
     table = pd.read_csv(official / "results" / "human_pairwiseCorrs_by_scenario.csv")
@@ -147,7 +147,7 @@ def test_stimulus_list(tmp_path: Path) -> None:
 # --- reading ---------------------------------------------------------------------------------
 
 
-def test_share_of_yes_follows_from_accuracy_and_label(tmp_path: Path) -> None:
+def test_fraction_of_yes_follows_from_accuracy_and_label(tmp_path: Path) -> None:
     humans = read_humans(folder_with(tmp_path, collide=HEADER + "a,.9,10\nb,.9,10\nc,.9,10\n"))
     found = with_labels(humans, {"a_img": True, "b": False})
     assert np.allclose(found["p_yes"], [0.9, 0.1, np.nan], equal_nan=True)

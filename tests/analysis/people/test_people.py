@@ -79,7 +79,7 @@ def official_people(official: Path) -> pd.DataFrame:
 # --- accuracy -----------------------------------------------------------------------------------
 
 
-def test_accuracies_are_those_of_plain_grouping(made: Responses) -> None:
+def test_accuracies_match_plain_grouping(made: Responses) -> None:
     test = made.test
     by_stimulus = accuracy_by_stimulus(test, FEW).set_index("stimulus")
     plain = test.groupby("stimulus")["correct"].mean()
@@ -202,7 +202,7 @@ arrays = st.tuples(st.integers(1, 4), st.integers(3, 20)).flatmap(
 
 @settings(deadline=None, max_examples=50)
 @given(arrays, st.integers(0, 50))
-def test_correlations_of_many_are_those_of_each(x: Array, seed: int) -> None:
+def test_correlations_of_many_match_each(x: Array, seed: int) -> None:
     generator = np.random.default_rng(seed)
     y = np.where(generator.random(x.shape) < 0.2, np.nan, generator.random(x.shape))
     weights = generator.integers(0, 3, x.shape).astype(float)
@@ -258,7 +258,7 @@ def test_below_chance_is_scipys_binomial_test_and_guards_against_many_looks() ->
 # --- biases, practice, background ---------------------------------------------------------------
 
 
-def test_a_liking_for_yes_and_for_the_left_are_told_apart(made: Responses) -> None:
+def test_a_liking_for_yes_and_for_the_left_are_distinguished(made: Responses) -> None:
     balanced = yes_bias(made.test, FEW).set_index("scenario")
     assert balanced["bias_low"].lt(0.1).all() and (balanced["d_prime"] > 0.3).all()
     generator = np.random.default_rng(0)
@@ -386,7 +386,7 @@ def stimuli_table(seed: int, effect: float) -> pd.DataFrame:
     )  # fmt: skip
 
 
-def test_slopes_and_robust_errors_are_those_of_statsmodels() -> None:
+def test_slopes_and_robust_errors_match_statsmodels() -> None:
     stimuli = stimuli_table(0, -0.05)
     found = regress_hypotheses(stimuli).set_index(["hypothesis", "scenario"])
     dummies = pd.get_dummies(stimuli["scenario"], dtype=float)

@@ -94,9 +94,7 @@ def test_all_88_published_means_to_three_decimals(
         assert f"{ours[(model, scenario.lower())]:.3f}" == mean, (model, scenario)
 
 
-def test_the_expected_cells_are_those_of_the_files(
-    official: Path, results: PublishedResults
-) -> None:
+def test_the_expected_cells_match_the_files(official: Path, results: PublishedResults) -> None:
     raw = pd.read_csv(official / "results" / "model_human_accuracies.csv")
     cell = raw[(raw["Readout Type"] == "B") & (raw["Dynamics Training Dataset Type"] == "all")]
     means = cell.groupby(["Model", "scenario"])["model_correct"].mean().groupby("Model").mean()
@@ -177,7 +175,7 @@ def test_words_say_what_was_averaged(released: PublishedTables) -> None:
 # --- panels -------------------------------------------------------------------------------------
 
 
-def test_panels_a_and_c_have_the_first_seed_alone(
+def test_panels_a_and_c_have_only_the_first_seed(
     released: PublishedTables, results: PublishedResults
 ) -> None:
     runs = released.distinct
@@ -195,7 +193,7 @@ def test_panels_a_and_c_have_the_first_seed_alone(
             assert table.loc[(model, "mean"), measure] == pytest.approx(own[measure].mean())
 
 
-def test_panels_set_models_beside_people(results: PublishedResults) -> None:
+def test_panels_set_models_next_to_people(results: PublishedResults) -> None:
     a = results.tables["panel_a"].set_index(["model", "scenario"])
     drop = a.loc[("DPI", "drop")]
     assert (round(drop["people"], 3), round(drop["zone_low"], 3)) == (0.746, 0.668)
@@ -209,7 +207,7 @@ def test_panels_set_models_beside_people(results: PublishedResults) -> None:
     assert not c.xs("mean", level="scenario")["in_zone"].any()
 
 
-def test_panels_d_and_e_are_those_of_the_released_notebook(
+def test_panels_d_and_e_match_the_released_notebook(
     official: Path, results: PublishedResults
 ) -> None:
     """All 24 and 33 cells, of SVG and RPIN with the rows of encoder seed 0 alone."""
@@ -290,7 +288,7 @@ def test_supplementary_figures(released: PublishedTables, results: PublishedResu
 # --- people -------------------------------------------------------------------------------------
 
 
-def test_people_beside_the_paper(results: PublishedResults) -> None:
+def test_people_next_to_the_paper(results: PublishedResults) -> None:
     claims = results.tables["people_claims"].set_index("claim")["ours"]
     assert claims["participants after exclusions"] == "688"
     assert claims["proportion correct over scenarios"] == "0.747"

@@ -81,7 +81,7 @@ def test_the_earlier_state_has_the_rows_of_the_released_notebook(
         ),
     ],
 )  # fmt: skip
-def test_fits_are_those_of_lmertest(
+def test_fits_match_lmertest(
     released: PublishedTables, contrast: Contrast, b: float, se: float, df: float, t: float
 ) -> None:
     found = fit_contrast(contrast, released, "twice")

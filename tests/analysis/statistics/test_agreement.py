@@ -33,7 +33,7 @@ def test_r_lies_between_minus_one_and_one(pair: Array) -> None:
 
 
 @given(pairs)
-def test_r_is_that_of_scipy_and_symmetric(pair: Array) -> None:
+def test_r_matches_scipy_and_symmetric(pair: Array) -> None:
     x, y = pair
     r = agreement.pearson(x, y)
     if np.ptp(x) == 0 or np.ptp(y) == 0:

@@ -13,7 +13,7 @@ from physion.core.errors import BadInputError
 
 
 @given(st.integers(1, 60), st.integers(0, 5))
-def test_weights_draw_n_of_n_and_depend_on_their_names_alone(n: int, seed: int) -> None:
+def test_weights_draw_n_of_n_and_depend_only_on_their_names(n: int, seed: int) -> None:
     bootstrap = Bootstrap(resamples=7, seed=seed)
     weights = bootstrap.weights("drop", n)
     assert weights.shape == (7, n)
@@ -38,7 +38,7 @@ def test_the_interval_of_a_mean_of_symmetric_values_holds_the_mean(half: np.ndar
     assert low - 1e-9 <= values.mean() <= high + 1e-9
 
 
-def test_width_is_that_of_the_normal_interval() -> None:
+def test_width_matches_the_normal_interval() -> None:
     values = np.random.default_rng(0).random(400)
     bootstrap = Bootstrap(resamples=4000)
     low, high = bootstrap.interval(bootstrap.weights("x", 400) @ values / 400)

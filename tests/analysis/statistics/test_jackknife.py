@@ -24,7 +24,7 @@ values_of_units = hnp.arrays(
 
 
 @given(values_of_units)
-def test_the_variance_of_a_mean_is_that_of_the_textbook(values: np.ndarray) -> None:
+def test_the_variance_of_a_mean_matches_the_textbook(values: np.ndarray) -> None:
     without = (1 - np.eye(len(values))) @ values / (len(values) - 1)
     expected = np.var(values, ddof=1) / len(values)
     for found in (jackknife(without), variance_of_mean(values)):
@@ -36,7 +36,7 @@ def test_the_variance_of_a_mean_is_that_of_the_textbook(values: np.ndarray) -> N
         assert variance_of_mean(values, counts=True).df == pytest.approx(len(values) - 1)
 
 
-def test_degrees_of_freedom_are_those_of_a_chi_square_as_variable() -> None:
+def test_degrees_of_freedom_match_a_chi_square_as_variable() -> None:
     """Over many samples, the variance of the estimated variance is 2 / df of its squared mean."""
     rng = np.random.default_rng(6)
     for values, most in ((rng.normal(size=(40, 4000)), 39), (rng.uniform(size=(40, 4000)), 39)):

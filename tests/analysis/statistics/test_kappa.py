@@ -67,7 +67,7 @@ def test_kappa_without_variation() -> None:
 
 @settings(deadline=None)
 @given(with_gaps)
-def test_correlation_is_that_of_scipy(values: Array) -> None:
+def test_correlation_matches_scipy(values: Array) -> None:
     found = kappa.pairwise_correlation(values)
     a, b = values[0], values[1]
     shared = ~np.isnan(a) & ~np.isnan(b)

@@ -205,7 +205,7 @@ def test_sessions_are_chosen(busy: tuple[Lab, Visitor]) -> None:
     assert "No matching session." in visitor.see("/sessions?state=none").text
 
 
-def test_flags_are_those_of_the_analysis(busy: tuple[Lab, Visitor]) -> None:
+def test_flags_match_the_analysis(busy: tuple[Lab, Visitor]) -> None:
     found, visitor = busy
     trials, sessions = read_tables(found.store.engine, found.study, kinds=("person",))
     expected = {
@@ -323,7 +323,7 @@ def test_a_bonus_is_for_answers_beyond_guessing_in_finished_sessions() -> None:
         assert bonus_of(rule, line(100, 100, state)) == 0.0
 
 
-def test_ids_are_on_no_page_but_that_of_payments(busy: tuple[Lab, Visitor]) -> None:
+def test_ids_are_only_on_the_page_of_payments(busy: tuple[Lab, Visitor]) -> None:
     found, visitor = busy
     ids = [row.raw_id for row in rows(found.store, RAW_IDS)]
     for page in ("", "/sessions", "/export"):
@@ -434,7 +434,7 @@ def test_pages_of_one_hostile_session(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_export_is_that_of_the_command(
+def test_the_export_matches_the_command(
     busy: tuple[Lab, Visitor], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found, visitor = busy

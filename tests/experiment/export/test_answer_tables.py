@@ -81,7 +81,7 @@ def test_every_answer_is_there_once_with_all_that_was_stored(
     assert not stored
 
 
-def test_order_is_that_of_time(engine: sa.Engine, study: Study) -> None:
+def test_order_matches_time(engine: sa.Engine, study: Study) -> None:
     trials, sessions = read_tables(engine, study)
     assert list(sessions["started_at"]) == sorted(sessions["started_at"])
     assert list(trials["session"].unique()) == [

@@ -243,7 +243,7 @@ def test_nothing_secret_is_exported(small: sa.Engine, study: Study, tmp_path: Pa
     assert settings[0]["settings"]["title"] == study.title
 
 
-def test_people_alone_and_one_scenario(small: sa.Engine, study: Study, tmp_path: Path) -> None:
+def test_only_people_and_one_scenario(small: sa.Engine, study: Study, tmp_path: Path) -> None:
     report = export_study(small, study, tmp_path / "out", simulated=False, scenario="drop")
     assert set(report.sessions) == {"person"}
     trials = pd.read_csv(tmp_path / "out" / "trials.csv")

@@ -131,7 +131,7 @@ def test_simulated_is_written_in_the_data_for_good(
 
 
 @pytest.mark.parametrize("with_sessions", [False, True])
-def test_models_are_not_compared_with_simulated_participants_alone(
+def test_models_are_not_compared_with_only_simulated_participants(
     study: Study,
     served: tuple[ServerProcess, list[SimulatedVisit], list[SimulatedVisit]],
     tmp_path: Path,

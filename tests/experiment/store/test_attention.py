@@ -67,7 +67,7 @@ def test_failed_checks_are_counted_and_flagged(checked_store: Store) -> None:
     assert (result.correct, result.trials, result.accuracy) == (4, 4, 1.0)
 
 
-def test_the_page_learns_of_instructed_checks_alone(checked_store: Store) -> None:
+def test_the_page_learns_only_of_instructed_checks(checked_store: Store) -> None:
     store = checked_store
     token = walk(store, enter(store, "Ada"), "instructions")
     order = order_of(store, run(store.state(token)).reference)

@@ -87,7 +87,7 @@ def test_a_session_has_practice_and_test_of_each_block(blocks_store: Store) -> N
     assert (result.trials, result.correct) == (4, sum(s.label for s in order["test"]))
 
 
-def test_the_media_of_all_blocks_are_those_of_the_order(blocks_store: Store) -> None:
+def test_the_media_of_all_blocks_match_the_order(blocks_store: Store) -> None:
     store = blocks_store
     token = walk(store, enter(store, "ada"), "familiarization")
     order = trial_order(store.study, ALL_SCENARIOS, rows(store, SESSIONS)[0].order_seed)

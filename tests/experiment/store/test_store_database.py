@@ -192,7 +192,7 @@ def test_waiting_commands_are_written_before_the_writer_closes(engine: Engine) -
         writer.submit(put(99))
 
 
-def test_a_lock_of_another_program_is_a_refusal_after_which_all_goes_on(
+def test_a_lock_of_another_program_is_a_refusal_after_which_all_continues(
     engine: Engine, tmp_path: Path
 ) -> None:
     writer = Writer(engine)

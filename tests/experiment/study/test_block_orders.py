@@ -86,7 +86,7 @@ def test_odd_numbers_and_rare_outcomes_still_fill_a_block(blocks_study: Study) -
         assert len(part) == 4 and sum(each.label for each in part) == 1
 
 
-def test_the_first_block_alone_can_have_familiarization(blocks_study: Study) -> None:
+def test_only_the_first_block_can_have_familiarization(blocks_study: Study) -> None:
     study = replace(blocks_study, blocks=Blocks(all_scenarios=True, familiarization="first"))
     trials = session_trials(study, ALL_SCENARIOS, 3)
     assert dict(trials) == {"familiarization": 2, "test": 18}

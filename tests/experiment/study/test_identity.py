@@ -41,7 +41,7 @@ from physion.experiment.study.study import Study
 KEYS = Secrets(b"a" * 32, b"b" * 32)
 
 
-def test_keys_are_kept_for_their_owner_alone(tmp_path: Path) -> None:
+def test_keys_are_kept_only_for_their_owner(tmp_path: Path) -> None:
     made = Secrets.create(tmp_path, "a long password")
     path = tmp_path / SECRET_FILE
     assert Secrets.load(tmp_path) == made
@@ -109,7 +109,7 @@ def test_tokens_and_references_do_not_repeat() -> None:
     assert len(hash_token("\ud800")) == 64  # whatever a header holds
 
 
-def test_orders_are_of_the_seed_alone(small_study: Study) -> None:
+def test_orders_depend_only_on_the_seed(small_study: Study) -> None:
     order = trial_order(small_study, "collide", 11)
     assert order["familiarization"] == small_study.phase("collide", "familiarization")
     assert set(order["test"]) == set(small_study.phase("collide", "test"))

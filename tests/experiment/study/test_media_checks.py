@@ -25,7 +25,7 @@ def test_a_right_study_passes(study: Study) -> None:
     check_media(study)
 
 
-def test_a_movie_that_goes_on_is_refused(study: Study) -> None:
+def test_a_movie_that_continues_is_refused(study: Study) -> None:
     path = study.folder / study.stimuli[-1].movie
     path.write_bytes(encode_movie(draw(3, False, 64)[: OBSERVED + 1]))
     with pytest.raises(BadInputError, match=r"46 frames; stimuli\.csv says 45") as raised:

@@ -26,7 +26,7 @@ TEXTS = {
 }
 
 
-def test_shipped_files_are_those_of_the_lock() -> None:
+def test_shipped_files_match_the_lock() -> None:
     lock = json.loads((VENDOR / "vendor.lock.json").read_text(encoding="utf-8"))
     assert lock["files"]
     for entry in lock["files"]:
@@ -60,7 +60,7 @@ def test_the_page_uses_no_other_host_and_nothing_inline() -> None:
     assert "url(" not in (STATIC / "pages.css").read_text(encoding="utf-8")
 
 
-def test_types_of_messages_are_those_of_the_server() -> None:
+def test_types_of_messages_match_the_server() -> None:
     """The interfaces of messages.d.ts have the fields of the pydantic models."""
     declared = (STATIC / "messages.d.ts").read_text(encoding="utf-8")
     interfaces = re.findall(r"export interface (\w+) \{\n(.*?)\n\}", declared, re.DOTALL)
@@ -72,7 +72,7 @@ def test_types_of_messages_are_those_of_the_server() -> None:
         assert re.findall(r"^  (\w+)\??:", body, re.MULTILINE) == expected, name
 
 
-def test_refusal_codes_are_those_of_the_server() -> None:
+def test_refusal_codes_match_the_server() -> None:
     (listed,) = re.findall(r"const CODES = new Set\(\[(.*?)\]\)", CODE["api.js"], re.DOTALL)
     staying = {code for code, status in REFUSALS.items() if status < 500} - {
         "too_many",

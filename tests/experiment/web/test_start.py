@@ -31,7 +31,7 @@ SLOW_TO_IMPORT = (
 )
 
 
-def test_rules_are_those_of_the_analysis() -> None:
+def test_rules_match_the_analysis() -> None:
     allowed = get_type_hints(StudySettings)["exclusions"]
     assert tuple(RULE_SETS) == get_args(allowed)
 

@@ -116,7 +116,7 @@ def listed(edges: tuple[Tensor, Tensor]) -> list[list[int]]:
 
 
 @pytest.mark.parametrize(("count", "size"), [(2, 0.1), (60, 0.2), (400, 0.6), (400, 50.0)])
-def test_radius_pairs_are_those_of_all_pairs(count: int, size: float) -> None:
+def test_radius_pairs_match_all_pairs(count: int, size: float) -> None:
     points, scene = random_points(f"{count} {size}", count, size)
     edges = listed(radius_edges(points, scene, RADIUS))
     assert edges == all_swept(points, torch.zeros_like(points), scene, RADIUS)
@@ -124,7 +124,7 @@ def test_radius_pairs_are_those_of_all_pairs(count: int, size: float) -> None:
 
 @pytest.mark.parametrize("speed", [0.0, 0.1, 1.0, 4.0, 30.0, 3000.0])
 @pytest.mark.parametrize("fast", [0.05, 1.0])
-def test_swept_pairs_are_those_of_all_pairs(speed: float, fast: float) -> None:
+def test_swept_pairs_match_all_pairs(speed: float, fast: float) -> None:
     """Displacements from 0 to 3000 radii, of few particles or of all."""
     points, scene = random_points(f"swept {speed} {fast}", 300, 0.5)
     rng = seeds.generator("displacements", str(speed), str(fast))

@@ -129,7 +129,7 @@ def test_a_jump_of_the_velocity_is_predicted_by_half_of_the_windows(
     np.testing.assert_allclose(found[holds], rest + ABRUPT / holds.sum())
 
 
-def test_what_gravity_alone_does_is_not_abrupt(calm: Trajectory) -> None:
+def test_what_only_gravity_does_is_not_abrupt(calm: Trajectory) -> None:
     falling = calm.velocities.copy()
     falling[:, 0, 2] = -9.81 * 0.01 * np.arange(len(falling))
     found = start_probabilities(replace(calm, velocities=falling), STRIDE, LENGTH, ABRUPT)

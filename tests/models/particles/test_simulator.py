@@ -181,7 +181,7 @@ def test_the_graph_leaves_out_what_nothing_reaches(collide: Motion) -> None:
     assert torch.equal(kept[~free], reached[~free])
 
 
-def test_the_graph_of_dpi_has_particles_near_something_alone(collide: Motion) -> None:
+def test_the_graph_of_dpi_has_only_particles_near_something(collide: Motion) -> None:
     model = model_of("dpi")
     layout, _, now = last_states(model, collide)
     free = (layout.kinds != KINEMATIC)[layout.owners]
@@ -237,7 +237,7 @@ def test_the_graph_of_gns_has_all_particles_that_can_move(collide: Motion) -> No
     assert set(free.tolist()) <= set(graph.rows.tolist()) and not len(graph.moments)
 
 
-def test_joined_inputs_are_those_of_one_matrix() -> None:
+def test_joined_inputs_match_one_matrix() -> None:
     torch.manual_seed(0)
     layers, rows = JoinedInputs(3 + 5 + 4, 8), torch.tensor([0, 2, 1, 1, 2, 0])
     first, second, shared = torch.randn(6, 3), torch.randn(6, 5), torch.randn(3, 4)
@@ -430,7 +430,7 @@ def test_what_follows_the_observed_part_is_not_seen(
     assert gap != straight.imagine(window(clean), 2, 5).gap.tobytes()
 
 
-def test_the_gap_of_the_true_motion_is_that_of_the_label() -> None:
+def test_the_gap_of_the_true_motion_matches_the_label() -> None:
     """Contacts of the engine are found again from poses, misses are misses."""
     right = []
     for scenario in ("collide", "drop", "dominoes"):

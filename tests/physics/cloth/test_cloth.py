@@ -82,7 +82,7 @@ def strain(vertices: np.ndarray, scene: Scene) -> np.ndarray:
     return np.asarray(apart / springs.lengths[family] - 1)
 
 
-def test_free_fall_is_that_of_a_point_and_keeps_the_sheet_flat() -> None:
+def test_free_fall_matches_a_point_and_keeps_the_sheet_flat() -> None:
     settings = ClothSettings(damping=0.0)
     scene = draped(far_away(), height=2.0)
     motion = still(scene, 41, settings)
@@ -257,7 +257,7 @@ def test_springs_join_the_edges_of_the_triangles_and_the_corners_across_them() -
     assert springs.degree.tolist() == degree.tolist()
 
 
-def test_a_spring_takes_back_its_share_of_its_error() -> None:
+def test_a_spring_takes_back_its_fraction_of_its_error() -> None:
     springs = sheet_springs(
         Cloth("c", (0.0, 0.0, 0.0), (1.0, 1.0, 0.0), resolution=2, stretch=0.6, bend=0.0)
     )
@@ -272,7 +272,7 @@ def test_a_spring_takes_back_its_share_of_its_error() -> None:
     assert shift.sum(axis=1) == pytest.approx(0.0, abs=1e-15)
 
 
-def test_recorded_distance_is_that_of_the_recorded_vertices() -> None:
+def test_recorded_distance_matches_the_recorded_vertices() -> None:
     motion = still(draped(ball()), 81)
     world = particles_of(ball(), SPACING) + ball().position
     for frame in (0, 30, 60, 80):
@@ -320,7 +320,7 @@ def test_solids_settle_on_the_floor_whatever_way_they_are_turned() -> None:
     assert settle_solids(unsettled) is unsettled
 
 
-def test_a_state_can_be_gone_on_from() -> None:
+def test_a_simulation_continues_from_a_state() -> None:
     scene = draped(far_away(), height=2.0)
     whole = still(scene, 31).vertices
     speed = (whole[20] - whole[19]) / 0.01
@@ -381,7 +381,7 @@ def test_label_asks_for_pressure_not_for_a_touch() -> None:
 
 
 @pytest.mark.slow
-def test_official_trials_are_told_apart_above_chance(official: Path) -> None:
+def test_official_trials_are_distinguished_above_chance(official: Path) -> None:
     """A quarter of the official cloth trials: enough to see skill, too few to measure it well."""
     trials = read_scenes(official / "scenes", "drape").unique()[0][::4]
     distances, contacts = [], []
@@ -392,7 +392,7 @@ def test_official_trials_are_told_apart_above_chance(official: Path) -> None:
     assert area_under_curve(-np.array(distances), np.array(contacts)) > 0.6
 
 
-def test_the_engine_lays_cloth_over_bodies_and_goes_on_from_a_state() -> None:
+def test_the_engine_lays_cloth_over_bodies_and_continues_from_a_state() -> None:
     solid = replace(ball(), kinematic=True)
     scene = replace(draped(solid), settle_frames=100)
     whole = simulate(scene, frames=61)

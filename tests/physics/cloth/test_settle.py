@@ -73,7 +73,7 @@ def particles(body: SolidBody, position: Vec3, rotation: tuple[float, ...]) -> n
     return np.asarray(rotate_vectors(rotation, origin + SPACING * np.argwhere(filled)) + position)
 
 
-def test_free_fall_is_that_of_a_point() -> None:
+def test_free_fall_matches_a_point() -> None:
     given = options(damping=0.0)
     state, frames = settle_frames(10, given, box(0.0, height=5.0))
     step, steps = 0.01 / 3, 30
@@ -83,7 +83,7 @@ def test_free_fall_is_that_of_a_point() -> None:
     assert state.q[0] == pytest.approx(UPRIGHT)
 
 
-def test_a_solid_alone_falls_on_the_floor_and_stands_where_the_short_way_puts_it() -> None:
+def test_a_single_solid_falls_on_the_floor_and_stands_where_the_short_way_puts_it() -> None:
     state, frames = settle_frames(100, options(), box(0.0))
     ((position, rotation),) = settled_poses((box(0.0),), options(), SPACING, 100)
     assert frames < 100
@@ -118,7 +118,7 @@ def test_the_heavier_solid_gives_way_less() -> None:
     assert moved[0, 0] == pytest.approx(-moved[1, 0] / 4, rel=0.02)
 
 
-def test_a_push_beside_the_centre_turns_a_solid() -> None:
+def test_a_push_next_to_the_centre_turns_a_solid() -> None:
     given = options(gravity=0.0, damping=0.0, floor=-100.0)
     low = box(0.0, mass=1e6, height=0.0, side=0.2)
     tall = SolidBody("cube", (0.2, 0.2, 0.8), (0.22, 0.0, 0.0), UPRIGHT, 5.0)

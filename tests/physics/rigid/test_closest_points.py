@@ -97,7 +97,7 @@ def test_hulls_farther_apart_than_the_reach_are_apart(reach: float, result: int)
 
 @CASES
 @given(seed=SEEDS, flattest=st.sampled_from([1.0, 0.1, 0.01, 0.001]))
-def test_the_distance_is_that_of_a_least_squares_problem(seed: int, flattest: float) -> None:
+def test_the_distance_matches_a_least_squares_problem(seed: int, flattest: float) -> None:
     a, b, rot, shift = far_pair(seed, flattest)
     found = search(a, b, rot, shift)
     expected = distance_by_least_squares(differences(a, b, rot, shift))

@@ -109,7 +109,7 @@ def test_bodies_of_one_actor_and_fixed_bodies_are_no_pairs() -> None:
     assert search.pairs() == []
 
 
-def test_candidates_without_room_are_told_and_nothing_is_lost() -> None:
+def test_candidates_without_room_are_counted_and_nothing_is_lost() -> None:
     search = Search(hulls_of(*[box(0.5)] * 3), capacity=2)
     assert search.step([0, 0, 5], [0.2, 0, 5], [0.4, 0, 5]) == FULL
     assert search.space.counters[0] == 2

@@ -414,7 +414,7 @@ def test_friction_acts_in_the_last_position_sweeps_and_the_velocity_sweep(sweeps
     assert bodies.v[0, 0] == pytest.approx(0.01 * left ** (sweeps + 1), abs=1e-15)
 
 
-def test_rotations_are_those_of_the_quaternions() -> None:
+def test_rotations_match_the_quaternions() -> None:
     q = np.array([axis_angle_quaternion([1.0, 2, 3], a) for a in (0.0, 0.7, 3.0)])
     rot = np.zeros((3, 3, 3))
     fill_rotations(q, rot, 1, 3)

@@ -109,7 +109,7 @@ def test_is_clear_of_compares_footprints() -> None:
     assert not is_clear_of(one, (Body("near", "cube", (0.9, 0.9, 0.0)),))
 
 
-def test_masses_are_those_of_the_official_logs() -> None:
+def test_masses_match_the_official_logs() -> None:
     cap = Body("cap", "cylinder", (0, 0, 0), (0.2, 0.2, 0.4), mass=2.0)
     assert set_mass_by_volume(cap).mass == pytest.approx(0.256)
     ring = Body("ring", "torus", (0, 0, 0), (0.35, 0.35, 0.35), mass=2.0)

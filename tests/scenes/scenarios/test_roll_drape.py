@@ -87,7 +87,7 @@ def test_all_published_configurations_are_there(scenario: str, count: int) -> No
 
 
 @pytest.mark.parametrize("scenario", ["roll", "drape"])
-def test_published_numbers_are_those_of_the_study(official: Path, scenario: str) -> None:
+def test_published_numbers_match_the_study(official: Path, scenario: str) -> None:
     with (official / "stimuli" / "readout_labels.csv").open() as file:
         readout = {row[0]: row[1] == "True" for row in list(csv.reader(file))[1:]}
     with (official / "stimuli" / "stimulus_names_and_labels.csv").open() as file:
@@ -360,7 +360,7 @@ def test_natural_sizes_are_python_floats() -> None:
     assert {type(side) for one in scene.bodies for side in one.scale} == {float}
 
 
-def test_cloth_over_the_zone_touches_it_and_cloth_beside_it_does_not() -> None:
+def test_cloth_over_the_zone_touches_it_and_cloth_next_to_it_does_not() -> None:
     low = drape.AnchorRule(height=0.05, height_jitter=0.0, taller=0.0, extra=0.0)
     near = drape.ClothRule(size=(0.8, 0.8), x=(0.0, 0.0), y=(0.1, 0.1), height=(0.6, 0.6))
     params = drape.DrapeParameters(

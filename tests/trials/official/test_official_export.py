@@ -437,7 +437,7 @@ def test_a_second_run_keeps_what_is_whole(exported: Path, dataset: Path, tmp_pat
     assert cut.read_bytes() == (exported / f"{CONFIGS['collide']}.hdf5").read_bytes()
 
 
-def test_a_missing_movie_is_rendered_and_a_bad_trial_fails_alone(
+def test_a_missing_movie_is_rendered_and_a_bad_trial_fails_without_the_others(
     exported: Path, dataset: Path, tmp_path: Path
 ) -> None:
     copy, out = tmp_path / "dataset", tmp_path / "out"
@@ -627,7 +627,7 @@ def test_cameras_come_back(eye: np.ndarray, aim: np.ndarray) -> None:
     assert back.fov == pytest.approx(camera.fov, abs=1e-6)
 
 
-def test_a_tilted_camera_is_told_from_an_upright_one() -> None:
+def test_a_tilted_camera_is_distinguished_from_an_upright_one() -> None:
     world_to_camera, projection = to_official_camera(CAMERA, 64, 64)
     turn = np.eye(4)
     turn[:2, :2] = [[0.8, -0.6], [0.6, 0.8]]

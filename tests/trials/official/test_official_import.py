@@ -469,7 +469,7 @@ def test_broken_fields_are_named(edited: Callable[..., Path], path: str) -> None
     assert what in reason and f"field '{'frames' if what == 'gaps' else path}'" in reason
 
 
-def test_a_cut_file_fails_alone(exported: Path, tmp_path: Path) -> None:
+def test_a_cut_file_fails_without_the_others(exported: Path, tmp_path: Path) -> None:
     folder = tmp_path / "mixed"
     shutil.copytree(exported, folder)
     path = folder / "configurations/Collide/collide_testing/0003.hdf5"
@@ -555,7 +555,7 @@ def test_what_has_no_motion_is_not_exported(core: Path, tmp_path: Path) -> None:
     assert not list((tmp_path / "out").rglob("*.hdf5"))
 
 
-def test_a_movie_without_label_fails_alone(core: Path) -> None:
+def test_a_movie_without_label_fails_without_the_others(core: Path) -> None:
     rows = list(csv.reader((core / "labels.csv").open()))
     with (core / "labels.csv").open("w") as file:
         csv.writer(file).writerows(row for row in rows if not row[0].startswith("collide"))

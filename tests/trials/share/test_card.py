@@ -156,7 +156,7 @@ def test_croissant_gives_the_movies_themselves(dataset: Path, metadata: dict[str
     assert fields["video"]["source"]["transform"] == {"jsonPath": "bytes"}
 
 
-def test_counts_and_rates_are_those_of_the_index(dataset: Path, tmp_path: Path) -> None:
+def test_counts_and_rates_match_the_index(dataset: Path, tmp_path: Path) -> None:
     text = write_card(dataset, tmp_path).readme.read_text()
     lines = text.splitlines()
     assert "| training | drop | 4 | 0.250 | 0 | 60 | - | free |" in lines
@@ -180,7 +180,7 @@ def test_the_card_follows_the_index(dataset: Path, tmp_path: Path) -> None:
     assert "was not measured" in text
 
 
-def test_states_alone_have_no_movies_to_describe(tmp_path: Path) -> None:
+def test_only_states_have_no_movies_to_describe(tmp_path: Path) -> None:
     _make(tmp_path, "training", "only", movies=False)
     paths = find_trials(tmp_path)[0]
     for path in (paths.movie, paths.observed_movie, paths.map):

@@ -211,7 +211,7 @@ def test_shards_follow_a_dataset_that_grows_and_shrinks(tmp_path: Path) -> None:
     assert len(list(out.iterdir())) == 5 and report.samples == 2
 
 
-def test_files_that_are_not_those_of_the_index_are_refused(tmp_path: Path) -> None:
+def test_files_that_do_not_match_the_index_are_refused(tmp_path: Path) -> None:
     folder = tmp_path / "dataset"
     paths = _make(folder, "training", "t0", True)
     _index(folder)
@@ -282,7 +282,7 @@ def test_bad_arguments_say_so(dataset: Path, tmp_path: Path) -> None:
         export_shards(dataset, tmp_path, shard_bytes=0)
 
 
-def test_folders_of_something_else_are_left_alone(dataset: Path, tmp_path: Path) -> None:
+def test_folders_of_something_else_are_not_changed(dataset: Path, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(BadInputError, match=r"thesis\.tex"):
         export_shards(dataset, tmp_path)
@@ -311,7 +311,7 @@ IMAGE_EXTENSIONS = (
 """Extensions that webdataset 1.0.2 takes for pictures (its ``autodecode.py``)."""
 
 
-def test_pictures_alone_are_decoded_as_pictures() -> None:
+def test_only_pictures_are_decoded_as_pictures() -> None:
     """The part of a key after its last dot decides, as in ``ImageHandler`` of webdataset."""
     pictures = IMAGE_EXTENSIONS.split()
     taken = [part for part in shards_module.PARTS if part.split(".")[-1] in pictures]

@@ -207,7 +207,7 @@ def background(sessions: pd.DataFrame) -> pd.DataFrame:
 def accuracy_by_background(test: pd.DataFrame, sessions: pd.DataFrame) -> pd.DataFrame:
     """Test whether accuracy depends on age, gender, education or reported difficulty.
 
-    Accuracies are taken relative to the mean of their scenario, since scenarios differ. One row a
+    Accuracies are taken relative to the mean of their scenario, since scenarios differ. One row per
     question: ``question``, ``sessions``, ``test`` (``spearman`` for numbers, ``kruskal-wallis`` for
     groups of at least two sessions), ``statistic``, ``df``, ``p``, ``reason``. Exploratory: as many
     tests as questions, p not corrected.

@@ -208,8 +208,8 @@ def session_measures(responses: Responses, expected: Expected | None = None) -> 
 
     ``expected``: the test stimuli by scenario, or by session if people see subsets; by default
     those that at least half of the scenario's sessions answered (`completeness`). Columns:
-    ``session``, ``participant``, ``scenario``, ``expected`` (number of stimuli), ``missing`` (those
-    of them without an answer), ``trials``, ``accuracy``, ``yes``, ``mean_log_rt``,
+    ``session``, ``participant``, ``scenario``, ``expected`` (number of stimuli), ``missing``
+    (stimuli without an answer), ``trials``, ``accuracy``, ``yes``, ``mean_log_rt``,
     ``median_log_rt``, ``no_log_rt`` (trials without a response time above 0), ``longest_streak``,
     ``longest_alternation``, ``longest_alternation_from_first``, ``familiarization_trials``,
     ``familiarization_correct``. Raises `BadInputError` if no session has a test answer.

@@ -32,8 +32,8 @@ from physion.core.names import OFFICIAL_SCENARIOS, canonical_name, is_ledge, sce
 
 # Schema of participant-level data, shared by the experiment's export and the analysis.
 #
-# Two tables make a study's data: one row per participant and trial (`TRIAL_COLUMNS`) and one row a
-# session (`SESSION_COLUMNS`). The experiment exports exactly these columns and writes its data
+# Two tables make a study's data: one row per participant and trial (`TRIAL_COLUMNS`) and one row
+# per session (`SESSION_COLUMNS`). The experiment exports exactly these columns and writes its data
 # dictionary with `data_dictionary`; the analysis refuses a file that violates them and names the
 # row.
 

@@ -115,8 +115,8 @@ class PublishedTables:
 
     @property
     def first_seeds(self) -> pd.DataFrame:
-        """`distinct` with seed 0 only of `FIRST_SEED`, as the paper's main figure has them: one
-        row a model, scenario, training and readout.
+        """`distinct` with seed 0 only of `FIRST_SEED`, as the paper's main figure has them: one row
+        per model, scenario, training and readout.
         """
         runs = self.distinct
         return runs[~runs["model"].isin(FIRST_SEED) | (runs["seed"] == 0)]

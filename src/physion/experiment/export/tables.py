@@ -125,8 +125,8 @@ def _columns(question: Question, texts: Mapping[str, str]) -> list[Column]:
             about = f"{words} ({ends})"
             return [Column(question.name, "integer", about, low=1, high=question.steps)]
         case "choice":
-            told = "; ".join(f"{option}: {label}" for option, label in labels.items())
-            about = f"{words} ({told})"
+            listed = "; ".join(f"{option}: {label}" for option, label in labels.items())
+            about = f"{words} ({listed})"
             return [Column(question.name, "choice", about, choices=question.options)]
     names = zip(columns_of(question), labels.values(), strict=True)
     return [Column(name, "flag", f"{words} Was chosen: {label}") for name, label in names]

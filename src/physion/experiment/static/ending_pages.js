@@ -58,7 +58,7 @@ function question(t, name, text, parts, answerOf) {
  */
 export function endedPage({ texts, study, state, another, address }, { completion }) {
   const { t } = bound(texts);
-  const told = completion.code || completion.url;
+  const submitted = completion.code || completion.url;
   const declined = state.stage === "declined"; // nothing was stored
   const takePart = () => window.location.replace(address);
   const changed = () => {
@@ -70,7 +70,7 @@ export function endedPage({ texts, study, state, another, address }, { completio
     page.append(
       el("h1", {}, t(`${state.stage}.title`)),
       ...paragraphs(t(`${state.stage}.text`, study)),
-      ...(told ? [] : [el("p", {}, t("ended.return_submission"))]),
+      ...(submitted ? [] : [el("p", {}, t("ended.return_submission"))]),
       ...completionParts(completion, t, "ended.go_hint"),
       declined ? changed() : el("p", { class: "small" }, reference),
     );

@@ -64,7 +64,7 @@ def differences(scenario: str) -> list[str]:
 
 
 def main() -> None:
-    """Print all digests as JSON; with ``--write`` store them as those of this version.
+    """Print all digests as JSON; with ``--write`` store them for this version.
 
     Store them only after a change that is meant to alter scenes, motions or pictures, and increase
     `physion.physics.rigid.engine.VERSION` or `physion.rendering.renderer.VERSION` at the same time.

@@ -178,7 +178,7 @@ def test_missing_files_are_named_all_at_once(dataset: Path, tmp_path: Path) -> N
     assert not (tmp_path / "study").exists()
 
 
-def test_a_failed_making_goes_on_where_it_stopped(
+def test_a_failed_making_continues_where_it_stopped(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     taken: list[str] = []
@@ -226,7 +226,7 @@ def test_another_choice_leaves_nothing_of_the_first(
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "responses.sqlite", "study.toml"])
-def test_folders_with_something_in_them_are_left_alone(
+def test_folders_with_something_in_them_are_not_changed(
     dataset: Path, tmp_path: Path, name: str
 ) -> None:
     folder = tmp_path / "study"
@@ -237,14 +237,14 @@ def test_folders_with_something_in_them_are_left_alone(
     assert [path.name for path in folder.iterdir()] == [name]
 
 
-def test_a_finished_study_is_left_alone(dataset: Path, tmp_path: Path) -> None:
+def test_a_finished_study_is_not_changed(dataset: Path, tmp_path: Path) -> None:
     study = make_tiny_study(tmp_path)
     with pytest.raises(BadInputError, match=r"study in .* already"):
         make_study(_study(tmp_path), choose_trials(dataset).sources, "a password")
     assert load_study(tmp_path) == study
 
 
-def test_answers_in_an_unfinished_folder_are_left_alone(dataset: Path, tmp_path: Path) -> None:
+def test_answers_in_an_unfinished_folder_are_not_changed(dataset: Path, tmp_path: Path) -> None:
     make_tiny_study(tmp_path)
     (tmp_path / JOURNAL).write_text("")
     (tmp_path / "responses.sqlite").write_text("answers")
@@ -320,7 +320,7 @@ def test_bad_commands_are_one_line_and_leave_nothing(
     assert not (tmp_path / "study").exists()
 
 
-def test_the_verb_alone_says_which_words_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_verb_without_words_says_which_there_are(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["experiment"]) == 2
     out = capsys.readouterr().out
     assert all(f"physion experiment {word}" in out for word in SUBVERBS)

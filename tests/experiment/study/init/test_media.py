@@ -51,7 +51,7 @@ def test_our_movies_are_copied_as_they_are(source: StimulusSource, study: Path) 
     assert (found.width, found.height, found.label) == (SIZE, SIZE, True)
 
 
-def test_names_are_those_of_the_content(source: StimulusSource, study: Path) -> None:
+def test_names_match_the_content(source: StimulusSource, study: Path) -> None:
     found = import_stimulus(source, study)
     for name in (found.movie, found.map, found.full):
         assert Path(name).stem == hashlib.sha256((study / name).read_bytes()).hexdigest()
@@ -131,9 +131,7 @@ def test_what_browsers_may_not_play_rightly_is_encoded_again(
     assert numbers == list(range(OBSERVED))
 
 
-def test_files_that_are_not_those_of_the_index_are_refused(
-    source: StimulusSource, study: Path
-) -> None:
+def test_files_that_do_not_match_the_index_are_refused(source: StimulusSource, study: Path) -> None:
     with pytest.raises(BadInputError, match="index"):
         import_stimulus(replace(source, digests={"observed": "0" * 64}), study)
 
