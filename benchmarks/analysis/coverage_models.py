@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -10,12 +10,11 @@ import pandas as pd
 from coverage_studies import F64, MODELS, SCENARIOS, Coverage, Size, Study
 from physion.analysis.intervals import Variance, jackknife
 from physion.analysis.metrics import all_metrics, metrics
-from physion.analysis.model_tests import PooledStimuli, paired_measures, pool_scenarios
+from physion.analysis.model_tests import PooledStimuli, paired_measures
 from physion.analysis.rollout_errors import CONSTANT_VELOCITY, rollout_error_table
 from physion.analysis.sample import Resampled, Sample
 from physion.analysis.scores import sample_of_models, sampling_variances, score_table
 from physion.analysis.statistics.agreement import correlate_resampled
-from physion.analysis.statistics.paired import compare_models
 from physion.analysis.statistics.regression import reliability_curve
 from physion.analysis.tables import MEAN, POOLED
 from physion.core.seeds import generator
@@ -92,23 +91,35 @@ def of_stimuli(coverage: Coverage, size: Size, repeats: int) -> None:
 
 
 def _differences(coverage: Coverage, size: Size, study: Study) -> None:
-    pooled = pool_scenarios([(study.models(), study.answers())])
-    tests = compare_models(
-        list(MODELS), pooled.correct, pooled.p_contact, pooled.p_yes, permutations=1
+    _paired(coverage, "", size, _pool({"drop": study}), ("r", "rmsd", "kappa_from_averages"))
+
+
+def _pool(studies: Mapping[str, Study]) -> PooledStimuli:
+    """Return the models on the stimuli of studies by scenario."""
+    each = studies.values()
+    p_contact = np.concatenate([study.p_contact for study in each], axis=1)
+    label = np.concatenate([study.label for study in each])
+    return PooledStimuli(
+        names=MODELS,
+        p_contact=p_contact,
+        correct=((p_contact > 0.5) == label).astype(np.float64),
+        label=label,
+        p_yes=np.concatenate([study.p_yes for study in each]),
+        scenario=tuple(name for name, study in studies.items() for _ in study.label),
     )
-    for row in tests.to_dict("records"):
-        coverage.add(
-            f"{row['first']} less {row['second']}: r", "stimuli", size,
-            row["r_difference"], row["r_difference_low"], row["r_difference_high"],
-        )  # fmt: skip
-    _paired(coverage, "", size, pooled)
 
 
-def _paired(coverage: Coverage, prefix: str, size: Size | str, pooled: PooledStimuli) -> None:
-    """Add differences of RMSD and kappa; those of r are the ones of `compare_models`."""
+def _paired(
+    coverage: Coverage,
+    prefix: str,
+    size: Size | str,
+    pooled: PooledStimuli,
+    measures: Sequence[str] = ("rmsd", "kappa_from_averages"),
+) -> None:
+    """Add differences of two models on all stimuli."""
     table = paired_measures(pooled, permutations=1)
     last = table["scenario"].iloc[-1]
-    table = table[(table["scenario"] == last) & (table["measure"] != "r")]
+    table = table[(table["scenario"] == last) & table["measure"].isin(measures)]
     for row in table.to_dict("records"):
         what = f"{prefix}{row['first']} less {row['second']}: {row['measure']}"
         coverage.add(what, "stimuli", size, row["difference"], row["low"], row["high"])
@@ -168,8 +179,7 @@ def pooled(coverage: Coverage, size: Size, repeats: int) -> None:
                 coverage.add(f"good, {where}: {name}", "stimuli", named, row[name],
                              row[f"{name}_low"], row[f"{name}_high"])  # fmt: skip
         if coverage.wants(*pairs):
-            both = [(study.models(), study.answers(name)) for name, study in parts.items()]
-            _paired(coverage, "pooled: ", named, pool_scenarios(both))
+            _paired(coverage, "pooled: ", named, _pool(parts))
 
 
 def _good(scenario: str, study: Study, people: int) -> pd.DataFrame:

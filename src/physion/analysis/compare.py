@@ -22,9 +22,7 @@ from physion.analysis.model_tests import (
     fits_of_people,
     paired_measures,
     paired_tests,
-    permutations_of,
     pool_comparison,
-    pool_scenarios,
 )
 from physion.analysis.people.measures import HALVES, accuracy_by_stimulus, all_answers, split_halves
 from physion.analysis.people.results import PeopleResults
@@ -40,7 +38,7 @@ from physion.analysis.scores import (
     released_r_zone,
     with_kind,
 )
-from physion.analysis.tables import check_excluded_names, require_columns
+from physion.analysis.tables import check_excluded_names, name_models, require_columns
 from physion.core.errors import BadInputError
 
 # All models compared with all participants: every scenario, their mean, and what was excluded.
@@ -57,18 +55,12 @@ class PeopleComparison:
     - ``zones``: `human_zones` of every scenario, and for several scenarios also the paper's
       band of r (`released_r_zone`), whose scenario is the mean.
     - ``pairs``: `model_pairs` of every scenario.
-    - ``tests``: `compare_models` on the stimuli of all scenarios together;
-      ``measure_tests``: `paired_measures`.
-    - ``calibration``: `calibration_table`, likewise.
     - ``dropped``: ``model``, ``scenario``, ``reason``, ``stimuli``.
     """
 
     scores: pd.DataFrame
     zones: pd.DataFrame
     pairs: pd.DataFrame
-    tests: pd.DataFrame
-    measure_tests: pd.DataFrame
-    calibration: pd.DataFrame
     dropped: pd.DataFrame
 
 
@@ -78,7 +70,6 @@ def compare_everywhere(
     bootstrap: Bootstrap | None = None,
     *,
     halves: int = HALVES,
-    permutations: int = 2000,
 ) -> PeopleComparison:
     """Compare the models of ``predictions`` with the people of ``test`` in every scenario.
 
@@ -90,11 +81,9 @@ def compare_everywhere(
     test
         Test rows of `Responses`.
     bootstrap
-        Level of the intervals, and draws of the tests.
+        Level of the intervals, and seed of the halves.
     halves
         Number of random splits of the people into halves.
-    permutations
-        Permutations of the test of differences in r.
     """
     columns = ["model", "stimulus", "p_contact", "predicted"]
     require_columns(predictions, columns, "the predictions")
@@ -103,12 +92,11 @@ def compare_everywhere(
     rows = predictions[columns].assign(scenario=predictions["stimulus"].map(scenario_by_stimulus))
     names = list(rows["model"].unique())
     dropped = [_unseen(rows)]
-    measured, scored, zones, pairs = [], [], [], []
+    measured, zones, pairs = [], [], []
     for answers in all_answers(test):
         subset = rows[rows["scenario"] == answers.scenario]
         models, unmatched = models_of(subset, answers, names)
         dropped.append(unmatched.assign(scenario=answers.scenario))
-        scored.append((models, answers))
         measured.append(
             measure_models(add_baselines(models, answers), answers, two_people=TWO_PEOPLE)
         )
@@ -120,14 +108,10 @@ def compare_everywhere(
     tables = [measure_table(one, draws.level) for one in measured]
     if len(measured) > 1:
         tables.append(measure_table(mean_measures(measured), draws.level))
-    pooled = pool_scenarios(scored)
     return PeopleComparison(
         scores=with_kind(_with_zone(pd.concat(tables, ignore_index=True), zone), "model"),
         zones=zone,
         pairs=pd.concat(pairs, ignore_index=True),
-        tests=paired_tests(pooled, draws, permutations),
-        measure_tests=paired_measures(pooled, draws.level, permutations, draws.seed),
-        calibration=calibration_scores(pooled),
         dropped=pd.concat(dropped, ignore_index=True)[["model", "scenario", "reason", "stimuli"]],
     )
 
@@ -220,75 +204,46 @@ def all_results(
         "exclude_ledge": exclude_ledge,
         "bootstrap": draws,
     }
-    column = "stimulus" if "stimulus" in predictions else "Stimulus Name"
-    predicted = set(predictions[column].astype(str))
-    if people is not None:
+    predictions = name_models(predictions)
+    predicted = set(predictions["stimulus"])
+    whole, beside, about_people = None, None, []
+    if people is None:
+        seen = set() if humans is None else set(humans["stimulus"])
+        check_excluded_names(settings["exclude"], {*predicted, *seen, *(labels or {})})
+        main = compare_scores(
+            predictions, humans, labels, zone=zone, zone_origin=zone_origin, **settings
+        )
+    else:
         if humans is not None or labels is not None or zone is not None:
             raise BadInputError("give averages of people or their single responses, not both")
         check_excluded_names(settings["exclude"], predicted | people.stimuli)
-        return _with_participants(predictions, people, draws, settings)
-    seen = set() if humans is None else set(humans["stimulus"])
-    check_excluded_names(settings["exclude"], {*predicted, *seen, *(labels or {})})
-    comparison = compare_scores(
-        predictions, humans, labels, zone=zone, zone_origin=zone_origin, **settings
-    )
-    return _with_averages(comparison, predictions, draws)
-
-
-def _with_averages(
-    comparison: Comparison, predictions: pd.DataFrame, draws: Bootstrap
-) -> ComparisonResults:
-    """Complete a comparison with people's averages, or without people, by tests and fits."""
-    pooled = pool_comparison(comparison)
-    several = len(comparison.names) > 1
-    return ComparisonResults(
-        comparison,
-        predictions=predictions,
-        paired=paired_tests(pooled, draws) if several else None,
-        paired_measures=paired_measures(pooled, draws.level, seed=draws.seed)
-        if several and comparison.has_people
-        else None,
-        calibration=calibration_scores(pooled),
-        mixed=tuple(fits_of_models(comparison)),
-        warnings=comparison.warnings,
-    )
-
-
-def _with_participants(
-    predictions: pd.DataFrame,
-    people: PeopleResults,
-    draws: Bootstrap,
-    settings: Mapping[str, Any],
-) -> ComparisonResults:
-    """Compare models with the sessions that are not flagged, and with all complete ones.
-
-    ``settings`` are the options of `compare_scores`, which resamples with ``draws``.
-    """
-    main = compare_scores(
-        predictions,
-        people.tables["by_stimulus"],
-        people.labels(),
-        zone=people.zone(),
-        zone_origin="from the responses themselves",
-        participants=True,
-        **settings,
-    )
-    everybody = accuracy_by_stimulus(people.whole.test, draws)
-    whole = compare_scores(predictions, everybody, people.labels(), **settings)
-    count = len(main.names)
-    permutations = permutations_of(count * (count - 1) // 2)
-    beside = compare_everywhere(main.stimuli, people.kept.test, draws, permutations=permutations)
+        known, test = people.labels(), people.kept.test
+        main = compare_scores(
+            predictions,
+            people.tables["by_stimulus"],
+            known,
+            zone=people.zone(),
+            zone_origin="from the responses themselves",
+            participants=True,
+            **settings,
+        )
+        everybody = accuracy_by_stimulus(people.whole.test, draws)
+        whole = compare_scores(predictions, everybody, known, **settings)
+        beside = compare_everywhere(main.stimuli, test, draws)
+        about_people = fits_of_people(people)
+    pooled = pool_comparison(main)
+    several = len(main.names) > 1
     return ComparisonResults(
         main,
         predictions=predictions,
         people=people,
-        comparison_all=whole,
         beside=beside,
-        paired=beside.tests if count > 1 else None,
-        paired_measures=beside.measure_tests if count > 1 else None,
-        calibration=beside.calibration,
-        mixed=(*fits_of_people(people), *fits_of_models(main)),
-        warnings=(*people.warnings, *main.warnings),
+        comparison_all=whole,
+        paired=paired_tests(pooled, draws) if several else None,
+        paired_measures=paired_measures(pooled, draws) if several and main.has_people else None,
+        calibration=calibration_scores(pooled),
+        mixed=(*about_people, *fits_of_models(main)),
+        warnings=(*(people.warnings if people else ()), *main.warnings),
     )
 
 

@@ -18,7 +18,7 @@ from scipy import stats
 from physion.analysis.intervals import Bootstrap
 from physion.analysis.people.responses import EXCLUDED, LEDGE
 from physion.analysis.scores import baseline_scores, kind_of, people_table, score_table, with_kind
-from physion.analysis.tables import check_predictions, in_order, name_models, with_labels
+from physion.analysis.tables import in_order, name_models, with_labels
 from physion.core.errors import BadInputError
 from physion.core.names import canonical_name, is_ledge, scenario_of
 
@@ -316,9 +316,7 @@ def compare_scores(
         If no stimulus is left, or a model or the tables contradict themselves.
     """
     draws = bootstrap or Bootstrap()
-    rows = (
-        predictions if "base_model" in predictions else name_models(check_predictions(predictions))
-    )
+    rows = name_models(predictions)
     unwanted = {canonical_name(name) for name in exclude}
     known = _recorded(rows)
     known |= {canonical_name(name): bool(value) for name, value in (labels or {}).items()}

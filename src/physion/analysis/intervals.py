@@ -160,18 +160,41 @@ def jackknife(
 
 
 def variance_of_mean(values: Array, *, counts: bool = False) -> Variance:
-    """Return the jackknife variance of the mean of values (n, ...).
+    """Return the variance of the mean of values (n, ...), by the jackknife.
 
     NaN are left out; the result is NaN for fewer than two values. ``counts``: the values are 0 or
     1, as in `jackknife`.
     """
     known = np.isfinite(values)
-    n = np.sum(known, axis=0).astype(np.float64)
+    filled, n = np.where(known, values, 0.0), known.sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        mean = np.sum(np.where(known, values, 0.0), axis=0) / n
-        apart = np.where(known, values - mean, 0.0)
-        variance = np.where(n > 1, np.sum(apart**2, axis=0) / (n - 1) / n, np.nan)
-    return Variance(variance, np.maximum(n - 1, 1) if counts else degrees_of_freedom(apart, n))
+        without = (filled.sum(axis=0) - filled) / (n - 1)
+    found = jackknife(without, used=known, counts=counts)
+    return Variance(np.where(n > 0, found.value, np.nan), found.df)
+
+
+def wilson(fraction: npt.ArrayLike, n: npt.ArrayLike, level: float = 0.95) -> tuple[Array, Array]:
+    """Return Wilson's interval of fractions of ``n`` independent trials; NaN if undefined."""
+    p, size = np.asarray(fraction, np.float64), np.asarray(n, np.float64)
+    z = float(special.ndtri(0.5 + level / 2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        centre = (p + z * z / (2 * size)) / (1 + z * z / size)
+        half = z / (1 + z * z / size) * np.sqrt(p * (1 - p) / size + (z / (2 * size)) ** 2)
+    return centre - half, centre + half
+
+
+def distribution(values: npt.ArrayLike) -> dict[str, float]:
+    """Return number, mean, median and middle 95 % of the values that are defined.
+
+    Keys: ``values`` (all of them), ``undefined`` (NaN), ``mean``, ``low``, ``median``, ``high``
+    (2.5th, 50th, 97.5th percentile; NaN if nothing is defined).
+    """
+    array = np.asarray(values, dtype=np.float64)
+    known = array[np.isfinite(array)]
+    low, median, high = np.percentile(known, [2.5, 50, 97.5]) if len(known) else [np.nan] * 3
+    return {"values": len(array), "undefined": len(array) - len(known),
+            "mean": float(np.mean(known)) if len(known) else np.nan,
+            "low": float(low), "median": float(median), "high": float(high)}  # fmt: skip
 
 
 def degrees_of_freedom(apart: Array, n: Array) -> Array:

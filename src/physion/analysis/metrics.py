@@ -16,15 +16,18 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
 import numpy as np
-from scipy import special
 
 from physion.analysis.intervals import Scale
 from physion.analysis.sample import RESAMPLED, Array, Resampled, Sample, Sums
 from physion.analysis.statistics.agreement import (
+    ROUNDING,
     correctness,
     correlation_from_sums,
     correlation_within_groups,
     cross_kappa,
+    in_units_of_kappa,
+    kappa_from_fractions,
+    z_rates,
 )
 from physion.core.registry import Registry
 
@@ -253,9 +256,6 @@ def difference(sample: Sample) -> Array:
 
 # Metrics of a model with the average person: they need P(yes) by stimulus only.
 
-ROUNDING = 1e-12
-"""Distance from 1 below which agreement by chance counts as 1."""
-
 
 def r_of_two_people(sample: Sample) -> Array:
     """Return the expected r of one person's answers with the average of all others, (b, 1).
@@ -322,11 +322,10 @@ def r_same_outcome(sample: Sample) -> Array:
 
 
 def _kappa_of_two_people(sample: Sample) -> Array:
-    """Return kappa of one person with another: agreement 1 - mean of P(they differ)."""
+    """Return kappa of one person with another, who both say yes in yes - P(they differ) / 2."""
     sums = sample.of_people.sums
     yes = sums.y / sums.n_people + 0.5
-    agreement = 1 - sums.differ / sums.n_people
-    return _kappa(agreement, yes**2 + (1 - yes) ** 2)
+    return kappa_from_fractions(yes, yes, yes - sums.differ / sums.n_people / 2)
 
 
 @register_metric(
@@ -359,12 +358,7 @@ def kappa_from_averages(sample: Sample) -> Array:
     """
     sums = sample.sums
     model, people = sums.yes / sums.n_people, sums.y / sums.n_people + 0.5
-    agreement = 1 - model - people + 2 * sums.both_yes / sums.n_people
-    return _kappa(agreement, model * people + (1 - model) * (1 - people))
-
-
-def _kappa(agreement: Array, expected: Array) -> Array:
-    return np.where(1 - expected > ROUNDING, (agreement - expected) / (1 - expected), np.nan)
+    return kappa_from_fractions(model, people, sums.both_yes / sums.n_people)
 
 
 @register_metric(
@@ -488,7 +482,7 @@ def _within_of_two_people(sample: Sample) -> Array:
         _agreeing(part.n_people, _yes_of_people(part), _yes_of_people(part))
         for part in sample.of_people.sums_by_outcome
     )
-    return _in_units_of_kappa(agreement - independent / sums.n_people, yes, yes)
+    return in_units_of_kappa(agreement - independent / sums.n_people, yes, yes)
 
 
 @register_metric(
@@ -524,7 +518,7 @@ def kappa_within_outcomes(sample: Sample) -> Array:
     independent = sum(
         _agreeing(part.n_people, part.yes, _yes_of_people(part)) for part in sample.sums_by_outcome
     )
-    return _in_units_of_kappa(agreement - independent / sums.n_people, model, people)
+    return in_units_of_kappa(agreement - independent / sums.n_people, model, people)
 
 
 def _yes_of_people(sums: Sums) -> Array:
@@ -536,12 +530,6 @@ def _agreeing(n: Array, first: Array, second: Array) -> Array:
     """Return the expected agreements in n stimuli of two with so many yes in random places."""
     with_both = np.where(n > 0, 2 * first * second / n, 0.0)
     return np.asarray(n - first - second + with_both)
-
-
-def _in_units_of_kappa(excess: Array, first: Array, second: Array) -> Array:
-    """Return an excess of agreement divided by 1 - C, with the fractions of yes of both."""
-    rest = first * (1 - second) + second * (1 - first)
-    return np.where(rest > ROUNDING, excess / rest, np.nan)
 
 
 # Metrics of a model with single participants: they need the answers of each of them.
@@ -608,26 +596,6 @@ def error_consistency(sample: Sample) -> Array:
 # Metrics of signal detection: how well a model tells contacts from others, and how it leans.
 
 
-def _z_rates(sample: Sample) -> tuple[Array, Array]:
-    """Return z of the rates of hits and of false alarms, each (b, m).
-
-    Notes
-    -----
-    With h answers yes at n contacts, z is the normal quantile of (h + 1/2) / (n + 1): the
-    log-linear correction, by which d' of a model without an error is finite. NaN without a contact,
-    or without a stimulus that has none.
-    """
-    known = np.isfinite(sample.predicted)
-    yes = np.where(known, sample.predicted, 0.0)
-    rates = []
-    for outcome in (1.0, 0.0):
-        members = (sample.label == outcome).astype(np.float64)
-        said_yes = sample.stimuli @ (yes * members).T
-        of = sample.stimuli @ (known * members).T
-        rates.append(np.where(of > 0, special.ndtri((said_yes + 0.5) / (of + 1)), np.nan))
-    return rates[0], rates[1]
-
-
 @register_metric(
     "d_prime",
     label="d′",
@@ -640,7 +608,7 @@ def _z_rates(sample: Sample) -> tuple[Array, Array]:
 )
 def d_prime(sample: Sample) -> Array:
     """Return d' of the model's answers."""
-    hits, alarms = _z_rates(sample)
+    hits, alarms = z_rates(sample.predicted, sample.label, sample.stimuli)
     return hits - alarms
 
 
@@ -655,5 +623,5 @@ def d_prime(sample: Sample) -> Array:
 )
 def criterion(sample: Sample) -> Array:
     """Return the criterion of the model's answers."""
-    hits, alarms = _z_rates(sample)
+    hits, alarms = z_rates(sample.predicted, sample.label, sample.stimuli)
     return -(hits + alarms) / 2

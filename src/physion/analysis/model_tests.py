@@ -7,7 +7,7 @@ and permutations of r (`paired_tests`), differences of every measure with interv
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -16,15 +16,18 @@ import numpy.typing as npt
 import pandas as pd
 
 from physion.analysis.comparison import Comparison
-from physion.analysis.intervals import Bootstrap, jackknife
+from physion.analysis.intervals import Bootstrap
 from physion.analysis.mixed.fit import fit_linear, fit_logistic
 from physion.analysis.mixed.result import MixedFit, effect_name
 from physion.analysis.people.effects import HYPOTHESES, answer_rows, with_attributes
-from physion.analysis.people.measures import ScenarioAnswers
 from physion.analysis.people.results import PeopleResults
-from physion.analysis.scores import Models
-from physion.analysis.statistics.agreement import correctness, correlation_from_sums
-from physion.analysis.statistics.paired import compare_models, corrected_p, swap_coins
+from physion.analysis.statistics.paired import (
+    MEASURES,
+    Difference,
+    corrected_p,
+    mcnemar_exact,
+    paired_difference,
+)
 from physion.analysis.statistics.regression import calibration_table
 from physion.analysis.tables import MEAN, POOLED, in_order
 from physion.core.errors import PhysionError
@@ -59,23 +62,6 @@ def permutations_of(pairs: int) -> int:
     return min(20_000, max(2_000, 40 * pairs))
 
 
-def pool_scenarios(scored: Sequence[tuple[Models, ScenarioAnswers]]) -> PooledStimuli:
-    """Pool the stimuli of several scenarios that single participants answered.
-
-    ``scored`` holds the same models with the answers of people for each scenario.
-    """
-    return PooledStimuli(
-        names=scored[0][0].names,
-        p_contact=np.concatenate([models.p_contact for models, _ in scored], axis=1),
-        correct=np.concatenate(
-            [correctness(models.predicted, answers.label) for models, answers in scored], axis=1
-        ),
-        label=np.concatenate([answers.label for _, answers in scored]),
-        p_yes=np.concatenate([answers.p_yes() for _, answers in scored]),
-        scenario=tuple(answers.scenario for _, answers in scored for _ in answers.stimuli),
-    )
-
-
 def pool_comparison(comparison: Comparison) -> PooledStimuli:
     """Pool the stimuli of a comparison with people's averages, or without people."""
     rows = comparison.stimuli.assign(
@@ -98,19 +84,61 @@ def pool_comparison(comparison: Comparison) -> PooledStimuli:
 
 
 def paired_tests(
-    pooled: PooledStimuli, bootstrap: Bootstrap, permutations: int | None = None
+    pooled: PooledStimuli, bootstrap: Bootstrap | None = None, permutations: int | None = None
 ) -> pd.DataFrame:
-    """Test every two models with `compare_models`; empty for one model only."""
-    pairs = len(pooled.names) * (len(pooled.names) - 1) // 2
-    return compare_models(
-        list(pooled.names),
-        pooled.correct,
-        pooled.p_contact,
-        pooled.p_yes,
-        bootstrap,
-        strata=list(pooled.scenario),
-        permutations=permutations_of(pairs) if permutations is None else permutations,
-    )
+    """Test accuracy and r of every two models on the stimuli that both predict; one row per pair.
+
+    Parameters
+    ----------
+    pooled
+        Models and people on the stimuli of all scenarios.
+    bootstrap
+        Level of the intervals, and the seed of the permutations.
+    permutations
+        Permutations of the test of differences in r; None: `permutations_of` the pairs.
+
+    Returns
+    -------
+    ``first``, ``second``, ``stimuli``, ``accuracy_difference`` (first - second), ``only_first``,
+    ``only_second``, ``p_accuracy`` (McNemar, exact), ``r_difference`` with ``_low``, ``_high``
+    (jackknife over stimuli) and ``p_r`` (permutations), from `paired_difference`; ``reason``; and
+    of both p the corrected ``_holm`` and ``_bh`` over all pairs of this table.
+    """
+    draws = bootstrap or Bootstrap()
+    pairs = list(combinations(range(len(pooled.names)), 2))
+    count = permutations_of(len(pairs)) if permutations is None else permutations
+    records = []
+    for i, j in pairs:
+        first, second = pooled.correct[i], pooled.correct[j]
+        shared = np.isfinite(first) & np.isfinite(second)
+        counts = mcnemar_exact(first, second)
+        r = _difference(pooled, (i, j), shared & np.isfinite(pooled.p_yes), "r", draws, count)
+        why = "" if np.isfinite(r.value) else "r: undefined for one of the two"
+        records.append(
+            {
+                "first": pooled.names[i],
+                "second": pooled.names[j],
+                "stimuli": int(shared.sum()),
+                "accuracy_difference": float(np.mean(first[shared] - second[shared]))
+                if shared.any()
+                else np.nan,
+                "only_first": counts.only_first,
+                "only_second": counts.only_second,
+                "p_accuracy": counts.p if shared.any() else np.nan,
+                "r_difference": r.value,
+                "r_difference_low": r.low,
+                "r_difference_high": r.high,
+                "p_r": r.p,
+                "reason": why if shared.any() else "no stimulus that both predict",
+            }
+        )
+    columns = ["first", "second", "stimuli", "accuracy_difference", "only_first", "only_second"]
+    columns += ["p_accuracy", "r_difference", "r_difference_low", "r_difference_high", "p_r"]
+    table = pd.DataFrame(records, columns=[*columns, "reason"])
+    for p in ("p_accuracy", "p_r"):
+        table[f"{p}_holm"] = corrected_p(table[p], "holm")
+        table[f"{p}_bh"] = corrected_p(table[p], "fdr_bh")
+    return table
 
 
 def calibration_scores(pooled: PooledStimuli) -> pd.DataFrame:
@@ -118,107 +146,47 @@ def calibration_scores(pooled: PooledStimuli) -> pd.DataFrame:
     return calibration_table(list(pooled.names), pooled.p_contact, pooled.label)
 
 
-# Paired tests of RMSD, kappa and r of every two models, in each scenario and over all of them.
-
 COLUMNS = ("scenario", "measure", "first", "second", "stimuli", "difference", "low", "high", "p",
            "p_holm", "p_bh")  # fmt: skip
 
 
-@dataclass(frozen=True)
-class SumMeasure:
-    """A measure that is a function of sums over stimuli.
-
-    - ``columns``: from P(contact), answers (1 or 0) and P(yes), each (n,), to what is summed
-      (n, k);
-    - ``value``: from sums (..., k) to the measure (...).
-    """
-
-    columns: Callable[[Array, Array, Array], Array]
-    value: Callable[[Array], Array]
-
-
-def _squares(p: Array, answer: Array, people: Array) -> Array:
-    return np.stack([np.ones_like(p), (p - people) ** 2], axis=-1)
-
-
-def _root_mean(sums: Array) -> Array:
-    return np.asarray(np.sqrt(np.maximum(sums[..., 1], 0.0) / sums[..., 0]))
-
-
-def _agreements(p: Array, answer: Array, people: Array) -> Array:
-    return np.stack([np.ones_like(p), answer, people, answer * people], axis=-1)
-
-
-def _kappa(sums: Array) -> Array:
-    """Return (A - C) / (1 - C), as `metrics.average_person.kappa_from_averages`."""
-    answer, people, both = (sums[..., k] / sums[..., 0] for k in (1, 2, 3))
-    expected = answer * people + (1 - answer) * (1 - people)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        kappa = (1 - answer - people + 2 * both - expected) / (1 - expected)
-    return np.where(1 - expected > 1e-12, kappa, np.nan)
-
-
-def _products(p: Array, answer: Array, people: Array) -> Array:
-    # Standardised, so that two models whose values spread differently can be swapped.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        x = (p - p.mean()) / p.std()
-    y = people - people.mean()
-    return np.stack([np.ones_like(p), x, y, x * x, y * y, x * y], axis=-1)
-
-
-def _pearson(sums: Array) -> Array:
-    return correlation_from_sums(*(sums[..., k] for k in range(6)))
-
-
-MEASURES: Mapping[str, SumMeasure] = {
-    "rmsd": SumMeasure(_squares, _root_mean),
-    "kappa_from_averages": SumMeasure(_agreements, _kappa),
-    "r": SumMeasure(_products, _pearson),
-}
-"""What is compared, by the name of its metric."""
-
-
 def paired_measures(
-    pooled: PooledStimuli, level: float = 0.95, permutations: int = 2000, seed: int = 0
+    pooled: PooledStimuli, bootstrap: Bootstrap | None = None, permutations: int | None = None
 ) -> pd.DataFrame:
-    """Test the differences of every two models in `MEASURES`.
+    """Test the differences of every two models in `MEASURES`, by scenario and over all of them.
 
     Parameters
     ----------
     pooled
         Models and people on the stimuli of all scenarios.
-    level
-        Level of the intervals.
-    permutations, seed
-        Number of permutations, and the seed of the coins that decide who is swapped.
+    bootstrap
+        Level of the intervals, and the seed of the permutations.
+    permutations
+        As in `paired_tests`.
 
     Returns
     -------
     table
         `COLUMNS`: one row per scenario (and `POOLED`), measure and pair on the stimuli that both
-        predict: ``difference`` (first less second) with its jackknife interval over stimuli, the
-        two-sided ``p`` of the permutation test, and ``p`` corrected over the pairs of the same
-        scenario and measure. Empty without people or with one model.
-
-    Notes
-    -----
-    Under the null hypothesis the two models are exchangeable, so for every stimulus they are
-    swapped with probability 1/2. p = (1 + count of |difference| as large) / (1 + permutations).
+        predict: `paired_difference`, and ``p`` corrected over the pairs of the same scenario and
+        measure. Empty without people or with one model.
     """
+    draws = bootstrap or Bootstrap()
+    pairs = list(combinations(range(len(pooled.names)), 2))
+    count = permutations_of(len(pairs)) if permutations is None else permutations
     scenarios = in_order(set(pooled.scenario))
     groups = [*scenarios, POOLED] if len(scenarios) > 1 else scenarios
-    strata = np.array([scenarios.index(name) for name in pooled.scenario])
+    known = np.isfinite(pooled.p_contact)
     parts = []
     for group in groups:
-        members = np.ones(len(strata), bool)
-        if group != POOLED:
-            members = strata == scenarios.index(group)
+        members = np.isin(pooled.scenario, scenarios if group == POOLED else [group])
         members &= np.isfinite(pooled.p_yes)
         for measure in MEASURES:
-            rows = [
-                _pair(pooled, i, j, members, strata, measure, level, permutations, seed)
-                for i, j in combinations(range(len(pooled.names)), 2)
-            ]
+            rows = []
+            for i, j in pairs:
+                shared = members & known[i] & known[j]
+                found = _difference(pooled, (i, j), shared, measure, draws, count)
+                rows.append((pooled.names[i], pooled.names[j], int(shared.sum()), *found))
             table = pd.DataFrame(rows, columns=list(COLUMNS[2:9]))
             table = table.assign(
                 p_holm=corrected_p(table["p"], "holm"), p_bh=corrected_p(table["p"], "fdr_bh")
@@ -228,41 +196,26 @@ def paired_measures(
     return table[table["difference"].notna()].reset_index(drop=True)
 
 
-def _pair(
+def _difference(
     pooled: PooledStimuli,
-    i: int,
-    j: int,
-    members: npt.NDArray[np.bool_],
-    strata: npt.NDArray[np.int_],
-    name: str,
-    level: float,
+    pair: tuple[int, int],
+    shared: npt.NDArray[np.bool_],
+    measure: str,
+    draws: Bootstrap,
     permutations: int,
-    seed: int,
-) -> tuple[str, str, int, float, float, float, float]:
-    shared = members & np.isfinite(pooled.p_contact[i]) & np.isfinite(pooled.p_contact[j])
-    n, nan = int(shared.sum()), float("nan")
-    names = pooled.names[i], pooled.names[j]
-    if n < 3:
-        return *names, n, nan, nan, nan, nan
-    measure, label, people = MEASURES[name], pooled.label[shared], pooled.p_yes[shared]
-    first, second = (
-        measure.columns(
-            pooled.p_contact[k, shared],
-            np.where(pooled.correct[k, shared] == 1, label, 1 - label),
-            people,
-        )
-        for k in (i, j)
+) -> Difference:
+    right = pooled.correct[np.ix_(pair, shared)] == 1
+    label = pooled.label[shared]
+    return paired_difference(
+        measure,
+        pooled.p_contact[np.ix_(pair, shared)],
+        np.where(right, label, 1 - label),
+        pooled.p_yes[shared],
+        np.unique(pooled.scenario, return_inverse=True)[1][shared],
+        level=draws.level,
+        permutations=permutations,
+        seed=draws.seed,
     )
-    totals = first.sum(axis=0), second.sum(axis=0)
-    difference = float(measure.value(totals[0]) - measure.value(totals[1]))
-    if not np.isfinite(difference):
-        return *names, n, nan, nan, nan, nan
-    without = measure.value(totals[0] - first) - measure.value(totals[1] - second)
-    low, high = jackknife(without, strata[shared]).interval(difference, level)
-    change = swap_coins(permutations, n, seed) @ (second - first)
-    swapped = measure.value(totals[0] + change) - measure.value(totals[1] - change)
-    as_large = np.sum(np.abs(swapped) >= abs(difference) - 1e-12)
-    return *names, n, difference, low, high, float((1 + as_large) / (1 + permutations))
 
 
 # Mixed models of a report: of people's single answers, and of the models' accuracies.

@@ -25,6 +25,7 @@ from physion.analysis.intervals import (
     Variance,
     add,
     delete_one,
+    distribution,
     jackknife,
     mean_of,
     second_order,
@@ -724,7 +725,9 @@ def measure_table(measured: Sequence[Measured], level: float = 0.95) -> pd.DataF
             if measure in one.reasons:
                 reasons.insert(0, one.reasons[measure])
             if measure in one.by_participant:
-                record |= _measures_over_people(one.by_participant[measure])
+                found = distribution(one.by_participant[measure])
+                record |= {f"pair_{end}": found[end] for end in ("low", "median", "high")}
+                record["undefined"] = found["undefined"]
             records.append(
                 {
                     "model": one.model,
@@ -784,13 +787,6 @@ def _interval_columns(
     return record, reasons
 
 
-def _measures_over_people(values: Array) -> dict[str, float]:
-    known = values[np.isfinite(values)]
-    low, median, high = np.percentile(known, [2.5, 50, 97.5]) if len(known) else [np.nan] * 3
-    return {"pair_low": float(low), "pair_median": float(median), "pair_high": float(high),
-            "undefined": len(values) - len(known)}  # fmt: skip
-
-
 def _why(measure: str, k: int, models: Models, answers: ScenarioAnswers) -> str:
     known = ~np.isnan(models.p_contact[k])
     if not known.any():
@@ -843,7 +839,7 @@ def human_zones(answers: ScenarioAnswers, halves: Array | None = None) -> pd.Dat
         ranges.append(("r", "halves", halves))
     return pd.DataFrame(
         [
-            {"scenario": answers.scenario, "measure": measure, "of": of, **_zone(values)}
+            {"scenario": answers.scenario, "measure": measure, "of": of, **distribution(values)}
             for measure, of, values in ranges
         ]
     )
@@ -853,15 +849,6 @@ def rmsd_of(first: Array, second: Array) -> float:
     """Return the RMSD of two vectors where both are finite."""
     known = np.isfinite(first) & np.isfinite(second)
     return rmsd(first[known], second[known])
-
-
-def _zone(values: npt.ArrayLike) -> dict[str, float]:
-    array = np.asarray(values, dtype=np.float64)
-    known = array[np.isfinite(array)]
-    low, median, high = np.percentile(known, [2.5, 50, 97.5]) if len(known) else [np.nan] * 3
-    return {"values": len(array), "mean": float(np.mean(known)) if len(known) else np.nan,
-            "low": float(low), "median": float(median), "high": float(high),
-            "undefined": len(array) - len(known)}  # fmt: skip
 
 
 def released_zone(

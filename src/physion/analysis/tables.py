@@ -256,20 +256,6 @@ def as_numbers(values: pd.Series, low: float, high: float, where: str) -> Array:
     return numbers
 
 
-def as_booleans(values: pd.Series, where: str) -> npt.NDArray[np.bool_]:
-    """Return ``values`` as bool: True/False, 1/0 or yes/no in any case; else raise
-    `BadInputError`.
-    """
-    result = [FLAGS.get(str(value).strip().lower()) for value in values]
-    for row, value in enumerate(result):
-        if value is None:
-            raise BadInputError(
-                f"{where}: row {row + 1} of column {values.name!r} holds {values.iloc[row]!r}; "
-                "expected True or False"
-            )
-    return np.array(result, dtype=bool)
-
-
 def refuse_duplicates(names: pd.Series, where: str) -> None:
     """Raise `BadInputError` with the first name that occurs twice."""
     twice = names[names.duplicated()]
@@ -451,9 +437,15 @@ def name_models(predictions: pd.DataFrame) -> pd.DataFrame:
     """Return ``predictions`` with a unique ``model`` for each row of results, and ``base_model``.
 
     The unique name is model and readout and, if several models share these, also what
-    distinguishes them (protocol, seed, ...). Raises `BadInputError` if one model predicts a
-    stimulus twice, or if two models were shown trials of one name but of different scenarios.
+    distinguishes them (protocol, seed, ...). A table that is not of `check_predictions` is checked
+    first; one with ``base_model`` is returned as it is. Raises `BadInputError` if one model
+    predicts a stimulus twice, or if two models were shown trials of one name but of different
+    scenarios.
     """
+    if "base_model" in predictions:
+        return predictions
+    if set(predictions.columns) != {column.name for column in PREDICTIONS}:
+        predictions = check_predictions(predictions)
     base, readout = predictions["model"], predictions["readout"]
     model = base.where(readout == "", base + " · " + readout)
     for column in DISTINGUISHING:

@@ -265,7 +265,7 @@ def test_predictions_of_both_baselines_leave_one_person_with_another() -> None:
                       "predicted": True})
         for name in names
     ]  # fmt: skip
-    found = compare_everywhere(pd.concat(rows), test, QUICK, halves=10, permutations=20)
+    found = compare_everywhere(pd.concat(rows), test, QUICK, halves=10)
     assert list(found.scores["model"].unique()) == [*(f"{n} · full" for n in names), TWO_PEOPLE]
 
 
@@ -354,7 +354,7 @@ def test_with_participants_baselines_stand_next_to_models() -> None:
     stimuli = test.drop_duplicates("stimulus")["stimulus"]
     p = np.random.default_rng(0).random(len(stimuli))
     given = pd.DataFrame({"model": "m", "stimulus": stimuli, "p_contact": p, "predicted": p > 0.5})
-    found = compare_everywhere(given, test, QUICK, halves=10, permutations=20)
+    found = compare_everywhere(given, test, QUICK, halves=10)
     scores = found.scores.set_index(["scenario", "model", "measure"])
     assert list(found.scores["model"].unique()) == ["m", *COMPUTED]
     kinds = found.scores.drop_duplicates("model").set_index("model")["kind"]
@@ -369,8 +369,7 @@ def test_with_participants_baselines_stand_next_to_models() -> None:
     assert scores.loc[("mean", OUTCOME, "accuracy"), "value"] == 1
     best = scores.xs("kappa", level="measure").loc["mean", "value"]
     assert best.idxmax() == MAJORITY
-    # Tests of models against each other are about what was predicted.
-    assert found.tests.empty and found.pairs.empty and len(found.calibration) == 1
+    assert found.pairs.empty  # they are about what was predicted
 
 
 # --- official data -------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Models beside single people: against plain loops, scikit-learn, scipy and statsmodels."""
+"""Models next to single people: against plain loops and scikit-learn."""
 
 from __future__ import annotations
 
@@ -8,12 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
-from sklearn.metrics import brier_score_loss, cohen_kappa_score
-from statsmodels.stats.contingency_tables import mcnemar
-from statsmodels.stats.multitest import multipletests
+from sklearn.metrics import cohen_kappa_score
 
 from physion.analysis.compare import PeopleComparison, compare_everywhere
 from physion.analysis.intervals import Bootstrap, Variance, degrees_of_freedom
@@ -36,19 +31,6 @@ from physion.analysis.scores import (
 )
 from physion.analysis.statistics import agreement
 from physion.analysis.statistics.agreement import correctness
-from physion.analysis.statistics.paired import (
-    compare_models,
-    corrected_p,
-    mcnemar_exact,
-    r_permutation_p,
-    swap_coins,
-)
-from physion.analysis.statistics.regression import (
-    brier,
-    calibration_table,
-    decompose,
-    reliability_curve,
-)
 from physion.core.errors import BadInputError
 from support.simulated_people import study
 
@@ -329,7 +311,7 @@ def everywhere(**changes: object) -> tuple[PeopleComparison, pd.DataFrame, pd.Da
         for model, p in (("people", shares["yes"]), ("chance", generator.random(len(shares))))
     ]  # fmt: skip
     predictions = pd.concat(parts, ignore_index=True).assign(**changes)
-    return compare_everywhere(predictions, test, FEW, halves=20, permutations=50), predictions, test
+    return compare_everywhere(predictions, test, FEW, halves=20), predictions, test
 
 
 def test_all_scenarios_and_their_mean() -> None:
@@ -356,11 +338,7 @@ def test_all_scenarios_and_their_mean() -> None:
         "yes" if row["zone_low"] <= row["value"] <= row["zone_high"] else "no"
     )
     assert scores.loc[("people", "mean", "accuracy"), "in_zone"] == ""
-    assert found.dropped.empty and len(found.tests) == 1 and len(found.pairs) == 2
-    assert found.tests["stimuli"].iloc[0] == 40 and found.calibration["stimuli"].tolist() == [
-        40,
-        40,
-    ]
+    assert found.dropped.empty and len(found.pairs) == 2
     halves = found.zones[found.zones["of"] == "halves"]
     (band,) = found.zones[found.zones["of"] == RELEASED_R].to_dict("records")
     assert (band["scenario"], band["measure"], band["values"]) == ("mean", "r", 2)
@@ -375,7 +353,7 @@ def test_what_is_missing_somewhere_is_counted_and_undefined_there() -> None:
     constant = predictions["stimulus"].str.startswith("roll")
     odd = predictions.assign(p_contact=predictions["p_contact"].where(~constant, 0.5))
     odd.loc[0, "stimulus"] = "elsewhere"
-    found = compare_everywhere(odd, test, FEW, halves=20, permutations=50)
+    found = compare_everywhere(odd, test, FEW, halves=20)
     scores = found.scores.set_index(["model", "scenario", "measure"])
     row = scores.loc[("chance", "mean", "r")]
     assert np.isnan(row["value"]) and row["reason"].startswith("undefined in roll")
@@ -383,7 +361,7 @@ def test_what_is_missing_somewhere_is_counted_and_undefined_there() -> None:
         ["people", "unknown", "people did not see it", 1],
         ["people", "collide", "the model does not predict it", 1],
     ]
-    no_roll = compare_everywhere(predictions[~constant], test, FEW, halves=20, permutations=50)
+    no_roll = compare_everywhere(predictions[~constant], test, FEW, halves=20)
     gone = no_roll.dropped.set_index(["model", "scenario"])["stimuli"]
     assert gone.to_dict() == {("people", "roll"): 20, ("chance", "roll"): 20}
 
@@ -404,156 +382,3 @@ def test_r_within_thirds_matches_their_stimuli(answers: ScenarioAnswers, models:
         assert row.r == pytest.approx(expected, abs=1e-9, nan_ok=True)
         assert row.stimuli == (third == row.third).sum()
     assert table["stimuli"].sum() == 25 * 5 and (table["model"] == -1).sum() == 3
-
-
-# --- paired tests and corrections ---------------------------------------------------------------
-
-bits = st.integers(1, 40).flatmap(
-    lambda n: hnp.arrays(np.float64, (2, n), elements=st.sampled_from([0.0, 1.0]))
-)
-
-
-@settings(deadline=None)
-@given(bits)
-def test_mcnemar_matches_statsmodels(pair: Array) -> None:
-    a, b = pair
-    found = mcnemar_exact(a, b)
-    table = [[np.sum((a == 1) & (b == 1)), found.only_first],
-             [found.only_second, np.sum((a == 0) & (b == 0))]]  # fmt: skip
-    assert found.only_first - found.only_second == np.sum(a) - np.sum(b)
-    if found.only_first + found.only_second:
-        assert found.p == pytest.approx(mcnemar(table, exact=True).pvalue)
-    else:
-        assert found.p == 1
-
-
-def test_corrections_count_the_tests_that_have_a_p() -> None:
-    p = [0.01, np.nan, 0.04, 0.03]
-    np.testing.assert_allclose(corrected_p(p, "holm"), [0.03, np.nan, 0.06, 0.06])
-    np.testing.assert_allclose(corrected_p(p, "fdr_bh"), [0.03, np.nan, 0.04, 0.04])
-
-
-def test_p_values_that_are_none_are_refused() -> None:
-    with pytest.raises(BadInputError, match="p values"):
-        corrected_p([0.2, 1.5], "holm")
-    assert corrected_p([], "fdr_bh").shape == (0,)
-
-
-def test_permutations_keep_their_level_and_find_a_difference() -> None:
-    generator = np.random.default_rng(0)
-    p = []
-    for seed in range(60):
-        y = generator.random(60)
-        a, b = (y + generator.normal(0, 0.5, 60) for _ in range(2))
-        p.append(r_permutation_p(a, b, y, permutations=200, seed=seed))
-    assert np.mean(np.array(p) < 0.05) < 0.15 and 0.3 < np.mean(p) < 0.7
-    y = generator.random(100)
-    near, far = y + generator.normal(0, 0.1, 100), generator.random(100)
-    assert r_permutation_p(near, far, y, permutations=500) == pytest.approx(1 / 501)
-    assert r_permutation_p(5 * near + 3, near, y, permutations=100) == 1.0
-    assert np.isnan(r_permutation_p(np.full(100, 0.5), far, y))
-
-
-def test_permutations_match_swapping_by_hand() -> None:
-    generator = np.random.default_rng(4)
-    y, a, b = generator.random((3, 15))
-    found = r_permutation_p(a, b, y, permutations=50, seed=2)
-    coins = swap_coins(50, 15, 2) == 1
-    one, two = ((x - x.mean()) / x.std() for x in (a, b))
-    differences = [
-        agreement.pearson(np.where(coin, two, one), y)
-        - agreement.pearson(np.where(coin, one, two), y)
-        for coin in coins
-    ]
-    observed = abs(agreement.pearson(a, y) - agreement.pearson(b, y))
-    assert found == (1 + np.sum(np.abs(differences) >= observed - 1e-12)) / 51
-
-
-def test_pairs_of_models_are_compared_on_what_both_answered() -> None:
-    generator = np.random.default_rng(1)
-    people, label = generator.random(80), generator.integers(0, 2, 80).astype(float)
-    p = np.vstack(
-        [people * 0.9 + 0.05, generator.random(80), np.full(80, 0.5), generator.random(80)]
-    )
-    predicted = (p > 0.5).astype(float)
-    correct = (predicted == label).astype(float)
-    correct[3], p[3] = np.nan, np.nan
-    table = compare_models(list("abcd"), correct, p, people, FEW, permutations=200)
-    table = table.set_index(["first", "second"])
-    row = table.loc[("a", "b")]
-    assert row["accuracy_difference"] == pytest.approx(np.mean(correct[0]) - np.mean(correct[1]))
-    assert row["r_difference"] == pytest.approx(
-        agreement.pearson(p[0], people) - agreement.pearson(p[1], people)
-    )
-    assert row["r_difference_low"] > 0 and row["p_r"] < 0.01
-    known = table["p_accuracy"].dropna()
-    np.testing.assert_allclose(
-        table.loc[known.index, "p_accuracy_holm"], multipletests(known, method="holm")[1]
-    )
-    gaps = p.copy()
-    gaps[0, :7] = np.nan
-    part = compare_models(list("ab"), np.where(np.isnan(gaps[:2]), np.nan, correct[:2]), gaps[:2],
-                          people, FEW, permutations=20).iloc[0]  # fmt: skip
-    assert part["stimuli"] == 73
-    assert part["r_difference"] == pytest.approx(
-        agreement.pearson(p[0, 7:], people[7:]) - agreement.pearson(p[1, 7:], people[7:])
-    )
-    assert part["r_difference_low"] < part["r_difference"] < part["r_difference_high"]
-    assert table.loc[("a", "c"), "reason"].startswith("r: undefined")
-    assert table.loc[("a", "d"), "reason"] == "no stimulus that both predict"
-    assert table.loc[("a", "d"), ["p_accuracy", "accuracy_difference", "p_r"]].isna().all()
-
-
-# --- calibration --------------------------------------------------------------------------------
-
-forecasts = st.integers(1, 50).flatmap(
-    lambda n: st.tuples(
-        hnp.arrays(np.float64, n, elements=st.floats(0, 1)),
-        hnp.arrays(np.float64, n, elements=st.sampled_from([0.0, 1.0])),
-    )
-)
-
-
-@settings(deadline=None)
-@given(forecasts, st.integers(1, 15))
-def test_the_parts_of_the_brier_score_add_up(pair: tuple[Array, Array], bins: int) -> None:
-    p, label = pair
-    found = decompose(p, label, bins)
-    assert found.brier == pytest.approx(float(np.mean((p - label) ** 2)))
-    total = found.reliability - found.resolution + found.uncertainty + found.within
-    assert total == pytest.approx(found.brier, abs=1e-12)
-    curve = reliability_curve(p, label, bins)
-    assert curve["stimuli"].sum() == len(p) and len(curve) == bins
-    full = curve[curve["stimuli"] > 0]
-    assert full["fraction"].between(full["low"] - 1e-12, full["high"] + 1e-12).all()
-    assert full["mean_p"].between(full["from"] - 1e-9, full["to"] + 1e-9).all()
-    gap = np.sum(full["stimuli"] / len(p) * (full["mean_p"] - full["fraction"]).abs())
-    assert found.calibration_error == pytest.approx(gap, abs=1e-12)
-
-
-def test_brier_matches_scikit_learn_and_knows_calibrated_forecasts() -> None:
-    generator = np.random.default_rng(0)
-    p = generator.random(20_000)
-    label = (generator.random(20_000) < p).astype(float)
-    assert brier(p, label) == pytest.approx(brier_score_loss(label, p))
-    good, bold = decompose(p, label), decompose((p > 0.5).astype(float), label)
-    assert good.calibration_error < 0.02 < 0.2 < bold.calibration_error
-    assert good.skill > bold.skill and abs(good.within) < 0.01
-    table = calibration_table(["good", "part"], np.stack([p, np.where(p < 0.5, p, np.nan)]), label)
-    assert table["stimuli"].tolist() == [20_000, int(np.sum(p < 0.5))]
-
-
-def test_forecasts_that_are_none_are_refused_and_one_outcome_has_no_skill() -> None:
-    one = decompose([0.2, 0.9], [1, 1])
-    assert np.isnan(one.skill) and "one outcome" in one.reason
-    assert decompose([], []).reason == "no stimulus" and np.isnan(brier([], []))
-    for p, label, words in (
-        ([1.1], [1], "does not lie"),
-        ([np.nan], [1], "does not lie"),
-        ([0.1], [0.5], "0 or 1"),
-        ([0.1, 0.2], [1], "do not pair"),
-    ):
-        with pytest.raises(BadInputError, match=words):
-            brier(p, label)
-    with pytest.raises(BadInputError, match="bins"):
-        reliability_curve([0.1], [1], bins=0)

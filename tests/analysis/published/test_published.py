@@ -23,7 +23,6 @@ from physion.analysis.published.tables import (
     grid,
     panel_a,
     read_published,
-    wilson,
 )
 from physion.core.errors import BadInputError
 from physion.core.names import OFFICIAL_SCENARIOS, SCENARIOS
@@ -151,15 +150,6 @@ def test_intervals_by_the_papers_way_are_the_released_ones(released: PublishedTa
         ours = own[[f"{way}_low", f"{way}_high"]].to_numpy()
         assert np.abs(ours - bounds).mean() < difference
         assert low < np.mean((ours[:, 1] - ours[:, 0]) / width) < high
-
-
-def test_wilson_against_scipy() -> None:
-    from scipy.stats import binomtest
-
-    for k, n in ((0, 10), (7, 10), (120, 199), (10, 10)):
-        known = binomtest(k, n).proportion_ci(method="wilson")
-        assert wilson(k / n, n) == pytest.approx((known.low, known.high), abs=1e-12)
-    assert np.isnan(wilson(float("nan"), 10)).all() and np.isnan(wilson(0.5, 0)).all()
 
 
 def test_words_say_what_was_averaged(released: PublishedTables) -> None:

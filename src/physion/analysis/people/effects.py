@@ -16,16 +16,15 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
-from physion.analysis.intervals import Bootstrap
+from physion.analysis.intervals import Bootstrap, distribution
 from physion.analysis.people.measures import (
-    ScenarioAnswers,
     accuracy_by_participant,
     all_answers,
     draws_of_people,
     mean_over_people,
     split_halves,
 )
-from physion.analysis.statistics.agreement import correlate_rows, pearson
+from physion.analysis.statistics.agreement import correlate_rows, pearson, z_rates
 from physion.analysis.statistics.paired import corrected_p
 from physion.analysis.statistics.regression import clustered_logit
 from physion.analysis.tables import ATTRIBUTES, in_order, require_columns
@@ -56,35 +55,21 @@ def yes_bias(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataF
         given = ~np.isnan(answers.yes)
         own_base = np.array([answers.label[row].mean() for row in given])
         own_yes = np.nanmean(answers.yes, axis=1)
-        d_prime, criterion, reason = _signal_detection(answers)
+        once = np.ones((1, len(answers.stimuli)))
+        hits, alarms = (z[0] for z in z_rates(answers.yes, answers.label, once))
         record: dict[str, Any] = {
             "scenario": answers.scenario,
             "people": len(own_yes),
             "base_rate": float(np.mean(own_base)),
             "yes": float(np.mean(own_yes)),
         }
-        values = {"bias": own_yes - own_base, "d_prime": d_prime, "criterion": criterion}
+        d_prime = hits - alarms
+        values = {"bias": own_yes - own_base, "d_prime": d_prime, "criterion": -(hits + alarms) / 2}
+        reason = "d' and criterion: stimuli of only one outcome" if np.isnan(d_prime).any() else ""
         for name, by_person in values.items():
             record |= _mean_with_interval(name, by_person, weights, draws)
         records.append({**record, "reason": reason})
     return pd.DataFrame(records)
-
-
-def _signal_detection(answers: ScenarioAnswers) -> tuple[Array, Array, str]:
-    """Return d' and criterion of each person; NaN if all stimuli seen have the same outcome."""
-    given = ~np.isnan(answers.yes)
-    touch = given & (answers.label == 1)
-    miss = given & (answers.label == 0)
-    yes = np.where(given, answers.yes, 0.0)
-    hits, of_hits = np.sum(yes * touch, axis=1), touch.sum(axis=1)
-    alarms, of_alarms = np.sum(yes * miss, axis=1), miss.sum(axis=1)
-    z_hit = stats.norm.ppf((hits + 0.5) / (of_hits + 1))
-    z_alarm = stats.norm.ppf((alarms + 0.5) / (of_alarms + 1))
-    undefined = (of_hits == 0) | (of_alarms == 0)
-    d_prime = np.where(undefined, np.nan, z_hit - z_alarm)
-    criterion = np.where(undefined, np.nan, -(z_hit + z_alarm) / 2)
-    reason = "d' and criterion: stimuli of only one outcome" if undefined.any() else ""
-    return d_prime, criterion, reason
 
 
 def _mean_with_interval(
@@ -344,10 +329,8 @@ def r_by_third(
         )
         rows += [(name, len(members), k, float(value), np.nan, np.nan) for k, value in enumerate(r)]
         among = split_halves(answers[:, members], halves, seed) if len(members) else np.empty(0)
-        among = among[np.isfinite(among)]
-        low, high = np.percentile(among, [2.5, 97.5]) if len(among) else (np.nan, np.nan)
-        mean = float(np.mean(among)) if len(among) else np.nan
-        rows.append((name, len(members), -1, mean, float(low), float(high)))
+        found = distribution(among)
+        rows.append((name, len(members), -1, found["mean"], found["low"], found["high"]))
     return pd.DataFrame(rows, columns=["third", "stimuli", "model", "r", "low", "high"])
 
 

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
-from physion.analysis.intervals import Bootstrap
+from physion.analysis.intervals import Bootstrap, distribution
 from physion.analysis.statistics.agreement import (
     correlate_rows,
     pair_values,
@@ -312,24 +312,13 @@ def agreement_by_scenario(
 
 
 def _spread(scenario: str, measure: str, values: Array) -> dict[str, Any]:
-    known = values[np.isfinite(values)]
-    low, median, high = np.percentile(known, [2.5, 50, 97.5]) if len(known) else [np.nan] * 3
+    found = distribution(values)
     reasons = []
-    if len(known) < len(values):
-        reasons.append(f"{len(values) - len(known)} undefined (constant answers) and left out")
+    if found["undefined"]:
+        reasons.append(f"{found['undefined']} undefined (constant answers) and left out")
     if not len(values):
-        reasons.append("one person makes no pair")
-    return {
-        "scenario": scenario,
-        "measure": measure,
-        "values": len(values),
-        "undefined": len(values) - len(known),
-        "mean": float(np.mean(known)) if len(known) else np.nan,
-        "low": float(low),
-        "median": float(median),
-        "high": float(high),
-        "reason": "; ".join(reasons),
-    }
+        reasons.append("one person only makes no pair")
+    return {"scenario": scenario, "measure": measure, **found, "reason": "; ".join(reasons)}
 
 
 def split_halves(yes: Array, halves: int = HALVES, seed: int = 0) -> Array:

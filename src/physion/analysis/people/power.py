@@ -24,7 +24,7 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import optimize, special, stats
 
-from physion.analysis.intervals import jackknife
+from physion.analysis.intervals import jackknife, wilson
 from physion.analysis.statistics.agreement import correlate_resampled
 from physion.core.errors import BadInputError
 from physion.core.seeds import generator
@@ -115,10 +115,8 @@ def power_table(
     for n, s in product(people, stimuli):
         rng = generator("power", seed, n, s)
         found = sum(find(rng.choice(logit, s), n, planned, level, rng) for _ in range(repeats))
-        interval = stats.binomtest(found, repeats).proportion_ci(0.95, method="wilson")
-        records.append(
-            (n, s, planned.effect, repeats, found / repeats, interval.low, interval.high)
-        )
+        low, high = map(float, wilson(found / repeats, repeats))
+        records.append((n, s, planned.effect, repeats, found / repeats, low, high))
     return pd.DataFrame(records, columns=list(COLUMNS))
 
 

@@ -25,7 +25,7 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
-from physion.analysis.intervals import Bootstrap
+from physion.analysis.intervals import Bootstrap, wilson
 from physion.analysis.people.effects import below_chance_level
 from physion.analysis.people.measures import spearman_brown
 from physion.analysis.scores import released_zone
@@ -327,8 +327,8 @@ def accuracy_table(tables: PublishedTables, bootstrap: Bootstrap | None = None) 
                 "rows": len(rows),
                 "without_copies": float(own["accuracy"].mean()),
                 "expected": expected,
-                "expected_low": expected_low,
-                "expected_high": expected_high,
+                "expected_low": float(expected_low),
+                "expected_high": float(expected_high),
                 "runs": len(cell),
                 "stimuli": stimuli,
                 "difference": expected - float(values.mean()),
@@ -392,16 +392,6 @@ def count_tested(runs: pd.DataFrame) -> dict[tuple[str, str], int]:
 
 def _denominator(fraction: float) -> int:
     return Fraction(fraction).limit_denominator(MOST_STIMULI).denominator
-
-
-def wilson(fraction: float, n: float, level: float = 0.95) -> tuple[float, float]:
-    """Return Wilson's interval of a fraction of ``n`` independent trials; NaN, NaN if undefined."""
-    if not (np.isfinite(fraction) and n > 0):
-        return float("nan"), float("nan")
-    z = float(stats.norm.ppf(0.5 + level / 2))
-    centre = fraction + z * z / (2 * n)
-    half = z * float(np.sqrt(fraction * (1 - fraction) / n + (z / (2 * n)) ** 2))
-    return (centre - half) / (1 + z * z / n), (centre + half) / (1 + z * z / n)
 
 
 def copies_of_observed(tables: PublishedTables) -> tuple[int, int]:

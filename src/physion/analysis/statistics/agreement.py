@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtri
 
 from physion.core.errors import BadInputError
 
@@ -285,6 +286,57 @@ def pairwise_correlation(answers: npt.ArrayLike) -> Array:
 def pair_values(matrix: Array) -> Array:
     """Return the values of an (n, n) matrix above its diagonal: each pair once, (n (n-1) / 2,)."""
     return np.asarray(matrix[np.triu_indices(len(matrix), 1)], dtype=np.float64)
+
+
+ROUNDING = 1e-12
+"""Distance from 1 below which agreement by chance counts as 1."""
+
+
+def kappa_from_fractions(first: npt.ArrayLike, second: npt.ArrayLike, both: npt.ArrayLike) -> Array:
+    """Return kappa of two raters from their fractions of yes, and that of yes by both.
+
+    Agreement exceeds the one by chance by 2 (both - first second); NaN where chance gives 1.
+    """
+    a, b = np.asarray(first, np.float64), np.asarray(second, np.float64)
+    return in_units_of_kappa(2 * (np.asarray(both, np.float64) - a * b), a, b)
+
+
+def in_units_of_kappa(excess: Array, first: Array, second: Array) -> Array:
+    """Return an excess of agreement divided by 1 less the agreement by chance.
+
+    ``first``, ``second``: fractions of yes. NaN where chance gives 1.
+    """
+    rest = first * (1 - second) + second * (1 - first)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(rest > ROUNDING, excess / rest, np.nan)
+
+
+def z_rates(yes: Array, contact: Array, weights: Array) -> tuple[Array, Array]:
+    """Return z of the rates of hits and of false alarms, each (b, m).
+
+    Parameters
+    ----------
+    yes
+        (m, s): answers 1, 0 or NaN.
+    contact
+        (s,): outcomes, 1 or 0.
+    weights
+        (b, s): how often each stimulus counts.
+
+    Notes
+    -----
+    With h answers yes at n contacts, z is the normal quantile of (h + 1/2) / (n + 1): the
+    log-linear correction, by which d' without an error is finite. d' is the first less the second,
+    the criterion minus their mean. NaN if there is no stimulus of the outcome.
+    """
+    known = np.isfinite(yes)
+    said = np.where(known, yes, 0.0)
+    rates = []
+    for outcome in (1.0, 0.0):
+        own = weights * (contact == outcome)
+        total = own @ known.T.astype(np.float64)
+        rates.append(np.where(total > 0, ndtri((own @ said.T + 0.5) / (total + 1)), np.nan))
+    return rates[0], rates[1]
 
 
 def resampled_mean_of_pairs(matrix: Array, weights: npt.ArrayLike) -> Array:

@@ -1,23 +1,26 @@
-"""Paired tests of differences between models, and corrections for multiple comparisons."""
+"""Paired tests of differences between two models, and corrections for many tests.
+
+`mcnemar_exact` compares correct answers; `paired_difference` any measure of `MEASURES`, which is a
+function of sums over stimuli, so that leaving stimuli out and swapping models need sums only.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import combinations
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import pandas as pd
 from scipy import stats
 
-from physion.analysis.intervals import Bootstrap, jackknife
+from physion.analysis.intervals import jackknife
 from physion.analysis.statistics.agreement import (
-    correlate_resampled,
+    CONSTANT,
+    FEWEST,
     correlation_from_sums,
-    pearson,
+    kappa_from_fractions,
 )
 from physion.core.errors import BadInputError
 from physion.core.seeds import generator
@@ -52,42 +55,120 @@ def mcnemar_exact(first: npt.ArrayLike, second: npt.ArrayLike) -> McNemar:
     return McNemar(only_a, only_b, p)
 
 
-def r_differences(
-    first: npt.ArrayLike, second: npt.ArrayLike, people: npt.ArrayLike, weights: npt.ArrayLike
-) -> Array:
-    """Return r(first, people) - r(second, people) for each row of weights of stimuli, (rows,)."""
-    pair = np.stack([np.asarray(first, np.float64), np.asarray(second, np.float64)])
-    drawn = np.asarray(weights, dtype=np.float64)
-    p_yes = np.broadcast_to(np.asarray(people, dtype=np.float64), drawn.shape)
-    r = correlate_resampled(pair, p_yes, drawn)
-    return np.asarray(r[:, 0] - r[:, 1])
+@dataclass(frozen=True)
+class SumMeasure:
+    """A measure that is a function of sums over stimuli.
+
+    - ``columns``: from P(contact), answers (1 or 0) and P(yes), each (n,), to what is summed
+      (n, k);
+    - ``value``: from sums (..., k) to the measure (...).
+    """
+
+    columns: Callable[[Array, Array, Array], Array]
+    value: Callable[[Array], Array]
 
 
-def r_permutation_p(
-    first: npt.ArrayLike,
-    second: npt.ArrayLike,
-    people: npt.ArrayLike,
+def _squares(p: Array, answer: Array, people: Array) -> Array:
+    return np.stack([np.ones_like(p), (p - people) ** 2], axis=-1)
+
+
+def _root_mean(sums: Array) -> Array:
+    return np.asarray(np.sqrt(np.maximum(sums[..., 1], 0.0) / sums[..., 0]))
+
+
+def _agreements(p: Array, answer: Array, people: Array) -> Array:
+    return np.stack([np.ones_like(p), answer, people, answer * people], axis=-1)
+
+
+def _kappa(sums: Array) -> Array:
+    return kappa_from_fractions(*(sums[..., k] / sums[..., 0] for k in (1, 2, 3)))
+
+
+def _products(p: Array, answer: Array, people: Array) -> Array:
+    # Standardised, so that two models whose values spread differently can be swapped.
+    x = (p - p.mean()) / (p.std() if p.std() >= CONSTANT else np.nan)
+    y = people - people.mean()
+    return np.stack([np.ones_like(p), x, y, x * x, y * y, x * y], axis=-1)
+
+
+def _pearson(sums: Array) -> Array:
+    return correlation_from_sums(*(sums[..., k] for k in range(6)))
+
+
+MEASURES: Mapping[str, SumMeasure] = {
+    "rmsd": SumMeasure(_squares, _root_mean),
+    "kappa_from_averages": SumMeasure(_agreements, _kappa),
+    "r": SumMeasure(_products, _pearson),
+}
+"""What is compared, by the name of its metric."""
+
+
+class Difference(NamedTuple):
+    """A difference of two models (first less second) with its interval and two-sided p."""
+
+    value: float = float("nan")
+    low: float = float("nan")
+    high: float = float("nan")
+    p: float = float("nan")
+
+
+def paired_difference(
+    measure: str,
+    p_contact: Array,
+    answers: Array,
+    people: Array,
+    strata: npt.NDArray[np.int_],
+    *,
+    level: float = 0.95,
     permutations: int = 2000,
     seed: int = 0,
-) -> float:
-    """Return the two-sided p of the difference of two models' r with people, by permutation.
+) -> Difference:
+    """Test the difference of two models in one of `MEASURES` on n stimuli.
 
-    Under the null hypothesis the standardised models are exchangeable, since r does not depend on
-    shift and scale; for every stimulus the two are swapped with probability 1/2. p = (1 + count of
-    |difference| as large) / (1 + permutations). NaN if an r is undefined.
+    Parameters
+    ----------
+    measure
+        Name in `MEASURES`.
+    p_contact, answers
+        (2, n): P(contact) and answers (1 or 0) of the two models.
+    people
+        (n,): fraction of people who say yes.
+    strata
+        (n,): scenario of each stimulus, for the jackknife interval over stimuli.
+    level
+        Level of the interval.
+    permutations, seed
+        Number of permutations, and the seed of the coins that decide who is swapped.
+
+    Returns
+    -------
+    difference
+        NaN if the measure is undefined for one of the two, or for fewer than three stimuli.
+
+    Notes
+    -----
+    Under the null hypothesis the two models are exchangeable (for r: their standardised values,
+    since r does not depend on shift and scale), so for every stimulus they are swapped with
+    probability 1/2. p = (1 + count of |difference| as large) / (1 + permutations).
     """
-    a, b = np.asarray(first, np.float64), np.asarray(second, np.float64)
-    y = np.asarray(people, np.float64)
-    known = np.isfinite(a) & np.isfinite(b) & np.isfinite(y)
-    a, b, y = a[known], b[known], y[known]
-    observed = pearson(a, y) - pearson(b, y)
-    if not np.isfinite(observed):
-        return float("nan")
-    a, b = (a - a.mean()) / a.std(), (b - b.mean()) / b.std()
-    swap = swap_coins(permutations, len(a), seed)
-    r = _swapped_r(a, b, y - y.mean(), swap) - _swapped_r(b, a, y - y.mean(), swap)
-    as_large = np.sum(np.abs(r) >= abs(observed) - 1e-12)
-    return float((1 + as_large) / (1 + permutations))
+    n = len(people)
+    if n < FEWEST:
+        return Difference()
+    value = MEASURES[measure].value
+    first, second = (
+        MEASURES[measure].columns(p, said, people)
+        for p, said in zip(p_contact, answers, strict=True)
+    )
+    totals = first.sum(axis=0), second.sum(axis=0)
+    difference = float(value(totals[0]) - value(totals[1]))
+    if not np.isfinite(difference):
+        return Difference()
+    without = value(totals[0] - first) - value(totals[1] - second)
+    low, high = jackknife(without, strata).interval(difference, level)
+    change = swap_coins(permutations, n, seed) @ (second - first)
+    swapped = value(totals[0] + change) - value(totals[1] - change)
+    as_large = np.sum(np.abs(swapped) >= abs(difference) - 1e-12)
+    return Difference(difference, low, high, float((1 + as_large) / (1 + permutations)))
 
 
 @lru_cache(maxsize=2)
@@ -101,119 +182,25 @@ def swap_coins(permutations: int, n: int, seed: int) -> Array:
     return coins
 
 
-def _swapped_r(a: Array, b: Array, y: Array, swap: Array) -> Array:
-    """Return r with ``y`` of ``a`` with the values of ``b`` at the stimuli of ``swap``."""
-    change = swap @ np.stack([b - a, b * b - a * a, (b - a) * y], axis=1)
-    n, ones = float(len(a)), np.ones(len(swap))
-    return correlation_from_sums(
-        n * ones, a.sum() + change[:, 0], y.sum() * ones,
-        (a * a).sum() + change[:, 1], (y * y).sum() * ones, (a * y).sum() + change[:, 2],
-    )  # fmt: skip
-
-
-# --- corrections for many comparisons -----------------------------------------------------------
-
-
 def corrected_p(p: npt.ArrayLike, method: Literal["holm", "fdr_bh"]) -> Array:
     """Return p values corrected for many tests; NaN stays NaN and is not counted as a test.
 
-    ``holm`` is Holm's step-down method, which controls the family-wise error; ``fdr_bh`` the method
-    of Benjamini and Hochberg, which controls the false discovery rate.
+    ``holm`` is Holm's step-down method, which controls the family-wise error; ``fdr_bh`` that of
+    Benjamini and Hochberg, which controls the false discovery rate. Holm's is not statsmodels'
+    `multipletests`, which collects garbage at every call: a second in a large process.
     """
-    from statsmodels.stats.multitest import multipletests  # half a second to import
-
     values = np.asarray(p, dtype=np.float64)
     known = np.isfinite(values)
     if ((values[known] < 0) | (values[known] > 1)).any():
         raise BadInputError("p values must lie in 0..1")
+    tests = values[known]
+    if method == "fdr_bh":
+        corrected = stats.false_discovery_control(tests) if len(tests) else tests
+    else:
+        order = np.argsort(tests)
+        corrected = np.empty_like(tests)
+        steps = tests[order] * np.arange(len(tests), 0, -1)
+        corrected[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
     adjusted = np.full(values.shape, np.nan)
-    if known.any():
-        adjusted[known] = multipletests(values[known], method=method)[1]
+    adjusted[known] = corrected
     return adjusted
-
-
-# --- the table of all pairs ---------------------------------------------------------------------
-
-
-def compare_models(
-    names: list[str],
-    correct: Array,
-    p_contact: Array,
-    people: Array,
-    bootstrap: Bootstrap | None = None,
-    *,
-    strata: Sequence[str] | None = None,
-    permutations: int = 2000,
-) -> pd.DataFrame:
-    """Test every two models on the same stimuli; one row per pair.
-
-    Parameters
-    ----------
-    names
-        Names of the m models.
-    correct, p_contact
-        (m, s), NaN for stimuli that a model lacks. A pair is compared on the stimuli that both
-        answered.
-    people
-        (s,): fraction of people who say yes.
-    bootstrap
-        Level of the intervals, and the seed of the permutations.
-    strata
-        (s,): scenario of each stimulus; every scenario keeps its number of stimuli.
-    permutations
-        Permutations of the test of differences in r.
-
-    Returns
-    -------
-    ``first``, ``second``, ``stimuli``, ``accuracy_difference`` (first - second), ``only_first``,
-    ``only_second``, ``p_accuracy`` (McNemar, exact), ``r_difference`` with ``_low``, ``_high``
-    (jackknife over stimuli), ``p_r`` (permutations), and of both p the corrected ``_holm`` and
-    ``_bh`` over all pairs of this table, ``reason``.
-    """
-    draws = bootstrap or Bootstrap()
-    groups = pd.factorize(np.asarray(["pooled"] * len(people) if strata is None else strata))[0]
-    without = 1 - np.eye(len(people))
-    together = correlate_resampled(p_contact, np.broadcast_to(people, without.shape), without)
-    records = []
-    for i, j in combinations(range(len(names)), 2):
-        shared = np.isfinite(correct[i]) & np.isfinite(correct[j])
-        counts = mcnemar_exact(correct[i], correct[j])
-        both = shared & np.isfinite(people)
-        x, z = np.where(both, p_contact[i], np.nan), np.where(both, p_contact[j], np.nan)
-        difference = pearson(x[both], people[both]) - pearson(z[both], people[both])
-        if (np.isfinite(p_contact[i]) == np.isfinite(p_contact[j])).all():
-            drawn = together[:, i] - together[:, j]
-        else:
-            drawn = r_differences(x, z, people, without)
-        low, high = jackknife(drawn, groups, both).interval(difference, draws.level)
-        records.append(
-            {
-                "first": names[i],
-                "second": names[j],
-                "stimuli": int(shared.sum()),
-                "accuracy_difference": float(np.mean(correct[i, shared] - correct[j, shared]))
-                if shared.any()
-                else np.nan,
-                "only_first": counts.only_first,
-                "only_second": counts.only_second,
-                "p_accuracy": counts.p if shared.any() else np.nan,
-                "r_difference": difference,
-                "r_difference_low": low,
-                "r_difference_high": high,
-                "p_r": r_permutation_p(x, z, people, permutations, draws.seed),
-                "reason": _why(shared, difference),
-            }
-        )
-    columns = ["first", "second", "stimuli", "accuracy_difference", "only_first", "only_second"]
-    columns += ["p_accuracy", "r_difference", "r_difference_low", "r_difference_high", "p_r"]
-    table = pd.DataFrame(records, columns=[*columns, "reason"])
-    for p in ("p_accuracy", "p_r"):
-        table[f"{p}_holm"] = corrected_p(table[p], "holm")
-        table[f"{p}_bh"] = corrected_p(table[p], "fdr_bh")
-    return table
-
-
-def _why(shared: npt.NDArray[np.bool_], difference: float) -> str:
-    if not shared.any():
-        return "no stimulus that both predict"
-    return "" if np.isfinite(difference) else "r: undefined for one of the two"

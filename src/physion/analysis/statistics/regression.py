@@ -14,6 +14,7 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import special, stats
 
+from physion.analysis.intervals import wilson
 from physion.analysis.tables import require_columns
 from physion.core.errors import BadInputError
 
@@ -99,13 +100,9 @@ def reliability_curve(
     bin_of = _bin(values, bins)
     n = np.bincount(bin_of, minlength=bins).astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
-        mean_p, fraction = (
-            np.bincount(bin_of, values, bins) / n,
-            np.bincount(bin_of, truth, bins) / n,
-        )
-        z = float(stats.norm.ppf(0.5 + level / 2))
-        centre = (fraction + z * z / (2 * n)) / (1 + z * z / n)
-        half = z / (1 + z * z / n) * np.sqrt(fraction * (1 - fraction) / n + (z / (2 * n)) ** 2)
+        mean_p = np.bincount(bin_of, values, bins) / n
+        fraction = np.bincount(bin_of, truth, bins) / n
+    low, high = wilson(fraction, n, level)
     edges = np.linspace(0, 1, bins + 1)
     return pd.DataFrame(
         {
@@ -113,9 +110,9 @@ def reliability_curve(
             "to": edges[1:],
             "stimuli": n.astype(int),
             "mean_p": mean_p,
-            "fraction": fraction,
-            "low": centre - half,
-            "high": centre + half,
+            "share": fraction,
+            "low": low,
+            "high": high,
         }
     )
 
