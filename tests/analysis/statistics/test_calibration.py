@@ -47,7 +47,7 @@ def test_the_parts_of_the_brier_score_add_up(pair: tuple[Array, Array], bins: in
     assert found.calibration_error == pytest.approx(gap, abs=1e-12)
 
 
-def test_brier_is_that_of_scikit_learn_and_knows_calibrated_forecasts() -> None:
+def test_brier_matches_scikit_learn_and_knows_calibrated_forecasts() -> None:
     generator = np.random.default_rng(0)
     p = generator.random(20_000)
     label = (generator.random(20_000) < p).astype(float)
@@ -75,7 +75,7 @@ def test_forecasts_that_are_none_are_refused_and_one_outcome_has_no_skill() -> N
         reliability_curve([0.1], [1], bins=0)
 
 
-def test_intervals_of_fractions_are_those_of_wilson() -> None:
+def test_intervals_of_fractions_match_wilson() -> None:
     for k, n in ((0, 10), (7, 10), (120, 199), (10, 10)):
         known = binomtest(k, n).proportion_ci(method="wilson")
         assert wilson(k / n, n) == pytest.approx((known.low, known.high), abs=1e-12)

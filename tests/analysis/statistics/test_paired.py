@@ -67,7 +67,7 @@ def step_down(p: Array) -> Array:
     return found
 
 
-def test_corrections_are_those_of_statsmodels() -> None:
+def test_corrections_match_statsmodels() -> None:
     rng = np.random.default_rng(0)
     for p in (rng.random(7), rng.integers(1, 5, 12) / 100, np.array([0.03])):
         holm = multipletests(p, method="holm")[1]
@@ -95,7 +95,7 @@ bits = st.integers(1, 40).flatmap(
 
 @settings(deadline=None)
 @given(bits)
-def test_mcnemar_is_that_of_statsmodels(pair: Array) -> None:
+def test_mcnemar_matches_statsmodels(pair: Array) -> None:
     a, b = pair
     found = mcnemar_exact(a, b)
     table = [[np.sum((a == 1) & (b == 1)), found.only_first],
@@ -120,7 +120,7 @@ def test_permutations_keep_their_level_and_find_a_difference() -> None:
     assert np.isnan(r_test(np.full(100, 0.5), far, y))
 
 
-def test_permutations_are_those_of_swapping_by_hand() -> None:
+def test_permutations_match_swapping_by_hand() -> None:
     rng = np.random.default_rng(4)
     y, a, b = rng.random((3, 15))
     found = r_test(a, b, y, permutations=50, seed=2)
@@ -134,7 +134,7 @@ def test_permutations_are_those_of_swapping_by_hand() -> None:
     assert found == (1 + np.sum(np.abs(differences) >= observed - 1e-12)) / 51
 
 
-def test_the_interval_is_that_of_leaving_out_stimuli_of_both_models_at_once() -> None:
+def test_the_interval_matches_leaving_out_stimuli_of_both_models_at_once() -> None:
     """Two models whose errors are alike: paired, their difference hardly varies."""
     rng = np.random.default_rng(7)
     y, strata = rng.random(50), np.repeat([0, 1], 25)
@@ -155,7 +155,7 @@ def test_the_interval_is_that_of_leaving_out_stimuli_of_both_models_at_once() ->
 # --- tables of all pairs -------------------------------------------------------------------------
 
 
-def test_differences_are_those_of_the_measures_and_corrected_over_the_pairs() -> None:
+def test_differences_match_the_measures_and_corrected_over_the_pairs() -> None:
     rng = np.random.default_rng(1)
     p = rng.random((4, 60))
     p[2, :5] = np.nan
@@ -236,7 +236,9 @@ def test_pairs_of_models_are_tested_on_what_both_answered() -> None:
         np.sum(correct[0] > correct[1]), np.sum(correct[0] < correct[1]),
     )  # fmt: skip
     known = table["p_accuracy"].dropna()
-    np.testing.assert_allclose(table.loc[known.index, "p_accuracy_holm"], step_down(known.to_numpy()))
+    np.testing.assert_allclose(
+        table.loc[known.index, "p_accuracy_holm"], step_down(known.to_numpy())
+    )
     np.testing.assert_allclose(table.loc[known.index, "p_accuracy_bh"], step_up(known.to_numpy()))
     assert table.loc[("a", "c"), "reason"].startswith("r: undefined")
     assert table.loc[("a", "d"), "reason"] == "no stimulus that both predict"

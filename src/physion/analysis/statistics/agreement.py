@@ -293,7 +293,7 @@ ROUNDING = 1e-12
 
 
 def kappa_from_fractions(first: npt.ArrayLike, second: npt.ArrayLike, both: npt.ArrayLike) -> Array:
-    """Return kappa of two raters from their fractions of yes, and that of yes by both.
+    """Return kappa of two raters from their fractions of yes, and the fraction of yes by both.
 
     Agreement exceeds the one by chance by 2 (both - first second); NaN where chance gives 1.
     """

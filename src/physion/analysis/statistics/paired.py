@@ -185,9 +185,9 @@ def swap_coins(permutations: int, n: int, seed: int) -> Array:
 def corrected_p(p: npt.ArrayLike, method: Literal["holm", "fdr_bh"]) -> Array:
     """Return p values corrected for many tests; NaN stays NaN and is not counted as a test.
 
-    ``holm`` is Holm's step-down method, which controls the family-wise error; ``fdr_bh`` that of
-    Benjamini and Hochberg, which controls the false discovery rate. Holm's is not statsmodels'
-    `multipletests`, which collects garbage at every call: a second in a large process.
+    ``holm`` is Holm's step-down method, which controls the family-wise error; ``fdr_bh`` is
+    the method of Benjamini and Hochberg, which controls the false discovery rate. Holm's is not
+    statsmodels' `multipletests`, which collects garbage at every call: a second in a large process.
     """
     values = np.asarray(p, dtype=np.float64)
     known = np.isfinite(values)
