@@ -41,9 +41,9 @@ def test_the_parts_of_the_brier_score_add_up(pair: tuple[Array, Array], bins: in
     curve = reliability_curve(p, label, bins)
     assert curve["stimuli"].sum() == len(p) and len(curve) == bins
     full = curve[curve["stimuli"] > 0]
-    assert full["share"].between(full["low"] - 1e-12, full["high"] + 1e-12).all()
+    assert full["fraction"].between(full["low"] - 1e-12, full["high"] + 1e-12).all()
     assert full["mean_p"].between(full["from"] - 1e-9, full["to"] + 1e-9).all()
-    gap = np.sum(full["stimuli"] / len(p) * (full["mean_p"] - full["share"]).abs())
+    gap = np.sum(full["stimuli"] / len(p) * (full["mean_p"] - full["fraction"]).abs())
     assert found.calibration_error == pytest.approx(gap, abs=1e-12)
 
 
@@ -82,5 +82,5 @@ def test_intervals_of_fractions_match_wilson() -> None:
     assert np.isnan(wilson(float("nan"), 10)).all() and np.isnan(wilson(0.5, 0)).all()
     curve = reliability_curve([0.61, 0.63, 0.66, 0.95], [1, 1, 0, 1]).iloc[6]
     known = binomtest(2, 3).proportion_ci(method="wilson")
-    found = curve[["stimuli", "mean_p", "share", "low", "high"]].tolist()
+    found = curve[["stimuli", "mean_p", "fraction", "low", "high"]].tolist()
     assert found == pytest.approx([3, 1.9 / 3, 2 / 3, known.low, known.high])

@@ -317,7 +317,7 @@ def _spread(scenario: str, measure: str, values: Array) -> dict[str, Any]:
     if found["undefined"]:
         reasons.append(f"{found['undefined']} undefined (constant answers) and left out")
     if not len(values):
-        reasons.append("one person only makes no pair")
+        reasons.append("one person makes no pair")
     return {"scenario": scenario, "measure": measure, **found, "reason": "; ".join(reasons)}
 
 

@@ -110,7 +110,7 @@ def reliability_curve(
             "to": edges[1:],
             "stimuli": n.astype(int),
             "mean_p": mean_p,
-            "share": fraction,
+            "fraction": fraction,
             "low": low,
             "high": high,
         }
