@@ -283,7 +283,7 @@ def check(study: Study, tally: Tally) -> int:
 
 def measure(name: str, options: argparse.Namespace, folder: Path) -> Row:
     """Make a study, serve it, load it, stop, and look everything up."""
-    from physion.experiment.study.study import Plausibility
+    from physion.experiment.study.settings import Plausibility
     from support.experiment.tiny_study import make_tiny_study
 
     # Every answer is checked, at a speed that the participants of a load can keep.

@@ -27,7 +27,8 @@ from physion.experiment.protocol import Answer, Enter, PageDone, Phase
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import make_pass
-from physion.experiment.study.study import Study, Timing
+from physion.experiment.study.settings import Timing
+from physion.experiment.study.study import Study
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 TEST_TRIALS = 150

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from physion.experiment.study.study import Attention
+from physion.experiment.study.settings import Attention
 from support.experiment.browser import Visit, chromium, rows_of, served
 
 __all__ = ["chromium"]

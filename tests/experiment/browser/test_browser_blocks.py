@@ -11,7 +11,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.experiment.server_process import ServerProcess
 from physion.experiment.study.orders import block_scenarios
-from physion.experiment.study.study import Blocks, Recruitment
+from physion.experiment.study.settings import Blocks, Recruitment
 from physion.experiment.study.texts import TEXTS_FOLDER
 from support.experiment.browser import FAST, SHORT, Visit, chromium, rows_of
 from support.experiment.tiny_study import make_tiny_study

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from physion.experiment.study.study import Comprehension, EarlyEnd
+from physion.experiment.study.settings import Comprehension, EarlyEnd
 from support.experiment.browser import Visit, chromium, rows_of, served
 from support.experiment.own_questions import COMPREHENSION, COMPREHENSION_TEXTS
 

@@ -11,7 +11,8 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from physion.experiment.study.study import EarlyEnd, Study
+from physion.experiment.study.settings import EarlyEnd
+from physion.experiment.study.study import Study
 from support.experiment.browser import Visit, chromium, rows_of, served
 
 __all__ = ["chromium"]

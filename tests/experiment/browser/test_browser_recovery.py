@@ -11,7 +11,8 @@ import pytest
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.experiment.study.orders import trial_order
-from physion.experiment.study.study import Recruitment, Study
+from physion.experiment.study.settings import Recruitment
+from physion.experiment.study.study import Study
 from support.experiment.browser import Visit, chromium, rows_of, served, signed_query
 
 __all__ = ["chromium"]

@@ -17,7 +17,8 @@ import sqlalchemy as sa
 from physion.experiment.store.database import RAW_IDS, SESSIONS, open_database
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import make_pass
-from physion.experiment.study.study import Recruitment, Study
+from physion.experiment.study.settings import Recruitment
+from physion.experiment.study.study import Study
 from support.experiment.browser import HIDE, SHORT, Visit, chromium, rows_of, served
 
 __all__ = ["chromium"]

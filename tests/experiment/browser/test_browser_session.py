@@ -14,7 +14,8 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from physion.experiment.study.study import Study, Timing
+from physion.experiment.study.settings import Timing
+from physion.experiment.study.study import Study
 from support.experiment.browser import SHORT, Visit, chromium, rows_of, served
 
 __all__ = ["chromium"]

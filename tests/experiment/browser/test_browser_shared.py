@@ -12,7 +12,8 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 import sqlalchemy as sa
 
 from physion.experiment.store.database import PARTICIPANTS, SESSIONS, open_database
-from physion.experiment.study.study import Recruitment, Study
+from physion.experiment.study.settings import Recruitment
+from physion.experiment.study.study import Study
 from support.experiment.browser import Visit, chromium, rows_of, served
 
 __all__ = ["chromium"]

@@ -33,7 +33,7 @@ from physion.experiment.export.tables import read_tables
 from physion.experiment.protocol import Enter
 from physion.experiment.store.database import ANSWERS, EVENTS, PAUSES, RAW_IDS, SESSIONS
 from physion.experiment.store.lab import set_voided
-from physion.experiment.study.study import Bonus
+from physion.experiment.study.settings import Bonus
 from support.experiment.experimenter_client import TWO, Lab, Visitor, lab
 from support.experiment.experimenter_rows import insert_sessions
 from support.experiment.store_walk import begin, enter, give, refusal, rows, run, walk

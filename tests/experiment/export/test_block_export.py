@@ -19,8 +19,7 @@ from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.orders import block_scenarios
-from physion.experiment.study.settings import Attention
-from physion.experiment.study.study import ALL_SCENARIOS, Blocks
+from physion.experiment.study.settings import ALL_SCENARIOS, Attention, Blocks
 from support.experiment.store_walk import enter, rows, run, walk
 from support.experiment.tiny_study import make_tiny_study
 

@@ -30,7 +30,8 @@ from physion.experiment.store.database import (
     create_database,
 )
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.study import Recruitment, Study
+from physion.experiment.study.settings import Recruitment
+from physion.experiment.study.study import Study
 from support.experiment import experimenter_rows
 from support.experiment.experimenter_rows import insert_sessions
 from support.experiment.tiny_study import make_tiny_study

@@ -17,8 +17,9 @@ from physion.core.errors import UnknownNameError
 from physion.experiment.server_process import ServerProcess
 from physion.experiment.simulated import SimulatedPerson, SimulatedVisit, SimulationPlan, simulate
 from physion.experiment.study.identity import Secrets
+from physion.experiment.study.settings import Plausibility
 from physion.experiment.study.stimuli import Stimulus
-from physion.experiment.study.study import Plausibility, Study
+from physion.experiment.study.study import Study
 from support.experiment.serving import stored_answers, stored_sessions
 from support.experiment.tiny_study import make_tiny_study
 

@@ -13,7 +13,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 from physion.experiment.server_process import ServerProcess
 from physion.experiment.simulated import SimulationPlan, simulate
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.study import Attention, Practice
+from physion.experiment.study.settings import Attention, Practice
 from support.experiment.experimenter_client import BASE
 from support.experiment.own_questions import (
     COMPREHENSION,

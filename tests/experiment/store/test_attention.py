@@ -16,8 +16,9 @@ from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.orders import trial_order
+from physion.experiment.study.settings import Attention
 from physion.experiment.study.stimuli import ATTENTION, Stimulus
-from physion.experiment.study.study import Attention, Study
+from physion.experiment.study.study import Study
 from support.experiment.store_walk import enter, give, open_store, rows, run, walk
 from support.experiment.tiny_study import make_tiny_study
 

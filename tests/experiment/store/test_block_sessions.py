@@ -17,7 +17,8 @@ from physion.experiment.study.identity import Secrets
 from physion.experiment.study.media import read_media_path
 from physion.experiment.study.orders import block_scenarios, order_number, trial_order
 from physion.experiment.study.recruitment import links
-from physion.experiment.study.study import ALL_SCENARIOS, Blocks, Study, load_study, write_settings
+from physion.experiment.study.settings import ALL_SCENARIOS, Blocks
+from physion.experiment.study.study import Study, load_study, write_settings
 from support.experiment.store_walk import (
     answer,
     begin,

@@ -15,7 +15,8 @@ from physion.experiment.store.answering import ATTEMPT
 from physion.experiment.store.database import EVENTS, SESSIONS
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.study import Comprehension, EarlyEnd, Study
+from physion.experiment.study.settings import Comprehension, EarlyEnd
+from physion.experiment.study.study import Study
 from physion.experiment.web.api import public_study
 from support.experiment.own_questions import COMPREHENSION, COMPREHENSION_TEXTS, RIGHT, WRONG
 from support.experiment.store_walk import enter, open_store, page, refusal, request, rows, run, walk

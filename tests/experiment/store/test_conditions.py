@@ -20,8 +20,8 @@ from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.media import read_media_path
 from physion.experiment.study.recruitment import links, make_pass
-from physion.experiment.study.settings import Condition
-from physion.experiment.study.study import Blocks, Study, Timing, load_study, under, write_settings
+from physion.experiment.study.settings import Blocks, Condition, Timing
+from physion.experiment.study.study import Study, load_study, under, write_settings
 from physion.experiment.study.texts import TEXTS_FOLDER
 from support.experiment.store_walk import (
     begin,

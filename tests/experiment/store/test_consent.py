@@ -13,7 +13,8 @@ from physion.experiment.store.database import METADATA, RAW_IDS, SESSIONS, STUDI
 from physion.experiment.store.lab import forget_sessions, set_paused
 from physion.experiment.store.store import Refused, Store
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.study import EarlyEnd, Study
+from physion.experiment.study.settings import EarlyEnd
+from physion.experiment.study.study import Study
 from support.experiment.store_walk import (
     begin,
     enter,

@@ -17,7 +17,8 @@ from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.media import read_media
 from physion.experiment.study.recruitment import make_pass
-from physion.experiment.study.study import Plausibility, Recruitment, Study
+from physion.experiment.study.settings import Plausibility, Recruitment
+from physion.experiment.study.study import Study
 from support.experiment.store_walk import (
     PAGES,
     answer,

@@ -18,7 +18,8 @@ from physion.experiment.store.lab import forget_sessions
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.orders import trial_order
-from physion.experiment.study.study import Blocks, EarlyEnd, Practice, Study
+from physion.experiment.study.settings import Blocks, EarlyEnd, Practice
+from physion.experiment.study.study import Study
 from support.experiment.store_walk import (
     answer,
     enter,

@@ -27,7 +27,8 @@ from physion.experiment.store.sessions import ACTIVE_WITHIN
 from physion.experiment.store.store import Refused, Store
 from physion.experiment.study.identity import Secrets, participant_hash
 from physion.experiment.study.recruitment import make_pass
-from physion.experiment.study.study import Recruitment, Study
+from physion.experiment.study.settings import Recruitment
+from physion.experiment.study.study import Study
 from support.experiment.store_walk import (
     PAGES,
     STAGES,

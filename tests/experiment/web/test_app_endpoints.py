@@ -16,7 +16,7 @@ from physion.experiment import protocol as wire
 from physion.experiment.protocol import PublicStudy
 from physion.experiment.store.database import ANSWERS, RAW_IDS, SESSIONS
 from physion.experiment.study.recruitment import make_pass
-from physion.experiment.study.study import Recruitment
+from physion.experiment.study.settings import Recruitment
 from support.experiment.app_walk import Person, Served, answer_body, served
 
 TRIALS = {"familiarization": 2, "test": 3}

@@ -15,7 +15,8 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 from physion.cli.main import main
 from physion.core.errors import BadInputError
 from physion.experiment.study.recruitment import links
-from physion.experiment.study.study import Recruitment, load_study
+from physion.experiment.study.settings import Recruitment
+from physion.experiment.study.study import load_study
 from support.experiment.app_walk import Person, Served, served
 from support.experiment.tiny_study import make_tiny_study
 

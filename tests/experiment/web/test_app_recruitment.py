@@ -27,7 +27,8 @@ from physion.experiment.study.recruitment import (
     session_code,
     start_warnings,
 )
-from physion.experiment.study.study import Recruitment, Study
+from physion.experiment.study.settings import Recruitment
+from physion.experiment.study.study import Study
 from support.experiment.app_walk import served
 from support.experiment.tiny_study import make_tiny_study
 

@@ -24,7 +24,8 @@ from physion.experiment.server_process import ServerProcess
 from physion.experiment.store.database import ANSWERS, EVENTS, SESSIONS, open_database
 from physion.experiment.study.identity import Secrets, participant_hash
 from physion.experiment.study.recruitment import make_pass
-from physion.experiment.study.study import Plausibility, Recruitment, Study, Timing
+from physion.experiment.study.settings import Plausibility, Recruitment, Timing
+from physion.experiment.study.study import Study
 from support.experiment.tiny_study import make_tiny_study
 from support.programs import absent, find_chromium, find_firefox
 

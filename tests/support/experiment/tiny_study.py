@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from physion.experiment.study.identity import SECRET_FILE, Secrets
+from physion.experiment.study.settings import Plausibility
 from physion.experiment.study.stimuli import STIMULI_FILE, Stimulus, write_stimuli
-from physion.experiment.study.study import Plausibility, Study, load_study, write_settings
+from physion.experiment.study.study import Study, load_study, write_settings
 from physion.experiment.study.texts import TEXTS_FOLDER, shipped_file
 from physion.trials.video import encode_movie
 

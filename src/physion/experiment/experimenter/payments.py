@@ -16,7 +16,8 @@ from physion.experiment.export.descriptions import guard_cell
 from physion.experiment.store.database import RAW_IDS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import completion
-from physion.experiment.study.study import Bonus, Study
+from physion.experiment.study.settings import Bonus
+from physion.experiment.study.study import Study
 
 COLUMNS = (
     "source", "id", "reference", "scenario", "state", "finished_at", "test_trials", "correct",

@@ -86,7 +86,8 @@ from physion.experiment.export.tables import (
     snapshot,
 )
 from physion.experiment.store.database import STUDIES
-from physion.experiment.study.study import EARLY_ENDS, Study
+from physion.experiment.study.settings import EARLY_ENDS
+from physion.experiment.study.study import Study
 
 # --- the folder: replaces an older export, and nothing else ---
 

@@ -33,9 +33,9 @@ from physion.experiment.study.orders import (
     stimuli_by_session,
     trial_order,
 )
-from physion.experiment.study.settings import Question, columns_of
+from physion.experiment.study.settings import ALL_SCENARIOS, Question, columns_of
 from physion.experiment.study.stimuli import ATTENTION, LOOKS, PHASES, STIMULUS_PHASES, Stimulus
-from physion.experiment.study.study import ALL_SCENARIOS, Study, under
+from physion.experiment.study.study import Study, under
 
 # --- columns as Arrow types and data frames ---
 

@@ -63,7 +63,8 @@ from physion.experiment.study.recruitment import (
     is_unfilled,
     read_pass,
 )
-from physion.experiment.study.study import ALL_SCENARIOS, Study, under, variants
+from physion.experiment.study.settings import ALL_SCENARIOS
+from physion.experiment.study.study import Study, under, variants
 
 
 @dataclass(frozen=True)

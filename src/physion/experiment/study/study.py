@@ -27,18 +27,7 @@ from physion.core.files import check_plain, read_ids, read_plain, write_atomic
 from physion.core.names import canonical_name
 from physion.experiment.study.settings import (
     ALL_SCENARIOS,
-    EARLY_ENDS,
-    Attention,
-    Blocks,
-    Bonus,
-    Comprehension,
-    EarlyEnd,
-    Plausibility,
-    Practice,
-    Recruitment,
-    Screen,
     StudySettings,
-    Timing,
     condition_text_keys,
     format_settings,
     parse_settings,
@@ -47,23 +36,6 @@ from physion.experiment.study.stimuli import MAX_BYTES as MAX_STIMULI_BYTES
 from physion.experiment.study.stimuli import PHASES, STIMULI_FILE, Stimulus, parse_stimuli
 from physion.experiment.study.texts import TEXTS_FOLDER, parse_bytes, read_consent_file, read_texts
 
-__all__ = [
-    "ALL_SCENARIOS",
-    "EARLY_ENDS",
-    "Attention",
-    "Blocks",
-    "Bonus",
-    "Comprehension",
-    "EarlyEnd",
-    "Plausibility",
-    "Practice",
-    "Recruitment",
-    "Screen",
-    "Study",
-    "Timing",
-    "load_study",
-    "write_settings",
-]
 STUDY_FILE = "study.toml"
 MAX_BYTES = 1_000_000
 
