@@ -37,6 +37,9 @@ def read_csv(path: Path, columns: Iterable[str] = ()) -> pd.DataFrame:
         table = pd.read_csv(io.BytesIO(content), dtype=str, keep_default_na=False, encoding="utf-8")
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
         raise BadInputError(f"{path} is not a CSV table: {error}") from error
+    if not isinstance(table.index, pd.RangeIndex):
+        # pandas takes the first cells of such rows for an index, which shifts all others.
+        raise BadInputError(f"{path}: its rows have more cells than its header")
     if len(table.columns) == 1 and ";" in str(table.columns[0]):
         raise BadInputError(
             f"{path} separates its columns with semicolons; save it as CSV with commas"

@@ -1,39 +1,26 @@
-"""Recovery in a real browser: reload, lost connection, two tabs, killed server."""
+"""Recovery: reload, lost connection, two tabs, a killed server, changed URLs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import json
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
-
+from physion.experiment.study.identity import SECRET_FILE
 from physion.experiment.study.orders import trial_order
-from physion.experiment.study.settings import Recruitment
 from physion.experiment.study.study import Study
-from support.experiment.browser import Visit, chromium, rows_of, served, signed_query
+from support.experiment.browser import (
+    Visit,
+    answers_to_test,
+    rows_of,
+    served,
+    signed_query,
+)
 
-__all__ = ["chromium"]
 pytestmark = pytest.mark.slow
-TEST = 4
-
-
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Study, str]]:
-    folder = tmp_path_factory.mktemp("study")
-    code = Recruitment(link_code="TINY-CODE")
-    with served(folder, test=TEST, familiarization=1, recruitment=code) as (study, server):
-        yield study, server.url
-
-
-def to_the_test(visit: Visit, name: str) -> None:
-    """Go to the first test trial."""
-    visit.begin(f"?participant={name}")
-    visit.practise(1)
-    visit.begin_test()
-    visit.page.locator(".answer").first.wait_for()
 
 
 def check_complete(study: Study, name: str, responses: list[str]) -> list[Any]:
@@ -50,29 +37,28 @@ def check_complete(study: Study, name: str, responses: list[str]) -> list[Any]:
 def test_a_reload_continues_at_the_same_trial(chromium: Any, site: tuple[Study, str]) -> None:
     study, url = site
     with Visit(chromium, url) as visit:
-        to_the_test(visit, "Reload")
+        visit.to_the_test("?participant=Reload")
         sides = visit.left()
         visit.answer("yes")
-        visit.page.get_by_text("Trial 2 of 4").wait_for()
+        visit.page.get_by_text("Trial 2 of 3").wait_for()
         before = [path for path in visit.requests if "/t-1-movie-" in path]
         visit.requests.clear()
         visit.page.reload()
-        visit.page.get_by_text("Trial 2 of 4").wait_for()
+        visit.page.get_by_text("Trial 2 of 3").wait_for()
         assert [path for path in visit.requests if "/t-1-movie-" in path] == before
         assert not any("/t-0-" in path for path in visit.requests)
         assert visit.left() == sides
         visit.answer("no")
-        visit.page.get_by_text("Trial 3 of 4").wait_for()
-    # The next day, in another browser: the id alone is not enough, but a signed link is.
+        visit.page.get_by_text("Trial 3 of 3").wait_for()
+    # The next day, in another browser: the id is not enough, but a signed link is.
     with Visit(chromium, url) as visit:
         visit.go("?participant=Reload")
         visit.page.get_by_text("Your session began in another browser").wait_for()
     with Visit(chromium, url) as visit:
         visit.go(signed_query(study, "Reload"))
-        visit.page.get_by_text("Trial 3 of 4").wait_for()
+        visit.page.get_by_text("Trial 3 of 3").wait_for()
         assert visit.left() == sides
         visit.answer("yes")
-        visit.answer("no")
         visit.finish()
         assert visit.unexpected() == []
         # A person who has finished finds the result again in this browser ...
@@ -80,13 +66,12 @@ def test_a_reload_continues_at_the_same_trial(chromium: Any, site: tuple[Study, 
             visit.go(query)
             visit.heading("Thank you!")
             assert visit.page.inner_text("#code") == "TINY-CODE"
-    test = check_complete(study, "Reload", ["yes", "no", "yes", "no"])
-    assert [row.resumed for row in test] == [False, True, True, False]
+    test = check_complete(study, "Reload", ["yes", "no", "yes"])
+    assert [row.resumed for row in test] == [False, True, True]
     # ... and elsewhere reads that one can take part only once.
     with Visit(chromium, url, "twice") as visit:
         visit.go("?participant=Reload")
         visit.page.get_by_text("You have already taken part").wait_for()
-        visit.picture("told")
         assert visit.page.locator("#code").count() == 0
 
 
@@ -98,14 +83,14 @@ def test_a_reload_without_browser_storage(chromium: Any, site: tuple[Study, str]
             "Object.defineProperty(window, 'localStorage',"
             " { get() { throw new DOMException('forbidden', 'SecurityError'); } });"
         )
-        to_the_test(visit, "Forbidden")
+        visit.to_the_test("?participant=Forbidden")
         assert visit.page.url.endswith("?participant=Forbidden")
         visit.answer("no")
-        visit.page.get_by_text("Trial 2 of 4").wait_for()
+        visit.page.get_by_text("Trial 2 of 3").wait_for()
         while len(rows_of(study, "Forbidden")[1]) < 2:
             visit.page.wait_for_timeout(50)
         visit.page.reload()
-        visit.page.get_by_text("Trial 2 of 4").wait_for()
+        visit.page.get_by_text("Trial 2 of 3").wait_for()
         assert visit.unexpected() == []
 
 
@@ -125,27 +110,26 @@ WATCH_STATUS = """() => {
 """Records in which part of a trial the message about the connection can be seen."""
 
 
-def test_twenty_seconds_offline(chromium: Any, site: tuple[Study, str]) -> None:
+def test_answers_wait_while_the_browser_is_offline(chromium: Any, site: tuple[Study, str]) -> None:
     study, url = site
     with Visit(chromium, url, "offline") as visit:
-        to_the_test(visit, "Offline")
-        visit.wait_for_answer()
+        visit.to_the_test("?participant=Offline")
         visit.page.evaluate(WATCH_STATUS)
+        visit.wait_for_answer()
         visit.context.set_offline(True)
         visit.answer("no")
-        visit.page.get_by_text("Trial 2 of 4").wait_for()
+        visit.page.get_by_text("Trial 2 of 3").wait_for()
         visit.answer("no")
         visit.page.get_by_text("No connection.").wait_for()
         assert visit.page.locator("#status").bounding_box()["height"] < 45, "one line"
         visit.picture("lost")
-        visit.page.get_by_text("Trial 3 of 4").wait_for()
-        visit.page.wait_for_timeout(15_000)
-        assert len([row for row in rows_of(study, "Offline")[1] if row.phase == "test"]) == 0
+        visit.page.get_by_text("Trial 3 of 3").wait_for()
+        visit.wait_for_answer()
+        assert answers_to_test(study, "Offline") == []
         kept = visit.page.evaluate("JSON.parse(localStorage.getItem('physion:answers')).length")
         assert kept == 2
         visit.context.set_offline(False)
         visit.page.get_by_text("The connection is back.").wait_for()
-        visit.answer("yes")
         visit.answer("yes")
         seen = set(visit.page.evaluate("[...window.statusSeen]"))
         assert {"movie hidden", "answer visible"} <= seen and "movie visible" not in seen
@@ -153,17 +137,28 @@ def test_twenty_seconds_offline(chromium: Any, site: tuple[Study, str]) -> None:
         assert visit.page.evaluate("localStorage.getItem('physion:answers')") is None
         visit.finish()
         assert visit.unexpected() == []
-    check_complete(study, "Offline", ["no", "no", "yes", "yes"])
+    check_complete(study, "Offline", ["no", "no", "yes"])
     kinds = {event.kind for event in rows_of(study, "Offline")[2]}
     assert {"offline", "online"} <= kinds
 
 
-def test_a_form_stays_until_it_is_stored(chromium: Any, site: tuple[Study, str]) -> None:
+def test_a_browser_that_is_closed_offline(chromium: Any, site: tuple[Study, str]) -> None:
+    """Answers are sent when the page is opened again; a form stays until it is stored."""
     study, url = site
     with Visit(chromium, url, "form") as visit:
-        to_the_test(visit, "Form")
-        for _ in range(TEST):
-            visit.answer("yes")
+        visit.to_the_test("?participant=Closed")
+        visit.wait_for_answer()
+        visit.context.set_offline(True)
+        visit.answer("no")
+        visit.page.get_by_text("Trial 2 of 3").wait_for()
+        visit.answer("yes")
+        visit.page.get_by_text("Trial 3 of 3").wait_for()
+        visit.page.close()
+        visit.context.set_offline(False)
+        visit.page = visit.open_tab()
+        visit.go()
+        visit.page.get_by_text("Trial 3 of 3").wait_for()
+        visit.answer("yes")
         visit.heading("About you")
         visit.page.fill("#age", "47")
         server = "busy"
@@ -183,7 +178,6 @@ def test_a_form_stays_until_it_is_stored(chromium: Any, site: tuple[Study, str])
         # Each trouble lasts until the page shows it, however slow the browser is.
         visit.page.get_by_text("The server is busy.").wait_for()
         visit.page.get_by_text("Your answers are being sent").wait_for()
-        visit.picture("busy")
         server = "lost"
         visit.page.get_by_text("No connection.").wait_for()
         assert visit.page.input_value("#age") == "47"
@@ -191,101 +185,148 @@ def test_a_form_stays_until_it_is_stored(chromium: Any, site: tuple[Study, str])
         server = "back"
         visit.heading("How was it?")
         assert set(requests) == {"busy", "lost", "back"} and requests.count("back") == 1
-    assert rows_of(study, "Form")[0].age == 47
-
-
-def test_a_browser_that_is_closed_offline(chromium: Any, site: tuple[Study, str]) -> None:
-    """The answers are sent when the page is opened again, before it requests the state."""
-    study, url = site
-    with Visit(chromium, url) as visit:
-        to_the_test(visit, "Closed")
-        visit.wait_for_answer()
-        visit.context.set_offline(True)
-        visit.answer("no")
-        visit.page.get_by_text("Trial 2 of 4").wait_for()
-        visit.answer("yes")
-        visit.page.get_by_text("Trial 3 of 4").wait_for()
-        visit.page.close()
-        visit.context.set_offline(False)
-        visit.page = visit.open_tab()
-        visit.go()
-        visit.page.get_by_text("Trial 3 of 4").wait_for()
-        visit.answer("yes")
-        visit.answer("yes")
-        visit.heading("About you")
-        visit.finish()
-        assert visit.unexpected() == []
-    test = check_complete(study, "Closed", ["no", "yes", "yes", "yes"])
-    assert [row.resumed for row in test] == [False, False, True, False]
+    assert rows_of(study, "Closed")[0].age == 47
+    test = answers_to_test(study, "Closed")
+    assert [row.response for row in test] == ["no", "yes", "yes"]
+    assert [row.resumed for row in test] == [False, False, True]
 
 
 def test_the_second_tab_takes_over(chromium: Any, site: tuple[Study, str]) -> None:
     study, url = site
     with Visit(chromium, url, "tabs") as visit:
-        to_the_test(visit, "Tabs")
+        visit.to_the_test("?participant=Tabs")
         visit.answer("yes")
-        visit.page.get_by_text("Trial 2 of 4").wait_for()
+        visit.page.get_by_text("Trial 2 of 3").wait_for()
         first, visit.page = visit.page, visit.open_tab()
         visit.go()
-        visit.page.get_by_text("Trial 2 of 4").wait_for()
+        visit.page.get_by_text("Trial 2 of 3").wait_for()
         first.get_by_text("The study continues in another tab").wait_for()
         assert first.locator(".answer").count() == 0
         visit.answer("no")
-        visit.page.get_by_text("Trial 3 of 4").wait_for()
+        visit.page.get_by_text("Trial 3 of 3").wait_for()
         second, visit.page = visit.page, first
         visit.page.bring_to_front()
         visit.picture("first")
         visit.main_button().click()  # continue here
         second.get_by_text("The study continues in another tab").wait_for()
-        visit.page.get_by_text("Trial 3 of 4").wait_for()
+        visit.page.get_by_text("Trial 3 of 3").wait_for()
         visit.answer("no")
-        visit.answer("yes")
         visit.heading("About you")
         visit.finish()
         assert visit.unexpected() == []
-    check_complete(study, "Tabs", ["yes", "no", "no", "yes"])
+    check_complete(study, "Tabs", ["yes", "no", "no"])
 
 
 def test_another_device_answers_meanwhile(chromium: Any, site: tuple[Study, str]) -> None:
-    """The page learns of the other device by the server's refusal, and continues."""
+    """The page learns it by the server's refusal, also in the middle of the next trial."""
     study, url = site
     with Visit(chromium, url) as here, Visit(chromium, url) as there:
-        to_the_test(here, "Devices")
+        here.to_the_test("?participant=Devices")
         there.go(signed_query(study, "Devices"))
         there.answer("yes")
-        there.page.get_by_text("Trial 2 of 4").wait_for()
-        there.answer("yes")
-        there.page.get_by_text("Trial 3 of 4").wait_for()
+        there.page.get_by_text("Trial 2 of 3").wait_for()
         there.page.close()
+        held: list[Any] = []
+
+        def hold_the_first(route: Any) -> None:
+            if held:
+                route.continue_()
+            else:
+                held.append(route)
+
+        here.context.route("**/api/answers", hold_the_first)
         here.answer("no")
-        here.page.get_by_text("Trial 3 of 4").wait_for()
+        here.page.get_by_text("Trial 2 of 3").wait_for()
+        here.wait_for_answer()  # the movie of the second trial is over
+        held[0].continue_()
+        here.page.locator(".answer:enabled").first.wait_for(state="detached")
         here.answer("no")
-        here.page.get_by_text("Trial 4 of 4").wait_for()
+        here.page.get_by_text("Trial 3 of 3").wait_for()
         here.answer("no")
         here.heading("About you")
         here.finish()
         assert here.unexpected() == []
-    check_complete(study, "Devices", ["yes", "yes", "no", "no"])
+    test = check_complete(study, "Devices", ["yes", "no", "no"])
+    # What was shown twice is marked: the first trial elsewhere, the second one here.
+    assert [row.resumed for row in test] == [True, True, False]
+    assert json.loads(test[1].details)["attempts"] == 2
     refused = [event for event in rows_of(study, "Devices")[2] if event.kind == "answer_refused"]
     assert [event.data["code"] for event in refused] == ["already_answered"]
 
 
-def test_the_server_is_killed(chromium: Any, tmp_path: Path) -> None:
-    code = Recruitment(link_code="TINY-CODE")
+def test_a_server_that_is_killed_and_has_other_keys(chromium: Any, tmp_path: Path) -> None:
+    """Answers wait for the server; media URLs that became invalid are requested anew."""
     with (
-        served(tmp_path, test=TEST, familiarization=1, recruitment=code) as (study, server),
+        served(tmp_path, preload=1) as (study, server),
         Visit(chromium, server.url) as visit,
     ):
-        to_the_test(visit, "Killed")
-        visit.answer("yes")
-        visit.page.get_by_text("Trial 2 of 4").wait_for()
+
+        def restart(other_keys: bool) -> None:
+            server.kill()
+            if other_keys:
+                path = study.folder / SECRET_FILE
+                content = json.loads(path.read_text())
+                content["link_key"] = content["link_key"][::-1]
+                path.write_text(json.dumps(content))
+            server.start()
+
+        visit.begin("?participant=Killed")
+        visit.wait_for_answer()
+        restart(True)
+        # The full movie of practice has its own URL, which becomes invalid meanwhile.
+        spoilt: list[str] = []
+
+        def spoil(route: Any) -> None:
+            answer = route.fetch().json()
+            if answer["feedback"] and not spoilt:
+                movie = re.sub(r"-\w+$", "-" + "0" * 32, answer["feedback"]["movie"])
+                answer["feedback"]["movie"] = movie
+                spoilt.append(movie)
+            route.fulfill(json=answer)
+
+        visit.context.route("**/api/answers", spoil)
+        visit.practise(1)
+        assert len(spoilt) == 1
+        visit.context.unroute("**/api/answers")
+        visit.begin_test()
+        visit.wait_for_answer()
+        lists = len([url for url in visit.requests if url.endswith("/api/trials/test")])
         server.kill()
-        visit.answer("yes")
-        visit.page.get_by_text("No connection.").wait_for()
         visit.answer("no")
-        server.start()
+        visit.page.get_by_text("No connection.").wait_for(state="attached")
+        restart(True)
+        visit.answer("yes")
         visit.answer("no")
         visit.heading("About you")
+        asked = [url for url in visit.requests if url.endswith("/api/trials/test")]
+        assert (lists, len(asked)) == (1, 2)
         visit.finish()
-        assert visit.unexpected() == []
-        check_complete(study, "Killed", ["yes", "yes", "no", "no"])
+    test = check_complete(study, "Killed", ["no", "yes", "no"])
+    assert [json.loads(row.details)["attempts"] for row in test] == [1, 1, 1]
+
+
+def test_the_language_of_the_session_decides(chromium: Any, site: tuple[Study, str]) -> None:
+    _, url = site
+    with Visit(chromium, url) as visit:
+        visit.go("?participant=Words&language=de")
+        visit.heading("Teilnahme an dieser Studie")
+        # The browser remembers a language that the study no longer has.
+        visit.page.evaluate("localStorage.setItem('physion:language', '\"fr\"')")
+        visit.go("?participant=Words")
+        visit.heading("Teilnahme an dieser Studie")
+
+        def other_language(language: str) -> Any:
+            def change(route: Any) -> None:
+                route.fulfill(json={**route.fetch().json(), "language": language})
+
+            return change
+
+        # Meanwhile the study lost the language in which the session began ...
+        visit.context.route("**/api/page", other_language("en"))
+        visit.main_button().click()
+        visit.heading("What you will do")
+        visit.context.unroute("**/api/page")
+        # ... and texts that cannot be loaded stop nobody.
+        visit.context.route("**/api/session**", other_language("fr"))
+        visit.page.reload()
+        visit.heading("What you will do")

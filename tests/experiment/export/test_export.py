@@ -207,8 +207,6 @@ def test_what_was_left_out_is_said(small: sa.Engine, study: Study, tmp_path: Pat
     )
     latest = [trials["answered_at"].max(), sessions["finished_at"].dropna().max()]
     assert report.until == max(latest)
-    manifest = json.loads((tmp_path / "out" / "export.json").read_bytes())
-    assert manifest["left_out"] == list(report.left_out)
     assert (
         f"left out: {withdrew} sessions (person): the participant withdrew"
         in (tmp_path / "out" / "README.md").read_text()
@@ -283,7 +281,7 @@ def test_a_failure_leaves_nothing_and_the_old_export(
     assert not list(tmp_path.glob("*out*"))
     export_study(small, study, out)
     before = contents(out)
-    for name in ("write_manifest", "read_trials"):
+    for name in ("readme", "read_trials"):
         with monkeypatch.context() as broken:
             broken.setattr(export, name, fails)
             with pytest.raises(OSError, match="No space"):
@@ -312,12 +310,12 @@ def test_an_export_is_replaced_and_nothing_else(
     export_study(small, study, out)
     both = contents(out)
     (out / "psych-ds" / "notes.txt").write_text("mine")
-    with pytest.raises(BadInputError, match="files were added"):
+    with pytest.raises(BadInputError, match=r"psych-ds/notes\.txt was added"):
         export_study(small, study, out)
     (out / "psych-ds" / "notes.txt").unlink()
     export_study(small, study, out)
     assert contents(out) == both
-    (out / "export.json").write_text("{}")
+    (out / "study.json").unlink()
     with pytest.raises(BadInputError, match="something else"):
         export_study(small, study, out)
     own = tmp_path / "own"
@@ -363,7 +361,7 @@ def test_two_exports_do_not_meet(
 
     monkeypatch.setattr(export, "read_sessions", once_more)
     export_study(small, study, tmp_path / "out")
-    assert inner and (tmp_path / "out" / "export.json").exists()
+    assert inner and (tmp_path / "out" / "README.md").exists()
 
 
 def test_others_on_the_machine_cannot_read_it(

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from physion.core.errors import BadInputError
 from physion.experiment.study.stimuli import COLUMNS, Stimulus, read_stimuli, write_stimuli
 
+NAMES_OF_COLUMNS = [column.name for column in COLUMNS]
 NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,30}", fullmatch=True)
 FILES = st.from_regex(r"media/[A-Za-z0-9][A-Za-z0-9_-]{0,20}", fullmatch=True)
 
@@ -73,20 +74,21 @@ def test_columns_may_stand_in_any_order(tmp_path: Path) -> None:
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "a formula for a name": ({"stimulus": "=1+1"}, "stimulus must be letters"),
     "a path for a name": ({"stimulus": "../x"}, "stimulus must be"),
-    "an unknown phase": ({"phase": "main"}, "phase must be familiarization or test"),
-    "an unknown look": ({"look": "blue"}, "look must be"),
-    "a label of another kind": ({"label": "contact"}, "label must be True or False"),
-    "no label": ({"label": ""}, "label must be True or False"),
-    "a negative place": ({"place": "-1"}, "place must be an integer"),
-    "half a frame": ({"frames": "44.5"}, "frames must be an integer"),
-    "no frame": ({"frames": "0"}, "frames must be from 1"),
-    "no rate": ({"rate": "nan"}, "rate must be from 1"),
-    "a rate in words": ({"rate": "slow"}, "rate must be a number"),
-    "a tiny picture": ({"width": "2"}, "width must be from 16"),
+    "an unknown phase": ({"phase": "main"}, "expected familiarization or test"),
+    "an unknown look": ({"look": "blue"}, "expected free or redyellow"),
+    "a label of another kind": ({"label": "contact"}, "expected True or False"),
+    "no label": ({"label": ""}, "expected a value"),
+    "a negative place": ({"place": "-1"}, "expected a whole number from 0"),
+    "half a frame": ({"frames": "44.5"}, "expected a whole number from 1"),
+    "no frame": ({"frames": "0"}, "expected a whole number from 1"),
+    "no rate": ({"rate": "nan"}, "expected a number from 1 to 240"),
+    "too high a rate": ({"rate": "241"}, "expected a number from 1 to 240"),
+    "a rate in words": ({"rate": "slow"}, "expected a number"),
+    "a tiny picture": ({"width": "15"}, "expected a whole number from 16"),
     "a movie outside": ({"movie": "media/../secret.json"}, "movie must be the path"),
     "a movie anywhere": ({"movie": "/etc/passwd"}, "movie must be the path"),
     "a movie below": ({"movie": "media/a/b.mp4"}, "movie must be the path"),
-    "no map": ({"map": ""}, "map must be the path"),
+    "no map": ({"map": ""}, "expected a value"),
     "a whole movie in the test": ({"full": "media/a.mp4"}, "full must be empty"),
     "its frames in the test": ({"full_frames": "60"}, "full_frames must be 0"),
     "no whole movie to practise on": (
@@ -94,8 +96,8 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "no later frame to practise on": (
         {"phase": "familiarization", "full": "media/w9.mp4", "full_frames": "45"},
         "more than the 45 observed"),
-    "an outcome shown before": ({"movie": "media/w0.mp4"}, "full movie of row 2"),
-    "a stimulus practised before": ({"stimulus": "a0"}, "is already in row 2"),
+    "an outcome shown before": ({"movie": "media/w0.mp4"}, "full movie of row 1"),
+    "a stimulus practised before": ({"stimulus": "a0"}, "is already in row 1"),
     "a place taken": ({"place": "0", "scenario": "collide"}, "place 0 of test"),
 }  # fmt: skip
 
@@ -107,10 +109,10 @@ def test_bad_rows_are_named(tmp_path: Path, case: str) -> None:
     rows = list(csv.DictReader(path.read_text().splitlines()))
     rows[3] |= change
     with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS)
+        writer = csv.DictWriter(file, NAMES_OF_COLUMNS)
         writer.writeheader()
         writer.writerows(rows)
-    with pytest.raises(BadInputError, match="row 5") as raised:
+    with pytest.raises(BadInputError, match="row 4") as raised:
         read_stimuli(path)
     assert message in str(raised.value) and str(path) in str(raised.value)
 
@@ -118,13 +120,15 @@ def test_bad_rows_are_named(tmp_path: Path, case: str) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (b"look", b"lock", "unknown column 'lock'; closest: look|lacks the column 'look'"),
-        (b",look", b",look,colour", "cells|unknown column 'colour'"),
-        (b"width,height", b"width,width", "more than one column 'width'"),
-        (b"45,0,30.0", b"45,30.0", "row 4: 13 cells, not 14"),
-        (b"a2", b'"a2', "not CSV"),
-        (b"a2", b"a\xff", "not UTF-8"),
-        (b"a2", b"a\x00", "stimulus must be|not CSV"),
+        (b"look", b"lock", "unknown column 'lock'; closest: look"),
+        (b",look", b",look,colour", "unknown column 'colour'"),
+        (b"width,height", b"width,width", r"unknown column 'width\.1'"),
+        (b",map,", b",", "rows have more cells than its header"),
+        (b",place,", b",", "rows have more cells"),
+        (b"45,0,30.0", b"45,30.0", "row 3 of column 'look' holds ''"),
+        (b"a2", b'"a2', "is not a CSV table"),
+        (b"a2", b"a\xff", "is not a CSV table"),
+        (b"a2", b"a\x00", "stimulus must be|not a CSV table"),
     ],
 )
 def test_other_files_are_refused(tmp_path: Path, old: bytes, new: bytes, message: str) -> None:
@@ -136,19 +140,9 @@ def test_other_files_are_refused(tmp_path: Path, old: bytes, new: bytes, message
 
 def test_an_empty_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "stimuli.csv"
-    path.write_text("")
-    with pytest.raises(BadInputError, match="lacks the column"):
+    path.write_text(",".join(NAMES_OF_COLUMNS))
+    with pytest.raises(BadInputError, match="no rows"):
         read_stimuli(path)
-    path.write_text(",".join(COLUMNS))
-    with pytest.raises(BadInputError, match="no stimulus"):
-        read_stimuli(path)
-
-
-def test_what_would_be_refused_is_not_written(tmp_path: Path) -> None:
-    bad = [dataclasses.replace(_stimuli()[0], frames=0)]
-    with pytest.raises(BadInputError, match="frames"):
-        write_stimuli(tmp_path / "stimuli.csv", bad)
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
@@ -160,11 +154,14 @@ def test_names_that_are_one_to_the_analysis_are_refused(
 ) -> None:
     names = [first, "other", "a", second]
     rows = [dataclasses.replace(s, stimulus=n) for s, n in zip(_stimuli(), names, strict=True)]
+    path = tmp_path / "stimuli.csv"
+    write_stimuli(path, rows)
     with pytest.raises(BadInputError, match="one stimulus to the analysis") as raised:
-        write_stimuli(tmp_path / "stimuli.csv", rows)
+        read_stimuli(path)
     assert first in str(raised.value) and second in str(raised.value)
     rows[3] = dataclasses.replace(rows[3], scenario="drop")
-    write_stimuli(tmp_path / "stimuli.csv", rows)
+    write_stimuli(path, rows)
+    assert list(read_stimuli(path)) == rows
 
 
 def _stimuli() -> list[Stimulus]:

@@ -33,6 +33,7 @@ SIZE = {"width": 1280, "height": 800}
 FAST = Plausibility(reading_s=0.0, fast_ms=0)
 """Rules of plausible sessions under which a test may read and answer faster than people do."""
 SHORT = Timing(fixation_ms=(60, 120), cue_ms=500, flash_hz=2.0)
+MTURK = "https://workersandbox.mturk.com"
 OFFLINE = re.compile(
     r"ERR_(INTERNET_DISCONNECTED|CONNECTION_(REFUSED|RESET)|EMPTY_RESPONSE)|status of (409|425|503)"
 )
@@ -48,39 +49,37 @@ hidden => {
 """Function of the page that hides it, or shows it again, as far as its scripts can tell."""
 
 
-# One per module: while it runs, its event loop blocks this thread for other event loops.
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
-    """A running browser for one test module; skips the tests if there is no browser."""
+# One for all tests of a folder: while it runs, its event loop blocks this thread for others.
+@pytest.fixture(scope="package")
+def driver() -> Iterator[Any]:
+    """Playwright; skips the tests if it is not installed."""
     if importlib.util.find_spec("playwright") is None:
         absent("playwright is absent: install the extra 'dev'")
-    driver = importlib.import_module("playwright.sync_api")
-    path = find_chromium()
-    with driver.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=path, args=["--no-sandbox"], timeout=120_000
-        )
-        yield browser
-        browser.close()
+    with importlib.import_module("playwright.sync_api").sync_playwright() as playwright:
+        yield playwright
 
 
-@pytest.fixture(scope="module")
-def firefox(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """A running Firefox, likewise; `firefox_bridge` stands between it and Playwright."""
-    if importlib.util.find_spec("playwright") is None:
-        absent("playwright is absent: install the extra 'dev'")
-    driver = importlib.import_module("playwright.sync_api")
+@pytest.fixture(scope="package")
+def chromium(driver: Any) -> Iterator[Any]:
+    """A running Chromium; skips the tests if there is none."""
+    browser = driver.chromium.launch(
+        executable_path=find_chromium(), args=["--no-sandbox"], timeout=120_000
+    )
+    yield browser
+    browser.close()
+
+
+@pytest.fixture(scope="package")
+def firefox(driver: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A running Firefox; `firefox_bridge` stands between it and Playwright."""
     bridge = Path(__file__).with_name("firefox_bridge.py")
     start = tmp_path_factory.mktemp("firefox") / "start"
     command = shlex.join([sys.executable, str(bridge), find_firefox()])
     start.write_text(f'#!/bin/sh\nexec {command} "$@"\n')
     start.chmod(0o700)
-    with driver.sync_playwright() as playwright:
-        browser = playwright.firefox.launch(
-            channel="moz-firefox", executable_path=start, timeout=120_000
-        )
-        yield browser
-        browser.close()
+    browser = driver.firefox.launch(channel="moz-firefox", executable_path=start, timeout=120_000)
+    yield browser
+    browser.close()
 
 
 @contextlib.contextmanager
@@ -88,7 +87,7 @@ def served(folder: Path, **settings: Any) -> Iterator[tuple[Study, ServerProcess
     """Serve a tiny study by its own server process."""
     given: dict[str, Any] = {
         "test": 3,
-        "familiarization": 2,
+        "familiarization": 1,
         "timing": SHORT,
         "plausibility": FAST,
         "recruitment": Recruitment(link_code="TINY-CODE", link_address="https://lab.example/done"),
@@ -96,6 +95,11 @@ def served(folder: Path, **settings: Any) -> Iterator[tuple[Study, ServerProcess
     study = make_tiny_study(folder, **{**given, **settings})
     with ServerProcess(study.folder) as server:
         yield study, server
+
+
+def answers_to_test(study: Study, raw_id: str) -> list[Any]:
+    """Return the answers of a person to test trials, in order."""
+    return [row for row in rows_of(study, raw_id)[1] if row.phase == "test"]
 
 
 def signed_query(study: Study, raw_id: str) -> str:
@@ -213,6 +217,22 @@ class Visit:
     def begin_test(self, title: str = "You are ready") -> None:
         self.heading(title)
         self.main_button().click()
+
+    def to_the_test(self, query: str = "") -> None:
+        """Go to the first test trial of a study with one practice trial."""
+        self.begin(query)
+        self.practise(1)
+        self.begin_test()
+        self.page.locator(".answer").first.wait_for()
+
+    def take_part(self, query: str, *responses: str) -> str:
+        """Complete a session with these answers to the test; return the text of the last page."""
+        self.to_the_test(query)
+        for response in responses:
+            self.answer(response)
+        self.heading("About you")
+        self.finish()
+        return str(self.page.inner_text("main"))
 
     def finish(self) -> None:
         """Fill in demographics and feedback and wait for the completion code."""

@@ -1,7 +1,7 @@
 """Create a study folder from a generated dataset, official scenes, or official lists and movies.
 
 Movies are cut to their observed frames. Texts, settings and stimuli are files that can be edited.
-An interrupted command can be repeated and continues. The experimenter's password is shown once.
+The experimenter's password is shown once.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any, Literal
 
+from physion.core.version import __version__
 from physion.experiment.study.study import Study
 
 if TYPE_CHECKING:
@@ -191,7 +192,6 @@ _FILES = """\
 - `data_dictionary.json`: description of every column of every table.
 - `study.json`: settings and texts of each version of the study under which sessions ran.
 - `psych-ds/`: the same tables as a Psych-DS dataset.
-- `export.json`: counts, and what was left out.
 
 A row of `trials` is identified by `session`, `phase` and `trial`. To compare them with models:
 
@@ -224,6 +224,7 @@ def readme(
     parts = [
         f"# {study.title}",
         f"Study {study.name}, version {study.version}. Contact: {study.contact}",
+        f"Written by physion {__version__}.",
         _TASK + _structure(study),
         special,
         _PEOPLE,

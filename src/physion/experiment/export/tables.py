@@ -34,7 +34,8 @@ from physion.experiment.study.orders import (
     trial_order,
 )
 from physion.experiment.study.settings import ALL_SCENARIOS, Question, columns_of
-from physion.experiment.study.stimuli import ATTENTION, LOOKS, PHASES, STIMULUS_PHASES, Stimulus
+from physion.experiment.study.stimuli import ATTENTION, LOOKS, PHASES, Stimulus
+from physion.experiment.study.stimuli import COLUMNS as ALL_STIMULI_COLUMNS
 from physion.experiment.study.study import Study, under
 
 # --- columns as Arrow types and data frames ---
@@ -551,22 +552,10 @@ def _trial_table(
 
 _SESSION = Column("session", "text", "As in the sessions", required=True, may_be_empty=False)
 
-STIMULI_COLUMNS: tuple[Column, ...] = (
-    Column("stimulus", "text", "Name, as in the trials"),
-    Column("scenario", "text", "Scenario, as in the trials"),
-    Column(
-        "phase",
-        "choice",
-        "Phase in which it is shown; attention: a check among the test trials",
-        choices=STIMULUS_PHASES,
-    ),
-    Column("place", "integer", "Position in familiarization, from 0; no order in the test", low=0),
-    Column("label", "flag", "Whether the agent touches the patient"),
-    Column("frames", "integer", "Number of frames of the observed movie", low=1),
-    Column("rate", "number", "Frames per second", unit="Hz", low=0),
-    Column("width", "integer", "Width of the movie", unit="px", low=1),
-    Column("height", "integer", "Height of the movie", unit="px", low=1),
-    Column("look", "choice", "Colours of the stimulus", choices=LOOKS),
+STIMULI_COLUMNS = tuple(
+    column
+    for column in ALL_STIMULI_COLUMNS
+    if column.name not in ("movie", "map", "full", "full_frames")
 )
 """Columns of ``stimuli``: one row per stimulus."""
 

@@ -6,10 +6,8 @@ order of the familiarization trials is fixed here and the same for all participa
 
 from __future__ import annotations
 
-import json
-import re
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -17,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
+from physion.analysis.tables import Column, check_table, must, read_csv
 from physion.compute.tasks import Executor, Progress
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import read_plain
@@ -29,8 +28,9 @@ from physion.core.names import (
     scenario_of,
 )
 from physion.core.seeds import generator, stable_hash
+from physion.core.settings import parse_json
 from physion.experiment.study.make import StimulusSource
-from physion.experiment.study.stimuli import MAX_FRAMES, csv_rows, is_name
+from physion.experiment.study.stimuli import MAX_FRAMES, is_name
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
 from physion.rendering.renderer import Renderer
@@ -218,18 +218,19 @@ def _source(
 # Selection of a study's stimuli from stimulus lists in the official format, with their movies.
 #
 # A list is a JSON file as published by the official study (one object per column, keyed by row) or
-# a CSV file. Its columns are ``stim_ID``, ``target_hit_zone_label`` (whether the agent touches the
-# patient) and optionally ``map_url`` (name of the map, if it does not follow from the stimulus),
-# ``scenario`` (any name, the same in all rows) and ``observed_frames`` (number of frames before
-# the answer, 45 in the official study). Movies are called ``STIM_ID.mp4`` and contain all frames;
-# they are cut to the observed frames later.
+# a CSV file, with the columns below. Movies are called ``STIM_ID.mp4`` and contain all frames; they
+# are cut to the observed frames later.
 
 MAX_LIST_BYTES = 50_000_000
-ID, LABEL, MAP = "stim_ID", "target_hit_zone_label", "map_url"
-SCENARIO, FRAMES = "scenario", "observed_frames"
-OPTIONAL = (MAP, SCENARIO, FRAMES)
-_REDYELLOW = "-redyellow"
-_LABELS = {"true": True, "false": False, "1": True, "0": False}
+LIST_COLUMNS: tuple[Column, ...] = (
+    must("stim_ID", "text", "Name of the stimulus"),
+    must("target_hit_zone_label", "flag", "Whether the agent touches the patient"),
+    Column("map_url", "text", "Name of the map, if it does not follow from the stimulus"),
+    Column("scenario", "text", "Any name, the same in all rows"),
+    Column("observed_frames", "integer", "Number of frames before the answer",
+           low=1, high=MAX_FRAMES),
+)  # fmt: skip
+"""Columns of a list that are used; others are ignored."""
 
 
 @dataclass(frozen=True)
@@ -240,7 +241,7 @@ class ListedStimulus:
 
     stim_id: str
     contact: bool
-    map_name: str
+    map_name: str = ""
     scenario: str = ""
     frames: int = OBSERVED_FRAMES
 
@@ -252,7 +253,7 @@ class ListedStimulus:
     @property
     def look(self) -> str:
         """Colours of the movie (``free`` or ``redyellow``), derived from its name."""
-        return "redyellow" if _REDYELLOW in self.stim_id else "free"
+        return "redyellow" if "-redyellow" in self.stim_id else "free"
 
 
 def choose_listed(
@@ -299,77 +300,60 @@ def choose_listed(
                 rows = _select(path, rows, scenario, test, seed)
             files = _MediaFinder(movies, maps, scenario)
             sources += [
-                _official_lists_source(row, scenario, phase, i, files) for i, row in enumerate(rows)
-            ]
+                StimulusSource(
+                    stimulus=row.stimulus, scenario=scenario, phase=phase, place=place,
+                    label=row.contact, look=row.look, movie=files.movie(row), map=files.map(row),
+                    frames=row.frames,
+                )
+                for place, row in enumerate(rows)
+            ]  # fmt: skip
     return StimulusSelection(tuple(sources))
 
 
 def read_list(path: Path) -> list[ListedStimulus]:
     """Read and check the rows of a list; `BadInputError` names an invalid row and column.
 
-    Rows of JSON files count from 1, rows of CSV files as a spreadsheet shows them.
+    Rows count from 1, without the header of a CSV file.
     """
-    content = read_plain(path, MAX_LIST_BYTES)
-    rows: Iterable[tuple[int, dict[str, Any]]]
     if path.suffix.lower() == ".csv":
-        rows = csv_rows(path, content, (ID, LABEL))
+        table = read_csv(path)
     else:
-        rows = enumerate(_json_rows(path, content), start=1)
+        columns = parse_json(read_plain(path, MAX_LIST_BYTES).decode(errors="replace"), str(path))
+        if not isinstance(columns, dict) or not all(isinstance(c, dict) for c in columns.values()):
+            raise BadInputError(
+                f'{path} is not one object per column, {{"stim_ID": {{"0": ...}}, ...}}'
+            )
+        table = pd.DataFrame(columns)
+    table = check_table(table, LIST_COLUMNS, str(path))
     by_name: dict[str, ListedStimulus] = {}
-    for number, row in rows:
-        name = str(row[ID]).strip()
-        label = _LABELS.get(str(row[LABEL]).strip().lower())
-        if not is_name(name):
-            raise BadInputError(
-                f"{path}, row {number}: {ID} must be letters, digits and ._+- only, not "
-                f"{name[:100]!r}"
-            )
-        if label is None:
-            raise BadInputError(
-                f"{path}, row {number}: {LABEL} must be true or false, not {row[LABEL]!r}"
-            )
+    for number, row in enumerate(table.to_dict("records"), start=1):
+        for name in ("stim_ID", "scenario"):
+            given = row.get(name, "")
+            if not is_name(given) and (name == "stim_ID" or given):
+                raise BadInputError(
+                    f"{path}, row {number}: {name} must be letters, digits and ._+- only, not "
+                    f"{given[:100]!r}"
+                )
         # URLs are never opened; only their last part is used, as a name in a local folder.
-        map_name = str(row.get(MAP) or "").strip().rpartition("/")[2]
+        map_name = row.get("map_url", "").rpartition("/")[2]
+        frames = row.get("observed_frames", pd.NA)
         listed = ListedStimulus(
-            name,
-            label,
+            row["stim_ID"],
+            row["target_hit_zone_label"],
             map_name if is_name(map_name) else "",
-            _scenario(path, number, row),
-            _frames(path, number, row),
+            row.get("scenario", ""),
+            OBSERVED_FRAMES if pd.isna(frames) else int(frames),
         )
         if listed.stimulus in by_name:
-            raise BadInputError(f"{path}, row {number}: {name} is there already")
+            raise BadInputError(f"{path}, row {number}: {listed.stim_id} is there already")
         by_name[listed.stimulus] = listed
     if not by_name:
         raise BadInputError(f"{path} lists no stimulus")
     return list(by_name.values())
 
 
-def _scenario(path: Path, number: int, row: Mapping[str, Any]) -> str:
-    """Return the scenario of a row, or an empty text if the list does not name it."""
-    given = str(row.get(SCENARIO) or "").strip()
-    if given and not is_name(given):
-        raise BadInputError(
-            f"{path}, row {number}: {SCENARIO} must be letters, digits and ._+- only, not "
-            f"{given[:100]!r}"
-        )
-    return given
-
-
-def _frames(path: Path, number: int, row: Mapping[str, Any]) -> int:
-    """Return the number of observed frames of a row; as in the official study if not given."""
-    given = str(row.get(FRAMES) or "").strip()
-    if not given:
-        return OBSERVED_FRAMES
-    if not re.fullmatch(r"[0-9]{1,6}(\.0)?", given) or not 1 <= float(given) <= MAX_FRAMES:
-        raise BadInputError(
-            f"{path}, row {number}: {FRAMES} must be from 1 to {MAX_FRAMES}, not {given[:100]!r}"
-        )
-    return int(float(given))
-
-
 def list_scenario(path: Path, rows: Iterable[ListedStimulus]) -> str:
-    """Return the scenario of a list: as in its rows, else as in its stimulus names or file name."""
+    """Return the scenario that the rows of a list name, else their stimuli or the file's name."""
     rows = list(rows)
     named = {row.scenario for row in rows}
     if len(named) > 1:
@@ -386,31 +370,10 @@ def list_scenario(path: Path, rows: Iterable[ListedStimulus]) -> str:
     from_name &= set(SCENARIOS)
     if len(from_name) != 1:
         raise BadInputError(
-            f"{path}: which scenario is it? Give a column {SCENARIO}, or put one of "
+            f"{path}: which scenario is it? Give a column scenario, or put one of "
             f"{', '.join(SCENARIOS)} into the file's name"
         )
     return from_name.pop()
-
-
-def _json_rows(path: Path, content: bytes) -> list[dict[str, Any]]:
-    """Return the rows of a JSON list, with the columns that are used here."""
-    try:
-        columns = json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise BadInputError(f"{path} is not JSON: {error}") from error
-    if not isinstance(columns, dict) or not all(isinstance(c, dict) for c in columns.values()):
-        raise BadInputError(f'{path} is not one object per column, {{"{ID}": {{"0": ...}}, ...}}')
-    for name in (ID, LABEL):
-        if name not in columns:
-            raise BadInputError(
-                f"{path} lacks the column {name}; it has {', '.join(columns)[:200]}"
-            )
-    keys = list(columns[ID])
-    optional = [name for name in OPTIONAL if name in columns]
-    for name in (LABEL, *optional):
-        if list(columns[name]) != keys:
-            raise BadInputError(f"{path}: the columns {ID} and {name} have different rows")
-    return [{name: columns[name][key] for name in (ID, LABEL, *optional)} for key in keys]
 
 
 def _select(
@@ -427,14 +390,10 @@ def _select(
             f"not {count // 2} of each"
         )
     rng = generator("study list", seed, scenario)
-    kept = {row for group in by_label for row in _official_lists_sample(group, count // 2, rng)}
+    kept = {
+        group[index] for group in by_label for index in rng.permutation(len(group))[: count // 2]
+    }
     return [row for row in rows if row in kept]
-
-
-def _official_lists_sample(
-    rows: list[ListedStimulus], count: int, rng: np.random.Generator
-) -> list[ListedStimulus]:
-    return [rows[i] for i in rng.permutation(len(rows))[:count]]
 
 
 class _MediaFinder:
@@ -467,29 +426,12 @@ def _first_existing(folders: Sequence[Path], names: Sequence[str]) -> Path:
     return next((path for path in paths if path.is_file()), paths[0])
 
 
-def _official_lists_source(
-    row: ListedStimulus, scenario: str, phase: str, place: int, files: _MediaFinder
-) -> StimulusSource:
-    """Return the source files of one row of a list."""
-    return StimulusSource(
-        stimulus=row.stimulus,
-        scenario=scenario,
-        phase=phase,
-        place=place,
-        label=row.contact,
-        look=row.look,
-        movie=files.movie(row),
-        map=files.map(row),
-        frames=row.frames,
-    )
-
-
 # Selection of official scenes for a study with people, before their trials are rendered.
 #
-# Test trials are scenes that people of the original study saw. Familiarization trials are the ones
-# of the study where the data hold any, else scenes that nobody saw and whose physics no test trial
+# Test trials are scenes that people of the original study saw. Familiarization trials are those of
+# the study where the data hold any, else scenes that nobody saw and whose physics no test trial
 # has. Only scenes are taken whose simulation has the recorded outcome: the movie that participants
-# see ends as the original one did, and their answers can be compared with the study's.
+# see ends as the original one did, and their answers can be compared with those of the study.
 # Agent and patient must be visible in the first frame, where the map marks them.
 
 Group = tuple[str, str, bool]

@@ -6,76 +6,17 @@ this file.
 
 from __future__ import annotations
 
-import csv
-import io
-import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import pandas as pd
+
+from physion.analysis.tables import Column, check_table, must, read_csv
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.core.files import read_plain, write_atomic
+from physion.core.files import write_atomic
 from physion.core.names import canonical_name
-
-# Checked reading of CSV files that users edit, with the row numbers that spreadsheets show.
-
-
-def csv_rows(
-    path: Path, content: bytes, columns: tuple[str, ...]
-) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield the row number and the cells of each non-empty row of a CSV file.
-
-    Parameters
-    ----------
-    path
-        Where ``content`` was read from; used in error messages only.
-    content
-        The bytes of the file, UTF-8 with or without a byte order mark.
-    columns
-        Columns that the header must have. Further columns are allowed.
-
-    Yields
-    ------
-    tuple of int and dict
-        Row number as a spreadsheet shows it (the header is row 1), and the stripped cells by
-        column name.
-
-    Raises
-    ------
-    BadInputError
-        The file is not UTF-8 or not CSV, the header lacks a column or has one twice, or a row has
-        another number of cells than the header.
-    """
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise BadInputError(f"{path} is not UTF-8 text; save it as CSV UTF-8") from error
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    try:
-        header = [name.strip() for name in next(reader, [])]
-        _check_header(path, header, columns)
-        for row, cells in enumerate(reader, start=2):
-            if not any(cells):
-                continue
-            if len(cells) != len(header):
-                raise BadInputError(
-                    f"{path}, row {row}: {len(cells)} cells, not {len(header)} as in the header"
-                )
-            yield row, dict(zip(header, map(str.strip, cells), strict=True))
-    except csv.Error as error:
-        raise BadInputError(f"{path}, line {reader.line_num}: not CSV: {error}") from error
-
-
-def _check_header(path: Path, header: list[str], columns: tuple[str, ...]) -> None:
-    """Check that the header has all ``columns`` and no duplicates."""
-    duplicates = [name for name in header if header.count(name) > 1]
-    if duplicates:
-        raise BadInputError(f"{path} has more than one column {duplicates[0]!r}")
-    for name in columns:
-        if name not in header:
-            raise BadInputError(f"{path} lacks the column {name!r}; it needs {', '.join(columns)}")
-
 
 STIMULI_FILE = "stimuli.csv"
 MEDIA_FOLDER = "media"
@@ -87,7 +28,6 @@ LOOKS = ("free", "redyellow")
 NAME = r"[A-Za-z0-9][A-Za-z0-9._+-]{0,199}"
 """Pattern of stimulus and scenario names: letters, digits and ._+- only, so that they have no
 special meaning in file systems, URLs or spreadsheets."""
-MAX_BYTES = 50_000_000
 MAX_FRAMES = 100_000
 MAX_SIDE = 10_000
 
@@ -139,7 +79,24 @@ class Stimulus:
     look: str
 
 
-COLUMNS = tuple(field.name for field in fields(Stimulus))
+COLUMNS: tuple[Column, ...] = (
+    must("stimulus", "text", "Name, as in the trials"),
+    must("scenario", "text", "Scenario, as in the trials"),
+    must("phase", "choice", "Phase in which it is shown; attention: a check among the test trials",
+         choices=STIMULUS_PHASES),
+    must("place", "integer", "Position in familiarization, from 0; no order in the test", low=0),
+    must("label", "flag", "Whether the agent touches the patient"),
+    must("movie", "text", "Movie of the observed frames only"),
+    must("map", "text", "Image that marks agent and patient"),
+    Column("full", "text", "Full movie, in familiarization", required=True),
+    must("frames", "integer", "Number of frames of the observed movie", low=1, high=MAX_FRAMES),
+    must("full_frames", "integer", "Number of frames of the full movie", low=0, high=MAX_FRAMES),
+    must("rate", "number", "Frames per second", unit="Hz", low=1, high=240),
+    must("width", "integer", "Width of the movie", unit="px", low=16, high=MAX_SIDE),
+    must("height", "integer", "Height of the movie", unit="px", low=16, high=MAX_SIDE),
+    must("look", "choice", "Colours of the stimulus", choices=LOOKS),
+)  # fmt: skip
+"""Columns of ``stimuli.csv``."""
 
 
 def is_name(name: str) -> bool:
@@ -150,74 +107,23 @@ def is_name(name: str) -> bool:
 def read_stimuli(path: Path) -> tuple[Stimulus, ...]:
     """Read and check a stimuli file; `BadInputError` names the row and column of an error.
 
-    Rows are counted as a spreadsheet shows them: the header is row 1.
+    Rows count from 1, without the header.
     """
-    return parse_stimuli(path, read_plain(path, MAX_BYTES))
-
-
-def parse_stimuli(path: Path, content: bytes) -> tuple[Stimulus, ...]:
-    """Parse and check the content of a stimuli file that was read from ``path``."""
-    rows = []
-    for row, cells in csv_rows(path, content, COLUMNS):
-        if unknown := set(cells) - set(COLUMNS):
-            raise BadInputError(f"{path}: {UnknownNameError('column', min(unknown), COLUMNS)}")
-        rows.append((row, _parse(path, row, cells)))
-    check_stimuli(rows, path)
-    return tuple(stimulus for _, stimulus in rows)
+    table = read_csv(path)
+    if unknown := set(table.columns) - {column.name for column in COLUMNS}:
+        known = [column.name for column in COLUMNS]
+        raise BadInputError(f"{path}: {UnknownNameError('column', min(unknown), known)}")
+    # Spreadsheets may end a file with rows of empty cells.
+    table = check_table(table[(table != "").any(axis=1)], COLUMNS, str(path))
+    stimuli = tuple(Stimulus(**row) for row in table.to_dict("records"))  # type: ignore[misc]
+    _check_stimuli(stimuli, path)
+    return stimuli
 
 
 def write_stimuli(path: Path, stimuli: Iterable[Stimulus]) -> None:
-    """Check the stimuli as `read_stimuli` does, then write ``stimuli.csv`` atomically."""
-    chosen = list(stimuli)
-    check_stimuli(list(enumerate(chosen, start=2)), path)
-    lines = io.StringIO(newline="")
-    writer = csv.writer(lines, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for stimulus in chosen:
-        writer.writerow([getattr(stimulus, name) for name in COLUMNS])
-    write_atomic(path, lines.getvalue().encode())
-
-
-def _flag(cell: str) -> bool:
-    # Spreadsheets write TRUE, Python writes True.
-    known = {"true": True, "false": False}
-    if cell.lower() not in known:
-        raise ValueError("True or False")
-    return known[cell.lower()]
-
-
-def _whole(cell: str) -> int:
-    if not re.fullmatch(r"[0-9]{1,9}", cell):
-        raise ValueError("an integer of at least 0")
-    return int(cell)
-
-
-def _number(cell: str) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        raise ValueError("a number") from None
-
-
-_READ: Mapping[str, Callable[[str], str | int | float | bool]] = {
-    **dict.fromkeys(COLUMNS, str),
-    **dict.fromkeys(("place", "frames", "full_frames", "width", "height"), _whole),
-    "label": _flag,
-    "rate": _number,
-}
-
-
-def _parse(path: Path, row: int, cells: dict[str, str]) -> Stimulus:
-    """Convert the cells of one row; `BadInputError` names row and column of an invalid cell."""
-    values: dict[str, str | int | float | bool] = {}
-    for name, cell in cells.items():
-        try:
-            values[name] = _READ[name](cell)
-        except ValueError as error:
-            raise BadInputError(
-                f"{path}, row {row}: {name} must be {error}, not {cell[:60]!r}"
-            ) from error
-    return Stimulus(**values)  # type: ignore[arg-type]
+    """Write ``stimuli.csv`` atomically; `read_stimuli` checks it."""
+    table = pd.DataFrame(map(asdict, stimuli))
+    write_atomic(path, table.to_csv(index=False, lineterminator="\n").encode())
 
 
 # --- checks --------------------------------------------------------------------------------------
@@ -226,20 +132,15 @@ _MOVIE = re.compile(rf"{MEDIA_FOLDER}/[A-Za-z0-9][A-Za-z0-9_-]{{0,99}}\.mp4")
 _MAP = re.compile(rf"{MEDIA_FOLDER}/[A-Za-z0-9][A-Za-z0-9_-]{{0,99}}\.png")
 
 
-def check_stimuli(rows: list[tuple[int, Stimulus]], path: Path) -> None:
-    """Check each stimulus, then that names, places and movies are consistent among all rows.
-
-    ``rows`` are pairs of row number and stimulus. `BadInputError` names the first invalid row.
-    """
-    if not rows:
-        raise BadInputError(f"{path} has no stimulus")
-    for row, stimulus in rows:
-        for column, allowed in _faults(stimulus):
-            value = getattr(stimulus, column)
-            raise BadInputError(f"{path}, row {row}: {column} must be {allowed}, not {value!r}")
+def _check_stimuli(stimuli: tuple[Stimulus, ...], path: Path) -> None:
+    """Check each stimulus, then that names, places and movies are consistent among all rows."""
     names: dict[tuple[str, str], int] = {}
     places: dict[tuple[str, str, int], int] = {}
-    for row, s in rows:
+    whole = {s.full: row for row, s in enumerate(stimuli, start=1) if s.full}
+    for row, s in enumerate(stimuli, start=1):
+        for column, allowed in _faults(s):
+            value = getattr(s, column)
+            raise BadInputError(f"{path}, row {row}: {column} must be {allowed}, not {value!r}")
         first = names.setdefault((s.scenario, s.stimulus), row)
         if first != row:
             # In both phases, the outcome would be known when the test trial is answered.
@@ -253,8 +154,12 @@ def check_stimuli(rows: list[tuple[int, Stimulus]], path: Path) -> None:
                 f"{path}, row {row}: place {s.place} of {s.phase} of {s.scenario} is taken by "
                 f"row {first}"
             )
-    check_distinct_names(((s.scenario, s.stimulus) for _, s in rows), path)
-    _check_futures(rows, path)
+        if s.movie in whole:
+            raise BadInputError(
+                f"{path}, row {row}: movie is the full movie of row {whole[s.movie]}; it must "
+                "contain the observed frames only"
+            )
+    check_distinct_names(((s.scenario, s.stimulus) for s in stimuli), path)
 
 
 def check_distinct_names(names: Iterable[tuple[str, str]], where: Path) -> None:
@@ -278,10 +183,6 @@ def _faults(s: Stimulus) -> Iterable[tuple[str, str]]:
         yield "stimulus", letters
     if not is_name(s.scenario):
         yield "scenario", letters
-    if s.phase not in STIMULUS_PHASES:
-        yield "phase", " or ".join(STIMULUS_PHASES)
-    if s.look not in LOOKS:
-        yield "look", " or ".join(LOOKS)
     if not _MOVIE.fullmatch(s.movie):
         yield "movie", f"the path of a movie, {MEDIA_FOLDER}/NAME.mp4"
     if not _MAP.fullmatch(s.map):
@@ -290,25 +191,7 @@ def _faults(s: Stimulus) -> Iterable[tuple[str, str]]:
         yield "full", f"the path of the full movie, {MEDIA_FOLDER}/NAME.mp4, in familiarization"
     if not practice and s.full:
         yield "full", "empty in the test: participants never see the outcome of a test trial"
-    if not 1 <= s.frames <= MAX_FRAMES:
-        yield "frames", f"from 1 to {MAX_FRAMES}"
-    if practice and not s.frames < s.full_frames <= MAX_FRAMES:
-        yield "full_frames", f"more than the {s.frames} observed frames, at most {MAX_FRAMES}"
+    if practice and s.full_frames <= s.frames:
+        yield "full_frames", f"more than the {s.frames} observed frames"
     if not practice and s.full_frames:
         yield "full_frames", "0 in the test"
-    if not (math.isfinite(s.rate) and 1 <= s.rate <= 240):
-        yield "rate", "from 1 to 240 frames per second"
-    for side in ("width", "height"):
-        if not 16 <= getattr(s, side) <= MAX_SIDE:
-            yield side, f"from 16 to {MAX_SIDE} pixels"
-
-
-def _check_futures(rows: list[tuple[int, Stimulus]], path: Path) -> None:
-    """Check that no movie shown before an answer is also the full movie of some stimulus."""
-    whole = {s.full: row for row, s in rows if s.full}
-    for row, s in rows:
-        if s.movie in whole:
-            raise BadInputError(
-                f"{path}, row {row}: movie is the full movie of row {whole[s.movie]}; it must "
-                "contain the observed frames only"
-            )

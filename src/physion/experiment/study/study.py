@@ -32,8 +32,7 @@ from physion.experiment.study.settings import (
     format_settings,
     parse_settings,
 )
-from physion.experiment.study.stimuli import MAX_BYTES as MAX_STIMULI_BYTES
-from physion.experiment.study.stimuli import PHASES, STIMULI_FILE, Stimulus, parse_stimuli
+from physion.experiment.study.stimuli import PHASES, STIMULI_FILE, Stimulus, read_stimuli
 from physion.experiment.study.texts import TEXTS_FOLDER, parse_bytes, read_consent_file, read_texts
 
 STUDY_FILE = "study.toml"
@@ -123,8 +122,9 @@ def load_study(folder: Path | str) -> Study:
             written.append(consent)
     allow_list = study.recruitment.allow_list
     listed = folder / STIMULI_FILE
-    rows = read_plain(listed, MAX_STIMULI_BYTES)
-    stimuli = tuple(s for s in parse_stimuli(listed, rows) if s.scenario in study.scenarios)
+    check_plain(listed)
+    rows = listed.read_bytes()
+    stimuli = tuple(s for s in read_stimuli(listed) if s.scenario in study.scenarios)
     _check_stimuli(study, stimuli, listed)
     _check_blocks(study, stimuli, listed)
     return replace(

@@ -217,16 +217,17 @@ def test_fewer_may_be_taken_and_are_balanced(tmp_path: Path) -> None:
 REFUSED: dict[str, tuple[Any, str]] = {
     "no JSON": ("{", "is not JSON"),
     "another form": ([{"stim_ID": "a"}], "one object per column"),
-    "no names": ({"target_hit_zone_label": {"0": True}}, "lacks the column stim_ID"),
-    "no labels": ({"stim_ID": {"0": "a"}}, "lacks the column target_hit_zone_label"),
+    "no names": ({"target_hit_zone_label": {"0": True}}, r"lacks the column\(s\) stim_ID"),
+    "no labels": ({"stim_ID": {"0": "a"}}, r"lacks the column\(s\) target_hit_zone_label"),
     "columns of other rows": (
-        {"stim_ID": {"0": "a", "1": "b"}, "target_hit_zone_label": {"0": True}}, "different rows"),
+        {"stim_ID": {"0": "a", "1": "b"}, "target_hit_zone_label": {"0": True}},
+        "row 2 .*expected a value"),
     "a path for a name": (
         {"stim_ID": {"0": "../a"}, "target_hit_zone_label": {"0": True}}, "row 1: stim_ID must be"),
     "a list for a name": (
         {"stim_ID": {"0": ["a"]}, "target_hit_zone_label": {"0": True}}, "row 1: stim_ID must be"),
     "no outcome": (
-        {"stim_ID": {"0": "a"}, "target_hit_zone_label": {"0": None}}, "must be true or false"),
+        {"stim_ID": {"0": "a"}, "target_hit_zone_label": {"0": None}}, "expected a value"),
     "a stimulus twice": (
         {"stim_ID": {"0": "a", "1": "a_img"}, "target_hit_zone_label": {"0": 1, "1": 0}},
         "row 2: a_img is there already"),
@@ -310,11 +311,17 @@ def test_own_movies_have_any_scenario_and_length(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("columns", "told"),
     [
-        ({"scenario": ["a b"] * 2}, r"row 2: scenario must be letters"),
+        ({"scenario": ["a b"] * 2}, r"row 1: scenario must be letters"),
         ({"scenario": ["pool", "snooker"]}, r"of one scenario, not of pool and snooker"),
         ({"scenario": ["pool", ""]}, r"of one scenario"),
-        ({"scenario": ["pool"] * 2, "observed_frames": [0, 9]}, r"row 2: observed_frames must be"),
-        ({"scenario": ["pool"] * 2, "observed_frames": [9, 2.5]}, r"row 3: observed_frames must"),
+        (
+            {"scenario": ["pool"] * 2, "observed_frames": [0, 9]},
+            r"row 1 of column .obs.* holds .0.",
+        ),
+        (
+            {"scenario": ["pool"] * 2, "observed_frames": [9, 2.5]},
+            r"row 2 of column .obs.* holds .2\.5.",
+        ),
     ],
 )
 def test_bad_columns_of_own_movies_are_named(
