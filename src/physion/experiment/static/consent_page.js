@@ -3,9 +3,9 @@
  * @module consent_page
  */
 
-import { ask } from "./dialog.js";
 import { button, el, paragraphs } from "./dom.js";
 import { declineQuestion } from "./ending_pages.js";
+import { ask } from "./page_trial.js";
 import { minutes } from "./pages.js";
 import { bound } from "./texts.js";
 

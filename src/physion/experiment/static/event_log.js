@@ -4,7 +4,7 @@
  * @module event_log
  */
 
-import { newKey } from "./random_key.js";
+import { newKey } from "./storage.js";
 
 const DAY_MS = 86_400_000;
 const BATCH = 50;

@@ -5,18 +5,16 @@
 
 import { AnswerQueue } from "./answer_queue.js";
 import { Api, Refused } from "./api.js";
-import { readArrival } from "./arrival.js";
-import { completionParts } from "./completion.js";
-import { anotherPerson, cameWithoutId, enter } from "./entering.js";
+import { completionParts } from "./ending_pages.js";
+import { anotherPerson, cameWithoutId, enter, readArrival } from "./entering.js";
 import { EventLog } from "./event_log.js";
 import { Frame } from "./frame.js";
 import { deviceProblem } from "./gate.js";
 import { patiently, showPage } from "./page_trial.js";
 import { messagePage, openingPage } from "./pages.js";
 import { Session } from "./session.js";
-import { keep, recall } from "./storage.js";
-import { takeOver } from "./tabs.js";
-import { Texts, bound, chooseLanguage, offeredLanguage } from "./texts.js";
+import { keep, recall, takeOver } from "./storage.js";
+import { bound, chooseLanguage, offeredLanguage, Texts } from "./texts.js";
 
 /** @typedef {import("./session.js").Basis} Basis */
 
@@ -46,7 +44,7 @@ async function begin() {
 /**
  * Enter and run the session; show refusals.
  * @param {Basis} basis
- * @param {import("./arrival.js").Arrival} arrival
+ * @param {import("./entering.js").Arrival} arrival
  */
 async function takePart(basis, arrival) {
   const { api, frame, log } = basis;

@@ -4,9 +4,9 @@
  */
 
 import { currentBlock, hasBlocks, size } from "./blocks.js";
-import { wrongAttempt } from "./comprehension_page.js";
 import { button, el, paragraphs, sleep } from "./dom.js";
 import { showExample } from "./example.js";
+import { wrongAttempt } from "./forms.js";
 import { focusHeading } from "./page_trial.js";
 import { bound } from "./texts.js";
 

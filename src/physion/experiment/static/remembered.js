@@ -5,8 +5,7 @@
  */
 
 import { currentBlock } from "./blocks.js";
-import { newKey } from "./random_key.js";
-import { keep, outlivesPage, recall } from "./storage.js";
+import { keep, newKey, outlivesPage, recall } from "./storage.js";
 
 /**
  * A remembered session. `who`: see `whoOf`; `link`: query of the other URL parameters, for the next

@@ -5,24 +5,20 @@
  * @module session
  */
 
+import { announce, newShowing } from "./answer_queue.js";
 import { Refused } from "./api.js";
 import { blockPage, currentBlock } from "./blocks.js";
-import { comprehensionPage } from "./comprehension_page.js";
 import { consentPage } from "./consent_page.js";
-import { ask } from "./dialog.js";
+import { endedPage, resultPage, stopQuestion } from "./ending_pages.js";
 import { hideAddress } from "./entering.js";
-import { endedPage, stopQuestion } from "./ending_pages.js";
-import { demographicsPage, feedbackPage } from "./forms.js";
+import { comprehensionPage, demographicsPage, feedbackPage, questionPage } from "./forms.js";
 import { leaveFullscreen } from "./fullscreen.js";
 import { Media } from "./media.js";
-import { PageTrial, patiently, showPage } from "./page_trial.js";
+import { ask, PageTrial, patiently, showPage } from "./page_trial.js";
 import * as pages from "./pages.js";
 import { PredictionTrial } from "./prediction_trial.js";
-import { newKey } from "./random_key.js";
 import { dueFeedback, forgetFeedback, forgetSession, rememberFeedback } from "./remembered.js";
-import { questionPage } from "./question_page.js";
-import { resultPage } from "./result_page.js";
-import { announce, newShowing } from "./showings.js";
+import { newKey } from "./storage.js";
 import { feedbackPieces, repeatBefore, trialPieces } from "./trial_pieces.js";
 
 const PAGES = {
@@ -71,7 +67,7 @@ export class Session {
   /**
    * The running trial with its last showing, and how often the question was opened during it.
    * @type {{phase: string|null, trial: number|null, asked: number,
-   *   showing: import("./showings.js").Announced|null}}
+   *   showing: import("./answer_queue.js").Announced|null}}
    */
   #running = { phase: null, trial: null, asked: 0, showing: null };
   /** How often the scene of a trial was shown, by phase and trial. @type {Map<string, number>} */

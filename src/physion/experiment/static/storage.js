@@ -41,3 +41,23 @@ export function keep(name, value) {
     // Storage is full or forbidden: the value stays in memory while the page is open.
   }
 }
+
+/** Draw a 128-bit key. (`crypto.randomUUID` is not available without HTTPS.) @returns {string} */
+export function newKey() {
+  const bytes = crypto.getRandomValues(new Uint8Array(16));
+  return Array.from(bytes, (byte) => byte.toString(16).padStart(2, "0")).join("");
+}
+
+/**
+ * Take over the study from other tabs of this browser.
+ * @param {() => void} onLost Called once when another tab takes it over.
+ */
+export function takeOver(onLost) {
+  if (!("BroadcastChannel" in window)) return;
+  const channel = new BroadcastChannel("physion");
+  channel.postMessage("mine");
+  channel.onmessage = () => {
+    channel.close();
+    onLost();
+  };
+}
