@@ -1,4 +1,4 @@
-"""The tables of trials and sessions, from SQLite and PostgreSQL alike."""
+"""The tables of trials and sessions, as stored in the database."""
 
 from __future__ import annotations
 
@@ -81,7 +81,76 @@ def test_every_answer_is_there_once_with_all_that_was_stored(
     assert not stored
 
 
-def test_order_matches_time(engine: sa.Engine, study: Study) -> None:
+def test_each_column_is_of_its_own_answer(engine: sa.Engine, study: Study) -> None:
+    """All measurements of all answers differ; each is found in its row and column."""
+    keys = ("session", "phase", "trial")
+    names = ("rt_ms", "fixation_ms", "cue_ms", "movie_ms", "break_ms", "frames_expected",
+             "frames_shown", "frames_dropped", "visibility_changes", "window_width",
+             "window_height", "showings")  # fmt: skip
+    words = {
+        "input": ("mouse", "touch", "keyboard"),
+        "void": (None, "hidden", "dialog", "window"),
+        "resumed": (False, True, True),
+    }
+    with engine.begin() as connection:
+        columns = [ANSWERS.c[key] for key in keys]
+        stored = {}
+        for number, key in enumerate(connection.execute(sa.select(*columns)).all()):
+            values = {name: 1000 * place + number for place, name in enumerate(names, 1)}
+            values |= {name: known[number % len(known)] for name, known in words.items()}
+            stored[tuple(key)] = values | {"details": f'{{"number": {number}}}'}
+            of_key = [column == value for column, value in zip(columns, key, strict=True)]
+            connection.execute(sa.update(ANSWERS).where(*of_key).values(stored[tuple(key)]))
+    trials, _ = read_tables(engine, study)
+    for row in trials.itertuples():
+        values = stored[row.session, row.phase, row.trial]
+        for name in (*names, "input", "resumed"):
+            assert getattr(row, name) == values[name], name
+        assert row.void == (values["void"] or "")
+    with snapshot(engine) as connection:
+        sessions = read_sessions(connection, study)
+        (part,) = read_trials(connection, study, sessions.table, details=True)
+    assert part.details is not None and len(part.details) == len(trials)
+    for row, details in zip(trials.itertuples(), part.details.to_pylist(), strict=True):
+        assert details == stored[row.session, row.phase, row.trial]["details"]
+
+
+def test_each_column_of_a_session_is_its_own(engine: sa.Engine, study: Study) -> None:
+    """All numbers and times of all sessions differ; each is found in its row and column."""
+    direct = [column for column in SESSION_COLUMNS if column.name in SESSIONS.c]
+    special = {"scenario", "session", "participant"}
+    numeric = [c for c in direct if c.kind in ("integer", "number", "time")]
+    assert len(numeric) >= 15
+    device = {"user_agent": "a", "refresh_hz": 1, "screen_width": 2, "screen_height": 3,
+              "pixel_ratio": 4, "touch": True}  # fmt: skip
+    with engine.begin() as connection:
+        stored = {}
+        for number, name in enumerate(connection.execute(sa.select(SESSIONS.c.session)).scalars()):
+            values = {c.name: 1000 * place + number for place, c in enumerate(numeric, 1)}
+            values |= {"withdrawn_at": None, "voided_at": None, "screened_out_by": f"by {number}",
+                       "failed_checks": f"failed {number}", "source": f"source {number}",
+                       "device": {k: v if k == "touch" else f"{v}{number}" if v == "a"
+                                  else 10 * v + number for k, v in device.items()}}  # fmt: skip
+            stored[name] = values
+            connection.execute(sa.update(SESSIONS).where(SESSIONS.c.session == name).values(values))
+    _, sessions = read_tables(engine, study)
+    assert len(sessions) == 48
+    for row in sessions.itertuples():
+        values = stored[row.session]
+        for column in numeric:
+            found = getattr(row, column.name)
+            if column.kind == "time":
+                found = pd.Timestamp(found).timestamp()
+            assert found == values[column.name], column.name
+        assert row.screened_out == values["screened_out_by"]
+        assert row.failed_checks == values["failed_checks"]
+        assert row.recruited_by == values["source"]
+        for name in device:
+            assert getattr(row, name) == values["device"][name], name
+    assert special <= set(sessions.columns)
+
+
+def test_order_is_that_of_time(engine: sa.Engine, study: Study) -> None:
     trials, sessions = read_tables(engine, study)
     assert list(sessions["started_at"]) == sorted(sessions["started_at"])
     assert list(trials["session"].unique()) == [

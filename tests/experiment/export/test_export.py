@@ -24,6 +24,7 @@ from physion.experiment.export.export_study import GONE, TABLES, export_study
 from physion.experiment.export.tables import read_tables
 from physion.experiment.store.database import (
     ANSWERS,
+    EVENTS,
     RAW_IDS,
     SESSIONS,
     STUDIES,
@@ -164,6 +165,22 @@ def test_details_and_events_are_there(small: sa.Engine, study: Study, tmp_path: 
         assert [entry["name"] for entry in words[name]] == header
     assert [entry["name"] for entry in words["trial_details"]] == list(details.columns)
     assert "apostrophe" in words["spreadsheet_safety"]
+
+
+def test_events_are_numbered_and_timed_by_session(
+    small: sa.Engine, study: Study, tmp_path: Path
+) -> None:
+    with small.begin() as connection:
+        first = connection.execute(sa.select(EVENTS).order_by(EVENTS.c.event)).first()
+        assert first is not None
+        more = {"kind": "visible", "at_ms": 2345.5, "stored_at": first.stored_at + 1.25}
+        connection.execute(sa.insert(EVENTS).values(session=first.session, data={}, **more))
+    out = export_study(small, study, tmp_path / "out").out
+    events = pd.read_csv(out / "events.csv").set_index("session").loc[first.session]
+    assert events[["number", "kind", "at_ms"]].values.tolist() == [
+        [0, "hidden", 1234.5], [1, "visible", 2345.5]]  # fmt: skip
+    times = [pd.Timestamp(text).timestamp() for text in events["stored_at"]]
+    assert times == pytest.approx([first.stored_at, first.stored_at + 1.25], abs=0.001)
 
 
 def test_the_same_data_give_the_same_bytes(fill: Fill, study: Study, tmp_path: Path) -> None:

@@ -14,8 +14,16 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.cli.main import main
 from physion.core.errors import UnknownNameError
+from physion.experiment.protocol import TrialMedia
 from physion.experiment.server_process import ServerProcess
-from physion.experiment.simulated import SimulatedPerson, SimulatedVisit, SimulationPlan, simulate
+from physion.experiment.simulated import (
+    SimulatedPerson,
+    SimulatedVisit,
+    SimulationPlan,
+    build_answer,
+    minutes_each,
+    simulate,
+)
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.settings import Plausibility
 from physion.experiment.study.stimuli import Stimulus
@@ -63,12 +71,56 @@ def test_people_are_right_as_often_as_they_should_be_and_slower_where_it_is_hard
     assert rt.min() > 0
 
 
+def test_answers_follow_the_rasch_model_and_log_normal_times() -> None:
+    people = [SimulatedPerson(0, number) for number in range(400)]
+    stimuli = [_stimulus(number, number % 2 == 0) for number in range(100)]
+    chance = np.array([[p.probability_correct(s) for s in stimuli] for p in people])
+    log_odds = np.log(chance / (1 - chance))
+    # The sum of a person and a stimulus: differences of people are the same for all stimuli.
+    ability = log_odds[:, :1] - log_odds[:1, :1]
+    np.testing.assert_allclose(log_odds - ability, np.broadcast_to(log_odds[:1], chance.shape))
+    assert np.std(log_odds[:, 0]) == pytest.approx(0.35, rel=0.12)  # standard error 3.5 %
+    assert np.std(log_odds[0]) == pytest.approx(1.3, rel=0.25)  # standard error 7 %
+    assert log_odds.mean() == pytest.approx(1.2, abs=0.4)  # standard error 0.13
+    # A bias towards yes does not change how often both outcomes together are right.
+    rt = np.array([[p.predict(s).rt_ms for s in stimuli] for p in people])
+    rest = np.log(rt) - 0.4 * (1 - chance)
+    assert rest.mean() == pytest.approx(6.6, abs=0.04)  # 735 ms; standard error 0.01
+    assert np.std(rest.mean(axis=1)) == pytest.approx(0.2, rel=0.15)
+    assert np.std(rest - rest.mean(axis=1, keepdims=True)) == pytest.approx(0.35, rel=0.03)
+
+
+def test_an_answer_is_what_the_pages_would_send() -> None:
+    media = TrialMedia(
+        trial=3, movie="", map="", frames=45, rate=30.0, width=8, height=8, fixation_ms=700
+    )
+    stimulus = _stimulus(0, True)
+    for number, by in ((1, "keyboard"), (2, "mouse")):
+        person = SimulatedPerson(0, number)
+        found = build_answer(2000, media, "test", person, stimulus)
+        drawn = person.predict(stimulus)
+        assert (found.response, found.rt_ms, found.input) == (drawn.response, drawn.rt_ms, by)
+        assert (found.trial, found.fixation_ms, found.cue_ms) == (3, 700, 2000)
+        assert (found.frames_shown, found.frames_dropped) == (45, 0)
+        times = found.details["frames_ms"]
+        assert times == pytest.approx([frame * 1000 / 30 for frame in range(45)], abs=0.051)
+        assert found.movie_ms == times[-1]
+    # Attention checks are answered as they ask, whatever the person would predict.
+    people = [SimulatedPerson(0, number) for number in range(20)]
+    for label in (True, False):
+        check = replace(_stimulus(0, label), phase="attention")
+        answers = {build_answer(0, media, "test", person, check).response for person in people}
+        assert answers == {"yes" if label else "no"}
+
+
 def test_a_fraction_of_the_people_leaves() -> None:
     leaving = [SimulatedPerson(0, n).dropout_trial(150, 0.1) for n in range(1000)]
     trials = [trial for trial in leaving if trial is not None]
     assert 70 < len(trials) < 130
     assert min(trials) >= 0 and max(trials) < 150 and len(set(trials)) > 30
     assert all(SimulatedPerson(0, n).dropout_trial(150, 0.0) is None for n in range(100))
+    # Before any of the trials, the first and the last too.
+    assert {SimulatedPerson(0, n).dropout_trial(3, 1.0) for n in range(50)} == {0, 1, 2}
 
 
 @pytest.fixture(scope="module")
@@ -172,8 +224,6 @@ def test_the_verb_serves_by_itself_and_prints(
 def test_without_leave_of_the_study_they_take_their_time(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from physion.experiment.simulated import minutes_each
-
     real = make_tiny_study(tmp_path / "real", plausibility=Plausibility())
     # 16 trials of 1 s cross, 2 s cue, 1.5 s movie and some 0.8 s to answer, 10 s of reading,
     # and ten full movies of 2 s.

@@ -65,6 +65,45 @@ def practise(store: Store, token: str, name: str, *responses: str) -> SessionSta
     return state
 
 
+@pytest.mark.parametrize(
+    ("responses", "right"),
+    [(("yes", "no", "yes"), 3), (("yes", "yes", "yes"), 2), (("yes", "yes", "no"), 1),
+     (("no", "yes", "no"), 0)],
+)  # fmt: skip
+@pytest.mark.parametrize("needed", [0, 1, 2, 3, 4])
+def test_as_many_right_answers_as_needed_pass(
+    practising: Study, tmp_path: Path, responses: tuple[str, ...], right: int, needed: int
+) -> None:
+    """The labels are contact, none, contact; more than there are trials means all of them."""
+    study = replace(practising, practice=Practice(needed, 1, "end"))
+    store = open_store(study, Secrets.load(study.folder), tmp_path / "a")
+    token = walk(store, enter(store, "Ada", scenario="drop"), PHASE)
+    state = practise(store, token, "first", *responses)
+    passed = right >= min(needed, 3)
+    assert (state.stage, state.practice_repeats) == (("ready", 0) if passed else (PHASE, 1))
+    assert len(rows(store, PRACTICE_REPEATS)) == (0 if passed else 3)
+    store.close()
+
+
+@pytest.mark.parametrize("repeats", [0, 1, 3])
+def test_a_practice_is_repeated_as_often_as_the_study_says(
+    practising: Study, tmp_path: Path, repeats: int
+) -> None:
+    study = replace(practising, practice=Practice(3, repeats, "end"))
+    store = open_store(study, Secrets.load(study.folder), tmp_path / "a")
+    token = walk(store, enter(store, "Ada", scenario="drop"), PHASE)
+    for number in range(repeats):
+        state = practise(store, token, f"repeat{number}", "no", "no", "no")
+        assert (state.stage, state.practice_repeats, state.ended) == (PHASE, number + 1, False)
+    state = practise(store, token, "the-last", "no", "no", "no")
+    assert (state.stage, state.ended) == ("screened_out", True)
+    kept = rows(store, PRACTICE_REPEATS)
+    assert [(row.repeat, row.trial) for row in kept] == [
+        (repeat, trial) for repeat in range(repeats) for trial in range(3)
+    ]
+    store.close()
+
+
 def test_the_practice_is_repeated_and_then_passed(practice_store: Store) -> None:
     store = practice_store
     token = walk(store, enter(store, "Ada", scenario="drop"), PHASE)

@@ -154,6 +154,10 @@ def test_fixations_lie_within_the_timing(small_study: Study) -> None:
     )
     assert set(drawn) == {500, 501, 502}
     assert min(drawn.values()) > 330  # of 1200, 400 expected
+    # Drawn anew for each trial of either phase.
+    usual = [fixations(small_study, "collide", 1, phase) for phase in ("familiarization", "test")]
+    assert len({*usual[0], *usual[1]}) == len(usual[0]) + len(usual[1])
+    assert usual[1] != fixations(small_study, "collide", 2, "test")
     without = replace(small_study, timing=Timing(fixation_in_familiarization=False))
     assert fixations(without, "collide", 1, "familiarization") == (0, 0, 0)
 

@@ -175,7 +175,7 @@ _PEOPLE = """\
 `participant` is a keyed hash: the same for all sessions of a person in this study, and of no use
 without the study's key. Recruiters' ids are not exported. Free text, rare combinations of age,
 gender and education, times of answers to the millisecond, and the descriptions of browser and
-screen may still identify a person: check them before you share the data.
+screen may still identify a person: check them before you publish the data.
 Sessions with `simulated` = true are of simulated participants."""
 
 _FILES = """\

@@ -1,7 +1,7 @@
 """The tables of an export, read from the database: columns, and rows as Arrow tables.
 
-Columns of trials and sessions as in `physion.analysis.people.responses`; the other tables
-describe theirs here. Sessions are sorted by start time; trials by session, then familiarization
+Columns of trials and sessions are defined in `physion.analysis.people.responses`, of the other
+tables here. Sessions are sorted by start time; trials by session, then familiarization
 before test, in the order in which they were shown. Labels are read from the study folder. Sessions
 that are left out are counted by reason (`SessionTable.left_out`).
 """
@@ -126,8 +126,8 @@ def _columns(question: Question, texts: Mapping[str, str]) -> list[Column]:
             about = f"{words} ({ends})"
             return [Column(question.name, "integer", about, low=1, high=question.steps)]
         case "choice":
-            listed = "; ".join(f"{option}: {label}" for option, label in labels.items())
-            about = f"{words} ({listed})"
+            named = "; ".join(f"{option}: {label}" for option, label in labels.items())
+            about = f"{words} ({named})"
             return [Column(question.name, "choice", about, choices=question.options)]
     names = zip(columns_of(question), labels.values(), strict=True)
     return [Column(name, "flag", f"{words} Was chosen: {label}") for name, label in names]

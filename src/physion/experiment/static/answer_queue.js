@@ -19,7 +19,7 @@ const DAY_MS = 86_400_000;
 
 /**
  * Return the time in ms since 1970. Within a page it only grows, even if the machine's clock is
- * set; `performance.now` alone starts at 0 again after a reload, which stored showings outlive.
+ * set; `performance.now` starts at 0 again after a reload, which stored showings outlive.
  * @returns {number}
  */
 function present() {

@@ -87,7 +87,7 @@ function pause(ms, signal) {
 
 /**
  * @typedef {Object} Options
- * @property {string|null} [token] Token to send; by default of the current session.
+ * @property {string|null} [token] Token to send; by default the token of the current session.
  * @property {AbortSignal} [signal]
  * @property {string} [expects] Field that the response must have to be accepted as our server's.
  * @property {(ms: number) => void} [onBusy] Called when there are too many requests, with the time

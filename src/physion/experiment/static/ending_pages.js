@@ -94,7 +94,7 @@ export function stopQuestion({ texts, study, state }) {
 }
 
 /**
- * Render a question whose main button continues the study and whose other button ends it.
+ * Render a question whose main button continues with the study and whose other button ends it.
  * @param {(key: string) => string} t
  * @param {string} name Table of the texts `title`, `confirm` and `go_on`.
  * @param {string} text
@@ -125,7 +125,7 @@ function question(t, name, text, parts, answerOf) {
  */
 export function endedPage({ texts, study, state, another, address }, { completion }) {
   const { t } = bound(texts);
-  const submitted = completion.code || completion.url;
+  const shown = completion.code || completion.url;
   const declined = state.stage === "declined"; // nothing was stored
   const takePart = () => window.location.replace(address);
   const changed = () => {
@@ -137,7 +137,7 @@ export function endedPage({ texts, study, state, another, address }, { completio
     page.append(
       el("h1", {}, t(`${state.stage}.title`)),
       ...paragraphs(t(`${state.stage}.text`, study)),
-      ...(submitted ? [] : [el("p", {}, t("ended.return_submission"))]),
+      ...(shown ? [] : [el("p", {}, t("ended.return_submission"))]),
       ...completionParts(completion, t, "ended.go_hint"),
       declined ? changed() : el("p", { class: "small" }, reference),
     );

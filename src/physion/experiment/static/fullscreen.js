@@ -20,7 +20,7 @@ export function offersFullscreen(study) {
 }
 
 /**
- * Render the page that switches to full screen; browsers demand a press of a button for it. Who *
+ * Render the page that switches to full screen; browsers demand a press of a button for it. Who
  * cannot or does not want to continues without.
  * @param {import("./pages.js").Context} context
  * @returns {import("./pages.js").Render}

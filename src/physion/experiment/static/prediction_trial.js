@@ -279,8 +279,8 @@ function answerButton(trial, choice, side) {
 
 /**
  * Enable the buttons in the next animation frame and wait for one of them or its key. The response
- * time is the time of the press (mouse, finger or key). Presses that began earlier and repeated
- * keys do not count.
+ * time is the moment of the press (mouse, finger or key). Presses that began earlier and repeated keys do
+ * not count.
  * @param {HTMLButtonElement[]} buttons
  * @param {any} trial
  * @param {AbortSignal} signal

@@ -32,7 +32,7 @@ const PAGES = {
   feedback: feedbackPage,
 };
 
-/** Refusals after which no session of this page can go on. */
+/** Refusals after which no session of this page can continue. */
 const FINAL = ["unknown_token", "bad_link", "id_needed", "already_took_part", "study_full", "held",
   "paused"];
 

@@ -55,7 +55,7 @@ _UNFILLED = re.compile(r"\{\{|\}\}|^%.*%$|\$\{", re.DOTALL)
 def is_unfilled(enter: Enter) -> bool:
     """Return whether the id or another recruiter value is still an unreplaced placeholder.
 
-    All participants who came by such a URL would otherwise share one id.
+    All participants who came by such a URL would otherwise have the same id.
     """
     for value in (enter.id or "", *enter.recruiter.values()):
         decoded = value

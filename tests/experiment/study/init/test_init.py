@@ -57,11 +57,19 @@ def test_the_choice_is_balanced_and_always_the_same(dataset: Path) -> None:
 
 
 def test_another_seed_chooses_otherwise(dataset: Path) -> None:
-    choices = {
-        tuple(s.stimulus for s in choose_trials(dataset, test=2, seed=seed).sources)
-        for seed in range(10)
+    """Which trials, and their places; drawn apart for trials with and without contact."""
+    few = [choose_trials(dataset, test=2, scenarios=["roll"], seed=seed) for seed in range(12)]
+    pairs = {
+        tuple(sorted(s.stimulus for s in chosen.sources if s.phase == "test")) for chosen in few
     }
-    assert len(choices) == 10
+    # Of three trials with contact (even numbers) and three without; nine pairs.
+    assert len(pairs) >= 5
+    assert {(int(b[-1]) - int(a[-1])) % 6 for a, b in pairs} > {1}
+    all_of_them = [
+        tuple(s.stimulus for s in choose_trials(dataset, test=6, seed=seed).sources)
+        for seed in range(10)
+    ]
+    assert len(set(all_of_them)) == 10 and len({frozenset(names) for names in all_of_them}) == 1
 
 
 def test_where_fewer_are_there_it_says_so(dataset: Path) -> None:
