@@ -26,9 +26,7 @@ import csv
 import io
 import json
 import re
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,7 +64,6 @@ from physion.experiment.export.tables import (
     STIMULI_COLUMNS,
     SessionSelection,
     SessionTable,
-    TrialBatch,
     arrow_schema,
     detail_table,
     expected_stimuli,
@@ -201,10 +198,8 @@ class TableWriter:
         self._stack.close()
 
 
-# --- all tables, in batches: one is written while the next one is read ---
+# --- all tables, in batches of sessions ---
 
-WAITING = 2
-"""Maximum number of batches waiting to be written, which bounds the memory."""
 TABLES = {
     "trials": TRIAL_COLUMNS,
     "sessions": SESSION_COLUMNS,
@@ -269,19 +264,15 @@ def write_tables(
             TableWriter(folder, "trial_details", DETAIL_COLUMNS, with_csv=False, level=1)
         )
 
-        def write(part: TrialBatch) -> None:
-            files["trials"].write(part.table)
-            details.write(detail_table(part))
-
         files["sessions"].write(sessions.table)
         own = _write_own_answers(folder, connection, study, sessions)
         for events in read_events(connection, sessions.table):
             files["events"].write(events)
-        with _BackgroundWriter(write) as behind:
-            for part in read_trials(connection, study, sessions.table, details=True):
-                gone += len(part.unknown)
-                latest.append(_latest(part.table, "answered_at"))
-                behind(part)
+        for part in read_trials(connection, study, sessions.table):
+            gone += len(part.unknown)
+            latest.append(_latest(part.table, "answered_at"))
+            files["trials"].write(part.table)
+            details.write(detail_table(part))
         rows = {name: file.rows for name, file in (*files.items(), ("trial_details", details))}
     described = dict(TABLES)
     if own is not None:
@@ -316,29 +307,6 @@ def _write_own_answers(
 def _latest(table: pa.Table, column: str) -> str:
     """Return the latest time in a column, or an empty text."""
     return str(pc.max(table.column(column)).as_py() or "")
-
-
-class _BackgroundWriter:
-    """Calls a function in order in a background thread, while this thread reads the next batch."""
-
-    def __init__(self, function: Callable[[TrialBatch], None]) -> None:
-        self._function = function
-        self._pool = ThreadPoolExecutor(1)
-        self._waiting: deque[Future[None]] = deque()
-
-    def __call__(self, part: TrialBatch) -> None:
-        self._waiting.append(self._pool.submit(self._function, part))
-        while len(self._waiting) > WAITING:
-            self._waiting.popleft().result()
-
-    def __enter__(self) -> _BackgroundWriter:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self._pool.shutdown(cancel_futures=kind is not None)
-        if kind is None:
-            for future in self._waiting:
-                future.result()
 
 
 GONE = "its stimulus is no longer in the study folder"

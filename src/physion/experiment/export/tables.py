@@ -13,15 +13,14 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, groupby
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 import pyarrow as pa
-from sqlalchemy import Connection, Engine, Float, Integer, case, cast, func, select
-from sqlalchemy.sql import ColumnElement
+import pyarrow.compute as pc
+from sqlalchemy import Connection, Engine, select
 
 from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS, Column
 from physion.core.errors import PhysionError, UnknownNameError
@@ -34,7 +33,7 @@ from physion.experiment.study.orders import (
     trial_order,
 )
 from physion.experiment.study.settings import ALL_SCENARIOS, Question, columns_of
-from physion.experiment.study.stimuli import ATTENTION, LOOKS, PHASES, Stimulus
+from physion.experiment.study.stimuli import ATTENTION, PHASES, Stimulus
 from physion.experiment.study.stimuli import COLUMNS as ALL_STIMULI_COLUMNS
 from physion.experiment.study.study import Study, under
 
@@ -139,22 +138,18 @@ def read_own_answers(
     sessions: pa.Table,
 ) -> pa.Table:
     """Return the table of answers of these exported sessions, in their order."""
-    columns = (*KEYS, *question_columns(questions))
     query = select(SESSIONS.c.session, SESSIONS.c.own_answers)
     rows = connection.execute(query.where(SESSIONS.c.questions_at.is_not(None)))
     given: dict[str, Mapping[str, Any]] = {session: answers or {} for session, answers in rows}
-    values: dict[str, list[Any]] = {column.name: [] for column in columns}
-    pairs = (sessions.column(name).to_pylist() for name in ("participant", "session"))
-    for participant, session in zip(*pairs, strict=True):
-        if session not in given:
-            continue
-        values["participant"].append(participant)
-        values["session"].append(session)
-        for question, _ in questions:
-            for name, cell in _cells(question, given[session]).items():
-                values[name].append(cell)
-    arrays = [pa.array(values[column.name], ARROW_TYPES[column.kind]) for column in columns]
-    return pa.table(arrays, schema=arrow_schema(columns))
+    found = []
+    for keys in sessions.select(["participant", "session"]).to_pylist():
+        if keys["session"] in given:
+            answers = given[keys["session"]]
+            found.append(
+                {k: v for question, _ in questions for k, v in _cells(question, answers).items()}
+                | keys
+            )
+    return _as_table(found, (*KEYS, *question_columns(questions)))
 
 
 def _cells(question: Question, answers: Mapping[str, Any]) -> dict[str, Any]:
@@ -166,45 +161,15 @@ def _cells(question: Question, answers: Mapping[str, Any]) -> dict[str, Any]:
     return {name: None if answer is None else option in answer for name, option in names}
 
 
-# --- arrays of times in ISO 8601 ---
-
-_FORM = "0000-00-00T00:00:00.000Z"
-_DAY_MS = 86_400_000
-
-
 def iso_times(seconds: npt.NDArray[np.float64]) -> pa.Array:
-    """Format Unix times as text such as ``2026-01-31T09:30:00.123Z``.
+    """Format Unix times (UTC, in the years 1000 to 9999) as ``2026-01-31T09:30:00.123Z``.
 
-    Digits are computed for the whole array at once, since the usual functions take a microsecond
-    or more per value.
-
-    Parameters
-    ----------
-    seconds
-        Seconds since 1970 (UTC), in the years 1000 to 9999; NaN for a missing time.
-
-    Returns
-    -------
-    pa.Array
-        Texts, truncated to milliseconds; null for NaN.
+    Milliseconds are truncated; NaN becomes null.
     """
     known = np.isfinite(seconds)
-    whole = np.floor(np.where(known, seconds, 0.0) * 1000).astype(np.int64)
-    days, rest = np.divmod(whole, _DAY_MS)
-    text = np.tile(np.frombuffer(_FORM.encode(), np.uint8), (len(whole), 1))
-    dates, which = np.unique(days, return_inverse=True)
-    spelt = np.datetime_as_string(dates.astype("datetime64[D]")).astype("S10")
-    text[:, :10] = spelt.view(np.uint8).reshape(-1, 10)[which]
-    for last, unit, base in ((12, 3_600_000, 24), (15, 60_000, 60), (18, 1000, 60), (22, 1, 1000)):
-        value = rest // unit % base
-        for digit in range(3 if base == 1000 else 2):
-            text[:, last - digit] = ord("0") + value // 10**digit % 10
-    offsets = np.arange(len(whole) + 1, dtype=np.int32) * len(_FORM)
-    buffers = [None, pa.py_buffer(offsets), pa.py_buffer(np.ascontiguousarray(text))]
-    times = pa.Array.from_buffers(pa.string(), len(whole), buffers)
-    if known.all():
-        return times
-    return times.take(pa.array(np.arange(len(whole)), mask=~known))
+    milliseconds = np.floor(np.where(known, seconds, 0.0) * 1000).astype(np.int64)
+    moments = pa.array(milliseconds, pa.timestamp("ms"), mask=~known)
+    return pc.strftime(moments, format="%Y-%m-%dT%H:%M:%SZ")
 
 
 EXPORTED_KINDS = ("person", "simulated")
@@ -276,7 +241,11 @@ def read_sessions(
     # Sorted here because databases differ in how they order text.
     kept.sort(key=lambda row: (row.started_at, row.session))
     digests = tuple(dict.fromkeys(row.study for row in kept))
-    return SessionTable(_session_table(kept, study), states, left_out, digests)
+    cells = [
+        {column.name: _session_value(row, column.name, study) for column in SESSION_COLUMNS}
+        for row in kept
+    ]
+    return SessionTable(_as_table(cells, SESSION_COLUMNS), states, left_out, digests)
 
 
 def _why_not(row: _Row, wanted: SessionSelection, study: Study) -> str | None:
@@ -296,18 +265,6 @@ def _why_not(row: _Row, wanted: SessionSelection, study: Study) -> str | None:
     if wanted.finished_only and row.finished_at is None:
         return UNFINISHED
     return None
-
-
-def _session_table(rows: Sequence[_Row], study: Study) -> pa.Table:
-    """Return the exported table of these sessions."""
-    columns: dict[str, pa.Array] = {}
-    for column in SESSION_COLUMNS:
-        values = [_session_value(row, column.name, study) for row in rows]
-        if column.kind == "time":
-            columns[column.name] = iso_times(np.array(values, dtype=np.float64))
-        else:
-            columns[column.name] = pa.array(values, ARROW_TYPES[column.kind])
-    return pa.table(columns, arrow_schema(SESSION_COLUMNS))
 
 
 def _session_value(row: _Row, name: str, study: Study) -> Any:
@@ -344,70 +301,20 @@ class TrialBatch:
 
     Attributes
     ----------
-    sessions
-        Row numbers of these sessions in the table of sessions.
     table
         One row per answer.
-    counts
-        Number of rows of ``table`` for each session.
     details
-        JSON text of each row, if requested.
+        Measured details of each row as JSON text.
     unknown
         Stimulus of each answer that was left out because the study folder no longer has it.
     """
 
-    sessions: range
     table: pa.Table
-    counts: npt.NDArray[np.int64]
-    details: pa.Array | None
+    details: pa.Array
     unknown: tuple[str, ...]
 
 
-_INPUTS = ("mouse", "touch", "keyboard")
-_RESPONSES = ("no", "yes")
-_VOID = ("hidden", "dialog", "window")
-_ABSENT = -1.0
-"""Value of empty cells while numbers are fetched; real values are never negative."""
-
-
-def _index(column: Any, values: Sequence[str]) -> ColumnElement[int]:
-    """Return the SQL expression of the index of a cell in ``values``, -1 if it is not in them."""
-    return case({value: index for index, value in enumerate(values)}, value=column, else_=-1)
-
-
-def _or_absent(column: Any) -> ColumnElement[Any]:
-    """Return the SQL expression of a column with `_ABSENT` in place of NULL."""
-    return func.coalesce(column, _ABSENT if isinstance(column.type, Float) else int(_ABSENT))
-
-
-_NUMBERS: dict[str, Any] = {
-    "phase": _index(ANSWERS.c.phase, PHASES),
-    "trial": ANSWERS.c.trial,
-    "response": _index(ANSWERS.c.response, _RESPONSES),
-    "rt_ms": ANSWERS.c.rt_ms,
-    "input": _index(ANSWERS.c.input, _INPUTS),
-    "fixation_ms": _or_absent(ANSWERS.c.fixation_ms),
-    "cue_ms": _or_absent(ANSWERS.c.cue_ms),
-    "frames_expected": ANSWERS.c.frames_expected,
-    "frames_shown": _or_absent(ANSWERS.c.frames_shown),
-    "frames_dropped": _or_absent(ANSWERS.c.frames_dropped),
-    "movie_ms": _or_absent(ANSWERS.c.movie_ms),
-    "visibility_changes": _or_absent(ANSWERS.c.visibility_changes),
-    "window_width": _or_absent(ANSWERS.c.window_width),
-    "window_height": _or_absent(ANSWERS.c.window_height),
-    "break_ms": _or_absent(ANSWERS.c.break_ms),
-    "resumed": cast(ANSWERS.c.resumed, Integer),
-    "showings": _or_absent(ANSWERS.c.showings),
-    "void": _index(ANSWERS.c.void, _VOID),
-    "answered_at": ANSWERS.c.answered_at,
-}
-"""Columns of an answer that are fetched as numbers, several times faster than as text."""
-_CHOICES = {"phase": PHASES, "response": _RESPONSES, "input": _INPUTS, "void": _VOID}
-
-
-def read_trials(
-    connection: Connection, study: Study, sessions: pa.Table, *, details: bool = False
-) -> Iterator[TrialBatch]:
+def read_trials(connection: Connection, study: Study, sessions: pa.Table) -> Iterator[TrialBatch]:
     """Yield the answers of a batch of sessions at a time, in the order of ``sessions``.
 
     Parameters
@@ -418,134 +325,52 @@ def read_trials(
         The study, for the labels of its stimuli.
     sessions
         Table of `read_sessions`.
-    details
-        Whether to read the measured details of each trial too.
     """
-    known = _Stimuli(study.stimuli)
-    names = sessions.column("session").to_pylist()
-    for first in range(0, len(names), AT_ONCE):
-        chosen = range(first, min(first + AT_ONCE, len(names)))
-        rows = _fetch(connection, [names[at] for at in chosen], details)
-        batch = sessions.slice(first, len(chosen)).combine_chunks()
-        yield _trials(chosen, batch, rows, known, details)
+    stimuli = {(s.scenario, s.stimulus): s for s in study.stimuli}
+    names = ["participant", "session", "simulated", "buttons", "condition", "scenario"]
+    listed = sessions.select(names).to_pylist()
+    for first in range(0, len(listed), AT_ONCE):
+        chosen = {each["session"]: each for each in listed[first : first + AT_ONCE]}
+        ranks = {name: rank for rank, name in enumerate(chosen)}
+        wanted = ANSWERS.c.session.in_(chosen), ANSWERS.c.phase.in_(PHASES)
+        kept: list[tuple[tuple[int, ...], dict[str, Any]]] = []
+        unknown: list[str] = []
+        for row in connection.execute(select(ANSWERS).where(*wanted)).mappings():
+            session = chosen[row["session"]]
+            blocks = session["scenario"].split(" ")
+            known = [n for n, each in enumerate(blocks) if (each, row["stimulus"]) in stimuli]
+            if not known:
+                unknown.append(row["stimulus"])
+                continue
+            block, scenario = known[0], blocks[known[0]]
+            stimulus = stimuli[scenario, row["stimulus"]]
+            cells = {
+                **row,
+                **session,
+                "scenario": scenario,
+                "block": block if len(blocks) > 1 else None,
+                "label": stimulus.label,
+                "correct": (row["response"] == "yes") == stimulus.label,
+                "look": stimulus.look,
+            }
+            place = ranks[row["session"]], block, PHASES.index(row["phase"]), row["trial"]
+            kept.append((place, cells))
+        kept.sort(key=lambda entry: entry[0])
+        rows = [cells for _, cells in kept]
+        details = pa.array([cells["details"] for cells in rows], pa.string())
+        yield TrialBatch(_as_table(rows, TRIAL_COLUMNS), details, tuple(unknown))
 
 
-def _fetch(connection: Connection, names: Sequence[str], details: bool) -> list[tuple[Any, ...]]:
-    """Fetch rows of session, stimulus, details (if requested) and `_NUMBERS`."""
-    texts = [ANSWERS.c.session, ANSWERS.c.stimulus, *([ANSWERS.c.details] if details else [])]
-    chosen = ANSWERS.c.session.in_(names), ANSWERS.c.phase.in_(PHASES)
-    query = select(*texts, *_NUMBERS.values()).where(*chosen)
-    text = query.compile(dialect=connection.dialect, compile_kwargs={"literal_binds": True})
-    # Plain rows of the driver: SQLAlchemy's row objects would double the time.
-    cursor = connection.connection.cursor()
-    try:
-        cursor.execute(str(text))
-        return list(cursor.fetchall())
-    finally:
-        cursor.close()
-
-
-class _Stimuli:
-    """Scenarios, names, labels and looks of all stimuli as arrays, and their indices by name."""
-
-    def __init__(self, stimuli: Sequence[Stimulus]) -> None:
-        self.indices = {(s.scenario, s.stimulus): index for index, s in enumerate(stimuli)}
-        self.scenarios = pa.array([s.scenario for s in stimuli], pa.string())
-        self.names = pa.array([s.stimulus for s in stimuli], pa.string())
-        self.labels = np.array([s.label for s in stimuli], dtype=bool)
-        self.looks = np.array([LOOKS.index(s.look) for s in stimuli], dtype=np.int64)
-
-    def find(self, blocks: Sequence[str], name: str) -> tuple[int, float]:
-        """Return the index of a stimulus of a session, -1 if it is unknown, and its block.
-
-        ``blocks``: the scenarios of the session. The block is `_ABSENT` if there is only one.
-        """
-        for number, scenario in enumerate(blocks):
-            index = self.indices.get((scenario, name), -1)
-            if index >= 0:
-                return index, number if len(blocks) > 1 else _ABSENT
-        return -1, _ABSENT
-
-
-def _trials(
-    chosen: range,
-    sessions: pa.Table,
-    rows: list[tuple[Any, ...]],
-    known: _Stimuli,
-    details: bool,
-) -> TrialBatch:
-    """Convert fetched rows to a table in the order shown; unknown stimuli are left out."""
-    texts = 3 if details else 2
-    ranks = {name: rank for rank, name in enumerate(sessions.column("session").to_pylist())}
-    blocks = [cell.split(" ") for cell in sessions.column("scenario").to_pylist()]
-    rank = np.array([ranks[row[0]] for row in rows], dtype=np.int64)
-    found = [known.find(blocks[ranks[row[0]]], row[1]) for row in rows]
-    stimulus, block = np.array(found, dtype=np.int64).reshape(-1, 2).T
-    unknown = tuple(rows[at][1] for at in np.flatnonzero(stimulus < 0))
-    flat = chain.from_iterable(row[texts:] for row in rows)
-    width = len(_NUMBERS)
-    numbers = np.fromiter(flat, np.float64, len(rows) * width).reshape(-1, width).T
-    values = dict(zip(_NUMBERS, numbers, strict=True))
-    values["block"] = block.astype(np.float64)
-    order = np.lexsort((values["trial"], values["phase"], block, rank))
-    order = order[stimulus[order] >= 0]
-    values = {name: column[order] for name, column in values.items()}
-    rank, stimulus = rank[order], stimulus[order]
-    return TrialBatch(
-        sessions=chosen,
-        table=_trial_table(sessions, rank, known, stimulus, values),
-        counts=np.bincount(rank, minlength=len(chosen)).astype(np.int64),
-        details=pa.array([rows[at][2] for at in order], pa.string()) if details else None,
-        unknown=unknown,
-    )
-
-
-def _trial_table(
-    sessions: pa.Table,
-    rank: npt.NDArray[np.int64],
-    known: _Stimuli,
-    stimulus: npt.NDArray[np.int64],
-    values: dict[str, npt.NDArray[np.float64]],
-) -> pa.Table:
-    """Return the table of trials from fetched numbers.
-
-    Parameters
-    ----------
-    sessions
-        Rows of the sessions of this batch.
-    rank
-        Index of the session of each answer.
-    known
-        The stimuli of the study.
-    stimulus
-        Index of the stimulus of each answer.
-    values
-        Columns of `_NUMBERS`, and ``block``.
-    """
-    of_session = sessions.select(["participant", "session", "simulated", "buttons", "condition"])
-    of_session = of_session.take(pa.array(rank))
-    label = known.labels[stimulus]
-    columns: dict[str, Any] = {name: of_session.column(name) for name in of_session.column_names}
-    columns |= {
-        "scenario": known.scenarios.take(pa.array(stimulus)),
-        "stimulus": known.names.take(pa.array(stimulus)),
-        "label": pa.array(label),
-        "correct": pa.array((values["response"] == _RESPONSES.index("yes")) == label),
-        "look": pa.array(LOOKS).take(pa.array(known.looks[stimulus])),
-        "answered_at": iso_times(values["answered_at"]),
-        "resumed": pa.array(values["resumed"] != 0),
-    }
-    for name, choices in _CHOICES.items():
-        indices = values[name].astype(np.int64)
-        columns[name] = pa.array(choices).take(pa.array(indices, mask=indices < 0))
-    for column in TRIAL_COLUMNS:
-        if column.name not in columns:
-            cells = values[column.name]
-            absent = None if column.name == "rt_ms" else cells == _ABSENT
-            typed = cells.astype(np.int64) if column.kind == "integer" else cells
-            columns[column.name] = pa.array(typed, mask=absent)
-    ordered = {column.name: columns[column.name] for column in TRIAL_COLUMNS}
-    return pa.table(ordered, arrow_schema(TRIAL_COLUMNS))
+def _as_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> pa.Table:
+    """Return the exported table of these rows; moments are seconds since 1970."""
+    arrays = []
+    for column in columns:
+        values = [cells[column.name] for cells in rows]
+        if column.kind == "time":
+            arrays.append(iso_times(np.array(values, dtype=np.float64)))
+        else:
+            arrays.append(pa.array(values, ARROW_TYPES[column.kind]))
+    return pa.table(arrays, schema=arrow_schema(columns))
 
 
 # --- browser events, measured details of trials, and stimuli ---
@@ -594,34 +419,19 @@ def read_events(connection: Connection, sessions: pa.Table) -> Iterator[pa.Table
     """Yield tables of the events of some sessions at a time, in the order of ``sessions``."""
     names = sessions.column("session").to_pylist()
     for first in range(0, len(names), AT_ONCE):
-        chosen = names[first : first + AT_ONCE]
-        rank = {name: index for index, name in enumerate(chosen)}
-        rows = connection.execute(select(EVENTS).where(EVENTS.c.session.in_(chosen))).fetchall()
-        ordered = sorted(rows, key=lambda row: (rank[row.session], row.event))
-        numbers: list[int] = []
-        for _, group in groupby(ordered, key=lambda row: row.session):
-            numbers += range(len(list(group)))
-        yield _event_table(ordered, numbers)
-
-
-def _event_table(rows: list[Any], numbers: list[int]) -> pa.Table:
-    """Return the exported table of these events."""
-    stored_at = np.array([row.stored_at for row in rows], dtype=np.float64)
-    # Keys are sorted because databases may return them in another order.
-    data = [json.dumps(row.data, sort_keys=True, ensure_ascii=False) for row in rows]
-    columns = {
-        "session": pa.array([row.session for row in rows], pa.string()),
-        "number": pa.array(numbers, pa.int64()),
-        "kind": pa.array([row.kind for row in rows], pa.string()),
-        "at_ms": pa.array([row.at_ms for row in rows], pa.float64()),
-        "stored_at": iso_times(stored_at),
-        "data": pa.array(data, pa.string()),
-    }
-    return pa.table(columns, arrow_schema(EVENT_COLUMNS))
+        chosen: dict[str, list[dict[str, Any]]] = {
+            name: [] for name in names[first : first + AT_ONCE]
+        }
+        query = select(EVENTS).where(EVENTS.c.session.in_(chosen)).order_by(EVENTS.c.event)
+        for row in connection.execute(query).mappings():
+            data = json.dumps(row["data"], sort_keys=True, ensure_ascii=False)
+            events = chosen[row["session"]]
+            events.append({**row, "number": len(events), "data": data})
+        yield _as_table([event for events in chosen.values() for event in events], EVENT_COLUMNS)
 
 
 def detail_table(trials: TrialBatch) -> pa.Table:
-    """Return the table of details of trials that were read with ``details=True``."""
+    """Return the table of details of trials."""
     keys = [trials.table.column(name) for name in ("session", "phase", "trial")]
     return pa.table([*keys, trials.details], schema=arrow_schema(DETAIL_COLUMNS))
 
@@ -696,14 +506,7 @@ def _table(
         }
         kept.append(((at, repeat, row.trial), cells))
     kept.sort(key=lambda entry: entry[0])
-    arrays = []
-    for column in columns:
-        values = [cells[column.name] for _, cells in kept]
-        if column.kind == "time":
-            arrays.append(iso_times(np.array(values, dtype=np.float64)))
-        else:
-            arrays.append(pa.array(values, ARROW_TYPES[column.kind]))
-    return pa.table(arrays, schema=arrow_schema(columns))
+    return _as_table([cells for _, cells in kept], columns)
 
 
 # --- the test stimuli that a complete session has answered: of its scenario or its blocks ---

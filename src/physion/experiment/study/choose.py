@@ -428,10 +428,10 @@ def _first_existing(folders: Sequence[Path], names: Sequence[str]) -> Path:
 
 # Selection of official scenes for a study with people, before their trials are rendered.
 #
-# Test trials are scenes that people of the original study saw. Familiarization trials are the
-# scenes that the study showed in it, where the data hold any, else scenes that nobody saw and whose physics no test trial
+# Test trials are scenes that people of the original study saw. Familiarization trials are the ones
+# of that study where the data hold any, else scenes that nobody saw and whose physics no test trial
 # has. Only scenes are taken whose simulation has the recorded outcome: the movie that participants
-# see ends as the original one did, and their answers can be compared with those of the study.
+# see ends as the original one did, and their answers can be compared with the study's.
 # Agent and patient must be visible in the first frame, where the map marks them.
 
 Group = tuple[str, str, bool]
