@@ -125,7 +125,7 @@ def test_bad_rows_are_named(tmp_path: Path, case: str) -> None:
         (b"width,height", b"width,width", r"unknown column 'width\.1'"),
         (b",map,", b",", "rows have more cells than its header"),
         (b",place,", b",", "rows have more cells"),
-        (b"45,0,30.0", b"45,30.0", "row 3 of column 'look' holds ''"),
+        (b"45,0,30.0", b"45,30.0", "row 3 of column 'height' holds 'free'"),
         (b"a2", b'"a2', "is not a CSV table"),
         (b"a2", b"a\xff", "is not a CSV table"),
         (b"a2", b"a\x00", "stimulus must be|not a CSV table"),

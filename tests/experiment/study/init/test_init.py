@@ -205,7 +205,7 @@ def test_an_interrupted_making_leaves_nothing(
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "responses.sqlite", "study.toml"])
-def test_folders_with_something_in_them_are_left_alone(
+def test_folders_with_something_in_them_are_refused(
     dataset: Path, tmp_path: Path, name: str
 ) -> None:
     folder = tmp_path / "study"
@@ -216,7 +216,7 @@ def test_folders_with_something_in_them_are_left_alone(
     assert [path.name for path in folder.iterdir()] == [name]
 
 
-def test_a_finished_study_is_left_alone(dataset: Path, tmp_path: Path) -> None:
+def test_a_finished_study_is_never_replaced(dataset: Path, tmp_path: Path) -> None:
     study = make_tiny_study(tmp_path)
     with pytest.raises(BadInputError, match=r"study in .* already"):
         make_study(_study(tmp_path), choose_trials(dataset).sources, "a password")
@@ -290,7 +290,7 @@ def test_bad_commands_are_one_line_and_leave_nothing(
     assert not (tmp_path / "study").exists()
 
 
-def test_the_verb_alone_says_which_words_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_verb_without_words_lists_them(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["experiment"]) == 2
     out = capsys.readouterr().out
     assert all(f"physion experiment {word}" in out for word in SUBVERBS)
