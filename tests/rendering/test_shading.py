@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from physion.rendering.camera import View, intrinsics
-from physion.rendering.light import pack_light
+from physion.rendering.light import pack_light, to_linear, tone_table
 from physion.rendering.rasterizer import (
     BLOCK,
     CAMERA,
@@ -248,7 +248,9 @@ def test_shadow_takes_its_fraction_only_of_the_direct_light(kept: int) -> None:
     points = np.zeros(SIZE * SIZE + 1, POINT)
     shade_static_points(ids, kept, inputs, points)
     nothing = flat_map(np.inf)
-    for blocker, direct in ((np.inf, 1.0), (-1.0, 0.25)):
+    # A surface is looked up 3 cm above itself: it throws no shadow on itself, nor does what is
+    # nearer than that. Depths of the map are heights with the sign reversed.
+    for blocker, direct in ((np.inf, 1.0), (-1.0, 0.25), (0.0, 1.0), (-0.02, 1.0), (-0.04, 0.25)):
         colors = np.zeros((SIZE, SIZE, 3), np.uint8)
         shade(ids, kept, inputs, LightMaps(flat_map(blocker), nothing), points, colors)
         expected = round(BYTES * (0.5 * 0.8 + 0.5 * direct))
@@ -274,3 +276,20 @@ def test_room_light_is_packed_by_name() -> None:
     np.testing.assert_array_equal(light["window_color"], room.window[2])
     np.testing.assert_array_equal(light["room_high"], room.high)
     assert light["shadow_strength"] == room.shadow_strength
+
+
+@pytest.mark.parametrize("exposure", [1.0, 1.3])
+def test_tone_curve_is_srgb_up_to_the_knee_and_bends_to_white_beyond(exposure: float) -> None:
+    tones = tone_table(exposure)
+    assert tones[0] == 0 and tones.dtype == np.uint8 and (np.diff(tones.astype(int)) >= 0).all()
+    for light in (0.001, 0.01, 0.05, 0.2, 0.4, 0.7, 1.5, 3.9):
+        x = light * exposure
+        y = x if x < 0.55 else 0.55 + 0.45 * (1 - math.exp(-(x - 0.55) / 0.45))
+        coded = 12.92 * y if y <= 0.0031308 else 1.055 * y ** (1 / 2.4) - 0.055
+        assert tones[round(light * (TONES - 1) / WHITEST)] == pytest.approx(255 * coded, abs=0.6)
+
+
+def test_srgb_colours_in_linear_light() -> None:
+    """Half a code is 21.4 % of the light; the first codes are on the straight part."""
+    linear = to_linear([0.0, 0.02, 0.5, 1.0])
+    assert linear.tolist() == pytest.approx([0.0, 0.02 / 12.92, 0.21404114, 1.0], abs=1e-6)

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from physion.core.errors import BadInputError
-from physion.physics.engine import simulate_many
 from physion.physics.rigid import step as run_module
 from physion.physics.rigid.bodies import RigidSettings
 from physion.physics.rigid.engine import RigidEngine
@@ -45,25 +41,6 @@ def digests(paths: Sequence[Trajectory]) -> list[str]:
     return [path.digest() for path in paths]
 
 
-def test_same_bytes_in_every_process() -> None:
-    scene = heap(0)
-    here = [RigidEngine().simulate(scene, frames=FRAMES).digest() for _ in range(2)]
-    code = (
-        "import sys; from physion.scenes.scene import Scene; "
-        "from physion.physics.rigid.engine import RigidEngine; "
-        "scene = Scene.from_json(sys.stdin.read()); "
-        f"print(RigidEngine().simulate(scene, frames={FRAMES}).digest())"
-    )
-    there = subprocess.run(
-        [sys.executable, "-c", code],
-        input=scene.to_json(),
-        text=True,
-        capture_output=True,
-        check=True,
-    ).stdout.strip()
-    assert here == [there, there]
-
-
 def test_same_bytes_with_any_number_of_threads_and_in_any_order() -> None:
     scenes = [heap(seed) for seed in range(6)]
     alone = digests([RigidEngine().simulate(scene, frames=FRAMES) for scene in scenes])
@@ -75,19 +52,6 @@ def test_same_bytes_with_any_number_of_threads_and_in_any_order() -> None:
     # The same scene in several threads at once shares the hulls of its shapes.
     same = RigidEngine(threads=4).simulate_many([scenes[0]] * 8, frames=FRAMES)
     assert digests(same) == [alone[0]] * 8
-
-
-def test_many_scenes_go_on_from_their_own_starts() -> None:
-    scenes = [heap(seed) for seed in (1, 2)]
-    starts = [RigidEngine().simulate(s, frames=30).state(10 + i) for i, s in enumerate(scenes)]
-    together = simulate_many(scenes, starts=starts, frames=20)
-    apart = [
-        RigidEngine().simulate(scene, start=start, frames=20)
-        for scene, start in zip(scenes, starts, strict=True)
-    ]
-    assert digests(together) == digests(apart)
-    with pytest.raises(BadInputError, match="as many starts"):
-        simulate_many(scenes, starts=starts[:1])
 
 
 def test_many_scenes_stop_at_contact_each_for_itself() -> None:

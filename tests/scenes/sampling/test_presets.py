@@ -1,18 +1,21 @@
-"""Preset files of the package, and error messages for bad preset files."""
+"""Presets of the package and of users, and scenes sampled from them."""
 
 from __future__ import annotations
 
 import csv
 import dataclasses
+import json
 import re
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import physion
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.names import SCENARIOS
-from physion.core.seeds import trial_seed
+from physion.core.seeds import named_seed, trial_seed
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
 from physion.scenes.sampling.build import scenarios
@@ -95,11 +98,13 @@ def test_every_preset_draws_sound_scenes(preset: Preset) -> None:
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_familiarization_has_both_outcomes(scenario: str) -> None:
     params = get_preset(scenario, FAMILIARIZATION).params
-    contacts = 0
+    outcomes: Counter[bool] = Counter()
     for index in range(16):
         scene = sample_scene(scenario, trial_seed("test", scenario, "practice", index), params)
-        contacts += label_contact(scene, simulate(scene)).contact
-    assert 3 <= contacts <= 13
+        outcomes[label_contact(scene, simulate(scene, until_contact=True)).contact] += 1
+        if min(outcomes[True], outcomes[False]) == 3:
+            return
+    raise AssertionError(f"each outcome comes at least three times in sixteen: {outcomes}")
 
 
 def test_published_values_equal_the_tables(official: Path) -> None:
@@ -141,7 +146,7 @@ def read_command_line(file: Path) -> dict[str, str]:
     return options
 
 
-def test_presets_have_the_values_of_the_command_lines(official: Path) -> None:
+def test_presets_have_the_values_of_the_command_lines_and_metadata(official: Path) -> None:
     checked = 0
     for preset in published():
         file = official / "scenes" / preset.scenario / str(preset.official) / "commandline_args.txt"
@@ -154,6 +159,12 @@ def test_presets_have_the_values_of_the_command_lines(official: Path) -> None:
         assert int(line.get("num_occluders", 0)) == scenery.occluders, preset.name
         if scenery.occluders:
             assert float(line.get("occlusion_scale", 0.75)) == scenery.occlusion, preset.name
+        records = json.loads((file.parent / "metadata.json").read_text())
+        said = preset.published
+        assert said is not None and said.trials == len(records), preset.name
+        assert said.contact == sum(record["does_target_contact_zone"] for record in records)
+        lengths = [record["num_frames"] for record in records]
+        assert said.frames == pytest.approx(np.mean(lengths), abs=1), preset.name
         checked += 1
     assert checked >= 40
 
@@ -339,3 +350,30 @@ def test_parameters_of_another_scenario_are_refused() -> None:
         BadInputError, match=r"'collide' takes .*collide\.CollideParameters, not DropParameters"
     ):
         sample_scene("collide", seed, drop)
+
+
+def test_a_number_gives_the_same_scene_and_another_gives_another() -> None:
+    first = physion.sample_scene("collide", 3)
+    assert physion.sample_scene("collide", 3) == first != physion.sample_scene("collide", 4)
+    assert physion.sample_scene("collide", named_seed("scene", "collide", 3)) == first
+    assert physion.sample_scene("collide") == physion.sample_scene("collide", 0)
+
+
+def test_a_preset_stands_for_its_parameters() -> None:
+    name = "familiarization"
+    scene = physion.sample_scene("collide", 1, preset=name)
+    assert scene == physion.sample_scene("collide", 1, get_preset("collide", name).params)
+    assert scene != physion.sample_scene("collide", 1)
+    with pytest.raises(BadInputError, match="a preset, not both"):
+        physion.sample_scene("collide", 1, scenarios.get("collide").params(), preset=name)
+    with pytest.raises(UnknownNameError, match="closest: familiarization"):
+        physion.sample_scene("collide", 1, preset="familiarisation")
+
+
+def test_an_engine_can_be_named() -> None:
+    scene = physion.sample_scene("collide", 1)
+    own = physion.simulate(scene, frames=5)
+    assert own.engine.startswith("physion-")
+    assert physion.simulate(scene, frames=5, engine="mujoco").engine.startswith("mujoco-")
+    with pytest.raises(UnknownNameError, match="unknown engine 'bullet'"):
+        physion.simulate(scene, engine="bullet")

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import itertools
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -72,37 +70,6 @@ def inside(outer: Sequence[Any], inner: Sequence[Any], slack: float = 0.0) -> bo
     (low, high), (inner_low, inner_high) = span(outer), span(inner)
     room = slack * (high - low) + 1e-4
     return bool((inner_low >= low - room).all() and (inner_high <= high + room).all())
-
-
-# Presets and what was published about them.
-
-
-@pytest.mark.parametrize(("scenario", "count"), [("roll", 14), ("drape", 11)])
-def test_all_published_configurations_are_there(scenario: str, count: int) -> None:
-    presets = load_presets(scenario)
-    assert len(published(scenario)) == count
-    assert list(presets)[:3] == ["default", "familiarization", "debug"]
-    for preset in published(scenario):
-        assert preset.official and preset.official.endswith(preset.name)
-
-
-@pytest.mark.parametrize("scenario", ["roll", "drape"])
-def test_published_numbers_match_the_study(official: Path, scenario: str) -> None:
-    with (official / "stimuli" / "readout_labels.csv").open() as file:
-        readout = {row[0]: row[1] == "True" for row in list(csv.reader(file))[1:]}
-    with (official / "stimuli" / "stimulus_names_and_labels.csv").open() as file:
-        tested = [row["stim_ID"] for row in csv.DictReader(file) if row["scenario"] == scenario]
-    for preset in published(scenario):
-        labels = [label for name, label in readout.items() if name[:-5] == preset.official]
-        said = preset.published
-        assert said is not None
-        assert (said.readout_trials, said.readout_contact) == (len(labels), sum(labels))
-        assert said.tested == sum(name[:-5] == preset.official for name in tested)
-        path = official / "scenes" / scenario / str(preset.official) / "metadata.json"
-        if path.is_file():
-            records = json.loads(path.read_text())
-            assert said.trials == len(records)
-            assert said.contact == sum(r["does_target_contact_zone"] for r in records)
 
 
 # Roll.
@@ -241,11 +208,11 @@ def test_scenery_stands_on_both_sides_of_the_ledge() -> None:
     assert all(math.hypot(*thing.position[:2]) < 6 for thing in scenery)
 
 
-@pytest.mark.slow
 def test_probes_of_collisions_are_tumbled_and_start_above_the_floor() -> None:
     params = roll.RollParameters(template=("collision",))
+    turns = np.array([euler_rotation(a, a, a) for a in np.arange(-180, 180, 0.25)])
     raised = 0
-    for index in range(100):
+    for index in range(60):
         scene = draw("roll", params, index)
         probe = body(scene, "probe")
         assert world_bounds(probe)[0, 2] >= -1e-9
@@ -255,9 +222,8 @@ def test_probes_of_collisions_are_tumbled_and_start_above_the_floor() -> None:
         assert push.point[2] == pytest.approx(
             probe.position[2] + 0.35 * min(0.8, float(shape(probe.shape).bounds[1, 2]))
         )
-        turns = [euler_rotation(a, a, a) for a in np.arange(-180, 180, 0.25)]
-        assert np.abs(np.array(turns) @ probe.rotation).max() > 0.99999
-    assert 0 < raised < 50
+        assert np.abs(turns @ probe.rotation).max() > 0.99999
+    assert 0 < raised < 30
 
 
 # Drape.
@@ -360,7 +326,7 @@ def test_natural_sizes_are_python_floats() -> None:
     assert {type(side) for one in scene.bodies for side in one.scale} == {float}
 
 
-def test_cloth_over_the_zone_touches_it_and_cloth_next_to_it_does_not() -> None:
+def test_cloth_over_the_zone_touches_it_and_cloth_beside_it_does_not() -> None:
     low = drape.AnchorRule(height=0.05, height_jitter=0.0, taller=0.0, extra=0.0)
     near = drape.ClothRule(size=(0.8, 0.8), x=(0.0, 0.0), y=(0.1, 0.1), height=(0.6, 0.6))
     params = drape.DrapeParameters(

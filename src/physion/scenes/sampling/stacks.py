@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Protocol
 
 import numpy as np
 
@@ -18,12 +17,14 @@ from physion.core.seeds import child_generator
 from physion.numerics.elementary import cos, sin, tan
 from physion.numerics.linear_algebra import apply, inverse, multiply, norm
 from physion.numerics.rotations import rotate_vectors
-from physion.scenes.sampling.build import Palette, SceneParams, build_scene, move_up
+from physion.scenes.sampling.build import Palette, build_scene, move_up
 from physion.scenes.sampling.parameters import (
     LEAST_MASS,
     Counts,
     CountsFromOne,
     Fraction,
+    Length,
+    Room,
     Slope,
     draw_count,
     retry,
@@ -31,7 +32,9 @@ from physion.scenes.sampling.parameters import (
 )
 from physion.scenes.sampling.placement import (
     BodyRule,
+    CameraRule,
     PushRule,
+    SceneryRule,
     ZoneRule,
     draw_body,
     draw_push,
@@ -360,48 +363,30 @@ STACK_MASS = 0.25
 """Factor of the masses of the stack's bodies (docs/official-system.md, 3.4)."""
 
 
-class StandParams(SceneParams, Protocol):
-    """Parameters that a scenario with a stand has."""
+@dataclass(frozen=True)
+class StandParameters:
+    """Parameters of a scenario in which a ball hits a stand.
 
-    @property
-    def length(self) -> float:
-        """Distance in metres; the probe starts at x = -length / 2."""
-        ...
+    - ``length``: metres; the probe starts at x = -length / 2, the stand is at the centre.
+    - ``stand``: what carries or holds the stack.
+    - ``stack``: the bodies on or in it, from below. ``choice``: indices of those that may be the
+      agent (0 is the lowest), all equally likely.
 
-    @property
-    def stand(self) -> StandRule:
-        """Rule of the stand in the centre."""
-        ...
+    Masses of stand and stack are those of a cube with sides of 0.5 m (`StackRule`), and a quarter
+    of it for the stack.
+    """
 
-    @property
-    def stack(self) -> FilledStackRule:
-        """Rule of the stack on or in it."""
-        ...
-
-    @property
-    def choice(self) -> tuple[int, int]:
-        """First and last index in the stack at which the agent may be."""
-        ...
-
-    @property
-    def zone(self) -> ZoneRule:
-        """Rule of the patient."""
-        ...
-
-    @property
-    def probe(self) -> BodyRule:
-        """Rule of the body that is pushed."""
-        ...
-
-    @property
-    def push(self) -> PushRule:
-        """Rule of the push."""
-        ...
-
-    @property
-    def monochrome(self) -> bool:
-        """Whether the bodies of the stack have one colour."""
-        ...
+    length: Length
+    stand: StandRule
+    stack: FilledStackRule
+    choice: Counts
+    zone: ZoneRule
+    probe: BodyRule
+    push: PushRule
+    monochrome: bool
+    room: Room
+    camera: CameraRule
+    scenery: SceneryRule
 
 
 @dataclass
@@ -413,7 +398,7 @@ class _DrawnStand:
 
 def sample_standing(
     scenario: str,
-    params: StandParams,
+    params: StandParameters,
     seed: np.random.SeedSequence,
     base_color: Vec3 | None,
     attachment_color: Vec3,

@@ -9,7 +9,12 @@ import numpy as np
 from physion.scenes.sampling.build import scenario
 from physion.scenes.sampling.parameters import Counts, Length, Room
 from physion.scenes.sampling.placement import BodyRule, CameraRule, PushRule, SceneryRule, ZoneRule
-from physion.scenes.sampling.stacks import FilledStackRule, StandRule, sample_standing
+from physion.scenes.sampling.stacks import (
+    FilledStackRule,
+    StandParameters,
+    StandRule,
+    sample_standing,
+)
 from physion.scenes.scene import Scene, Vec3
 
 ATTACHMENT_COLOR: Vec3 = (0.8, 0.8, 0.8)
@@ -45,16 +50,10 @@ SCENERY = SceneryRule()
 
 
 @dataclass(frozen=True)
-class ContainParameters:
+class ContainParameters(StandParameters):
     """Parameters of the scenario contain (docs/official-system.md, 2.1, 3.0 and 3.4).
 
-    - ``length``: metres; the probe starts at x = -length / 2, the container is at the centre.
-    - ``stand``: the container, and a second one on it if ``attached``.
-    - ``stack``: the objects in or on it, from below. ``choice``: indices of those that may be the
-      agent (0 is the lowest), all equally likely.
-
-    Masses of stand and stack are for a cube with sides of 0.5 m (`StackRule`), and a quarter
-    of it for the stack.
+    The stand is the container, and a second one on it if ``attached``.
     """
 
     length: Length = 2.0

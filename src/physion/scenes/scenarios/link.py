@@ -9,7 +9,12 @@ import numpy as np
 from physion.scenes.sampling.build import scenario
 from physion.scenes.sampling.parameters import Counts, Length, Room
 from physion.scenes.sampling.placement import BodyRule, CameraRule, PushRule, SceneryRule, ZoneRule
-from physion.scenes.sampling.stacks import FilledStackRule, StandRule, sample_standing
+from physion.scenes.sampling.stacks import (
+    FilledStackRule,
+    StandParameters,
+    StandRule,
+    sample_standing,
+)
 from physion.scenes.scene import Scene, Vec3
 
 STAND_COLOR: Vec3 = (1.0, 1.0, 1.0)
@@ -50,17 +55,11 @@ SCENERY = SceneryRule()
 
 
 @dataclass(frozen=True)
-class LinkParameters:
+class LinkParameters(StandParameters):
     """Parameters of the scenario link (docs/official-system.md, 2.1, 3.0 and 3.6).
 
-    - ``length``: metres; the probe starts at x = -length / 2, the pole is at the centre.
-    - ``stand``: the base, the pole on it, and possibly a cap that keeps the rings on the pole.
-    - ``stack``: the rings, from below. ``choice``: indices of those that may be the agent (0 is
-      the lowest), all equally likely.
-
-    Masses of stand and rings are for a cube with sides of 0.5 m (`StackRule`), and a quarter
-    of it for the rings. Below a cap the rings start lower than in the official scenes, where they
-    may start inside it.
+    The stand is a base with a pole, and possibly a cap that keeps the rings on the pole. Below a
+    cap the rings start lower than in the official scenes, where they may start inside it.
     """
 
     length: Length = 2.0

@@ -7,6 +7,7 @@ import itertools
 import math
 import re
 from collections import Counter
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -116,9 +117,36 @@ def test_scenery_changes_neither_motion_nor_camera_nor_looks(scenario: Scenario)
         assert full.bodies[: len(bare.bodies)] == bare.bodies
         assert full.camera == bare.camera and full.pushes == bare.pushes
         assert full.physics_digest() == bare.physics_digest()
-        more = draw(scenario, index, 2, 1)
-        by_name = {thing.name: thing for thing in full.bodies}
-        assert by_name["distractor_0"].shape == body(more, "distractor_0").shape
+
+
+def props(scene: Scene, kind: str) -> list[tuple[object, ...]]:
+    """Return what is drawn of each prop of a kind; its place depends on the others."""
+    return [(b.shape, b.scale, b.look) for b in scene.bodies if b.name.startswith(kind)]
+
+
+def test_distractors_and_occluders_have_streams_of_their_own(scenario: Scenario) -> None:
+    same = 0
+    for index in TRIALS:
+        scenes = [draw(scenario, index, count, 1) for count in range(4)]
+        assert all(props(scene, "occluder") == props(scenes[0], "occluder") for scene in scenes)
+        longest = props(scenes[3], "distractor")
+        for count, scene in enumerate(scenes):
+            assert props(scene, "distractor") == longest[:count]
+        more = draw(scenario, index, 1, 3)
+        assert props(more, "distractor") == longest[:1]
+        params = scenario.params()
+        rule = dataclasses.replace(
+            params.scenery,
+            distractors=1,
+            occluders=1,
+            distractor_props=("full",),
+            occluder_props=("full",),
+        )
+        params = dataclasses.replace(params, scenery=rule)
+        alike = scenario.sample(params, trial_seed("test", scenario.name, "train", index))
+        one, other = body(alike, "distractor_0"), body(alike, "occluder_0")
+        same += (one.shape, one.look) == (other.shape, other.look)
+    assert same < 4, "the same prop is drawn for both now and then, not always"
 
 
 def test_scenery_is_behind_and_in_front(scenario: Scenario) -> None:
@@ -140,6 +168,7 @@ def test_role_colors(scenario: Scenario) -> None:
     assert painted == with_role_colors(scene)
     assert thing(painted, scene.roles.agent).look.color == RED
     assert thing(painted, scene.roles.patient).look.color == YELLOW
+    assert (RED, YELLOW) == ((1.0, 0.0, 0.0), (1.0, 1.0, 0.0))
     assert painted.physics_digest() == scene.physics_digest()
     for name in scene.names():
         before, after = thing(scene, name).look, thing(painted, name).look
@@ -210,6 +239,129 @@ def test_camera_follows_the_official_rule() -> None:
         assert math.hypot(x, y) == pytest.approx(2 * math.sqrt(2))
         assert 45 <= math.degrees(math.atan2(y, x)) <= 135
         assert 1.5 <= z <= 2.5 and camera.target == (0, 0, 0.7)
+    for mirror, x in ((0.0, 1.0), (1.0, -1.0)):
+        rule = CameraRule((1.0, 1.0), (0.0, 0.0), (1.0, 1.0), mirror)
+        camera = place_camera(np.random.default_rng(0), rule, 0.5, ())
+        assert camera.position == pytest.approx((x, 1.0, 1.0))
+        assert math.degrees(camera.fov) == pytest.approx(55.0)
+
+
+def speed(scene: Scene) -> float:
+    """Return the speed that the push gives to the probe, m/s."""
+    (push,) = scene.pushes
+    return math.hypot(*push.impulse) / body(scene, push.body).mass
+
+
+def heading(scene: Scene) -> float:
+    x, y, _ = scene.pushes[0].impulse
+    return math.degrees(math.atan2(y, x))
+
+
+def mass_of(name: str) -> Callable[[Scene], float]:
+    return lambda scene: body(scene, name).mass
+
+
+def size_of(name: str, axis: int = 0) -> Callable[[Scene], float]:
+    return lambda scene: body(scene, name).scale[axis]
+
+
+def place_of(name: str, axis: int) -> Callable[[Scene], float]:
+    return lambda scene: body(scene, name).position[axis]
+
+
+def density_of(name: str) -> Callable[[Scene], float]:
+    """Return the mass of a cube with sides of 0.5 m of the body's density."""
+    return lambda scene: body(scene, name).mass / math.prod(body(scene, name).scale) / 8
+
+
+DRAWN: dict[str, list[tuple[Callable[[Scene], float], float, float]]] = {
+    "dominoes": [
+        (speed, 0.75, 0.75),
+        (lambda scene: scene.pushes[0].frame, 0, 14),
+        (lambda scene: scene.pushes[0].point[2], 0.4, 0.4),  # type: ignore[index]
+        (mass_of("target"), 2, 2),
+        (place_of("probe", 0), -0.75, -0.75),
+        # Half a target, and 0.1 m of gap, before a zone of 0.5 m.
+        (place_of("zone", 0), 0.75 + 0.1 + 0.5, 0.75 + 0.1 + 0.5),
+    ],
+    "support": [
+        (speed, 1, 8),
+        (density_of("target"), 2, 2),
+        (density_of("block_0"), 2, 2),
+        (size_of("block_0"), 0.4, 0.5),
+        (lambda scene: scene.pushes[0].frame, 15, 15),
+    ],
+    "collide": [
+        (speed, 5, 10),
+        (heading, -8, 8),
+        (mass_of("probe"), 2, 2),
+        (size_of("probe"), 0.35, 0.35),
+        (place_of("zone", 0), 2, 2),
+        (place_of("zone", 1), -0.35, 0.35),
+        (lambda scene: body(scene, "probe").contact.static_friction, 0.4, 0.4),
+        (lambda scene: scene.camera.position[2], 0.75, 2.0),
+    ],
+    "contain": [
+        (speed, 4, 9),
+        (density_of("base"), 2, 3),
+        (size_of("base"), 0.5, 1.0),
+        # A quarter of the mass of 2 kg.
+        (density_of("target"), 0.5, 0.5),
+        (size_of("target"), 0.2, 0.4),
+        (mass_of("probe"), 3, 3),
+    ],
+    "drop": [
+        (mass_of("target"), 2, 7),
+        (mass_of("lower"), 10, 11),
+        (size_of("target"), 0.1, 0.4),
+        (size_of("lower"), 0.3, 1.0),
+        (place_of("target", 0), -0.2, 0.2),
+        (place_of("target", 1), -0.2, 0.2),
+    ],
+    "link": [
+        (speed, 1, 7),
+        (mass_of("probe"), 12, 12),
+        (density_of("base"), 4, 4),
+        (density_of("target"), 0.5, 0.5),
+        # A cylinder of 4 kg for the cube around it.
+        (density_of("attachment"), math.pi, math.pi),
+    ],
+    "roll": [
+        (place_of("ramp", 0), -0.625, -0.625),
+        (place_of("zone", 0), 1.25, 1.25),
+        (mass_of("target"), 2, 2),
+    ],
+    "drape": [
+        (lambda scene: scene.cloths[0].stretch, 0, 1),
+        (lambda scene: scene.cloths[0].bend, 0, 1),
+        (lambda scene: scene.cloths[0].tether, 0, 1),
+        (lambda scene: scene.cloths[0].mass, 0.5, 0.5),
+        (lambda scene: scene.cloths[0].position[0], -0.2, 0.2),
+        (lambda scene: scene.cloths[0].position[1], -0.6, -0.4),
+        (lambda scene: scene.cloths[0].position[2], 1.3, 1.5),
+        (lambda scene: abs(scene.camera.position[0]), 0, 2.5 * math.sqrt(2) * math.sqrt(0.5)),
+    ],
+}
+"""What a scene's default parameters draw, from the smallest to the largest value of the official
+rules (docs/official-system.md, sections 2 and 3)."""
+
+
+def test_values_are_drawn_from_the_whole_of_their_official_range(scenario: Scenario) -> None:
+    params = scenario.params()
+    seeds = [trial_seed("range", scenario.name, "train", index) for index in range(60)]
+    scenes = [scenario.sample(params, seed) for seed in seeds]
+    for number, (value, low, high) in enumerate(DRAWN[scenario.name]):
+        values = [value(scene) for scene in scenes]
+        margin = 0.15 * (high - low)
+        assert low - 1e-6 <= min(values) <= low + margin + 1e-6, (number, min(values))
+        assert high - margin - 1e-6 <= max(values) <= high + 1e-6, (number, max(values))
+
+
+def test_floor_of_the_bright_room_is_4_to_5_mm_higher() -> None:
+    for room, low, high in (("box", 0.0, 0.0), ("bright", 0.004, 0.005), ("empty", 0.0, 0.0)):
+        scene = sample_scene("collide", 3, dataclasses.replace(Collide(), room=room))
+        assert low <= scene.floor <= high
+        assert body(scene, "zone").position[2] == scene.floor == body(scene, "target").position[2]
 
 
 def still_row(**changed: object) -> Dominoes:

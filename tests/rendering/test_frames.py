@@ -1,11 +1,13 @@
-"""Whole frames: repeatable, independent of each other, with plausible colours."""
+"""Whole frames: repeatable, independent of each other, in every room, with plausible colours."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +24,9 @@ from physion.rendering.renderer import (
 )
 from physion.rendering.rooms import rooms
 from physion.rendering.textures.atlas import FINISHES, SIZE, build_atlas, finish
-from physion.scenes.scene import BodyEvent, Camera, Look
+from physion.scenes.sampling.sample import parse_presets
+from physion.scenes.scene import FLOORS, BodyEvent, Camera, Look
+from physion.scenes.tdw.read_logs import read_scenes
 from support.paths import FIND_TESTS
 from support.rendered_scenes import ALL, body, resting, scene_of, tumbling
 
@@ -112,7 +116,7 @@ def test_a_fresh_process_gives_the_same_bytes() -> None:
     scene, trajectory = tumbling()
     code = (
         "from support.rendered_scenes import tumbling, ALL\n"
-        "from tests.rendering.test_rendering_frames import digest\n"
+        "from tests.rendering.test_frames import digest\n"
         "from physion.rendering.renderer import Renderer\n"
         "print(digest(Renderer(*tumbling()).render(1, ALL)))"
     )
@@ -227,3 +231,68 @@ def test_errors_name_what_is_wrong() -> None:
         Renderer(dataclasses.replace(scene, room="attic"), trajectory)
     with pytest.raises(UnknownNameError, match="wood_ash"):
         finish("wood_ahs")
+
+
+def test_first_trial_of_every_scenario_shows_agent_and_patient(official: Path) -> None:
+    trials = read_scenes(official / "scenes", limit=1).trials
+    assert len({trial.scene.scenario for trial in trials}) == 8
+    for trial in trials:
+        scene = trial.scene
+        frame = Renderer(scene, resting(scene), 96, 96).render(0, ("color", "depth", "ids"))
+        assert frame.color is not None and frame.depth is not None and frame.ids is not None
+        assert np.isfinite(frame.depth).all(), scene.name
+        assert 30 < frame.color.mean() < 190, scene.name
+        assert (frame.color.min(-1) >= 253).mean() < 0.02, scene.name
+        for role in (scene.roles.agent, scene.roles.patient):
+            assert (frame.ids == scene.index(role) + 1).any(), (scene.name, role)
+
+
+PRESET = """
+scenario = "collide"
+[presets.mine]
+about = "In a room of another package."
+params = {room = "red"}
+"""
+PLUG_IN = """
+from dataclasses import replace
+from physion.rendering.rooms import rooms
+empty = rooms.get("empty")
+RED = replace(empty, panels=tuple(replace(p, color=(1.0, 0.0, 0.0)) for p in empty.panels))
+"""
+SHOW = """
+import numpy as np, sys
+from physion.physics.engine import simulate
+from physion.rendering.renderer import PASSES, Renderer
+from physion.scenes.sampling.sample import sample_scene
+scene = sample_scene("collide", 3, preset=f"{sys.argv[1]}:mine")
+frame = Renderer(scene, simulate(scene, frames=2), 32, 32).render(0, PASSES)
+room = frame.color[frame.ids == 0].astype(float)
+print(scene.room, scene.floor, room[:, 0].mean() > 3 * room[:, 1].mean())
+"""
+
+
+def test_the_rooms_of_presets_are_those_of_the_renderer() -> None:
+    assert set(FLOORS) == set(rooms.names())
+
+
+def test_an_unknown_room_is_refused_when_the_preset_is_read() -> None:
+    with pytest.raises(BadInputError, match="'red'"):
+        parse_presets(PRESET, "my.toml")
+
+
+def test_a_preset_may_use_a_room_of_another_package(tmp_path: Path) -> None:
+    (tmp_path / "own_room.py").write_text(PLUG_IN)
+    (tmp_path / "own-1.0.dist-info").mkdir()
+    (tmp_path / "own-1.0.dist-info" / "METADATA").write_text("Name: own\nVersion: 1.0\n")
+    points = "[physion.rooms]\nred = own_room:RED\n"
+    (tmp_path / "own-1.0.dist-info" / "entry_points.txt").write_text(points)
+    (tmp_path / "mine.toml").write_text(PRESET)
+    path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
+    done = subprocess.run(
+        [sys.executable, "-c", SHOW, str(tmp_path / "mine.toml")],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout.split() == ["red", "0.0", "True"], done.stderr

@@ -1,4 +1,4 @@
-"""Depth, ids, normals and flow of whole frames against ray casting and known motion."""
+"""Camera, depth, ids, normals and flow against numbers by hand, ray casting and known motion."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from physion.core.errors import BadInputError
 from physion.numerics.rotations import rotation_matrix
-from physion.rendering.camera import View
+from physion.rendering.camera import View, axes, intrinsics, projection_matrix, view_matrix
 from physion.rendering.rasterizer import (
     NOTHING,
     SAMPLES,
@@ -22,7 +23,6 @@ from physion.rendering.renderer import Frame, Renderer
 from physion.scenes.scene import Camera, Cloth, Scene
 from physion.scenes.shapes.primitives import shape, shapes
 from support.rendered_scenes import (
-    CAMERA,
     body,
     flat_sheet,
     resting,
@@ -30,6 +30,71 @@ from support.rendered_scenes import (
     trajectory_of,
     tumbling,
 )
+
+# At (0, -2, 0.5), looking along +y; 90 degrees, so that the focal length is half the height.
+CAMERA = Camera((0.0, -2.0, 0.5), (0.0, 3.0, 0.5), fov=math.pi / 2, near=0.1, far=100.0)
+VIEW = View(CAMERA, 320, 200)
+
+
+def test_axes_are_right_down_forward() -> None:
+    np.testing.assert_allclose(axes(CAMERA), [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-15)
+
+
+def test_view_matrix() -> None:
+    expected = [[1, 0, 0, 0], [0, 0, -1, 0.5], [0, 1, 0, 2], [0, 0, 0, 1]]
+    np.testing.assert_allclose(view_matrix(CAMERA), expected, atol=1e-15)
+
+
+def test_intrinsics() -> None:
+    expected = [[100, 0, 160], [0, 100, 100], [0, 0, 1]]
+    np.testing.assert_allclose(intrinsics(CAMERA, 320, 200), expected, rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("point", "pixel", "depth"),
+    [
+        ((0.0, 0.0, 0.5), (160.0, 100.0), 2.0),
+        ((1.0, 0.0, 0.5), (210.0, 100.0), 2.0),
+        ((0.0, 0.0, 1.5), (160.0, 50.0), 2.0),
+        ((-3.2, 0.0, -1.5), (0.0, 200.0), 2.0),
+        ((0.0, 8.0, 2.5), (160.0, 80.0), 10.0),
+    ],
+)
+def test_project(point: tuple[float, ...], pixel: tuple[float, ...], depth: float) -> None:
+    result, result_depth = VIEW.project(point)
+    np.testing.assert_allclose(result, pixel, atol=1e-9)
+    assert result_depth == pytest.approx(depth)
+    np.testing.assert_allclose(VIEW.unproject(pixel, depth), point, atol=1e-12)
+
+
+def test_behind_the_camera_is_a_negative_depth() -> None:
+    assert VIEW.project((0.0, -3.0, 0.5))[1] == pytest.approx(-1.0)
+
+
+def test_projection_matrix_agrees_with_pixels() -> None:
+    camera = Camera((1.3, -2.0, 1.7), (0.1, 0.2, 0.3), fov=0.9, near=0.2, far=30.0)
+    points = np.random.default_rng(0).uniform(-1, 1, (20, 3))
+    seen = np.concatenate([points, np.ones((20, 1))], axis=1) @ view_matrix(camera).T
+    clip = seen @ projection_matrix(camera, 320, 200).T
+    ndc = clip[:, :3] / clip[:, 3:]
+    pixels = np.stack([(ndc[:, 0] + 1) * 160, (1 - ndc[:, 1]) * 100], axis=1)
+    result, depth = View(camera, 320, 200).project(points)
+    np.testing.assert_allclose(pixels, result, atol=1e-9)
+    near_far = np.array([[0, 0, 0.2, 1], [0, 0, 30.0, 1]]) @ projection_matrix(camera, 320, 200).T
+    np.testing.assert_allclose(near_far[:, 2] / near_far[:, 3], [-1, 1], atol=1e-9)
+    np.testing.assert_allclose(clip[:, 3], depth)
+
+
+def test_straight_down_has_y_upright() -> None:
+    pixel, _ = View(Camera((0, 0, 3), (0, 0, 0)), 100, 100).project((0.0, 0.5, 0.0))
+    assert pixel[0] == pytest.approx(50.0)
+    assert pixel[1] < 50.0
+
+
+def test_a_camera_at_its_own_target_is_an_error() -> None:
+    with pytest.raises(BadInputError, match="same point"):
+        axes(Camera((1.0, 1.0, 1.0), (1.0, 1.0, 1.0)))
+
 
 EXACT = ("depth", "normals", "ids", "flow")
 Array = NDArray[np.float64]
@@ -99,6 +164,25 @@ def test_sphere_depth_silhouette_and_normals() -> None:
     normal = (eye + ray * expected[..., None] - center) / 0.4
     angle = np.degrees(np.arccos(np.clip((normal * frame.normals).sum(-1)[both], -1, 1)))
     assert angle.max() < 1.0
+
+
+def test_normals_of_a_stretched_and_turned_ball_are_those_of_an_ellipsoid() -> None:
+    """The gradient of x²/a² + y²/b² + z²/c² in the body's axes."""
+    half, turn = np.array([0.5, 0.25, 0.35]), (0.8, 0.36, 0.0, 0.48)
+    scene = scene_of(
+        body("ball", "test:fine_sphere", (0.1, 0.0, 0.2), scale=tuple(2 * half), rotation=turn)
+    )
+    frame = render(scene)
+    assert frame.normals is not None
+    matrix = rotation_matrix(np.array(turn))
+    center = np.array([0.1, 0.0, 0.2]) + matrix @ [0, 0, half[2]]
+    own = (seen_points(scene, frame) - center) @ matrix
+    normal = (own / half**2) @ matrix.T
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    mask = inner(frame.ids == 1) & (frame.ids == 1)
+    assert mask.sum() > 1500
+    angle = np.degrees(np.arccos(np.clip((normal * frame.normals).sum(-1)[mask], -1, 1)))
+    assert np.quantile(angle, 0.99) < 1.5
 
 
 def test_box_silhouette_and_normals() -> None:
@@ -231,7 +315,7 @@ def test_every_shape_is_closed(name: str) -> None:
         pictures.append(inverse)
     assert (pictures[0] > 0).sum() > 2000
     np.testing.assert_allclose(pictures[0], pictures[1], atol=1e-6)
-    scene = scene_of(body("it", name), camera=CAMERA)
+    scene = scene_of(body("it", name))
     frame = render(scene)
     assert frame.ids is not None and frame.normals is not None
     assert (frame.ids == 1).sum() > 1000
