@@ -1,6 +1,7 @@
 """Plant defects that make results silently wrong, one at a time; print which tests notice them.
 
-    python benchmarks/planted.py [--room ROOM ...] [--only TEXT] [--missed] [--check | --table]
+    python benchmarks/planted.py [--room ROOM ...] [--only TEXT] [--everyday] [--missed]
+    python benchmarks/planted.py --check | --table
 
 Each file `planted/ROOM.toml` beside this script lists the defects of one room:
 
@@ -18,7 +19,8 @@ also without the defect notices nothing: the result is then `invalid` and names 
 
 Results are kept, one line per defect, in `results/planted.jsonl`. A defect is run again if its
 entry has changed, or with --missed if neither everyday nor slow tests noticed it. Interrupt at any
-time. --check only compares the texts with the code. --table only prints the results.
+time. With --everyday only the first stage is run, and what it misses is not recorded. --check only
+compares the texts with the code. --table only prints the results.
 """
 
 from __future__ import annotations
@@ -48,7 +50,10 @@ RESULTS = Path(__file__).parent / "results" / "planted.jsonl"
 COPIED = ("src", "tests", "docs", "examples", "benchmarks", "pyproject.toml", "README.md")
 DIGESTS = "tests/trials/test_same_bytes.py"
 GOLDEN = f"{DIGESTS}::test_trials_are_those_of_this_version"
-STAGES = ("everyday", "slow", "digests")
+OFFICIAL = {"PHYSION_OFFICIAL": str(ROOT.parent / "shared" / "official")}
+"""Where tests look for the data of the study; by default next to the checkout, not to its copy."""
+STAGES = {"everyday": "not slow and not alone", "slow": "slow", "digests": "not alone"}
+"""Tests of each stage, by their marks."""
 MISSED = ("digests", "not noticed", "invalid")
 FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
 TIME_LIMIT = 1800
@@ -126,7 +131,7 @@ def run_tests(folder: Path, tests: Sequence[str], marks: str) -> tuple[int, str]
     """Run tests in a copy until one fails; return pytest's exit code and the failing test."""
     command = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=no", "-p", "no:cacheprovider"]
     command += ["-m", marks, *tests] + ([] if DIGESTS in tests[0] else ["--ignore", DIGESTS])
-    settings = {**os.environ, "PYTHONPATH": str(folder / "src"), "OMP_NUM_THREADS": "1"}
+    settings = {**OFFICIAL, **os.environ, "PYTHONPATH": str(folder / "src"), "OMP_NUM_THREADS": "1"}
     try:
         done = subprocess.run(
             command, cwd=folder, env=settings, capture_output=True, text=True, timeout=TIME_LIMIT
@@ -139,7 +144,7 @@ def run_tests(folder: Path, tests: Sequence[str], marks: str) -> tuple[int, str]
     return done.returncode, failed[1] if failed else ""
 
 
-def try_defect(defect: Defect) -> dict[str, Any]:
+def try_defect(defect: Defect, stages: Sequence[str]) -> dict[str, Any]:
     """Return which stage notices the defect, and the test that does."""
     started = time.monotonic()
     noticed, by = "not noticed", ""
@@ -151,10 +156,9 @@ def try_defect(defect: Defect) -> dict[str, Any]:
         # A new file, since the one in the copy may be a hard link.
         file.unlink()
         file.write_text(defect.planted(), encoding="utf-8")
-        marks = ("not slow and not alone", "slow", "not alone")
-        for stage, mark in zip(STAGES, marks, strict=True):
+        for stage in stages:
             tests = defect.tests if stage != "digests" else (GOLDEN,)
-            code, by = run_tests(folder, tests, mark)
+            code, by = run_tests(folder, tests, STAGES[stage])
             if code not in (ALL_PASSED, NONE_FOUND):
                 noticed = stage
                 break
@@ -189,6 +193,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--room", nargs="+", help="only defects of these rooms")
     parser.add_argument("--only", default="", help="only defects whose name contains this")
+    parser.add_argument("--everyday", action="store_true", help="run only the everyday tests")
     parser.add_argument("--missed", action="store_true", help="run those again that were missed")
     parser.add_argument("--check", action="store_true", help="only compare texts with the code")
     parser.add_argument("--table", action="store_true", help="only print the results")
@@ -208,10 +213,11 @@ def main() -> None:
         old = results.get(defect.key)
         if old and not (options.missed and old["noticed"] in MISSED):
             continue
-        result = try_defect(defect)
-        results[defect.key] = result
-        with RESULTS.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(result) + "\n")
+        result = try_defect(defect, list(STAGES)[:1] if options.everyday else list(STAGES))
+        if not (options.everyday and result["noticed"] in MISSED):
+            results[defect.key] = result
+            with RESULTS.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(result) + "\n")
         where = f"{number}/{len(defects)} {defect.room}/{defect.name}"
         print(f"{where}: {result['noticed']} {result['by']} ({result['seconds']} s)", flush=True)
     print_table(defects, results)

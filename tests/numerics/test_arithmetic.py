@@ -165,7 +165,7 @@ def test_normal_numbers_have_the_moments_and_tails_of_their_distribution() -> No
     assert standard_normal(np.random.default_rng(4), 0).shape == (0,)
 
 
-def test_the_inverse_transform_is_that_of_numpy() -> None:
+def test_the_inverse_transform_matches_numpy() -> None:
     picture = RNG.normal(size=(64, 64))
     spectrum = np.fft.rfft2(picture)
     assert inverse_real_transform(spectrum) == pytest.approx(picture, abs=1e-12)

@@ -107,7 +107,7 @@ def test_a_push_moves_and_spins_and_the_spin_is_capped(name: str) -> None:
 def test_a_push_turns_a_turned_body_by_the_torque_over_its_inertia(name: str) -> None:
     """w = R I⁻¹ Rᵀ (r x J), with I of a box along its own axes."""
     turn = Rotation.from_rotvec([0.5, -0.8, 1.1])
-    size, mass, impulse = np.array([0.2, 0.5, 0.9]), 2.0, np.array([0.3, -0.2, 0.4])
+    size, mass, impulse = np.array([0.2, 0.5, 0.9]), 2.0, np.array([0.03, -0.02, 0.04])
     center, arm = np.array([0.0, 0.0, 5.0]), np.array([0.2, 0.1, -0.3])
     x, y, z, w = turn.as_quat()
     box = Body(
@@ -124,7 +124,7 @@ def test_a_push_turns_a_turned_body_by_the_torque_over_its_inertia(name: str) ->
     squares = size**2
     own = turn.inv().apply(np.cross(arm, impulse)) / (mass / 12 * (squares.sum() - squares))
     # MuJoCo lets the spin's direction change within the step.
-    np.testing.assert_allclose(path.angular_velocities[0, 0], turn.apply(own), rtol=0.02, atol=2e-3)
+    np.testing.assert_allclose(path.angular_velocities[0, 0], turn.apply(own), rtol=0.01, atol=3e-4)
     np.testing.assert_allclose(
         path.velocities[0, 0], impulse / mass - [0, 0, G * 0.01], rtol=1e-3, atol=1e-5
     )

@@ -271,7 +271,7 @@ print(scene.room, scene.floor, room[:, 0].mean() > 3 * room[:, 1].mean())
 """
 
 
-def test_the_rooms_of_presets_are_those_of_the_renderer() -> None:
+def test_the_rooms_of_presets_match_the_renderer() -> None:
     assert set(FLOORS) == set(rooms.names())
 
 

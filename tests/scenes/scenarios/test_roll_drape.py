@@ -326,7 +326,7 @@ def test_natural_sizes_are_python_floats() -> None:
     assert {type(side) for one in scene.bodies for side in one.scale} == {float}
 
 
-def test_cloth_over_the_zone_touches_it_and_cloth_beside_it_does_not() -> None:
+def test_cloth_over_the_zone_touches_it_and_cloth_next_to_it_does_not() -> None:
     low = drape.AnchorRule(height=0.05, height_jitter=0.0, taller=0.0, extra=0.0)
     near = drape.ClothRule(size=(0.8, 0.8), x=(0.0, 0.0), y=(0.1, 0.1), height=(0.6, 0.6))
     params = drape.DrapeParameters(

@@ -211,7 +211,7 @@ REST = [
 
 
 @pytest.mark.parametrize(("name", "lying_on", "recorded"), REST)
-def test_pivot_height_at_rest_is_that_of_official_trials(
+def test_pivot_height_at_rest_matches_official_trials(
     name: str, lying_on: str, recorded: float
 ) -> None:
     """Height of the pivot of official objects at rest, in units of the scale."""
