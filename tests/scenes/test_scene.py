@@ -187,12 +187,3 @@ def test_too_many_bodies_are_refused_at_once(count: int) -> None:
     bodies = tuple(Body(f"b{i}", "cube", (0.0, 0.0, 0.0)) for i in range(10_001))
     with pytest.raises(BadSceneError, match="'many' has 10001 bodies and cloths, more than 10000"):
         Scene("many", "drop", bodies, Roles("b0", "b1"), Camera((1.0, 0.0, 0.0)))
-
-
-def test_events_of_many_bodies_take_a_moment() -> None:
-    bodies = tuple(Body(f"b{i}", "cube", (0.0, 0.0, 0.0)) for i in range(3000))
-    events = tuple(BodyEvent(1, body.name, "appear") for body in bodies[2:])
-    start = time.process_time()
-    scene = Scene("many", "drop", bodies, Roles("b0", "b1"), Camera((1.0, 0.0, 0.0)), events=events)
-    assert scene.present(0) == (True, True, *[False] * 2998) and all(scene.present(1))
-    assert time.process_time() - start < 5

@@ -293,11 +293,11 @@ BAD = {
     "bad about": (OTHER + "about = 3", "presets.mine.about must be a text, not 3"),
     "bad published": (
         OTHER + 'published = { trials = "a", contact = 0, frames = 151 }',
-        "preset 'mine': published: trials must be a number (0 to 1e+06), not 'a'",
+        "presets.mine.published.trials must be a whole number, not 'a'",
     ),
     "half published": (
         OTHER + "published = { trials = 3 }",
-        "preset 'mine': published lacks contact, frames",
+        "presets.mine.published: missing 'contact', 'frames'",
     ),
     "published is no table": (
         OTHER + "published = 3",

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
@@ -28,12 +28,11 @@ from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.seeds import named_seed
 from physion.core.settings import parse_toml, read_settings
 from physion.scenes.sampling.build import scenarios
-from physion.scenes.sampling.parameters import Quantity, check_params, check_together, read_params
+from physion.scenes.sampling.parameters import check_params, check_together, read_params
 from physion.scenes.scene import Scene
 
 DEFAULT, FAMILIARIZATION, DEBUG = "default", "familiarization", "debug"
 """Names of presets that every scenario of this package has besides the published ones."""
-Trials = Annotated[int, Quantity("", 0, 1_000_000)]
 
 
 @dataclass(frozen=True)
@@ -45,12 +44,12 @@ class Published:
     - ``readout_trials``, ``readout_contact``: the same for the readout set.
     """
 
-    trials: Trials
-    contact: Trials
-    frames: Annotated[float, Quantity("frames", 0.0, 10000.0)]
-    tested: Trials = 0
-    readout_trials: Trials = 0
-    readout_contact: Trials = 0
+    trials: int
+    contact: int
+    frames: float
+    tested: int = 0
+    readout_trials: int = 0
+    readout_contact: int = 0
 
 
 @dataclass(frozen=True)
@@ -151,11 +150,8 @@ def parse_presets(text: str, where: str, *, own: bool = True) -> Mapping[str, Pr
             )
         params = read_params(kind, entry.params, here, base)
         check_together(params, here)
-        published = None
-        if entry.published is not None:
-            published = _published(entry.published, here)
         presets[name] = Preset(
-            name, file.scenario, params, entry.about, entry.official, entry.seed, published
+            name, file.scenario, params, entry.about, entry.official, entry.seed, entry.published
         )
     return presets
 
@@ -168,7 +164,7 @@ class _PresetEntry:
     based_on: str | None = None
     official: str | None = None
     seed: int | None = None
-    published: Mapping[str, Any] | None = None
+    published: Published | None = None
     params: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -179,15 +175,6 @@ class _PresetFile:
     scenario: str
     shared: Mapping[str, Any] = field(default_factory=dict)
     presets: Mapping[str, _PresetEntry] = field(default_factory=dict)
-
-
-def _published(table: Mapping[str, Any], here: str) -> Published:
-    missing = [key for key in ("trials", "contact", "frames") if key not in table]
-    if missing:
-        raise BadInputError(f"{here}: published lacks {', '.join(missing)}")
-    read = read_params(Published, table, f"{here}: published", Published(0, 0, 0.0))
-    assert isinstance(read, Published)
-    return read
 
 
 def _from_file(path: Path, name: str, scenario: str) -> Preset:

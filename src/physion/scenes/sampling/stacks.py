@@ -372,7 +372,7 @@ class StandParameters:
     - ``stack``: the bodies on or in it, from below. ``choice``: indices of those that may be the
       agent (0 is the lowest), all equally likely.
 
-    Masses of stand and stack are those of a cube with sides of 0.5 m (`StackRule`), and a quarter
+    Masses of stand and stack are for a cube with sides of 0.5 m (`StackRule`), and a quarter
     of it for the stack.
     """
 
