@@ -97,7 +97,8 @@ def any_shape(request: pytest.FixtureRequest) -> Shape:
     return shape(request.param)
 
 
-def test_unknown_shape_error_has_closest_names() -> None:
+def test_official_shapes_are_registered_and_others_get_the_closest_names() -> None:
+    assert set(BOUNDS) == set(NAMES)
     with pytest.raises(UnknownNameError, match="torus"):
         shape("tours")
 
@@ -250,8 +251,11 @@ def test_props_are_listed_once() -> None:
 
 @pytest.mark.parametrize("name", PROPS)
 def test_prop_fills_the_unit_box_and_is_closed(name: str) -> None:
-    prop = shape(name)
-    assert prop.name == name
+    prop, size = shape(name), NATURAL_SIZES[name.removeprefix(PREFIX)]
+    assert isinstance(prop, PropShape) and prop.name == name
+    assert prop.modelled_size == pytest.approx(size, rel=0.01)
+    assert min(size) > 0.01 and max(size) < 3.0, "a thing that one person can carry"
+    assert len(prop.mesh.faces) <= 2500, "cheap to draw"
     assert prop.bounds == pytest.approx(np.array([[-0.5, -0.5, 0], [0.5, 0.5, 1]]))
     solid = trimesh.Trimesh(prop.mesh.vertices, prop.mesh.faces, process=False)
     assert solid.is_watertight and solid.is_winding_consistent
@@ -413,6 +417,11 @@ def test_bad_bounds_are_one_clear_error(tmp_path: Path, text: str) -> None:
     (tmp_path / "b.json").write_text(text)
     with pytest.raises(BadInputError, match=r"b\.json"):
         read_model_bounds(tmp_path / "b.json")
+
+
+def test_missing_file_is_a_clear_error(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="absent"):
+        read_model_bounds(tmp_path / "absent.json")
 
 
 def test_official_bounds_are_read_and_agree_with_our_primitives(official: Path) -> None:
