@@ -400,7 +400,10 @@ def test_the_engine_lays_cloth_over_bodies_and_continues_from_a_state() -> None:
     # A ball of radius 0.25 stands so that its lowest particle is the floor gap above the floor.
     assert 0.0 <= whole.positions[0, 0, 2] < ClothSettings().floor_gap
     assert len(whole.contacts.frames_of(0, 1))
-    later = simulate(scene, start=whole.state(40), frames=21)
+    state, vertices = whole.state(40), whole.cloth_vertices.astype(np.float64)
+    assert np.array_equal(state.cloth_velocities, (vertices[40] - vertices[39]) / 0.01)
+    assert not whole.state(0).cloth_velocities.any(), "it starts from rest"
+    later = simulate(scene, start=state, frames=21)
     assert np.abs(later.cloth_vertices[0] - whole.cloth_vertices[40]).max() < 1e-6
     assert np.abs(later.cloth_vertices[20] - whole.cloth_vertices[60]).max() < 0.05
 

@@ -137,6 +137,71 @@ def test_rotations_are_converted_to_our_axes(
         np.testing.assert_allclose(ours, vector(xyz(*after)), atol=1e-12)
 
 
+ANGLE = {"$type": "rotate_object_by", "id": 2, "angle": 90}
+HALF = math.sqrt(0.5)
+
+
+@pytest.mark.parametrize(
+    ("commands", "about"),
+    [
+        # The same quarter turn about the upright, as a quaternion and as an angle: in our axes
+        # Unity's rotations have the opposite sense.
+        ([{"$type": "rotate_object_to", "id": 2, "rotation": xyz(0, HALF, 0) | {"w": HALF}}], "Z"),
+        ([ANGLE | {"axis": "yaw"}], "Z"),
+        # About the world's axes the later rotation comes from the left, about its own from the
+        # right.
+        ([ANGLE | {"axis": "pitch"}, ANGLE | {"axis": "yaw"}], "ZX"),
+        ([ANGLE | {"axis": "pitch"}, ANGLE | {"axis": "yaw", "is_world": False}], "XZ"),
+        ([ANGLE | {"axis": "roll"}, ANGLE | {"axis": "pitch"}], "XY"),
+    ],
+)
+def test_objects_are_turned_as_the_log_says(
+    tmp_path: Path, commands: list[Command], about: str
+) -> None:
+    write_log(tmp_path / "config", [[[*two_cubes(), *commands]]])
+    w, x, y, z = only_scene(tmp_path).bodies[1].rotation
+    expected = np.eye(3)
+    for axis in about:
+        expected = expected @ Rotation.from_euler(axis, -90, degrees=True).as_matrix()
+    np.testing.assert_allclose(Rotation.from_quat([x, y, z, w]).as_matrix(), expected, atol=1e-12)
+
+
+def test_library_models_become_props_that_fill_their_bounds(tmp_path: Path) -> None:
+    """A quarter turn about the upright takes our y to x and x to -y, also for the pivot."""
+    faces = {"left": (0, 2, 1), "right": (1, 2, 1), "front": (0.5, 2, 3), "back": (0.5, 2, -1)}
+    faces |= {"top": (0.5, 3.5, 1), "bottom": (0.5, 0.5, 1)}
+    bounds = {"urn": {"bounds": {side: xyz(*at) for side, at in faces.items()}}}
+    (tmp_path / "model_bounds.json").write_text(json.dumps({"models": bounds}))
+    urn = thing(3, "urn", xyz(1, 2, 3), rotation=xyz(0, 90, 0), scale=xyz(2, 2, 2))
+    urn[0]["category"] = "vase"
+    write_log(tmp_path / "config", [[[*two_cubes(), *urn]]])
+    body = only_scene(tmp_path).bodies[2]
+    assert (body.shape, body.scale) == ("prop:vase", (2, 8, 6))
+    # The centre of its bottom face is at (0.5, 1, 0.5) of the model, twice as large.
+    assert body.position == pytest.approx((1 + 2, 3 - 1, 2 + 1))
+
+
+def test_cloth_has_its_size_and_stiffnesses(tmp_path: Path) -> None:
+    """The sheet of the official cloth is 2 m wide at scale 1."""
+    cloth = [
+        *thing(2, "cloth_square", xyz(0.1, 1.5, -0.4), scale=xyz(0.8, 1, 0.6)),
+        {
+            "$type": "set_flex_cloth_actor",
+            "id": 2,
+            "stretch_stiffness": 0.1,
+            "bend_stiffness": 0.2,
+            "tether_stiffness": 0.3,
+        },
+        {"$type": "set_flex_object_mass", "id": 2, "mass": 0.7},
+    ]
+    write_log(tmp_path / "config", [[[*thing(1, "cube", xyz(0, 0, 0)), *cloth]]])
+    scene = only_scene(tmp_path)
+    (sheet,) = scene.cloths
+    assert scene.roles.agent == sheet.name and sheet.position == (0.1, -0.4, 1.5)
+    assert sheet.size == pytest.approx((1.6, 1.2, 0.0)) and sheet.mass == 0.7
+    assert (sheet.stretch, sheet.bend, sheet.tether) == (0.1, 0.2, 0.3)
+
+
 def test_target_is_the_last_of_its_colour_where_object_two_is_gone(tmp_path: Path) -> None:
     red, blue = (1, 0, 0), (0, 0, 1)
     commands = [
