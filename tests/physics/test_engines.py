@@ -96,7 +96,7 @@ def test_a_push_moves_and_spins_and_the_spin_is_capped(name: str) -> None:
     # J r / I with the arm from the centre of mass, which has fallen for three steps by then, and
     # I = m a² / 6.
     arm = 0.4 + G * 0.01**2 * (1 + 2 + 3)
-    assert path.angular_velocities[3, 0, 1] == pytest.approx(0.6 * arm / (2.0 / 6.0), rel=2e-3)
+    assert path.angular_velocities[3, 0, 1] == pytest.approx(0.6 * arm / (2.0 / 6.0), rel=5e-3)
     hard = replace(push, impulse=(60.0, 0.0, 0.0))
     capped = run(name, scene_of(box, pushes=(hard,)), 6)
     assert np.linalg.norm(capped.angular_velocities[3, 0]) == pytest.approx(7.0, rel=1e-4)

@@ -222,7 +222,7 @@ def test_scenery_does_not_overlap_or_is_an_error() -> None:
                 reach = math.hypot(*one.scale[:2]) + math.hypot(*other.scale[:2])
                 assert math.dist(one.position[:2], other.position[:2]) >= reach / 2
     assert 0 < sum(crowded.values()) < 2 * len(TRIALS)
-    assert all(re.match(r"no room for (distractor|occluder)_\d+ beside \w+: ", c) for c in crowded)
+    assert all(re.match(r"no room for (distractor|occluder)_\d+ next to \w+: ", c) for c in crowded)
 
 
 @pytest.mark.parametrize("key", ["distractors", "occluders"])
