@@ -153,7 +153,7 @@ def cards_page() -> str:
     """Return the cards of the models whose weights come with the package."""
     parts = [
         "# Model cards\n`physion train` writes a card next to the weights of every training. These "
-        "are the cards of the weights that come with the package (`weights=shipped`).\n"
+        "are the cards of the weights that come with the package, the default of these models.\n"
     ]
     cards = [path.read_text(encoding="utf-8") for path in sorted(CARDS.glob("*.md"))]
     # One level lower, below the heading of the page.

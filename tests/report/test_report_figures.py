@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.stats
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -28,10 +29,16 @@ from physion.core.names import SCENARIOS
 from physion.report import html as blocks
 from physion.report import people, scores
 from physion.report.figures import theme
-from physion.report.figures.by_scenario import measure_figure
-from physion.report.figures.by_stimulus import SQUARE, difficulty_figure, scatter_figure
+from physion.report.figures.by_scenario import measure_figure, model_and_people_figure
+from physion.report.figures.by_stimulus import (
+    SQUARE,
+    calibration_figure,
+    difficulty_figure,
+    response_time_figure,
+    scatter_figure,
+)
 from physion.report.figures.theme import make_plots
-from physion.report.figures.training import generalization_figure
+from physion.report.figures.training import generalization_figure, grouped_figure
 from physion.report.html import Picture, number
 from physion.report.inputs import ReportInputs
 from support.paths import ROOT
@@ -181,6 +188,131 @@ def test_thirds_show_what_halves_of_people_reach(make_comparison: Maker) -> None
     place = list(table["people"].notna()).index(True)
     value = table["people"].iloc[place]
     assert any(np.allclose(line.get_xdata(), value) for line in figure.axes[place].lines)
+
+
+# --- marks stand where the table says -----------------------------------------------------------
+
+
+def segments(axis: Axes) -> list[tuple[float, float, float]]:
+    """Height and ends of the horizontal lines of a panel that are no marks, from top to bottom."""
+    lines = [np.asarray(line.get_xydata()) for line in axis.lines if line.get_linestyle() == "-"]
+    flat = [line for line in lines if len(line) == 2 and line[0, 1] == line[1, 1]]
+    return sorted((line[0, 1], line[0, 0], line[1, 0]) for line in flat)
+
+
+def test_intervals_zones_and_written_values_belong_to_their_row(make_comparison: Maker) -> None:
+    table = figure_tables.accuracy_table(make_comparison())
+    figure = measure_figure(table, "accuracy")
+    models = list(table["model"].unique())
+    assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == models
+    for axis, name in zip(figure.axes, ("collide", "drop", MEAN), strict=False):
+        rows = table[table["panel"] == name].set_index("model").loc[models]
+        known = rows[rows["low"].notna()]
+        expected = [
+            (models.index(model), row["low"], row["high"]) for model, row in known.iterrows()
+        ]
+        own = [line for line in segments(axis) if line[0] == int(line[0])]
+        np.testing.assert_allclose(own, expected)
+        words = [text.get_text() for text in axis.texts]
+        assert words == [number(value) for value in rows["value"]]
+        if rows["zone_low"].notna().any():
+            (zone,) = (patch.get_extents() for patch in axis.patches)
+            ends = axis.transData.inverted().transform(zone)[:, 0]
+            np.testing.assert_allclose(ends, rows.iloc[0][["zone_low", "zone_high"]].astype(float))
+
+
+def test_points_of_the_calibration_are_bins_of_their_model(make_comparison: Maker) -> None:
+    table = figure_tables.calibration_table(make_comparison())
+    figure = calibration_figure(table)
+    for axis, model in zip(figure.axes, table["model"].unique(), strict=False):
+        rows = table[(table["model"] == model) & (table["stimuli"] > 0)]
+        bars, points = axis.collections
+        np.testing.assert_allclose(points.get_offsets(), rows[["mean_p", "fraction"]])
+        ends = [np.asarray(bar) for bar in bars.get_segments()]  # type: ignore[attr-defined]
+        np.testing.assert_allclose([bar[:, 1] for bar in ends], rows[["low", "high"]])
+        areas = np.asarray(points.get_sizes()) - 8  # type: ignore[attr-defined]
+        np.testing.assert_allclose(areas / areas.sum(), rows["stimuli"] / rows["stimuli"].sum())
+        assert axis.get_title(loc="left") == f"{model}\nBrier {rows['brier'].iloc[0]:.3f}"
+
+
+def test_marks_of_conditions_stand_in_the_row_of_their_model() -> None:
+    rows = [
+        ("readout", model, group, value, value - 0.02, value + 0.05, 0.7, 9.0, "")
+        for model, values in (("one", (0.5, 0.6)), ("two", (0.7, 0.8)), ("three", (0.3, 0.4)))
+        for group, value in zip(("observed", "full"), values, strict=True)
+    ]
+    table = pd.DataFrame(
+        rows,
+        columns=["panel", "model", "group", "value", "low", "high", "people", "stimuli", "reason"],
+    )
+    axis = grouped_figure(table, "accuracy", 0.5).axes[0]
+    assert [text.get_text() for text in axis.get_yticklabels()] == ["one", "two", "three"]
+    marks = [line for line in axis.lines if line.get_marker() not in ("None", None)]
+    bars = list(axis.collections)
+    for mark, bar, group, shift in zip(
+        marks, bars, ("observed", "full"), (-0.12, 0.12), strict=True
+    ):
+        own = table[table["group"] == group]
+        places = np.arange(3) + shift
+        np.testing.assert_allclose(mark.get_xydata(), np.column_stack([own["value"], places]))
+        ends = np.array(bar.get_segments())  # type: ignore[attr-defined]
+        np.testing.assert_allclose(ends[:, :, 0], own[["low", "high"]])
+        np.testing.assert_allclose(ends[:, 0, 1], places)
+    texts = axis.get_legend().get_texts()  # type: ignore[union-attr]
+    assert [text.get_text() for text in texts] == ["observed", "full", "people"]
+    assert any(np.allclose(line.get_xdata(), 0.7) for line in axis.lines)
+
+
+def test_cells_of_the_generalization_are_of_their_row_and_column() -> None:
+    rows = [
+        ("m", trained, tested, 0.1 * i + 0.01 * j, 0.7)
+        for i, trained in enumerate(("all", "drop", "roll"))
+        for j, tested in enumerate(("drop", "roll"))
+    ]
+    table = pd.DataFrame(rows, columns=["model", "trained", "tested", "difference", "people"])
+    axis = generalization_figure(table).axes[0]
+    found = {text.get_position()[::-1]: text.get_text() for text in axis.texts}
+    assert found[(0, 0)] == "0.00" and found[(2, 1)] == "+0.21" and found[(1, 0)] == "+0.10"
+    assert [text.get_text() for text in axis.get_yticklabels()] == ["all", "drop", "roll"]
+    assert [text.get_text() for text in axis.get_xticklabels()] == ["drop", "roll"]
+    assert axis.images[0].get_array()[1, 1] == pytest.approx(0.11)  # type: ignore[index]
+
+
+def test_parts_of_the_tail_have_their_colour() -> None:
+    """Of 200 people 84 right is below chance by the study's rule only, 20 also when corrected."""
+    rows = pd.DataFrame({"scenario": "drop", "stimulus": [f"s{i}" for i in range(30)],
+                         "accuracy": [0.42, 0.1] + [0.9] * 28, "count": 200})  # fmt: skip
+    axis = difficulty_figure(below_chance_level(rows)).axes[0]
+    found = {
+        round(patch.get_x(), 2): (to_hex(patch.get_facecolor()).upper(), patch.get_height())
+        for patch in axis.patches
+    }
+    palette = theme.LIGHT.palette
+    assert found == {0.9: (palette[0].upper(), 28), 0.4: (palette[4].upper(), 1),
+                     0.1: (palette[5].upper(), 1)}  # fmt: skip
+    assert axis.texts[0].get_text() == "2 of 30\nbelow chance"
+    mean = [line for line in axis.lines if line.get_linestyle() == "--"]
+    assert mean[0].get_xdata()[0] == pytest.approx((0.42 + 0.1 + 28 * 0.9) / 30)  # type: ignore[index]
+
+
+def test_the_line_of_response_times_is_the_least_squares_line() -> None:
+    x, y = np.array([0.2, 0.4, 0.5, 0.9]), np.array([7.0, 7.4, 7.1, 6.5])
+    table = pd.DataFrame({"scenario": "drop", "accuracy": x, "mean_log_rt": y})
+    axis = response_time_figure(table).axes[0]
+    points, line = (np.asarray(drawn.get_xydata()) for drawn in axis.lines)
+    np.testing.assert_allclose(points, np.column_stack([x, y]))
+    slope, level, r, *_ = scipy.stats.linregress(x, y)
+    np.testing.assert_allclose(line, [[0.2, level + 0.2 * slope], [0.9, level + 0.9 * slope]])
+    assert axis.get_title(loc="right") == f"r = {number(r)}"
+
+
+def test_points_of_a_model_against_people_have_the_model_to_the_right() -> None:
+    table = pd.DataFrame({"model": "DPI", "scenario": ["drop", "roll", MEAN],
+                          "accuracy": [0.6, 0.9, 0.75], "people": [0.7, 0.65, 0.675]})  # fmt: skip
+    axis = model_and_people_figure(table).axes[0]
+    points = [np.asarray(line.get_xydata())[0].tolist() for line in axis.lines[1:]]
+    assert points == [[0.6, 0.7], [0.9, 0.65], [0.75, 0.675]]
+    assert "people" in axis.get_ylabel() and "DPI" in axis.get_xlabel()
 
 
 # --- readout and training -----------------------------------------------------------------------

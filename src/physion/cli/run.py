@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from physion.readout.evaluate import Evaluation
     from physion.report.compare import CompareResult
-    from physion.scenes.tdw.read_logs import ImportedTrial
+    from physion.scenes.tdw.read_logs import ImportedTrial, TrialSet
     from physion.trials.making.plan import TrialTask
 
 OFFICIAL_MODELS = (
@@ -279,7 +279,7 @@ def plan_official(scenes: Path, humans: Path | None, limit: int | None) -> RunPl
     logs.require_trials()
     recorded = {trial.scene.name: trial.outcome.contact for trial in logs.trials}
     parts: dict[str, list[ImportedTrial]] = {"testing": [], "readout": []}
-    for trial in logs.trials:
+    for trial in _once(logs):
         # Familiarization trials are neither tested nor fitted.
         if "familiarization" not in trial.scene.name:
             tested = seen is None or canonical_name(trial.scene.name) in seen
@@ -295,6 +295,18 @@ def plan_official(scenes: Path, humans: Path | None, limit: int | None) -> RunPl
         raise BadInputError(f"none of the scenes in {scenes} is in {humans}")
     check_names(tasks)
     return RunPlan(tasks, recorded, [str(failure) for failure in logs.failures])
+
+
+def _once(logs: TrialSet) -> list[ImportedTrial]:
+    """Return the trials without copies; raise `BadInputError` if two of one name differ."""
+    found: dict[str, ImportedTrial] = {}
+    for trial in logs.trials:
+        name = trial.scene.name
+        first = found.setdefault(name, trial)
+        if first is not trial and trial.scene.physics_digest() != first.scene.physics_digest():
+            files = " and ".join(str(path) for path in logs.logs[name][:2])
+            raise BadInputError(f"two trials are called {name!r}, in {files}; give one folder")
+    return list(found.values())
 
 
 def balanced_trials(trials: Iterable[ImportedTrial], limit: int | None) -> list[ImportedTrial]:

@@ -135,9 +135,10 @@ def check_finite(values: NDArray[Any], model: Model, what: str, trials: tuple[st
         finite = np.isfinite(row)
         if not finite.all():
             where = tuple(int(at) for at in np.argwhere(~finite)[0])
+            place = f" at {where} of {row.shape}" if where else ""
             raise BadInputError(
                 f"model {model_name(model)!r}, trial {trial!r}: {what} that are not finite "
-                f"({row[where]} at {where} of {row.shape}); check its weights and its inputs"
+                f"({row[where]}{place}); check its weights and its inputs"
             )
 
 

@@ -157,7 +157,12 @@ def _print(values: dict[str, Any], json: bool) -> None:
         print(json_module.dumps(values))
         return
     outcomes = ("done", "done_before", "left", "screened_out", "refused", "failed")
-    counts = [f"{values[name]} {name.replace('_', ' ')}" for name in outcomes if name in values]
+    words = {"left": "dropped out"}
+    counts = [
+        f"{values[name]} {words.get(name, name.replace('_', ' '))}"
+        for name in outcomes
+        if name in values
+    ]
     repeated = f"{values['asked_again']} requests repeated"
     line = f"{', '.join(counts)}; {values['answers']} answers, {repeated}"
     if values["mean_accuracy"] is not None:

@@ -87,10 +87,11 @@ class TrialSet:
     """Result of importing a folder.
 
     ``unknown`` counts the commands that the importer does not know, ``unrecorded`` the trials
-    without an outcome in ``metadata.json``.
+    without an outcome in ``metadata.json``, ``logs`` are the files of the trials by name.
     """
 
     trials: list[ImportedTrial] = field(default_factory=list)
+    logs: dict[str, list[Path]] = field(default_factory=dict)
     failures: list[ImportFailure] = field(default_factory=list)
     unknown: Counter[str] = field(default_factory=Counter)
     unrecorded: int = 0
@@ -142,6 +143,7 @@ def read_scenes(root: Path, scenario: str | None = None, limit: int | None = Non
                 continue
             counts[name] += 1
             result.trials.append(trial)
+            result.logs.setdefault(trial.scene.name, []).append(log)
     return result
 
 
