@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from physion.cli.output import Stages, console, text_table
+from physion.cli.output import Stages, print_line, text_table
 from physion.compute.tasks import processor
 from physion.core.errors import BadInputError
 from physion.core.version import MADE_WITH
@@ -82,7 +82,7 @@ def main(options: Options) -> int:
         return 0
     table = pd.DataFrame(map(dataclasses.asdict, rows)).rename(columns=COLUMNS)
     title = f"{MADE_WITH}, {machine}, one of {os.cpu_count()} cores"
-    console.print(text_table(table, title), markup=False, soft_wrap=True)
+    print_line(text_table(table, title))
     return 0
 
 

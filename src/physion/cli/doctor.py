@@ -12,7 +12,7 @@ import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from physion.cli.output import console
+from physion.cli.output import print_line
 from physion.core.version import __version__
 
 DISTRIBUTION = "physion-benchmark"
@@ -52,9 +52,7 @@ def main(options: Options) -> int:
         for check in checks:
             mark = "ok     " if check.good else "MISSING" if check.needed else "absent "
             remedy = f"   -> {check.remedy}" if check.remedy else ""
-            console.print(
-                f"{mark} {check.name:<18} {check.value}{remedy}", markup=False, soft_wrap=True
-            )
+            print_line(f"{mark} {check.name:<18} {check.value}{remedy}")
     return 1 if any(check.needed and not check.good for check in checks) else 0
 
 

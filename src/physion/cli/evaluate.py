@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import tyro
 
 from physion.cli.model_options import choose_models, split_names
-from physion.cli.output import Stages, console, print_warnings, text_table
+from physion.cli.output import Stages, print_line, print_warnings, text_table
 from physion.compute.run_tasks import ExecutorSettings
 from physion.core.errors import BadInputError
 from physion.core.settings import read_pairs
@@ -111,22 +111,22 @@ def _print(done: Evaluation, options: Options) -> None:
              "done": "yes" if one.done else "no", "predictions": one.path}
             for one in done.evaluated
         ]  # fmt: skip
-        _line(text_table(pd.DataFrame(rows, dtype=object)))
+        print_line(text_table(pd.DataFrame(rows, dtype=object)))
         left = sum(not one.done for one in done.evaluated)
-        _line(f"{left} of {len(rows)} evaluations to do")
+        print_line(f"{left} of {len(rows)} evaluations to do")
         return
     for where, reason in done.problems.items():
-        _line(f"no prediction: {where}: {reason}")
+        print_line(f"no prediction: {where}: {reason}")
     for label, reason in done.failed.items():
-        _line(f"failed: {label}: {reason}")
+        print_line(f"failed: {label}: {reason}")
     if done.evaluated:
         print_warnings(done.warnings)
-        _line(text_table(done.scores.dropna(axis="columns", how="all")))
+        print_line(text_table(done.scores.dropna(axis="columns", how="all")))
         _print_people(done)
     for one in done.evaluated:
-        _line(f"predictions: {one.path}{' (done before)' if one.done else ''}")
+        print_line(f"predictions: {one.path}{' (done before)' if one.done else ''}")
         if one.rollout_errors is not None:
-            _line(f"errors of imagined motion: {one.rollout_errors}")
+            print_line(f"errors of imagined motion: {one.rollout_errors}")
 
 
 def _print_people(done: Evaluation) -> None:
@@ -142,8 +142,8 @@ def _print_people(done: Evaluation) -> None:
     except BadInputError as error:
         print_warnings([f"no comparison with people: {error}"])
         return
-    _line("With the people of the original study:")
-    _line(text_table(result.summary))
+    print_line("With the people of the original study:")
+    print_line(text_table(result.summary))
 
 
 def _values(one: EvaluatedModel) -> dict[str, Any]:
@@ -158,7 +158,3 @@ def _values(one: EvaluatedModel) -> dict[str, Any]:
     if one.rollout_errors is not None:
         values["rollout_errors"] = str(one.rollout_errors)
     return values
-
-
-def _line(text: str) -> None:
-    console.print(text, markup=False, soft_wrap=True)

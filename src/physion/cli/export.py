@@ -7,11 +7,11 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
-from physion.cli.output import Stages, console, counted, print_report
+from physion.cli.output import Stages, counted, print_line, print_report
 from physion.compute.local import LocalExecutor
 from physion.core.errors import BadInputError
 
@@ -69,115 +69,84 @@ CARD_TERMS = ("license", "creator", "version", "url", "published")
 """Options that apply only to a card."""
 HDF5_LAYOUTS = ("official", "physion-particles", "physopt")
 """Layouts with official HDF5 files."""
+WHOLE = ("card", "result-tables")
+"""Layouts that describe a whole folder."""
 
 
 def main(options: Options) -> int:
     """Export what is missing; return 1 if a trial failed."""
-    terms = [name for name in CARD_TERMS if getattr(options, name) is not None]
-    if terms and options.layout != "card":
-        raise BadInputError(f"--{terms[0]} applies only to a card: use it with --layout card")
-    if options.parts != "all" and options.layout != "webdataset":
-        raise BadInputError("--parts applies only to shards: use it with --layout webdataset")
-    if not options.images and options.layout not in HDF5_LAYOUTS:
-        raise BadInputError(
-            f"--no-images applies to HDF5 files: use it with --layout {', '.join(HDF5_LAYOUTS)}"
-        )
-    if not options.verify and options.layout in ("webdataset", "result-tables"):
-        raise BadInputError(f"--no-verify does not apply to {options.layout}: leave it out")
+    _check(options)
     if options.layout == "card":
-        return _card(options)
+        from physion.trials.share.card import write_card
+
+        given = {name: getattr(options, name) for name in CARD_TERMS}
+        terms = {name: value for name, value in given.items() if value is not None}
+        card = write_card(options.folder, options.out, verify=options.verify, **terms)
+        return _print_paths([card.readme, card.metadata, *card.tables], options.json)
     if options.out is None:
         raise BadInputError(f"--layout {options.layout} needs a folder to write into")
     if options.layout == "result-tables":
-        return _result_tables(options, options.out)
-    if options.layout == "webdataset":
-        return _webdataset(options, options.out)
-    if options.layout == "gltf":
-        return _gltf(options, options.out)
-    return _official(options, options.out)
+        from physion.trials.share.result_tables import export_result_tables
+
+        return _print_paths(export_result_tables(options.folder, options.out), options.json)
+    with Stages() as stages:
+        return _trials(options, options.out, stages)
 
 
-def _card(options: Options) -> int:
-    from physion.trials.share.card import write_card
-
-    if options.split or options.scenario:
-        raise BadInputError("a card describes a whole dataset: leave out --split and --scenario")
-    given = {name: getattr(options, name) for name in CARD_TERMS}
-    terms = {name: value for name, value in given.items() if value is not None}
-    card = write_card(options.folder, options.out, verify=options.verify, **terms)
-    return _print_paths([card.readme, card.metadata, *card.tables], options.json)
-
-
-def _result_tables(options: Options, out: Path) -> int:
-    from physion.trials.share.result_tables import export_result_tables
-
-    if options.split or options.scenario:
+def _check(options: Options) -> None:
+    """Raise `BadInputError` for an option that does not apply to the layout."""
+    layout = options.layout
+    terms = [name for name in CARD_TERMS if getattr(options, name) is not None]
+    if terms and layout != "card":
+        raise BadInputError(f"--{terms[0]} applies only to a card: use it with --layout card")
+    if options.parts != "all" and layout != "webdataset":
+        raise BadInputError("--parts applies only to shards: use it with --layout webdataset")
+    if not options.images and layout not in HDF5_LAYOUTS:
         raise BadInputError(
-            "tables of results are exported whole: leave out --split and --scenario"
+            f"--no-images applies to HDF5 files: use it with --layout {', '.join(HDF5_LAYOUTS)}"
         )
-    return _print_paths(export_result_tables(options.folder, out), options.json)
+    if not options.verify and layout in ("webdataset", "result-tables"):
+        raise BadInputError(f"--no-verify does not apply to {layout}: leave it out")
+    if layout in WHOLE and (options.split or options.scenario):
+        raise BadInputError(
+            f"--layout {layout} is of a whole folder: leave out --split, --scenario"
+        )
+
+
+def _trials(options: Options, out: Path, stages: Stages) -> int:
+    """Export trials in one of the layouts that hold trials."""
+    chosen: dict[str, Any] = {"split": options.split, "scenario": options.scenario}
+    if options.layout == "gltf":
+        from physion.trials.share.gltf import export_gltf
+
+        made = export_gltf(options.folder, out, verify=options.verify, progress=stages, **chosen)
+        return _print_paths(made, options.json)
+    chosen |= {"executor": LocalExecutor(workers=options.workers), "progress": stages}
+    if options.layout == "webdataset":
+        from physion.trials.share.shards import PARTS, SEEN_PARTS, export_shards
+
+        parts = SEEN_PARTS if options.parts == "seen" else PARTS
+        shards = export_shards(options.folder, out, parts=parts, **chosen)
+        if options.json:
+            names = [shard.name for shard in shards.shards]
+            values = {"made": names, "samples": shards.samples, "bytes": shards.bytes}
+            print(json_module.dumps(values | {"index": str(shards.manifest)}))
+        else:
+            done = f"{shards.samples} trials in {counted(len(shards.shards), 'shard')}"
+            print_line(f"{done}: {shards.manifest}")
+        return 0
+    from physion.trials.official.export_folder import export_official
+
+    report = export_official(
+        options.folder, out, layout=options.layout, verify=options.verify, images=options.images,
+        **chosen,
+    )  # fmt: skip
+    return print_report(report, options.json)
 
 
 def _print_paths(paths: Sequence[Path], as_json: bool) -> int:
     if as_json:
         print(json_module.dumps({"made": [str(path) for path in paths]}))
-        return 0
-    for path in paths:
-        console.print(str(path), markup=False, soft_wrap=True)
+    else:
+        print_line("\n".join(map(str, paths)))
     return 0
-
-
-def _webdataset(options: Options, out: Path) -> int:
-    from physion.trials.share.shards import PARTS, SEEN_PARTS, export_shards
-
-    with Stages() as stages:
-        report = export_shards(
-            options.folder,
-            out,
-            split=options.split,
-            scenario=options.scenario,
-            parts=SEEN_PARTS if options.parts == "seen" else PARTS,
-            executor=LocalExecutor(workers=options.workers),
-            progress=stages,
-        )
-    if options.json:
-        made = [shard.name for shard in report.shards]
-        values = {"made": made, "samples": report.samples, "bytes": report.bytes}
-        print(json_module.dumps(values | {"index": str(report.manifest)}))
-        return 0
-    done = f"{report.samples} trials in {counted(len(report.shards), 'shard')}"
-    console.print(f"{done}: {report.manifest}", markup=False, soft_wrap=True)
-    return 0
-
-
-def _gltf(options: Options, out: Path) -> int:
-    from physion.trials.share.gltf import export_gltf
-
-    with Stages() as stages:
-        made = export_gltf(
-            options.folder,
-            out,
-            split=options.split,
-            scenario=options.scenario,
-            verify=options.verify,
-            progress=stages,
-        )
-    return _print_paths(made, options.json)
-
-
-def _official(options: Options, out: Path) -> int:
-    from physion.trials.official.export_folder import export_official
-
-    with Stages() as stages:
-        report = export_official(
-            options.folder,
-            out,
-            layout=options.layout,
-            verify=options.verify,
-            split=options.split,
-            scenario=options.scenario,
-            images=options.images,
-            executor=LocalExecutor(workers=options.workers),
-            progress=stages,
-        )
-    return print_report(report, options.json)

@@ -16,7 +16,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from physion.cli.output import Stages, console, print_report
+from physion.cli.output import Stages, print_line, print_report
 from physion.core.errors import BadInputError
 
 
@@ -73,11 +73,7 @@ def _checkout(options: Options) -> int:
         print(json_module.dumps(dataclasses.asdict(made), default=str))
         return 0
     for note in made.notes:
-        console.print(f"note: {note}", markup=False, soft_wrap=True)
-    console.print(
-        f"{made.trials} scenes, {made.stimuli} labels, {made.answered} stimuli with answers: "
-        f"{made.folder}",
-        markup=False,
-        soft_wrap=True,
-    )
+        print_line(f"note: {note}")
+    counts = f"{made.trials} scenes, {made.stimuli} labels, {made.answered} stimuli with answers"
+    print_line(f"{counts}: {made.folder}")
     return 0

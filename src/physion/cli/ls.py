@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from physion.cli.output import console
+from physion.cli.output import print_line
 from physion.compute.tasks import executors
 from physion.core.errors import BadInputError
 from physion.core.registry import Registry
@@ -115,7 +115,7 @@ def _print_described(registry: Registry[Any]) -> None:
     for name in registry.names():
         text = registry.describe(name).removeprefix("Build ").removeprefix("Return ")
         line = f"{name}: {text}" if text else name
-        console.print(line, markup=False, soft_wrap=True, highlight=False)
+        print_line(line)
 
 
 def _print_presets(scenario: str, as_json: bool) -> int:
@@ -127,7 +127,7 @@ def _print_presets(scenario: str, as_json: bool) -> int:
         text = preset.about or preset.official or ""
         if preset.published:
             text += f" (published: {preset.published.contact} of {preset.published.trials} contact)"
-        console.print(f"{preset.name}: {text}", markup=False, soft_wrap=True)
+        print_line(f"{preset.name}: {text}")
     return 0
 
 
@@ -138,7 +138,7 @@ def _print_preset(preset: Preset, as_json: bool) -> int:
     limits = describe_limits(preset.params)
     for key, value in _flat(as_record(preset.params)).items():
         line = f"{key} = {json_module.dumps(value)}   # {limits.get(key, '')}"
-        console.print(line, markup=False, soft_wrap=True)
+        print_line(line)
     return 0
 
 

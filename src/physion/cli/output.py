@@ -108,6 +108,11 @@ class Stages:
         self.note(f"{what}: {done} of {total}{left}")
 
 
+def print_line(text: str) -> None:
+    """Print a line of results as it is: no markup, not broken at the width of the terminal."""
+    console.print(text, markup=False, soft_wrap=True)
+
+
 def print_warnings(warnings: Iterable[str]) -> None:
     """Print each warning as a line on standard error."""
     for warning in warnings:
@@ -131,7 +136,7 @@ def print_scores(result: CompareResult) -> None:
 
     over = "mean over scenarios" if result.summary_of == MEAN else "all stimuli pooled"
     title = f"People and models, {over}, with 95 % intervals"
-    console.print(text_table(result.summary, title) + "\n", markup=False, soft_wrap=True)
+    print_line(text_table(result.summary, title) + "\n")
 
 
 def text_table(table: pd.DataFrame, title: str = "") -> str:
@@ -177,13 +182,13 @@ def print_report(report: RunReport, as_json: bool) -> int:
         print(json.dumps(values))
         return report.exit_code
     for name, reason in report.failed.items():
-        console.print(f"failed: {name}: {reason}", markup=False, soft_wrap=True)
+        print_line(f"failed: {name}: {reason}")
     notes = [f"{name}: {note}" for name, texts in report.notes.items() for note in texts]
     for note in notes[:SHOWN_NOTES]:
-        console.print(f"note: {note}", markup=False, soft_wrap=True)
+        print_line(f"note: {note}")
     if len(notes) > SHOWN_NOTES:
         more = len(notes) - SHOWN_NOTES
         console.print(f"... and {more} more notes (--json lists all)", markup=False)
     done = f"{len(report.made)} made, {len(report.kept)} kept, {len(report.failed)} failed"
-    console.print(f"{done}: {report.index}", markup=False, soft_wrap=True)
+    print_line(f"{done}: {report.index}")
     return report.exit_code

@@ -19,7 +19,7 @@ from typing import Annotated
 import pandas as pd
 import tyro
 
-from physion.cli.output import Stages, console, text_table, write_text
+from physion.cli.output import Stages, console, print_line, text_table, write_text
 from physion.compute.run_tasks import ExecutorSettings
 from physion.compute.tasks import Executor, tracked
 from physion.core.errors import BadInputError
@@ -167,7 +167,7 @@ def _print(result: ReplayResult, logs: TrialSet) -> None:
     # Without jitter, and without cloth, some columns are empty.
     table = table.dropna(axis="columns", how="all")
     title = "Simulated outcomes compared with the recorded ones"
-    console.print(text_table(table, title), markup=False, soft_wrap=True)
+    print_line(text_table(table, title))
     console.print("; ".join(f"{name}: {LEGEND[name]}" for name in table if name in LEGEND))
     unknown = ", ".join(f"{name} x{count}" for name, count in logs.unknown.items()) or "none"
     console.print(f"duplicates left out: {result.copies}; unknown commands: {unknown}")
@@ -177,7 +177,7 @@ def _print(result: ReplayResult, logs: TrialSet) -> None:
     failures = result.failures
     console.print(f"notes on imported trials: {notes}; failures: {len(failures)}")
     for failure in failures[:SHOWN_FAILURES]:
-        console.print(f"  {failure}", markup=False, soft_wrap=True)
+        print_line(f"  {failure}")
     if len(failures) > SHOWN_FAILURES:
         console.print(f"  ... and {len(failures) - SHOWN_FAILURES} more (--json lists all)")
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from physion.cli.model_options import choose_models, split_names
-from physion.cli.output import Stages, console, print_scores, print_warnings
+from physion.cli.output import Stages, print_line, print_scores, print_warnings
 from physion.core.errors import BadInputError
 from physion.data.official import PACKAGED
 
@@ -106,12 +106,10 @@ def main(options: Options) -> int:
         print(json_module.dumps(answer, indent=1))
         return 1 if failures else 0
     for failure in failures:
-        console.print(f"failed: {failure}", markup=False, soft_wrap=True)
+        print_line(f"failed: {failure}")
     print_scores(result)
     minutes, seconds = divmod(round(time.monotonic() - started), 60)
-    console.print(
-        f"report, made in {minutes} min {seconds} s: {page}", markup=False, soft_wrap=True
-    )
+    print_line(f"report, made in {minutes} min {seconds} s: {page}")
     return 1 if failures else 0
 
 

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import tyro
 
 from physion.cli.model_options import choose_models, split_names
-from physion.cli.output import Stages, console, text_table
+from physion.cli.output import Stages, print_line, text_table
 from physion.compute.run_tasks import ExecutorSettings
 from physion.readout.settings import HarnessSettings
 from physion.readout.train import Trainings, train
@@ -100,13 +100,13 @@ def _print(done: Trainings, options: Options) -> None:
         rows = [dataclasses.asdict(one) for one in done.planned]
         table = pd.DataFrame(rows, dtype=object)
         table["done"] = table["done"].map({True: "yes", False: "no"})
-        _line(text_table(table.rename(columns={"name": "trained on"})))
+        print_line(text_table(table.rename(columns={"name": "trained on"})))
         left = sum(not one.done for one in done.planned)
-        _line(f"{left} of {len(done.planned)} trainings to do")
+        print_line(f"{left} of {len(done.planned)} trainings to do")
         return
     for trained in done.trained:
         for note in trained.notes:
-            _line(note)
+            print_line(note)
         losses = [
             f"{what} {value:.4g}"
             for what, value in (
@@ -117,12 +117,12 @@ def _print(done: Trainings, options: Options) -> None:
             if not math.isnan(value)
         ]
         how = "was trained before" if trained.loaded else f"trained for {trained.steps} steps"
-        _line(
+        print_line(
             f"{trained.model}, {trained.name}, seed {trained.seed} {how}, {', '.join(losses)}: "
             f"{trained.folder}"
         )
     for label, reason in done.failed.items():
-        _line(f"failed: {label}: {reason}")
+        print_line(f"failed: {label}: {reason}")
 
 
 def _values(done: Trainings) -> dict[str, Any]:
@@ -139,7 +139,3 @@ def _values(done: Trainings) -> dict[str, Any]:
         "planned": [fields(one) for one in done.planned],
         "failed": [{"cell": label, "reason": reason} for label, reason in done.failed.items()],
     }
-
-
-def _line(text: str) -> None:
-    console.print(text, markup=False, soft_wrap=True)

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import tyro
 
-from physion.cli.output import Stages, console, counted
+from physion.cli.output import Stages, counted, print_line
 from physion.trials.making.verify import SAMPLE, DatasetComparison, compare_datasets, verify_dataset
 
 
@@ -50,7 +50,7 @@ def main(options: Options) -> int:
         print(json_module.dumps({**asdict(result), **compared}, indent=1))
         return 1 if failed else 0
     for line in (*result.notes, *result.other_versions, *result.faults):
-        console.print(line, markup=False, soft_wrap=True)
+        print_line(line)
     others = result.other_versions
     differ = f", {counted(len(others), 'difference')} from another version" if others else ""
     noted = f", {counted(len(result.notes), 'note')}" if result.notes else ""
@@ -63,7 +63,7 @@ def main(options: Options) -> int:
             if options.repair
             else (f"; --repair deletes the {trials}, and {again}")
         )
-    console.print(line, markup=False, soft_wrap=True)
+    print_line(line)
     if other is not None and options.against is not None:
         _print_comparison(other, options.folder, options.against)
     return 1 if failed else 0
@@ -81,4 +81,4 @@ def _print_comparison(compared: DatasetComparison, folder: Path, against: Path) 
         f"{len(compared.differences)} differ, {single} are only in one of them"
     )
     for line in lines:
-        console.print(line, markup=False, soft_wrap=True)
+        print_line(line)

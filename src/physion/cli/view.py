@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from physion.cli.model_options import parse_options
-from physion.cli.output import Stages, console
+from physion.cli.output import Stages, print_line
 from physion.clips.imagined import Imagine
 from physion.core.errors import BadInputError
 from physion.report.viewer.build import ViewerOptions, build_viewer
@@ -61,7 +61,7 @@ def main(options: Options) -> int:
         print(json_module.dumps(values | {"shown": report.shown, "left_out": report.left_out}))
     else:
         summary = f"{report.shown} trials, {report.left_out} left out, {report.size / 1e6:.1f} MB"
-        console.print(f"{summary}: {report.page}", markup=False, soft_wrap=True)
+        print_line(f"{summary}: {report.page}")
     if options.open:
         webbrowser.open(report.page.resolve().as_uri())
     return 0
