@@ -136,7 +136,7 @@ def test_the_wheel_of_the_sdist_is_the_same(built: Path, tmp_path: Path) -> None
 
 @pytest.mark.slow
 def test_an_installed_wheel_runs_in_another_folder(built: Path, tmp_path: Path) -> None:
-    """Dependencies are those of this environment; the package itself is the wheel's alone."""
+    """Dependencies come from this environment, the package itself only from the wheel."""
     venv.create(tmp_path / "venv", with_pip=False)
     bin_folder = tmp_path / "venv" / ("Scripts" if os.name == "nt" else "bin")
     python = bin_folder / "python"
@@ -171,20 +171,10 @@ def test_an_installed_wheel_runs_in_another_folder(built: Path, tmp_path: Path) 
     small = ["--size", "64", "--models", "constant-motion,gns"]
     run(physion_, "run", "--sampled", "--limit", "1", *small)
     assert (folder / "runs" / "sampled" / "report" / "report.html").is_file()
-    tiny = ["--width", "64", "--height", "64", "--jitters", "0"]
-    for split in ("testing", "familiarization"):
-        command = ["generate", "trials", "--scenario", "drop", "--split", split, "--count", "2"]
-        run(physion_, *command, *tiny)
-    run(
-        physion_,
-        "experiment",
-        "init",
-        "--contact",
-        "Ada, ada@example.org",
-        "study",
-        "--trials",
-        "trials",
-        "--practice",
-        "2",
-    )
+    # Templates of the viewer and the pages of the experiment come from the wheel, too.
+    run(physion_, "view", "runs/sampled/trials", "--trials", "1", "--details", "1")
+    tiny = ["--width", "64", "--height", "64", "--jitters", "0", "--count", "2"]
+    run(physion_, "generate", "trials", "--scenario", "drop", *tiny)
+    contact = ["--contact", "Ada, ada@example.org"]
+    run(physion_, "experiment", "init", "study", "--trials", "trials", "--practice", "0", *contact)
     assert (folder / "study" / "study.toml").is_file()

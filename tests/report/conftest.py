@@ -21,7 +21,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     found.close()
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_comparison() -> Maker:
     """Builds a comparison of two models on Collide and Drop; ``model`` names the first one."""
 

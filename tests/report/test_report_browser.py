@@ -20,16 +20,17 @@ SIZES = ((1280, 900), (400, 900))
 MODEL = "a model with a name that is far too long for one line of a card of the page"
 
 
-@pytest.fixture
-def page(make_comparison: Maker, tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def page(make_comparison: Maker, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A report with trial pages; its movies become brighter from picture to picture."""
     grey = np.arange(60, dtype=np.uint8)[:, None, None, None]
-    movie = tmp_path / "movie.mp4"
+    folder = tmp_path_factory.mktemp("report")
+    movie = folder / "movie.mp4"
     movie.write_bytes(encode_movie(np.broadcast_to(40 + 3 * grey, (60, 64, 64, 3)).copy()))
     comparison = make_comparison(model=MODEL)
     movies = dict.fromkeys(comparison.stimuli["stimulus"], movie)
     inputs = ReportInputs(comparison, movies=movies, trial_pages=True)
-    return build_report(inputs, tmp_path / "report")
+    return build_report(inputs, folder / "report")
 
 
 def test_movies_in_view_play_and_nothing_else_is_asked_for(browser: Browser, page: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable
 from html.parser import HTMLParser
@@ -16,7 +15,9 @@ from physion.analysis import Comparison
 from physion.analysis.tables import MEAN
 from physion.core.errors import BadInputError
 from physion.report import ReportInputs, build_report
+from physion.report.build import report_numbers
 from physion.report.compare import compare
+from physion.report.figures.theme import make_plots
 from physion.report.html import Picture
 from physion.report.inputs import EXPECTED_METHODS
 from physion.report.page import render_page
@@ -96,26 +97,6 @@ def test_page_needs_nothing_from_elsewhere(make_comparison: Maker, movie: Path) 
     assert "default-src 'none'" in raw and "prefers-color-scheme: dark" in raw
 
 
-@pytest.mark.slow
-def test_bytes_repeat_in_any_folder(make_comparison: Maker, tmp_path: Path, movie: Path) -> None:
-    def build(name: str) -> dict[str, bytes]:
-        comparison = make_comparison()
-        movies = dict.fromkeys(comparison.stimuli["stimulus"], movie)
-        build_report(ReportInputs(comparison, movies=movies), tmp_path / name)
-        files = sorted(path for path in (tmp_path / name).rglob("*") if path.is_file())
-        return {str(path.relative_to(tmp_path / name)): path.read_bytes() for path in files}
-
-    first = build("one")
-    assert first == build("two")
-    assert set(first) == {
-        "report.html",
-        *(f"tables/{n}.csv" for n in ("comparison", "people", "stimuli", "changed_outcomes")),
-        "tables/left_out.csv",
-        "report.json",
-        *(f"figures/{n}.{k}" for n in FIGURES for k in ("svg", "pdf", "png", "csv")),
-    }
-
-
 def test_foreign_text_stays_text(make_comparison: Maker) -> None:
     evil = "<script>alert(1)</script>\"'&amp;"
     inputs = ReportInputs(
@@ -124,20 +105,6 @@ def test_foreign_text_stays_text(make_comparison: Maker) -> None:
     page = render(inputs)
     assert "script" not in {tag for tag, _ in page.tags}
     assert page.text.count(evil) >= 5  # title, heading, methods and tables, as written
-
-
-@pytest.mark.slow
-def test_page_says_the_numbers_of_the_tables(make_comparison: Maker, tmp_path: Path) -> None:
-    comparison = make_comparison()
-    path = build_report(ReportInputs(comparison), tmp_path / "out")
-    text = page_of(path).text
-    table = pd.read_csv(tmp_path / "out" / "tables" / "comparison.csv")
-    mean = table[table["scenario"] == MEAN].iloc[0]
-    for key in ("accuracy", "r", "rmsd"):
-        low, high = (f"{mean[f'{key}_{end}']:.2f}".replace("-", "−") for end in ("low", "high"))
-        assert f"{mean[key]:.2f}".replace("-", "−") + f" {low} to {high}" in text
-    assert "In 1 of these stimuli the simulated outcome is not the official one" in text
-    assert comparison.changed["stimulus"].iloc[0] in text
 
 
 def test_choices_are_stated_or_said_to_be_missing(make_comparison: Maker) -> None:
@@ -156,31 +123,28 @@ def test_undefined_scores_come_with_their_reason(make_comparison: Maker) -> None
     assert any("constant" in str(title) for title in titles)
 
 
-def test_without_people_there_is_a_page_too(make_comparison: Maker, tmp_path: Path) -> None:
-    path = build_report(ReportInputs(make_comparison(with_people=False)), tmp_path / "out")
-    text = page_of(path).text
+def test_without_people_there_is_a_page_too(make_comparison: Maker) -> None:
+    inputs = ReportInputs(make_comparison(with_people=False))
+    text = render(inputs).text
     assert "No answers of people were given" in text
     assert "Pearson r by scenario" not in text
     assert "Everything that compares with people" in text
-    assert not (tmp_path / "out" / "figures" / "scatter.svg").exists()
+    assert {plot.name for plot in make_plots(inputs)} == {"accuracy", "calibration"}
+
+
+def test_numbers_for_machines_say_null_where_undefined(make_comparison: Maker) -> None:
+    comparison = make_comparison(constant=True)
+    values = report_numbers(ReportInputs(comparison))
+    assert [row["kind"] for row in values["comparison"]] == list(comparison.all_scores["kind"])
+    assert values["comparison"][0]["accuracy"] == comparison.scores["accuracy"].iloc[0]
+    assert values["comparison"][0]["r"] is None and "constant" in values["comparison"][0]["reason"]
+    assert values["methods"]["Intervals"] == comparison.settings["Intervals"]
 
 
 def test_contents_lead_to_every_section(make_comparison: Maker) -> None:
     page = render(ReportInputs(make_comparison()))
     places = [f"#{attrs['id']}" for tag, attrs in page.tags if tag == "section"]
     assert page.links() == places and len(places) > 6
-
-
-@pytest.mark.slow
-def test_numbers_for_machines_match_the_tables(make_comparison: Maker, tmp_path: Path) -> None:
-    comparison = make_comparison(constant=True)
-    build_report(ReportInputs(comparison), tmp_path)
-    values = json.loads((tmp_path / "report.json").read_text())
-    assert len(values["comparison"]) == len(comparison.all_scores)
-    assert [row["kind"] for row in values["comparison"]] == list(comparison.all_scores["kind"])
-    assert values["comparison"][0]["accuracy"] == comparison.scores["accuracy"].iloc[0]
-    assert values["comparison"][0]["r"] is None and "constant" in values["comparison"][0]["reason"]
-    assert values["methods"]["Intervals"] == comparison.settings["Intervals"]
 
 
 # --- movies --------------------------------------------------------------------------------------
@@ -248,8 +212,9 @@ def test_files_in_report_out(tmp_path: Path) -> None:
         compare([predicted], humans=humans)
     assert not out.exists()
     labels = {f"s_{i}": i % 2 == 0 for i in range(12)}
-    given = compare(predicted, humans=humans, labels=labels, resamples=50).report(out)
-    assert "those recorded with the trials" in page_of(given).text
+    given = compare(predicted, humans=humans, labels=labels, resamples=50)
+    assert isinstance(given.inputs, ReportInputs)
+    assert "those recorded with the trials" in render(given.inputs).text
     # The official layout: labels and zone lie in the folders beside the people's.
     (tmp_path / "stimuli").mkdir()
     text = "stim_ID,label\n" + "".join(f"{name},{value}\n" for name, value in labels.items())
@@ -259,10 +224,9 @@ def test_files_in_report_out(tmp_path: Path) -> None:
         "agent,scenario,pct_2.5,pct_97.5\nhuman,collision,.6,.9\n"
     )
     path = compare([predicted], humans=humans, resamples=50).report(tmp_path / "two")
-    found, before = (
-        pd.read_csv(folder / "tables" / "comparison.csv") for folder in (tmp_path / "two", out)
-    )
-    pd.testing.assert_frame_equal(found, before)
+    found = pd.read_csv(tmp_path / "two" / "tables" / "comparison.csv")
+    before = given.inputs.tables()["comparison"]
+    np.testing.assert_array_equal(found["accuracy"], before["accuracy"])
     assert "Official outcomes stimulus_names_and_labels.csv" in page_of(path).text
     people = pd.read_csv(tmp_path / "two" / "tables" / "people.csv").set_index("scenario")
     assert people.loc["collide", "zone_high"] == 0.9

@@ -12,7 +12,7 @@ import pytest
 
 from physion.analysis.figure_tables import SCENARIO_ZONE
 from physion.analysis.published.claims import PublishedResults, published_results
-from physion.report.published import build_published_report, published_plots
+from physion.report.published import build_published_report
 
 FIGURES = [*(f"panel_{name}" for name in "acde"), "figure_s1", "figure_s3"]
 
@@ -52,10 +52,3 @@ def test_four_panels_with_their_tables(built: Path) -> None:
     panel = pd.read_csv(built.parent / "figures" / "panel_a.csv")
     assert set(panel.loc[panel["panel"] == "mean", "zone"]) == {SCENARIO_ZONE}
     assert panel["value"].notna().all() and len(panel) == 99
-
-
-@pytest.mark.slow
-def test_bytes_repeat(results: PublishedResults, built: Path, tmp_path: Path) -> None:
-    assert [plot.name for plot in published_plots(results)] == FIGURES
-    again = build_published_report(results, tmp_path / "again")
-    assert again.read_bytes() == built.read_bytes()

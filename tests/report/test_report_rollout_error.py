@@ -15,7 +15,7 @@ from physion.analysis.rollout_errors import COLUMNS, CONSTANT_VELOCITY, ERRORS
 from physion.cli.main import main
 from physion.report.figures.by_scenario import draw_rollout_error as draw
 from physion.report.figures.by_scenario import rollout_error
-from physion.report.figures.theme import DARK, LIGHT, figure_bytes
+from physion.report.figures.theme import LIGHT
 from physion.report.inputs import ReportInputs
 
 Maker = Callable[..., Comparison]
@@ -52,12 +52,6 @@ def test_curves_and_bands_match_the_table() -> None:
     assert len(styles) == 3, "lines differ without colour"
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     assert names == ["one", "two", CONSTANT_VELOCITY]
-
-
-def test_bytes_depend_only_on_the_table() -> None:
-    for theme in (LIGHT, DARK):
-        first, second = (figure_bytes(draw(table(), theme), "svg") for _ in range(2))
-        assert first == second
 
 
 def test_no_errors_no_figure(make_comparison: Maker) -> None:
