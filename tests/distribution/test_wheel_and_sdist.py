@@ -174,7 +174,8 @@ def test_an_installed_wheel_runs_in_another_folder(built: Path, tmp_path: Path) 
     # Templates of the viewer and the pages of the experiment come from the wheel, too.
     run(physion_, "view", "runs/sampled/trials", "--trials", "1", "--details", "1")
     tiny = ["--width", "64", "--height", "64", "--jitters", "0", "--count", "2"]
-    run(physion_, "generate", "trials", "--scenario", "drop", *tiny)
+    for split in ("testing", "familiarization"):
+        run(physion_, "generate", "trials", "--scenario", "drop", "--split", split, *tiny)
     contact = ["--contact", "Ada, ada@example.org"]
-    run(physion_, "experiment", "init", "study", "--trials", "trials", "--practice", "0", *contact)
+    run(physion_, "experiment", "init", "study", "--trials", "trials", "--practice", "2", *contact)
     assert (folder / "study" / "study.toml").is_file()

@@ -56,7 +56,7 @@ def dots(figure: Figure, panel: int) -> list[float]:
 def test_dots_stand_at_the_accuracies(make_comparison: Maker) -> None:
     comparison = make_comparison()
     table = figure_tables.accuracy_table(comparison)
-    figure = measure_figure(table, "accuracy")
+    figure = measure_figure(table, measure="accuracy")
     for place, scenario in enumerate(["collide", "drop", "mean"]):
         own = table[table["panel"] == scenario]
         assert dots(figure, place) == pytest.approx(own["value"].tolist())
@@ -71,7 +71,7 @@ def test_baselines_stand_below_the_models_lighter_and_hollow(make_comparison: Ma
     given, model = "constant-motion · observed", "encoder · observed+simulated"
     table = figure_tables.accuracy_table(comparison)
     assert set(table.loc[table["kind"] != figure_tables.BASELINE, "model"]) == {model}
-    figure = measure_figure(table, "accuracy")
+    figure = measure_figure(table, measure="accuracy")
     names = [text.get_text() for text in figure.axes[0].get_yticklabels()]
     assert names == [model, given, *COMPUTED]
     inks = [text.get_color() for text in figure.axes[0].get_yticklabels()]
@@ -99,7 +99,7 @@ def test_zones_of_participants_and_of_scenarios_look_different(make_comparison: 
     row = table.iloc[[0]].assign(zone_low=0.4, zone_high=0.6)
     hatches = []
     for zone in (figure_tables.PARTICIPANTS, figure_tables.SCENARIO_ZONE):
-        axis = measure_figure(row.assign(zone=zone), "accuracy").axes[0]
+        axis = measure_figure(row.assign(zone=zone), measure="accuracy").axes[0]
         hatches.append(axis.patches[0].get_hatch())
     assert hatches[0] is None and hatches[1]
 
@@ -108,7 +108,7 @@ def test_undefined_values_are_called_nan_in_the_figure(make_comparison: Maker) -
     table = figure_tables.r_table(make_comparison(constant=True))
     table = table[table["kind"] != figure_tables.BASELINE]
     assert table["value"].isna().all() and table["reason"].str.contains("undefined|constant").all()
-    words = [text.get_text() for text in measure_figure(table, "r").axes[0].texts]
+    words = [text.get_text() for text in measure_figure(table, measure="r").axes[0].texts]
     assert words == ["NaN", "NaN"]
 
 
@@ -184,7 +184,7 @@ def test_thirds_show_what_halves_of_people_reach(make_comparison: Maker) -> None
     assert row["people"] == pytest.approx(np.mean(r), abs=0.02)
     assert row["zone_low"] == pytest.approx(np.percentile(r, 2.5), abs=0.08)
     assert row["zone_low"] < row["people"] < row["zone_high"]
-    figure = measure_figure(figure_tables.thirds_table(comparison, rows), "r")
+    figure = measure_figure(figure_tables.thirds_table(comparison, rows), measure="r")
     place = list(table["people"].notna()).index(True)
     value = table["people"].iloc[place]
     assert any(np.allclose(line.get_xdata(), value) for line in figure.axes[place].lines)
@@ -202,7 +202,7 @@ def segments(axis: Axes) -> list[tuple[float, float, float]]:
 
 def test_intervals_zones_and_written_values_belong_to_their_row(make_comparison: Maker) -> None:
     table = figure_tables.accuracy_table(make_comparison())
-    figure = measure_figure(table, "accuracy")
+    figure = measure_figure(table, measure="accuracy")
     models = list(table["model"].unique())
     assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == models
     for axis, name in zip(figure.axes, ("collide", "drop", MEAN), strict=False):
@@ -245,7 +245,7 @@ def test_marks_of_conditions_stand_in_the_row_of_their_model() -> None:
         rows,
         columns=["panel", "model", "group", "value", "low", "high", "people", "stimuli", "reason"],
     )
-    axis = grouped_figure(table, "accuracy", 0.5).axes[0]
+    axis = grouped_figure(table).axes[0]
     assert [text.get_text() for text in axis.get_yticklabels()] == ["one", "two", "three"]
     marks = [line for line in axis.lines if line.get_marker() not in ("None", None)]
     bars = list(axis.collections)
@@ -398,7 +398,7 @@ def test_an_odd_number_of_models_leaves_no_column_without_scenarios() -> None:
 def test_panels_inside_have_neither_ticks_nor_numbers(make_comparison: Maker) -> None:
     table = figure_tables.accuracy_table(make_comparison())
     table = pd.concat([table[table["panel"] == "drop"].assign(panel=name) for name in SCENARIOS])
-    axes = measure_figure(table, "accuracy").axes
+    axes = measure_figure(table, measure="accuracy").axes
     ticks = [(numbered(axis, "x"), numbered(axis, "y")[0]) for axis in axes[: len(SCENARIOS)]]
     yes, no = (True, True), (False, False)
     assert [x for x, _ in ticks] == [no] * 5 + [yes] * 3
@@ -512,6 +512,6 @@ def test_figures_are_sound_files(make_comparison: Maker) -> None:
 
 def test_model_names_are_text_and_not_formulas(make_comparison: Maker) -> None:
     table = figure_tables.accuracy_table(make_comparison(model="$x_1$ <b> & co"))
-    figure = measure_figure(table, "accuracy")
+    figure = measure_figure(table, measure="accuracy")
     assert figure.axes[0].get_yticklabels()[0].get_text().startswith("$x_1$ <b>")
     assert theme.figure_bytes(figure, "png")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -75,29 +76,12 @@ def mark_rehearsal(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def build_people_report(report: PeopleReport, folder: Path) -> Path:
-    """Write ``report.html``, ``report.json``, ``tables/*.csv`` and ``figures/*``; return the page.
-
-    Every file is complete or absent, the page is written last, and the same results give the same
-    bytes. Raises `BadInputError`, before anything is written, if ``folder`` is a file.
-    """
-    pictures = prepare_folder(folder)
+    """Write a report about people without predictions, as `build_report`; return the page."""
     tables = {f"people_{name}": t for name, t in report.people.tables.items() if len(t.columns)}
-    rehearsal = bool(report.people.mark)
-    for name, table in tables.items():
-        write_csv(folder / "tables" / f"{name}.csv", table, rehearsal)
-    numbers: dict[str, Any] = {
-        name: json.loads(table.to_json(orient="records", double_precision=15))
-        for name, table in tables.items()
-    }
-    shown = [write_plot(plot, pictures, rehearsal) for plot in people_plots(report.people)]
-    warnings = list(report.people.warnings)
-    methods = people_methods(report)
-    content = {"package": MADE_WITH, "methods": methods, "warnings": warnings, **numbers}
-    text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
-    write_atomic(folder / "report.json", f"{text}\n".encode())
-    page = folder / "report.html"
-    write_atomic(page, render_people_page(report, shown, folder).encode())
-    return page
+    plots = people_plots(report.people)
+    shown = _write_parts(folder, tables, plots, bool(report.people.mark))
+    numbers = _numbers(people_methods(report), report.people.warnings, tables)
+    return _write_pages(folder, numbers, (), render_people_page(report, shown, folder))
 
 
 def people_plots(people: PeopleResults) -> list[Plot]:
@@ -121,30 +105,48 @@ def build_report(inputs: ReportInputs, folder: Path) -> Path:
     `BadInputError`, before anything is written, if ``folder`` is a file or a movie is not readable.
     """
     check_movies(inputs.movies, shown_stimuli(inputs))
-    pictures = prepare_folder(folder)
-    for name, table in inputs.tables().items():
-        write_csv(folder / "tables" / f"{name}.csv", table, bool(inputs.mark))
-    shown = [write_plot(plot, pictures, bool(inputs.mark)) for plot in make_plots(inputs)]
-    text = json.dumps(report_numbers(inputs), indent=1, ensure_ascii=False, allow_nan=False)
-    write_atomic(folder / "report.json", f"{text}\n".encode())
-    if inputs.trial_pages:
-        (folder / FOLDER).mkdir(exist_ok=True)
-        for name, content in trial_pages(inputs):
-            write_atomic(folder / FOLDER / name, content.encode())
-    page = folder / "report.html"
-    write_atomic(page, render_page(inputs, shown, folder).encode())
-    return page
+    shown = _write_parts(folder, inputs.tables(), make_plots(inputs), bool(inputs.mark))
+    pages = trial_pages(inputs) if inputs.trial_pages else ()
+    return _write_pages(folder, report_numbers(inputs), pages, render_page(inputs, shown, folder))
 
 
 def report_numbers(inputs: ReportInputs) -> dict[str, Any]:
     """Return every table of a report, and the settings, as plain values for JSON; NaN becomes
     null.
     """
-    values: dict[str, Any] = {
+    tables = {name: table for name, table in inputs.tables().items() if name != "stimuli"}
+    return _numbers({**inputs.methods, **inputs.comparison.settings}, inputs.warnings, tables)
+
+
+def _numbers(
+    methods: Mapping[str, str], warnings: Sequence[str], tables: Mapping[str, pd.DataFrame]
+) -> dict[str, Any]:
+    values = {
         name: json.loads(table.to_json(orient="records", double_precision=15))
-        for name, table in inputs.tables().items()
-        if name != "stimuli"
+        for name, table in tables.items()
     }
-    methods = {**inputs.methods, **inputs.comparison.settings}
-    warnings = list(inputs.warnings)
-    return {"package": MADE_WITH, "methods": methods, "warnings": warnings, **values}
+    return {"package": MADE_WITH, "methods": methods, "warnings": list(warnings), **values}
+
+
+def _write_parts(
+    folder: Path, tables: Mapping[str, pd.DataFrame], plots: Sequence[Plot], rehearsal: bool
+) -> list[Picture]:
+    """Write tables and figures; return the figures for the page."""
+    figures = prepare_folder(folder)
+    for name, table in tables.items():
+        write_csv(folder / "tables" / f"{name}.csv", table, rehearsal)
+    return [write_plot(plot, figures, rehearsal) for plot in plots]
+
+
+def _write_pages(
+    folder: Path, numbers: Mapping[str, Any], trials: Iterable[tuple[str, str]], page: str
+) -> Path:
+    """Write the numbers for machines, the pages of trials and, last, the page; return its path."""
+    text = json.dumps(numbers, indent=1, ensure_ascii=False, allow_nan=False)
+    write_atomic(folder / "report.json", f"{text}\n".encode())
+    for name, content in trials:
+        (folder / FOLDER).mkdir(exist_ok=True)
+        write_atomic(folder / FOLDER / name, content.encode())
+    path = folder / "report.html"
+    write_atomic(path, page.encode())
+    return path

@@ -47,7 +47,7 @@ def render_page(
         Section(TRAINING, _figures(TRAINING, shown, {})),
         Section(BY_STIMULUS, _stimuli(inputs, shown, links)),
         Section(DISAGREE, Markup()),
-        Section("People", people_parts.people(inputs, shown)),
+        Section("People", people_parts.people(inputs)),
         Section("Sessions left out", people_parts.sessions(inputs)),
         Section("Tests", scores.tests(inputs)),
         Section("Trials whose simulated outcome differs", scores.changed(inputs.comparison, links)),
@@ -182,7 +182,8 @@ def _stimuli(inputs: ReportInputs, shown: Mapping[str, Markup], links: Mapping[s
 
 def _methods(inputs: ReportInputs) -> Markup:
     stated = dict.fromkeys(EXPECTED_METHODS, "not stated") | dict(inputs.methods)
-    choices = {**stated, **inputs.comparison.settings, **people_parts.methods(inputs)}
+    rules = {} if inputs.people is None else people_parts.rules_text(inputs.people)
+    choices = {**stated, **inputs.comparison.settings, **rules}
     return html.definition_list(choices) + scores.definitions(inputs.comparison)
 
 

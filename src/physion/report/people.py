@@ -64,7 +64,7 @@ def averages(comparison: Comparison) -> Markup:
 MORE = "every scenario, and why an interval is missing, is in tables/measures.csv"
 
 
-def people(inputs: ReportInputs, shown: Mapping[str, str]) -> Markup:
+def people(inputs: ReportInputs) -> Markup:
     """Return accuracy of and agreement among people."""
     if not inputs.comparison.has_people:
         return Markup()
@@ -556,11 +556,6 @@ def dropped(result: PeopleResults) -> Markup:
     ]
     cells = [[column.cell(row) for column in columns] for _, row in totals.iterrows()]
     return table([column.heading for column in columns], cells)
-
-
-def methods(inputs: ReportInputs) -> dict[str, str]:
-    """Return the settings about participant-level answers, as text."""
-    return {} if inputs.people is None else rules_text(inputs.people)
 
 
 def rules_text(people: PeopleResults) -> dict[str, str]:

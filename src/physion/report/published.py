@@ -24,7 +24,7 @@ from physion.core.version import MADE_WITH
 from physion.report.build import prepare_folder, write_csv, write_plot
 from physion.report.figures.by_scenario import measure_figure, model_and_people_figure
 from physion.report.figures.by_stimulus import difficulty_figure
-from physion.report.figures.theme import Plot, Theme
+from physion.report.figures.theme import Plot
 from physion.report.figures.training import grouped_figure
 from physion.report.html import (
     MACROS,
@@ -82,19 +82,19 @@ def published_plots(results: PublishedResults) -> list[Plot]:
             "panel_a",
             f"{TITLES['panel_a']}. {_ACCURACY}",
             _measure(tables["panel_a"], "accuracy", PARTICIPANTS),
-            partial(_draw, "accuracy"),
+            partial(measure_figure, measure="accuracy"),
         ),
         Plot(
             "panel_c",
             f"{TITLES['panel_c']}. {_KAPPA}",
             _measure(tables["panel_c"], "kappa", "95 % of pairs of participants"),
-            partial(_draw, "kappa"),
+            partial(measure_figure, measure="kappa"),
         ),
         Plot(
             "panel_d",
             f"{TITLES['panel_d']}. {words}",
             _grouped(tables["panel_d"], "readout", "by readout (trained on all)", people),
-            _draw_grouped,
+            grouped_figure,
         ),
         Plot(
             "panel_e",
@@ -102,7 +102,7 @@ def published_plots(results: PublishedResults) -> list[Plot]:
             _grouped(
                 tables["panel_e"], "training", "by training (readout observed+simulated)", people
             ),
-            _draw_grouped,
+            grouped_figure,
         ),
         Plot(
             "figure_s1",
@@ -154,14 +154,6 @@ def _grouped(panel: pd.DataFrame, column: str, name: str, people: float) -> pd.D
     rows = panel.rename(columns={column: "group", "accuracy": "value"})
     rows = rows.assign(panel=name, people=people, stimuli=float("nan"), reason="")
     return rows[list(GROUPED_COLUMNS)].reset_index(drop=True)
-
-
-def _draw(measure: str, rows: pd.DataFrame, theme: Theme) -> Any:
-    return measure_figure(rows, measure, theme)
-
-
-def _draw_grouped(rows: pd.DataFrame, theme: Theme) -> Any:
-    return grouped_figure(rows, "accuracy", 0.5, theme)
 
 
 # --- page ---------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ thirds of stimuli and the published results use it too.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import matplotlib
@@ -59,7 +60,7 @@ BAND = (
 """Sentence of captions about the hatched zone."""
 
 
-def measure_figure(table: pd.DataFrame, measure: str, theme: Theme = LIGHT) -> Figure:
+def measure_figure(table: pd.DataFrame, theme: Theme = LIGHT, *, measure: str) -> Figure:
     """Draw one measure by scenario and model, with intervals, people as a line, their zone as a
     band.
 
@@ -187,12 +188,8 @@ def accuracy(inputs: ReportInputs) -> Plot:
             caption += " Grey: the middle 95 % of participants."
         caption += BAND
     table = tables.accuracy_table(comparison)
+    draw = partial(measure_figure, measure="accuracy")
     return Plot("accuracy", f"{caption} Dotted: chance.", table, draw)
-
-
-def draw(table: pd.DataFrame, theme: Theme) -> Figure:
-    """Draw the table of the figure."""
-    return measure_figure(table, "accuracy", theme)
 
 
 # --- correlation with the average person --------------------------------------------------------
@@ -215,12 +212,8 @@ def correlation(inputs: ReportInputs) -> Plot | None:
             "they answer yes or no, which lowers r, so that a model can exceed them. Hatched, in "
             "the mean: the band of the paper, r between random halves of the people."
         )
-    return Plot("r", caption, tables.r_table(inputs.comparison, zones), draw_correlation)
-
-
-def draw_correlation(table: pd.DataFrame, theme: Theme) -> Figure:
-    """Draw the table of the figure."""
-    return measure_figure(table, "r", theme)
+    table = tables.r_table(inputs.comparison, zones)
+    return Plot("r", caption, table, partial(measure_figure, measure="r"))
 
 
 # --- agreement with single participants ---------------------------------------------------------
@@ -239,12 +232,7 @@ def kappa(inputs: ReportInputs) -> Plot | None:
         "95 % of participants, each by the mean kappa with the others." + BAND
     )
     table = tables.kappa_table(inputs.comparison, inputs.beside)
-    return Plot("kappa", caption, table, draw_kappa)
-
-
-def draw_kappa(table: pd.DataFrame, theme: Theme) -> Figure:
-    """Draw the table of the figure."""
-    return measure_figure(table, "kappa", theme)
+    return Plot("kappa", caption, table, partial(measure_figure, measure="kappa"))
 
 
 # --- error of imagined motion over time ---------------------------------------------------------

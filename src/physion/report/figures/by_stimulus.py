@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import matplotlib
@@ -151,12 +152,8 @@ def thirds(inputs: ReportInputs) -> Plot | None:
             "models are correlated."
         )
     table = tables.thirds_table(inputs.comparison, answers)
+    draw = partial(measure_figure, measure="r")
     return Plot("thirds", f"{caption} Dotted: chance.", table, draw)
-
-
-def draw(table: pd.DataFrame, theme: Theme) -> Figure:
-    """Draw the table of the figure."""
-    return measure_figure(table, "r", theme)
 
 
 # --- calibration of P(contact) ------------------------------------------------------------------

@@ -1,6 +1,6 @@
 """Figures of readout and training: effects on accuracy, and generalisation between scenarios.
 
-`grouped_figure` draws a measure by model and condition; the published results use it too.
+`grouped_figure` draws accuracy by model and condition; the published results use it too.
 """
 
 from __future__ import annotations
@@ -38,10 +38,8 @@ PROTOCOLS = (
 """Sentence of captions about the training protocols."""
 
 
-def grouped_figure(
-    table: pd.DataFrame, measure: str, chance_level: float, theme: Theme = LIGHT
-) -> Figure:
-    """Draw a measure by model (rows) and condition (marks).
+def grouped_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
+    """Draw accuracy by model (rows) and condition (marks).
 
     ``table``: see `figure_tables.GROUPED_COLUMNS`; one panel for each of its ``panel``.
     """
@@ -57,12 +55,12 @@ def grouped_figure(
                 subset = rows[rows["group"] == group]
                 at = subset["model"].map(models.index) + (place - (len(groups) - 1) / 2) * 0.24
                 _group_marks(axis, subset, at.to_numpy(dtype=np.float64), theme.mark(place), theme)
-            axis.axvline(chance_level, color=theme.faint, linestyle=":", linewidth=1, zorder=0)
+            axis.axvline(0.5, color=theme.faint, linestyle=":", linewidth=1, zorder=0)
             people = rows["people"].iloc[0]
             if np.isfinite(people):
                 axis.axvline(people, color=theme.ink, linestyle="--", linewidth=1.3, zorder=0)
             title(axis, str(name))
-            axis.set_xlabel(measure)
+            axis.set_xlabel("accuracy")
             axis.set_yticks(range(len(models)), [label(model) for model in models])
             axis.set_ylim(len(models) - 0.5, -0.5)
             axis.grid(axis="y", color=theme.zone, linewidth=0.5)
@@ -111,12 +109,7 @@ def effects(inputs: ReportInputs) -> Plot | None:
         f"{PROTOCOLS}"
     )
     caption += " Dashed: people." if inputs.comparison.has_people else ""
-    return Plot("effects", caption, table, draw)
-
-
-def draw(table: pd.DataFrame, theme: Theme) -> Figure:
-    """Draw the table of the figure."""
-    return grouped_figure(table, "accuracy", 0.5, theme)
+    return Plot("effects", caption, table, grouped_figure)
 
 
 # --- accuracy by the scenario of training and the tested one ------------------------------------
