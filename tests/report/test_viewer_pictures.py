@@ -133,7 +133,7 @@ def test_large_pictures_take_less_than_a_megabyte() -> None:
     frames = np.arange(45, 300)
     noise = np.random.default_rng(0).integers(0, 256, (64, 40, 40, 3), np.uint8)
     row = np.arange(len(frames)) % len(noise)
-    rgb = noise[row].repeat(8, axis=1).repeat(8, axis=2)
+    rgb = noise[row].repeat(5, axis=1).repeat(5, axis=2)
     masks = np.random.default_rng(1).random((len(frames), 20, 64, 64), np.float32)
     one = ImaginedTrial("painter", "none", frames, {"rgb": rgb, "masks": masks}, true={"rgb": rgb})
     record = packed(one, 300)
