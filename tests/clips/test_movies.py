@@ -297,18 +297,6 @@ def test_threads_read_at_the_same_time() -> None:
     assert list(background(range(6), read, ahead=3, threads=3)) == list(range(6))
 
 
-def test_no_thread_is_left_after_an_early_stop() -> None:
-    results = background(iter(range(10**9)), slow_square, ahead=4, threads=4)
-    assert next(results) == 0 and running()
-    for value in results:
-        assert value == 1
-        break
-    results.close()  # type: ignore[attr-defined]
-    assert not running()
-    with pytest.raises(StopIteration):
-        next(results)
-
-
 def test_a_forgotten_iterator_ends_its_threads() -> None:
     results = background(iter(range(10**9)), slow_square, ahead=4, threads=4)
     next(results)

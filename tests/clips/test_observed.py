@@ -20,9 +20,10 @@ from physion.core.errors import BadInputError
 from physion.physics.trajectory import Contacts, Trajectory
 from physion.scenes.scene import OBSERVED_FRAMES
 from physion.trials.dataset import Dataset
-from physion.trials.trial_file import Trial, write_trial
+from physion.trials.trial_file import Trial
 from physion.trials.video import encode_movie
-from support.official_hand_made import CLOTH, FRAMES, RIGID, SIZE
+from support.hand_made import write_trial
+from support.official_hand_made import CLOTH, FRAMES, RIGID, SIZE, make_scene, make_trajectory
 
 EVERYTHING = ("rgb", "ids", "depth", "boxes", "camera", "state")
 SPEC = Spec(inputs=EVERYTHING, image_size=16, stride=4, context=12, future=1)
@@ -133,6 +134,21 @@ def test_motions_in_memory_are_cut_too(made: Dataset, noisy: Dataset) -> None:
         ]
         assert as_bytes(batches[0]) == as_bytes(batches[1])
         assert all(len(motion.trajectory) == OBSERVED_FRAMES for motion in batches[0].state or ())
+
+
+def test_the_cut_keeps_frames_and_contacts_up_to_number_44() -> None:
+    scene = make_scene(RIGID, False)
+    motion = make_trajectory(scene)
+    frames = np.array([0, 43, 44, 45, 46], np.int32)
+    rows = np.arange(15, dtype=np.float32).reshape(5, 3)
+    contacts = Contacts(frames, np.tile(np.int32([[0, 1]]), (5, 1)), rows, -rows, rows[:, 0])
+    motion = dataclasses.replace(motion, contacts=contacts)
+    cut = cut_to_observed(scene, motion)
+    assert cut.contacts.frame.tolist() == [0, 43, 44]
+    np.testing.assert_array_equal(cut.contacts.point, rows[:3])
+    np.testing.assert_array_equal(cut.contacts.normal, -rows[:3])
+    assert len(cut) == 45 and not cut.completed
+    np.testing.assert_array_equal(cut.positions[-1], motion.positions[44])
 
 
 def reachable(start: object) -> Iterator[object]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -259,37 +258,6 @@ def test_a_trial_that_is_read_again_is_rendered_as_a_whole_and_then_never(
     assert np.isfinite(found[0]).any() and not np.array_equal(found[0], found[3], equal_nan=True)
     reader.read(CLOTH, windows[0])
     assert len(drawn) == FRAMES + 3  # frames of another trial are others
-
-
-def test_pictures_are_rendered_again_without_ids(
-    motions: dict[str, Motion], drawn: list[tuple[int, tuple[str, ...]]]
-) -> None:
-    reader = reader_of(motions, "rgb", "boxes")
-    first = reader.read(RIGID, np.array([3, 9]))
-    assert sorted(drawn) == [(3, ("color",)), (3, ("ids",)), (9, ("color",)), (9, ("ids",))]
-    drawn.clear()
-    again = reader.read(RIGID, np.array([3, 9]))
-    assert drawn == [(3, ("color",)), (9, ("color",))]
-    for name, values in first.items():
-        np.testing.assert_array_equal(values, again[name], name)
-
-
-def test_what_a_caller_changes_does_not_change_what_is_kept(motions: dict[str, Motion]) -> None:
-    reader, frames = reader_of(motions, "boxes"), np.array([3, 9])
-    first, again = (reader.read(RIGID, frames)["boxes"] for _ in range(2))
-    known = first.copy()
-    first[...] = again[...] = -1
-    np.testing.assert_array_equal(reader.read(RIGID, frames)["boxes"], known)
-
-
-def test_a_copy_in_another_process_starts_empty_and_reads_the_same(
-    motions: dict[str, Motion], drawn: list[tuple[int, tuple[str, ...]]]
-) -> None:
-    reader, frames = reader_of(motions, "boxes"), np.array([0, 6])
-    here = reader.read(RIGID, frames)
-    there = pickle.loads(pickle.dumps(reader))
-    np.testing.assert_array_equal(there.read(RIGID, frames)["boxes"], here["boxes"])
-    assert [frame for frame, _ in drawn] == [0, 6, 0, 6]
 
 
 def test_threads_may_share_a_reader(motions: dict[str, Motion]) -> None:

@@ -126,6 +126,11 @@ def make_parts(name: str = "tiny", *, cloth: bool = True, contact_frame: int | N
     return Parts(metadata, scene, trajectory, label_contact(scene, trajectory), ids)
 
 
+def write_trial(path: Path, *parts: Any, compatible: bool = False) -> None:
+    """Write a trial file from metadata, scene, trajectory, labels and ids."""
+    path.write_bytes(TrialWriter(*parts, compatible=compatible).finish())
+
+
 def make_by_hand(job: GenerateJob) -> str:
     """Write a trial without engine and renderer; what happens depends on the trial's name.
 

@@ -28,8 +28,9 @@ from physion.physics.trajectory import Contacts, Trajectory
 from physion.scenes.scene import OBSERVED_FRAMES
 from physion.trials.dataset import Dataset
 from physion.trials.index import write_index
-from physion.trials.trial_file import Trial, write_trial
+from physion.trials.trial_file import Trial
 from physion.trials.video import encode_movie, read_frames
+from support.hand_made import write_trial
 
 Pictures = NDArray[np.uint8]
 _MOTION = ("positions", "rotations", "velocities", "angular_velocities", "cloth_vertices")

@@ -56,8 +56,8 @@ def make_scene(name: str, cloth: bool) -> Scene:
     )
 
 
-def make_trajectory(scene: Scene) -> Trajectory:
-    """The zone and the vase stand, the others fly and turn."""
+def make_trajectory(scene: Scene, touch: bool = True) -> Trajectory:
+    """The zone and the vase stand, the others fly and turn; the target may touch the zone."""
     rng = np.random.default_rng(5)
     count = len(scene.bodies)
     starts = np.array([body.position for body in scene.bodies])
@@ -69,7 +69,7 @@ def make_trajectory(scene: Scene) -> Trajectory:
     for body in np.flatnonzero(moving):
         rotations[:, body] = turning(rng, FRAMES)
     spins = rng.normal(size=(FRAMES, count, 3)) * moving[:, None]
-    rows = [(frame, 1, 3) for frame in range(TOUCH, PART)]
+    rows = [(frame, 1, 3) for frame in range(TOUCH, PART) if touch]
     rows += [(frame, 0, 3) for frame in range(10, 12)] + [(3, ENVIRONMENT, 3)]
     rows.sort()
     normals = rng.normal(size=(len(rows), 3))
@@ -104,11 +104,14 @@ def _cloth(scene: Scene, rng: np.random.Generator) -> np.ndarray:
     return (flat + wave * np.linspace(0, 1, FRAMES)[:, None, None]).astype(np.float32)
 
 
-def make_dataset(folder: Path) -> Path:
-    """A rigid trial and one with cloth, with movies in both looks and an index."""
-    for name, cloth in ((RIGID, False), (CLOTH, True)):
+def make_dataset(folder: Path, *, touch: bool = True) -> Path:
+    """A rigid trial and one with cloth, with movies in both looks and an index.
+
+    Without ``touch`` there is only the rigid one, in which target and zone do not touch.
+    """
+    for name, cloth in ((RIGID, False), (CLOTH, True))[: 1 + touch]:
         scene = make_scene(name, cloth)
-        trajectory = make_trajectory(scene)
+        trajectory = make_trajectory(scene, touch)
         paths = TrialPaths(folder, "testing", scene.scenario, name)
         files = {}
         for look in ("redyellow", "free"):

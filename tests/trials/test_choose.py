@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from physion.compute.local import SerialExecutor
@@ -12,7 +13,9 @@ from physion.core.errors import BadInputError, BadSceneError, PhysionError
 from physion.core.seeds import trial_seed
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
+from physion.rendering.renderer import Renderer
 from physion.scenes.sampling.sample import sample_scene
+from physion.scenes.scene import Scene
 from physion.trials.dataset import Dataset
 from physion.trials.making import choose as choosing
 from physion.trials.making.choose import (
@@ -50,19 +53,19 @@ def test_half_of_the_slots_want_contact_in_an_order_that_gives_nothing_away() ->
 
 
 def test_every_physics_belongs_to_one_split() -> None:
-    digests = [
-        sample_scene("collide", trial_seed("c", "collide", "x", i)).physics_digest()
-        for i in range(320)
-    ]
-    counts = {split: sum(split_of(d) == split for d in digests) for split in SPLITS}
-    assert sum(counts.values()) == 320
-    assert counts["training"] > counts["readout"] > counts["familiarization"] > 0
+    """Eight sixteenths train, four fit the readout, three test, one is for practice."""
+    splits = [split_of(f"1234567{digit:x}" + "0" * 56) for digit in range(16)]
+    counts = {"training": 8, "readout": 4, "testing": 3, "familiarization": 1}
+    assert splits == [name for name, count in counts.items() for _ in range(count)]
+    scene = sample_scene("collide", trial_seed("c", "collide", "x", 0))
+    renamed = dataclasses.replace(scene, name="other", room="bright")
+    assert renamed.physics_digest() == scene.physics_digest()
 
 
 @pytest.mark.parametrize("split", ["testing", "training"])
 def test_chosen_draws_are_what_their_split_takes(split: str, tmp_path: Path) -> None:
     contacts = []
-    for task in slots(split, 8):
+    for task in slots(split, 6):
         filled, scene = choose(GenerateJob(task, tmp_path, QUICK))
         assert scene == scene_of(filled) and scene.name == task.trial
         assert split_of(scene.physics_digest()) == split
@@ -72,7 +75,7 @@ def test_chosen_draws_are_what_their_split_takes(split: str, tmp_path: Path) -> 
             assert labels.contact == wanted_contact(task)
             assert not labels.observed
     if split == "testing":
-        assert sum(contacts) == 4
+        assert sum(contacts) == 3
 
 
 def few_scenes(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
@@ -89,16 +92,16 @@ def few_scenes(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
 def test_copies_are_refused_and_scarce_physics_is_said(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    few_scenes(monkeypatch, 12)
-    monkeypatch.setattr(choosing, "MAX_TRIES", 20)
-    monkeypatch.setattr(choosing, "MAX_ELSEWHERE", 100)
+    few_scenes(monkeypatch, 6)
+    monkeypatch.setattr(choosing, "MAX_TRIES", 5)
+    monkeypatch.setattr(choosing, "MAX_ELSEWHERE", 60)
     settings = dataclasses.replace(QUICK, width=32, height=32)
-    report = make_trials(tmp_path, slots("training", 12), settings, executor=SerialExecutor())
+    report = make_trials(tmp_path, slots("training", 6), settings, executor=SerialExecutor())
     digests = Dataset(tmp_path).index["scene_digest"]
-    assert digests.is_unique and len(digests) == len(report.made) > 2
-    assert report.failed, "twelve scenes, of which some belong to other splits, cannot fill twelve"
+    assert digests.is_unique and len(digests) == len(report.made) > 1
+    assert report.failed, "six scenes, of which some belong to other splits, cannot fill six"
     for reason in report.failed.values():
-        assert "another trial has the same physics: 20" in reason
+        assert "another trial has the same physics: 5" in reason
 
 
 def test_scenes_do_not_depend_on_order_or_on_what_else_is_asked(
@@ -141,6 +144,24 @@ def test_reasons_are_counted_and_settings_are_heeded() -> None:
         assert judge(*early, task, official)[0] is None
 
 
+def test_agent_and_patient_must_each_be_visible() -> None:
+    """Both fractions are counted here, in a picture of their own."""
+    task = TrialTask("choose", "collide", "training", 0)
+    seed = trial_seed("reasons", "collide", "x", 1)
+    scene = sample_scene("collide", seed)
+    ids = Renderer(scene, simulate(scene, frames=1), 64, 64).render(0, ("ids",)).ids
+    roles = (scene.roles.agent, scene.roles.patient)
+    fractions = sorted((ids == scene.index(name) + 1).mean() for name in roles)
+    assert 0 < fractions[0] < fractions[1]
+    for least, visible in (
+        (fractions[0], True),
+        (fractions[0] + 1e-6, False),
+        (fractions[1], False),
+    ):
+        reason, _ = judge(scene, seed, task, dataclasses.replace(QUICK, min_visible=least))
+        assert (reason is None) == visible
+
+
 def test_robustness_counts_the_runs_that_agree() -> None:
     seed = trial_seed("robust", "collide", "x", 0)
     scene = sample_scene("collide", seed)
@@ -150,9 +171,36 @@ def test_robustness_counts_the_runs_that_agree() -> None:
     assert share >= 0.5
 
 
+def test_every_run_of_the_robustness_has_a_noise_of_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of 1 mm: with one noise for all runs, or another seed, a trial would look too robust."""
+    seen: list[Scene] = []
+    real = choosing.simulate_many
+
+    def noted(scenes: list[Scene], **options: object) -> object:
+        seen.extend(scenes)
+        return real(scenes[:1], **options) * len(scenes)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(choosing, "simulate_many", noted)
+    seed, other = (trial_seed("robust", "dominoes", "x", index) for index in (0, 1))
+    scene = sample_scene("dominoes", seed)
+    for one in (seed, seed, other):
+        robustness(scene, True, one, 12)
+    free = [row for row, body in enumerate(scene.bodies) if not (body.kinematic or body.scenery)]
+    start = np.array([body.position for body in scene.bodies])[free]
+    moved = np.array([[body.position for body in run.bodies] for run in seen])[:, free] - start
+    first, again, others = moved.reshape(3, 12, -1)
+    assert (first == again).all()
+    runs = np.concatenate([first, others])
+    assert len(np.unique(runs.round(9), axis=0)) == 24, "no noise occurs twice"
+    noise = runs[runs != 0]
+    assert noise.std() == pytest.approx(0.001, rel=4 / np.sqrt(2 * noise.size))
+
+
 def test_a_preset_that_hardly_varies_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     few_scenes(monkeypatch, 1)
-    monkeypatch.setattr(choosing, "MAX_ELSEWHERE", 40)
+    monkeypatch.setattr(choosing, "MAX_ELSEWHERE", 8)
     digest = sample_scene("collide", trial_seed("few", "collide", "x", 0)).physics_digest()
     other = next(split for split in SPLITS if split != split_of(digest))
     with pytest.raises(PhysionError, match="default hardly varies"):

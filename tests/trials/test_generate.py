@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import errno
-import json
 import os
 import random
 import shutil
@@ -13,13 +11,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import physion
-from physion.cli.output import print_report
 from physion.compute.local import LocalExecutor, SerialExecutor
 from physion.compute.run_tasks import RunReport
 from physion.core.errors import BadInputError, PhysionError, UnknownNameError
@@ -33,8 +31,7 @@ from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, TrialTask, plan_dataset, plan_scenes
 from physion.trials.making.verify import verify_dataset
 from physion.trials.trial_file import Trial
-from physion.trials.video import count_frames, read_frames
-from support import hand_made
+from physion.trials.video import read_frames
 from support.hand_made import make_by_hand, make_scene, tree_digest
 from support.paths import TESTS
 
@@ -61,6 +58,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_index_equals_the_files(finished: Path) -> None:
     dataset = Dataset(finished)
     assert dataset.trials() == ["a", "b", "c", "d"]
+    assert [dataset[row].metadata.trial for row in range(4)] == dataset.trials()
     for paths in find_trials(finished):
         row = index_row(paths)
         stored = dataset.index[dataset.index["trial"] == paths.trial].iloc[0]
@@ -73,28 +71,20 @@ def test_index_equals_the_files(finished: Path) -> None:
     assert dataset.index["first_frame"].isna().tolist() == [True, False, True, False]
 
 
-def test_observed_movie_is_cut_and_the_full_one_is_not(finished: Path) -> None:
-    dataset = Dataset(finished)
-    paths = dataset.paths("a")
-    assert count_frames(paths.observed_movie) == 45 == len(read_frames(paths.observed_movie))
-    assert count_frames(paths.movie) == 60 == len(dataset.frames("a"))
-    assert dataset.observed_frames("a", stride=6).shape == (8, 32, 32, 3)
-
-
-def test_observed_view_needs_no_file_with_the_future(finished: Path, tmp_path: Path) -> None:
+def test_observed_frames_need_no_file_with_the_future(finished: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, tmp_path / "set")
     for paths in find_trials(tmp_path / "set"):
         paths.movie.unlink()
         paths.trial_file.unlink()
-    observed = Dataset(tmp_path / "set").observed
-    assert [observed.frames(name).shape[0] for name in observed.trials] == [45] * 4
+    dataset = Dataset(tmp_path / "set")
+    assert [len(dataset.observed_frames(name)) for name in dataset.trials()] == [45] * 4
     with pytest.raises(BadInputError, match="46 frames"):
-        observed.frames("a", count=46)
+        dataset.observed_frames("a", count=46)
     with pytest.raises(UnknownNameError, match="closest"):
-        observed.frames("aa")
+        dataset.observed_frames("aa")
 
 
-def test_observed_view_refuses_a_movie_that_shows_more(finished: Path, tmp_path: Path) -> None:
+def test_an_observed_movie_that_shows_more_is_refused(finished: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, tmp_path / "set")
     paths = Dataset(tmp_path / "set").paths("a")
     shutil.copy(paths.movie, paths.observed_movie)
@@ -128,12 +118,10 @@ def test_more_trials_later_change_none_of_the_first(finished: Path, tmp_path: Pa
     assert tree_digest(tmp_path / "s") == tree_digest(finished)
 
 
-@pytest.mark.parametrize("workers", [1, 2, pytest.param(8, marks=pytest.mark.slow)])
-def test_workers_and_order_do_not_matter(workers: int, finished: Path, tmp_path: Path) -> None:
+def test_workers_and_order_do_not_matter(finished: Path, tmp_path: Path) -> None:
     # Scenes keep the index that they have in their set, whatever the order of work.
     tasks = scenes_named("a", "b", "c", "d")
-    random.Random(workers).shuffle(tasks)
-    report = run(tmp_path / "s", tasks, executor=LocalExecutor(workers))
+    report = run(tmp_path / "s", [tasks[i] for i in (2, 0, 3, 1)], executor=LocalExecutor(3))
     assert report.exit_code == 0
     assert tree_digest(tmp_path / "s") == tree_digest(finished)
 
@@ -193,8 +181,10 @@ def check_only_whole_files(folder: Path) -> None:
         assert len(read_frames(paths.movie)) == 60
 
 
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO])
-@pytest.mark.parametrize("name", ["write", "replace", "fsync"])
+@pytest.mark.parametrize(
+    ("name", "code"),
+    [("write", errno.ENOSPC), ("replace", errno.EIO), ("fsync", errno.EIO)],
+)
 def test_a_fault_at_every_step_leaves_only_whole_files(
     name: str, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -308,9 +298,7 @@ def run_and_kill(folder: Path, trials: int, after: int, delay: float) -> int:
     return code
 
 
-@pytest.mark.parametrize(
-    ("kills", "trials"), [(1, 8), pytest.param(10, 30, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("kills", "trials"), [(1, 8), pytest.param(5, 16, marks=pytest.mark.slow)])
 def test_killed_runs_resume_to_the_same_tree(kills: int, trials: int, tmp_path: Path) -> None:
     chance = random.Random(kills)
     killed = [
@@ -358,13 +346,6 @@ def test_folder_that_cannot_be_written_is_one_clear_error(tmp_path: Path) -> Non
             run(folder, scenes_named("a"))
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write all")
-def test_read_only_folder_is_one_clear_error(tmp_path: Path) -> None:
-    tmp_path.chmod(0o555)
-    with pytest.raises(BadInputError, match="Permission denied"):
-        run(tmp_path, scenes_named("a"))
-
-
 def test_broken_trials_are_found_when_the_index_is_made(finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "s"
     shutil.copytree(finished, folder)
@@ -395,26 +376,6 @@ def test_a_file_of_another_size_is_made_again(
         return
     assert report.made == ["b"] and report.kept == ["a", "c", "d"] and not report.failed
     assert tree_digest(folder) == tree_digest(finished)
-
-
-def test_trials_of_several_versions_are_marked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = tmp_path / "s"
-    assert run(folder, scenes_named("a")).notes == {}
-    make = hand_made.make_parts
-
-    def later(*names: Any, **options: Any) -> hand_made.Parts:
-        parts = make(*names, **options)
-        return parts._replace(metadata=dataclasses.replace(parts.metadata, package="physion 9"))
-
-    monkeypatch.setattr(hand_made, "make_parts", later)
-    report = run(folder, scenes_named("a", "b"))
-    (note,) = report.notes[str(folder)]
-    assert report.made == ["b"] and "several versions: 1 by 0, 1 by physion 9" in note
-    assert any("several versions" in line for line in verify_dataset(folder, again=0).notes)
-    print_report(report, as_json=False)
-    assert "note: " in capsys.readouterr().out
 
 
 def test_renamed_trials_are_found(finished: Path, tmp_path: Path) -> None:
@@ -453,7 +414,8 @@ def test_plan_gives_every_trial_its_own_seed_and_name() -> None:
     presets = {"drop": ["default", "debug"]}
     tasks = plan_dataset("d", ["drop", "collide"], counts, presets)
     assert len({task.trial for task in tasks}) == len(tasks) == 26
-    assert len({task.seed().entropy for task in tasks}) == 26
+    seeds = {replace(task, attempt=attempt).seed().entropy for task in tasks for attempt in (0, 1)}
+    assert len(seeds) == 2 * 26
     assert {t.presets for t in tasks if t.scenario == "drop"} == {("default", "debug")}
     practice = next(t for t in tasks if (t.scenario, t.split) == ("collide", "familiarization"))
     assert practice.presets == ("familiarization",)
@@ -481,15 +443,9 @@ def test_bad_plans_are_refused(tmp_path: Path) -> None:
             tmp_path / "s",
             [TrialTask("d", "drop", "testing", 0), TrialTask("e", "drop", "testing", 1)],
         )
-    for wrong in ({"width": 33}, {"passes": ("colour",)}, {"look": "blue"}):
-        with pytest.raises(BadInputError):
+    for wrong in ({"width": 33}, {"passes": ("colour",)}, {"look": "blue"}, {"engine": "mujocco"}):
+        with pytest.raises((BadInputError, UnknownNameError), match=str(*wrong)):
             GenerateSettings(**wrong)  # type: ignore[arg-type]
-
-
-def test_progress_sees_every_outcome(tmp_path: Path) -> None:
-    seen: list[tuple[str, int, int]] = []
-    run(tmp_path / "s", scenes_named("a", "b"), progress=lambda *step: seen.append(step))
-    assert seen == [("generating", done, 2) for done in (0, 1, 2)]
 
 
 def test_writers_of_one_path_do_not_meet(tmp_path: Path) -> None:
@@ -597,23 +553,3 @@ def test_trials_of_another_engine_are_verified_with_it(tmp_path: Path) -> None:
     assert name == make_engine("mujoco").name
     result = verify_dataset(tmp_path, again=-1)
     assert result.faults == [] and result.other_versions == []
-
-
-def test_the_engine_is_stored_only_by_its_whole_name(tmp_path: Path) -> None:
-    assert GenerateSettings(engine="mujoco").stored() == GenerateSettings().stored()
-    tasks = plan_dataset("tests", ["collide"], {"testing": 1})
-    make_trials(tmp_path, tasks, MUJOCO, executor=SerialExecutor(), make=lambda job: "")
-    stored = json.loads((tmp_path / "dataset.json").read_text())
-    assert stored["made_by"]["engine"] == make_engine("mujoco").name
-    with pytest.raises(BadInputError, match="made_by"):
-        make_trials(
-            tmp_path,
-            tasks,
-            GenerateSettings(width=32, height=32, jitters=1, min_visible=0.0, movies=False),
-            executor=SerialExecutor(),
-        )
-
-
-def test_unknown_engines_are_refused() -> None:
-    with pytest.raises(UnknownNameError, match="mujoco"):
-        GenerateSettings(engine="mujocco")

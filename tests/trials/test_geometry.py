@@ -9,15 +9,13 @@ from typing import Any
 
 import h5py
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 import physion
-from physion.core.errors import BadInputError
 from physion.trials.files import TrialPaths
 from physion.trials.making.verify import _check_trial
 from physion.trials.state import world_vertices
-from physion.trials.trial_file import GEOMETRY, SEAL_BYTES, Trial, TrialWriter, seal
+from physion.trials.trial_file import GEOMETRY, Trial, TrialWriter, seal
 from support.hand_made import make_parts
 
 PIXELS = 128
@@ -101,35 +99,6 @@ def test_matrices_lead_from_the_world_to_the_pixels_of_the_picture() -> None:
     # The pixels that show the object fill the box around its vertices.
     assert np.abs(rows.min(axis=0) - pixels.min(axis=0)).max() < 1
     assert np.abs(rows.max(axis=0) + 1 - pixels.max(axis=0)).max() < 1
-
-
-def without_geometry(data: bytes, keep: tuple[str, ...] = ()) -> bytes:
-    """The same file without the geometry, as older versions wrote it; some of it may be kept."""
-    buffer = io.BytesIO()
-    with (
-        h5py.File(io.BytesIO(data)) as source,
-        h5py.File(buffer, "w", libver=("v110", "v110"), userblock_size=SEAL_BYTES) as target,
-    ):
-        target.attrs["schema"] = source.attrs["schema"]
-        for name in source:
-            if name not in ("camera", "meshes"):
-                source.copy(name, target)
-        for path in keep:
-            source.copy(path, target.require_group(path.partition("/")[0]))
-    return seal(buffer.getvalue())
-
-
-def test_files_of_older_versions_stay_readable() -> None:
-    parts = make_parts()
-    trial = Trial(without_geometry(parts.pack()), "t")
-    assert trial.geometry is None
-    np.testing.assert_array_equal(trial.trajectory.positions, parts.trajectory.positions)
-
-
-def test_a_file_with_a_part_of_the_geometry_is_refused() -> None:
-    data = without_geometry(make_parts().pack(), keep=("camera/intrinsics",))
-    with pytest.raises(BadInputError, match=r"camera/extrinsics.*missing"):
-        Trial(data, "t")
 
 
 def test_verify_finds_geometry_of_another_scene(tmp_path: Path) -> None:

@@ -181,8 +181,9 @@ def test_every_environment_is_tested() -> None:
 @pytest.mark.parametrize("names", TOGETHER, ids=" + ".join)
 def test_other_processors_give_the_same_bytes(names: tuple[str, ...]) -> None:
     """The effect of the settings is checked first: ignored ones would prove nothing."""
-    printed = run_in(effective_settings(names), "-m", "physion.trials.making.reproduce")
-    assert json.loads(printed) == golden_digests()
+    several = ("collide", "contain", "drape", "roll")
+    printed = run_in(effective_settings(names), "-m", "physion.trials.making.reproduce", *several)
+    assert json.loads(printed) == {name: golden_digests()[name] for name in several}
 
 
 def test_movies_do_not_depend_on_the_processor(tmp_path: Path) -> None:

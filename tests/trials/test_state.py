@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
-from physion.core.errors import BadInputError, BadSceneError
+from physion.core.errors import BadInputError
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
 from physion.rendering.renderer import Renderer
@@ -81,7 +81,6 @@ def collision() -> Trial:
         ),
         room="empty",
         ending=Ending(min_frames=60, max_frames=60),
-        parameters={"speed": 3.0, "list": [1, {"a": None}]},
     )
     return _pack(scene)
 
@@ -94,7 +93,7 @@ def hanging() -> Trial:
 
 def test_centres_of_mass_move_as_fast_as_the_engine_says(collision: Trial) -> None:
     centers = state.centroids(collision)
-    linear = state.velocities(collision).linear
+    linear = collision.trajectory.velocities
     assert centers.shape == (60, 4, 3) and linear.shape == (60, 4, 3)
 
     def error(places: NDArray[np.float32]) -> float:
@@ -104,7 +103,7 @@ def test_centres_of_mass_move_as_fast_as_the_engine_says(collision: Trial) -> No
 
     assert np.ptp(linear[:, 1, 0]) > 2
     assert error(centers) < 0.02
-    assert error(state.poses(collision).positions) > 0.2, "the ball rolls, and its pivot with it"
+    assert error(collision.trajectory.positions) > 0.2, "the ball rolls, and its pivot with it"
 
 
 def test_centres_of_mass_match_solids(collision: Trial) -> None:
@@ -121,51 +120,22 @@ def test_a_cloth_is_where_its_vertices_are(hanging: Trial) -> None:
     np.testing.assert_allclose(centers[:, 2], vertices.mean(axis=1), atol=1e-5)
 
 
-def test_poses_and_velocities_are_the_trajectory(collision: Trial) -> None:
-    pose, motion = state.poses(collision), collision.trajectory
-    np.testing.assert_array_equal(pose.positions, motion.positions)
-    np.testing.assert_array_equal(pose.rotations, motion.rotations)
-    np.testing.assert_array_equal(state.velocities(collision).angular, motion.angular_velocities)
-
-
-def test_normals_go_from_the_first_thing_to_the_second(collision: Trial) -> None:
-    there = state.contacts_between(collision, "ball", "box")
-    back = state.contacts_between(collision, "box", "ball")
-    assert len(there.frame) and there.frame[0] == collision.labels.first_frame
-    np.testing.assert_allclose(there.normal[0], [1, 0, 0], atol=0.2)
-    np.testing.assert_array_equal(there.normal, -back.normal)
-    np.testing.assert_array_equal(there.point, back.point)
-    np.testing.assert_array_equal(there.impulse, back.impulse)
-    assert there.point[0, 0] == pytest.approx(0.35, abs=0.05), "the box's side"
-    assert there.impulse.max() > 0.1
-    assert not len(state.contacts_between(collision, "ball", "cone").frame)
-    with pytest.raises(BadSceneError, match="bell"):
-        state.contacts_between(collision, "bell", "box")
-
-
-def test_contacts_with_the_floor_point_up(collision: Trial) -> None:
-    found = state.environment_contacts(collision)
-    assert set(found) == {"box", "ball"}
-    for touches in found.values():
-        assert len(touches.frame) and touches.normal[:, 2].min() > 0.99
-        np.testing.assert_allclose(touches.point[:, 2], 0, atol=0.01)
-    under = state.contacts_between(collision, "box", state.FLOOR)
-    np.testing.assert_array_equal(under.normal, -found["box"].normal)
-
-
-def test_the_contact_table_holds_every_contact(collision: Trial) -> None:
-    table = state.contact_table(collision)
-    assert len(table) == len(collision.trajectory.contacts.frame)
-    pair = table[(table["first"] == "box") & (table["second"] == "ball")]
-    normals = pair[["normal_x", "normal_y", "normal_z"]].to_numpy(np.float32)
-    np.testing.assert_array_equal(normals, state.contacts_between(collision, "box", "ball").normal)
-    assert set(table["first"]) == {"floor", "box"}
+def test_contacts_are_named_and_normals_go_from_the_first_to_the_second(collision: Trial) -> None:
+    table, stored = state.contact_table(collision), collision.trajectory.contacts
+    assert len(table) == len(stored.frame)
+    np.testing.assert_array_equal(table["impulse"], stored.impulse)
     np.testing.assert_allclose(table["time"], table["frame"] * 0.01)
-
-
-def test_nothing_touches_in_a_trial_without_contacts() -> None:
-    trial = Trial(make_parts(contact_frame=None).pack(), "apart")
-    assert state.contact_table(trial).empty and state.environment_contacts(trial) == {}
+    assert set(table["first"]) == {state.FLOOR, "box"}
+    normals = table[["normal_x", "normal_y", "normal_z"]].to_numpy()
+    pair = ((table["first"] == "box") & (table["second"] == "ball")).to_numpy()
+    assert pair.any() and table["frame"][pair].iloc[0] == collision.labels.first_frame
+    np.testing.assert_allclose(normals[pair][0], [-1, 0, 0], atol=0.2)
+    assert table["point_x"][pair].iloc[0] == pytest.approx(0.35, abs=0.05), "the box's side"
+    on_floor = (table["first"] == state.FLOOR).to_numpy()
+    assert set(table["second"][on_floor]) == {"box", "ball"}
+    assert normals[on_floor, 2].min() > 0.99
+    np.testing.assert_allclose(table["point_z"][on_floor], 0, atol=0.01)
+    assert state.contact_table(Trial(make_parts(contact_frame=None).pack(), "apart")).empty
 
 
 def test_meshes_scaled_and_unscaled(collision: Trial, hanging: Trial) -> None:
@@ -190,18 +160,6 @@ def test_world_vertices_rest_where_the_bodies_are(collision: Trial, hanging: Tri
     np.testing.assert_array_equal(cloth, hanging.trajectory.cloth_vertices[7])
     with pytest.raises(BadInputError, match="no frame 60"):
         state.world_vertices(collision, 60)
-
-
-def test_particles_lie_inside_the_drawn_bodies(collision: Trial) -> None:
-    cloud = state.particles(collision, frames=[59])
-    for index in (0, 1, 2):
-        mine = cloud.positions[0, cloud.things == index]
-        name = collision.scene.names()[index]
-        drawn = state.world_vertices(collision, 59)[name]
-        assert len(mine) > 20
-        assert (mine >= drawn.min(axis=0) - 1e-5).all()
-        assert (mine <= drawn.max(axis=0) + 1e-5).all()
-    assert not (cloud.things == 3).any(), "scenery"
 
 
 def test_the_object_table_says_what_everything_is(collision: Trial) -> None:
@@ -286,19 +244,12 @@ def test_pushes_say_when_and_how_hard(collision: Trial) -> None:
     np.testing.assert_allclose(table["speed"], [3.0, 0.1])
     assert table.loc[0, ["point_x", "point_y", "point_z"]].tolist() == [-0.65, 0.0, 0.15]
     assert table.loc[1, ["point_x", "point_y", "point_z"]].isna().all()
-    linear = state.velocities(collision).linear
+    linear = collision.trajectory.velocities
     # The push acts in the step that leads to frame 4.
     assert abs(linear[3, 1, 0]) < 0.01 and linear[4, 1, 0] == pytest.approx(3.0, abs=0.1)
 
 
-def test_scenario_parameters_are_a_copy(collision: Trial) -> None:
-    found = state.scenario_parameters(collision)
-    assert found == {"speed": 3.0, "list": [1, {"a": None}]}
-    found["list"].append(2)
-    assert state.scenario_parameters(collision)["list"] == [1, {"a": None}]
-
-
-def test_cloths_are_distinguished() -> None:
+def test_cloths_are_told_apart() -> None:
     parts = make_parts()
     scene = parts.scene
     two = dataclasses.replace(

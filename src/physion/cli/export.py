@@ -150,3 +150,60 @@ def _print_paths(paths: Sequence[Path], as_json: bool) -> int:
     else:
         print_line("\n".join(map(str, paths)))
     return 0
+
+
+def _webdataset(options: Options, out: Path) -> int:
+    from physion.trials.share.shards import MANIFEST, PARTS, SEEN_PARTS, export_shards
+
+    with Stages() as stages:
+        shards = export_shards(
+            options.folder,
+            out,
+            split=options.split,
+            scenario=options.scenario,
+            parts=SEEN_PARTS if options.parts == "seen" else PARTS,
+            executor=LocalExecutor(workers=options.workers),
+            progress=stages,
+        )
+    samples = sum(shard.samples for shard in shards)
+    if options.json:
+        values: dict[str, object] = {"made": [shard.name for shard in shards]}
+        values |= {"samples": samples, "bytes": sum(shard.bytes for shard in shards)}
+        print(json_module.dumps(values | {"index": str(out / MANIFEST)}))
+        return 0
+    done = f"{samples} trials in {counted(len(shards), 'shard')}"
+    console.print(f"{done}: {out / MANIFEST}", markup=False, soft_wrap=True)
+    return 0
+
+
+def _gltf(options: Options, out: Path) -> int:
+    from physion.trials.share.gltf import export_gltf
+
+    with Stages() as stages:
+        made = export_gltf(
+            options.folder,
+            out,
+            split=options.split,
+            scenario=options.scenario,
+            verify=options.verify,
+            progress=stages,
+        )
+    return _print_paths(made, options.json)
+
+
+def _official(options: Options, out: Path) -> int:
+    from physion.trials.official.export_folder import export_official
+
+    with Stages() as stages:
+        report = export_official(
+            options.folder,
+            out,
+            layout=options.layout,
+            verify=options.verify,
+            split=options.split,
+            scenario=options.scenario,
+            images=options.images,
+            executor=LocalExecutor(workers=options.workers),
+            progress=stages,
+        )
+    return print_report(report, options.json)

@@ -12,8 +12,8 @@ from typing import Annotated
 
 import tyro
 
-from physion.cli.output import Stages, counted, print_line
-from physion.trials.making.verify import SAMPLE, DatasetComparison, compare_datasets, verify_dataset
+from physion.cli.output import Stages, console, counted
+from physion.trials.making.verify import SAMPLE, compare_datasets, verify_dataset
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Options:
     trials again."""
     against: Path | None = None
     """Folder of another dataset, for example of another machine or version: trials that only one of
-    both has, or that differ in scene, motion, label or bytes of files, are named."""
+    both has, or that differ in scene, motion, label, movies or map, are named."""
     json: bool = False
     """Print one JSON object: faults, differences from trials of another version, and notes; with
     --against also what differs from the other dataset."""
@@ -37,16 +37,15 @@ class Options:
 
 def main(options: Options) -> int:
     """Print faults, notes and differences; return 1 if there is a fault or a difference."""
-    other = None
+    against = options.against
     with Stages() as stages:
         result = verify_dataset(
             options.folder, again=options.again, repair=options.repair, progress=stages
         )
-        if options.against is not None:
-            other = compare_datasets(options.folder, options.against, progress=stages)
-    failed = bool(result.faults) or (other is not None and not other.equal)
+    other = [] if against is None else compare_datasets(options.folder, against)
+    failed = bool(result.faults or other)
     if options.json:
-        compared = {} if other is None else {"against": asdict(other)}
+        compared = {} if against is None else {"against": other}
         print(json_module.dumps({**asdict(result), **compared}, indent=1))
         return 1 if failed else 0
     for line in (*result.notes, *result.other_versions, *result.faults):
@@ -63,22 +62,9 @@ def main(options: Options) -> int:
             if options.repair
             else (f"; --repair deletes the {trials}, and {again}")
         )
-    print_line(line)
-    if other is not None and options.against is not None:
-        _print_comparison(other, options.folder, options.against)
+    console.print(line, markup=False, soft_wrap=True)
+    if against is not None:
+        other.append(f"{options.folder} against {against}: {counted(len(other), 'difference')}")
+        for line in other:
+            console.print(line, markup=False, soft_wrap=True)
     return 1 if failed else 0
-
-
-def _print_comparison(compared: DatasetComparison, folder: Path, against: Path) -> None:
-    """Print what differs between two datasets, and a line that counts it."""
-    lines = [f"made by other versions: {line}" for line in compared.versions]
-    for place, names in ((folder, compared.only_first), (against, compared.only_second)):
-        lines += [f"{name}: only in {place}" for name in names]
-    lines += compared.differences
-    single = len(compared.only_first) + len(compared.only_second)
-    lines.append(
-        f"{folder} against {against}: {compared.same} trials are the same, "
-        f"{len(compared.differences)} differ, {single} are only in one of them"
-    )
-    for line in lines:
-        print_line(line)

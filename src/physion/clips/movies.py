@@ -60,14 +60,10 @@ def movie_files(
 ) -> dict[str, MovieFile | None]:
     """Return the movies of a dataset by trial; None where there is none in the look.
 
-    Parameters
-    ----------
-    dataset
-        The dataset.
-    observed
-        Whether the movies of the observed part are meant, not of the whole trials.
-    look
-        Colours: ``redyellow`` or ``free``, by default each trial's own.
+    - ``dataset``: the dataset.
+    - ``observed``: whether the movies of the observed part are meant, and not those of the whole
+      trials.
+    - ``look``: colours: ``redyellow`` or ``free``, by default each trial's own.
     """
     kind = "observed_movie" if observed else "movie"
     files: dict[str, MovieFile | None] = {}

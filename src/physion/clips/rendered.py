@@ -43,18 +43,11 @@ _MOST_OBJECTS = 255
 class MotionRenderer:
     """Reader of what the camera sees, rendered from motions.
 
-    Parameters
-    ----------
-    motions
-        Scene, in its free colours, and motion by trial.
-    inputs
-        Which of `PIXELS` are rendered.
-    size
-        Pixels per side.
-    objects
-        Rows of ``boxes``.
-    looks
-        Colours by trial, ``redyellow`` or ``free``.
+    - ``motions``: scene, in its free colours, and motion by trial.
+    - ``inputs``: which of `PIXELS` are rendered.
+    - ``size``: pixels per side.
+    - ``objects``: rows of ``boxes``.
+    - ``looks``: colours by trial, ``redyellow`` or ``free``.
     """
 
     def __init__(
@@ -146,17 +139,11 @@ class MotionRenderer:
 class RenderedSource(WholeSource):
     """Source over motions in memory.
 
-    Parameters
-    ----------
-    motions
-        Scene, in its free colours, and motion by trial.
-    spec
-        What the batches hold.
-    look
-        Colours: ``redyellow`` or ``free``.
-    observed
-        Cut all motions at the last observed frame. Then `later`, `whole` and `window` raise
-        `FutureFrameError` unless all their frames are observed.
+    - ``motions``: scene, in its free colours, and motion by trial.
+    - ``spec``: what the batches hold.
+    - ``look``: colours: ``redyellow`` or ``free``.
+    - ``observed``: cut all motions at the last observed frame. Then `later`, `whole` and `window`
+      raise `FutureFrameError` unless all their frames are observed.
     """
 
     def __init__(

@@ -7,7 +7,6 @@ observed part: it opens the observed movies, and motions that were cut when they
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Protocol
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from physion.clips.batch import LAST_OBSERVED, Batch, Motion, Spec, clip_frames
 from physion.clips.states import motion_digest
 from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.files import digest_of
 
 Part = Literal["context", "later", "whole"]
 """Part of a clip: its context, the frames after the context, or both."""
@@ -221,4 +221,4 @@ def clip_key(spec: Spec, part: Part, identity: Sequence[str]) -> str:
         "objects": spec.objects if "boxes" in spec.inputs else None,
         "read": list(identity),
     }
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+    return digest_of(json.dumps(values, sort_keys=True))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import os
 import threading
 from collections import OrderedDict
@@ -15,6 +14,7 @@ import numpy as np
 
 from physion.clips.batch import Motion, cut_to_observed
 from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.files import digest_of
 from physion.trials.files import IndexedFile
 from physion.trials.trial_file import Trial
 
@@ -57,7 +57,7 @@ def motion_digest(motion: Motion) -> str:
         trajectory.engine,
         str(trajectory.completed),
     )
-    return hashlib.sha256("\n".join(texts).encode()).hexdigest()
+    return digest_of("\n".join(texts))
 
 
 def _copies(values: object) -> dict[str, Any]:

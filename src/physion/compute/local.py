@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
 from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -22,10 +22,6 @@ from physion.core.errors import PhysionError
 
 T = TypeVar("T")
 R = TypeVar("R")
-
-_READY = "ready"
-_EXIT_SECONDS = 5.0
-"""Seconds to wait for a process to end by itself before it is killed."""
 
 
 class SerialExecutor:
@@ -84,51 +80,53 @@ class LocalExecutor:
             return  # the processes end with the outer block
         workers, self._kept = self._kept, []
         for worker in workers:
-            worker.pipe.close()  # all end at the same time
-        for worker in workers:
             worker.stop()
 
     def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[TaskOutcome[R]]:
         """Yield outcomes as they come; see `physion.compute.tasks.Executor`."""
-        waiting = deque(_QueuedTask(key, task) for key, task in tasks.items())
-        workers = self._start_workers(function, min(self.workers, len(tasks)))
+        waiting = deque(_Job(key, task) for key, task in tasks.items())
+        count = min(self.workers, len(tasks))
+        workers = [self._kept.pop() for _ in range(min(count, len(self._kept)))]
+        workers += [_Worker() for _ in range(count - len(workers))]
         failed_starts = 0
         try:
-            workers = self._assign(workers, waiting)
+            workers = self._assign(workers, waiting, function)
             while workers:
                 done: list[TaskOutcome[R]] = []
                 for worker in self._wait(workers):
-                    outcome = worker.listen(self.timeout)
-                    if outcome is not None:
-                        done.append(outcome)
-                    failed_starts = 0 if worker.ready else failed_starts + worker.lost
-                    if worker.lost:
+                    job, worker.job = worker.job, None
+                    outcome = worker.outcome(job)
+                    if outcome is None:
                         workers.remove(worker)
-                        done += self._take_back(worker, waiting)
+                        failed_starts += job is None
                         if failed_starts >= self.tries:
                             raise _startup_error(worker)
+                        if job is not None and job.tries < self.tries:
+                            # Last, so that a task that kills workers does not delay the others.
+                            waiting.append(replace(job, tries=job.tries + 1))
+                        elif job is not None:
+                            outcome = TaskOutcome(job.key, error=worker.reason(), tries=job.tries)
                         if waiting:
-                            workers.append(_Worker(function, self.logs))
+                            workers.append(_Worker())
+                    else:
+                        failed_starts = 0
+                    if outcome is not None and job is not None:
+                        done.append(outcome)
                 # Before yielding, so that workers are busy while the caller handles the outcomes.
-                workers = self._assign(workers, waiting)
+                workers = self._assign(workers, waiting, function)
                 yield from done
         finally:
             for worker in workers:
                 worker.stop()
 
-    def _start_workers(self, function: Callable[..., Any], count: int) -> list[_Worker]:
-        """Return ``count`` processes for ``function``: kept ones, and new ones for the rest."""
-        workers = [self._kept.pop() for _ in range(min(count, len(self._kept)))]
-        for worker in workers:
-            worker.take(function)
-        return workers + [_Worker(function, self.logs) for _ in range(count - len(workers))]
-
-    def _assign(self, workers: list[_Worker], waiting: deque[_QueuedTask]) -> list[_Worker]:
+    def _assign(
+        self, workers: list[_Worker], waiting: deque[_Job], function: Callable[..., Any]
+    ) -> list[_Worker]:
         """Give a task to each idle worker, keep or stop those that have none; return the others."""
         busy = []
         for worker in workers:
-            if worker.job is None and worker.ready and waiting:
-                worker.start(waiting.popleft())
+            if worker.idle and waiting:
+                worker.start(function, waiting.popleft(), self.logs)
             if worker.job is not None or waiting:
                 busy.append(worker)
             elif self._blocks:
@@ -138,37 +136,18 @@ class LocalExecutor:
         return busy
 
     def _wait(self, workers: list[_Worker]) -> list[_Worker]:
-        """Wait until workers send a message, die or exceed the timeout; return these workers."""
-        things: list[Any] = [worker.pipe for worker in workers]
-        things += [worker.process.sentinel for worker in workers]
+        """Wait until workers have ended what they do, or were ended for its time; return them."""
         pause = None
         if self.timeout is not None:
-            ages = [time.monotonic() - worker.since for worker in workers if worker.job]
-            pause = max(self.timeout - max(ages), 0) if ages else None
-        ready = wait(things, pause)
-        return [
-            worker
-            for worker in workers
-            if worker.pipe in ready
-            or worker.process.sentinel in ready
-            or worker.overdue(self.timeout)
-        ]
-
-    def _take_back(self, worker: _Worker, waiting: deque[_QueuedTask]) -> list[TaskOutcome[Any]]:
-        """Queue the task of a dead worker again, or return a failed outcome after the last try."""
-        job = worker.job
-        worker.stop()
-        if job is None:
-            return []
-        if job.tries >= self.tries:
-            return [TaskOutcome(job.key, error=worker.reason(), tries=job.tries)]
-        # At the end of the queue, so that a task that kills workers does not delay the others.
-        waiting.append(_QueuedTask(job.key, job.task, job.tries + 1))
-        return []
+            ends = [worker.since + self.timeout for worker in workers if worker.job is not None]
+            pause = max(min(ends) - time.monotonic(), 0) if ends else None
+        done, _ = wait([worker.future for worker in workers], pause, FIRST_COMPLETED)
+        ended = [worker for worker in workers if worker.future in done]
+        return ended + [worker for worker in workers if worker.end_late(self.timeout)]
 
 
 @dataclass(frozen=True)
-class _QueuedTask:
+class _Job:
     """A task with its name and the number of this try."""
 
     key: str
@@ -176,89 +155,71 @@ class _QueuedTask:
     tries: int = 1
 
 
-@dataclass(frozen=True)
-class _NextFunction:
-    """Message to a worker process: the function of the tasks that follow."""
-
-    function: Callable[..., Any]
-
-
 class _Worker:
-    """Parent's handle of one worker process, which has at most one task at a time."""
+    """One process, with at most one task at a time.
 
-    def __init__(self, function: Callable[..., Any], logs: Path | None) -> None:
+    Each is a pool of its own: where a process of a pool dies, all tasks of the pool are lost.
+    """
+
+    def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
-        self.pipe, far = context.Pipe()
-        self.process: BaseProcess = context.Process(
-            target=_serve, args=(far, function, logs), daemon=True
-        )
+        self._pool = ProcessPoolExecutor(1, context, _prepare)
         with _one_thread(), _interrupts_blocked():
-            self.process.start()
-        # Only the child holds the far end now, so its death closes the pipe.
-        far.close()
-        self.job: _QueuedTask | None = None
-        self.ready, self.lost, self.since = False, False, time.monotonic()
+            self.future: Future[Any] = self._pool.submit(os.getpid)  # starts the process
+        (self._process,) = self._pool._processes.values()
+        self.job: _Job | None = None
+        self.since = time.monotonic()
         self._late = False
 
-    def take(self, function: Callable[..., Any]) -> None:
-        """Send the function of the next tasks to a process that was kept."""
-        self._send(_NextFunction(function))
+    @property
+    def idle(self) -> bool:
+        """Whether the process has started and has no task."""
+        return self.job is None and self.future.done() and self.future.exception() is None
 
-    def start(self, job: _QueuedTask) -> None:
+    def start(self, function: Callable[..., Any], job: _Job, logs: Path | None) -> None:
         """Send a task to the process."""
         self.job, self.since = job, time.monotonic()
-        self._send((job.key, job.task))
-
-    def _send(self, message: object) -> None:
-        # A worker that has just died is noticed at the next wait, and its task is queued again.
-        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-            self.pipe.send(message)
-
-    def overdue(self, timeout: float | None) -> bool:
-        """Return whether the task has run longer than ``timeout`` seconds."""
-        if timeout is None or self.job is None:
-            return False
-        return time.monotonic() - self.since >= timeout
-
-    def listen(self, timeout: float | None) -> TaskOutcome[Any] | None:
-        """Return the outcome that the worker sent, or None; set ``lost`` if the worker is gone."""
         try:
-            if self.pipe.poll():
-                message: Any = self.pipe.recv()
-                if message == _READY:
-                    self.ready = True
-                    return None
-                job, self.job = self.job, None
-                assert job is not None and message.key == job.key, (
-                    "a worker answers the task that it was given"
-                )
-                outcome: TaskOutcome[Any] = dataclasses.replace(message, tries=job.tries)
-                return outcome
-        except (EOFError, ConnectionResetError):
-            self.lost = True
+            self.future = self._pool.submit(run_task, job.key, function, job.task, logs)
+        except BrokenProcessPool as error:  # it died while it was idle
+            self.future = Future()
+            self.future.set_exception(error)
+
+    def outcome(self, job: _Job | None) -> TaskOutcome[Any] | None:
+        """Return the outcome of the task ``job``, or of the start; None if the process died."""
+        key, tries = ("start", 1) if job is None else (job.key, job.tries)
+        try:
+            result = self.future.result()
+        except BrokenProcessPool:
+            self.stop()
             return None
-        self._late = self.overdue(timeout)
-        self.lost = self._late or not self.process.is_alive()
-        return None
+        except Exception as error:
+            return TaskOutcome(key, error=f"task or result cannot be sent: {error}", tries=tries)
+        return TaskOutcome(key) if job is None else replace(result, tries=tries)
+
+    def end_late(self, timeout: float | None) -> bool:
+        """Kill the process if its task has run longer than ``timeout``; return whether it has."""
+        if timeout is None or self.job is None or self.future.done():
+            return False
+        self._late = time.monotonic() - self.since >= timeout
+        if self._late:
+            self._process.kill()
+        return self._late
 
     def reason(self) -> str:
         """Return one line that says why a stopped process ended."""
         if self._late:
             return f"still running after {time.monotonic() - self.since:.0f} s, so it was stopped"
-        code = self.process.exitcode
+        code = self._process.exitcode
         if code is not None and code < 0:
             return f"the worker process was ended by signal {signal.Signals(-code).name}"
         return f"the worker process ended with exit code {code}"
 
     def stop(self) -> None:
-        """End the process: let it finish if it is idle, kill it if it runs a task."""
-        self.pipe.close()
-        idle = self.ready and self.job is None
-        # A lost process is ending by itself; its exit code says why; after a kill it would not.
-        self.process.join(_EXIT_SECONDS if idle or (self.lost and not self._late) else 0)
-        if self.process.is_alive():
-            self.process.kill()
-            self.process.join()
+        """End the process: let it end by itself if it is idle, kill it if it runs a task."""
+        if not self.future.done():
+            self._process.kill()
+        self._pool.shutdown()
 
 
 def _startup_error(worker: _Worker) -> PhysionError:
@@ -268,29 +229,19 @@ def _startup_error(worker: _Worker) -> PhysionError:
     )
 
 
-def _serve(pipe: Connection, function: Callable[..., Any], logs: Path | None) -> None:
-    """Run the tasks that come through the pipe, in the worker process, until it is closed."""
-    # Ctrl-C is sent to all processes of the group; only the parent reacts to it.
+def _prepare() -> None:
+    """Prepare a new worker process: it leaves Ctrl-C to its parent, and ends with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    try:
-        pipe.send(_READY)
-        while True:
-            message = pipe.recv()
-            if isinstance(message, _NextFunction):
-                function = message.function
-                continue
-            key, task = message
-            outcome = run_task(key, function, task, logs)
-            try:
-                pipe.send(outcome)
-            except (BrokenPipeError, ConnectionResetError):
-                raise
-            except Exception as error:
-                pipe.send(TaskOutcome(key, error=f"the result cannot be sent: {error}"))
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        return
+    parent = multiprocessing.parent_process()
+    assert parent is not None, "this runs in a child process"
+
+    def end_with_parent() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
 @contextlib.contextmanager

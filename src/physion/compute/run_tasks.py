@@ -29,16 +29,10 @@ FATAL_ERRNOS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACC
 class RunReport:
     """Result of a run over many trials.
 
-    Parameters
-    ----------
-    made, kept
-        Names of the trials that were written, and of those that existed before.
-    failed
-        Reason of the failure by name of the trial or file.
-    index
-        Path of the list of all trials in the folder.
-    notes
-        Remarks by name of the trial, such as what an import had to guess.
+    - ``made``, ``kept``: names of the trials that were written, and of those that existed before.
+    - ``failed``: reason of the failure by name of the trial or file.
+    - ``index``: path of the list of all trials in the folder.
+    - ``notes``: remarks by name of the trial, such as what an import had to guess.
     """
 
     made: Sequence[str]

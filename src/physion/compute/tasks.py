@@ -9,7 +9,6 @@ how the package runs tasks that write files.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
 import platform
 import re
@@ -22,6 +21,7 @@ from pathlib import Path
 from typing import Generic, Protocol, TypeVar, cast
 
 from physion.core.errors import BadInputError, PhysionError, one_line
+from physion.core.files import digest_of
 from physion.core.registry import Registry
 
 T = TypeVar("T")
@@ -39,20 +39,13 @@ _NAME_BYTES = 80
 class TaskOutcome(Generic[R]):
     """Result or error of one task.
 
-    Parameters
-    ----------
-    key
-        Name of the task.
-    result
-        Return value of the function; None if the task failed.
-    error
-        One line about the failure; None if the task succeeded.
-    traceback
-        Traceback of the exception; empty if the task succeeded or the worker process died.
-    errno
-        Error number of the operating system if an ``OSError`` ended the task, else None.
-    tries
-        How often the task was started; more than 1 if a worker process died.
+    - ``key``: name of the task.
+    - ``result``: return value of the function; None if the task failed.
+    - ``error``: one line about the failure; None if the task succeeded.
+    - ``traceback``: traceback of the exception; empty if the task succeeded or the worker process
+      died.
+    - ``errno``: error number of the operating system if an ``OSError`` ended the task, else None.
+    - ``tries``: how often the task was started; more than 1 if a worker process died.
     """
 
     key: str
@@ -165,7 +158,7 @@ def log_path(logs: Path, key: str) -> Path:
     """Return the path of the log of a task; different keys have different names."""
     readable = re.sub(r"[^A-Za-z0-9._-]+", "-", key)[:_NAME_BYTES].strip("-.") or "task"
     if readable != key:
-        readable += "-" + hashlib.sha256(key.encode()).hexdigest()[:8]
+        readable += "-" + digest_of(key)[:8]
     return logs / f"{readable}.log"
 
 

@@ -216,6 +216,11 @@ SUFFIX = ".sha256"
 """Ending of a digest file, after the whole name of its file."""
 
 
+def digest_of(data: bytes | str) -> str:
+    """Return the hexadecimal SHA-256 of bytes, or of a text in UTF-8."""
+    return hashlib.sha256(data.encode() if isinstance(data, str) else data).hexdigest()
+
+
 def file_sha256(path: Path) -> str:
     """Return the hexadecimal SHA-256 of a file; `OSError` if it cannot be read."""
     with path.open("rb") as file:
@@ -231,7 +236,7 @@ def write_with_digest(path: Path, content: bytes) -> None:
     digest = digest_path(path)
     digest.unlink(missing_ok=True)
     write_atomic(path, content)
-    line = f"{hashlib.sha256(content).hexdigest()}  {path.name}\n"
+    line = f"{digest_of(content)}  {path.name}\n"
     write_atomic(digest, line.encode())
 
 
@@ -265,7 +270,7 @@ def check_digest(path: Path, content: bytes, advice: str) -> None:
         stored = _stored(path)
     except (OSError, UnicodeDecodeError):
         stored = ""
-    if stored != hashlib.sha256(content).hexdigest():
+    if stored != digest_of(content):
         raise BadInputError(
             f"{path} was changed since it was written: its SHA-256 is not the one in "
             f"{digest_path(path).name}; {advice}"

@@ -21,12 +21,9 @@ class Registry(Generic[T]):
 
     Other packages add objects through the entry-point group ``physion.<kind>s``.
 
-    Parameters
-    ----------
-    kind
-        What is registered, in the singular; used in messages and in the entry-point group.
-    lazy
-        ``"module:attribute"`` by name, for objects that `get` imports when they are asked for.
+    - ``kind``: what is registered, in the singular; used in messages and in the entry-point group.
+    - ``lazy``: ``"module:attribute"`` by name, for objects that `get` imports when they are asked
+      for.
     """
 
     def __init__(self, kind: str, lazy: dict[str, str] | None = None) -> None:

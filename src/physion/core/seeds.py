@@ -21,12 +21,9 @@ def trial_seed(
 ) -> np.random.SeedSequence:
     """Return the seed of one trial, a function of the trial's name only.
 
-    Parameters
-    ----------
-    dataset, scenario, split, index
-        Name of the trial.
-    attempt
-        Number of scenes sampled for this trial and rejected before; each has a different seed.
+    - ``dataset``, ``scenario``, ``split``, ``index``: name of the trial.
+    - ``attempt``: number of scenes sampled for this trial and rejected before; each has a different
+      seed.
     """
     parts = (dataset, scenario, split, index)
     return named_seed(*parts, attempt) if attempt else named_seed(*parts)

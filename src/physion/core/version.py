@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from functools import cache
 from importlib.resources import files
+
+from physion.core.files import digest_of
 
 __version__ = "0.1.0"
 MADE_WITH = f"physion {__version__}"
@@ -37,4 +38,4 @@ def version_digest(*parts: str) -> str:
     """
     golden = golden_digests()
     known = [golden[scenario].get(part, "") for scenario in sorted(golden) for part in parts]
-    return hashlib.sha256("\n".join(known).encode()).hexdigest()[:8]
+    return digest_of("\n".join(known))[:8]

@@ -22,45 +22,6 @@ if TYPE_CHECKING:
     from physion.trials.trial_file import Trial
 
 
-class ObservedDataset:
-    """Access to the observed movies of a dataset and to nothing else.
-
-    For code that must not see the outcome of a trial: only files that end with the observed part
-    are opened, so the future cannot be read by mistake. With ``verify``, movies are compared with
-    their SHA-256 in the index.
-    """
-
-    def __init__(self, folder: Path, index: pd.DataFrame, *, verify: bool = True) -> None:
-        self._movies = _files(folder, index, "observed_movie", verify)
-        self._lengths = dict(zip(index["trial"], index["observed_frames"], strict=True))
-
-    @property
-    def trials(self) -> list[str]:
-        """Names of all trials, in the order of the index."""
-        return list(self._movies)
-
-    def frames(
-        self,
-        trial: str,
-        *,
-        count: int | None = None,
-        stride: int = 1,
-        size: tuple[int, int] | None = None,
-    ) -> NDArray[np.uint8]:
-        """Return observed frames 0, ``stride``, ... (T, H, W, 3), sRGB; see `video.read_frames`."""
-        if trial not in self._movies:
-            raise UnknownNameError("trial", trial, self._movies)
-        from physion.trials.video import read_frames
-
-        path = _checked(self._movies[trial], trial)
-        frames = read_frames(path, count=count, stride=stride, size=size)
-        if (len(frames) - 1) * stride >= self._lengths[trial]:
-            raise BadInputError(
-                f"{path} shows more than the {self._lengths[trial]} observed frames of its trial"
-            )
-        return frames
-
-
 class Dataset:
     """Dataset in a folder: a map from row numbers to trials, and from names to files and frames.
 
@@ -103,11 +64,6 @@ class Dataset:
             table = table[table["scenario"] == scenario]
         return [str(name) for name in table["trial"]]
 
-    @cached_property
-    def observed(self) -> ObservedDataset:
-        """Access to the observed movies only, for code that must not see the outcome."""
-        return ObservedDataset(self.folder, self.index, verify=self.verify)
-
     def paths(self, trial: str) -> TrialPaths:
         """Return the paths of the files of a trial."""
         if trial not in self._rows:
@@ -125,8 +81,9 @@ class Dataset:
 
     def files(self, column: str) -> dict[str, IndexedFile]:
         """Return the files of one column of the index by trial, without trials that have none."""
-        found = _files(self.folder, self.index, column, self.verify)
-        return {trial: file for trial, file in found.items() if file is not None}
+        rows = self.index[["trial", "split", "scenario", f"{column}_sha256"]].to_dict("records")
+        found = [indexed_file(self.folder, row, column, verify=self.verify) for row in rows]
+        return {file.trial: file for file in found if file is not None}
 
     def trial(self, trial: str) -> Trial:
         """Open and check a trial file."""
@@ -160,8 +117,18 @@ class Dataset:
         stride: int = 1,
         size: tuple[int, int] | None = None,
     ) -> NDArray[np.uint8]:
-        """Return frames of the observed movie (T, H, W, 3) in sRGB; see `video.read_frames`."""
-        return self.observed.frames(trial, count=count, stride=stride, size=size)
+        """Return frames of the observed movie (T, H, W, 3) in sRGB; see `video.read_frames`.
+
+        No file with the future is opened.
+        """
+        from physion.trials.video import read_frames
+
+        path = _checked(self.file(trial, "observed_movie"), trial)
+        frames = read_frames(path, count=count, stride=stride, size=size)
+        observed = self.index["observed_frames"].iloc[self._rows[trial]]
+        if (len(frames) - 1) * stride >= observed:
+            raise BadInputError(f"{path} shows more than the {observed} observed frames")
+        return frames
 
     @cached_property
     def _rows(self) -> dict[str, int]:
@@ -181,14 +148,6 @@ def indexed_file(
         return None
     paths = TrialPaths(folder, str(row["split"]), str(row["scenario"]), str(row["trial"]))
     return IndexedFile(paths.trial, getattr(paths, column), str(sha256), verify)
-
-
-def _files(
-    folder: Path, index: pd.DataFrame, column: str, verify: bool
-) -> dict[str, IndexedFile | None]:
-    """Return the files of one column of an index by trial."""
-    rows = index[["trial", "split", "scenario", f"{column}_sha256"]].to_dict("records")
-    return {str(row["trial"]): indexed_file(folder, row, column, verify=verify) for row in rows}
 
 
 def _checked(file: IndexedFile | None, trial: str) -> Path:

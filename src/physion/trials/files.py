@@ -6,7 +6,6 @@ A trial has one trial file, and movies and a map unless they were left out. The 
 
 from __future__ import annotations
 
-import hashlib
 import io
 import stat
 import zlib
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from physion.core.errors import BadInputError
-from physion.core.files import file_sha256, read_plain, write_atomic
+from physion.core.files import digest_of, file_sha256, read_plain, write_atomic
 
 INDEX = "index.parquet"
 """File with one row per trial, written last."""
@@ -158,7 +157,7 @@ class IndexedFile:
             content = read_plain(self.path, MAX_FILE_BYTES, follow_links=True)
         except BadInputError as error:
             raise BadInputError(f"trial {self.trial!r}: {error}") from error
-        if self.verify and hashlib.sha256(content).hexdigest() != self.sha256:
+        if self.verify and digest_of(content) != self.sha256:
             raise self._changed()
         return content
 
@@ -191,33 +190,12 @@ def encode_png(picture: NDArray[np.uint8], compress_level: int = 6) -> bytes:
 
 
 def same_picture(one: bytes, other: bytes) -> bool:
-    """Return whether two PNG files differ at most in how their pixels are compressed.
-
-    All chunks except the compressed pixels must be equal, so that a file with a damaged
-    header or end is another one.
-    """
-    first, second = _uncompressed_chunks(one), _uncompressed_chunks(other)
-    if first is None or first != second:
-        return False
+    """Return whether two PNG files hold the same pixels, however they are compressed."""
     try:
         left, right = (np.asarray(Image.open(io.BytesIO(data))) for data in (one, other))
     except (OSError, SyntaxError, ValueError, zlib.error):
         return False
     return np.array_equal(left, right)
-
-
-def _uncompressed_chunks(data: bytes) -> list[bytes] | None:
-    """Return all chunks of a PNG file except its pixels; None if one is damaged."""
-    chunks, place = [data[:8]], 8
-    while place < len(data):
-        end = place + 12 + int.from_bytes(data[place : place + 4], "big")
-        body, checksum = data[place + 4 : end - 4], data[end - 4 : end]
-        if end > len(data) or zlib.crc32(body).to_bytes(4, "big") != checksum:
-            return None
-        if body[:4] != b"IDAT":
-            chunks.append(body)
-        place = end
-    return chunks
 
 
 def write_files(paths: TrialPaths, files: Mapping[str, bytes]) -> None:
@@ -242,40 +220,26 @@ MAX_RATE = 1000
 class Metadata:
     """Origin and settings of a trial; nothing in it depends on the time of its making.
 
-    Parameters
-    ----------
-    trial, dataset, scenario, split
-        Names; the trial's is unique in the dataset.
-    index
-        Position in the split of the scenario, from 0.
-    preset
-        Name of the scenario's parameter set; None for an imported scene.
-    seed
-        Entropy of the trial's `SeedSequence` in hexadecimal; None for an imported scene.
-    look
-        Colours of the trial's movies, one of `physion.scenes.looks.LOOKS`.
-    width, height
-        Size of the pictures in pixels.
-    frames, observed_frames
-        Number of frames of the whole trial, and of the part shown before the prediction.
-    frame_time
-        Seconds of physics per frame.
-    playback_rate
-        Frames per second of the movies.
-    completed
-        True if everything came to rest before the time limit.
-    engine, renderer, package
-        Names with versions.
-    digest
-        SHA-256 of the trajectory.
-    scene_digest
-        SHA-256 of everything that determines the motion (`Scene.physics_digest`).
-    attempt
-        Number of scenes sampled for this trial and rejected before; None for an imported scene.
-    movies, free_movies
-        Whether there are movies and a map, and further movies in free colours.
-    recorded_contact
-        Outcome that an imported scene was recorded with, else None.
+    - ``trial``, ``dataset``, ``scenario``, ``split``: names; that of the trial is unique in the
+      dataset.
+    - ``index``: position in the split of the scenario, from 0.
+    - ``preset``: name of the scenario's parameter set; None for an imported scene.
+    - ``seed``: entropy of the trial's `SeedSequence` in hexadecimal; None for an imported scene.
+    - ``look``: colours of the trial's movies, one of `physion.scenes.looks.LOOKS`.
+    - ``width``, ``height``: size of the pictures in pixels.
+    - ``frames``, ``observed_frames``: number of frames of the whole trial, and of the part shown
+      before the prediction.
+    - ``frame_time``: seconds of physics per frame.
+    - ``playback_rate``: frames per second of the movies.
+    - ``completed``: True if everything came to rest before the time limit.
+    - ``engine``, ``renderer``, ``package``: names with versions.
+    - ``digest``: SHA-256 of the trajectory.
+    - ``scene_digest``: SHA-256 of everything that determines the motion (`Scene.physics_digest`).
+    - ``attempt``: number of scenes sampled for this trial and rejected before; None for an imported
+      scene.
+    - ``movies``, ``free_movies``: whether there are movies and a map, and further movies in free
+      colours.
+    - ``recorded_contact``: outcome that an imported scene was recorded with, else None.
     """
 
     trial: str

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -13,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from physion.core.errors import BadInputError
-from physion.core.files import check_digest, read_plain, write_with_digest
+from physion.core.files import check_digest, digest_of, read_plain, write_with_digest
 from physion.scenes.scene import Scene
 from physion.trials.files import FILES, INDEX, MAX_FILE_BYTES, SAFE_NAME, TrialPaths, find_trials
 from physion.trials.trial_file import Trial
@@ -118,7 +117,7 @@ def index_row(paths: TrialPaths, opened: Trial | None = None) -> dict[str, Any]:
         content = read_plain(path, MAX_FILE_BYTES, follow_links=True)
         row[name] = path.relative_to(paths.folder).as_posix()
         row[f"{name}_bytes"] = len(content)
-        row[f"{name}_sha256"] = hashlib.sha256(content).hexdigest()
+        row[f"{name}_sha256"] = digest_of(content)
     row |= {name: getattr(meta, name) for name in COLUMNS if hasattr(meta, name)}
     row |= {
         "contact": labels.contact,
@@ -194,18 +193,6 @@ def has_sizes(row: Mapping[Any, Any], paths: TrialPaths) -> bool:
         return all(files[name].stat().st_size == size for name, size in sizes.items())
     except OSError:
         return False
-
-
-def describe_mixed_versions(table: pd.DataFrame) -> str:
-    """Return a note on trials that several versions of the package made; "" if one made all.
-
-    Versions that simulate or render differently are never mixed: `generate` refuses them.
-    """
-    counts = table["package"].dropna().value_counts().sort_index()
-    if len(counts) < 2:
-        return ""
-    listed = ", ".join(f"{count} by {package}" for package, count in counts.items())
-    return f"the trials were made by several versions: {listed}; make a new folder"
 
 
 def same_value(one: Any, other: Any) -> bool:

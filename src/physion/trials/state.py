@@ -1,6 +1,7 @@
-"""State of a trial: the physical quantities that the original study offers for every stimulus.
+"""State of a trial: quantities that follow from a trial file and are not stored in it.
 
-Every function takes an open `Trial` and computes one quantity from the trial file only. Units are
+Every function takes an open `Trial`. Poses, velocities, contacts and parameters are stored:
+`Trial.trajectory` and `Trial.scene` hold them. Units are
 metres, kilograms, seconds and radians; axes are right-handed with z up; quaternions are
 (w, x, y, z). In shapes, F counts frames, N all objects in the order of `Scene.names` (rigid bodies,
 then cloths), and B rigid bodies. Frame f shows the time f * `FRAME_TIME`.
@@ -11,11 +12,9 @@ participants that predict. docs/reference/trial-files.md has examples.
 
 from __future__ import annotations
 
-import copy
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -23,11 +22,9 @@ from numpy.typing import NDArray
 
 from physion.core.errors import BadInputError
 from physion.numerics.rotations import rotate_vectors
-from physion.physics.particles import Particles, particles_over_time
 from physion.physics.rigid.bodies import collision_hulls, hull_mass
-from physion.physics.trajectory import ENVIRONMENT
 from physion.rendering.camera import intrinsics, view_matrix
-from physion.scenes.scene import FRAME_TIME, Body, Cloth, Scene, SurfaceMaterial, Vec3
+from physion.scenes.scene import FRAME_TIME, Body, Cloth, SurfaceMaterial, Vec3
 from physion.trials.trial_file import Trial, mesh_of
 
 Floats = NDArray[np.float32]
@@ -38,56 +35,15 @@ FLOOR = "floor"
 """Name of the environment in contacts."""
 
 
-class RigidPoses(NamedTuple):
-    """Poses of rigid bodies: ``positions`` (F, B, 3) of pivots, ``rotations`` (F, B, 4)."""
-
-    positions: Floats
-    rotations: Floats
-
-
-class RigidVelocities(NamedTuple):
-    """``linear`` (F, B, 3) of centres of mass, m/s; ``angular`` (F, B, 3), world axes, rad/s."""
-
-    linear: Floats
-    angular: Floats
-
-
-@dataclass(frozen=True)
-class PairContacts:
-    """Contacts of two objects: one row per frame in which they touch, at the deepest point.
-
-    Parameters
-    ----------
-    frame
-        (C,) frame numbers.
-    point
-        (C, 3) in metres, world coordinates.
-    normal
-        (C, 3) unit vectors from the first object to the second.
-    impulse
-        (C,) in newton seconds along the normal, during the frame.
-    """
-
-    frame: NDArray[np.int32]
-    point: Floats
-    normal: Floats
-    impulse: Floats
-
-
 @dataclass(frozen=True)
 class ThingMesh:
     """Rendered surface of a body or cloth.
 
-    Parameters
-    ----------
-    vertices
-        (V, 3) in metres, in the frame of the shape at unit scale. For a cloth: the undeformed
-        sheet about its centre.
-    scaled
-        (V, 3): vertices multiplied by the body's scale, before the pose; for a cloth the same as
-        ``vertices``. `world_vertices` returns the vertices as they move.
-    faces
-        (T, 3) indices of vertices, counter-clockwise as seen from outside.
+    - ``vertices``: (V, 3) in metres, in the frame of the shape at unit scale. For a cloth: the
+      undeformed sheet about its centre.
+    - ``scaled``: (V, 3): vertices multiplied by the body's scale, before the pose; for a cloth the
+      same as ``vertices``. `world_vertices` returns the vertices as they move.
+    - ``faces``: (T, 3) indices of vertices, counter-clockwise as seen from outside.
     """
 
     vertices: Matrix
@@ -98,8 +54,8 @@ class ThingMesh:
 def centroids(trial: Trial) -> Floats:
     """Return the centres of mass (F, N, 3) in metres, world coordinates.
 
-    The centre of a body is the centre of its collision hulls, whose velocity is
-    `RigidVelocities.linear`; the centre of a cloth is the mean of its vertices.
+    The centre of a body is that of its collision hulls, whose velocity is `Trajectory.velocities`;
+    the centre of a cloth is the mean of its vertices.
     """
     scene, motion = trial.scene, trial.trajectory
     masses = [
@@ -113,49 +69,12 @@ def centroids(trial: Trial) -> Floats:
     return np.concatenate([rigid, *(s[:, None] for s in sheets)], axis=1).astype(np.float32)
 
 
-def poses(trial: Trial) -> RigidPoses:
-    """Return positions and rotations of the rigid bodies."""
-    return RigidPoses(trial.trajectory.positions, trial.trajectory.rotations)
-
-
-def velocities(trial: Trial) -> RigidVelocities:
-    """Return linear and angular velocities of the rigid bodies."""
-    return RigidVelocities(trial.trajectory.velocities, trial.trajectory.angular_velocities)
-
-
-def contacts_between(trial: Trial, a: str, b: str) -> PairContacts:
-    """Return the contacts of the objects named ``a`` and ``b``, with normals from a to b.
-
-    `FLOOR` names the environment. Raises `BadSceneError` for a name that is not in the scene.
-    """
-    first, second = (_number(trial.scene, name) for name in (a, b))
-    contacts = trial.trajectory.contacts
-    rows = (contacts.bodies == np.sort([first, second])).all(axis=1)
-    sign = np.float32(1 if first <= second else -1)
-    return PairContacts(
-        contacts.frame[rows],
-        contacts.point[rows],
-        sign * contacts.normal[rows],
-        contacts.impulse[rows],
-    )
-
-
-def environment_contacts(trial: Trial) -> dict[str, PairContacts]:
-    """Return the contacts with the floor by name of the object; normals point away from the floor.
-
-    Objects that never touch the floor are left out.
-    """
-    pairs = trial.trajectory.contacts.bodies
-    touching = np.unique(pairs[(pairs == ENVIRONMENT).any(axis=1)].max(axis=1, initial=ENVIRONMENT))
-    names = trial.scene.names()
-    return {names[i]: contacts_between(trial, FLOOR, names[i]) for i in touching if i >= 0}
-
-
 def contact_table(trial: Trial) -> pd.DataFrame:
-    """Return all contacts as a table with one row per contact.
+    """Return all contacts as a table with one row per pair and frame, at the deepest point.
 
-    Columns: frame, time (s), first, second (names, `FLOOR` for the environment), point_x .. point_z
-    (m), normal_x .. normal_z (from first to second), impulse (N s).
+    Columns: frame, time (s), first, second (names in the order of `Scene.names`, `FLOOR` before
+    them), point_x .. point_z (m), normal_x .. normal_z (from first to second), impulse (N s along
+    the normal, during the frame).
     """
     contacts = trial.trajectory.contacts
     names = np.array([FLOOR, *trial.scene.names()], dtype=object)
@@ -198,13 +117,6 @@ def world_vertices(trial: Trial, frame: int) -> dict[str, Matrix]:
     for cloth, part in zip(trial.scene.cloths, _cloth_parts(trial), strict=True):
         found[cloth.name] = part[frame].astype(np.float64)
     return found
-
-
-def particles(
-    trial: Trial, spacing: float | None = None, frames: Sequence[int] | None = None
-) -> Particles:
-    """Return all objects but scenery as particles over time; see `particles_over_time`."""
-    return particles_over_time(trial.scene, trial.trajectory, spacing, frames)
 
 
 def object_table(trial: Trial, look: str | None = None) -> pd.DataFrame:
@@ -314,21 +226,12 @@ def pushes(trial: Trial) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=[*names, "speed"])
 
 
-def scenario_parameters(trial: Trial) -> dict[str, Any]:
-    """Return a copy of the parameters that the sampler drew or the importer read; JSON values."""
-    return copy.deepcopy(dict(trial.scene.parameters))
-
-
 def _cloth_parts(trial: Trial) -> list[Floats]:
     """Return the vertices (F, V, 3) of each cloth."""
     counts = [cloth.resolution**2 for cloth in trial.scene.cloths]
     ends = np.cumsum(counts)
     vertices = trial.trajectory.cloth_vertices
     return [vertices[:, end - count : end] for count, end in zip(counts, ends, strict=True)]
-
-
-def _number(scene: Scene, name: str) -> int:
-    return ENVIRONMENT if name == FLOOR and FLOOR not in scene.names() else scene.index(name)
 
 
 def _check_frame(trial: Trial, frame: int) -> None:

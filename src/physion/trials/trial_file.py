@@ -8,7 +8,6 @@ library, and a killed process would leave incomplete files that look complete.
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import io
 import json
 import math
@@ -24,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.core.errors import BadInputError
-from physion.core.files import read_plain, write_atomic
+from physion.core.files import digest_of, read_plain
 from physion.core.settings import parse_json, read_settings
 from physion.physics.cloth.springs import sheet_triangles, sheet_vertices
 from physion.physics.labels import Labels
@@ -68,16 +67,10 @@ def open_hdf5(source: Path | bytes, where: str) -> h5py.File:
 class GuardedHdf5:
     """Access to the members of an open HDF5 file, with the checks that hold for every format.
 
-    Parameters
-    ----------
-    file
-        The open file.
-    where
-        Name of the file in error messages.
-    filters
-        Numbers of the HDF5 filters (compression, checksums) that arrays may use.
-    max_chunk_bytes
-        Largest chunk that is read, in bytes of memory.
+    - ``file``: the open file.
+    - ``where``: name of the file in error messages.
+    - ``filters``: numbers of the HDF5 filters (compression, checksums) that arrays may use.
+    - ``max_chunk_bytes``: largest chunk that is read, in bytes of memory.
     """
 
     def __init__(
@@ -180,14 +173,10 @@ _FILTERS = {h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32, h5py.h5z.FILTER
 class Field:
     """Declaration of one array of a trial file.
 
-    Parameters
-    ----------
-    dtype
-        NumPy type, or ``text``: UTF-8 of fixed length, in an array of one element.
-    axes
-        For each axis its length, or a name; axes of one name have one length in all fields.
-    meaning
-        What the values are, with their unit; stored as attribute ``meaning`` of the array.
+    - ``dtype``: NumPy type, or ``text``: UTF-8 of fixed length, in an array of one element.
+    - ``axes``: for each axis its length, or a name; axes of one name have one length in all fields.
+    - ``meaning``: what the values are, with their unit; stored as attribute ``meaning`` of the
+      array.
     """
 
     dtype: str
@@ -213,7 +202,7 @@ FIELDS: Mapping[str, Field] = {
     "first_frame/ids": Field("<i2", ("row", "column"), "0 the room, i + 1 the i-th of Scene.names"),
     "first_frame/fractions": Field("<f4", ("thing",), "fraction of the picture by Scene.names"),
 }
-"""Fields that every trial file has, by their path."""
+"""Fields with the content of a trial, by their path; every trial file has them."""
 
 GEOMETRY: Mapping[str, Field] = {
     "camera/intrinsics": Field("<f8", (3, 3), "camera coordinates to pixels, as in OpenCV"),
@@ -223,8 +212,8 @@ GEOMETRY: Mapping[str, Field] = {
     "meshes/ranges": Field("<i4", ("thing", 4), "first and end row of vertices, then of faces"),
     "meshes/scale": Field("<f4", ("thing", 3), "factors of the vertices; 1 for cloth"),
 }
-"""Fields that follow from the scene and the size of the pictures, for readers without this package.
-Files that were made before they existed lack all of them."""
+"""Fields that follow from the scene and the size of the pictures, for readers without this
+package."""
 
 PASSES: Mapping[str, Field] = {
     "color": Field("|u1", ("frame", "row", "column", 3), "sRGB"),
@@ -241,7 +230,7 @@ def seal(content: bytes) -> bytes:
     """Return ``content`` with its length and SHA-256 written into its first 512 bytes."""
     rest = content[SEAL_BYTES:]
     lines = [_MAGIC + b" %d" % SCHEMA, b"length %d" % len(content)]
-    lines += [b"sha256 " + hashlib.sha256(rest).hexdigest().encode()]
+    lines += [b"sha256 " + digest_of(rest).encode()]
     return (b"\n".join(lines) + b"\n").ljust(SEAL_BYTES, b"\0") + rest
 
 
@@ -262,7 +251,7 @@ def check_seal(data: bytes, where: str) -> None:
         raise BadInputError(
             f"{where} is cut short or too long: {len(data)} bytes, not {promised} (field 'seal')"
         )
-    if head[2] != b"sha256 " + hashlib.sha256(data[SEAL_BYTES:]).hexdigest().encode():
+    if head[2] != b"sha256 " + digest_of(data[SEAL_BYTES:]).encode():
         raise BadInputError(
             f"{where} is damaged: its bytes do not match their SHA-256 (field 'seal')"
         )
@@ -273,15 +262,11 @@ def storage(
 ) -> dict[str, Any]:
     """Return the options with which h5py stores an array: chunks, compression, checksum.
 
-    Parameters
-    ----------
-    array_shape, dtype
-        Shape and type of the array; empty arrays get no options.
-    compatible
-        Compress with gzip, which every HDF5 reader has, instead of zstd, which reads five times
-        faster.
-    columns
-        Store each column of a table with many rows as one chunk. Meshes compress to half the size.
+    - ``array_shape``, ``dtype``: shape and type of the array; empty arrays get no options.
+    - ``compatible``: compress with gzip, which every HDF5 reader has, instead of zstd, which reads
+      five times faster.
+    - ``columns``: store each column of a table with many rows as one chunk. Meshes compress to half
+      the size.
     """
     size = int(np.prod(array_shape)) * dtype.itemsize
     if size == 0:
@@ -338,10 +323,6 @@ class FieldReader(GuardedHdf5):
         if not isinstance(group, h5py.Group):
             raise self.bad("passes", "is not a group")
         return self.guard("passes", lambda: tuple(name for name in PASSES if name in group))
-
-    def has_geometry(self) -> bool:
-        """Return whether the file holds any of `GEOMETRY`; then it must hold all."""
-        return self.find("camera") is not None or self.find("meshes") is not None
 
     def check(self, path: str) -> None:
         """Check the field at ``path`` against its declaration without reading its values."""
@@ -450,18 +431,11 @@ _CONTACTS = ("frame", "bodies", "point", "normal", "impulse")
 class TrialWriter:
     """Builder of the bytes of a trial file; equal input gives equal bytes.
 
-    Parameters
-    ----------
-    metadata, trajectory, labels
-        Parts of the trial.
-    scene
-        The scene in its free colours, whatever the look of the trial's movies.
-    ids
-        Ids (H, W) of frame 0: 0 is the room, i + 1 the i-th object of `Scene.names`.
-    passes
-        Names of image passes that will be added by `add_frame` for every frame.
-    compatible
-        Compress with gzip instead of zstd, for readers without hdf5plugin.
+    - ``metadata``, ``trajectory``, ``labels``: parts of the trial.
+    - ``scene``: the scene in its free colours, whatever the look of the trial's movies.
+    - ``ids``: ids (H, W) of frame 0: 0 is the room, i + 1 the i-th object of `Scene.names`.
+    - ``passes``: names of image passes that will be added by `add_frame` for every frame.
+    - ``compatible``: compress with gzip instead of zstd, for readers without hdf5plugin.
     """
 
     def __init__(
@@ -544,35 +518,6 @@ class TrialWriter:
         dataset.attrs["meaning"] = np.bytes_(meaning.encode())
 
 
-def write_trial(
-    path: Path,
-    metadata: Metadata,
-    scene: Scene,
-    trajectory: Trajectory,
-    labels: Labels,
-    ids: NDArray[np.integer[Any]],
-    *,
-    passes: Sequence[Mapping[str, NDArray[Any]]] = (),
-    compatible: bool = False,
-) -> None:
-    """Write a trial file to ``path`` atomically; parameters as for `TrialWriter`.
-
-    ``passes`` has one mapping from pass name to image per frame, or is empty.
-    """
-    writer = TrialWriter(
-        metadata,
-        scene,
-        trajectory,
-        labels,
-        ids,
-        passes=sorted(passes[0]) if passes else (),
-        compatible=compatible,
-    )
-    for images in passes:
-        writer.add_frame(images)
-    write_atomic(path, writer.finish())
-
-
 class Trial:
     """Reader of a trial file; `Trial.open` checks the file, and parts are read on first use."""
 
@@ -582,7 +527,7 @@ class Trial:
         self._where = where
         self._renderers: dict[tuple[int, int, str], Renderer] = {}
         self._reader = FieldReader(open_hdf5(data, where), where)
-        for path in (*FIELDS, *(GEOMETRY if self._reader.has_geometry() else ())):
+        for path in (*FIELDS, *GEOMETRY):
             self._reader.check(path)
         for name in self.pass_names:
             self._reader.check(f"passes/{name}")
@@ -681,10 +626,8 @@ class Trial:
         return self._reader.array("first_frame/fractions")
 
     @cached_property
-    def geometry(self) -> dict[str, NDArray[Any]] | None:
-        """Camera matrices and meshes by path (`GEOMETRY`); None for a file made without them."""
-        if not self._reader.has_geometry():
-            return None
+    def geometry(self) -> dict[str, NDArray[Any]]:
+        """Camera matrices and meshes by path (`GEOMETRY`)."""
         return {path: self._reader.array(path) for path in GEOMETRY}
 
     @cached_property

@@ -219,17 +219,11 @@ _INDEX_BYTES = (2048, 24)
 class MovieEncoder:
     """Encoder of one MP4 file; equal frames give equal bytes.
 
-    Parameters
-    ----------
-    width, height
-        Size of the pictures in pixels, both even.
-    frames
-        Number of frames that will be added. It is needed in advance because the index is placed
-        before the pictures, so that a browser can play while it loads ("faststart").
-    rate
-        Frames per second.
-    crf
-        Quality of x264, lower is better.
+    - ``width``, ``height``: size of the pictures in pixels, both even.
+    - ``frames``: number of frames that will be added. It is needed in advance because the index is
+      placed before the pictures, so that a browser can play while it loads ("faststart").
+    - ``rate``: frames per second.
+    - ``crf``: quality of x264, lower is better.
     """
 
     def __init__(

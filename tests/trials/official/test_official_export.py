@@ -15,6 +15,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -27,6 +28,7 @@ from physion.core.errors import BadInputError
 from physion.core.names import CONTROLLERS, guess_scenario, plain_name
 from physion.physics.cloth.simulate import ClothSettings
 from physion.physics.engine import simulate
+from physion.physics.trajectory import Contacts, Trajectory
 from physion.rendering.camera import View, axes
 from physion.scenes.scene import Body, Camera, Joint, Push, Roles, Scene
 from physion.scenes.shapes.primitives import shape
@@ -53,7 +55,7 @@ from physion.trials.official.names import (
     to_official_euler,
     to_official_rotation,
 )
-from physion.trials.official.write_file import _of_stack, _push
+from physion.trials.official.write_file import FrameWriter, _of_stack, _push, trial_stats
 from physion.trials.official.write_objects import OfficialObjects
 from physion.trials.trial_file import Trial
 from physion.trials.video import count_frames
@@ -63,19 +65,6 @@ CONFIGS = {
     "collide": "configurations/Collide/collide_testing/0003",
     "drape": "configurations/Drape/drape_testing/0000",
 }
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_dataset(tmp_path_factory.mktemp("official") / "dataset")
-
-
-@pytest.fixture(scope="module")
-def exported(dataset: Path) -> Path:
-    out = dataset.parent / "exported"
-    report = export_official(dataset, out, executor=SerialExecutor())
-    assert report.made == (RIGID, CLOTH) and not report.failed and report.exit_code == 0
-    return out
 
 
 @pytest.fixture(scope="module")
@@ -298,6 +287,36 @@ def test_labels(exported: Path, rigid: Trial) -> None:
         assert labels[-1]["target_has_moved"][()] and not labels[0]["target_has_moved"][()]
 
 
+def test_a_tower_fell_when_its_top_is_below_half_of_its_first_height() -> None:
+    """The cap's top is at 0.6 m at first and the block's at 0.2 m; the probe does not count."""
+    bodies = (
+        Body("zone", "cube", (0, 0, 0), (1, 1, 0.01), kinematic=True),
+        Body("block", "cube", (0, 0, 0), (0.2, 0.2, 0.2)),
+        Body("cap", "cube", (0, 0, 0.4), (0.2, 0.2, 0.2)),
+        Body("probe", "sphere", (1, 0, 3), (0.2, 0.2, 0.2)),
+    )
+    scene = Scene("a", "support", bodies, Roles("cap", "zone", "probe"), Camera((3.0, 0.0, 1.0)))
+    heights = [0.4, 0.395, 0.3, 0.11, 0.09, 0.0, 0.3]
+    positions = np.tile([body.position for body in bodies], (7, 1, 1)).astype(np.float32)
+    positions[:, 2, 2] = heights
+    rotations = np.tile(np.float32([1, 0, 0, 0]), (7, 4, 1))
+    still = np.zeros_like(positions)
+    nothing = np.zeros((7, 0, 3), np.float32)
+    gaps = np.full(7, np.nan, np.float32)
+    contacts = Contacts(
+        np.array([2], np.int32), np.array([[0, 2]], np.int32), still[:1, 0], still[:1, 0], gaps[:1]
+    )
+    motion = Trajectory(
+        positions, rotations, still, still, nothing, gaps, contacts, False, "by hand"
+    )
+    labels = FrameWriter(OfficialObjects(scene, motion), 8, 8).labels
+    assert labels["did_fall"].tolist() == [False] * 4 + [True, True, False]
+    assert labels["target_has_moved"].tolist() == [False, False] + [True] * 5
+    assert labels["target_contacting_zone"].tolist() == [False, False, True] + [False] * 4
+    assert labels["trial_timeout"].tolist() == [False] * 6 + [True]
+    assert not labels["trial_complete"].any()
+
+
 def test_cloth_has_particles_and_distances(exported: Path, cloth: Trial) -> None:
     path = exported / f"{CONFIGS['drape']}.hdf5"
     assert [name.decode() for name in static(path, "model_names")][1] == "cloth_square"
@@ -401,6 +420,61 @@ def test_metadata_is_measured(exported: Path, rigid: Trial) -> None:
         (line[None] * last).sum() / last.sum() - (line[None] * first).sum() / first.sum(),
     ]
     np.testing.assert_allclose(record["final_target_mask_displacement"], moved, atol=1e-3)
+
+
+def test_a_trial_without_contact_is_exported_as_one(tmp_path: Path) -> None:
+    """In every list, as false: the other trials here all touch."""
+    dataset = make_dataset(tmp_path / "d", touch=False)
+    executor = SerialExecutor()
+    export_official(dataset, tmp_path / "o", images=False, executor=executor)
+    assert not read_label(tmp_path / "o" / f"{CONFIGS['collide']}.hdf5")
+    assert f"{RIGID}_img,False" in (tmp_path / "o/labels.csv").read_text()
+    table = pd.read_csv(tmp_path / "o/stimulus_names_and_labels.csv")
+    assert table["label"].tolist() == [False]
+    path = (tmp_path / "o" / CONFIGS["collide"]).with_name("metadata.json")
+    (record,) = json.loads(path.read_text())
+    assert record["does_target_contact_zone"] is False and record["does_target_miss_zone"] is True
+    assert record["first_target_contact_zone_frame"] is None
+    export_official(dataset, tmp_path / "e", layout="physion-evaluator", executor=executor)
+    labels = json.loads((tmp_path / "e/physion_mp4s/test/all_video_labels.json").read_text())
+    (label,) = labels.values()
+    assert label == {"label": False, "contact_frame_label": FRAMES // 2}
+
+
+def test_means_over_the_trials_of_a_configuration() -> None:
+    records: list[dict[str, Any]] = [
+        {"trial_num": 0, "contact": True, "area": 0.1, "room": "box", "shift": [1.0, 0.0],
+         "away": {"x": 1.0}, "frame": None},
+        {"trial_num": 1, "contact": False, "area": 0.3, "room": "tdw", "shift": [2.0, -1.0],
+         "away": {"x": 4.0}, "frame": 7},
+        {"trial_num": 2, "contact": False, "area": 0.4, "room": "tdw", "shift": None,
+         "away": None, "frame": 8},
+    ]  # fmt: skip
+    assert trial_stats(records) == {
+        "contact/avg_label": 0.333,
+        "area/avg_label": 0.267,
+        "room/avg_label": "box-tdw",
+        "shift/avg_label": [1.5, -0.5],
+        "away/avg_label": {"x": 2.5},
+        "frame/avg_label": 7.5,
+        "num_trials": 3,
+    }
+
+
+def test_zone_ramp_target_and_probe_come_first_and_ids_count_from_1() -> None:
+    bodies = (
+        Body("block", "cube", (2, 0, 0)),
+        Body("probe", "sphere", (1, 0, 0)),
+        Body("ramp", "ramp_with_platform_30", (0, 1, 0), kinematic=True),
+        Body("target", "cone", (0, 0, 0)),
+        Body("zone", "cube", (0, 2, 0), kinematic=True),
+    )
+    scene = Scene("a", "roll", bodies, Roles("target", "zone", "probe"), Camera((3.0, 0.0, 1.0)))
+    objects = OfficialObjects(scene, simulate(scene, frames=1))
+    assert objects.ids == {"zone": 1, "ramp": 2, "target": 3, "probe": 4, "block": 5}
+    # The renderer's ids are 0 for the room, then 1 to 5 in the order of the scene.
+    seen = objects.official_ids(np.arange(6, dtype=np.int16).reshape(2, 3))
+    assert seen.tolist() == [[0, 5, 4], [2, 3, 1]]
 
 
 def test_core_folders_hold_both_looks(exported: Path, dataset: Path) -> None:

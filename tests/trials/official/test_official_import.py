@@ -29,7 +29,6 @@ from physion.trials.index import build_index, write_index
 from physion.trials.making.verify import verify_dataset
 from physion.trials.official.export_folder import export_official
 from physion.trials.official.import_folder import import_official
-from physion.trials.official.read_file import OfficialFile
 from physion.trials.trial_file import Trial, TrialWriter
 from physion.trials.video import count_frames, encode_movie, read_frames
 from support.official_hand_made import (
@@ -40,22 +39,9 @@ from support.official_hand_made import (
     RIGID,
     SIZE,
     TOUCH,
-    make_dataset,
 )
 
 Edit = Callable[[h5py.File], None]
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_dataset(tmp_path_factory.mktemp("official") / "dataset")
-
-
-@pytest.fixture(scope="module")
-def exported(dataset: Path) -> Path:
-    out = dataset.parent / "exported"
-    export_official(dataset, out, executor=SerialExecutor())
-    return out
 
 
 @pytest.fixture(scope="module")
@@ -543,7 +529,7 @@ def test_core_folders_become_trials_without_motion(core: Path, dataset: Path) ->
     assert count_frames(paths.observed_movie) == OBSERVED
     assert paths.map.read_bytes() == ours.map.read_bytes()
     assert verify_dataset(out).faults == []
-    assert len(Dataset(out).observed.frames(RIGID)) == OBSERVED
+    assert len(Dataset(out).observed_frames(RIGID)) == OBSERVED
 
 
 def test_what_has_no_motion_is_not_exported(core: Path, tmp_path: Path) -> None:
@@ -563,16 +549,30 @@ def test_a_movie_without_label_fails_without_the_others(core: Path) -> None:
     assert report.made == (CLOTH,) and "labels.csv" in report.failed[RIGID]
 
 
-def test_a_configuration_of_movies_has_labels_in_its_metadata(
-    exported: Path, tmp_path: Path
+@pytest.mark.parametrize("first", [44, 45])
+@pytest.mark.parametrize("kind", ["movie", "state"])
+def test_a_contact_up_to_frame_44_is_observed(
+    exported: Path, tmp_path: Path, kind: str, first: int
 ) -> None:
+    """By the metadata next to a movie, and by the labels in an HDF5 file."""
     folder = tmp_path / "configs/Collide/collide_testing"
     shutil.copytree(exported / "configurations/Collide/collide_testing", folder)
-    (folder / "0003.hdf5").unlink()
-    report = bring(tmp_path / "configs")
-    assert report.made == (RIGID,)
+    if kind == "movie":
+        (folder / "0003.hdf5").unlink()
+        text = (folder / "metadata.json").read_text()
+        whole = f'"first_target_contact_zone_frame": {TOUCH}'
+        assert whole in text
+        (folder / "metadata.json").write_text(text.replace(whole, whole.replace("46", str(first))))
+    else:
+        with h5py.File(folder / "0003.hdf5", "r+") as file:
+            for frame in (44, 45, 46, 47):
+                labels = file[f"frames/{frame:04d}/labels"]
+                del labels["target_contacting_zone"]
+                labels["target_contacting_zone"] = frame >= first
+    assert bring(tmp_path / "configs").made == (RIGID,)
     trial = trial_of(tmp_path / "configs")
-    assert (trial.labels.contact, trial.labels.first_frame) == (True, TOUCH)
+    labels = trial.labels
+    assert (labels.contact, labels.first_frame, labels.observed) == (True, first, first == 44)
     assert not trial.metadata.free_movies
 
 
@@ -641,27 +641,3 @@ def test_the_verb(
         == 0
     )
     assert "0 made, 1 kept, 0 failed" in capsys.readouterr().out.replace("\n", " ")
-
-
-# Official HDF5 files whose arrays take more memory together than a file may are refused.
-
-
-def test_many_small_arrays_are_bounded_together(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "0000.hdf5"
-    with h5py.File(path, "w") as file:
-        for frame in range(4):
-            # Zeros take almost no room in the file.
-            file.create_dataset(
-                f"frames/{frame:04}/objects/positions",
-                data=np.zeros((1000, 3)), chunks=(1000, 3), compression="gzip",
-            )  # fmt: skip
-    monkeypatch.setattr("physion.trials.official.read_file.MAX_FILE_BYTES", 80_000)
-    with OfficialFile.open(path) as official:
-        for _ in range(5):  # the same array counts once
-            official.numbers("frames/0000/objects/positions", (None, 3))
-        for frame in (1, 2):
-            official.numbers(f"frames/{frame:04}/objects/positions", (None, 3))
-        with pytest.raises(BadInputError, match=r"frames/0003/objects/positions.*80000 bytes"):
-            official.numbers("frames/0003/objects/positions", (None, 3))

@@ -34,10 +34,6 @@ RAI_WORDS = {
     "annotatorDemographics", "machineAnnotationTools",
 }  # fmt: skip
 """All properties of the responsible-AI vocabulary 1.0."""
-RAI_MANY = {
-    "dataCollectionType", "dataPreprocessingProtocol", "dataBiases", "dataLimitations",
-    "dataUseCases", "machineAnnotationTools", "personalSensitiveInformation",
-}  # fmt: skip
 SCHEMA_ORG_WORDS = {
     "name", "description", "url", "license", "version", "datePublished", "creator", "keywords",
     "distribution", "contentUrl", "contentSize", "encodingFormat", "sha256",
@@ -163,7 +159,9 @@ def test_counts_and_rates_match_the_index(dataset: Path, tmp_path: Path) -> None
     assert "| testing | drop | 2 | 1.000 | 0 | 60 | 0.875 | redyellow |" in lines
     assert "6 simulated physical scenes, 6 of them with movies" in text
     assert "- Agent and patient touch in 0.250 of the 4 training trials." in lines
-    assert "5 scenes were sampled at random" in text and "1 scene was imported" in text
+    assert (
+        "sampled at random by 0: 5." in text and "imported from records made elsewhere: 1." in text
+    )
     assert "In 1 of 6 trials something still moved" in text
     assert "0.875 of cases, measured on 2 of 6 trials" in text
     assert "min_visible = 0.0005, robust = 0.5, observed_contact = False" in text
@@ -176,7 +174,7 @@ def test_the_card_follows_the_index(dataset: Path, tmp_path: Path) -> None:
     write_index(tmp_path, table)
     text = write_card(tmp_path).readme.read_text()
     assert "| training | drop | 1 | 0.000 | 0 | 60 | - | free |" in text
-    assert "imported from records" not in text and "were chosen with" not in text
+    assert "records made elsewhere: 0." in text and "were chosen with" not in text
     assert "was not measured" in text
 
 
@@ -192,7 +190,7 @@ def test_only_states_have_no_movies_to_describe(tmp_path: Path) -> None:
     metadata = json.loads(card.metadata.read_text())
     assert [item["@id"] for item in metadata["distribution"]] == ["index.parquet", "trial-files"]
     assert "none of them with movies" in metadata["description"]
-    assert "H.264" not in card.metadata.read_text()
+    assert "video/mp4" not in card.metadata.read_text()
 
 
 def test_every_column_has_a_meaning() -> None:
@@ -236,21 +234,6 @@ def test_the_context_stands_in_the_file_and_knows_every_word(metadata: dict[str,
                 check(value)
 
     check({key: value for key, value in metadata.items() if key != "@context"})
-
-
-def test_responsible_properties_have_their_cardinality(metadata: dict[str, Any]) -> None:
-    said = {k.removeprefix("rai:"): v for k, v in metadata.items() if k.startswith("rai:")}
-    for name in (
-        "dataCollection",
-        "dataBiases",
-        "dataLimitations",
-        "dataUseCases",
-        "personalSensitiveInformation",
-    ):
-        assert said[name], name
-    for name, value in said.items():
-        texts = value if name in RAI_MANY else [value]
-        assert isinstance(texts, list) and all(isinstance(t, str) and t for t in texts), name
 
 
 def _nodes(node: Any) -> list[dict[str, Any]]:
@@ -320,15 +303,6 @@ def test_fields_are_the_columns_of_the_index(dataset: Path, metadata: dict[str, 
         }[kind](plain.dtype), name
 
 
-def test_splits_and_scenarios_are_enumerated(metadata: dict[str, Any]) -> None:
-    records = {r["@id"]: r for r in metadata["recordSet"]}
-    assert records["splits"]["dataType"] == "cr:Split"
-    assert [row["splits/name"] for row in records["splits"]["data"]] == ["testing", "training"]
-    assert [row["scenarios/name"] for row in records["scenarios"]["data"]] == ["drop"]
-    fields = {field["name"]: field for field in records["trials"]["field"]}
-    assert fields["split"]["references"] == {"field": {"@id": "splits/name"}}
-
-
 def _validate(path: Path) -> str:
     """What MLCommons' own program says of a file; skips where it is not installed.
 
@@ -358,12 +332,6 @@ def test_the_reference_validator_agrees(
     assert "1 error(s)" in _validate(tmp_path / "croissant.json")
 
 
-def test_same_arguments_same_bytes(dataset: Path, tmp_path: Path) -> None:
-    cards = [write_card(dataset, tmp_path / n, published="2026-11-21") for n in ("one", "two")]
-    assert cards[0].readme.read_bytes() == cards[1].readme.read_bytes()
-    assert cards[0].metadata.read_bytes() == cards[1].metadata.read_bytes()
-
-
 @pytest.mark.parametrize(
     ("argument", "value"),
     [
@@ -391,10 +359,7 @@ def test_folders_without_trials_are_refused(dataset: Path, tmp_path: Path) -> No
     ("name", "text"),
     [
         ("README.md", "# My own words\n"),
-        ("README.md", '---\ntitle: x\n---\npretty_name: "Physion: mine"\n'),
         ("croissant.json", '{"description": "somebody else\'s"}'),
-        ("croissant.json", "not JSON"),
-        ("croissant.json", "[]"),
     ],
 )
 def test_files_of_others_are_not_written_over(

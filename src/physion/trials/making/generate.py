@@ -34,7 +34,6 @@ from physion.trials.files import FAILURES, INDEX, SETTINGS, find_trials
 from physion.trials.index import (
     as_table,
     build_index,
-    describe_mixed_versions,
     has_sizes,
     read_index,
     write_index,
@@ -128,10 +127,8 @@ def make_trials(
             for name in todo:
                 jobs[name].paths.trial_file.unlink()
                 made.pop(name, None)
-        note = describe_mixed_versions(index)
     kept = [name for name in jobs if name not in missing and name not in problems]
-    notes = {str(folder): (note,)} if note else {}
-    return RunReport(list(made), kept, {**failed, **problems}, folder / INDEX, notes)
+    return RunReport(list(made), kept, {**failed, **problems}, folder / INDEX)
 
 
 def _known_index(folder: Path) -> pd.DataFrame:

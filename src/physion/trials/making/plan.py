@@ -41,23 +41,15 @@ PLAYBACK_RATES = {"slow": PLAYBACK_RATE, "real": round(1 / FRAME_TIME)}
 class TrialTask:
     """One trial to make, fully determined by the fields of this class and the settings.
 
-    Parameters
-    ----------
-    dataset, scenario, split, index
-        Name of the trial; with ``attempt`` they determine the seed of a sampled scene.
-    preset
-        Parameter set to sample from; None for the scenario's own parameters.
-    scene
-        Imported scene; None to sample one.
-    recorded_contact
-        Outcome recorded with an imported scene, if known.
-    presets
-        Parameter sets to choose from. `physion.trials.making.choose` fills in ``preset``,
-        ``attempt`` and ``robust`` in their place.
-    attempt
-        Number of scenes sampled for this trial and rejected before.
-    robust
-        Fraction of jittered simulations with the same outcome, if measured.
+    - ``dataset``, ``scenario``, ``split``, ``index``: name of the trial; with ``attempt`` they
+      determine the seed of a sampled scene.
+    - ``preset``: parameter set to sample from; None for the scenario's own parameters.
+    - ``scene``: imported scene; None to sample one.
+    - ``recorded_contact``: outcome recorded with an imported scene, if known.
+    - ``presets``: parameter sets to choose from. `physion.trials.making.choose` fills in
+      ``preset``, ``attempt`` and ``robust`` in their place.
+    - ``attempt``: number of scenes sampled for this trial and rejected before.
+    - ``robust``: fraction of jittered simulations with the same outcome, if measured.
     """
 
     dataset: str

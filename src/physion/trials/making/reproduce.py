@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from physion.core.files import digest_of
 from physion.core.seeds import trial_seed
 from physion.core.version import FILE, golden_digests
 from physion.physics.engine import simulate
@@ -42,7 +42,7 @@ def trial_digests(scenario: str) -> dict[str, str]:
     particles = particles_over_time(scene, trajectory, frames=[0, middle])
     frame = Renderer(scene, trajectory, SIZE, SIZE).render(middle, PASSES)
     return {
-        "scene": hashlib.sha256(scene.to_json().encode()).hexdigest(),
+        "scene": digest_of(scene.to_json()),
         "motion": trajectory.digest(),
         "label": f"{labels.contact} {labels.first_frame} {labels.observed} {labels.min_distance}",
         "robust": f"{robustness(scene, labels.contact, seed, RUNS)}",
@@ -53,7 +53,7 @@ def trial_digests(scenario: str) -> dict[str, str]:
 
 def _digest(array: Any) -> str:
     data = np.ascontiguousarray(array)
-    return hashlib.sha256(repr((data.shape, data.dtype.str)).encode() + data.tobytes()).hexdigest()
+    return digest_of(repr((data.shape, data.dtype.str)).encode() + data.tobytes())
 
 
 def differences(scenario: str) -> list[str]:
@@ -64,19 +64,21 @@ def differences(scenario: str) -> list[str]:
 
 
 def main() -> None:
-    """Print all digests as JSON; with ``--write`` store them for this version.
+    """Print digests, by default of all scenarios, as JSON; with ``--write`` store them.
 
     Store them only after a change that is meant to alter scenes, motions or pictures, and increase
     `physion.physics.rigid.engine.VERSION` or `physion.rendering.renderer.VERSION` at the same time.
     """
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--write", action="store_true")
+    parser.add_argument("scenario", nargs="*", default=sorted(scenarios.names()))
     options = parser.parse_args()
-    text = json.dumps({name: trial_digests(name) for name in sorted(scenarios.names())}, indent=1)
+    found = {name: trial_digests(name) for name in options.scenario}
     if options.write:
+        text = json.dumps({**golden_digests(), **found}, indent=1)
         (Path(__file__).parents[2] / "core" / FILE).write_text(text + "\n")
     else:
-        print(text)
+        print(json.dumps(found, indent=1))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,8 +9,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError
@@ -19,15 +16,8 @@ from physion.core.seeds import stable_hash
 from physion.core.settings import read_json
 from physion.physics.labels import label_contact
 from physion.scenes.sampling.sample import load_presets
-from physion.trials.files import FILES, INDEX, SETTINGS, TrialPaths, find_trials
-from physion.trials.index import (
-    COLUMNS,
-    describe_mixed_versions,
-    index_bytes,
-    index_row,
-    read_index,
-    same_value,
-)
+from physion.trials.files import FILES, SETTINGS, TrialPaths, find_trials
+from physion.trials.index import COLUMNS, index_row, read_index, same_value
 from physion.trials.making.choose import BALANCED, robustness, split_of, wanted_contact
 from physion.trials.making.plan import TrialTask
 from physion.trials.trial_file import Trial, geometry_arrays
@@ -43,9 +33,9 @@ class Verification:
 
     ``faults`` is empty if the dataset is intact. ``other_versions`` lists what cannot be reproduced
     because another version of engine, renderer or encoder made it, which is not a fault.
-    ``notes`` lists what is no fault either: trials of several versions of the package, pictures
-    that are only compressed differently, and trials whose scene was not drawn again because their
-    preset is unknown. ``damaged`` names the trials with faults.
+    ``notes`` lists what is no fault either: pictures that are only compressed differently, and
+    trials whose scene was not drawn again because their preset is unknown. ``damaged`` names the
+    trials with faults.
     """
 
     faults: list[str] = field(default_factory=list)
@@ -99,8 +89,6 @@ def verify_dataset(
             result.faults.append(f"{paths.trial_file} is not in the index")
     result.faults += _check_folder(folder, table)
     result.faults += _duplicates(table)
-    mixed = describe_mixed_versions(table)
-    result.notes += [f"{folder}: {mixed}"] if mixed else []
     settings = _settings(folder)
     remade = _choose_trials(table, again)
     rows = table.to_dict("records")
@@ -133,29 +121,14 @@ def _settings(folder: Path) -> Mapping[str, Any]:
 
 
 def _check_folder(folder: Path, table: pd.DataFrame) -> list[str]:
-    """Return faults of the files that are not part of a trial, and files that should not exist."""
-    faults = []
-    path = folder / INDEX
-    # Bytes are comparable only if the same version of the parquet library wrote them.
-    content, expected = path.read_bytes(), index_bytes(table)
-    if content != expected and _writer(content) == _writer(expected):
-        faults.append(f"{path}: its bytes differ from the table that it contains")
+    """Return faults for files that no trial of the index has."""
     listed = {folder / str(name) for file in FILES for name in table[file].dropna()}
     unknown = {path for path in folder.glob("*/*/*") if path.is_file()} - listed
-    faults += [
+    return [
         f"{path} is not a file of a trial in the index"
         for path in sorted(unknown)
         if path.suffix != ".h5"  # trial files are compared with the index by the caller
     ]
-    return faults
-
-
-def _writer(content: bytes) -> str:
-    """Return the name and version of the library that wrote a parquet file, or an empty text."""
-    try:
-        return str(pq.read_metadata(io.BytesIO(content)).created_by)
-    except (pa.ArrowException, OSError, ValueError):
-        return ""
 
 
 def _check_split(row: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
@@ -214,13 +187,12 @@ def _check_trial(paths: TrialPaths, trial: Trial) -> list[str]:
         faults.append(f"{paths.trial_file}: field 'trajectory' does not match its digest")
     if trial.scene.physics_digest() != meta.scene_digest:
         faults.append(f"{paths.trial_file}: field 'scene' does not match its digest")
-    if trial.geometry is not None:
-        wanted = geometry_arrays(trial.scene, meta.width, meta.height)
-        faults += [
-            f"{paths.trial_file}: field {path!r} is not as in the scene"
-            for path, array in trial.geometry.items()
-            if not np.array_equal(array, wanted[path])
-        ]
+    wanted = geometry_arrays(trial.scene, meta.width, meta.height)
+    faults += [
+        f"{paths.trial_file}: field {path!r} is not that of the scene"
+        for path, array in trial.geometry.items()
+        if not np.array_equal(array, wanted[path])
+    ]
     if meta.imported:
         return faults  # labels and movies come from another simulator
     labels = label_contact(trial.scene, trial.trajectory)
@@ -339,123 +311,27 @@ def _sample_again(paths: TrialPaths, trial: Trial, settings: Mapping[str, Any]) 
 
 # Comparison of two datasets that should be equal, such as from two machines or versions.
 
-_VERSIONS = ("engine", "renderer", "package")
-_LABELS = ("contact", "first_frame", "observed_contact", "min_distance", "robust")
-_PICTURES = tuple(name for name in FILES if name != "trial_file")
+_COMPARED = ("scene_digest", "digest", "contact", "first_frame", "observed_contact", "min_distance",
+             "robust", *(f"{name}_sha256" for name in FILES if name != "trial_file"))  # fmt: skip
 
 
-@dataclass
-class DatasetComparison:
-    """What differs between two datasets, one line per finding.
+def compare_datasets(first: Path, second: Path) -> list[str]:
+    """Return one line per difference between two datasets, whose trials are compared by name.
 
-    - ``same``: number of trials of both sets that have the same scene, motion, labels and files.
-    - ``only_first``, ``only_second``: names of the trials in only one set.
-    - ``versions``: engines, renderers or packages that made one set and not the other.
-    - ``differences``: one line for each trial that differs.
-    """
-
-    same: int = 0
-    only_first: list[str] = field(default_factory=list)
-    only_second: list[str] = field(default_factory=list)
-    versions: list[str] = field(default_factory=list)
-    differences: list[str] = field(default_factory=list)
-
-    @property
-    def equal(self) -> bool:
-        """Whether both sets have the same trials with the same content."""
-        return not (self.only_first or self.only_second or self.differences)
-
-
-def compare_datasets(
-    first: Path, second: Path, *, progress: Progress | None = None
-) -> DatasetComparison:
-    """Compare the trials of two datasets by name.
-
-    Scenes, motions, labels and files are compared by the digests in both indices; `verify_dataset`
-    tells whether the files are as in the index. Trial files are read only where motions differ.
-    Files that hold the same values in other bytes, for example by another compression, count as
-    different. A trial file stores the version of the package that made it: if that version differs
-    and nothing else does, the trials are the same.
-
-    Raises
-    ------
-    BadInputError
-        If a folder has no valid index, or the file of a trial whose motion differs is damaged.
+    Scenes, motions, labels, movies and maps are compared by both indices; `verify_dataset` tells
+    whether the files are those of the index. Trial files hold the version of the package and are
+    not compared. Raises `BadInputError` if a folder has no valid index.
     """
     tables = [read_index(folder).set_index("trial", drop=False) for folder in (first, second)]
     names = [set(table.index) for table in tables]
-    result = DatasetComparison(
-        only_first=sorted(names[0] - names[1]), only_second=sorted(names[1] - names[0])
-    )
-    for column in _VERSIONS:
-        of = [sorted(set(table[column].dropna())) for table in tables]
-        if of[0] != of[1]:
-            result.versions.append(f"{column}: {_listed(of[0])}; against {_listed(of[1])}")
-    shared = sorted(names[0] & names[1])
-    rows = [table.loc[shared].to_dict("records") for table in tables]
-    pairs = list(zip(*rows, strict=True))
-    for one, other in tracked(pairs, "comparing", len(pairs), progress):
-        findings = _differences(one, other, first, second)
-        if findings:
-            result.differences.append(f"{one['trial']}: {'; '.join(findings)}")
-        else:
-            result.same += 1
-    return result
-
-
-def _listed(versions: list[str]) -> str:
-    return ", ".join(versions) or "none"
-
-
-def _differences(
-    one: Mapping[str, Any], other: Mapping[str, Any], first: Path, second: Path
-) -> list[str]:
-    """Return what differs between two trials of one name."""
-    found = []
-    if one["scene_digest"] != other["scene_digest"]:
-        found.append("another scene")
-    elif one["digest"] != other["digest"]:
-        found.append(_describe_motions(_open(first, one), _open(second, other)))
-    found += [
-        f"{name} {_shown(one[name])} against {_shown(other[name])}"
-        for name in _LABELS
-        if not same_value(one[name], other[name])
-    ]
-    files = [
-        name for name in _PICTURES if not same_value(one[f"{name}_sha256"], other[f"{name}_sha256"])
-    ]
-    if files:
-        found.append(f"other bytes of {', '.join(files)}")
-    same_file = one["trial_file_sha256"] == other["trial_file_sha256"]
-    if not found and not same_file and one["package"] == other["package"]:
-        found.append("other bytes of trial_file")
+    places = (first, names[0] - names[1]), (second, names[1] - names[0])
+    found = [f"{name}: only in {folder}" for folder, only in places for name in sorted(only)]
+    for name in sorted(names[0] & names[1]):
+        one, other = (table.loc[name] for table in tables)
+        differs = [c for c in _COMPARED if not same_value(one[c], other[c])]
+        if differs:
+            by = (
+                "" if one["engine"] == other["engine"] else f" ({one['engine']}; {other['engine']})"
+            )
+            found.append(f"{name}: other {', '.join(differs)}{by}")
     return found
-
-
-def _open(folder: Path, row: Mapping[str, Any]) -> Trial:
-    return Trial.open(TrialPaths(folder, row["split"], row["scenario"], row["trial"]).trial_file)
-
-
-def _describe_motions(one: Trial, other: Trial) -> str:
-    """Return where two motions of a scene part, and how far."""
-    motions = one.trajectory, other.trajectory
-    frames = min(len(motion) for motion in motions)
-    parts, bodies = [], one.scene.names()
-    for name in ("positions", "cloth_vertices"):
-        a, b = (getattr(motion, name)[:frames].astype(np.float64) for motion in motions)
-        if a.shape != b.shape:
-            raise BadInputError(f"{one.metadata.trial}: the sets hold other numbers of {name}")
-        parts.append(np.linalg.norm(a - b, axis=-1))
-    apart = np.concatenate(parts, axis=1) if frames else np.zeros((0, 1))
-    lengths = f"{len(motions[0])} and {len(motions[1])} frames"
-    if not apart.size or not (apart > 0).any():
-        return f"other motion, with the same positions ({lengths})"
-    frame = int(np.flatnonzero((apart > 0).any(axis=1))[0])
-    column = int(np.argmax(apart.max(axis=0)))
-    # Vertices of cloths follow the bodies.
-    name = bodies[column] if column < len(one.scene.bodies) else "a cloth"
-    return f"other motion from frame {frame} on, by up to {apart.max():.3g} m ({name}; {lengths})"
-
-
-def _shown(value: Any) -> str:
-    return "-" if pd.isna(value) else str(value)

@@ -265,16 +265,11 @@ _IMAGE = "frames/0000/images/_img"
 class ExportJob:
     """One trial to export.
 
-    Parameters
-    ----------
-    paths
-        Files of the trial.
-    out, files
-        Folder to write into, and contents by path below it; the last is written last.
-    stored
-        Files of the index by column: trial file, own movie, and that in free colours.
-    images
-        Whether HDF5 files get pictures.
+    - ``paths``: files of the trial.
+    - ``out``, ``files``: folder to write into, and contents by path below it; the last is written
+      last.
+    - ``stored``: files of the index by column: trial file, own movie, and that in free colours.
+    - ``images``: whether HDF5 files get pictures.
     """
 
     paths: TrialPaths

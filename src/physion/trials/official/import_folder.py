@@ -80,20 +80,12 @@ IMPORTED = "imported"
 class ImportJob:
     """One official trial to import.
 
-    Parameters
-    ----------
-    source
-        The HDF5 file of the trial, or its movie if there is no HDF5 file.
-    paths
-        Files to write; they hold the trial's name, scenario and split.
-    index
-        Position of the trial in its split and scenario, from 0.
-    dataset
-        Name of the dataset.
-    contact
-        Recorded outcome from the lists next to the source; None if they do not hold it.
-    first_frame
-        First frame of contact from the same lists; None if unknown.
+    - ``source``: the HDF5 file of the trial, or its movie if there is no HDF5 file.
+    - ``paths``: files to write; they hold the trial's name, scenario and split.
+    - ``index``: position of the trial in its split and scenario, from 0.
+    - ``dataset``: name of the dataset.
+    - ``contact``: recorded outcome from the lists next to the source; None if they do not hold it.
+    - ``first_frame``: first frame of contact from the same lists; None if unknown.
     """
 
     source: Path
@@ -118,20 +110,13 @@ def imported_metadata(
 ) -> Metadata:
     """Return the metadata of an imported trial.
 
-    Parameters
-    ----------
-    job, scene, trajectory
-        The import job, and the scene and motion that were read.
-    ids
-        Ids of the first frame (H, W); they give the stored picture size.
-    look
-        ``redyellow`` or ``free``.
-    movies, free_movies
-        Whether there are movies in the trial's own look, and further ones in free colours.
-    rate
-        Movie frames per second.
-    recorded
-        Outcome that the source recorded; None if it recorded none.
+    - ``job``, ``scene``, ``trajectory``: the import job, and the scene and motion that were read.
+    - ``ids``: ids of the first frame (H, W); they give the stored picture size.
+    - ``look``: ``redyellow`` or ``free``.
+    - ``movies``, ``free_movies``: whether there are movies in the trial's own look, and further
+      ones in free colours.
+    - ``rate``: movie frames per second.
+    - ``recorded``: outcome that the source recorded; None if it recorded none.
     """
     return Metadata(
         trial=job.paths.trial,

@@ -60,8 +60,6 @@ from physion.trials.trial_file import GuardedHdf5, open_hdf5
 
 MAX_BYTES = 2**27
 """Largest array that is read, in bytes of memory."""
-MAX_FILE_BYTES = 2**31
-"""Most memory that the arrays of a file may take together."""
 MAX_TEXT = 2**20
 _SUFFIXES = ("", "_cam0")
 _FILTERS = {
@@ -78,18 +76,13 @@ class OfficialFile(GuardedHdf5, AbstractContextManager["OfficialFile"]):
     Paths are paths in the file, such as ``static/mass`` or ``frames/0000/objects/positions``.
     """
 
-    def __init__(self, file: h5py.File, where: str) -> None:
-        super().__init__(file, where, filters=_FILTERS, max_chunk_bytes=MAX_BYTES)
-        self._sizes: dict[str, int] = {}
-        self._total = 0
-
     @classmethod
     def open(cls, path: Path) -> OfficialFile:
         """Open ``path``; `BadInputError` if it is not a regular HDF5 file."""
         where = f"official file {path}"
         if path.is_symlink() or not path.is_file():
             raise BadInputError(f"{where} is not a regular file")
-        return cls(open_hdf5(path, where), where)
+        return cls(open_hdf5(path, where), where, filters=_FILTERS, max_chunk_bytes=MAX_BYTES)
 
     def __exit__(
         self,
@@ -209,12 +202,6 @@ class OfficialFile(GuardedHdf5, AbstractContextManager["OfficialFile"]):
             raise self.bad(path, f"has type {dataset.dtype}")
         self.check_size(path, dataset.shape, itemsize, MAX_BYTES)
         self.check_storage(path, dataset)
-        if path not in self._sizes:
-            self._sizes[path] = int(np.prod(dataset.shape, dtype=object)) * itemsize
-            self._total += self._sizes[path]
-        if self._total > MAX_FILE_BYTES:
-            limit = f"more than {MAX_FILE_BYTES} bytes of memory"
-            raise self.bad(path, f"is one array too many: the arrays of the file take {limit}")
 
 
 # Reading of the objects in official files: ids, models, sizes, poses, roles and physics.

@@ -78,18 +78,11 @@ def write_pictures(
 ) -> None:
     """Write the group ``images`` of a frame.
 
-    Parameters
-    ----------
-    group
-        Group of h5py's lower layer.
-    images
-        Passes color, depth, normals and flow of the frame.
-    ids
-        Official object ids (H, W), 0 the room.
-    colors
-        Colours (objects + 1, 3) by official object id.
-    view
-        Axes of the camera (3, 3), see `encode_normals`.
+    - ``group``: group of h5py's lower layer.
+    - ``images``: passes color, depth, normals and flow of the frame.
+    - ``ids``: official object ids (H, W), 0 the room.
+    - ``colors``: colours (objects + 1, 3) by official object id.
+    - ``view``: axes of the camera (3, 3), see `encode_normals`.
     """
     assert images.color is not None and images.depth is not None
     assert images.normals is not None and images.flow is not None
@@ -275,15 +268,10 @@ def trial_record(
 ) -> dict[str, Any]:
     """Return the record of one trial.
 
-    Parameters
-    ----------
-    objects, labels
-        Objects of the trial, and the labels of all frames (F, ...) by name.
-    first, last
-        Official object ids by pixel (H, W), 0 the room, of the first and the last frame; the last
-        may be None, if nothing was rendered.
-    static
-        Scalars of the static group.
+    - ``objects``, ``labels``: objects of the trial, and the labels of all frames (F, ...) by name.
+    - ``first``, ``last``: official object ids by pixel (H, W), 0 the room, of the first and the
+      last frame; the last may be None, if nothing was rendered.
+    - ``static``: scalars of the static group.
     """
     scene, frames = objects.scene, len(objects.trajectory)
     ids, roles = objects.ids, scene.roles
@@ -401,16 +389,11 @@ def official_file(
 ) -> tuple[bytes, dict[str, Any]]:
     """Return the bytes of a trial's official file and its record for metadata.json.
 
-    Parameters
-    ----------
-    trial
-        The trial; its pictures are rendered from its state.
-    look
-        Colours of objects and pictures; by default the trial's own look.
-    images
-        Whether to write pictures and flow. The file is built in memory and has about 0.3 MB per
-        frame at 256 x 256 pixels with them, and 10 KB without. Without them nothing is rendered,
-        and ``final_target_mask_displacement`` of the record is None.
+    - ``trial``: the trial; its pictures are rendered from its state.
+    - ``look``: colours of objects and pictures; by default the trial's own look.
+    - ``images``: whether to write pictures and flow. The file is built in memory and has about 0.3
+      MB per frame at 256 x 256 pixels with them, and 10 KB without. Without them nothing is
+      rendered, and ``final_target_mask_displacement`` of the record is None.
     """
     meta, scene = trial.metadata, trial.shown(look)
     objects = OfficialObjects(scene, trial.trajectory)

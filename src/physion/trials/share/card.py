@@ -36,8 +36,6 @@ from physion.trials.share.croissant import (
 
 CARD = "README.md"
 METADATA = "croissant.json"
-TITLE = "Physion: "
-"""Prefix of the name of the dataset in every card."""
 MADE_BY = "Made with the package physion after the study of Bear et al. (2021)."
 """Sentence in every description, by which existing files are recognised as cards."""
 CITATION = """@inproceedings{bear2021physion,
@@ -110,32 +108,13 @@ def write_card(
 
 def _check_target(target: Path) -> None:
     """Raise `BadInputError` if a file that is not a card would be overwritten."""
-    for name, is_ours in ((CARD, _is_readme), (METADATA, _is_metadata)):
-        path = target / name
-        if not path.exists() and not path.is_symlink():
-            continue
-        if not (path.is_file() and is_ours(path)):
+    for path in (target / CARD, target / METADATA):
+        there = path.exists() or path.is_symlink()
+        if there and not (path.is_file() and MADE_BY.encode() in path.read_bytes()):
             raise BadInputError(
                 f"{path} is not a dataset card and would be lost; move it away, or write the card "
                 "into another folder (`physion export DATASET FOLDER --layout card`)"
             )
-
-
-def _is_readme(path: Path) -> bool:
-    """Return whether a README has the front matter of a card."""
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    if not lines or lines[0] != "---" or "---" not in lines[1:]:
-        return False
-    return any(x.startswith(f'pretty_name: "{TITLE}') for x in lines[1 : lines.index("---", 1)])
-
-
-def _is_metadata(path: Path) -> bool:
-    """Return whether a JSON file has the description of a card."""
-    try:
-        data = json.loads(path.read_bytes())
-    except (ValueError, RecursionError):
-        return False
-    return isinstance(data, dict) and str(data.get("description")).endswith(MADE_BY)
 
 
 def description(facts: DatasetFacts) -> str:
@@ -165,8 +144,8 @@ def card_text(facts: DatasetFacts, terms: PublicationTerms) -> str:
         "model or participant that predicts may use the observed movies and the maps, and nothing "
         "else: the index, the trial files and the full movies contain the answers.",
         f"## Columns of the index\n{_table(_columns(facts))}",
-        "## Biases\n" + _list(facts.biases()),
-        "## Known limits\n" + _list(facts.limitations()),
+        _list("Biases", facts.biases()),
+        _list("Known limits", facts.limitations()),
         f"## Citation\n```bibtex\n{CITATION}\n```",
     ]
     return "\n\n".join(sections) + "\n"
@@ -176,7 +155,7 @@ def _front_matter(facts: DatasetFacts, terms: PublicationTerms) -> str:
     """Return the front matter of the hub; values are JSON, which is valid YAML."""
     values: dict[str, Any] = {
         "license": terms.license.lower(),
-        "pretty_name": f"{TITLE}{facts.name}",
+        "pretty_name": f"Physion: {facts.name}",
         "task_categories": ["video-classification"],
         "annotations_creators": ["machine-generated"],
         "size_categories": [_size_category(len(facts.index))],
@@ -239,8 +218,8 @@ def _table(table: pd.DataFrame) -> str:
     return "\n".join("| " + " | ".join(c.replace("|", "\\|") for c in row) + " |" for row in rows)
 
 
-def _list(items: list[str]) -> str:
-    return "\n".join(f"- {item}" for item in items)
+def _list(title: str, items: list[str]) -> str:
+    return "\n".join([f"## {title}", *(f"- {item}" for item in items)])
 
 
 def _checked(terms: PublicationTerms) -> PublicationTerms:

@@ -8,7 +8,6 @@ file, so that reading it requires no network access.
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 import pandas as pd
 
 from physion.core.errors import BadInputError
+from physion.core.files import digest_of
 from physion.core.settings import read_json
 from physion.trials.files import FILES, INDEX, SETTINGS
 from physion.trials.index import INDEX_COLUMNS, IndexColumn, read_index
@@ -76,27 +76,11 @@ class DatasetFacts:
     def collection(self) -> str:
         """Return how the trials were made."""
         drawn = len(self.index) - self.imported
-        parts = []
-        if drawn:
-            parts.append(
-                f"{drawn} {_scenes(drawn)} sampled at random by {self.versions('package')}."
-            )
-        if self.imported:
-            parts.append(
-                f"{self.imported} {_scenes(self.imported)} imported from records made elsewhere."
-            )
-        parts.append(
-            f"All were simulated by {self.versions('engine')} and rendered by "
-            f"{self.versions('renderer')}."
+        return (
+            f"Scenes sampled at random by {self.versions('package')}: {drawn}. Scenes imported "
+            f"from records made elsewhere: {self.imported}. All were simulated by "
+            f"{self.versions('engine')} and rendered by {self.versions('renderer')}."
         )
-        return " ".join(parts)
-
-    def missing(self) -> str:
-        """Return the numbers of missing cells of the index, by column."""
-        columns = [name for name in INDEX_COLUMNS if not name.endswith(("_bytes", "_sha256"))]
-        counts = self.index[columns].isna().sum()
-        gaps = [f"{name} ({count})" for name, count in counts.items() if count]
-        return f"Missing cells by column, of {len(self.index)}: {', '.join(gaps) or 'none'}."
 
     def biases(self) -> list[str]:
         """Return the known biases, with counts."""
@@ -125,26 +109,20 @@ class DatasetFacts:
     def limitations(self) -> list[str]:
         """Return the known limitations, with counts."""
         index, n = self.index, len(self.index)
-        statements = [
+        robust = index["robust"].dropna()
+        return [
             "Rigid bodies and cloth are simulated; another engine may give some trials another "
             "outcome.",
             "The camera never moves, and there is no sound.",
             f"In {int(index['observed_contact'].sum())} of {n} trials agent and patient touch "
             "already in the observed part.",
+            "How much labels depend on tiny changes of the scene was not measured."
+            if robust.empty
+            else "Jittered simulations agree with the label in "
+            f"{float(robust.mean()):.3f} of cases, measured on {len(robust)} of {n} trials.",
+            f"In {int((~index['completed']).sum())} of {n} trials something still moved at the "
+            "time limit.",
         ]
-        robust = index["robust"].dropna()
-        if len(robust):
-            statements.append(
-                "Jittered simulations agree with the label in "
-                f"{float(robust.mean()):.3f} of cases, measured on {len(robust)} of {n} trials."
-            )
-        else:
-            statements.append(
-                "How much labels depend on tiny changes of the scene was not measured."
-            )
-        unfinished = int((~index["completed"]).sum())
-        statements.append(f"In {unfinished} of {n} trials something still moved at the time limit.")
-        return statements
 
 
 def read_facts(folder: Path) -> DatasetFacts:
@@ -159,11 +137,7 @@ def read_facts(folder: Path) -> DatasetFacts:
             settings = dict(read_json(path, dict[str, Any])["settings"])
         except (KeyError, TypeError, ValueError) as error:
             raise BadInputError(f"{path} is damaged: field 'settings' is missing") from error
-    return DatasetFacts(index, len(data), hashlib.sha256(data).hexdigest(), settings)
-
-
-def _scenes(count: int) -> str:
-    return "scene was" if count == 1 else "scenes were"
+    return DatasetFacts(index, len(data), digest_of(data), settings)
 
 
 CROISSANT = "http://mlcommons.org/croissant/1.0"
@@ -203,18 +177,12 @@ CONTEXT: dict[str, Any] = {
 class PublicationTerms:
     """Information that the publisher of a dataset provides.
 
-    Parameters
-    ----------
-    published
-        Day of publication, ``YYYY-MM-DD``.
-    license
-        Identifier of spdx.org; by default as for this package and of the official command logs.
-    version
-        Version of the dataset, three numbers with dots.
-    creator
-        Name of the person or group.
-    url
-        Page of the dataset; by default a URN with the SHA-256 of its index.
+    - ``published``: day of publication, ``YYYY-MM-DD``.
+    - ``license``: identifier of spdx.org; by default that of this package and of the official
+      command logs.
+    - ``version``: version of the dataset, three numbers with dots.
+    - ``creator``: name of the person or group.
+    - ``url``: page of the dataset; by default a URN with the SHA-256 of its index.
     """
 
     published: str
@@ -244,7 +212,7 @@ def croissant(
         "citeAs": citation,
         "keywords": ["physics", "video", "prediction", "cognitive science", "benchmark"],
         "distribution": _distribution(facts),
-        "recordSet": [*_enumerations(facts), _trials(), *_videos(facts)],
+        "recordSet": [_trials(), *_videos(facts)],
         **responsible(facts),
     }
 
@@ -258,7 +226,6 @@ def responsible(facts: DatasetFacts) -> dict[str, Any]:
         + (["Secondary Data analysis"] if facts.imported else []),
         "rai:dataCollectionRawData": "Scenes (bodies, poses, pushes, camera) and their simulated "
         "motion are stored in every trial file; pictures can be rendered again from them.",
-        "rai:dataCollectionMissingData": facts.missing(),
         "rai:dataAnnotationProtocol": "Labels are computed, not judged by people: whether agent "
         "and patient touch at any time of the simulated trial, including its hidden part.",
         "rai:machineAnnotationTools": [facts.versions("engine"), facts.versions("package")],
@@ -279,18 +246,11 @@ def responsible(facts: DatasetFacts) -> dict[str, Any]:
         "rai:dataReleaseMaintenancePlan": f"The {n - facts.imported} trials with a seed can be "
         f"made again by {facts.versions('package')}; every file's SHA-256 is in the index, and "
         "`physion verify` compares them. A version of other pictures or labels gets a new number.",
-        "rai:dataPreprocessingProtocol": preprocessing(facts),
+        "rai:dataPreprocessingProtocol": [
+            "States are stored as the engine computed them, in single precision.",
+            "The observed part of a movie is a file of its own.",
+        ],
     }
-
-
-def preprocessing(facts: DatasetFacts) -> list[str]:
-    """Return how simulations were processed before they were stored."""
-    sizes = facts.index[["width", "height"]].drop_duplicates().sort_values(["width", "height"])
-    text = ", ".join(f"{row.width} x {row.height}" for row in sizes.itertuples())
-    steps = ["States are stored as the engine computed them, in single precision."]
-    if facts.movies:
-        steps.append(f"Movies are H.264 ({text} pixels); the observed part is a file of its own.")
-    return steps
 
 
 def _distribution(facts: DatasetFacts) -> list[dict[str, Any]]:
@@ -329,36 +289,6 @@ def _distribution(facts: DatasetFacts) -> list[dict[str, Any]]:
             }
         )
     return [index_file, *sets]
-
-
-def _enumerations(facts: DatasetFacts) -> list[dict[str, Any]]:
-    """Return record sets of the splits and scenarios that occur, with their meanings."""
-    sets = []
-    for column, meanings, kind in (
-        ("split", SPLIT_MEANINGS, "cr:Split"),
-        ("scenario", SCENARIO_MEANINGS, "sc:Enumeration"),
-    ):
-        name = f"{column}s"
-        rows = [
-            {f"{name}/name": value, f"{name}/meaning": meanings.get(value, "of the user's own")}
-            for value in sorted(set(facts.index[column]))
-        ]
-        fields = [
-            {"@type": "cr:Field", "@id": f"{name}/{part}", "name": part, "dataType": "sc:Text"}
-            for part in ("name", "meaning")
-        ]
-        sets.append(
-            {
-                "@type": "cr:RecordSet",
-                "@id": name,
-                "name": name,
-                "dataType": kind,
-                "key": {"@id": f"{name}/name"},
-                "field": fields,
-                "data": rows,
-            }
-        )
-    return sets
 
 
 def _trials() -> dict[str, Any]:
@@ -409,7 +339,7 @@ def _video_field(name: str, kind: str, transform: dict[str, Any]) -> dict[str, A
 
 
 def _field(name: str, column: IndexColumn) -> dict[str, Any]:
-    field: dict[str, Any] = {
+    return {
         "@type": "cr:Field",
         "@id": f"trials/{name}",
         "name": name,
@@ -417,6 +347,3 @@ def _field(name: str, column: IndexColumn) -> dict[str, Any]:
         "dataType": _TYPES[column.dtype],
         "source": {"fileObject": {"@id": INDEX}, "extract": {"column": name}},
     }
-    if name in ("split", "scenario"):
-        field["references"] = {"field": {"@id": f"{name}s/name"}}
-    return field

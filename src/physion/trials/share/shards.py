@@ -17,7 +17,6 @@ Equal datasets and options give equal bytes. Next to each shard is its digest fi
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import re
@@ -25,7 +24,7 @@ import tarfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -40,7 +39,8 @@ from physion.core.files import (
     write_with_digest,
 )
 from physion.core.settings import read_json
-from physion.trials.files import TrialPaths
+from physion.trials.dataset import indexed_file
+from physion.trials.files import IndexedFile
 from physion.trials.index import COLUMNS, read_index
 
 MANIFEST = "shards.json"
@@ -77,44 +77,14 @@ class Shard:
     bytes: int
 
 
-@dataclass(frozen=True)
-class ShardReport:
-    """All ``shards`` of a folder, and the path of its ``manifest``."""
-
-    shards: tuple[Shard, ...]
-    manifest: Path
-
-    @property
-    def samples(self) -> int:
-        """Number of trials in all shards."""
-        return sum(shard.samples for shard in self.shards)
-
-    @property
-    def bytes(self) -> int:
-        """Size of all shards in bytes."""
-        return sum(shard.bytes for shard in self.shards)
-
-
-@dataclass(frozen=True)
-class _Sample:
-    """One planned sample: texts, and files with expected size and SHA-256, by extension."""
+class _Sample(NamedTuple):
+    """One planned sample: its texts and its files by extension, and the size of all in a shard."""
 
     key: str
     split: str
     texts: Mapping[str, bytes]
-    files: Mapping[str, tuple[Path, int, str]]
-
-    def sizes(self) -> list[int]:
-        """Return the sizes in bytes of the files of the sample."""
-        return [len(text) for text in self.texts.values()] + [f[1] for f in self.files.values()]
-
-
-@dataclass(frozen=True)
-class _ShardTask:
-    """One shard to write: its path and its samples."""
-
-    path: Path
-    samples: tuple[_Sample, ...]
+    files: Mapping[str, IndexedFile]
+    bytes: int
 
 
 def export_shards(
@@ -127,7 +97,7 @@ def export_shards(
     shard_bytes: int = SHARD_BYTES,
     executor: Executor | None = None,
     progress: Progress | None = None,
-) -> ShardReport:
+) -> list[Shard]:
     """Write trials of the dataset in ``folder`` as tar shards into ``out``.
 
     Shards are called ``physion-<split>-000000.tar`` and contain trials in the order of the index.
@@ -149,6 +119,11 @@ def export_shards(
     progress
         Shows the progress.
 
+    Returns
+    -------
+    shards
+        All shards of the folder, which the file `MANIFEST` in it lists.
+
     Raises
     ------
     BadInputError
@@ -166,21 +141,29 @@ def export_shards(
         raise BadInputError(
             f"shards need at least one part and a size above 0, not {shard_bytes} bytes"
         )
-    table = _select(read_index(folder), split, scenario)
-    plan = _plan(_samples(folder, table, sorted(set(parts))), shard_bytes)
+    table = read_index(folder)
+    for column, wanted in (("split", split), ("scenario", scenario)):
+        if wanted is not None and wanted not in set(table[column]):
+            raise UnknownNameError(column, wanted, set(table[column]))
+        table = table if wanted is None else table[table[column] == wanted]
+    if table.empty:
+        raise BadInputError(f"{folder} has no trial of split {split} and scenario {scenario}")
+    chosen = sorted(set(parts))
+    plan = _plan(_samples(folder, table, chosen), shard_bytes)
     options: dict[str, Any] = {
         "dataset": sorted(set(table["dataset"])),
         "split": split,
         "scenario": scenario,
+        "parts": chosen,
+        "shard_bytes": shard_bytes,
     }
-    options |= {"parts": sorted(set(parts)), "shard_bytes": shard_bytes}
     with folder_for_writing(out):
         remove_leftovers(out)
         _check_folder(out, options)
         (out / MANIFEST).unlink(missing_ok=True)
         made, failed = run_tasks(
             _write_shard,
-            {name: _ShardTask(out / name, tuple(samples)) for name, samples in plan.items()},
+            {name: (out / name, samples) for name, samples in plan.items()},
             folder=out,
             what="shards",
             executor=executor,
@@ -193,8 +176,9 @@ def export_shards(
             if path.name not in plan:
                 path.unlink()
                 digest_path(path).unlink(missing_ok=True)
-        _write_manifest(out / MANIFEST, options, list(made.values()))
-    return ShardReport(tuple(made.values()), out / MANIFEST)
+        shards = list(made.values())
+        _write_manifest(out / MANIFEST, options, shards)
+    return shards
 
 
 def _check_folder(out: Path, options: Mapping[str, Any]) -> None:
@@ -210,45 +194,29 @@ def _check_folder(out: Path, options: Mapping[str, Any]) -> None:
         )
 
 
-def _select(table: pd.DataFrame, split: str | None, scenario: str | None) -> pd.DataFrame:
-    for column, wanted in (("split", split), ("scenario", scenario)):
-        if wanted is not None:
-            if wanted not in set(table[column]):
-                raise UnknownNameError(column, wanted, set(table[column]))
-            table = table[table[column] == wanted]
-    if table.empty:
-        raise BadInputError(
-            "there is no trial to export: the index has none of this split and scenario"
-        )
-    return table
-
-
 def _samples(folder: Path, table: pd.DataFrame, parts: Sequence[str]) -> list[_Sample]:
     keys = table["trial"].str.replace(".", "_", regex=False)
     if keys.duplicated().any():
         twice = sorted(table["trial"][keys.duplicated(keep=False)])
         raise BadInputError(f"trials {twice[:2]} differ in dots only, which keys cannot contain")
-    return [
-        _sample(folder, key, row, parts)
-        for key, row in zip(keys, table.to_dict("records"), strict=True)
-    ]
-
-
-def _sample(folder: Path, key: str, row: Mapping[str, Any], parts: Sequence[str]) -> _Sample:
-    paths = TrialPaths(folder, row["split"], row["scenario"], row["trial"])
-    files = {
-        # Paths in the index could point outside the folder; paths of the layout cannot.
-        part: (getattr(paths, column), int(row[f"{column}_bytes"]), str(row[f"{column}_sha256"]))
-        for part, column in FILE_PARTS.items()
-        if part in parts and not pd.isna(row[column])
-    }
-    columns_of = {"json": SEEN_COLUMNS, "outcome.json": COLUMNS}
-    texts = {
-        part: json.dumps({name: _plain(row[name]) for name in columns}, sort_keys=True).encode()
-        for part, columns in columns_of.items()
-        if part in parts
-    }
-    return _Sample(key, row["split"], texts, files)
+    samples = []
+    for key, row in zip(keys, table.to_dict("records"), strict=True):
+        columns_of = {"json": SEEN_COLUMNS, "outcome.json": tuple(COLUMNS)}
+        texts = {
+            part: json.dumps({n: _plain(row[n]) for n in columns}, sort_keys=True).encode()
+            for part, columns in columns_of.items()
+            if part in parts
+        }
+        files = {
+            part: file
+            for part, column in FILE_PARTS.items()
+            if part in parts and (file := indexed_file(folder, row, column)) is not None
+        }
+        sizes = [len(text) for text in texts.values()]
+        sizes += [int(row[f"{FILE_PARTS[part]}_bytes"]) for part in files]
+        size = sum(_BLOCK * (4 + -(-size // _BLOCK)) for size in sizes)
+        samples.append(_Sample(key, row["split"], texts, files, size))
+    return samples
 
 
 def _plain(value: Any) -> Any:
@@ -264,47 +232,30 @@ def _plan(samples: Iterable[_Sample], shard_bytes: int) -> dict[str, list[_Sampl
     counts: dict[str, int] = {}
     capacity = 0
     for sample in samples:
-        size = sum(_BLOCK * (4 + -(-bytes_ // _BLOCK)) for bytes_ in sample.sizes())
-        if sample.split not in counts or size > capacity:
+        if sample.split not in counts or sample.bytes > capacity:
             counts[sample.split] = counts.get(sample.split, -1) + 1
             # The end of an archive is padded to a whole record.
             capacity = shard_bytes - tarfile.RECORDSIZE
-        capacity -= size
+        capacity -= sample.bytes
         name = f"physion-{sample.split}-{counts[sample.split]:06d}.tar"
         plan.setdefault(name, []).append(sample)
     return plan
 
 
-def _write_shard(task: _ShardTask) -> Shard:
+def _write_shard(task: tuple[Path, Sequence[_Sample]]) -> Shard:
     """Write one shard and its digest file."""
-    data = _archive(task.samples)
-    write_with_digest(task.path, data)
-    return Shard(task.path.name, task.samples[0].split, len(task.samples), len(data))
-
-
-def _archive(samples: Sequence[_Sample]) -> bytes:
-    """Return the bytes of one shard."""
+    path, samples = task
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w", format=tarfile.PAX_FORMAT) as archive:
         for sample in samples:
             for part in sorted((*sample.texts, *sample.files)):
-                data = sample.texts[part] if part in sample.texts else _read(*sample.files[part])
+                data = sample.texts[part] if part in sample.texts else sample.files[part].read()
                 # Owner, time and mode are the constant defaults of tarfile.
                 member = tarfile.TarInfo(f"{sample.key}.{part}")
                 member.size = len(data)
                 archive.addfile(member, io.BytesIO(data))
-    return buffer.getvalue()
-
-
-def _read(path: Path, size: int, sha: str) -> bytes:
-    """Return the bytes of a file; `BadInputError` unless they match size and SHA-256."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise BadInputError(f"{path} cannot be read: {error.strerror}") from error
-    if len(data) != size or hashlib.sha256(data).hexdigest() != sha:
-        raise BadInputError(f"{path} is not the file of the index; run `physion verify` on it")
-    return data
+    write_with_digest(path, buffer.getvalue())
+    return Shard(path.name, samples[0].split, len(samples), len(buffer.getvalue()))
 
 
 def _write_manifest(path: Path, options: Mapping[str, Any], shards: Sequence[Shard]) -> None:
