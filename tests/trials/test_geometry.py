@@ -116,7 +116,7 @@ def test_verify_finds_geometry_of_another_scene(tmp_path: Path) -> None:
 
 def faults_of_geometry(paths: TrialPaths) -> list[str]:
     faults = _check_trial(paths, Trial.open(paths.trial_file))
-    return [fault for fault in faults if "not that of the scene" in fault]
+    return [fault for fault in faults if "does not match the scene" in fault]
 
 
 def with_width(data: bytes, width: int) -> bytes:

@@ -249,7 +249,7 @@ def test_pushes_say_when_and_how_hard(collision: Trial) -> None:
     assert abs(linear[3, 1, 0]) < 0.01 and linear[4, 1, 0] == pytest.approx(3.0, abs=0.1)
 
 
-def test_cloths_are_told_apart() -> None:
+def test_cloths_are_kept_apart() -> None:
     parts = make_parts()
     scene = parts.scene
     two = dataclasses.replace(

@@ -61,8 +61,7 @@ def movie_files(
     """Return the movies of a dataset by trial; None where there is none in the look.
 
     - ``dataset``: the dataset.
-    - ``observed``: whether the movies of the observed part are meant, and not those of the whole
-      trials.
+    - ``observed``: whether movies of the observed part are meant, and not of the whole trials.
     - ``look``: colours: ``redyellow`` or ``free``, by default each trial's own.
     """
     kind = "observed_movie" if observed else "movie"

@@ -220,7 +220,7 @@ MAX_RATE = 1000
 class Metadata:
     """Origin and settings of a trial; nothing in it depends on the time of its making.
 
-    - ``trial``, ``dataset``, ``scenario``, ``split``: names; that of the trial is unique in the
+    - ``trial``, ``dataset``, ``scenario``, ``split``: names; a trial's name is unique in the
       dataset.
     - ``index``: position in the split of the scenario, from 0.
     - ``preset``: name of the scenario's parameter set; None for an imported scene.

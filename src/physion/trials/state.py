@@ -54,7 +54,7 @@ class ThingMesh:
 def centroids(trial: Trial) -> Floats:
     """Return the centres of mass (F, N, 3) in metres, world coordinates.
 
-    The centre of a body is that of its collision hulls, whose velocity is `Trajectory.velocities`;
+    The velocity of the centre of a body, which its collision hulls give, is `Trajectory.velocities`;
     the centre of a cloth is the mean of its vertices.
     """
     scene, motion = trial.scene, trial.trajectory

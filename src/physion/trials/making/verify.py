@@ -189,7 +189,7 @@ def _check_trial(paths: TrialPaths, trial: Trial) -> list[str]:
         faults.append(f"{paths.trial_file}: field 'scene' does not match its digest")
     wanted = geometry_arrays(trial.scene, meta.width, meta.height)
     faults += [
-        f"{paths.trial_file}: field {path!r} is not that of the scene"
+        f"{paths.trial_file}: field {path!r} does not match the scene"
         for path, array in trial.geometry.items()
         if not np.array_equal(array, wanted[path])
     ]
@@ -318,9 +318,8 @@ _COMPARED = ("scene_digest", "digest", "contact", "first_frame", "observed_conta
 def compare_datasets(first: Path, second: Path) -> list[str]:
     """Return one line per difference between two datasets, whose trials are compared by name.
 
-    Scenes, motions, labels, movies and maps are compared by both indices; `verify_dataset` tells
-    whether the files are those of the index. Trial files hold the version of the package and are
-    not compared. Raises `BadInputError` if a folder has no valid index.
+    Scenes, motions, labels, movies and maps are compared by both indices; `verify_dataset` compares
+    the files with the index. Trial files hold the version of the package and are not compared. Raises `BadInputError` if a folder has no valid index.
     """
     tables = [read_index(folder).set_index("trial", drop=False) for folder in (first, second)]
     names = [set(table.index) for table in tables]

@@ -178,8 +178,8 @@ class PublicationTerms:
     """Information that the publisher of a dataset provides.
 
     - ``published``: day of publication, ``YYYY-MM-DD``.
-    - ``license``: identifier of spdx.org; by default that of this package and of the official
-      command logs.
+    - ``license``: identifier of spdx.org; by default the licence of this package and of the
+      official command logs.
     - ``version``: version of the dataset, three numbers with dots.
     - ``creator``: name of the person or group.
     - ``url``: page of the dataset; by default a URN with the SHA-256 of its index.
