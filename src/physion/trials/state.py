@@ -54,8 +54,8 @@ class ThingMesh:
 def centroids(trial: Trial) -> Floats:
     """Return the centres of mass (F, N, 3) in metres, world coordinates.
 
-    The velocity of the centre of a body, which its collision hulls give, is `Trajectory.velocities`;
-    the centre of a cloth is the mean of its vertices.
+    `Trajectory.velocities` is the velocity of a body's centre, which its collision hulls give; the
+    centre of a cloth is the mean of its vertices.
     """
     scene, motion = trial.scene, trial.trajectory
     masses = [

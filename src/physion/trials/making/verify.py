@@ -319,7 +319,8 @@ def compare_datasets(first: Path, second: Path) -> list[str]:
     """Return one line per difference between two datasets, whose trials are compared by name.
 
     Scenes, motions, labels, movies and maps are compared by both indices; `verify_dataset` compares
-    the files with the index. Trial files hold the version of the package and are not compared. Raises `BadInputError` if a folder has no valid index.
+    the files with the index. Trial files hold the version of the package and are not compared.
+    Raises `BadInputError` if a folder has no valid index.
     """
     tables = [read_index(folder).set_index("trial", drop=False) for folder in (first, second)]
     names = [set(table.index) for table in tables]
