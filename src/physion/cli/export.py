@@ -172,7 +172,7 @@ def _webdataset(options: Options, out: Path) -> int:
         print(json_module.dumps(values | {"index": str(out / MANIFEST)}))
         return 0
     done = f"{samples} trials in {counted(len(shards), 'shard')}"
-    console.print(f"{done}: {out / MANIFEST}", markup=False, soft_wrap=True)
+    print_line(f"{done}: {out / MANIFEST}")
     return 0
 
 

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import tyro
 
-from physion.cli.output import Stages, console, counted
+from physion.cli.output import Stages, counted, print_line
 from physion.trials.making.verify import SAMPLE, compare_datasets, verify_dataset
 
 
@@ -62,9 +62,9 @@ def main(options: Options) -> int:
             if options.repair
             else (f"; --repair deletes the {trials}, and {again}")
         )
-    console.print(line, markup=False, soft_wrap=True)
+    print_line(line)
     if against is not None:
         other.append(f"{options.folder} against {against}: {counted(len(other), 'difference')}")
         for line in other:
-            console.print(line, markup=False, soft_wrap=True)
+            print_line(line)
     return 1 if failed else 0
