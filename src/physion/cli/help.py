@@ -68,7 +68,6 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "experiment links": ("physion experiment links study --source prolific",),
     "experiment simulate": ("physion experiment simulate study --participants 50",),
     "experiment export": ("physion experiment export study --no-simulated",),
-    "experiment password": ("physion experiment password study",),
     "experiment backup": ("physion experiment backup study --out backups",),
     "experiment power": ("physion experiment power --effect 0.1 --people 20 40 --stimuli 60 100",),
     "experiment forget": ("physion experiment forget study --participant 5f0c1e",),

@@ -101,8 +101,12 @@ def _serve_media(app: FastAPI, study: Study, secrets: Secrets, store: Store) -> 
 async def _refused(request: Request, error: Exception) -> Response:
     """Handle a refusal by the store."""
     assert isinstance(error, Refused)
-    wait = {"retry-after": str(math.ceil(error.wait_s))} if error.wait_s else None
-    return refuse(error.code, error.message, error.state, headers=wait, completion=error.completion)
+    headers = {"retry-after": str(math.ceil(error.wait_s))} if error.wait_s else {}
+    if error.code == "too_large":  # the rest of the body is not read
+        headers["connection"] = "close"
+    return refuse(
+        error.code, error.message, error.state, headers=headers, completion=error.completion
+    )
 
 
 async def _bad_body(request: Request, error: Exception) -> Response:

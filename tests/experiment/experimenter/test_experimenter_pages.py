@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from statistics import fmean
+from time import gmtime, strftime
 from types import SimpleNamespace
 
 import pandas as pd
@@ -27,13 +28,15 @@ from physion.analysis.people.responses import clean
 from physion.experiment.experimenter import progress
 from physion.experiment.experimenter.pages import minutes, visible
 from physion.experiment.experimenter.payments import COLUMNS, bonus_of
-from physion.experiment.experimenter.progress import expected_end, session_state
+from physion.experiment.experimenter.progress import STATES, session_state
 from physion.experiment.export.export_study import export_study
 from physion.experiment.export.tables import read_tables
-from physion.experiment.protocol import Enter
+from physion.experiment.protocol import Enter, PageDone
 from physion.experiment.store.database import ANSWERS, EVENTS, PAUSES, RAW_IDS, SESSIONS
 from physion.experiment.store.lab import set_voided
-from physion.experiment.study.settings import Bonus
+from physion.experiment.study.orders import trial_order
+from physion.experiment.study.recruitment import session_code
+from physion.experiment.study.settings import Bonus, Condition
 from support.experiment.experimenter_client import TWO, Lab, Visitor, lab
 from support.experiment.experimenter_rows import insert_sessions
 from support.experiment.store_walk import begin, enter, give, refusal, rows, run, walk
@@ -92,18 +95,6 @@ def session_of(found: Lab, token: str) -> sa.Row:
 # --- progress ------------------------------------------------------------------------------------
 
 
-def test_the_expected_end_follows_the_rate_of_late() -> None:
-    finished = [1000.0 * number for number in range(1, 31)]
-    # The last 20 took 19,000 s; at the moment of the last one nothing else has passed.
-    assert expected_end(finished, 40, 30_000.0) == 30_000.0 + 10 * 1000.0
-    later = expected_end(finished, 40, 49_000.0)
-    assert later is not None and later == 49_000.0 + 10 * 2000.0
-    for enough in ([], finished[:2]):
-        assert expected_end(enough, 40, 30_000.0) is None
-    assert expected_end(finished, 30, 30_000.0) is None
-    assert expected_end(finished, 40, 30_000.0 + 86_400.0) is None
-
-
 def test_states_of_sessions() -> None:
     names = ("voided_at", "finished_at", "withdrawn_at", "screened_out_at")
     states = ("void", "finished", "withdrawn", "screened_out")
@@ -149,6 +140,19 @@ def test_progress_counts_people_and_their_answers(busy: tuple[Lab, Visitor]) -> 
     assert shown[-1][0] == "All" and len(shown) == 3
 
 
+def test_progress_counts_each_condition(tmp_path: Path) -> None:
+    groups = (Condition("plain"), Condition("brief"))
+    with lab(tmp_path, conditions=groups) as found:
+        for seed, (name, count) in enumerate((("plain", 2), ("brief", 3))):
+            insert_sessions(found.store.engine, found.study, found.secrets, count, seed=seed,
+                            ends=("finished",), condition=name)  # fmt: skip
+        insert_sessions(found.store.engine, found.study, found.secrets, 1, seed=9,
+                        ends=("finished",), condition="brief", implausible="short")  # fmt: skip
+        head, *shown = table_of(found.experimenter().see().text, 1)
+        assert head[:2] == ["Condition", "Counted"]
+        assert [row[:2] for row in shown] == [["plain", "2"], ["brief", "3"]]
+
+
 def test_simulated_ones_and_previews_stand_apart(busy: tuple[Lab, Visitor]) -> None:
     _, visitor = busy
     for kind, count in (("simulated", SIMULATED), ("preview", PREVIEWS)):
@@ -175,18 +179,17 @@ def test_many_entries_in_a_minute_raise_an_alarm(
 def test_recruitment_is_paused_and_resumed(small: tuple[Lab, Visitor]) -> None:
     found, visitor = small
     going = begin(found.store, "Early")
-    token = visitor.token("")
     for _ in range(2):
-        assert visitor.submit("/recruitment", token, action="pause").status_code == 303
+        assert visitor.submit("/recruitment", action="pause").status_code == 303
     assert "Recruitment is paused" in visitor.see().text
     assert refusal(found.store.enter(Enter(id="Late"))).code == "paused"
     walk(found.store, going, "test")
-    assert visitor.submit("/recruitment", token, action="resume").status_code == 303
+    assert visitor.submit("/recruitment", action="resume").status_code == 303
     assert "Recruitment is paused" not in visitor.see().text
     (pause,) = rows(found.store, PAUSES)
     assert pause.paused_at < pause.resumed_at
     assert refusal(found.store.enter(Enter(id="Late"))).code == "held"
-    assert visitor.submit("/recruitment", token, action="stop").status_code == 422
+    assert visitor.submit("/recruitment", action="stop").status_code == 422
 
 
 # --- sessions ------------------------------------------------------------------------------------
@@ -203,6 +206,36 @@ def test_sessions_are_chosen(busy: tuple[Lab, Visitor]) -> None:
     ]
     assert references(visitor.see("/sessions?scenario=drop&state=left").text) == left != []
     assert "No matching session." in visitor.see("/sessions?state=none").text
+    counts = re.findall(r'<span class="count">(\d+)', visitor.see("/sessions").text)
+    assert counts == [str(PEOPLE), str(SIMULATED), str(PREVIEWS)]
+
+
+def test_the_list_of_sessions_has_their_numbers(busy: tuple[Lab, Visitor]) -> None:
+    found, visitor = busy
+    labels = {stimulus.stimulus: stimulus.label for stimulus in found.study.stimuli}
+    people = sorted(sessions_of(found), key=lambda row: -row.started_at)
+    by_session: dict[str, list[sa.Row]] = {}
+    for answer in rows(found.store):
+        by_session.setdefault(answer.session, []).append(answer)
+    head, *shown = table_of(visitor.see("/sessions").text)
+    stages = Counter[str]()
+    for person, line in zip(people, shown, strict=True):
+        cells, own = dict(zip(head, line, strict=True)), by_session.get(person.session, [])
+        test = [answer for answer in own if answer.phase == "test"]
+        right = sum((answer.response == "yes") == labels[answer.stimulus] for answer in test)
+        accuracy = f"{100 * right / len(test):.0f} %" if test else "–"
+        lost = sum(answer.frames_shown != 45 for answer in own)
+        end = person.finished_at or person.withdrawn_at or person.last_seen
+        assert cells["Reference"] == person.reference and cells["Trials"] == str(len(test))
+        assert (cells["Accuracy"], cells["Frames"]) == (accuracy, str(lost))
+        assert cells["Duration"] == minutes((end - person.started_at) / 60)
+        assert cells["Started"] == strftime("%Y-%m-%d %H:%M", gmtime(person.started_at))
+        state = STATES[session_state(person, time.time())]
+        practice = len(own) < 10
+        stage = "" if person.finished_at else " Familiarization" if practice else " Test"
+        assert cells["State"] == state + stage
+        stages[stage] += 1
+    assert len(stages) == 3 and min(stages.values()) > 10
 
 
 def test_flags_match_the_analysis(busy: tuple[Lab, Visitor]) -> None:
@@ -244,7 +277,8 @@ def test_flags_are_found_anew_only_when_a_session_has_ended(
 
 def test_a_session_shows_its_answers_in_order_and_no_id(busy: tuple[Lab, Visitor]) -> None:
     found, visitor = busy
-    row = next(row for row in sessions_of(found) if row.finished_at)
+    lost = {each.session for each in rows(found.store) if each.frames_shown != 45}
+    row = next(row for row in sessions_of(found) if row.finished_at and row.session in lost)
     text = visitor.see(f"/sessions/{row.session}").text
     answers = table_of(text)[1:]
     assert [line[0] for line in answers] == ["practice"] * 10 + ["test"] * 6
@@ -256,8 +290,19 @@ def test_a_session_shows_its_answers_in_order_and_no_id(busy: tuple[Lab, Visitor
     )
     for line, answer in zip(answers, stored, strict=True):
         right = (answer.response == "yes") == labels[answer.stimulus]
-        assert line[2:4] == [answer.stimulus, answer.response]
-        assert line[5] == ("right" if right else "wrong")
+        outcome = "yes" if labels[answer.stimulus] else "no"
+        assert line[2:5] == [answer.stimulus, answer.response, outcome]
+        assert line[5:7] == ["right" if right else "wrong", f"{answer.rt_ms / 1000:.2f}"]
+        complete = answer.frames_shown == 45
+        assert line[7] == ("45" if complete else f"{answer.frames_shown} of 45")
+        assert line[10] == strftime("%Y-%m-%d %H:%M", gmtime(answer.answered_at))
+    facts = words_of(text)
+    right = sum((a.response == "yes") == labels[a.stimulus] for a in stored if a.phase == "test")
+    assert f"Test right {right} of 6 ({100 * right / 6:.1f} %)" in facts
+    lost = sum(answer.frames_shown != 45 for answer in stored)
+    assert f"Trials without all frames {lost} " in facts
+    for name, at in (("Started", row.started_at), ("Finished", row.finished_at)):
+        assert f"{name} {strftime('%Y-%m-%d %H:%M', gmtime(at))}" in facts
     ids = {each.participant: each.raw_id for each in rows(found.store, RAW_IDS)}
     assert ids[row.participant] not in text and row.participant not in text
     assert "It was fun." in text and visitor.see("/sessions/none").status_code == 404
@@ -268,20 +313,38 @@ def test_a_void_session_does_not_count(small: tuple[Lab, Visitor]) -> None:
     row = session_of(found, walk(found.store, enter(found.store, "Fake"), "done"))
     assert refusal(found.store.enter(Enter(id="Next"))).code == "study_full"
     page = f"/sessions/{row.session}"
-    form = visitor.token(page)
-    assert visitor.submit(f"{page}/void", form, action="void").status_code == 303
+    assert visitor.submit(f"{page}/void", action="void").status_code == 303
     assert "This session is void" in visitor.see(page).text
     assert len(read_tables(found.store.engine, found.study)[1]) == 0
     later = begin(found.store, "Next")
     assert refusal(found.store.enter(Enter(id="Fake"))).code == "already_took_part"
-    assert visitor.submit(f"{page}/void", form, action="count").status_code == 303
+    assert visitor.submit(f"{page}/void", action="count").status_code == 303
     assert session_of(found, later) and len(read_tables(found.store.engine, found.study)[1]) == 2
     # A void session that is not finished cannot be continued.
     other = session_of(found, later)
-    visitor.submit(f"/sessions/{other.session}/void", form, action="void")
+    visitor.submit(f"/sessions/{other.session}/void", action="void")
     assert run(found.store.state(later)).stage == "withdrawn"
     assert refusal(found.store.enter(Enter(id="Next"))).code == "already_took_part"
-    assert visitor.submit("/sessions/none/void", form, action="void").status_code == 404
+    assert visitor.submit("/sessions/none/void", action="void").status_code == 404
+
+
+def test_only_the_chosen_session_becomes_void(tmp_path: Path) -> None:
+    with lab(tmp_path) as found:
+        engine = found.store.engine
+        names = insert_sessions(engine, found.study, found.secrets, 3, ends=("finished",))
+        visitor = found.experimenter()
+        begin_at = time.time()
+        visitor.submit(f"/sessions/{names[1]}/void", action="void")
+        voided = {row.session: row.voided_at for row in sessions_of(found)}
+        assert [voided[name] is None for name in names] == [True, False, True]
+        assert begin_at <= voided[names[1]] <= time.time()
+        head, *_, total = table_of(visitor.see().text)
+        cells = dict(zip(head, total, strict=True))
+        assert (cells["Finished"], cells["Void"]) == ("2 of 200", "1")
+        visitor.submit(f"/sessions/{names[0]}/void", action="void")
+        visitor.submit(f"/sessions/{names[1]}/void", action="count")
+        voided = {row.session: row.voided_at for row in sessions_of(found)}
+        assert [voided[name] is None for name in names] == [False, True, True]
 
 
 def test_one_session_is_deleted_while_others_answer(small: tuple[Lab, Visitor]) -> None:
@@ -292,11 +355,10 @@ def test_one_session_is_deleted_while_others_answer(small: tuple[Lab, Visitor]) 
     give(found.store, token, 0)
     row = session_of(found, token)
     page = f"/sessions/{row.session}"
-    form = visitor.token(page)
     before = len(rows(found.store))
-    assert visitor.submit(f"{page}/forget", form, word="yes").status_code == 422
+    assert visitor.submit(f"{page}/forget", word="yes").status_code == 422
     assert len(rows(found.store)) == before
-    assert visitor.submit(f"{page}/forget", form, word=" Delete").status_code == 303
+    assert visitor.submit(f"{page}/forget", word=" Delete").status_code == 303
     assert not give(found.store, other, 0).duplicate
     for table in (ANSWERS, EVENTS):
         assert row.session not in {each.session for each in rows(found.store, table)}
@@ -354,16 +416,59 @@ def test_the_table_of_payments_is_shown_and_sent(tmp_path: Path) -> None:
         assert [cells[name] for name in names] == ["finished", "1", "0.5000", "3.00"]
 
 
+def finish(found: Lab, person: str, right: int) -> sa.Row:
+    """Take part with so many right test answers, the first ones; return the row of the session."""
+    token = walk(found.store, begin(found.store, person, source="mturk"), "test")
+    row = session_of(found, token)
+    order = trial_order(found.study, row.scenario, row.order_seed)["test"]
+    for trial, stimulus in enumerate(order):
+        answer = stimulus.label if trial < right else not stimulus.label
+        give(found.store, token, trial, response="yes" if answer else "no")
+    walk(found.store, token, "done")
+    return session_of(found, token)
+
+
+def test_each_person_is_paid_for_the_own_session(tmp_path: Path) -> None:
+    settings = {"bonus": Bonus(per_correct=0.25, above=0.5), "participants": 9, "test": 4}
+    with lab(tmp_path, **ONE | settings) as found:
+        done = {person: finish(found, person, right) for person, right in
+                (("w-ada", 4), ("w-bo", 3), ("w-cy", 1), ("w-di", 2))}  # fmt: skip
+        walk(found.store, begin(found.store, "w-late", source="mturk"), "feedback")
+        gone = walk(found.store, begin(found.store, "w-gone", source="mturk"), "test")
+        run(found.store.page(gone, PageDone(page="withdraw")))
+        visitor = found.experimenter()
+        visitor.submit(f"/sessions/{done['w-di'].session}/void", action="void")
+        cells = {
+            row["id"]: row for row in csv.DictReader(io.StringIO(visitor.see("/payments.csv").text))
+        }
+        bonus = {"w-ada": "0.50", "w-bo": "0.25", "w-cy": "0.00", "w-di": "0.00"}
+        right = {"w-ada": 4, "w-bo": 3, "w-cy": 1, "w-di": 2}
+        assert set(cells) == set(done)
+        for person, row in done.items():
+            paid = cells[person]
+            assert (paid["reference"], paid["source"]) == (row.reference, "mturk")
+            assert (paid["test_trials"], paid["correct"]) == ("4", str(right[person]))
+            assert (paid["accuracy"], paid["bonus"]) == (f"{right[person] / 4:.4f}", bonus[person])
+            assert paid["completion_code"] == session_code(found.secrets, row.session)
+            at = strftime("%Y-%m-%dT%H:%M:%S+00:00", gmtime(row.finished_at))
+            assert paid["finished_at"] == at
+            assert paid["state"] == ("void" if person == "w-di" else "finished")
+        everybody = list(csv.DictReader(io.StringIO(visitor.see("/payments.csv?who=all").text)))
+        states = {row["id"]: (row["state"], row["completion_code"]) for row in everybody}
+        assert states["w-late"] == ("going", "") and states["w-gone"] == ("withdrawn", "")
+        assert len(everybody) == 6
+
+
 def test_deleting_ids_needs_the_word_and_leaves_answers(tmp_path: Path) -> None:
     with lab(tmp_path) as own:
         insert_sessions(own.store.engine, own.study, own.secrets, 20)
         visitor = own.experimenter()
         assert "the 20 stored ids should be deleted" in visitor.see("/payments").text
-        token, before = visitor.token("/payments"), table_of(visitor.see().text)
+        before = table_of(visitor.see().text)
         for word in ("", "yes", "delete all"):
-            answer = visitor.submit("/payments/forget", token, word=word)
+            answer = visitor.submit("/payments/forget", word=word)
             assert answer.status_code == 422 and "Nothing was deleted" in answer.text
-        answer = visitor.submit("/payments/forget", token, word="Delete")
+        answer = visitor.submit("/payments/forget", word="Delete")
         assert "20 ids were deleted" in answer.text and "Delete raw ids" not in answer.text
         assert rows(own.store, RAW_IDS) == []
         assert table_of(visitor.see().text) == before
@@ -441,8 +546,7 @@ def test_the_export_matches_the_command(
     workplace = tmp_path / "workplace"
     workplace.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(workplace))
-    token = visitor.token("/export")
-    answer = visitor.submit("/export", token, simulated="yes")
+    answer = visitor.submit("/export", simulated="yes")
     assert answer.status_code == 200 and answer.headers["content-type"] == "application/zip"
     assert re.fullmatch(
         r'attachment; filename="tiny-1-\d{4}-\d\d-\d\d\.zip"', answer.headers["content-disposition"]
@@ -455,7 +559,7 @@ def test_the_export_matches_the_command(
         if path.is_file()
     }
     assert {name: packed.read(name) for name in packed.namelist()} == written
-    people = zipfile.ZipFile(io.BytesIO(visitor.submit("/export", token).content))
+    people = zipfile.ZipFile(io.BytesIO(visitor.submit("/export").content))
     table = pd.read_csv(io.BytesIO(people.read("tiny-1/sessions.csv")))
     assert set(table["simulated"]) == {False}
     assert list(workplace.iterdir()) == [], "nothing is left in the temporary folder"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,21 +37,21 @@ MOVIE_S = 44 / 30
 
 
 class Clock:
-    """The server's clock, which a test can put forward."""
+    """The server's clock, which stands until a test puts it forward."""
 
-    def __init__(self, real: Callable[[], float]) -> None:
-        self._real, self._ahead = real, 0.0
+    def __init__(self) -> None:
+        self.now = 1_800_000_000.0
 
     def __call__(self) -> float:
-        return self._real() + self._ahead
+        return self.now
 
     def wait(self, seconds: float) -> None:
-        self._ahead += seconds
+        self.now += seconds
 
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    clock = Clock(time.time)
+    clock = Clock()
     monkeypatch.setattr(time, "time", clock)
     return clock
 
@@ -92,7 +92,7 @@ class Person:
         if fetch:
             self.fetch(media)
         self.announce(phase, trial)
-        self.clock.wait(media.fixation_ms / 1000 + 2 + MOVIE_S + more.get("rt_ms", 512.5) / 1000)
+        self.clock.wait(lasts(media) + more.get("rt_ms", 512.5) / 1000)
         give(self.store, self.token, trial, phase, **more)
         if phase == "familiarization":
             self.clock.wait(2)  # the full movie
@@ -122,6 +122,11 @@ class Person:
         return next(row for row in rows(self.store, SESSIONS) if row.reference == reference)
 
 
+def lasts(media: TrialMedia) -> float:
+    """Return the time in seconds of cross, cue (2 s) and movie."""
+    return media.fixation_ms / 1000 + 2 + MOVIE_S
+
+
 def test_an_answer_is_refused_until_its_movie_can_have_been_shown(
     checked: Store, clock: Clock
 ) -> None:
@@ -131,14 +136,14 @@ def test_an_answer_is_refused_until_its_movie_can_have_been_shown(
     unseen = refusal(checked.answer(ada.token, answer(0)))
     assert unseen.code == "not_shown" and unseen.state is not None and unseen.state.trial == 0
     assert ada.announce("test", 0) == 1
-    shortest = media.fixation_ms / 1000 + 2 + MOVIE_S
-    clock.wait(shortest - 3)
-    early = refusal(checked.answer(ada.token, answer(0)))
-    assert early.code == "too_early"
-    # The real time since the showing began has passed too.
-    assert 0.4 < early.wait_s < 3 - TOLERANCE_S + 0.01
+    begin, earliest = clock.now, lasts(media) - TOLERANCE_S
+    for passed in (0.0, 1.5, earliest - 0.001):
+        clock.now = begin + passed
+        early = refusal(checked.answer(ada.token, answer(0)))
+        assert early.code == "too_early"
+        assert early.wait_s == pytest.approx(earliest - passed, abs=1e-5)
     assert ada.row().answered_test == 0 and len(rows(checked)) == 3
-    clock.wait(3)
+    clock.now = begin + earliest + 0.001
     assert give(checked, ada.token, 0).state.trial == 1
     # The next trial has its own time, however late the first answer came.
     clock.wait(60)
@@ -155,9 +160,28 @@ def test_the_time_counts_from_the_moment_at_which_the_movie_was_fetched(
     clock.wait(600)
     ada.fetch(media)
     asked = answer(0, "familiarization")
-    assert refusal(checked.answer(ada.token, asked)).code == "too_early"
-    clock.wait(2 + MOVIE_S)
+    early = refusal(checked.answer(ada.token, asked))
+    assert early.wait_s == pytest.approx(2 + MOVIE_S - TOLERANCE_S, abs=1e-5)
+    clock.wait(early.wait_s + 0.001)
     assert not run(checked.answer(ada.token, asked)).duplicate
+
+
+def test_a_trial_begins_when_its_browser_says_but_after_the_last_one(
+    checked: Store, clock: Clock
+) -> None:
+    ada = Person(checked, clock, "Ada").begin("test")
+    media = checked.trials(ada.token, "test").trials[0]
+    ada.fetch(media)
+    clock.wait(10)
+    ada.announce("test", 0, ago_ms=4000.0)
+    begin = clock.now - 4
+    clock.wait(60)
+    give(checked, ada.token, 0, rt_ms=812.5)
+    ended = begin + lasts(media) + 0.8125
+    assert ada.row().next_from == pytest.approx(ended, abs=1e-5)
+    ada.announce("test", 1, ago_ms=3_600_000)
+    begins = [row.began_at for row in rows(checked, SHOWINGS) if row.phase == "test"]
+    assert begins == pytest.approx([begin, ended], abs=1e-5)
 
 
 def test_answers_that_waited_for_a_connection_are_accepted_but_take_their_time(
@@ -167,11 +191,11 @@ def test_answers_that_waited_for_a_connection_are_accepted_but_take_their_time(
     trials = checked.trials(ada.token, "test").trials
     for media in trials:
         ada.fetch(media)
-    lasts = [media.fixation_ms / 1000 + 2 + MOVIE_S + 0.6 for media in trials]
-    clock.wait(sum(lasts[:3]))
+    taken = [lasts(media) + 0.6 for media in trials]
+    clock.wait(sum(taken[:3]))
     # Three trials were done offline, one after the other; each showing says how long ago it began.
     for trial in range(3):
-        ada.announce("test", trial, ago_ms=1000 * sum(lasts[trial:3]))
+        ada.announce("test", trial, ago_ms=1000 * sum(taken[trial:3]))
         give(checked, ada.token, trial)
     # Nobody can say that a trial began before the previous one had ended.
     ada.announce("test", 3, ago_ms=3_600_000)
@@ -254,22 +278,28 @@ def test_many_answers_under_100_ms_are_implausible(
     assert ada.row().implausible == implausible
 
 
-def test_a_session_shorter_than_its_movies_is_implausible(checked: Store, clock: Clock) -> None:
-    ada = Person(checked, clock, "Ada")
-    page(checked, ada.token, "consent")
-    page(checked, ada.token, "instructions")  # nothing was read
-    for trial in range(3):
-        media = checked.trials(ada.token, "familiarization").trials[trial]
-        ada.fetch(media)
-        ada.announce("familiarization", trial)
-        clock.wait(media.fixation_ms / 1000 + 2 + MOVIE_S)
-        give(checked, ada.token, trial, "familiarization")  # nor was the feedback looked at
-    page(checked, ada.token, "ready")
-    for trial in range(4):
-        ada.trial("test", trial)
-    page(checked, ada.token, "demographics")
+@pytest.mark.parametrize(("more", "implausible"), [(-0.01, "short"), (0.01, None)])
+def test_a_session_shorter_than_its_movies_is_implausible(
+    checked: Store, clock: Clock, more: float, implausible: str | None
+) -> None:
+    ada, begin = Person(checked, clock, "Ada"), clock.now
+    shortest = checked.study.plausibility.reading_s
+    for name in ("consent", "instructions"):
+        page(checked, ada.token, name)
+    for phase, count in (("familiarization", 3), ("test", 4)):
+        for trial in range(count):
+            media = checked.trials(ada.token, phase).trials[trial]  # type: ignore[arg-type]
+            ada.fetch(media)
+            ada.announce(phase, trial)
+            clock.wait(lasts(media) + 0.1)
+            give(checked, ada.token, trial, phase, rt_ms=100.0)
+            # The shortest answer takes as long as the tolerance; feedback has 60 frames.
+            shortest += lasts(media) + (59 / 30 if phase == "familiarization" else 0)
+        page(checked, ada.token, "ready" if phase == "familiarization" else "demographics")
+    assert clock.now < begin + shortest
+    clock.now = begin + shortest + more
     page(checked, ada.token, "feedback")
-    assert ada.row().implausible == "short"
+    assert ada.row().implausible == implausible
 
 
 def test_simulated_people_are_faster_where_the_study_allows_it(
@@ -296,19 +326,20 @@ def test_simulated_people_are_faster_where_the_study_allows_it(
         store.close()
 
 
-def test_a_place_is_given_back_after_a_time_without_an_answer(checked: Store, clock: Clock) -> None:
-    waiting = [Person(checked, clock, f"p{number}").begin("test") for number in range(3)]
-    assert refusal(checked.enter(request("late", scenario="drop"))).code == "held"
-    # To load the page does not hold the place, to go on does.
-    clock.wait(14 * 60)
-    for person in waiting:
-        run(checked.state(person.token, load=True))
-    waiting[0].trial("test", 0)
-    assert refusal(checked.enter(request("late", scenario="drop"))).code == "held"
-    clock.wait(2 * 60)
-    late = [Person(checked, clock, name).begin() for name in ("late", "later")]
-    for person in late:
-        person.begin("test")
-    assert refusal(checked.enter(request("latest", scenario="drop"))).code == "held"
-    # Who had begun can still finish.
-    waiting[1].trial("test", 0)
+def test_a_place_is_held_for_15_minutes_after_the_last_answer(checked: Store, clock: Clock) -> None:
+    late, waiting, times = request("late", scenario="drop"), [], []
+    for number in range(3):
+        assert run(checked.enter(late)).state.stage == "consent"
+        waiting.append(Person(checked, clock, f"p{number}").begin("test"))
+        times.append(clock.now)
+    assert refusal(checked.enter(late)).code == "held"
+    clock.now = times[0] + 15 * 60 - 0.001
+    run(checked.state(waiting[0].token, load=True))  # to load the page does not hold the place
+    assert refusal(checked.enter(late)).code == "held"
+    clock.wait(0.5)
+    assert run(checked.enter(late)).state.stage == "consent"
+    waiting[0].trial("test", 0)  # but to continue does
+    assert refusal(checked.enter(late)).code == "held"
+    clock.now = times[1] + 15 * 60 + 0.5
+    Person(checked, clock, "late").begin("test")
+    waiting[1].trial("test", 0)  # who had begun can still finish

@@ -10,8 +10,6 @@
 
 `physion experiment export DIR`: export the answers for the analysis, with a data dictionary.
 
-`physion experiment password DIR`: set a new password for the experimenter's pages.
-
 `physion experiment backup DIR`: copy the database, settings and texts while the study is served.
 
 `physion experiment forget DIR`: delete recruiters' ids, or all data of a session.
@@ -37,7 +35,6 @@ SUBVERBS = {
     "export": "physion.cli.experiment.export",
     "simulate": "physion.cli.experiment.simulate",
     "links": "physion.cli.experiment.links",
-    "password": "physion.cli.experiment.password",
     "backup": "physion.cli.experiment.backup",
     "forget": "physion.cli.experiment.forget",
     "power": "physion.cli.experiment.power",
@@ -52,7 +49,7 @@ class Options:
     """Options of ``physion experiment`` without a sub-verb."""
 
     words: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """One of init, serve, links, simulate, export, password, backup, forget, power."""
+    """One of init, serve, links, simulate, export, backup, forget, power."""
 
 
 def main(options: Options) -> int:

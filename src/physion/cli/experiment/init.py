@@ -31,8 +31,8 @@ class Options:
     trials: Path | None = None
     """Dataset from which testing and familiarization trials are drawn."""
     scenes: Path | None = None
-    """Instead of --trials: official scenes, which are rendered first: official (shipped with the
-    package), a folder made by physion import, or one with command logs."""
+    """Instead of --trials: official scenes, which are rendered first: the package's own
+    (official), a folder made by physion import, or one with command logs."""
     rendered: Path | None = None
     """Folder of the trials that --scenes makes; existing ones are kept. Default: next to the study,
     with -trials after its name."""
@@ -81,6 +81,7 @@ def main(options: Options) -> int:
 
     require_extra()
     from physion.cli.output import Stages
+    from physion.experiment.study.identity import read_password
     from physion.experiment.study.make import make_study
 
     if not options.contact:
@@ -88,12 +89,15 @@ def main(options: Options) -> int:
             'give --contact "NAME, EMAIL": participants see it with the consent, to ask questions '
             "and to have their data deleted"
         )
-    password, chosen = _password(options.password_file), _choose(options)
+    # A random password has 96 bits.
+    file = options.password_file
+    password = secrets.token_urlsafe(12) if file is None else read_password(file)
+    chosen = _choose(options)
     with Stages() as stages:
         study = make_study(
             _study(options, chosen.scenarios), chosen.sources, password, progress=stages
         )
-    _print(options, study, chosen, password if options.password_file is None else None)
+    _print(options, study, chosen, password if file is None else None)
     return 0
 
 
@@ -208,22 +212,6 @@ def _study(options: Options, scenarios: tuple[str, ...]) -> Study:
         participants=options.participants,
         seed=options.seed,
     )
-
-
-def _password(path: Path | None) -> str:
-    """Return the first line of the password file, or a random password (96 bits)."""
-    from physion.core.files import read_plain
-    from physion.experiment.study.identity import MAX_PASSWORD, MIN_PASSWORD
-
-    if path is None:
-        return secrets.token_urlsafe(12)
-    try:
-        password = read_plain(path, 10_000).decode().splitlines()[0].strip()
-    except (UnicodeDecodeError, IndexError) as error:
-        raise BadInputError(f"{path} has no password in its first line") from error
-    if not MIN_PASSWORD <= len(password) <= MAX_PASSWORD:
-        raise BadInputError(f"the password in {path} must have {MIN_PASSWORD} characters or more")
-    return password
 
 
 def _print(options: Options, study: Study, chosen: StimulusSelection, password: str | None) -> None:

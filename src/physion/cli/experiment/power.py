@@ -19,7 +19,7 @@ class Options:
     """The effect, the sizes, and the people whose answers are drawn."""
 
     humans: Path = Path("official")
-    """Answers of people by stimulus: official (shipped with the package), or a folder with
+    """Answers of people by stimulus: official (the package's own), or a folder with
     human_accuracy-*.csv."""
     labels: Path | None = None
     """Official outcomes (stim_ID, label); if not given, looked for next to the folder of people."""

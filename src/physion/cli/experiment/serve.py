@@ -32,6 +32,9 @@ class Options:
     """Certificate chain (PEM), to serve https without a proxy."""
     https_key: Path | None = None
     """Private key of the certificate (PEM)."""
+    password_file: Path | None = None
+    """File with a new password of the experimenter's pages in its first line. (There is no option
+    for the password itself, since other users of the machine can see command lines.)"""
     log_requests: bool = False
     """Log method, path and status of each request to standard error, without ids."""
     json: bool = False
@@ -44,7 +47,10 @@ def main(options: Options) -> int:
 
     require_extra()
     from physion.experiment.server import Address, serve
+    from physion.experiment.study.identity import read_password, set_password
 
+    if options.password_file is not None:
+        set_password(options.study, read_password(options.password_file))
     address = Address(
         options.host,
         options.port,

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
 import shutil
 import tempfile
 import threading
@@ -28,9 +27,9 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import FileResponse, RedirectResponse, Response
 
-from physion.core.errors import PhysionError
+from physion.core.errors import BadInputError, PhysionError
 from physion.core.html import environment
-from physion.experiment.experimenter.access import HEADERS, PATH, Access
+from physion.experiment.experimenter.access import HEADERS, PATH, Access, read_form
 from physion.experiment.experimenter.payments import payment_csv, read_payments
 from physion.experiment.experimenter.progress import (
     ALARM_ENTRIES,
@@ -39,7 +38,7 @@ from physion.experiment.experimenter.progress import (
     StudyProgress,
     load_analysis,
 )
-from physion.experiment.store.database import ANSWERS, SESSIONS
+from physion.experiment.store.database import ANSWERS
 from physion.experiment.store.entry import is_paused
 from physion.experiment.store.lab import forget_raw_ids, forget_session, set_paused, set_voided
 from physion.experiment.store.sessions import ACTIVE_WITHIN
@@ -58,6 +57,7 @@ REFRESH_SECONDS = 30
 FORGET_WORD = "delete"
 """Word that must be typed to confirm a deletion."""
 WRONG_FORM = "This form was no longer valid. Please try again."
+NO_SESSION = "There is no such session."
 NONE = "–"
 
 
@@ -105,7 +105,7 @@ class _Pages:
     def __init__(self, study: Study, secrets: Secrets, store: Store) -> None:
         self._study, self._secrets, self._store = study, secrets, store
         self._engine: Engine = store.engine
-        self.access = Access(self._read_secrets)
+        self.access = Access(secrets)
         self._progress = StudyProgress(study, store.engine)
         self._files = read_page_files(Path(__file__).parent / "static")
         self._exporting = False
@@ -117,38 +117,32 @@ class _Pages:
             "refresh_seconds": REFRESH_SECONDS,
         }  # fmt: skip
 
-    def _read_secrets(self) -> Secrets:
-        """Read the file again at each check, so that a new password takes effect at once."""
-        try:
-            return Secrets.load(self._study.folder)
-        except PhysionError:
-            return self._secrets
-
     def guarded(self, page: Handler) -> Handler:
-        """Return a handler that sends browsers without a login to the login page."""
+        """Return a handler that sends browsers without a login to the login page.
+
+        The fields of a form are in ``request.state.form``.
+        """
 
         async def handler(request: Request) -> Response:
-            by_person = request.query_params.get("auto") != "1"
-            if not self.access.is_logged_in(request, by_person):
+            if not self.access.is_logged_in(request):
                 return _redirect("/login")
+            if request.method == "POST":
+                request.state.form = await read_form(request)
+                if request.state.form is None:
+                    return self._problem(WRONG_FORM, 403)
             return await page(request)
 
         return handler
 
-    def _render(
-        self, request: Request, template: str, status: int = 200, **values: Any
-    ) -> Response:
-        """Render a page whose forms are bound to the browser's cookie."""
-        return self._render_for(self.access.visit(request), template, status, **values)
-
-    def _render_for(self, visit: str, template: str, status: int, **values: Any) -> Response:
+    def _render(self, template: str, status: int = 200, **values: Any) -> Response:
+        """Render a page."""
         text = self._templates.get_template(template).render(
-            form_token=self.access.form_token(visit), now=time.time(), **self._shared, **values
+            now=time.time(), **self._shared, **values
         )
         return Response(text, status, HEADERS, "text/html; charset=utf-8")
 
-    def _problem(self, request: Request, problem: str, status: int) -> Response:
-        return self._render(request, "problem.html", status, here="", problem=problem)
+    def _problem(self, problem: str, status: int) -> Response:
+        return self._render("problem.html", status, here="", problem=problem)
 
     async def static(self, request: Request) -> Response:
         """Send the style sheet or the icon."""
@@ -161,23 +155,20 @@ class _Pages:
         """Show the login form."""
         if self.access.is_logged_in(request):
             return _redirect("")
-        return self._login_form(request)
+        return self._render("login.html", problem="")
 
     async def login(self, request: Request) -> Response:
         """Check the password, and log in."""
-        fields = await self.access.form(request)
+        fields = await read_form(request)
         if fields is None:
-            return self._login_form(request, WRONG_FORM, 403)
-        wait = await self.access.log_in(request, fields.get("password", ""))
-        if wait < 0:
+            return self._render("login.html", 403, problem=WRONG_FORM)
+        right = await self.access.check(fields.get("password", ""))
+        if right is None:
+            problem = "Too many attempts at the same time. Please try again."
+            return self._render("login.html", 429, problem=problem)
+        if not right:
             LOG.warning("a login of an experimenter was refused")
-            return self._login_form(request, "This is not the password.", 403)
-        if wait > 0:
-            seconds = math.ceil(wait)
-            problem = f"Too many attempts. Please wait {seconds} s and try again."
-            response = self._login_form(request, problem, 429)
-            response.headers["retry-after"] = str(seconds)
-            return response
+            return self._render("login.html", 403, problem="This is not the password.")
         LOG.info("an experimenter logged in")
         response = _redirect("")
         self.access.open(request, response)
@@ -185,17 +176,8 @@ class _Pages:
 
     async def logout(self, request: Request) -> Response:
         """Log out."""
-        if await self.access.form(request) is None:
-            return self._problem(request, WRONG_FORM, 403)
         response = _redirect("/login")
         self.access.close(request, response)
-        return response
-
-    def _login_form(self, request: Request, problem: str = "", status: int = 200) -> Response:
-        """Show the login form, with a cookie to which it is bound."""
-        visit = self.access.visit(request)
-        response = self._render_for(visit, "login.html", status, problem=problem)
-        self.access.set_visit(request, response, visit)
         return response
 
     async def progress(self, request: Request) -> Response:
@@ -209,7 +191,7 @@ class _Pages:
                 paused = is_paused(connection)
             entries = self._store.entries(60.0)
             return self._render(
-                request, "progress.html", here="progress", kind=kind, rows=by_scenario,
+                "progress.html", here="progress", kind=kind, rows=by_scenario,
                 conditions=by_condition, flags=flags, paused=paused,
                 counts=self._progress.kinds(), entries=entries,
                 alarm=entries >= ALARM_ENTRIES,
@@ -219,18 +201,15 @@ class _Pages:
 
     async def set_recruitment(self, request: Request) -> Response:
         """Pause or resume recruitment."""
-        fields = await self.access.form(request)
-        if fields is None:
-            return self._problem(request, WRONG_FORM, 403)
-        action, now = fields.get("action"), time.time()
+        action, now = request.state.form.get("action"), time.time()
         if action not in ("pause", "resume"):
-            return self._problem(request, "This form was not understood.", 422)
+            return self._problem("This form was not understood.", 422)
         await self._store.write(lambda c: set_paused(c, action == "pause", now))
         LOG.warning("an experimenter asked to %s recruitment", action)
         return _redirect("")
 
     async def sessions(self, request: Request) -> Response:
-        """Show the sessions, all, or of one scenario, state or flag."""
+        """Show all sessions, or the sessions of one scenario, state or flag."""
         query = request.query_params
         kind, scenario, state = _kind(request), query.get("scenario", ""), query.get("state", "")
         flag = query.get("flag", "")[:40]
@@ -246,7 +225,7 @@ class _Pages:
                 and (not flag or flag in line.flags or (flag == "any" and bool(line.flags)))
             ]
             return self._render(
-                request, "sessions.html", here="sessions", kind=kind, lines=chosen, flags=flags,
+                "sessions.html", here="sessions", kind=kind, lines=chosen, flags=flags,
                 scenario=scenario, state=state, flag=flag, rules=rules,
                 counts=self._progress.kinds(),
             )  # fmt: skip
@@ -261,7 +240,7 @@ class _Pages:
         name = request.path_params["session"][:100]
         lines, _ = self._progress.sessions("", name)
         if not lines:
-            return self._problem(request, "There is no such session.", 404)
+            return self._problem(NO_SESSION, 404)
         line = lines[0]
         labels = {key: each.label for key, each in stimuli_by_session(self._study).items()}
         columns = [column for column in ANSWERS.c if column.name != "details"]
@@ -278,39 +257,35 @@ class _Pages:
             right = None if wanted is None else (row.response == "yes") == wanted
             answers.append((row, wanted, right))
         return self._render(
-            request, "session.html", here="sessions", line=line, row=line.row, answers=answers
+            "session.html", here="sessions", line=line, row=line.row, answers=answers
         )
 
     async def set_voided(self, request: Request) -> Response:
         """Void a session, or count it again."""
-        fields = await self.access.form(request)
-        if fields is None:
-            return self._problem(request, WRONG_FORM, 403)
-        action, now = fields.get("action"), time.time()
+        action, now = request.state.form.get("action"), time.time()
         if action not in ("void", "count"):
-            return self._problem(request, "This form was not understood.", 422)
-        reference = await self._reference(request)
-        if reference is None:
-            return self._problem(request, "There is no such session.", 404)
+            return self._problem("This form was not understood.", 422)
         session = request.path_params["session"]
-        await self._store.write(lambda c: set_voided(c, session, action == "void", now))
+        reference = await self._store.write(lambda c: set_voided(c, session, action == "void", now))
+        if reference is None:
+            return self._problem(NO_SESSION, 404)
         LOG.warning("an experimenter asked to %s session %s", action, reference)
         return _redirect(f"/sessions/{session}")
 
     async def forget_session(self, request: Request) -> Response:
         """Delete all data of a session."""
-        problem = await self._refuse_deletion(request)
+        problem = self._refuse_deletion(request)
         if problem is not None:
             return problem
-        reference = await self._reference(request)
-        if reference is None:
-            return self._problem(request, "There is no such session.", 404)
+        session = request.path_params["session"][:100]
         try:
-            await forget_session(self._store, reference)
+            reference = await forget_session(self._store, session)
+        except BadInputError:
+            return self._problem(NO_SESSION, 404)
         except PhysionError as error:
-            return self._problem(request, str(error), 503)
+            return self._problem(str(error), 503)
         LOG.warning("the data of session %s were deleted by an experimenter", reference)
-        return _redirect(f"/sessions/{request.path_params['session']}")
+        return _redirect(f"/sessions/{session}")
 
     async def payments(self, request: Request) -> Response:
         """Show the payments."""
@@ -322,7 +297,7 @@ class _Pages:
         payments, stored = read_payments(self._study, self._secrets, self._engine, lines, finished)
         payable = [each for each in payments if each.line.row.implausible is None]
         return self._render(
-            request, "payments.html", here="payments", payments=payments, stored=stored,
+            "payments.html", here="payments", payments=payments, stored=stored,
             finished=finished, message=message, ids=list(dict.fromkeys(p.raw_id for p in payable)),
             bonus=bool(self._study.bonus.per_correct),
         )  # fmt: skip
@@ -343,35 +318,32 @@ class _Pages:
 
     async def forget_ids(self, request: Request) -> Response:
         """Delete all raw ids."""
-        problem = await self._refuse_deletion(request)
+        problem = self._refuse_deletion(request)
         if problem is not None:
             return problem
         try:
             deleted = await forget_raw_ids(self._store)
         except PhysionError as error:
-            return self._problem(request, str(error), 503)
+            return self._problem(str(error), 503)
         LOG.warning("%d raw ids were deleted by an experimenter", deleted)
         return await run_in_threadpool(self._payments, request, f"{deleted} ids were deleted.")
 
     async def export_form(self, request: Request) -> Response:
         """Show the form of the export."""
-        return self._render(request, "export.html", here="export")
+        return self._render("export.html", here="export")
 
     async def export(self, request: Request) -> Response:
         """Send the export of ``physion experiment export`` as one zip file."""
-        fields = await self.access.form(request)
-        if fields is None:
-            return self._problem(request, WRONG_FORM, 403)
         if self._exporting:
-            return self._problem(request, "Another export is in progress.", 409)
+            return self._problem("Another export is in progress.", 409)
         folder = Path(tempfile.mkdtemp(prefix="physion-export-"))
         self._exporting = True
         try:
-            simulated = fields.get("simulated") == "yes"
+            simulated = request.state.form.get("simulated") == "yes"
             packed = await run_in_threadpool(_export, self._study, self._engine, folder, simulated)
         except PhysionError as error:
             shutil.rmtree(folder, ignore_errors=True)
-            return self._problem(request, str(error), 409)
+            return self._problem(str(error), 409)
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
@@ -384,27 +356,14 @@ class _Pages:
             background=BackgroundTask(shutil.rmtree, folder, ignore_errors=True),
         )  # fmt: skip
 
-    async def _refuse_deletion(self, request: Request) -> Response | None:
+    def _refuse_deletion(self, request: Request) -> Response | None:
         """Return the response to a form that does not confirm a deletion; None if it does."""
-        fields = await self.access.form(request)
-        if fields is None:
-            return self._problem(request, WRONG_FORM, 403)
-        if fields.get("word", "").strip().lower() != FORGET_WORD:
+        if request.state.form.get("word", "").strip().lower() != FORGET_WORD:
             problem = f"Nothing was deleted: type the word “{FORGET_WORD}” to confirm."
-            return self._problem(request, problem, 422)
+            return self._problem(problem, 422)
         if self._exporting:  # its snapshot would keep the deleted bytes in the write-ahead log
-            return self._problem(request, "An export is in progress; wait until it ends.", 409)
+            return self._problem("An export is in progress; wait until it ends.", 409)
         return None
-
-    async def _reference(self, request: Request) -> str | None:
-        """Return the reference of the session in the path, or None if there is none."""
-        named = SESSIONS.c.session == request.path_params["session"][:100]
-
-        def read() -> str | None:
-            with self._engine.connect() as connection:
-                return connection.scalar(select(SESSIONS.c.reference).where(named))
-
-        return await run_in_threadpool(read)
 
 
 def _export(study: Study, engine: Engine, folder: Path, simulated: bool) -> Path:

@@ -54,7 +54,7 @@ def read_payments(
 ) -> tuple[list[Payment], int]:
     """Return the payments of these sessions of people, and the number of stored raw ids.
 
-    ``finished``: only payments of finished sessions.
+    ``finished``: only of finished sessions.
     """
     with engine.connect() as connection:
         stored = connection.scalar(select(func.count()).select_from(RAW_IDS)) or 0

@@ -43,8 +43,6 @@ STATES = {
     "void": "Void",
 }
 """States of a session and their labels. Participants who dropped out may still continue."""
-RATE_SESSIONS, MIN_RATE_SESSIONS, RATE_WINDOW = 20, 3, 86_400.0
-"""The current rate: of the last 20 sessions, at least 3, that finished within a day."""
 FLAGS_SECONDS = 10.0
 """Least time in seconds between two computations of the flags."""
 ALARM_ENTRIES = 30
@@ -80,7 +78,7 @@ class SessionLine:
     incomplete
         Trials of all phases whose movie was not displayed with all its frames.
     flags
-        Exclusion rules that flag it; none while it is in progress, since they may change.
+        Exclusion rules that flag it; none while it is in progress, because they may change.
     """
 
     row: Any
@@ -140,8 +138,6 @@ class ProgressRow:
         Number of flagged finished sessions.
     accuracy
         Mean accuracy of the counted sessions.
-    done_at
-        When the wanted number will be reached at the current rate (Unix time); None if unknown.
     """
 
     name: str
@@ -150,7 +146,6 @@ class ProgressRow:
     counted: int
     flagged: int
     accuracy: float | None
-    done_at: float | None
 
     @property
     def percent(self) -> float:
@@ -215,16 +210,16 @@ class StudyProgress:
 
     def rows(self, lines: Sequence[SessionLine]) -> tuple[list[ProgressRow], list[ProgressRow]]:
         """Return the rows by scenario, with the total if there are several, and by condition."""
-        now, wanted = time.time(), self._study.participants
+        wanted = self._study.participants
         by_scenario = [
-            _row(name, wanted, [s for s in lines if s.row.scenario == name], now)
+            _row(name, wanted, [s for s in lines if s.row.scenario == name])
             for name in self._study.offered
         ]
         if len(by_scenario) > 1:
-            total = _row("All", wanted * len(by_scenario), lines, now)
+            total = _row("All", wanted * len(by_scenario), lines)
             by_scenario.append(total)
         by_condition = [
-            _row(each.name, 0, [s for s in lines if s.row.condition == each.name], now)
+            _row(each.name, 0, [s for s in lines if s.row.condition == each.name])
             for each in self._study.conditions
         ]
         return by_scenario, by_condition
@@ -271,12 +266,11 @@ def session_state(row: Any, now: float) -> str:
     return "going" if now - row.last_seen <= ACTIVE_WITHIN else "left"
 
 
-def _row(name: str, wanted: int, part: Sequence[SessionLine], now: float) -> ProgressRow:
+def _row(name: str, wanted: int, part: Sequence[SessionLine]) -> ProgressRow:
     """Return the row of some sessions."""
     states = Counter(line.state for line in part)
     counted = [line for line in part if line.counts]
     accuracies = [line.accuracy for line in counted if line.accuracy is not None]
-    finished = [float(line.row.finished_at) for line in counted]
     return ProgressRow(
         name,
         wanted,
@@ -284,36 +278,7 @@ def _row(name: str, wanted: int, part: Sequence[SessionLine], now: float) -> Pro
         len(counted),
         sum(line.state == "finished" and bool(line.flags) for line in part),
         fmean(accuracies) if accuracies else None,
-        expected_end(finished, wanted, now),
     )
-
-
-def expected_end(finished: Sequence[float], wanted: int, now: float) -> float | None:
-    """Estimate when ``wanted`` sessions will have finished, from the current rate.
-
-    The rate: of the last `RATE_SESSIONS` sessions. It includes the time since the last
-    one, so it decreases while nobody finishes. With n recent sessions, the first at time t, the
-    result is ``now + missing * (now - t) / (n - 1)``.
-
-    Parameters
-    ----------
-    finished
-        Times at which sessions finished (Unix time, seconds).
-    wanted
-        Number of sessions wanted.
-    now
-        Current time.
-
-    Returns
-    -------
-    float or None
-        The expected time; None if enough have finished, or too few recently.
-    """
-    missing = wanted - len(finished)
-    recent = sorted(t for t in finished if now - t <= RATE_WINDOW)[-RATE_SESSIONS:]
-    if missing <= 0 or len(recent) < MIN_RATE_SESSIONS or now <= recent[0]:
-        return None
-    return now + missing * (now - recent[0]) / (len(recent) - 1)
 
 
 def load_analysis() -> None:

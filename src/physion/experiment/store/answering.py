@@ -1,7 +1,7 @@
 """What a participant sends: answers, showings of trials, and the pages between the trials.
 
-An answer is stored only to the next trial and each once; in familiarization it gets feedback. What
-a request may change follows from the stage of the session, so every request may be sent again.
+Only the answer to the next trial is stored, and only once; in familiarization it gets feedback.
+What a request may change follows from the stage of the session, so every request may be sent again.
 `FetchedMedia` remembers which movies and maps the server has sent.
 """
 
@@ -11,18 +11,25 @@ import json
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
 
-from sqlalchemy import Connection, bindparam, func, insert, select, update
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    Field,
+    StringConstraints,
+    ValidationError,
+)
+from sqlalchemy import bindparam, func, select, update
 
+from physion.core.settings import STRICT
 from physion.experiment.protocol import (
     ENDED,
     PAGES,
     STAGES,
     Answer,
     AnswerStored,
-    Course,
     Feedback,
     PageDone,
     Refused,
@@ -30,12 +37,7 @@ from physion.experiment.protocol import (
     Showing,
     Shown,
 )
-from physion.experiment.store.database import (
-    ANSWERS,
-    EVENTS,
-    SESSIONS,
-    SHOWINGS,
-)
+from physion.experiment.store.database import ANSWERS, SESSIONS, SHOWINGS
 from physion.experiment.store.judging import (
     TOLERANCE_S,
     Presentation,
@@ -48,11 +50,9 @@ from physion.experiment.store.judging import (
 )
 from physion.experiment.store.sessions import (
     Session,
+    Step,
     answered,
-    change_session,
     insert_or_skip,
-    stage_of,
-    state_of,
     with_check,
 )
 from physion.experiment.study.identity import Secrets
@@ -100,34 +100,20 @@ def encode_details(answer: Answer) -> str:
 
 
 def store_answer(
-    connection: Connection,
-    study: Study,
-    secrets: Secrets,
-    course: Course,
-    session: Session,
-    answer: Answer,
-    details: str,
-    now: float,
-    fetched_at: float | None = None,
+    step: Step, secrets: Secrets, answer: Answer, details: str, fetched_at: float | None = None
 ) -> AnswerStored:
     """Store the answer to the next trial, unless the same answer is stored already.
 
     Parameters
     ----------
-    connection
-        Connection of the writer, in a transaction.
-    study, secrets
-        The study and its keys.
-    course
-        What the session consists of.
-    session
+    step
         The session; its count of answers is increased.
+    secrets
+        The keys of the study.
     answer
         The answer as sent by the client.
     details
         `encode_details` of the answer.
-    now
-        Time of the server in seconds since 1970.
     fetched_at
         `FetchedMedia.sent_at` of the trial.
 
@@ -137,82 +123,90 @@ def store_answer(
         Another trial is next, the trial or the key has another answer, or the trial was not shown
         or cannot have been shown until now.
     """
+    study, session = step.study, step.session
     known = answered(session, answer.phase)
     # Stimuli cannot change while there are sessions, so an answered trial has its stimulus still.
     order = trial_order(study, session.scenario, session.order_seed)[answer.phase]
-    repeated = repeated_response(connection, session, answer)
-    if repeated is not None:
-        response, duplicate = repeated, True
-    elif answer.trial < known:
-        response = _read_stored(connection, course, session, answer, order[answer.trial])
-        duplicate = True
-    else:
-        _check_next(course, session, answer, known)
+    response = repeated_response(step.connection, session, answer)
+    if response is None and answer.trial < known:
+        response = _read_stored(step, answer, order[answer.trial])
+    duplicate = response is not None
+    if response is None:
         response = answer.response
-        duplicate = False
-    stimulus = order[answer.trial]
-    if not duplicate:
-        if answer.phase == PHASES[0] and session.practice_repeats > 0:
-            fetched_at = None  # the browser may still have the media of the first practice
-        shown = read_presentation(connection, study, course, session, answer, fetched_at)
-        changes = _judge(study, session, answer, shown, now)
-        values = {
-            "phase": stimulus.phase,
-            "stimulus": stimulus.stimulus,
-            "frames_expected": stimulus.frames,
-            "showings": shown.showings or None,
-            "details": details,
-        }
-        _insert_answer(connection, course, session, answer, values, changes, now)
-        if answer.phase == PHASES[0]:
-            judge_practice(connection, study, course, session, now)
-        if stimulus.phase == ATTENTION:
-            _judge_attention(connection, study, session, answer, stimulus)
+        _store_new(step, answer, details, known, order, fetched_at)
     feedback = None
     if answer.phase == PHASES[0] and study.familiarization_feedback:
+        stimulus = order[answer.trial]
         feedback = _build_feedback(study, secrets, session, stimulus, answer.trial, response)
-    return AnswerStored(duplicate=duplicate, feedback=feedback, state=state_of(session, course))
+    return AnswerStored(duplicate=duplicate, feedback=feedback, state=step.state)
 
 
-def _judge_attention(
-    connection: Connection, study: Study, session: Session, answer: Answer, check: Stimulus
-) -> None:
-    """Count a failed attention check, unless its movie was interrupted."""
-    if (answer.response == "yes") == check.label or answer.void is not None:
-        return
-    failed = session.attention_failed + 1
-    flag = with_check(session, ATTENTION) if failed > study.attention.max_failed else {}
-    change_session(connection, session, attention_failed=failed, **flag)
-
-
-def _read_stored(
-    connection: Connection, course: Course, session: Session, answer: Answer, stimulus: Stimulus
-) -> str:
+def _read_stored(step: Step, answer: Answer, stimulus: Stimulus) -> str:
     """Return the stored response of a trial if it has the same key; else raise `Refused`."""
-    row = connection.execute(
-        _STORED,
-        {"of_session": session.session, "of_phase": stimulus.phase, "of_trial": answer.trial},
-    ).one()
+    of = {"of_session": step.session.session, "of_phase": stimulus.phase, "of_trial": answer.trial}
+    row = step.connection.execute(_STORED, of).one()
     if row.key != answer.key:
-        raise Refused(
-            "already_answered", "This trial is already answered.", state_of(session, course)
-        )
+        raise step.refused("already_answered", "This trial is already answered.")
     return str(row.response)
 
 
-def _check_next(course: Course, session: Session, answer: Answer, known: int) -> None:
-    """Raise `Refused` unless this trial is the next one of the session."""
-    stage = stage_of(session, course)
-    if stage not in PHASES:
-        raise Refused("wrong_stage", "No trial is next.", state_of(session, course))
-    if stage != answer.phase or answer.trial != known:
-        raise Refused("out_of_order", "Another trial is next.", state_of(session, course))
+def _store_new(
+    step: Step,
+    answer: Answer,
+    details: str,
+    known: int,
+    order: Sequence[Stimulus],
+    fetched_at: float | None,
+) -> None:
+    """Store an answer that is not stored yet, and judge it."""
+    session = step.session
+    if step.stage not in PHASES:
+        raise step.refused("wrong_stage", "No trial is next.")
+    if step.stage != answer.phase or answer.trial != known:
+        raise step.refused("out_of_order", "Another trial is next.")
+    stimulus = order[answer.trial]
+    if answer.phase == PHASES[0] and session.practice_repeats > 0:
+        fetched_at = None  # the browser may still have the media of the first practice
+    shown = _read_presentation(step, answer, fetched_at)
+    changes = _judge(step, answer, shown)
+    row = {
+        **answer.model_dump(exclude={"details"}),
+        "session": session.session,
+        "phase": stimulus.phase,
+        "stimulus": stimulus.stimulus,
+        "frames_expected": stimulus.frames,
+        "showings": shown.showings or None,
+        "details": details,
+        "resumed": (session.loaded_at_phase, session.loaded_at_trial)
+        == (answer.phase, answer.trial),
+        "answered_at": step.now,
+    }
+    # Only a key that another trial has can conflict; then nothing is written.
+    if step.connection.execute(insert_or_skip(ANSWERS), row).rowcount != 1:
+        raise step.refused("already_answered", "This key belongs to another trial.")
+    new = {f"new_{name}": value for name, value in changes.items()}
+    of = {"of_session": session.session, "count": answer.trial + 1, "now": step.now}
+    step.connection.execute(_COUNT[answer.phase], of | new)
+    setattr(session, f"answered_{answer.phase}", answer.trial + 1)
+    if answer.phase == PHASES[0]:
+        judge_practice(step)
+    if stimulus.phase == ATTENTION:
+        _judge_attention(step, answer, stimulus)
 
 
-def _judge(
-    study: Study, session: Session, answer: Answer, shown: Presentation, now: float
-) -> dict[str, Any]:
+def _judge_attention(step: Step, answer: Answer, check: Stimulus) -> None:
+    """Count a failed attention check, unless its movie was interrupted."""
+    if (answer.response == "yes") == check.label or answer.void is not None:
+        return
+    failed = step.session.attention_failed + 1
+    too_many = failed > step.study.attention.max_failed
+    flag = with_check(step.session, ATTENTION) if too_many else {}
+    step.change(attention_failed=failed, **flag)
+
+
+def _judge(step: Step, answer: Answer, shown: Presentation) -> dict[str, Any]:
     """Return the columns of `_JUDGED` after an answer; raise `Refused` if it comes too early."""
+    study, session, now = step.study, step.session, step.now
     earliest = earliest_answer(study, session, answer.phase, answer.trial, shown)
     if study.plausibility.server_checks and now < earliest:
         raise Refused(
@@ -225,37 +219,6 @@ def _judge(
         setattr(session, name, value)
     ended_at = earliest + (TOLERANCE_S + answer.rt_ms / 1000) / speed(study, session)
     return changes | {"implausible": reasons(study, session), "next_from": min(now, ended_at)}
-
-
-def _insert_answer(
-    connection: Connection,
-    course: Course,
-    session: Session,
-    answer: Answer,
-    values: Mapping[str, Any],
-    changes: Mapping[str, Any],
-    now: float,
-) -> None:
-    """Insert the answer with the further columns ``values``; count it and change the session."""
-    loaded = (session.loaded_at_phase, session.loaded_at_trial)
-    row: dict[str, Any] = {
-        **answer.model_dump(exclude={"details"}),
-        **values,
-        "session": session.session,
-        "resumed": loaded == (answer.phase, answer.trial),
-        "answered_at": now,
-    }
-    # Only a key that another trial has can conflict; then nothing is written.
-    if connection.execute(insert_or_skip(ANSWERS), row).rowcount != 1:
-        raise Refused(
-            "already_answered", "This key belongs to another trial.", state_of(session, course)
-        )
-    count = answer.trial + 1
-    new = {f"new_{name}": value for name, value in changes.items()}
-    connection.execute(
-        _COUNT[answer.phase], {"of_session": session.session, "count": count, "now": now, **new}
-    )
-    setattr(session, f"answered_{answer.phase}", count)
 
 
 def _build_feedback(
@@ -293,13 +256,7 @@ _OF_TRIAL = select(func.count(), func.max(SHOWINGS.c.began_at)).where(
 )
 
 
-def store_showing(
-    connection: Connection,
-    course: Course,
-    session: Session,
-    showing: Showing,
-    now: float,
-) -> Shown:
+def store_showing(step: Step, showing: Showing) -> Shown:
     """Store that the next trial begins; the same key is stored once.
 
     It cannot have begun before the previous trial had ended (``Session.next_from``). A showing of a
@@ -310,145 +267,95 @@ def store_showing(
     Refused
         Another trial or another page is next.
     """
-    phase, trial = showing.phase, showing.trial
+    session, phase, trial = step.session, showing.phase, showing.trial
+    count, _ = _read(step, phase, trial)
     if trial < answered(session, phase):
-        return Shown(showings=_read(connection, session, phase, trial)[0])
-    if stage_of(session, course) != phase:
-        raise Refused("wrong_stage", "No trial of this phase is next.", state_of(session, course))
+        return Shown(showings=count)
+    if step.stage != phase:
+        raise step.refused("wrong_stage", "No trial of this phase is next.")
     if trial != answered(session, phase):
-        raise Refused("out_of_order", "Another trial is next.", state_of(session, course))
-    count, _ = _read(connection, session, phase, trial)
+        raise step.refused("out_of_order", "Another trial is next.")
     if count < MAX_STORED:
         row = {
             "session": session.session,
             "key": showing.key,
             "phase": phase,
             "trial": trial,
-            "began_at": max(now - showing.ago_ms / 1000, session.next_from or 0.0),
-            "stored_at": now,
+            "began_at": max(step.now - showing.ago_ms / 1000, session.next_from or 0.0),
+            "stored_at": step.now,
         }
-        count += connection.execute(insert_or_skip(SHOWINGS), row).rowcount
+        count += step.connection.execute(insert_or_skip(SHOWINGS), row).rowcount
     return Shown(showings=count)
 
 
-def read_presentation(
-    connection: Connection,
-    study: Study,
-    course: Course,
-    session: Session,
-    answer: Answer,
-    fetched_at: float | None,
-) -> Presentation:
+def _read_presentation(step: Step, answer: Answer, fetched_at: float | None) -> Presentation:
     """Return what is known of the showings of the trial of an answer.
 
-    Parameters
-    ----------
-    connection
-        Connection of the writer.
-    study
-        The study; without its ``server_checks`` a trial need not have been announced.
-    course
-        What the session consists of.
-    session, answer
-        The session, and its answer to the next trial.
-    fetched_at
-        `FetchedMedia.sent_at` of the trial.
-
-    Raises
-    ------
-    Refused
-        The trial was never announced.
+    Without the server's checks a trial need not have been announced; else `Refused` is raised.
     """
-    count, began_at = _read(connection, session, answer.phase, answer.trial)
-    if not study.plausibility.server_checks:
+    count, began_at = _read(step, answer.phase, answer.trial)
+    if not step.study.plausibility.server_checks:
         return Presentation(count, began_at or 0.0, None)
     if began_at is None:
-        raise Refused("not_shown", "This trial was not shown yet.", state_of(session, course))
+        raise step.refused("not_shown", "This trial was not shown yet.")
     return Presentation(count, began_at, fetched_at)
 
 
-def _read(
-    connection: Connection, session: Session, phase: str, trial: int
-) -> tuple[int, float | None]:
+def _read(step: Step, phase: str, trial: int) -> tuple[int, float | None]:
     """Return the number of showings of a trial, and the start of the last one."""
-    values = {"of_session": session.session, "of_phase": phase, "of_trial": trial}
-    count, began_at = connection.execute(_OF_TRIAL, values).one()
+    values = {"of_session": step.session.session, "of_phase": phase, "of_trial": trial}
+    count, began_at = step.connection.execute(_OF_TRIAL, values).one()
     return count, began_at
 
 
 MIN_AGE, MAX_AGE = 18, 130
 MAX_LABEL = 200
 """Characters of a short text such as gender."""
+_Label = Annotated[
+    str,
+    StringConstraints(max_length=MAX_LABEL, strip_whitespace=True),
+    AfterValidator(lambda text: text or None),
+]
+_Block = Annotated[int, Field(ge=0, le=100_000)]
 
 
-def _check_bool(value: Any) -> bool:
-    """Validate a boolean."""
-    if not isinstance(value, bool):
-        raise ValueError("true or false")
-    return value
+class _Page(BaseModel):
+    """Data of a page without fields; None means "prefer not to say"."""
+
+    model_config = STRICT
 
 
-def _check_age(value: Any) -> int | None:
-    """Validate an age in years or null."""
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value):
-        raise ValueError(f"a whole number from {MIN_AGE} to {MAX_AGE}, or null")
-    if not MIN_AGE <= value <= MAX_AGE:
-        raise ValueError(f"a whole number from {MIN_AGE} to {MAX_AGE}, or null")
-    return int(value)
+class _Consent(_Page):
+    agreed: bool
+    language: _Label | None = None
 
 
-def _check_label(value: Any) -> str | None:
-    """Validate a short text or null."""
-    if value is None:
-        return None
-    if not isinstance(value, str) or len(value) > MAX_LABEL:
-        raise ValueError(f"text of at most {MAX_LABEL} characters, or null")
-    return value.strip() or None
+class _OfBlock(_Page):
+    block: _Block | None = None
 
 
-def _check_difficulty(value: Any) -> int:
-    """Validate a rating from 1 to 5."""
-    if isinstance(value, bool) or value not in (1, 2, 3, 4, 5):
-        raise ValueError("a whole number from 1 (very easy) to 5 (very hard)")
-    return int(value)
+class _Demographics(_Page):
+    age: Annotated[int, Field(ge=MIN_AGE, le=MAX_AGE)] | None
+    gender: _Label | None
+    education: _Label | None
 
 
-def _check_text(value: Any) -> str:
-    """Validate a text, which may be empty."""
-    if not isinstance(value, str):
-        raise ValueError("text, which may be empty")
-    return value.strip()
+class _Feedback(_Page):
+    difficulty: Annotated[int, Field(ge=1, le=5)]
+    technical_problems: bool
+    text: Annotated[str, StringConstraints(strip_whitespace=True)]
 
 
-def _check_index(value: Any) -> int:
-    """Validate an index from 0."""
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 100_000:
-        raise ValueError("a whole number of at least 0")
-    return value
-
-
-FIELDS: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
-    "consent": {"agreed": _check_bool},
-    "instructions": {},
-    "ready": {},
-    "block": {},
-    "demographics": {"age": _check_age, "gender": _check_label, "education": _check_label},
-    "feedback": {
-        "difficulty": _check_difficulty,
-        "technical_problems": _check_bool,
-        "text": _check_text,
-    },
-    "withdraw": {},
+FIELDS: Mapping[str, type[_Page]] = {
+    "consent": _Consent,
+    "instructions": _Page,
+    "ready": _OfBlock,
+    "block": _OfBlock,
+    "demographics": _Demographics,
+    "feedback": _Feedback,
+    "withdraw": _Page,
 }
-"""Required fields of each page with their validators; null means "prefer not to say"."""
-OPTIONAL: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
-    "consent": {"language": _check_label},
-    "ready": {"block": _check_index},
-    "block": {"block": _check_index},
-}
-"""Optional fields of each page."""
+"""What the pages send; the questions of the study are checked by `study.settings`."""
 
 
 def check_page(study: Study, done: PageDone) -> dict[str, Any]:
@@ -459,106 +366,65 @@ def check_page(study: Study, done: PageDone) -> dict[str, Any]:
     Refused
         A field is missing, invalid or unknown; the message names the first one.
     """
-    if done.page == "questions":
-        return _check_own_questions(study, done.data)
-    if done.page == "comprehension":
-        try:
-            return dict(check_attempt(study.comprehension_questions, done.data))
-        except ValueError as error:
-            raise Refused("bad_request", f"data.{error}") from None
-    if done.page not in FIELDS:
-        raise Refused("bad_request", f"page: {done.page} is no page that is submitted")
-    optional = OPTIONAL.get(done.page, {})
-    expected = {**FIELDS[done.page], **{k: v for k, v in optional.items() if k in done.data}}
-    unknown = sorted(set(done.data) - set(expected))
-    if unknown:
-        name = ascii(unknown[0][:40])
-        raise Refused("bad_request", f"data: the page {done.page} has no field {name}")
-    values = {}
-    for name, check in expected.items():
-        if name not in done.data:
-            raise Refused("bad_request", f"data.{name} is missing")
-        try:
-            values[name] = check(done.data[name])
-        except (ValueError, OverflowError) as error:
-            raise Refused("bad_request", f"data.{name}: {error}") from None
-    return values
-
-
-def _check_own_questions(study: Study, data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the validated answers to the lab's own questions."""
     try:
-        return {"own_answers": check_answers(study.questions, data)}
+        if done.page == "questions":
+            return {"own_answers": check_answers(study.questions, done.data)}
+        if done.page == "comprehension":
+            return dict(check_attempt(study.comprehension_questions, done.data))
     except ValueError as error:
         raise Refused("bad_request", f"data.{error}") from None
+    if done.page not in FIELDS:
+        raise Refused("bad_request", f"page: {done.page} is no page that is submitted")
+    try:
+        values = FIELDS[done.page].model_validate(done.data)
+    except ValidationError as error:
+        fault = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        name = ascii(str(fault["loc"][0])[:40])[1:-1]
+        raise Refused("bad_request", f"data.{name}: {fault['msg']}") from None
+    return values.model_dump(exclude_none=done.page != "demographics")
 
 
-def submit_page(
-    connection: Connection,
-    study: Study,
-    course: Course,
-    session: Session,
-    page: str,
-    values: Mapping[str, Any],
-    now: float,
-) -> SessionState:
+def submit_page(step: Step, page: str, values: Mapping[str, Any]) -> SessionState:
     """Apply a submitted page to the session; a page that was submitted before changes nothing.
-
-    Parameters
-    ----------
-    connection
-        Connection of the writer, in a transaction.
-    study
-        The study.
-    course
-        What the session consists of.
-    session
-        The session; it is updated.
-    page, values
-        Name of the page and its values from `check_page`.
-    now
-        Time of the server in seconds since 1970.
 
     Raises
     ------
     Refused
         The page is not the next one.
     """
-    stage = stage_of(session, course)
+    stage = step.stage
     if page == "withdraw" or values.get("agreed") is False:
         if stage == "done":
-            raise Refused("wrong_stage", "This session is finished.", state_of(session, course))
+            raise step.refused("wrong_stage", "This session is finished.")
         if stage not in ENDED:
-            change_session(connection, session, withdrawn_at=now, last_seen=now)
-        return state_of(session, course)
-    if "block" in values and values["block"] < session.block and stage not in ENDED:
-        return state_of(session, course)  # a page of an earlier block, sent again
+            step.change(withdrawn_at=step.now, last_seen=step.now)
+        return step.state
+    if "block" in values and values["block"] < step.session.block and stage not in ENDED:
+        return step.state  # a page of an earlier block, sent again
     if stage in ENDED or STAGES.index(stage) < STAGES.index(page):  # type: ignore[arg-type]
-        raise Refused("wrong_stage", "This page is not next.", state_of(session, course))
+        raise step.refused("wrong_stage", "This page is not next.")
     if stage == page:
         if stage == "comprehension":
-            columns = judge_attempt(connection, study, session, values, now)
+            columns = _judge_attempt(step, values)
         else:
-            columns = {PAGES[stage].column: now, **_columns(study, session, page, values, now)}
-        times = dict.fromkeys(("last_seen", "progressed_at", "next_from"), now)
-        change_session(connection, session, **times, **columns)
-    return state_of(session, course)
+            columns = {PAGES[stage].column: step.now, **_columns(step, page, values)}
+        times = dict.fromkeys(("last_seen", "progressed_at", "next_from"), step.now)
+        step.change(**times, **columns)
+    return step.state
 
 
-def _columns(
-    study: Study, session: Session, page: str, values: Mapping[str, Any], now: float
-) -> dict[str, Any]:
+def _columns(step: Step, page: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the columns of SESSIONS that a page sets, besides the time at which it was sent."""
     match page:
         case "block":
-            return {"block": session.block + 1, "ready_at": None, "practice_repeats": 0}
+            return {"block": step.session.block + 1, "ready_at": None, "practice_repeats": 0}
         case "demographics":
             return dict(values)
         case "questions":
-            return {**values, "questions_study": study.digest}
+            return {**values, "questions_study": step.study.digest}
         case "feedback":
             return {
-                "implausible": reasons(study, session, now),
+                "implausible": reasons(step.study, step.session, step.now),
                 "difficulty": values["difficulty"],
                 "technical_problems": values["technical_problems"],
                 "feedback": values["text"],
@@ -571,43 +437,20 @@ ATTEMPT = "comprehension_attempt"
 """Kind of the event of an attempt; its data are its number, whether all was right, the answers."""
 
 
-def judge_attempt(
-    connection: Connection,
-    study: Study,
-    session: Session,
-    answers: Mapping[str, str],
-    now: float,
-) -> dict[str, Any]:
+def _judge_attempt(step: Step, answers: Mapping[str, str]) -> dict[str, Any]:
     """Store an attempt as an event and return the columns of SESSIONS that it changes.
 
     After a wrong answer the instructions are next; after the last attempt the session has ended.
-
-    Parameters
-    ----------
-    connection
-        Connection of the writer, in a transaction.
-    study, session
-        The study, and the session whose comprehension check is next.
-    answers
-        Answers from `study.comprehension.check_attempt`.
-    now
-        Time of the server in seconds since 1970.
+    ``answers`` come from `study.settings.check_attempt`.
     """
-    attempts = session.comprehension_attempts + 1
+    attempts, study = step.session.comprehension_attempts + 1, step.study
     right = all(answers[each.name] == each.right for each in study.comprehension_questions)
-    event = {
-        "session": session.session,
-        "kind": ATTEMPT,
-        "at_ms": 0.0,
-        "stored_at": now,
-        "data": {"attempt": attempts, "right": right, **answers},
-    }
-    connection.execute(insert(EVENTS), event)
+    step.add_event(ATTEMPT, {"attempt": attempts, "right": right, **answers})
     columns: dict[str, Any] = {"comprehension_attempts": attempts}
     if right:
-        return columns | {"comprehended_at": now}
+        return columns | {"comprehended_at": step.now}
     if attempts >= study.comprehension.attempts:
-        return columns | {"screened_out_at": now, "screened_out_by": "comprehension"}
+        return columns | {"screened_out_at": step.now, "screened_out_by": "comprehension"}
     return columns | {"instructed_at": None}
 
 

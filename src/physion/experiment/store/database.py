@@ -80,59 +80,33 @@ RAW_IDS = Table(
 )
 """Recruiters' ids, for payment only; no table refers to it, so it can be emptied at any time."""
 
+
+def _columns(kind: Any, *names: str, **settings: Any) -> list[Column[Any]]:
+    """Return new columns of one type."""
+    return [Column(name, kind, **settings) for name in names]
+
+
 SESSIONS = Table(
     "sessions",
     METADATA,
     Column("session", String(32), primary_key=True),
     Column("participant", ForeignKey("participants.participant"), nullable=False),
-    Column("scenario", String(200), nullable=False),
-    Column("kind", String(10), nullable=False),
-    Column("source", String(20), nullable=False),
     Column("study", ForeignKey("studies.digest"), nullable=False),
-    Column("reference", String(20), nullable=False),
+    *_columns(String(200), "scenario", nullable=False),
+    *_columns(String(20), "kind", "source", "reference", "buttons", "language", nullable=False),
     Column("order_seed", BigInteger, nullable=False),
     Column("order_number", Integer, nullable=False),
-    Column("buttons", String(6), nullable=False),
-    Column("language", String(20), nullable=False),
-    Column("started_at", Float, nullable=False),
-    Column("consent_version", String(200)),
-    Column("consented_at", Float),
-    Column("instructed_at", Float),
-    Column("comprehended_at", Float),
-    Column("comprehension_attempts", Integer, nullable=False, default=0),
-    Column("ready_at", Float),
-    Column("demographics_at", Float),
-    Column("questions_at", Float),
-    Column("questions_study", String(64)),
-    Column("finished_at", Float),
-    Column("withdrawn_at", Float),
-    Column("closed_at", Float),
-    Column("voided_at", Float),
-    Column("screened_out_at", Float),
-    Column("screened_out_by", String(20)),
-    Column("browser", String(32)),
-    Column("progressed_at", Float),
-    Column("next_from", Float),
-    Column("practice_repeats", Integer, nullable=False, default=0),
-    Column("failed_checks", String(100)),
-    Column("attention_failed", Integer, nullable=False, default=0),
-    Column("answered_familiarization", Integer, nullable=False, default=0),
-    Column("answered_test", Integer, nullable=False, default=0),
-    Column("block", Integer, nullable=False, default=0),
-    Column("block_at", Float),
-    Column("condition", String(40)),
-    Column("fast_answers", Integer, nullable=False, default=0),
-    Column("unfetched", Integer, nullable=False, default=0),
-    Column("replayed", Integer, nullable=False, default=0),
-    Column("implausible", String(100)),
-    Column("loads", Integer, nullable=False, default=0),
-    Column("loaded_at_phase", String(15)),
-    Column("loaded_at_trial", Integer),
-    Column("last_seen", Float, nullable=False),
-    Column("age", Integer),
-    Column("gender", String(200)),
-    Column("education", String(200)),
-    Column("difficulty", Integer),
+    *_columns(Float, "started_at", "last_seen", nullable=False),
+    *_columns(Float, "consented_at", "instructed_at", "comprehended_at", "ready_at", "block_at",
+              "demographics_at", "questions_at", "finished_at", "withdrawn_at", "closed_at",
+              "voided_at", "screened_out_at", "progressed_at", "next_from"),
+    *_columns(Integer, "comprehension_attempts", "practice_repeats", "attention_failed",
+              "answered_familiarization", "answered_test", "block", "fast_answers", "unfetched",
+              "replayed", "loads", nullable=False, default=0),
+    *_columns(String(200), "consent_version", "questions_study", "screened_out_by", "browser",
+              "failed_checks", "condition", "implausible", "loaded_at_phase", "gender",
+              "education"),
+    *_columns(Integer, "loaded_at_trial", "age", "difficulty"),
     Column("technical_problems", Boolean),
     Column("feedback", Text),
     Column("own_answers", JSON(none_as_null=True)),
@@ -141,7 +115,7 @@ SESSIONS = Table(
     CheckConstraint("kind IN ('person', 'simulated', 'preview')", name="kind"),
     CheckConstraint("buttons IN ('yes-no', 'no-yes')", name="buttons"),
     Index("ix_sessions_scenario_kind", "scenario", "kind"),
-)
+)  # fmt: skip
 """Sessions. ``kind`` is written when the session begins and never changed. ``order_number`` is the
 number of the prepared order, 0 if the study has none; ``order_seed`` and the stimuli determine the
 order of the trials. ``scenario`` is `study.ALL_SCENARIOS` in sessions of several scenarios, and
@@ -153,7 +127,7 @@ version of the study that asked them.
 ``closed_at``: when the lab ended the session for good, so that the participant cannot take it up
 again: its data were deleted, or it was a preview of other stimuli. ``voided_at``: when the lab
 decided that the session does not count.
-``screened_out_at``: when the session ended since the participant failed the check
+``screened_out_at``: when the session ended because the participant failed the check
 ``screened_out_by``; ``comprehension_attempts``: how often the comprehension check was answered.
 ``attention_failed``: number of failed attention checks. ``practice_repeats``: how often the
 practice of the current block was repeated; ``failed_checks``: names of the lab's checks that flag
@@ -186,27 +160,16 @@ TOKENS = Table(
 def _answer_columns() -> list[Column[Any]]:
     """Return new columns of what is stored of an answer, besides session, phase and trial."""
     return [
-        Column("key", String(64), nullable=False),
-        Column("stimulus", String(200), nullable=False),
-        Column("response", String(3), nullable=False),
-        Column("rt_ms", Float, nullable=False),
-        Column("input", String(8), nullable=False),
-        Column("fixation_ms", Float),
-        Column("cue_ms", Float),
+        *_columns(String(200), "key", "stimulus", "response", "input", nullable=False),
+        *_columns(Float, "rt_ms", "answered_at", nullable=False),
+        *_columns(Float, "fixation_ms", "cue_ms", "movie_ms", "break_ms"),
         Column("frames_expected", Integer, nullable=False),
-        Column("frames_shown", Integer),
-        Column("frames_dropped", Integer),
-        Column("movie_ms", Float),
-        Column("visibility_changes", Integer),
-        Column("window_width", Integer),
-        Column("window_height", Integer),
-        Column("break_ms", Float),
+        *_columns(Integer, "frames_shown", "frames_dropped", "visibility_changes", "window_width",
+                  "window_height", "showings"),
         Column("resumed", Boolean, nullable=False),
-        Column("showings", Integer),
         Column("void", String(10)),
-        Column("answered_at", Float, nullable=False),
         Column("details", Text, nullable=False),
-    ]
+    ]  # fmt: skip
 
 
 ANSWERS = Table(

@@ -7,7 +7,7 @@ is forgotten, and may open the link again.
 
 Condition, scenario and order are those that the fewest sessions have, visitors who still read the
 consent included. A place of the study is taken by a finished session, and held by one that has come
-through the practice and still runs.
+through the practice and continues.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from sqlalchemy import ColumnElement, Connection, and_, case, func, insert, or_,
 from physion.core.seeds import stable_hash
 from physion.experiment.protocol import Enter, Kind, Refused
 from physion.experiment.store.database import (
-    EVENTS,
     PARTICIPANTS,
     PAUSES,
     RAW_IDS,
@@ -37,9 +36,8 @@ from physion.experiment.store.sessions import (
     SESSION_COLUMNS,
     Courses,
     Session,
-    change_session,
+    Step,
     insert_or_skip,
-    mark_loaded,
     new_session_of,
     session_from_row,
 )
@@ -285,7 +283,9 @@ def _known_session(
     session = _find_unfinished(sessions, wanted)
     if session is not None:
         _check_browser(connection, session, visitor)
-        _continue(connection, courses, session, visitor)
+        step = Step(connection, study, courses.of(session), session, visitor.now)
+        step.change(last_seen=visitor.now, **step.loaded())
+        step.add_event(ENTERED_AGAIN, visitor.enter.device.model_dump())
     else:
         own = next((each.condition for each in sessions if each.condition), None)
         session = _find_ended(under(study, own), sessions, wanted)
@@ -299,7 +299,7 @@ def _known_session(
 def _keep(connection: Connection, visitor: Visitor, session: str) -> None:
     """Store the visitor's token of a session, and the raw id for payment.
 
-    The recruiter's parameters come from the latest visit.
+    The recruiter's parameters of the latest visit are kept.
     """
     token = {"token_hash": hash_token(visitor.token), "session": session, "made": visitor.now}
     connection.execute(insert_or_skip(TOKENS), token)
@@ -371,20 +371,6 @@ def _match_language(study: Study, wanted: str) -> str:
     known = {language.lower(): language for language in study.languages}
     wanted = wanted.lower()
     return known.get(wanted) or known.get(wanted.partition("-")[0]) or study.languages[0]
-
-
-def _continue(connection: Connection, courses: Courses, session: Session, visitor: Visitor) -> None:
-    """Record that the visitor entered an unfinished session again."""
-    marks = mark_loaded(session, courses.of(session))
-    change_session(connection, session, last_seen=visitor.now, **marks)
-    event = {
-        "session": session.session,
-        "kind": ENTERED_AGAIN,
-        "at_ms": 0.0,
-        "stored_at": visitor.now,
-        "data": visitor.enter.device.model_dump(),
-    }
-    connection.execute(insert(EVENTS), event)
 
 
 @dataclass
@@ -540,9 +526,9 @@ def _choose_course(
 ) -> tuple[Study, str]:
     """Return the study under the condition of a new session, and its scenario.
 
-    The condition is taken from the person's earlier sessions, else the one that the link fixes,
-    else the one with the fewest sessions among those that have a place left in a wanted scenario.
-    If the link names a scenario, only sessions of this scenario count.
+    A person keeps the condition of earlier sessions; else the link fixes it, or it is the one with
+    the fewest sessions that has a place left in a wanted scenario. If the link names a scenario,
+    only sessions of this scenario count.
 
     Parameters
     ----------

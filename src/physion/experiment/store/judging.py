@@ -21,9 +21,9 @@ from typing import Any
 
 from sqlalchemy import Connection, bindparam, delete, func, insert, literal, or_, select
 
-from physion.experiment.protocol import Answer, Course
+from physion.experiment.protocol import Answer
 from physion.experiment.store.database import ANSWERS, PRACTICE_REPEATS, SESSIONS, SHOWINGS, STUDIES
-from physion.experiment.store.sessions import Session, block_of, change_session, with_check
+from physion.experiment.store.sessions import Session, Step, block_of, with_check
 from physion.experiment.study.orders import fixation, stimuli_by_session, trial_order
 from physion.experiment.study.stimuli import PHASES, Stimulus
 from physion.experiment.study.study import Study
@@ -112,7 +112,7 @@ def judged(study: Study, session: Session, answer: Answer, shown: Presentation) 
 def reasons(study: Study, session: Session, finished_at: float | None = None) -> str | None:
     """Return why a session is no person's, as stored in ``implausible``; None for a preview.
 
-    ``finished_at``: when it ended, to judge its duration; None while it runs.
+    ``finished_at``: when it ended, to judge its duration; None while it continues.
     """
     if session.kind == "preview":
         return None
@@ -142,43 +142,31 @@ def repeated_response(connection: Connection, session: Session, answer: Answer) 
     return connection.execute(same).scalar()
 
 
-def judge_practice(
-    connection: Connection, study: Study, course: Course, session: Session, now: float
-) -> None:
+def judge_practice(step: Step) -> None:
     """Judge the practice of the current block when its last trial has been answered.
 
     With fewer right answers than ``practice.min_correct`` it is repeated ``practice.repeats``
     times; afterwards the session ends or is flagged.
-
-    Parameters
-    ----------
-    connection
-        Connection of the writer, in a transaction.
-    study, course
-        The study, and what the session consists of.
-    session
-        The session, to whose last practice trial an answer was stored; it is updated.
-    now
-        Time of the server in seconds since 1970.
     """
-    rules, trials = study.practice, block_of(session, course).familiarization
+    session, rules = step.session, step.study.practice
+    trials = block_of(session, step.course).familiarization
     if session.answered_familiarization < trials.stop or not trials:
         return
-    if _count_right(connection, study, session, trials) >= min(rules.min_correct, len(trials)):
+    if _count_right(step, trials) >= min(rules.min_correct, len(trials)):
         return
     if session.practice_repeats < rules.repeats:
-        changes = _repeat(connection, session, trials)
+        step.change(**_repeat(step.connection, session, trials))
     elif rules.failed == "end":
-        changes = {"screened_out_at": now, "screened_out_by": PRACTICE}
+        step.change(screened_out_at=step.now, screened_out_by=PRACTICE)
     else:
-        changes = with_check(session, PRACTICE)
-    change_session(connection, session, **changes)
+        step.change(**with_check(session, PRACTICE))
 
 
-def _count_right(connection: Connection, study: Study, session: Session, trials: range) -> int:
+def _count_right(step: Step, trials: range) -> int:
     """Count the right answers to these practice trials."""
-    order = trial_order(study, session.scenario, session.order_seed)[PHASES[0]]
-    rows = connection.execute(
+    session = step.session
+    order = trial_order(step.study, session.scenario, session.order_seed)[PHASES[0]]
+    rows = step.connection.execute(
         select(ANSWERS.c.trial, ANSWERS.c.response).where(*_of(ANSWERS, session, trials))
     )
     return sum((response == "yes") == order[trial].label for trial, response in rows)
@@ -245,8 +233,8 @@ class Scores:
     def of(self, connection: Connection, session: Session) -> dict[str, int]:
         """Return the number of correct answers of each finished session like ``session``.
 
-        Sessions of its scenario, condition and kind. Sessions with other than the current stimuli
-        are left out, and implausible ones except ``session`` itself.
+        Alike are sessions of the same scenario, condition and kind. Sessions with other than the
+        current stimuli are left out, and implausible ones except ``session`` itself.
         """
         values = {"of_scenario": session.scenario, "of_kind": session.kind,
                   "of_condition": session.condition or "", "of_stimuli": self._stimuli,

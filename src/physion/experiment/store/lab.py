@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import Connection, Engine, delete, insert, select, update
+from sqlalchemy import Connection, Engine, delete, func, insert, select, update
 
 from physion.core.errors import BadInputError, PhysionError
 from physion.core.files import sync_folder
@@ -48,28 +48,22 @@ if TYPE_CHECKING:
 
 _OF_SESSION = (ANSWERS, PRACTICE_REPEATS, SHOWINGS, EVENTS, TOKENS)
 """Tables whose rows of a forgotten session are deleted."""
-_EMPTIED = dict.fromkeys((
-    "instructed_at", "comprehended_at", "screened_out_at", "screened_out_by", "failed_checks",
-    "ready_at", "demographics_at", "questions_at", "questions_study", "own_answers", "finished_at",
-    "loaded_at_phase", "loaded_at_trial", "block_at", "browser", "progressed_at", "next_from",
-    "implausible", "age", "gender", "education", "difficulty", "technical_problems", "feedback",
-)) | {"answered_familiarization": 0, "answered_test": 0, "block": 0, "comprehension_attempts": 0,
-      "practice_repeats": 0, "attention_failed": 0, "fast_answers": 0, "unfetched": 0,
-      "replayed": 0, "loads": 0, "device": {}}  # fmt: skip
+_KEPT = (
+    "session", "participant", "scenario", "kind", "source", "study", "reference", "order_seed",
+    "order_number", "buttons", "language", "condition", "started_at", "last_seen",
+    "consent_version", "consented_at", "voided_at",
+)  # fmt: skip
+"""Columns of a forgotten session that stay, so that the same person cannot take part again."""
+_EMPTIED: dict[str, Any] = {
+    column.name: 0 if column.default else None for column in SESSIONS.c if column.name not in _KEPT
+} | {"device": {}}
 """Column values that replace the data of a forgotten session."""
 
 
 def set_paused(connection: Connection, paused: bool, now: float) -> bool:
     """Pause or resume recruitment; return whether anything changed.
 
-    Parameters
-    ----------
-    connection
-        Connection of the writer, in a transaction.
-    paused
-        Whether new people are refused from now on. Those who have entered can go on.
-    now
-        Time of the server in seconds since 1970.
+    While it is paused, new people are refused. Those who have entered can continue.
     """
     if is_paused(connection) == paused:
         return False
@@ -81,28 +75,16 @@ def set_paused(connection: Connection, paused: bool, now: float) -> bool:
     return True
 
 
-def set_voided(connection: Connection, session: str, voided: bool, now: float) -> bool:
-    """Void a session, or count it again; return whether anything changed.
+def set_voided(connection: Connection, session: str, voided: bool, now: float) -> str | None:
+    """Void a session, or count it again; return its reference, None if there is no such session.
 
     A void session is not exported, gives no completion code if it is not finished, and its place is
     given to another participant. Its answers are kept.
-
-    Parameters
-    ----------
-    connection
-        Connection of the writer, in a transaction.
-    session
-        Identifier of the session.
-    voided
-        Whether it is void from now on.
-    now
-        Time of the server in seconds since 1970.
     """
-    columns = SESSIONS.c
-    change = columns.voided_at.is_(None) if voided else columns.voided_at.is_not(None)
-    values = {"voided_at": now if voided else None}
-    changed = update(SESSIONS).where(columns.session == session, change).values(**values)
-    return connection.execute(changed).rowcount > 0
+    columns, own = SESSIONS.c, SESSIONS.c.session == session
+    at = func.coalesce(columns.voided_at, now) if voided else None
+    connection.execute(update(SESSIONS).where(own).values(voided_at=at))
+    return connection.scalar(select(columns.reference).where(own))
 
 
 def back_up(study: Path, out: Path, *, media: bool = False, secret: bool = False) -> Path:
@@ -262,11 +244,20 @@ async def forget_raw_ids(store: Store, participants: Sequence[str] | None = None
     return count
 
 
-async def forget_session(store: Store, reference: str) -> None:
-    """Delete all data of one session as `forget_sessions` does, while the study is served."""
+async def forget_session(store: Store, session: str) -> str:
+    """Delete all data of one session as `forget_sessions` does, while the study is served.
+
+    Returns the reference of the session.
+    """
     now = time.time()
-    await store.write(lambda connection: _forget_session(connection, reference, now))
+
+    def work(connection: Connection) -> str:
+        reference = select(SESSIONS.c.reference).where(SESSIONS.c.session == session)
+        return _forget_session(connection, connection.scalar(reference) or session, now)
+
+    reference = await store.write(work)
     await asyncio.to_thread(_erase_deleted_bytes, store.engine, compact=False)
+    return reference
 
 
 def _check_participants(participants: Sequence[str] | None) -> None:
@@ -292,8 +283,8 @@ def _delete_raw_ids(connection: Connection, participants: Sequence[str] | None) 
     return len(names)
 
 
-def _forget_session(connection: Connection, reference: str, now: float) -> None:
-    """Delete the data of the session with this reference."""
+def _forget_session(connection: Connection, reference: str, now: float) -> str:
+    """Delete the data of the session with this reference, and return the reference."""
     columns = SESSIONS.c
     query = select(columns.session, columns.participant, columns.withdrawn_at)
     rows = connection.execute(query.where(columns.reference == reference)).all()
@@ -311,6 +302,7 @@ def _forget_session(connection: Connection, reference: str, now: float) -> None:
     devices = select(columns.device).where(columns.participant == participant)
     if not any(connection.execute(devices).scalars()):
         connection.execute(delete(RAW_IDS).where(RAW_IDS.c.participant == participant))
+    return reference
 
 
 def _erase_deleted_bytes(engine: Engine, *, compact: bool) -> None:

@@ -21,7 +21,7 @@ from physion.experiment.protocol import (
     SessionState,
     Stage,
 )
-from physion.experiment.store.database import SESSIONS, TOKENS
+from physion.experiment.store.database import EVENTS, SESSIONS, TOKENS
 from physion.experiment.study.orders import session_trials
 from physion.experiment.study.stimuli import PHASES
 from physion.experiment.study.study import Study, under
@@ -228,31 +228,73 @@ def _ends(indices: range) -> tuple[int, int]:
     return indices.start, indices.stop
 
 
+@dataclass
+class Step:
+    """What one request of a participant works on.
+
+    Attributes
+    ----------
+    connection
+        Connection to the database; the writer's connection, in a transaction, if anything changes.
+    study
+        The study under the condition of the session.
+    course
+        What the session consists of.
+    session
+        The session; changes are made here too.
+    now
+        Time of the server in seconds since 1970.
+    """
+
+    connection: Connection
+    study: Study
+    course: Course
+    session: Session
+    now: float
+
+    @property
+    def stage(self) -> Stage:
+        """The current stage."""
+        return stage_of(self.session, self.course)
+
+    @property
+    def state(self) -> SessionState:
+        """The state as sent to the client."""
+        return state_of(self.session, self.course)
+
+    def refused(self, code: str, message: str) -> Refused:
+        """Return a refusal with the state from which the client can continue."""
+        return Refused(code, message, self.state)
+
+    def change(self, **values: Any) -> None:
+        """Write columns of the session to the database and to ``session``."""
+        assert "kind" not in values, "the kind of a session never changes"
+        own = SESSIONS.c.session == self.session.session
+        self.connection.execute(update(SESSIONS).where(own).values(**values))
+        for name, value in values.items():
+            if hasattr(self.session, name):
+                setattr(self.session, name, value)
+
+    def add_event(self, kind: str, data: Mapping[str, Any]) -> None:
+        """Store an event of the session itself."""
+        values = {"session": self.session.session, "kind": kind, "at_ms": 0.0}
+        self.connection.execute(insert(EVENTS), values | {"stored_at": self.now, "data": data})
+
+    def loaded(self) -> dict[str, Any]:
+        """Return the columns that record a reload of the page at the next trial, if one is next.
+
+        The page was loaded before for the consent, so a load at a trial is always a reload.
+        """
+        if self.stage not in PHASES:
+            return {}
+        trial = answered(self.session, self.stage)
+        return {"loaded_at_phase": self.stage, "loaded_at_trial": trial}
+
+
 def with_check(session: Session, check: str) -> dict[str, str]:
     """Return the column of the failed checks of a session, with one more."""
     known = session.failed_checks.split(", ") if session.failed_checks else []
     return {"failed_checks": ", ".join(known if check in known else [*known, check])}
-
-
-def change_session(connection: Connection, session: Session, **values: Any) -> None:
-    """Write columns of a session to the database and to ``session``."""
-    assert "kind" not in values, "the kind of a session never changes"
-    statement = update(SESSIONS).where(SESSIONS.c.session == session.session).values(**values)
-    connection.execute(statement)
-    for name, value in values.items():
-        if hasattr(session, name):
-            setattr(session, name, value)
-
-
-def mark_loaded(session: Session, course: Course) -> dict[str, Any]:
-    """Return the columns that record a reload of the page at the next trial, if a trial is next.
-
-    The page was loaded before for the consent, so a load at a trial is always a reload.
-    """
-    stage = stage_of(session, course)
-    if stage not in PHASES:
-        return {}
-    return {"loaded_at_phase": stage, "loaded_at_trial": answered(session, stage)}
 
 
 def insert_or_skip(table: Table) -> Any:

@@ -56,12 +56,9 @@ from physion.experiment.store.entry import Visit, begin_session, enter_session, 
 from physion.experiment.store.judging import Scores, percentile
 from physion.experiment.store.sessions import (
     Courses,
-    Session,
-    change_session,
+    Step,
     insert_or_skip,
-    mark_loaded,
     read_session,
-    stage_of,
     state_of,
 )
 from physion.experiment.study.identity import Secrets, hash_token
@@ -165,18 +162,14 @@ class Store:
     async def state(self, token: str, load: bool = False) -> SessionState:
         """Return the state of a session; with ``load``, also count a load of the page."""
         if not load or hash_token(token) in self._visits:
-            return await asyncio.to_thread(self._read, lambda c: self._read_state(c, token))
-        now = time.time()
+            return await asyncio.to_thread(self._read, token, lambda step: step.state)
 
-        def count(connection: Connection) -> SessionState:
-            session, course = self._read_session(connection, token)
-            if stage_of(session, course) not in ENDED:
-                marks = mark_loaded(session, course)
-                loads = session.loads + 1
-                change_session(connection, session, loads=loads, last_seen=now, **marks)
-            return state_of(session, course)
+        def count(step: Step) -> SessionState:
+            if step.stage not in ENDED:
+                step.change(loads=step.session.loads + 1, last_seen=step.now, **step.loaded())
+            return step.state
 
-        return await self._writer.run(count)
+        return await self._write(token, count)
 
     def trials(self, token: str, phase: Phase) -> TrialList:
         """Return the media of the trials of a phase, in the session's order.
@@ -184,27 +177,23 @@ class Store:
         The lists of both phases are available once consent is given, so that media can be loaded
         ahead.
         """
-        session, course = self._read(lambda c: self._read_session(c, token))
-        stage = stage_of(session, course)
-        if stage in ENDED:
-            raise Refused("wrong_stage", "This session has ended.", state_of(session, course))
-        if stage == "consent":
-            raise Refused("not_yet", "Trials come after the consent.", state_of(session, course))
-        return TrialList(phase=phase, trials=self._list_media(session, phase))
+
+        def read(step: Step) -> TrialList:
+            if step.stage in ENDED:
+                raise step.refused("wrong_stage", "This session has ended.")
+            if step.stage == "consent":
+                raise step.refused("not_yet", "Trials come after the consent.")
+            return TrialList(phase=phase, trials=self._list_media(step, phase))
+
+        return self._read(token, read)
 
     async def page(self, token: str, done: PageDone) -> SessionState:
         """Store a submitted page and return the new state."""
-        values, now = check_page(self.study, done), time.time()
+        values = check_page(self.study, done)
         visit = self._visits.get(hash_token(token))
         if visit is not None:
-            return await self._decide(token, visit, done.page, values, now)
-
-        def submit(connection: Connection) -> SessionState:
-            session, course = self._read_session(connection, token)
-            study = under(self.study, session.condition)
-            return submit_page(connection, study, course, session, done.page, values, now)
-
-        return await self._writer.run(submit)
+            return await self._decide(token, visit, done.page, values, time.time())
+        return await self._write(token, lambda step: submit_page(step, done.page, values))
 
     async def _decide(
         self, token: str, visit: Visit, page: str, values: Mapping[str, Any], now: float
@@ -237,90 +226,73 @@ class Store:
 
     async def answer(self, token: str, answer: Answer) -> AnswerStored:
         """Store one answer; repeating the request does not store it twice."""
-        details, now = encode_details(answer), time.time()
+        details = encode_details(answer)
 
-        def store(connection: Connection) -> tuple[AnswerStored, str]:
-            session, course = self._read_session(connection, token)
-            study = under(self.study, session.condition)
-            tag = session_tag(self.secrets, session.session)
-            sent_at = self.fetched.sent_at(tag, session.started_at, answer.phase, answer.trial)
-            stored = store_answer(
-                connection, study, self.secrets, course, session, answer, details, now, sent_at
-            )
-            return stored, tag
+        def store(step: Step) -> tuple[AnswerStored, str]:
+            tag, since = session_tag(self.secrets, step.session.session), step.session.started_at
+            sent_at = self.fetched.sent_at(tag, since, answer.phase, answer.trial)
+            return store_answer(step, self.secrets, answer, details, sent_at), tag
 
-        stored, tag = await self._writer.run(store)
+        stored, tag = await self._write(token, store)
         self.fetched.forget(tag, answer.phase, answer.trial)
         return stored
 
     async def showing(self, token: str, showing: Showing) -> Shown:
         """Store that the next trial begins; repeating the request does not count it twice."""
-        now = time.time()
-
-        def store(connection: Connection) -> Shown:
-            session, course = self._read_session(connection, token)
-            return store_showing(connection, course, session, showing, now)
-
-        return await self._writer.run(store)
+        return await self._write(token, lambda step: store_showing(step, showing))
 
     async def events(self, token: str, events: Events) -> Stored:
         """Store events, up to MAX_EVENTS per session, unless the key of the batch is known.
 
         Those before the consent are not stored.
         """
-        now = time.time()
         rows = [
-            {"batch": events.key, "kind": event.kind, "at_ms": event.at_ms, "stored_at": now,
+            {"batch": events.key, "kind": event.kind, "at_ms": event.at_ms,
              "data": _check_event_data(event.data, index)}
             for index, event in enumerate(events.events)
         ]  # fmt: skip
-
         if hash_token(token) in self._visits:
             return Stored(stored=0)
 
-        def store(connection: Connection) -> Stored:
-            session, course = self._read_session(connection, token)
-            if stage_of(session, course) in ENDED:
-                raise Refused("wrong_stage", "This session has ended.", state_of(session, course))
-            of_session = EVENTS.c.session == session.session
+        def store(step: Step) -> Stored:
+            if step.stage in ENDED:
+                raise step.refused("wrong_stage", "This session has ended.")
+            of_session = EVENTS.c.session == step.session.session
             if events.key is not None:
                 same = select(EVENTS.c.event).where(of_session, EVENTS.c.batch == events.key)
-                if connection.execute(same.limit(1)).first() is not None:
+                if step.connection.execute(same.limit(1)).first() is not None:
                     return Stored(stored=0)
-            known = connection.scalar(select(func.count()).where(of_session)) or 0
-            kept = rows[: max(0, MAX_EVENTS - known)]
+            known = step.connection.scalar(select(func.count()).where(of_session)) or 0
+            own = {"session": step.session.session, "stored_at": step.now}
+            kept = [row | own for row in rows[: max(0, MAX_EVENTS - known)]]
             if kept:
-                connection.execute(
-                    insert(EVENTS), [{**row, "session": session.session} for row in kept]
-                )
-            change_session(connection, session, last_seen=now)
+                step.connection.execute(insert(EVENTS), kept)
+            step.change(last_seen=step.now)
             return Stored(stored=len(kept))
 
-        return await self._writer.run(store)
+        return await self._write(token, store)
 
     def result(self, token: str) -> Result:
         """Return accuracy, percentile and completion of a finished session."""
-        return self._read(lambda connection: self._compute_result(connection, token))
+        return self._read(token, self._compute_result)
 
     def ending(self, token: str) -> SessionEnd:
         """Return the end of a session that ended before it was complete."""
 
-        def read(connection: Connection) -> SessionEnd:
-            session, course = self._read_session(connection, token)
-            stage = stage_of(session, course)
-            if stage not in ENDED:
-                raise Refused("wrong_stage", "This session continues.", state_of(session, course))
+        def read(step: Step) -> SessionEnd:
+            if step.stage not in ENDED:
+                raise step.refused("wrong_stage", "This session has not ended.")
             visit = self._visits.get(hash_token(token))
             if visit is not None:
                 source = str(visit.values["source"])
             else:
-                of_session = SESSIONS.c.session == session.session
-                source = connection.scalars(select(SESSIONS.c.source).where(of_session)).one()
+                of_session = SESSIONS.c.session == step.session.session
+                source = step.connection.scalars(select(SESSIONS.c.source).where(of_session)).one()
             ends = {"declined": self.study.declined, "withdrawn": self.study.stopped}
-            end = ends.get(stage, self.study.screened_out)
+            end = ends.get(step.stage, self.study.screened_out)
             return SessionEnd(completion=ending_completion(end, source))
 
-        return self._read(read)
+        return self._read(token, read)
 
     async def write(self, command: Callable[[Connection], T]) -> T:
         """Run any command in the writer."""
@@ -329,34 +301,36 @@ class Store:
     def healthy(self) -> bool:
         """Return whether the database answers."""
         try:
-            return bool(self._read(lambda connection: connection.scalar(text("SELECT 1"))))
-        except Refused:
+            with self.engine.connect() as connection:
+                return bool(connection.scalar(text("SELECT 1")))
+        except OperationalError:
             return False
 
-    def _read(self, query: Callable[[Connection], T]) -> T:
-        """Run a query on a reading connection."""
+    def _read(self, token: str, work: Callable[[Step], T]) -> T:
+        """Run a query about the session of a token."""
         try:
             with self.engine.connect() as connection:
-                return query(connection)
+                return work(self._step(connection, token, time.time()))
         except OperationalError as error:
             raise Refused("unavailable", "The server cannot reach its database.") from error
 
-    def _read_session(self, connection: Connection, token: str) -> tuple[Session, Any]:
-        """Return the session of a token and its course; of a visitor, the session as it will be."""
+    async def _write(self, token: str, work: Callable[[Step], T]) -> T:
+        """Run a change of the session of a token."""
+        now = time.time()
+        return await self._writer.run(lambda c: work(self._step(c, token, now)))
+
+    def _step(self, connection: Connection, token: str, now: float) -> Step:
+        """Return the session of a token; of a visitor, the session as it will be."""
         visit = self._visits.get(hash_token(token))
-        if visit is None:
-            session = read_session(connection, self.study, hash_token(token))
-        else:
-            session = visit.session
-        return session, self._courses.of(session)
+        session = (
+            visit.session if visit else read_session(connection, self.study, hash_token(token))
+        )
+        course = self._courses.of(session)
+        return Step(connection, under(self.study, session.condition), course, session, now)
 
-    def _read_state(self, connection: Connection, token: str) -> SessionState:
-        """Return the state of the session of a token."""
-        return state_of(*self._read_session(connection, token))
-
-    def _list_media(self, session: Session, phase: Phase) -> list[TrialMedia]:
+    def _list_media(self, step: Step, phase: Phase) -> list[TrialMedia]:
         """Return the signed media and timing of the trials of a phase."""
-        study = under(self.study, session.condition)
+        study, session = step.study, step.session
         scenario, seed = session.scenario, session.order_seed
         crosses = fixations(study, scenario, seed, phase)
         tag = session_tag(self.secrets, session.session)
@@ -379,13 +353,12 @@ class Store:
             for trial, stimulus in enumerate(trial_order(study, scenario, seed)[phase])
         ]
 
-    def _compute_result(self, connection: Connection, token: str) -> Result:
+    def _compute_result(self, step: Step) -> Result:
         """Compute the result of a finished session."""
-        session, course = self._read_session(connection, token)
-        stage = stage_of(session, course)
-        if stage != "done":
-            code = "wrong_stage" if stage in ENDED else "not_yet"
-            raise Refused(code, "The result comes at the end.", state_of(session, course))
+        connection, session = step.connection, step.session
+        if step.stage != "done":
+            code = "wrong_stage" if step.stage in ENDED else "not_yet"
+            raise step.refused(code, "The result comes at the end.")
         scores = self._scores.of(connection, session)
         correct = scores.pop(session.session, None)
         if correct is None:  # a preview of other stimuli, whose labels are no longer known

@@ -161,6 +161,17 @@ def set_password(folder: Path, password: str) -> Secrets:
     return secrets
 
 
+def read_password(path: Path) -> str:
+    """Return the password in the first line of a file, without surrounding spaces."""
+    try:
+        password = read_plain(path, 10_000).decode().splitlines()[0].strip()
+    except (UnicodeDecodeError, IndexError) as error:
+        raise BadInputError(f"{path} has no password in its first line") from error
+    if not MIN_PASSWORD <= len(password) <= MAX_PASSWORD:
+        raise BadInputError(f"the password in {path} must have {MIN_PASSWORD} characters or more")
+    return password
+
+
 def check_password(secrets: Secrets, password: str) -> bool:
     """Return whether this is the password (deliberately slow, about 50 ms)."""
     from argon2 import PasswordHasher

@@ -1,16 +1,10 @@
-"""API endpoints: parse the request, call the store once, return its message.
-
-Bodies are untrusted: apart from the types of the message, a body must be plain JSON with unique
-keys, without NaN or infinity, integers beyond 2**53, NUL and unpaired surrogates (which databases
-cannot store), and with at most `MAX_DEPTH` levels of nesting.
-"""
+"""API endpoints: parse the request, call the store once, return its message."""
 
 from __future__ import annotations
 
 import json
-import math
 import re
-from typing import TYPE_CHECKING, Any, Literal, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 from fastapi import APIRouter
 from pydantic import ValidationError
@@ -20,6 +14,7 @@ from starlette.responses import Response
 
 from physion.core.errors import BadInputError
 from physion.experiment.protocol import (
+    MAX_BODY,
     Answer,
     AskedQuestion,
     CheckedQuestion,
@@ -29,17 +24,14 @@ from physion.experiment.protocol import (
     Message,
     PageDone,
     PublicStudy,
+    Refused,
     Showing,
     TrialMedia,
 )
 from physion.experiment.study.media import sign_media
 from physion.experiment.study.recruitment import RECRUITERS, ending_completion, is_mturk_preview
 from physion.experiment.study.stimuli import PHASES
-from physion.experiment.web.guards import (
-    Reply,
-    describe_faults,
-    refuse,
-)
+from physion.experiment.web.guards import MESSAGES, Reply, describe_faults, refuse
 
 if TYPE_CHECKING:
     from physion.experiment.store.store import Store
@@ -48,10 +40,9 @@ if TYPE_CHECKING:
     from physion.experiment.study.study import Study
 
 
-MAX_DEPTH = 8
-EXACT = 2**53
-"""Integers up to here are exact in every JSON parser."""
 M = TypeVar("M", bound=Message)
+_NUL = re.compile(rb"(?<!\\)(?:\\\\)*\\u0000")
+"""NUL in a text, which no table of others can hold."""
 
 
 class BadBodyError(BadInputError):
@@ -65,70 +56,30 @@ async def read_message(request: Request, message: type[M]) -> M:
     ------
     BadBodyError
         The body is not JSON, or not this message.
+    Refused
+        The body is too large; the rest of it is not read.
     """
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind != "application/json":
         raise BadBodyError("the body must be application/json")
-    return parse_message(await request.body(), message)
+    declared, body = request.headers.get("content-length", ""), b""
+    if declared.isdigit() and int(declared) > MAX_BODY:
+        raise Refused("too_large", MESSAGES["too_large"])
+    async for part in request.stream():
+        body += part
+        if len(body) > MAX_BODY:
+            raise Refused("too_large", MESSAGES["too_large"])
+    return parse_message(body, message)
 
 
 def parse_message(body: bytes, message: type[M]) -> M:
     """Validate the bytes of a body, as `read_message` does."""
-    try:
-        _check(json.loads(body, object_pairs_hook=_unique_keys, parse_constant=_no_constant), 0)
-    except BadBodyError:
-        raise
-    except (ValueError, RecursionError) as error:
-        raise BadBodyError("the body is not valid JSON") from error
+    if _NUL.search(body):
+        raise BadBodyError("the body has a NUL character")
     try:
         return message.model_validate_json(body, strict=True)
     except ValidationError as error:
         raise BadBodyError(describe_faults(error)) from error
-
-
-def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the object of JSON pairs; raise `BadBodyError` if a key is repeated."""
-    unique = dict(pairs)
-    if len(unique) != len(pairs):
-        raise BadBodyError("the body has the same key twice")
-    return unique
-
-
-def _no_constant(word: str) -> NoReturn:
-    """Refuse the constants NaN and Infinity."""
-    raise BadBodyError("the body has a number that is not finite")
-
-
-def _check(value: Any, depth: int) -> None:
-    """Check a JSON value and all values in it."""
-    kind = type(value)
-    if kind is str:
-        _check_text(value)
-    elif kind is float:
-        if not math.isfinite(value):
-            raise BadBodyError("the body has a number that is not finite")
-    elif kind is int:
-        if not -EXACT <= value <= EXACT:
-            raise BadBodyError("the body has a number that is too large")
-    elif kind is dict or kind is list:
-        if depth >= MAX_DEPTH:
-            raise BadBodyError("the body is nested too deeply")
-        if kind is dict:
-            for key in value:
-                _check_text(key)
-        for inner in value.values() if kind is dict else value:
-            _check(inner, depth + 1)
-
-
-def _check_text(text: str) -> None:
-    """Refuse a text with NUL or unpaired surrogates."""
-    if "\x00" in text:
-        raise BadBodyError("the body has a NUL character")
-    if not text.isascii():
-        try:
-            text.encode()
-        except UnicodeEncodeError as error:
-            raise BadBodyError("the body has an unpaired surrogate") from error
 
 
 _BEARER = re.compile(rb"bearer ([A-Za-z0-9_-]{1,200})", re.IGNORECASE)

@@ -1,4 +1,4 @@
-"""Storing answers: exactly once and in order, for any sequence of requests; on both databases."""
+"""Storing answers: exactly once and in order, for any sequence of requests."""
 
 from __future__ import annotations
 
@@ -220,7 +220,7 @@ POSTS = st.lists(
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(POSTS)
 def test_any_sequence_of_requests_stores_the_first_trials_once(
     machine: Machine, posts: Any

@@ -4,28 +4,38 @@ from __future__ import annotations
 
 import contextlib
 import http.client
+import ipaddress
 import json
+import re
 import signal
 import socket
 import ssl
 import subprocess
 import sys
 import threading
+import tomllib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
+import httpx2
+
+from physion.analysis.people.exclusions import RULE_SETS
+from physion.cli.experiment import serve
 from physion.cli.main import main
 from physion.experiment.server import Address
+from physion.experiment.server_process import ServerProcess
+from physion.experiment.study.identity import Secrets, check_password
+from physion.experiment.study.settings import StudySettings
 from physion.experiment.study.study import Study
 from support.experiment.app_walk import answer_body, served
 from support.experiment.live_app import HOST, read_all, running
-from support.experiment.tiny_study import make_tiny_study
+from support.experiment.tiny_study import PASSWORD, make_tiny_study
 from support.programs import find_program
 
 
@@ -205,7 +215,6 @@ class TestFaults:
 
     def test_a_second_server(self, study: Study, capsys: pytest.CaptureFixture[str]) -> None:
         from physion.experiment.store.store import Store
-        from physion.experiment.study.identity import Secrets
 
         store = Store.open(study, Secrets.load(study.folder))
         try:
@@ -226,6 +235,23 @@ class TestFaults:
 ])  # fmt: skip
 def test_unencrypted_addresses(address: Address, readable: bool) -> None:
     assert address.is_readable_on_the_way() == readable
+
+
+def test_a_new_password_is_the_first_line_of_a_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, file = make_tiny_study(tmp_path / "s", familiarization=1, test=1).folder, tmp_path / "p"
+    before = Secrets.load(folder)
+    words = ["experiment", "serve", str(folder), "--password-file", str(file), "--port=-1"]
+    for content in (b"", b"short\n", b"\xff\xff\xff\xff\xff\xff\xff\xff\xff"):
+        file.write_bytes(content)
+        assert main(words) == 2 and str(file) in capsys.readouterr().err
+    assert Secrets.load(folder) == before
+    file.write_text("another password \nnot this\n")
+    assert main(words) == 2 and "--port" in capsys.readouterr().err
+    after = Secrets.load(folder)
+    assert check_password(after, "another password") and not check_password(after, PASSWORD)
+    assert (after.hash_key, after.link_key) == (before.hash_key, before.link_key)
 
 
 @pytest.mark.parametrize("port", ["80000", "65536", "-1"])
@@ -251,3 +277,89 @@ def test_the_warning_is_printed(
 ) -> None:
     assert main(["experiment", "serve", str(tmp_path / "nothing"), "--host", "0.0.0.0"]) == 2
     assert "sent unencrypted" in capsys.readouterr().err
+
+
+SLOW_TO_IMPORT = (
+    "numpy",
+    "pandas",
+    "scipy",
+    "sklearn",
+    "statsmodels",
+    "matplotlib",
+    "numba",
+    "mujoco",
+)
+
+
+def test_rules_match_the_analysis() -> None:
+    allowed = get_type_hints(StudySettings)["exclusions"]
+    assert tuple(RULE_SETS) == get_args(allowed)
+
+
+def test_serving_imports_nothing_slow() -> None:
+    found = f"[name for name in {SLOW_TO_IMPORT} if name in sys.modules]"
+    code = f"import sys, physion.experiment.server; print({found})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_requests_are_logged_without_personal_data(tmp_path: Path) -> None:
+    folder = make_tiny_study(tmp_path / "study", test=2, familiarization=1).folder
+    with ServerProcess(folder, options=["--log-requests"]) as server:
+        asked = httpx2.get(f"{server.url}/?PROLIFIC_PID=SECRET", trust_env=False, timeout=60)
+        httpx2.get(f"{server.url}/no%0Asuch", trust_env=False, timeout=60)
+        lines = server.last_output().splitlines()
+    assert asked.status_code == 200
+    for request in ("GET / 200", "GET /no%0Asuch 404"):
+        assert sum(line.endswith(request) for line in lines) == 1
+    assert not [line for line in lines if "SECRET" in line]
+
+
+ROOT = Path(__file__).parents[3]
+SERVER = ROOT / "examples" / "server"
+DEFAULTS = {field.name: field.default for field in fields(serve.Options)}
+
+
+@pytest.fixture(scope="module")
+def services() -> dict[str, Any]:
+    yaml = pytest.importorskip("yaml")
+    found: dict[str, Any] = yaml.safe_load((SERVER / "compose.yaml").read_text())
+    subnet = found["networks"]["default"]["ipam"]["config"][0]["subnet"]
+    return {**found["services"], "subnet": subnet}
+
+
+def options_of(command: list[str]) -> dict[str, str]:
+    """Return the options of a command by the names of the fields of `serve.Options`."""
+    assert command[:2] == ["serve", "/study"] and len(command) % 2 == 0
+    pairs = zip(command[2::2], command[3::2], strict=True)
+    return {name.removeprefix("--").replace("-", "_"): value for name, value in pairs}
+
+
+def test_the_command_is_one_that_serve_accepts(services: dict[str, Any]) -> None:
+    options = options_of(services["study"]["command"])
+    assert set(options) <= set(DEFAULTS)
+    assert ipaddress.ip_network(options["behind_proxy"]) == ipaddress.ip_network(services["subnet"])
+    assert services["study"]["volumes"][0].endswith(":/study")
+
+
+def test_the_proxy_reaches_the_study(services: dict[str, Any]) -> None:
+    target = re.search(r"reverse_proxy (\w+):(\d+)", (SERVER / "Caddyfile").read_text())
+    assert target is not None
+    assert target[1] in services and int(target[2]) == DEFAULTS["port"]
+    assert services["proxy"]["volumes"][0].startswith("./Caddyfile:")
+    assert "ports" not in services["study"]
+
+
+def test_the_image_is_built_from_what_is_there(services: dict[str, Any]) -> None:
+    built = services["study"]["build"]
+    text = (SERVER / built["context"] / built["dockerfile"]).resolve().read_text()
+    for line in re.findall(r"^COPY (.*)", text, re.MULTILINE):
+        for name in line.split()[:-1]:
+            assert (ROOT / name).exists(), name
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    version = re.search(r"FROM python:([\d.]+)", text)
+    assert version is not None and project["requires-python"] == f">={version[1]}"
+    assert set(re.findall(r"\.\[(\w+)\]", text)) <= set(project["optional-dependencies"])
+    entry = json.loads(re.findall(r"ENTRYPOINT (.*)", text)[0])
+    assert entry[0] in project["scripts"] and entry[1:] == ["experiment"]
+    assert set(options_of(json.loads(re.findall(r"^CMD (.*)", text, re.MULTILINE)[0]))) == {"host"}

@@ -1,8 +1,11 @@
-"""Every endpoint: accepted requests, responses and refusals."""
+"""Every endpoint: accepted requests, responses and refusals; headers, errors and the log."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,16 +14,24 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 import sqlalchemy as sa
 from sqlalchemy.exc import OperationalError
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import Route
+from starlette.testclient import TestClient
 
 from physion.experiment import protocol as wire
 from physion.experiment.protocol import PublicStudy
-from physion.experiment.store.database import ANSWERS, RAW_IDS, SESSIONS
+from physion.experiment.store.database import SESSIONS
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.settings import Recruitment
+from physion.experiment.study.study import Study
+from physion.experiment.web.guards import Guards, content_policy
 from support.experiment.app_walk import Person, Served, answer_body, served
+from support.experiment.experimenter_client import lab
 
 TRIALS = {"familiarization": 2, "test": 3}
-OPEN = ("study", "texts/en", "enter", "health")
 WITH_TOKEN = [
     ("GET", "/api/session", None),
     ("GET", "/api/trials/test", None),
@@ -98,28 +109,17 @@ class TestWithoutASession:
         assert "secret" not in site.client.get("/api/health").text
 
     @pytest.mark.parametrize(("method", "path", "body"), WITH_TOKEN)
-    @pytest.mark.parametrize("header", [
-        None, "", "Bearer", "Bearer ", "Bearer nobody", "Basic eDp5", "Bearer " + "x" * 300,
-        "Bearer ' OR 1=1 --",
-    ])  # fmt: skip
     def test_session_endpoints_need_a_token(
-        self, site: Served, method: str, path: str, body: Any, header: str | None
+        self, site: Served, method: str, path: str, body: Any
     ) -> None:
-        headers = {} if header is None else {"authorization": header}
-        answer = site.client.request(method, path, json=body, headers=headers)
-        assert answer.status_code in (401, 429)
-        if answer.status_code == 401:
+        for header in (None, "", "Bearer ", "Bearer nobody", "Basic eDp5", "Bearer ' OR 1=1 --"):
+            headers = {} if header is None else {"authorization": header}
+            answer = site.client.request(method, path, json=body, headers=headers)
             refused(answer, 401, "unknown_token")
-
-    def test_other_endpoints_need_no_token(self, site: Served) -> None:
-        for name in ("study", "texts/en", "health"):
-            assert site.client.get(f"/api/{name}").status_code == 200
-        for path in ("/docs", "/redoc", "/openapi.json"):
-            refused(site.client.get(path), 404, "not_found")
 
     @pytest.mark.parametrize("path", [
         "/nowhere", "/api", "/api/", "/api/nowhere", "/api/session/", "/static", "/static/",
-        "/static/nowhere.js", "/media", "/media/", "/favicon.ico",
+        "/static/nowhere.js", "/media", "/media/", "/favicon.ico", "/docs", "/openapi.json",
     ])  # fmt: skip
     def test_unknown_addresses(self, site: Served, path: str) -> None:
         refused(site.client.get(path, follow_redirects=False), 404, "not_found")
@@ -176,15 +176,6 @@ class TestSession:
         )  # fmt: skip
         assert refusal["error"] == "already_took_part"
 
-    def test_the_same_answer_twice_is_one(self, site: Served) -> None:
-        person = site.person().walk("test")
-        assert not person.answer(0)["duplicate"]
-        assert person.answer(0)["duplicate"]
-        assert person.answer(0, key="another-key", status=409)["error"] == "already_answered"
-        refusal = person.answer(2, status=409)
-        assert refusal["error"] == "out_of_order"
-        assert refusal["state"]["trial"] == 1
-
     def test_a_second_browser_continues_by_a_signed_link_only(self, site: Served) -> None:
         who = {"source": "sona", "id": "1234", "scenario": "drop"}
         first = site.person(**who).walk("test")
@@ -201,34 +192,6 @@ class TestSession:
         # The first browser, which has a token, need not have kept its key.
         assert first.ask("POST", "/api/enter", who)["state"]["trial"] == 2
 
-    def test_a_token_opens_only_its_session(self, site: Served) -> None:
-        one, two = site.person().walk("test"), site.person().walk("test")
-        one.answer(0)
-        assert two.state()["trial"] == 0
-        assert one.state()["reference"] != two.state()["reference"]
-
-    def test_events(self, site: Served) -> None:
-        person = site.person().walk("instructions")
-        events = [{"kind": "hidden", "at_ms": 12.5, "data": {"why": "tab", "n": 2, "x": None}}]
-        assert person.ask("POST", "/api/events", {"events": events}) == {"stored": 1}
-
-    def test_withdrawal_ends_everything(self, site: Served) -> None:
-        person = site.person().walk("test")
-        assert person.page("withdraw")["stage"] == "withdrawn"
-        assert person.answer(0, status=409)["error"] == "wrong_stage"
-        person.ask("GET", "/api/trials/test", status=409)
-        person.ask("GET", "/api/result", status=409)
-
-    def test_ids_are_stored_apart(self, site: Served) -> None:
-        person = site.person(source="prolific", id="raw-id-1", recruiter={"STUDY_ID": "st"})
-        person.page("consent")
-        with site.store.engine.connect() as connection:
-            sessions = connection.execute(sa.select(SESSIONS)).all()
-            raw = connection.execute(sa.select(RAW_IDS).where(RAW_IDS.c.raw_id == "raw-id-1")).one()
-        assert not any("raw-id-1" in str(row) for row in sessions)
-        assert raw.recruiter == {"STUDY_ID": "st"}
-        assert "raw-id-1" not in str([answer.text for _, answer in person.heard])
-
     def test_mturk_preview_begins_nothing(self, site: Served) -> None:
         with site.store.engine.connect() as connection:
             before = connection.scalar(sa.select(sa.func.count()).select_from(SESSIONS))
@@ -240,17 +203,6 @@ class TestSession:
             after = connection.scalar(sa.select(sa.func.count()).select_from(SESSIONS))
         assert before == after
 
-    def test_answers_are_stored_as_sent(self, site: Served) -> None:
-        person = site.person(source="link", id="stored").walk("test")
-        person.answer(0, response="no", rt_ms=1234.5, input="touch", frames_shown=44)
-        with site.store.engine.connect() as connection:
-            row = connection.execute(
-                sa.select(ANSWERS).join(SESSIONS).where(
-                    SESSIONS.c.reference == person.state()["reference"], ANSWERS.c.phase == "test"
-                )
-            ).one()  # fmt: skip
-        assert (row.response, row.rt_ms, row.input, row.frames_shown) == ("no", 1234.5, "touch", 44)
-
     def test_entering_refuses_unknown_fields(self, site: Served) -> None:
         person = Person(site.client)
         assert person.ask("POST", "/api/enter", {"kind": "preview"}, 422)["error"] == "bad_request"
@@ -258,3 +210,127 @@ class TestSession:
         assert person.ask("POST", "/api/enter", {"pass_": "x"}, 403)["error"] == "bad_link"
         assert person.ask("POST", "/api/enter", {"source": "prolific"}, 403)["error"] == "id_needed"
         assert person.ask("POST", "/api/enter", {"scenario": "x"}, 403)["error"] == "bad_link"
+
+
+SECRET = "a word of the request that no answer may hold"
+STUDY = Study(folder=Path(), name="n", version="1", title="t", contact="c", scenarios=("collide",))
+
+
+async def _echo(request: Request) -> Response:
+    return PlainTextResponse(str(len(await request.body())))
+
+
+async def _fail(request: Request) -> Response:
+    raise RuntimeError(SECRET)
+
+
+async def _own_headers(request: Request) -> Response:
+    return PlainTextResponse("", headers={"cache-control": "private", "x-own": "1"})
+
+
+def client(study: Study = STUDY, **settings: str) -> TestClient:
+    routes = [
+        Route("/echo", _echo, methods=["POST", "GET"]),
+        Route("/fail", _fail),
+        Route("/own", _own_headers),
+    ]
+    app = Starlette(routes=routes, middleware=[Middleware(Guards, study=study)])
+    return TestClient(app, **settings)
+
+
+class TestHeaders:
+    def test_every_response_has_them(self) -> None:
+        asks = (("GET", "/echo"), ("GET", "/nowhere"), ("DELETE", "/echo"), ("GET", "/fail"))
+        answers = [client().request(*ask) for ask in asks]
+        assert [answer.status_code for answer in answers] == [200, 404, 405, 500]
+        for answer in answers:
+            assert answer.headers["content-security-policy"].startswith("default-src 'none'; ")
+            assert answer.headers["referrer-policy"] == "no-referrer"
+            assert answer.headers["cache-control"] == "no-store"
+            assert answer.headers["x-frame-options"] == "DENY"
+            assert "strict-transport-security" not in answer.headers
+
+    def test_https_is_kept(self) -> None:
+        headers = client(base_url="https://lab.example.org").get("/echo").headers
+        assert headers["strict-transport-security"] == "max-age=31536000"
+
+    def test_headers_of_the_application_are_kept(self) -> None:
+        headers = client().get("/own").headers
+        assert headers["cache-control"] == "private"
+        assert headers["x-own"] == "1"
+        assert headers["x-content-type-options"] == "nosniff"
+
+    def test_only_named_sites_may_embed_the_pages(self) -> None:
+        sites = ("https://www.mturk.com", "https://workersandbox.mturk.com")
+        headers = client(replace(STUDY, embed_from=sites)).get("/echo").headers
+        assert f"frame-ancestors {' '.join(sites)};" in headers["content-security-policy"]
+        assert "x-frame-options" not in headers
+
+    def test_nothing_inline_and_nothing_from_elsewhere_runs(self) -> None:
+        policy = content_policy(STUDY)
+        assert "unsafe" not in policy
+        assert "http" not in policy
+        assert "script-src 'self';" in policy
+
+
+class TestErrors:
+    def test_an_internal_error_reveals_nothing(self, caplog: pytest.LogCaptureFixture) -> None:
+        with caplog.at_level(logging.ERROR, logger="physion.experiment"):
+            answer = client().get(
+                "/fail?id=5f9c-prolific", headers={"authorization": "Bearer good"}
+            )
+        assert answer.status_code == 500
+        assert set(answer.json()) == {"error", "message", "state", "completion"}
+        assert answer.json()["error"] == "server_error"
+        assert SECRET not in answer.text and "Traceback" not in answer.text
+        # The log has the traceback, but neither the participant nor the token.
+        assert SECRET in caplog.text
+        assert "prolific" not in caplog.text and "good" not in caplog.text
+
+
+ALL = "physion.experiment"
+
+
+def test_a_request_is_one_line_without_its_query(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with (
+        served(tmp_path / "s", familiarization=1, test=1) as site,
+        caplog.at_level(logging.INFO, logger=ALL),
+    ):
+        site.client.get("/api/study?PROLIFIC_PID=5f0c")
+        site.client.get("/static/%0Aforged line")
+    assert [message for _, _, message in caplog.record_tuples if "/" in message] == [
+        "GET /api/study 200", "GET /static/%0Aforged%20line 404"
+    ]  # fmt: skip
+
+
+def test_a_missing_movie_is_named_only_in_the_log(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with served(tmp_path / "s", familiarization=1, test=1) as site:
+        shown = site.study.phase("collide", "familiarization")[0]
+        (site.study.folder / shown.movie).unlink()
+        person = site.person(id="watcher").walk("familiarization")
+        movie = person.ask("GET", "/api/trials/familiarization")["trials"][0]["movie"]
+        answer = site.client.get(movie)
+    assert answer.status_code == 404 and answer.json()["error"] == "not_found"
+    assert "missing on the server" in answer.json()["message"]
+    assert Path(shown.movie).name not in answer.text
+    assert [(record.levelname, record.exc_info) for record in caplog.records] == [("ERROR", None)]
+    assert f"{shown.movie} is missing" in caplog.text
+
+
+def test_logins_are_logged_without_addresses(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with (
+        lab(tmp_path / "s", test=1) as found,
+        caplog.at_level(logging.INFO, logger=f"{ALL}.experimenter"),
+    ):
+        visitor = found.visitor(address="198.51.100.23")
+        assert visitor.log_in("wrong").status_code == 403
+        assert visitor.log_in().status_code == 303
+    own = [record for record in caplog.records if record.name.startswith(f"{ALL}.experimenter")]
+    assert [record.levelname for record in own] == ["WARNING", "INFO"]
+    assert "198.51" not in caplog.text

@@ -32,7 +32,7 @@ ADDRESS = re.compile(
 )
 TELLING = {"contact", "correct", "accuracy", "percentile", "label", "outcome", "score", "stimulus",
            "full", "place", "answer", "feedback"}  # fmt: skip
-"""Names in messages under which an end could be told."""
+"""Names in messages that could reveal an outcome."""
 
 
 @pytest.fixture(scope="module")
@@ -49,16 +49,16 @@ def numbers(movie: bytes) -> list[int]:
         ]
 
 
-def told(value: Any) -> Iterator[tuple[str, Any]]:
+def telling(value: Any) -> Iterator[tuple[str, Any]]:
     """Return all fields of a message that could reveal an outcome, with their values."""
     if isinstance(value, dict):
         for key, inner in value.items():
             if key in TELLING and inner is not None:
                 yield key, inner
-            yield from told(inner)
+            yield from telling(inner)
     elif isinstance(value, list):
         for inner in value:
-            yield from told(inner)
+            yield from telling(inner)
 
 
 def secrets_of(site: Served) -> list[bytes]:
@@ -106,7 +106,7 @@ def test_a_session_reveals_no_outcome_before_the_answer(site: Served) -> None:
             for path, answer in person.heard:
                 assert_silent(site, answer)
                 if answer.headers["content-type"] == "application/json" and "texts" not in path:
-                    found = dict(told(answer.json()))
+                    found = dict(telling(answer.json()))
                     assert found == (
                         {} if path != "/api/study" else {"contact": site.study.contact}
                     )
@@ -114,7 +114,7 @@ def test_a_session_reveals_no_outcome_before_the_answer(site: Served) -> None:
             person.heard.clear()
             stored = person.answer(trial, phase)
             if phase == "test":
-                assert dict(told(stored)) == {}
+                assert dict(telling(stored)) == {}
             else:
                 ends[trial] = stored["feedback"]
                 person.heard.clear()
@@ -298,6 +298,6 @@ def test_the_search_itself_finds_what_it_looks_for(site: Served) -> None:
     answer._content = json.dumps({"trials": [{"x": name, "label": False}]}).encode()
     with pytest.raises(AssertionError):
         assert_silent(site, answer)
-    assert dict(told(answer.json())) == {"label": False}
+    assert dict(telling(answer.json())) == {"label": False}
     full = (site.study.folder / site.study.stimuli[0].full).read_bytes()
     assert numbers(full)[-1] == FULL - 1
