@@ -279,16 +279,7 @@ def test_the_warning_is_printed(
     assert "sent unencrypted" in capsys.readouterr().err
 
 
-SLOW_TO_IMPORT = (
-    "numpy",
-    "pandas",
-    "scipy",
-    "sklearn",
-    "statsmodels",
-    "matplotlib",
-    "numba",
-    "mujoco",
-)
+SLOW_TO_IMPORT = ("sklearn", "statsmodels", "matplotlib", "numba", "mujoco", "torch")
 
 
 def test_rules_match_the_analysis() -> None:
