@@ -123,17 +123,17 @@ def _trials(options: Options, out: Path, stages: Stages) -> int:
         return _print_paths(made, options.json)
     chosen |= {"executor": LocalExecutor(workers=options.workers), "progress": stages}
     if options.layout == "webdataset":
-        from physion.trials.share.shards import PARTS, SEEN_PARTS, export_shards
+        from physion.trials.share.shards import MANIFEST, PARTS, SEEN_PARTS, export_shards
 
         parts = SEEN_PARTS if options.parts == "seen" else PARTS
         shards = export_shards(options.folder, out, parts=parts, **chosen)
+        samples = sum(shard.samples for shard in shards)
         if options.json:
-            names = [shard.name for shard in shards.shards]
-            values = {"made": names, "samples": shards.samples, "bytes": shards.bytes}
-            print(json_module.dumps(values | {"index": str(shards.manifest)}))
+            values: dict[str, Any] = {"made": [shard.name for shard in shards]}
+            values |= {"samples": samples, "bytes": sum(shard.bytes for shard in shards)}
+            print(json_module.dumps(values | {"index": str(out / MANIFEST)}))
         else:
-            done = f"{shards.samples} trials in {counted(len(shards.shards), 'shard')}"
-            print_line(f"{done}: {shards.manifest}")
+            print_line(f"{samples} trials in {counted(len(shards), 'shard')}: {out / MANIFEST}")
         return 0
     from physion.trials.official.export_folder import export_official
 
@@ -150,60 +150,3 @@ def _print_paths(paths: Sequence[Path], as_json: bool) -> int:
     else:
         print_line("\n".join(map(str, paths)))
     return 0
-
-
-def _webdataset(options: Options, out: Path) -> int:
-    from physion.trials.share.shards import MANIFEST, PARTS, SEEN_PARTS, export_shards
-
-    with Stages() as stages:
-        shards = export_shards(
-            options.folder,
-            out,
-            split=options.split,
-            scenario=options.scenario,
-            parts=SEEN_PARTS if options.parts == "seen" else PARTS,
-            executor=LocalExecutor(workers=options.workers),
-            progress=stages,
-        )
-    samples = sum(shard.samples for shard in shards)
-    if options.json:
-        values: dict[str, object] = {"made": [shard.name for shard in shards]}
-        values |= {"samples": samples, "bytes": sum(shard.bytes for shard in shards)}
-        print(json_module.dumps(values | {"index": str(out / MANIFEST)}))
-        return 0
-    done = f"{samples} trials in {counted(len(shards), 'shard')}"
-    print_line(f"{done}: {out / MANIFEST}")
-    return 0
-
-
-def _gltf(options: Options, out: Path) -> int:
-    from physion.trials.share.gltf import export_gltf
-
-    with Stages() as stages:
-        made = export_gltf(
-            options.folder,
-            out,
-            split=options.split,
-            scenario=options.scenario,
-            verify=options.verify,
-            progress=stages,
-        )
-    return _print_paths(made, options.json)
-
-
-def _official(options: Options, out: Path) -> int:
-    from physion.trials.official.export_folder import export_official
-
-    with Stages() as stages:
-        report = export_official(
-            options.folder,
-            out,
-            layout=options.layout,
-            verify=options.verify,
-            split=options.split,
-            scenario=options.scenario,
-            images=options.images,
-            executor=LocalExecutor(workers=options.workers),
-            progress=stages,
-        )
-    return print_report(report, options.json)
