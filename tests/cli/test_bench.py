@@ -21,6 +21,9 @@ def test_every_quantity_of_a_scenario_is_measured(capsys: pytest.CaptureFixture[
     assert row.keys() == COLUMNS.keys() and row.pop("scenario") == "drop"
     assert row.pop("agreement") in (0.0, 1.0)
     assert all(math.isfinite(value) and value > 0 for value in row.values())
+    # One trial was made: its frames over its two times are a whole number, at most 3 s of them.
+    frames = row["frames_per_s"] * (row["choose_s"] + row["make_s"])
+    assert frames == pytest.approx(round(frames), abs=1e-6) and 45 < frames <= 302
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,8 @@ import hashlib
 import json
 import math
 import re
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -13,8 +15,10 @@ import pytest
 
 from physion.cli import output
 from physion.cli.main import main
-from physion.cli.run import balanced_trials
+from physion.cli.run import _once, balanced_trials, plan_sampled
+from physion.core.errors import BadInputError
 from physion.data.official import official
+from physion.scenes.tdw.read_logs import TrialSet
 
 SMALL = ["--limit", "2", "--size", "64", "--workers", "2"]
 FEW = ["--option", "steps=10", "noisy-simulation:samples=4"]
@@ -105,6 +109,31 @@ def test_a_larger_limit_adds_to_the_trials_of_a_smaller_one() -> None:
     counts = pd.Series([t.outcome.contact for t in more]).groupby([t.scene.scenario for t in more])
     assert (counts.size() == 7).all() and counts.sum().isin((3, 4)).all()
     assert len(balanced_trials(trials, None)) == len(trials)
+
+
+def test_scenarios_begin_with_either_outcome_in_turn() -> None:
+    ones = balanced_trials(official().trials, 1)
+    scenarios = sorted({trial.scene.scenario for trial in ones})
+    first = {trial.scene.scenario: trial.outcome.contact for trial in ones}
+    assert [first[name] for name in scenarios] == [k % 2 == 0 for k in range(len(scenarios))]
+
+
+def test_sampled_trials_are_twice_as_many_for_the_readout() -> None:
+    tasks = plan_sampled(3).tasks
+    counts = Counter((task.scenario, task.split) for task in tasks)
+    assert set(counts.values()) == {3, 6} and len(counts) == 6
+    assert all(counts[scenario, "readout"] == 6 for scenario, _ in counts)
+
+
+def test_two_different_trials_of_one_name_are_refused_with_their_files(tmp_path: Path) -> None:
+    trials = official().trial_set("drop", 2).trials
+    other = replace(trials[1], scene=replace(trials[1].scene, name=trials[0].scene.name))
+    logs = TrialSet([trials[0], trials[0]])
+    assert _once(logs) == [trials[0]], "a copy is left out"
+    name = trials[0].scene.name
+    logs = TrialSet([trials[0], other], {name: [tmp_path / "a.json", tmp_path / "b.json"]})
+    with pytest.raises(BadInputError, match=r"two trials are called .*a\.json and .*b\.json"):
+        _once(logs)
 
 
 def test_nobody_has_seen_sampled_scenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
