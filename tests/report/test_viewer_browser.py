@@ -111,7 +111,8 @@ def test_hidden_labels_tell_nothing(browser: Browser, page: Path) -> None:
     assert not browser.ask("document.querySelector('#track .first-contact').checkVisibility()")
     click(browser, "play")
     browser.key("End", 35)
-    assert browser.ask("document.getElementById('now').textContent").startswith("frame 44 of 60")
+    words = browser.ask("document.getElementById('now').textContent")
+    assert words == "frame 44 of 60, observed0.44 s physics, 1.47 s movie"
     latest = browser.ask(
         "Math.max(...[...document.querySelectorAll('.card video')].map(v => v.currentTime))"
     )
@@ -168,7 +169,8 @@ def test_scene_in_3d_moves_with_the_time_line_and_turns(browser: Browser, page: 
         now = browser.picture("#scene3d").astype(int)
         assert (np.abs(now - before).max(axis=2) > 30).sum() > 200, key
         before = now
-    assert browser.ask("document.getElementById('now').textContent").startswith("frame 50 of")
+    words = browser.ask("document.getElementById('now').textContent")
+    assert words == "frame 50 of 60, unobserved0.50 s physics, 1.67 s movie"
     x, y = browser.ask(
         "(({x, y, width, height}) => [x + width / 2, y + height / 2])"
         "(document.getElementById('scene3d').getBoundingClientRect())"
@@ -310,16 +312,22 @@ def of_colour(picture: np.ndarray, color: tuple[float, float, float]) -> np.ndar
     return np.nonzero(distance < 12)[0]
 
 
-@pytest.mark.parametrize("dark", [False, True])
-def test_imagined_particles_are_shown_next_to_the_true_motion(
-    browser: Browser, tmp_path: Path, dark: bool
-) -> None:
-    red, yellow = (0.88, 0.08, 0.08), (0.93, 0.72, 0)
-    folder = make_dataset(tmp_path / "set", (Plan("drop_0"), Plan("drop_1")))
+@pytest.fixture(scope="module")
+def imagined_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A page of two trials that a model imagined at rest."""
+    place = tmp_path_factory.mktemp("imagined")
+    folder = make_dataset(place / "set", (Plan("drop_0"), Plan("drop_1")))
     options = ViewerOptions(details=2, card_size=32, pass_size=32, stride=6)
     imagined = {"drop_0": [resting()], "drop_1": [resting()]}
-    page = build_viewer(folder, tmp_path / "v.html", options, imagine=lambda _: imagined).page
-    browser.open(page, "#trial=drop_0", dark=dark)
+    return build_viewer(folder, place / "v.html", options, imagine=lambda _: imagined).page
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_imagined_particles_are_shown_next_to_the_true_motion(
+    browser: Browser, imagined_page: Path, dark: bool
+) -> None:
+    red, yellow = (0.88, 0.08, 0.08), (0.93, 0.72, 0)
+    browser.open(imagined_page, "#trial=drop_0", dark=dark)
     click(browser, "play")
     browser.ask("document.querySelector('#view3d input').click()")  # hides paths
     # The true ball has the colour too, but lower, where it has fallen to; it is pale next to what
