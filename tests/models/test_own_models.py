@@ -144,7 +144,7 @@ WRONG = {
     "predict is no probability": (PREDICTS + "return np.full(len(batch), 1.5)",
         r"predict gave 1\.5, not a probability"),
     "predict is not finite": (PREDICTS + "return np.full(len(batch), np.inf)",
-        "predict gave probabilities that are not finite"),
+        r"predict gave probabilities that are not finite \(inf\); check"),
     "imagine gives no rollout": (IMAGINES + "return np.zeros(3)",
         "imagine gave ndarray, expected Rollout"),
     "imagine gives nothing": (IMAGINES + "return Rollout()",
