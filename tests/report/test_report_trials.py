@@ -142,12 +142,12 @@ def test_a_model_has_one_turn_and_none_without_an_opinion(make_comparison: Maker
 
 def test_counts_of_who_was_right(make_comparison: Maker) -> None:
     rows = some_rows(
-        human_accuracy=[0.9, 0.8, 0.2, 0.1, 0.5, 0.5],
-        predicted=[True, False, True, False, True, False],
+        human_accuracy=[0.9, 0.8, 0.7, 0.2, 0.1, 0.5, 0.5],
+        predicted=[True, False, False, True, False, True, False],
     )
     table = who_was_right(with_stimuli(make_comparison(), rows))
     assert table.iloc[0].to_dict() == {
-        "model": "m · observed", "stimuli": 6, "both": 1, "only_people": 1,
+        "model": "m · observed", "stimuli": 7, "both": 1, "only_people": 2,
         "only_model": 1, "neither": 1, "divided": 2,
     }  # fmt: skip
 
