@@ -42,7 +42,7 @@ from noise_simulations import F64, Simulations
 from physion.analysis.statistics.agreement import correlation_within_groups
 from physion.compute.tasks import processor
 from physion.core.seeds import generator
-from physion.models.state_noise import NoiseLevels
+from physion.models.noisy_simulation import NoiseLevels
 
 RESULTS = Path(__file__).parents[1] / "results" / "noise.md"
 GRID = {
@@ -274,7 +274,7 @@ def _intro() -> str:
     return (
         "# Noise of noisy-simulation\n\nWhat is fitted and how: "
         "`benchmarks/models/noise.py`. Levels: see "
-        "`physion.models.state_noise.NoiseLevels`.\n"
+        "`physion.models.noisy_simulation.NoiseLevels`.\n"
     )
 
 

@@ -20,8 +20,13 @@ from physion.analysis.tables import read_humans
 from physion.core.names import canonical_name
 from physion.core.seeds import stable_hash
 from physion.data.official import official
-from physion.models.noisy_simulation import configuration_half, cut_trial
-from physion.models.state_noise import NoiseLevels, ObservedTrial, simulate_contacts
+from physion.models.noisy_simulation import (
+    NoiseLevels,
+    ObservedTrial,
+    configuration_half,
+    cut_trial,
+    simulate_contacts,
+)
 from physion.physics.engine import make_engine, simulate
 from physion.physics.rigid.bodies import collision_hulls, hull_moments
 from physion.scenes.scene import OBSERVED_FRAMES, Body, Scene

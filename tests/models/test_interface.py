@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from importlib.metadata import EntryPoint
 from typing import Any
 
 import numpy as np
@@ -13,12 +12,9 @@ import pytest
 import torch
 from torch import nn
 
-import physion.core.registry
 from physion.clips.batch import clip_frames, join_batches
-from physion.core.errors import BadInputError, MissingExtraError, UnknownNameError
-from physion.core.registry import Registry
-from physion.models import Batch, Provenance, Spec, build_model, models
-from physion.models.build import ModelFactory
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.models import Batch, Spec, build_model, models
 from physion.models.interface import Model, can
 from physion.readout.predictor import ways
 from support.tiny_models import FROZEN, TINY, tiny
@@ -161,20 +157,6 @@ def test_every_frozen_encoder_encodes_imagines_and_learns(name: str) -> None:
     assert sum(float(g.abs().sum()) > 0 for g in gradients) >= 2
 
 
-def test_dynamics_that_add_nothing_are_as_good_as_the_baseline() -> None:
-    model = tiny("frozen-encoder")
-    features = torch.randn(3, 12, model.feature_size)
-    batch = clips(None, features)
-    model.prepare(batch)
-    assert float(model.loss(batch)["loss"].detach()) == pytest.approx(float(model.baseline(batch)))
-
-
-@pytest.mark.parametrize("name", FROZEN)
-def test_pictures_of_another_size_are_refused(name: str) -> None:
-    with pytest.raises(BadInputError, match="64, 64"):
-        tiny(name).encode(clips(torch.zeros(1, 7, 32, 32, 3, dtype=torch.uint8)))
-
-
 @pytest.mark.parametrize("name", models.names())
 def test_unknown_options_get_the_closest_ones(name: str) -> None:
     with pytest.raises(UnknownNameError, match=f"option of model {name} 'sampels'"):
@@ -190,37 +172,20 @@ def test_unknown_names_get_the_closest_ones() -> None:
         build_model("frozen-encoder", **{**TINY, "dynamics": "gru"})
 
 
-class _Foreign(nn.Module):
-    """Model as another package would define it."""
-
-    spec = Spec(image_size=8)
-
-    def provenance(self) -> Provenance:
-        return Provenance("foreign", "none")
-
-
-def test_another_package_adds_a_model_by_an_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
-    def points(group: str) -> list[EntryPoint]:
-        return [EntryPoint("foreign", f"{__name__}:_Foreign", group)]
-
-    monkeypatch.setattr(physion.core.registry, "entry_points", points)
-    fresh: Registry[ModelFactory] = Registry("model")
-    assert fresh.names() == ["foreign"]
-    assert fresh.get("foreign")().provenance().model == "foreign"
-
-
-def test_simulators_run_without_torch_and_others_name_the_extra() -> None:
+def test_simulators_and_baselines_run_without_torch_and_others_name_the_extra() -> None:
     code = """
 import sys
 class Absent:
     def find_spec(self, name, path=None, target=None):
-        if name in ("torch", "timm", "torchvision", "safetensors", "lightning_fabric"):
+        if name in ("torch", "timm", "torchvision", "safetensors", "lightning_fabric", "av"):
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 sys.meta_path.insert(0, Absent())
 import physion.readout
 from physion.core.errors import MissingExtraError
 from physion.models import build_model
-build_model("noisy-simulation")
+for name in ("noisy-simulation", "chance", "state-classifier", "already-touched",
+             "constant-motion", "blob-centroids", "copy-last-frame"):
+    build_model(name)
 try:
     build_model("pVGG-mlp")
 except MissingExtraError as error:
@@ -228,13 +193,3 @@ except MissingExtraError as error:
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "physion-benchmark[models]" in done.stdout
-
-
-def test_missing_libraries_of_other_kinds_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(name: str) -> None:
-        raise ModuleNotFoundError(f"No module named {name}", name="something_else")
-
-    monkeypatch.setattr(models, "get", missing)
-    with pytest.raises(BadInputError, match="library 'something_else'"):
-        build_model("pVGG-mlp")
-    assert not issubclass(BadInputError, MissingExtraError)

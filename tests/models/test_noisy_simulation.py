@@ -5,30 +5,32 @@ from __future__ import annotations
 import dataclasses
 import re
 from dataclasses import replace
-from functools import partial
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
 import pytest
 
-from physion.compute.local import LocalExecutor
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.seeds import child_generator, trial_seed
 from physion.data.official import official
 from physion.models import Batch, Motion, build_model
 from physion.models.noisy_simulation import (
     FITTED,
+    NoiseLevels,
     NoisySimulation,
     NoisySimulationSettings,
+    ObservedTrial,
+    add_noise,
     configuration_half,
     cut_trial,
     fitted_levels,
+    simulate_contacts,
 )
-from physion.models.state_noise import NoiseLevels, add_noise, simulate_contacts
 from physion.numerics.elementary import exp_of, standard_normal
-from physion.physics.engine import make_engine, simulate
+from physion.physics.engine import simulate
 from physion.physics.trajectory import Contacts, State, Trajectory
-from physion.scenes.scene import Body, Camera, Cloth, Joint, Push, Roles, Scene
+from physion.scenes.scene import Body, Camera, Cloth, Joint, Roles, Scene
 from support.paths import ROOT
 
 FRAMES = 120
@@ -106,28 +108,53 @@ def context(trial: Scene, truth: Trajectory) -> Batch:
     return Batch((trial.name,), frames, np.ones((1, 1), np.bool_), state=(Motion(trial, truth),))
 
 
+def observed(trial: Scene, engine: StraightEngine | None = None) -> ObservedTrial:
+    """Return the observed part of a trial in which everything moves straight on."""
+    return cut_trial(trial, (engine or StraightEngine()).simulate(trial))
+
+
 def fraction(simulation: NoisySimulation, trial: Scene, truth: Trajectory) -> float:
-    """Return the fraction of simulations with a contact, at the scale of the config."""
+    """Return the fraction of simulations with a contact, at the scale of the settings."""
     found = simulation.imagine(context(trial, truth), simulation.samples, simulation.seed)
     return float(found.contact.mean())
 
 
-def test_without_noise_it_says_what_happens() -> None:
-    for offset, expected in ((0.0, 1.0), (0.4, 1.0), (0.6, 0.0), (3.0, 0.0)):
+def test_the_fraction_of_contacts_is_that_of_a_straight_line_with_noise() -> None:
+    """Ball and box touch if they pass each other closer than 0.5 m. With noise of their places
+    only, the lateral distance d has the standard deviation 0.1 sqrt(2), and
+
+        P(contact) = P(|d| < 0.5),
+
+    with the trial's own answer where nothing is added."""
+    counts = 400
+    for offset in (0.0, 0.4, 0.5, 0.6, 3.0):
         trial = scene(offset)
         truth = StraightEngine().simulate(trial)
-        sure = model(scale=0.0)
-        assert fraction(sure, trial, truth) == expected
+        assert fraction(model(scale=0.0), trial, truth) == (offset < 0.5)
+        found = fraction(model(position=0.1, velocity=0.0, samples=counts), trial, truth)
+        low, high = (NormalDist(offset, 0.1 * 2**0.5).cdf(edge) for edge in (-0.5, 0.5))
+        expected = high - low
+        # The sampled positions lie 2 cm apart, so that a path may pass between two of them.
+        spread = 4 * (expected * (1 - expected) / counts) ** 0.5 + 0.01
+        assert found == pytest.approx(expected, abs=spread)
 
 
-def test_noise_makes_close_calls_uncertain_and_clear_ones_not() -> None:
-    shares = {}
-    for offset in (0.0, 0.5, 3.0):
-        trial = scene(offset)
-        truth = StraightEngine().simulate(trial)
-        shares[offset] = fraction(model(samples=200), trial, truth)
-    assert shares[0.0] == 1.0 and shares[3.0] == 0.0
-    assert 0.2 < shares[0.5] < 0.8
+def test_it_simulates_from_frame_44_with_the_noise_of_seed_and_scale_of_the_call() -> None:
+    trial, engine = scene(0.5), StraightEngine()
+    simulation = NoisySimulation(NoisySimulationSettings(samples=2), engine)
+    batch = context(trial, engine.simulate(trial))
+    for seed, scale in ((0, 1.0), (1, 1.0), (0, 9.0)):
+        engine.starts.clear()
+        simulation.imagine(batch, 2, seed, scale=scale)
+        question = observed(trial)
+        for sample, start in enumerate(engine.starts):
+            _, expected = add_noise(question, simulation.settings, scale, sample, seed)
+            assert start.frame == 44 and question.state.positions[0, 0] == pytest.approx(0.88)
+            assert np.array_equal(start.velocities, expected.velocities)
+            assert np.array_equal(start.positions, expected.positions)
+        assert len(engine.starts) == 2
+    ending = engine.scenes[0].ending
+    assert (ending.min_frames, ending.max_frames) == (151 - 44, 302 - 44)
 
 
 def test_contact_that_was_seen_needs_no_simulation() -> None:
@@ -159,19 +186,9 @@ def test_nothing_after_the_observed_part_can_change_the_answer() -> None:
     assert fraction(model(), trial, shorter) == expected
 
 
-def test_it_continues_from_the_last_observed_frame_under_the_trials_own_ending() -> None:
-    trial = scene(0.5)
-    engine = StraightEngine()
-    truth = engine.simulate(trial)
-    fraction(NoisySimulation(NoisySimulationSettings(samples=2), engine), trial, truth)
-    assert [start.frame for start in engine.starts] == [44, 44]
-    ending = engine.scenes[0].ending
-    assert (ending.min_frames, ending.max_frames) == (151 - 44, 302 - 44)
-
-
 def test_noise_has_the_stated_size_and_spares_what_cannot_move() -> None:
     trial = scene()
-    question = cut_trial(trial, StraightEngine().simulate(trial))
+    question = observed(trial)
     config = NoisySimulationSettings(position=0.1, velocity=0.3, mass=0.2)
     pairs = [add_noise(question, config, 2.0, sample, 0) for sample in range(400)]
     places = np.array([state.positions for _, state in pairs]) - question.state.positions
@@ -201,7 +218,7 @@ def test_joined_bodies_move_together_and_a_cloth_moves_whole() -> None:
 
 def test_noise_of_the_pose_matches_bodies_in_the_air() -> None:
     trial = scene()
-    question = cut_trial(trial, StraightEngine().simulate(trial))
+    question = observed(trial)
     config = NoisySimulationSettings(
         vertical=0.1, rotation=0.2, angular_velocity=0.5, friction=0.3, position=0.0
     )
@@ -220,31 +237,93 @@ def test_noise_of_the_pose_matches_bodies_in_the_air() -> None:
     grip = np.log([noisy.bodies[1].contact.static_friction / 0.5 for noisy, _ in pairs])
     assert grip.std() == pytest.approx(0.6, rel=0.15)
     assert np.linalg.norm(turned, axis=-1) == pytest.approx(np.ones((400, 3)))
-
-
-def test_bodies_that_touch_something_are_not_lifted() -> None:
-    trial = scene()
-    question = cut_trial(trial, StraightEngine().simulate(trial))
+    # A body that touches something is not lifted, and turns about the vertical only.
     resting = replace(question, touching=frozenset({0}))
-    config = NoisySimulationSettings(vertical=0.1, rotation=0.2)
     _, state = add_noise(resting, config, 1.0, 0, 0)
     assert (state.positions[:, 2] == question.state.positions[:, 2]).all()
     assert not state.rotations[0, 1:3].any() and state.rotations[0, 3] != 0
-
-
-def test_a_level_of_zero_leaves_the_random_numbers_of_the_others() -> None:
-    trial = scene()
-    question = cut_trial(trial, StraightEngine().simulate(trial))
-    _, base = add_noise(question, NoisySimulationSettings(), 1.0, 3, 0)
-    _, more = add_noise(question, NoisySimulationSettings(vertical=0.1, friction=0.2), 1.0, 3, 0)
+    # These levels have random numbers of their own.
+    _, base = add_noise(question, replace(config, vertical=0.0, friction=0.0), 1.0, 3, 0)
+    _, more = add_noise(question, config, 1.0, 3, 0)
     assert np.array_equal(base.velocities, more.velocities)
     assert np.array_equal(base.positions[:, :2], more.positions[:, :2])
-    assert np.array_equal(base.rotations, question.state.rotations)
+
+
+class ScriptedEngine(StraightEngine):
+    """Engine of straight motion with given contacts, by frame of the whole trial.
+
+    The bodies of the pair lose their velocity in the frame of a contact.
+    """
+
+    def __init__(self, *contacts: tuple[int, int, int]) -> None:
+        super().__init__()
+        self.contacts = contacts
+
+    def simulate(
+        self,
+        scene: Scene,
+        *,
+        start: State | None = None,
+        frames: int | None = None,
+        until_contact: bool = False,
+    ) -> Trajectory:
+        path = super().simulate(scene, start=start)
+        first = 0 if start is None else start.frame
+        rows = [(frame - first, a, b) for frame, a, b in self.contacts if frame >= first]
+        velocities = path.velocities.copy()
+        for frame, *pair in rows:
+            velocities[frame:, [body for body in pair if body >= 0]] = 0.0
+        count = len(rows)
+        contacts = replace(
+            Contacts.empty(),
+            frame=np.array([row[0] for row in rows], np.int32),
+            bodies=np.array([row[1:] for row in rows], np.int32).reshape(count, 2),
+            point=np.zeros((count, 3), np.float32),
+            normal=np.zeros((count, 3), np.float32),
+            impulse=np.ones(count, np.float32),
+        )
+        return replace(path, velocities=velocities, contacts=contacts)
+
+
+def kicked(engine: ScriptedEngine, level: float = 0.2, samples: int = 300) -> list[State]:
+    """Return the states from which bodies go on after a kick."""
+    trial = scene(3.0)
+    levels = NoiseLevels(position=0.0, velocity=0.0, mass=0.0, contact=level)
+    simulate_contacts(observed(trial), levels, 2.0, samples, 0, engine)
+    return engine.starts[samples:]
+
+
+def test_bodies_are_kicked_at_a_new_contact_by_their_speed_before_it() -> None:
+    """Ball and wall meet at frame 60 at 2 m/s; the noise is 0.2 x 2 of that, and none for walls."""
+    starts = kicked(ScriptedEngine((60, 0, 2)))
+    assert len(starts) == 300 and {start.frame for start in starts} == {60}
+    kicks = np.array([start.velocities for start in starts])
+    assert kicks[:, 0].std(0) == pytest.approx(np.full(3, 0.2 * 2 * 2.0), rel=0.15)
+    assert abs(kicks[:, 0].mean(0)).max() < 0.2 and not kicks[:, 1:].any()
+    assert [start.positions[0, 0] for start in starts[:2]] == pytest.approx([1.2, 1.2])
+    both = np.array([s.velocities for s in kicked(ScriptedEngine((60, 0, 1), (70, 1, 2)))])
+    assert not both.size, "after a contact of agent and patient nothing counts"
+
+
+@pytest.mark.parametrize(
+    ("contacts", "frames"),
+    [
+        ([(60, -1, 0)], []),  # the floor
+        ([(44, 0, 2)], []),  # known already
+        ([(119, 0, 2)], []),  # the last frame
+        ([(60, -1, 0), (70, 0, 2)], [70]),
+        ([(60, 0, 2), (70, 1, 2), (80, 0, 2)], [60, 70]),  # each pair once
+    ],
+)
+def test_contacts_that_count_as_new(
+    contacts: list[tuple[int, int, int]], frames: list[int]
+) -> None:
+    assert [start.frame for start in kicked(ScriptedEngine(*contacts), samples=1)] == frames
 
 
 def test_lapses_are_answers_at_random() -> None:
     trial = scene(0.0)
-    question = cut_trial(trial, StraightEngine().simulate(trial))
+    question = observed(trial)
     found = {
         lapse: np.mean(
             simulate_contacts(
@@ -262,54 +341,9 @@ def test_lapses_are_answers_at_random() -> None:
     assert found[0.4] == pytest.approx(0.8, abs=0.04) and found[1.0] == pytest.approx(0.5, abs=0.05)
 
 
-def relayed() -> Scene:
-    """Return a scene in which a pushed ball hits another one, which then rolls into a box."""
-    return Scene(
-        "relayed",
-        "collide",
-        (
-            Body("first", "sphere", (-6.5, 0.0, 0.0), (0.3, 0.3, 0.3)),
-            Body("second", "sphere", (0.0, 0.0, 0.0), (0.3, 0.3, 0.3)),
-            Body("box", "cube", (1.6, 0.0, 0.0), (0.3, 0.3, 0.3)),
-        ),
-        Roles("second", "box"),
-        Camera((3.0, 0.0, 1.0)),
-        pushes=(Push("first", (16.0, 0.0, 0.0)),),
-    )
-
-
-def test_noise_at_contacts_acts_where_bodies_meet() -> None:
-    """Without a contact nothing changes; after one, the paths spread."""
-    still = NoisySimulationSettings(position=0.0, velocity=0.0, mass=0.0)
-    noisy = replace(still, contact=0.4)
-    missed, hit = rolling(3.0), relayed()
-    engine = make_engine("physion")
-    for trial, changes in ((missed, False), (hit, True)):
-        question = cut_trial(trial, simulate(trial))
-        found = [simulate_contacts(question, c, 1.0, 24, 0, engine) for c in (still, noisy)]
-        assert len(set(found[0])) == 1
-        assert (found[0] != found[1]) is changes
-    assert found[1] == simulate_contacts(question, noisy, 1.0, 24, 0, engine)
-
-
-def test_noise_depends_only_on_seed_trial_and_sample() -> None:
-    truth = StraightEngine().simulate(scene())
-
-    def state(seed: int, name: str, sample: int) -> list[float]:
-        question = cut_trial(scene(name=name), truth)
-        _, noisy = add_noise(question, NoisySimulationSettings(), 1.0, sample, seed)
-        return noisy.positions.ravel().tolist()
-
-    assert state(0, "a", 0) == state(0, "a", 0)
-    assert (
-        len({tuple(state(*key)) for key in ((0, "a", 0), (1, "a", 0), (0, "b", 0), (0, "a", 1))})
-        == 4
-    )
-
-
-def test_noise_matches_the_platform_independent_functions() -> None:
+def test_noise_is_that_of_the_platform_independent_functions() -> None:
     trial = scene()
-    question = cut_trial(trial, StraightEngine().simulate(trial))
+    question = observed(trial)
     config = NoisySimulationSettings(position=0.1, velocity=0.3, mass=0.2)
     noisy, state = add_noise(question, config, 2.0, 7, config.seed)
     rng = child_generator(trial_seed(config.seed, trial.scenario, trial.name, 7), "noise")
@@ -331,47 +365,23 @@ def test_the_digest_follows_all_that_decides_a_simulation(monkeypatch: pytest.Mo
     assert model().digest() != before
 
 
-def test_seed_and_scale_of_the_rollouts_match_the_call() -> None:
-    trial = scene(0.5)
-    truth = StraightEngine().simulate(trial)
-    batch = context(trial, truth)
-
-    def contacts(seed: int, **arguments: float) -> list[bool]:
-        found: list[bool] = model().imagine(batch, 30, seed, **arguments).contact[0].tolist()
-        return found
-
-    assert contacts(0) == contacts(0) == contacts(0, scale=1.0)
-    assert contacts(0) != contacts(1) and contacts(0) != contacts(0, scale=9.0)
-
-
 @pytest.mark.parametrize(
     "wrong", [{"samples": 0}, {"position": -1.0}, {"scales": ()}, {"lapse": 1.5}, {"contact": -1.0}]
 )
 def test_impossible_settings_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(BadInputError):
         NoisySimulationSettings(**wrong)
-    with pytest.raises(BadInputError, match="fewer than the 45"):
-        cut_trial(scene(), replace_length(StraightEngine().simulate(scene()), 44))
 
 
-def replace_length(trajectory: Trajectory, frames: int) -> Trajectory:
+def test_trials_that_are_short_or_have_no_motion_are_refused() -> None:
+    whole = StraightEngine().simulate(scene())
     names = ("positions", "rotations", "velocities", "angular_velocities", "cloth_vertices")
-    return replace(trajectory, **{name: getattr(trajectory, name)[:frames] for name in names})
-
-
-def rolling(offset: float) -> Scene:
-    """Return a scene with a ball that is pushed towards a cube two metres away."""
-    return Scene(
-        f"rolling {offset}",
-        "collide",
-        (
-            Body("ball", "sphere", (-1.0, offset, 0.0), (0.3, 0.3, 0.3)),
-            Body("box", "cube", (1.0, 0.0, 0.0), (0.4, 0.4, 0.4)),
-        ),
-        Roles("ball", "box"),
-        Camera((3.0, 0.0, 1.0)),
-        pushes=(Push("ball", (4.0, 0.0, 0.0)),),
-    )
+    short = replace(whole, **{name: getattr(whole, name)[:44] for name in names})
+    with pytest.raises(BadInputError, match="fewer than the 45"):
+        cut_trial(scene(), short)
+    unknown = replace(whole, positions=np.full_like(whole.positions, np.nan))
+    with pytest.raises(BadInputError, match="imported without motion"):
+        cut_trial(scene(), unknown)
 
 
 def falling(offset: float) -> Scene:
@@ -402,33 +412,6 @@ def test_with_the_real_engine_hit_and_miss_differ() -> None:
     assert answers == [1.0, 0.0]
 
 
-@pytest.mark.slow
-def test_other_processes_give_the_same_answers() -> None:
-    real = build_model("noisy-simulation", samples=4)
-    assert isinstance(real, NoisySimulation)
-    batches = {}
-    for offset in (0.25, 0.35):
-        trial = rolling(offset)
-        batches[trial.name] = context(trial, simulate(trial))
-    imagine = partial(_imagine_four, real)
-    outcomes = {o.key: o.value for o in LocalExecutor(2).map(imagine, batches)}
-    assert outcomes == {key: imagine(batch) for key, batch in batches.items()}
-
-
-def _imagine_four(simulation: NoisySimulation, batch: Batch) -> list[bool]:
-    found: list[bool] = simulation.imagine(batch, 4, 0).contact[0].tolist()
-    return found
-
-
-def test_trials_without_motion_are_refused() -> None:
-    motion = StraightEngine().simulate(scene())
-    unknown = replace(
-        motion, positions=np.full_like(motion.positions, np.nan), engine="imported: movie alone"
-    )
-    with pytest.raises(BadInputError, match="imported without motion"):
-        cut_trial(scene(), unknown)
-
-
 # Levels of noise that were fitted to outcomes and to people, and the models that use them.
 
 
@@ -457,39 +440,18 @@ def test_scenes_of_a_configuration_are_in_one_half_and_both_halves_are_used() ->
 def test_levels_are_those_fitted_on_the_other_half(half: int) -> None:
     for target, levels in FITTED.items():
         assert fitted_levels(target, scene_of(half)) == levels[1 - half]
-
-
-@pytest.mark.parametrize("half", [0, 1])
-def test_the_model_simulates_with_these_levels(half: int) -> None:
-    scene = scene_of(half)
-    levels = dataclasses.asdict(FITTED["people"][1 - half])
-    motion = Motion(scene, simulate(scene, frames=45))
-    frames, valid = np.array([[44]]), np.ones((1, 1), np.bool_)
-    batch = Batch((scene.name,), frames, valid, state=(motion,))
-    fitted = build_model("noisy-simulation-people").imagine(batch, 20, 0)
-    given = build_model("noisy-simulation", **levels).imagine(batch, 20, 0)
-    assert np.array_equal(fitted.contact, given.contact)
+        simulation: Any = build_model(f"noisy-simulation-{target}")
+        assert simulation.levels_for(scene_of(half)) == levels[1 - half]
+        assert simulation.arguments == {"scale": (1.0,)}, "nothing is fitted to the trials at hand"
 
 
 def test_the_table_of_predictions_says_what_the_noise_was_fitted_to() -> None:
+    names = ("noisy-simulation", *(f"noisy-simulation-{name}" for name in FITTED))
+    assert len({build_model(name).digest() for name in names}) == 3
     names = {build_model(f"noisy-simulation-{name}").provenance() for name in FITTED}
     assert {p.model for p in names} == {"noisy-simulation-outcomes", "noisy-simulation-people"}
     assert all(p.dynamics_training_task.startswith("noise fitted to") for p in names)
     assert build_model("noisy-simulation").provenance().dynamics_training_task == ""
-
-
-def test_fitted_levels_have_digests_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    names = ("noisy-simulation", *(f"noisy-simulation-{name}" for name in FITTED))
-    digests = {build_model(name).digest() for name in names}
-    assert len(digests) == 3
-    other = {**FITTED, "people": (FITTED["people"][0], NoiseLevels(velocity=9.0))}
-    monkeypatch.setattr("physion.models.noisy_simulation.FITTED", other)
-    assert build_model("noisy-simulation-people").digest() not in digests
-
-
-def test_nothing_is_fitted_to_the_trials_at_hand() -> None:
-    assert build_model("noisy-simulation-people").arguments == {"scale": (1.0,)}
-    assert build_model("noisy-simulation").arguments == {"scale": (0.5, 1.0, 2.0)}
 
 
 def test_levels_are_fitted_or_given() -> None:
@@ -497,12 +459,6 @@ def test_levels_are_fitted_or_given() -> None:
         build_model("noisy-simulation-people", velocity=0.3)
     with pytest.raises(UnknownNameError, match="'noisy-simulation-persons'"):
         build_model("noisy-simulation-persons")
-
-
-def test_a_scene_without_a_configuration_counts_by_its_name() -> None:
-    scene = replace(scene_of(0), parameters={})
-    halves = {configuration_half(replace(scene, name=f"scene {i}")) for i in range(20)}
-    assert halves == {0, 1}
 
 
 def test_levels_are_those_that_the_benchmark_printed() -> None:

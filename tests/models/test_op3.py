@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,9 +12,8 @@ from torch import Tensor, nn
 from torch.distributions import Categorical, Independent, MixtureSameFamily, Normal
 
 from physion.clips.batch import Batch
-from physion.core.errors import BadInputError
 from physion.models.build import build_model, make_settings
-from physion.models.checkpoint import tensors_of, write_checkpoint
+from physion.models.checkpoint import tensors_of
 from physion.models.op3 import (
     BroadcastConv,
     Decoded,
@@ -203,7 +201,7 @@ def test_sizes_and_their_names() -> None:
     assert tiny(density="released").digest() != tiny().digest()
 
 
-def test_weights_fit_any_number_of_slots(tmp_path: Path) -> None:
+def test_weights_fit_any_number_of_slots() -> None:
     model = build_model("op3", slots=7, weights="random")
     assert isinstance(model, Op3) and model.name == "op3-small-7-slots"
     assert model.encode(squares(1, 2, model.spec)).shape == (1, 2, 7 * 32)
@@ -254,7 +252,60 @@ def test_futures_follow_from_seed_and_name_of_the_trial() -> None:
     assert torch.allclose(masks.sum(3), torch.ones(3, 3, 3, 16, 16), atol=1e-5)
 
 
-def test_masks_of_seen_frames_match_their_refined_slots() -> None:
+def test_a_future_goes_on_from_samples_with_noise_of_their_own() -> None:
+    """Step by step: the dynamics see z = mean + sqrt(softplus(raw) + 1e-5) noise of that step, and
+    the features hold the mean."""
+    model = tiny()
+    context = context_of(model)
+    with torch.no_grad():
+        for head in (model.slots.dynamics.mean, model.slots.dynamics.raw):
+            head[-1].weight.normal_()
+        found = model.imagine(context, 2, 7).features
+        pictures = normalized_pictures(context, model.spec, model.name)
+        last = model._watch(pictures)[1][-1]
+        noise = model.imagined_noise(context.trials, 7, (2, 4, 3, 5)).float()
+        assert noise.shape == (4, 4, 3, 5) and len(noise.unique()) == noise.numel()
+        fixed, mean, raw = (
+            part.repeat_interleave(2, 0) for part in (last.deterministic, last.mean, last.raw)
+        )
+        for step in range(3):
+            z = mean + (nn.functional.softplus(raw) + 1e-5).sqrt() * noise[:, step]
+            changes = model.slots.dynamics(torch.cat([fixed, z], -1))
+            fixed, mean, raw = fixed + changes[0], z + changes[1], raw + changes[2]
+            expected = torch.cat([fixed, mean], -1).flatten(1).view(2, 2, -1)
+            assert torch.allclose(found[:, :, step], expected, atol=1e-4)
+
+
+def test_every_step_of_a_training_has_noise_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The start, 2 + 1 refinements with what is seen, and 3 predictions."""
+    model, drawn = tiny().train(), []
+    randn = torch.randn
+
+    def recorded(*size: int) -> Tensor:
+        drawn.append(randn(*size))
+        return drawn[-1]
+
+    monkeypatch.setattr(torch, "randn", recorded)
+    model.loss(squares(2, model.window, model.spec))
+    assert [value.shape for value in drawn] == [(2, 3, 5)] * (1 + 3 + 3)
+    assert len({float(value.sum()) for value in drawn}) == len(drawn)
+
+
+def test_the_loss_is_by_pixel_with_beta_times_the_divergence() -> None:
+    losses = []
+    for beta in (0.0, 0.5):
+        model = tiny(beta=beta).train()
+        torch.manual_seed(0)
+        model.slots.refine = lambda explained, picture, noise: explained.slots  # type: ignore
+        losses.append(model.loss(squares(2, model.window, model.spec)))
+    for beta, parts in zip((0.0, 0.5), losses, strict=True):
+        expected = parts["nll"] + beta * parts["kl"] / 16**2
+        assert parts["loss"].item() == pytest.approx(expected.item(), rel=1e-6)
+    assert losses[0]["kl"].item() == pytest.approx(losses[1]["kl"].item(), rel=1e-6)
+    assert losses[0]["kl"] > 0.1
+
+
+def test_masks_of_seen_frames_are_those_of_their_refined_slots() -> None:
     model = tiny()
     context = context_of(model, 2)
     shown = model.imagine(context, 3, 7, show=1.0).shown
@@ -299,29 +350,3 @@ def test_every_weight_is_trained() -> None:
     model = tiny().train()
     model.loss(squares(2, model.window, model.spec))["loss"].backward()
     assert all(weight.grad is not None for weight in model.parameters())
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"slots": 0}, "slots must be at least 1"),
-        ({"samples": 0}, "samples must be at least 1"),
-        ({"size": "large"}, "sizes small, paper, released"),
-        ({"slots": 9}, "shipped weights of op3 are for slots=5, not 9"),
-    ],
-)
-def test_wrong_options_are_refused(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(BadInputError, match=message):
-        build_model("op3", **options)
-
-
-def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "model.safetensors"
-    model = build_model("op3")
-    assert isinstance(model, Op3)
-    write_checkpoint(path, tensors_of(tiny()), {"built_as": model.built_as()})
-    with pytest.raises(BadInputError, match=r"slots\.deterministic is float32 \(4,\)"):
-        build_model("op3", weights=str(path))
-    write_checkpoint(path, tensors_of(model), {"built_as": {"model": "svg-small", "version": 1}})
-    with pytest.raises(BadInputError, match="model was svg-small and is op3-small"):
-        build_model("op3", weights=str(path))

@@ -47,9 +47,34 @@ def test_values_of_another_type_are_one_line(option: str, says: str) -> None:
     assert "\n" not in str(error.value) and len(str(error.value)) < 300
 
 
-def test_a_choice_is_checked() -> None:
-    with pytest.raises(BadInputError, match="pooling of model frozen-encoder must be"):
-        build_model("frozen-encoder", pooling="other")
+@pytest.mark.parametrize(
+    ("name", "options", "says"),
+    [
+        ("frozen-encoder", {"pooling": "other"}, "pooling of model frozen-encoder must be"),
+        ("frozen-encoder", {"fine_tuned": True, "distillation": 0.0}, "must be above 0"),
+        ("frozen-encoder", {"fine_tuned": True, "standardised": False}, "standardised=true"),
+        ("pVGG-mlp", {"size": "released", "fine_tuned": True}, "trains no encoder"),
+        ("svg", {"backbone": "resnet"}, "must be 'dcgan' or 'vgg'"),
+        ("svg", {"image_size": 48}, "image_size must be 16, 32, 64, 128 or 256, not 48"),
+        ("svg", {"samples": 0}, "samples must be at least 1"),
+        ("svg", {"size": "large"}, "sizes small, paper, released"),
+        ("op3", {"slots": 0}, "slots must be at least 1"),
+        ("dpi", {"size": "huge"}, "sizes small, paper"),
+        ("dpi", {"samples": 1.5}, "samples of model dpi must be a whole number"),
+        ("dpi", {"stride": 2}, "stride of model dpi must be 1 or 3"),
+        ("dpi", {"spread": -1.0}, "spread must be at least 0"),
+        ("dpi", {"weights": "shipped", "size": "paper"}, "no weights are shipped for dpi-paper"),
+        ("constant-motion", {"frames": 0}, "frames must be at least 1"),
+        ("already-touched", {"margin": 0.5}, "margin must be at least 0 and below 0.5"),
+        ("state-classifier", {"trees": 0}, "trees and leaf"),
+    ],
+)
+def test_values_that_make_no_model_are_one_line(
+    name: str, options: dict[str, Any], says: str
+) -> None:
+    with pytest.raises(BadInputError, match=says) as error:
+        build_model(name, **options)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("name", models.names())

@@ -87,11 +87,6 @@ def test_evaluation_finds_what_was_trained_before(made: Dataset, tmp_path: Path)
             function(model, made, tmp_path, options={"channels": 4})  # type: ignore[operator]
 
 
-def test_the_examples_are_short() -> None:
-    lengths = {path.name: len(path.read_text().splitlines()) for path in EXAMPLES.glob("*.py")}
-    assert len(lengths) == 3 and max(lengths.values()) < 40, lengths
-
-
 def test_the_rule_follows_the_gap_of_the_boxes() -> None:
     rule: Any = physion.build_model(f"{EXAMPLES / 'my_rule.py'}:MyRule", scale=0.5)
     boxes = np.zeros((3, 1, 2, 4), np.float32)

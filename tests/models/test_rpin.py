@@ -207,6 +207,19 @@ def test_an_untrained_network_predicts_that_nothing_moves() -> None:
     assert torch.allclose(shown[:, 0, :, :2], last[:, None].expand(-1, 11, -1, -1), atol=1e-6)
 
 
+def test_what_is_decoded_moves_the_boxes_by_units_a_step() -> None:
+    """Step s adds s times the decoded change of centre and size to the last observed box."""
+    model = model_of()
+    decoded = torch.tensor([0.5, -1.0, 0.25, -0.5])
+    with torch.no_grad():
+        model.dynamics.decode.bias.copy_(decoded)
+        context = squares(2, model.spec.context, model.spec)
+        shown = model.imagine(context, 1, 0).shown["boxes"][:, 0, :, :2]
+    last = to_center(context.boxes)[:, -1:, :2]
+    steps = torch.arange(1.0, 12.0)[:, None, None]
+    assert torch.allclose(to_center(shown), last + steps * 0.02 * decoded, atol=1e-5)
+
+
 def test_the_distance_of_given_boxes() -> None:
     """Half the square up to one unit, linear beyond; what does not count is left out."""
     model = model_of()

@@ -164,12 +164,10 @@ def test_published_checkpoints_are_read_with_all_tensors(name: str, tmp_path: Pa
 def test_weights_of_another_network_name_the_tensors_that_differ(name: str, tmp_path: Path) -> None:
     paths = files(tmp_path)
     other = paths[NAMES[1 - NAMES.index(name)]]
-    with pytest.raises(
-        BadInputError, match=rf"'{name}': its tensors differ, \d+ missing"
-    ) as caught:
+    with pytest.raises(BadInputError, match=rf"'{name}': \S+ is missing; .*and \d+ more") as caught:
         make(name, weights=str(other))
     assert "\n" not in str(caught.value)
-    with pytest.raises(BadInputError, match=r"of another shape \('embeddings\.patch"):
+    with pytest.raises(BadInputError, match=r"embeddings\.patch\S+ is \(24, .* in the model"):
         make(name, weights=str(paths[name]), width=48)
     with pytest.raises(BadInputError, match="no such file"):
         make(name, weights=str(tmp_path / "absent.safetensors"))

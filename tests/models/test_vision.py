@@ -17,8 +17,6 @@ from physion.models.build import build_model
 from physion.models.checkpoint import (
     WEIGHTS,
     DamagedFileError,
-    read_checkpoint,
-    shipped_digests,
     tensors_of,
     write_checkpoint,
 )
@@ -260,16 +258,6 @@ def test_weights_of_another_architecture_are_refused_by_name(name: str, tmp_path
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_shipped_weights_load_or_are_said_to_be_missing(name: str) -> None:
-    digests = shipped_digests()
-    if f"{name}-small" not in digests:
-        with pytest.raises(BadInputError, match=f"no weights are shipped for {name}-small"):
-            model_of(name, weights="shipped")
-    else:
-        assert model_of(name, weights="shipped").init.startswith("shipped:")
-
-
-@pytest.mark.parametrize("name", NAMES)
 def test_a_digest_belongs_to_the_size(name: str) -> None:
     sizes = ("small", "paper", "released")
     built = {size: model_of(name, size=size) for size in sizes}
@@ -309,14 +297,6 @@ def test_clips_of_another_size_or_length_or_with_missing_frames_are_refused(name
     valid[1, frames - 1] = False
     with pytest.raises(BadInputError, match=rf"squares_0001.*up to frame {spec.stride * 6}"):
         model.imagine(with_arrays(context, valid=valid), 1, 0)
-
-
-def test_checkpoints_hold_no_code(tmp_path: Path) -> None:
-    model = model_of("cswm")
-    path = tmp_path / "model.safetensors"
-    write_checkpoint(path, tensors_of(model), {})
-    tensors, _ = read_checkpoint(path)
-    assert set(tensors) == {f"model/{name}" for name in model.state_dict()}
 
 
 # Error where something moves, and divergence of Gaussians: closed forms.

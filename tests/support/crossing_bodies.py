@@ -114,6 +114,7 @@ def replace_future(motion: Motion, seed: int = 0) -> Motion:
         replace(
             path,
             contacts=contacts,
+            completed=not path.completed,
             cloth_distance=noisy(path.cloth_distance),
             **{name: noisy(getattr(path, name)) for name in arrays},
         ),

@@ -16,12 +16,19 @@ SIDE, MARGIN = 0.2, 0.15
 """Side of the squares, and least distance of their centres from the edge of the picture."""
 
 
-def squares(clips: int, frames: int, spec: Spec, seed: int = 0, count: int = 2) -> Batch:
-    """Return clips with ``count`` squares, as tensors; other rows of the boxes are NaN."""
+def squares(
+    clips: int, frames: int, spec: Spec, seed: int = 0, count: int = 2, fall: float = 0.0
+) -> Batch:
+    """Return clips with ``count`` squares, as tensors; other rows of the boxes are NaN.
+
+    With ``fall`` they do not move at constant speed, but fall by so much more, as part of the
+    picture's height, until the last frame.
+    """
     rng = np.random.default_rng(seed)
     ends = rng.uniform(MARGIN, 1 - MARGIN, (2, clips, 1, count, 2))
     time = np.linspace(0, 1, frames)[None, :, None, None]
     centers = ends[0] + time * (ends[1] - ends[0])
+    centers[..., 1] += fall * time[..., 0] ** 2
     edges = np.concatenate([centers - SIDE / 2, centers + SIDE / 2], -1)
     pixels = (np.arange(spec.image_size) + 0.5) / spec.image_size
     rgb = np.full((clips, frames, spec.image_size, spec.image_size, 3), BACKGROUND, np.uint8)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import os
 import secrets
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 from physion.core.errors import BadInputError, PhysionError
 
@@ -225,6 +227,14 @@ def file_sha256(path: Path) -> str:
     """Return the hexadecimal SHA-256 of a file; `OSError` if it cannot be read."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def json_digest(values: Any, parts: Iterable[bytes] = ()) -> str:
+    """Return the hexadecimal SHA-256 of JSON values, whatever the order of keys, and of bytes."""
+    sha = hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode())
+    for part in parts:
+        sha.update(part)
+    return sha.hexdigest()
 
 
 def write_with_digest(path: Path, content: bytes) -> None:

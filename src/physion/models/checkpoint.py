@@ -1,12 +1,11 @@
 """Weights of models in safetensors files, with metadata as JSON in their headers.
 
 Only safetensors and JSON are read, so that no code in a file can be executed. Weights that are kept
-have a digest file next to them (`core.files`); checkpoints of an unfinished training have none.
+have a digest file next to them (`core.files`); checkpoints of a running training have none.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import platform
 from collections.abc import Mapping
@@ -44,12 +43,6 @@ _NAMED = 3
 
 class DamagedFileError(BadInputError):
     """Error for a checkpoint that was cut or changed, or that is none."""
-
-
-def hash_config(config: Mapping[str, Any]) -> str:
-    """Return the hexadecimal SHA-256 of JSON values, independent of the order of keys."""
-    text = json.dumps(config, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def versions() -> dict[str, str]:
@@ -125,7 +118,7 @@ def is_checkpoint(path: Path) -> bool:
 
 
 def tensors_of(model: nn.Module, optimizer: Optimizer | None = None) -> dict[str, Tensor]:
-    """Return the tensors of a model and of an optimiser, by the names in a checkpoint."""
+    """Return the tensors of a model, and of an optimiser, by the names in a checkpoint."""
     tensors = {_MODEL + name: value for name, value in model.state_dict().items()}
     if optimizer is not None:
         for index, values in optimizer.state_dict()["state"].items():
@@ -141,14 +134,13 @@ def load_tensors(
 ) -> None:
     """Load tensors of the file ``path`` into a model, and into an optimiser.
 
-    Raises `BadInputError`, and changes nothing, for weights of another network; the message names
+    Raises `BadInputError`, and changes nothing, for tensors of another network; the message names
     the tensors that differ.
     """
     weights = _with_prefix(tensors, _MODEL)
-    differences = _compare_tensors(weights, model.state_dict())
-    if differences:
+    if differences := compare_tensors(weights, model.state_dict()):
         raise BadInputError(
-            f"checkpoint {path} holds the weights of another network: {_listed(differences)}"
+            f"checkpoint {path} holds the weights of another network: {differences}"
         )
     model.load_state_dict(weights)
     if optimizer is not None:
@@ -189,31 +181,28 @@ def check_same(
         )
 
 
-def describe_tensors(tensors: Mapping[str, Tensor], model: nn.Module) -> str:
-    """Return which weights of a checkpoint differ from a model's, as text; "" if none."""
-    return _listed(_compare_tensors(_with_prefix(tensors, _MODEL), model.state_dict()))
-
-
 def _with_prefix(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
 
 
-def _compare_tensors(stored: Mapping[str, Tensor], model: Mapping[str, Tensor]) -> list[str]:
-    """Return which tensors are missing, unknown, or of another shape or type."""
+def compare_tensors(
+    stored: Mapping[str, Tensor], model: Mapping[str, Tensor], *, types: bool = True
+) -> str:
+    """Return which tensors are missing, unknown, or of another shape or type, as text; "" if none.
+
+    Without ``types``, only shapes are compared.
+    """
+
+    def described(tensor: Tensor) -> str:
+        kind = f"{str(tensor.dtype).removeprefix('torch.')} " if types else ""
+        return f"{kind}{tuple(tensor.shape)}"
+
     differences = [f"{name} is missing" for name in model if name not in stored]
     differences += [f"{name} is unknown" for name in stored if name not in model]
     for name in model:
-        if name in stored:
-            old, new = stored[name], model[name]
-            if (old.shape, old.dtype) != (new.shape, new.dtype):
-                differences.append(
-                    f"{name} is {_described(old)}, and {_described(new)} in the model"
-                )
-    return differences
-
-
-def _described(tensor: Tensor) -> str:
-    return f"{str(tensor.dtype).removeprefix('torch.')} {tuple(tensor.shape)}"
+        if name in stored and (old := described(stored[name])) != (new := described(model[name])):
+            differences.append(f"{name} is {old}, and {new} in the model")
+    return _listed(differences)
 
 
 def _listed(differences: list[str]) -> str:
@@ -237,7 +226,7 @@ def _shown(values: Mapping[str, Any], key: str) -> str:
     return text if len(text) <= 20 else text[:16] + "..."
 
 
-# Weights of models that this package trained: weights that ship, and weights of a user.
+# Weights of models that this package trained: shipped weights, and weights of a user.
 
 FOLDER = "physion.data.weights"
 """Name of the folder with the weights that are installed with the package."""
@@ -261,45 +250,43 @@ def load_named(model: Any, weights: str) -> None:
     model
         Torch ``Module`` with a ``name`` and its initial weights.
     weights
-        `RANDOM`, which leaves the model as it is; `SHIPPED`; or the path of a file, or of the
-        folder of a training.
+        `RANDOM`, which leaves the model as it is; `SHIPPED`; or the path of a ``model.safetensors``
+        of ``physion train``, or of its folder.
 
     Raises
     ------
     BadInputError
-        As `load_shipped` and `load_file`.
+        If there are no such weights, or if they belong to another model, or to one that was built
+        otherwise (`BUILT_AS`).
+    DamagedFileError
+        If the file was changed.
     """
     if weights == RANDOM:
         return
     if weights == SHIPPED:
-        model.init = load_shipped(model, model.name)
+        digests = shipped_digests()
+        if model.name not in digests:
+            raise BadInputError(
+                f"no weights are shipped for {model.name}, only for {', '.join(digests)}; train it "
+                "with physion train"
+            )
+        with as_file(files(FOLDER) / f"{model.name}.safetensors") as path:
+            try:
+                _load(path, model)
+            except DamagedFileError as error:
+                raise DamagedFileError(f"{error}; install the package again") from error
+        model.init = f"shipped:{digests[model.name][:12]}"
     else:
-        model.init = load_file(model, weights)
+        path = Path(weights)
+        path = path / WEIGHTS if path.is_dir() else path
+        if not path.is_file():
+            raise BadInputError(
+                f"there are no weights at {path}; give random, shipped, or the model.safetensors "
+                "of a training"
+            )
+        _load(path, model)
+        model.init = f"local:{file_sha256(path)[:12]}"
     model.trained = True
-
-
-def load_shipped(model: nn.Module, name: str) -> str:
-    """Load the weights that come with the package, and return their origin for the tables.
-
-    Raises
-    ------
-    BadInputError
-        If there are none for the model.
-    DamagedFileError
-        If the file was changed.
-    """
-    digests = shipped_digests()
-    if name not in digests:
-        known = f"only for {', '.join(digests)}" if digests else "nor for any other model"
-        raise BadInputError(
-            f"no weights are shipped for {name}, {known}; train it with physion train"
-        )
-    with as_file(files(FOLDER) / f"{name}.safetensors") as path:
-        try:
-            _load(path, model)
-        except DamagedFileError as error:
-            raise DamagedFileError(f"{error}; install the package again") from error
-    return f"shipped:{digests[name][:12]}"
 
 
 def trained_file(path: Path) -> Path | None:
@@ -311,25 +298,6 @@ def trained_file(path: Path) -> Path | None:
     return file if is_checkpoint(file) else None
 
 
-def load_file(model: nn.Module, file: str) -> str:
-    """Load a ``model.safetensors`` of ``physion train``, and return its origin for the tables.
-
-    ``file`` may be the folder of the training, too.
-
-    Raises `BadInputError` for a file that is missing, holds other weights, or weights of a model
-    that was built otherwise (`BUILT_AS`).
-    """
-    path = Path(file)
-    path = path / WEIGHTS if path.is_dir() else path
-    if not path.is_file():
-        raise BadInputError(
-            f"there are no weights at {path}; give random, shipped, or the model.safetensors of "
-            "a training"
-        )
-    _load(path, model)
-    return f"local:{file_sha256(path)[:12]}"
-
-
 def _load(path: Path, model: nn.Module) -> None:
     stored, metadata = read_checkpoint(path)
     # Large weights are shipped in half precision.
@@ -337,7 +305,8 @@ def _load(path: Path, model: nn.Module) -> None:
     tensors = {name: v.float() if name in halves else v for name, v in stored.items()}
     if built_as := ask(model, BUILT_AS)():
         advice = "build the model that the weights belong to, or give weights of this one"
-        if differences := describe_tensors(tensors, model):
+        weights = _with_prefix(tensors, _MODEL)
+        if differences := compare_tensors(weights, model.state_dict()):
             advice = f"{differences}; {advice}"
         check_same(path, "model", metadata.get(BUILT_AS, {}), built_as, advice)
     load_tensors(path, tensors, model)

@@ -285,8 +285,7 @@ def rank_next_states(predicted: Tensor, true: Tensor, candidates: Tensor) -> Ten
         (N), from 1, the nearest, to M. Of equally distant states each counts as half a rank before
         the true one, so that equal states are not ranked by chance.
     """
-    # Differences, not products: squared distances that are small compared with the states stay
-    # exact.
+    # Differences, not products: squared distances that are much smaller than the states stay exact.
     apart = torch.stack([(candidates - row).pow(2).sum(-1) for row in predicted])
     own = apart.gather(1, true[:, None])
     nearer, equal = (apart < own).sum(1), (apart == own).sum(1) - 1

@@ -110,17 +110,26 @@ class ModelSettings:
 
     @classmethod
     def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the defaults of the model of this name that differ from the fields' defaults.
+        """Return the defaults of a model by its name, where they differ from the fields' own.
 
-        ``options``: what the user gave, such as the size.
+        ``options`` are what the user gave, such as the size.
         """
         return {}
 
 
 Sizes = Mapping[str, Mapping[str, Any]]
 """By size, the settings that differ from the defaults of the fields."""
+
+
+def settings_of_size(model: str, sizes: Sizes, size: str) -> Mapping[str, Any]:
+    """Return the settings of a size; raise `BadInputError` if the model has no such size."""
+    if size not in sizes:
+        raise BadInputError(f"model {model} has the sizes {', '.join(sizes)}, not {size!r}")
+    return sizes[size]
+
+
 RANDOM, SHIPPED = "random", "shipped"
-"""Weights that are no path of a file: to be trained, or shipped with the package."""
+"""Weights that are no path of a file: initial ones, to be trained, and weights of the package."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,9 +156,8 @@ class SizedSettings(ModelSettings):
     def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return the settings of a size; weights are shipped for the small one."""
         size = options.get("size", "small")
-        if size not in cls.sizes:
-            raise BadInputError(f"{model} has the sizes {', '.join(cls.sizes)}, not {size!r}")
-        return {"weights": SHIPPED if size == "small" else RANDOM, **cls.sizes[size]}
+        weights = SHIPPED if size == "small" else RANDOM
+        return {"weights": weights, **settings_of_size(model, cls.sizes, size)}
 
     def check_shipped(self) -> None:
         """Raise `BadInputError` if shipped weights are wanted that are for other settings."""
@@ -189,7 +197,7 @@ class Model:
     settings
         All that a user can set, a dataclass; None for a model without options.
     samples, seed
-        Futures of a trial, and the seed of their random numbers; None: the evaluation's seed.
+        Futures of a trial, and the seed of their random numbers; None: the seed of the evaluation.
     arguments
         Values among which the decision chooses, by the name of an argument of `imagine`, such as a
         level of noise.
@@ -309,7 +317,7 @@ class Model:
     def encoder_digest(self) -> str:
         """Return the hexadecimal SHA-256 of all that determines the features of `encode`.
 
-        It differs from `digest` where some weights, such as the dynamics' weights, do not matter.
+        It differs from `digest` where some weights, such as the dynamics, do not matter.
         """
         return self.digest()
 
@@ -319,10 +327,6 @@ class Model:
         They are stored with the weights of a training and compared when these are loaded.
         """
         return {}
-
-    def with_outcomes(self, outcomes: Mapping[str, bool]) -> Any:
-        """Return the model with the outcomes of all trials by name; only baselines look at them."""
-        return self
 
 
 def can(model: object, method: str) -> bool:

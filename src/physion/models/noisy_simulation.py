@@ -1,36 +1,335 @@
 """Noisy simulation: the physics engine, started from the true state with noise added.
 
-At the last observed frame, normal noise is added to the state (`models.state_noise`), and the
-engine simulates the rest of the trial. P(contact) is the fraction of such simulations in which
-agent and patient touch, a multiple of 1 / samples; 1 if the contact was already observed. The model
-has no weights and needs no torch.
+At the last observed frame, normal noise is added to the state (`add_noise`), and the engine
+simulates the rest of the trial. P(contact) is the fraction of such simulations in which agent and
+patient touch, a multiple of 1 / samples; 1 if the contact was already observed. The model has no
+weights and needs no torch.
 
-All noise levels use the same normal random numbers, multiplied by the level. Noise and fit of the
-scale compute with `physion.numerics`, so that predictions are the same on every machine.
+All noise levels use the same normal random numbers, multiplied by the level and by one scale.
+Bodies that are connected by joints move together, a cloth moves as a whole, and nothing that cannot
+move gets noise. Noise and fit of the scale compute with `physion.numerics`, so that predictions are
+the same on every machine.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.clips.batch import Batch, Provenance, Rollout, Spec, cut_to_observed
+from physion.clips.batch import LAST_OBSERVED, Batch, Provenance, Rollout, Spec, cut_to_observed
 from physion.core.errors import BadInputError
-from physion.core.seeds import stable_hash
+from physion.core.files import json_digest
+from physion.core.seeds import child_generator, stable_hash, trial_seed
 from physion.core.version import __version__
 from physion.models.interface import Model, ModelSettings
-from physion.models.state_noise import NoiseLevels, ObservedTrial, simulate_contacts
-from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine
+from physion.numerics.elementary import cos, exp, sin, standard_normal
+from physion.numerics.linear_algebra import norm
+from physion.numerics.rotations import multiply_quaternions
+from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine, simulate_many
 from physion.physics.labels import label_contact
-from physion.physics.trajectory import Trajectory
-from physion.scenes.scene import OBSERVED_FRAMES, Scene
+from physion.physics.trajectory import State, Trajectory
+from physion.scenes.scene import Scene, SurfaceMaterial
+
+F64 = NDArray[np.float64]
+
+CONTACT_ROUNDS = 3
+"""Contacts of one simulation that get noise, the earliest ones."""
+MOVING = 1e-3
+"""Speed in metres per second above which a body moves."""
+
+
+@dataclass(frozen=True)
+class NoiseLevels:
+    """Standard deviations of the noise.
+
+    - ``position``: metres, along x and y. ``vertical``: metres, along z, of bodies in the air
+      only: it would push others into what they rest on.
+    - ``velocity``: metres per second. ``angular_velocity``: radians per second.
+    - ``rotation``: radians, about any axis for bodies in the air, about the vertical for others.
+    - ``mass``, ``friction``: of the logarithm, so that 0.1 is about 10 %.
+    - ``contact``: of the velocity after a new contact, as a fraction of the relative speed of the
+      two bodies before it.
+    - ``lapse``: probability of an answer at random.
+    """
+
+    position: float = 0.01
+    velocity: float = 0.1
+    mass: float = 0.1
+    vertical: float = 0.0
+    rotation: float = 0.0
+    angular_velocity: float = 0.0
+    friction: float = 0.0
+    contact: float = 0.0
+    lapse: float = 0.0
+
+    def check(self, where: str) -> None:
+        """Raise `BadInputError` for a negative level or a lapse above 1."""
+        levels = (
+            self.position, self.velocity, self.mass, self.vertical, self.rotation,
+            self.angular_velocity, self.friction, self.contact, self.lapse,
+        )  # fmt: skip
+        if min(levels) < 0 or self.lapse > 1:
+            raise BadInputError(f"{where}: noise levels must not be negative, nor lapse above 1")
+
+
+@dataclass(frozen=True)
+class ObservedTrial:
+    """Trial as the model receives it: the scene and its state at the last observed frame.
+
+    ``touching``: indices of the bodies with a contact in that frame.
+    """
+
+    scene: Scene
+    state: State
+    observed_contact: bool
+    touching: frozenset[int] = frozenset()
+
+
+def add_noise(
+    trial: ObservedTrial, levels: NoiseLevels, scale: float, sample: int, seed: int
+) -> tuple[Scene, State]:
+    """Return scene and state with noise added.
+
+    The noise is a function of ``seed``, the scene's name and ``sample``. All scales use the same
+    normal random numbers.
+    """
+    scene, state = trial.scene, trial.state
+    rng = _generator(scene, seed, sample, "noise")
+    count = len(scene.bodies)
+    cloths = len(scene.cloths)
+    shift = np.zeros((count + cloths, 3))
+    shift[:, :2] = standard_normal(rng, (count + cloths, 2)) * levels.position * scale
+    kick = standard_normal(rng, (count + cloths, 3)) * levels.velocity * scale
+    factors = exp(standard_normal(rng, count) * levels.mass * scale)
+    # Numbers of their own, so that the ones above do not depend on these levels.
+    more = _generator(scene, seed, sample, "noise of the pose")
+    rise = standard_normal(more, count + cloths) * levels.vertical * scale
+    rotations = standard_normal(more, (count, 3)) * levels.rotation * scale
+    spins = standard_normal(more, (count, 3)) * levels.angular_velocity * scale
+    grips = exp(standard_normal(more, count) * levels.friction * scale)
+    roots = joint_roots(scene)
+    airborne = _airborne(trial, roots)
+    shift[:, 2] = rise
+    shift, kick = shift[roots], kick[roots]
+    shift[~airborne, 2] = 0.0
+    still = fixed_bodies(scene)[roots]
+    shift[still] = kick[still] = 0.0
+    rotations[~airborne[:count], :2] = 0.0
+    fixed = still[:count] | _jointed(roots)[:count]
+    rotations[fixed] = spins[fixed] = 0.0
+    owner = np.repeat(np.arange(cloths), [cloth.resolution**2 for cloth in scene.cloths])
+    bodies = tuple(
+        body
+        if still[i]
+        else replace(
+            body,
+            mass=body.mass * float(factors[i]),
+            contact=body.contact if grips[i] == 1.0 else _rougher(body.contact, float(grips[i])),
+        )
+        for i, body in enumerate(scene.bodies)
+    )
+    noisy = replace(
+        state,
+        positions=state.positions + shift[: len(state.positions)],
+        velocities=state.velocities + kick[: len(state.velocities)],
+        rotations=_rotated(state.rotations, rotations),
+        angular_velocities=state.angular_velocities + spins,
+        cloth_vertices=state.cloth_vertices + shift[count:][owner],
+        cloth_velocities=state.cloth_velocities + kick[count:][owner],
+    )
+    return replace(scene, bodies=bodies), noisy
+
+
+def simulate_contacts(
+    trial: ObservedTrial,
+    levels: NoiseLevels,
+    scale: float,
+    samples: int,
+    seed: int,
+    engine: Engine,
+) -> list[bool]:
+    """Return for each of ``samples`` noisy simulations whether agent and patient touch."""
+    found = [True] * samples
+    if not trial.observed_contact:
+        starts = [add_noise(trial, levels, scale, sample, seed) for sample in range(samples)]
+        scenes = [scene for scene, _ in starts]
+        states = [state for _, state in starts]
+        paths = _simulate(scenes, states, engine)
+        if levels.contact > 0:
+            paths = _with_contact_noise(scenes, states, paths, levels.contact * scale, seed, engine)
+        found = [
+            label_contact(scene, path).contact for scene, path in zip(scenes, paths, strict=True)
+        ]
+    if levels.lapse > 0:
+        for sample in range(samples):
+            rng = _generator(trial.scene, seed, sample, "lapse")
+            if rng.random() < levels.lapse:
+                found[sample] = bool(rng.random() < 0.5)
+    return found
+
+
+def joint_roots(scene: Scene) -> NDArray[np.int64]:
+    """Return for each body and cloth the index of the root of its chain of joints, or its own."""
+    parents = {joint.child: joint.parent for joint in scene.joints}
+    roots = []
+    for name in scene.names():
+        seen = {name}
+        while name in parents and parents[name] not in seen:
+            name = parents[name]
+            seen.add(name)
+        roots.append(scene.index(name))
+    return np.array(roots, dtype=np.int64)
+
+
+def fixed_bodies(scene: Scene) -> NDArray[np.bool_]:
+    """Return which bodies and cloths cannot move."""
+    return np.array([b.kinematic or b.scenery for b in scene.bodies] + [False] * len(scene.cloths))
+
+
+def _generator(scene: Scene, seed: int, sample: int, what: str) -> np.random.Generator:
+    return child_generator(trial_seed(seed, scene.scenario, scene.name, sample), what)
+
+
+def _airborne(trial: ObservedTrial, roots: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which bodies and cloths move and touch nothing, nor does what they are joined to."""
+    count = len(trial.scene.bodies)
+    speed = norm(trial.state.velocities)
+    free = np.zeros(len(roots), np.bool_)
+    free[:count] = [i not in trial.touching and speed[i] > MOVING for i in range(count)]
+    return np.array([free[roots == root].all() for root in roots], np.bool_)
+
+
+def _jointed(roots: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which bodies and cloths are connected by a joint."""
+    return np.bincount(roots, minlength=len(roots))[roots] > 1
+
+
+def _rougher(material: SurfaceMaterial, factor: float) -> SurfaceMaterial:
+    return replace(
+        material,
+        static_friction=material.static_friction * factor,
+        dynamic_friction=material.dynamic_friction * factor,
+    )
+
+
+def _rotated(rotations: F64, vectors: F64) -> F64:
+    """Return quaternions (N, 4) after rotations by rotation vectors (N, 3), in world axes.
+
+    The quaternion of a rotation vector v is (cos(|v| / 2), sin(|v| / 2) v / |v|).
+    """
+    angles = norm(vectors)
+    rotated: F64 = rotations.copy()
+    rows = np.flatnonzero(angles > 0)
+    if len(rows):
+        half = angles[rows] / 2
+        axes = vectors[rows] / angles[rows, None]
+        change = np.column_stack([cos(half), axes * sin(half)[:, None]])
+        rotated[rows] = multiply_quaternions(change, rotations[rows])
+    return rotated
+
+
+def _simulate(scenes: Sequence[Scene], states: Sequence[State], engine: Engine) -> list[Trajectory]:
+    """Simulate every scene from its state; limits of length count from the trial's frame 0."""
+    endings = [
+        replace(
+            scene.ending,
+            min_frames=max(1, scene.ending.min_frames - state.frame),
+            max_frames=max(2, scene.ending.max_frames - state.frame),
+        )
+        for scene, state in zip(scenes, states, strict=True)
+    ]
+    shortened = [
+        replace(scene, ending=ending) for scene, ending in zip(scenes, endings, strict=True)
+    ]
+    return simulate_many(shortened, engine=engine, starts=states, until_contact=True)
+
+
+def _with_contact_noise(
+    scenes: Sequence[Scene],
+    states: Sequence[State],
+    paths: Sequence[Trajectory],
+    level: float,
+    seed: int,
+    engine: Engine,
+) -> list[Trajectory]:
+    """Simulate again from every new contact of a simulation, with noise of the velocities there."""
+    results, starts = list(paths), list(states)
+    known = [_pairs(path, 0) for path in results]
+    rngs = [_generator(s, seed, sample, "contacts") for sample, s in enumerate(scenes)]
+    active = list(range(len(scenes)))
+    for _ in range(CONTACT_ROUNDS):
+        again = []
+        for i in active:
+            new = _first_new_contact(scenes[i], results[i], known[i])
+            if new is None:
+                continue
+            frame, pair = new
+            known[i].add(pair)
+            starts[i] = _perturbed(
+                scenes[i], results[i], frame, pair, level, starts[i].frame + frame, rngs[i]
+            )
+            again.append(i)
+        if not again:
+            break
+        paths = _simulate([scenes[i] for i in again], [starts[i] for i in again], engine)
+        for i, path in zip(again, paths, strict=True):
+            results[i] = path
+        active = again
+    return results
+
+
+def _pairs(path: Trajectory, frame: int) -> set[tuple[int, int]]:
+    """Return the pairs of bodies that touch in a frame."""
+    rows = path.contacts.bodies[path.contacts.frame == frame]
+    return {(int(a), int(b)) for a, b in rows}
+
+
+def _first_new_contact(
+    scene: Scene, path: Trajectory, known: set[tuple[int, int]]
+) -> tuple[int, tuple[int, int]] | None:
+    """Return frame and pair of the first contact of two bodies that is not known.
+
+    Contacts with the floor, in the first and in the last frame, and of cloths do not count, nor
+    does what follows a contact of agent and patient, which decides the outcome.
+    """
+    contacts, count = path.contacts, len(scene.bodies)
+    roles = {scene.index(scene.roles.agent), scene.index(scene.roles.patient)}
+    for row in np.argsort(contacts.frame, kind="stable"):
+        frame = int(contacts.frame[row])
+        a, b = int(contacts.bodies[row, 0]), int(contacts.bodies[row, 1])
+        if {a, b} == roles:
+            return None
+        if 0 < frame < len(path) - 1 and 0 <= a < count and b < count and (a, b) not in known:
+            return frame, (a, b)
+    return None
+
+
+def _perturbed(
+    scene: Scene,
+    path: Trajectory,
+    frame: int,
+    pair: tuple[int, int],
+    level: float,
+    number: int,
+    rng: np.random.Generator,
+) -> State:
+    """Return the state of a frame, called ``number``, with noise in the velocities of a pair."""
+    state = replace(path.state(frame), frame=number)
+    before = path.velocities[frame - 1].astype(np.float64)
+    speed = float(norm(before[pair[0]] - before[pair[1]]))
+    velocities = state.velocities.copy()
+    fixed = fixed_bodies(scene)
+    for body in pair:
+        kick = standard_normal(rng, 3) * level * speed
+        if not fixed[body]:
+            velocities[body] += kick
+    return replace(state, velocities=velocities)
+
 
 # Levels of noise that were fitted to recorded outcomes or to people's answers.
 #
@@ -64,8 +363,6 @@ def fitted_levels(target: str, scene: Scene) -> NoiseLevels:
     """Return the levels fitted to ``target`` on the half without the scene's configuration."""
     return FITTED[target][1 - configuration_half(scene)]
 
-
-LAST_OBSERVED = OBSERVED_FRAMES - 1
 
 NAME = "noisy-simulation"
 NOISE_VERSION = 2
@@ -168,7 +465,7 @@ class NoisySimulation(Model):
     def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
         """Simulate every trial ``samples`` times; ``contact`` says whether agent and patient touch.
 
-        ``scale`` is the only argument; by default as in the settings. The noise of a sample is
+        ``scale`` is the only argument; its default is in the settings. The noise of a sample is
         a function of ``seed``, the trial's name and the number of the sample.
         """
         scale = arguments.get("scale", self.settings.scale)
@@ -193,7 +490,7 @@ class NoisySimulation(Model):
         parts: list[Any] = [NOISE_VERSION, self.engine.name, levels]
         if fitted := self.settings.fitted_to:
             parts += [dataclasses.asdict(levels) for levels in FITTED[fitted]]
-        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+        return json_digest(parts)
 
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions, and what noise was fitted to."""
@@ -210,21 +507,6 @@ class NoisySimulation(Model):
     def __getstate__(self) -> dict[str, Any]:
         """Leave the engine behind that another process can build from its name."""
         return {**self.__dict__, "_built": None}
-
-
-def noisy_simulation(settings: NoisySimulationSettings) -> NoisySimulation:
-    """Build simulations that start from the true state with noise added."""
-    return NoisySimulation(settings)
-
-
-def noise_of_outcomes(settings: NoisySimulationSettings) -> NoisySimulation:
-    """Build simulations whose noise was fitted to outcomes of other configurations."""
-    return NoisySimulation(settings)
-
-
-def noise_of_people(settings: NoisySimulationSettings) -> NoisySimulation:
-    """Build simulations whose noise was fitted to people's answers to other configurations."""
-    return NoisySimulation(settings)
 
 
 # Threshold on a distance that separates contacts from misses best.

@@ -1,8 +1,8 @@
-"""OP3: K slots that explain a picture together, and predict how they move.
+"""OP3: K slots that explain a picture together, and predict how they change.
 
 The steps of `SlotInference` follow a schedule: the slots of the first frame are refined
 ``seed_steps`` times; the slots of each later frame that is seen are predicted, then refined once;
-the slots of the frames after them are only predicted. With the objective O_i after step i = 1, 2,
+after these frames they are only predicted. With the objective O_i after step i = 1, 2,
 ..., for the picture of its frame,
 
     loss = sum_i i O_i / sum_i i / pixels
@@ -66,13 +66,13 @@ class Op3Settings(PictureSettings):
     - ``slots``: K.
     - ``deterministic``, ``stochastic``: sizes of the two parts of the state of a slot.
     - ``width``: channels of the convolutions, with ``kernel`` x ``kernel`` weights; ``layers`` of
-      the decoder; ``step``, the stride of the refinement's convolutions.
+      the decoder; ``step``, the stride of the ones of the refinement.
     - ``hidden``: units of the refinement's LSTM. ``effect``: size of the effect of one slot on
       another.
     - ``update``: whether refinement and dynamics ``add`` to the state or ``replace`` it, as in the
       published code.
-    - ``density``: of a pixel given a slot: ``gaussian``, or ``released``, as in the published code
-      (`log_likelihood`), with the standard deviation ``sigma``.
+    - ``density``: of a pixel given a slot: ``gaussian``, or ``released``, as in the published
+      code (`log_likelihood`), with the standard deviation ``sigma``.
     - ``seed_steps``: refinements with the first frame; each later one that is seen has one.
     """
 
@@ -524,7 +524,7 @@ class SlotInference(nn.Module):
         return Explained(slots, decoded, likelihood, nll, kl, nll + settings.beta * kl)
 
     def refine(self, explained: Explained, pictures: Tensor, noise: Tensor) -> Slots:
-        """Return the beliefs after one refinement; ``noise`` (B, K, Rs): of their samples.
+        """Return the beliefs after one refinement; ``noise`` (B, K, Rs) makes their samples.
 
         The gradients that the refinement sees are inputs: training does not differentiate them.
         """
@@ -548,7 +548,7 @@ class SlotInference(nn.Module):
         return replace(slots, mean=mean, raw=raw, noise=noise, memory=memory)
 
     def predict(self, slots: Slots, noise: Tensor) -> Slots:
-        """Return the beliefs about the next frame; ``noise`` (B, K, Rs): of the samples."""
+        """Return the beliefs about the next frame; ``noise`` (B, K, Rs) makes the samples."""
         deterministic, mean, raw = self.dynamics(slots.states)
         if self.settings.update == "add":
             deterministic = slots.deterministic + deterministic
@@ -608,8 +608,8 @@ class Op3(PictureModel):
 
         They follow from ``seed`` and the trial's name only. With the argument ``show`` above 0,
         ``shown`` holds pictures, ``rgb`` (B, S, future, H, W, 3) uint8, and ``masks``
-        (B, S, future, K, H, W) float32, and under ``context_masks`` the masks of the frames that
-        were seen (B, T, K, H, W).
+        (B, S, future, K, H, W) float32, and the masks of the frames that were seen under
+        ``context_masks`` (B, T, K, H, W).
         """
         _, seen = self._watch(context_pictures(context, self.spec, self.name))
         slots = seen[-1]

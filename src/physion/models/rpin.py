@@ -168,7 +168,7 @@ def last_changes(boxes: Tensor) -> Tensor:
 
 
 def constant_velocity(known: Tensor, steps: int) -> Tensor:
-    """Return boxes (B, steps, K, 4) that move on as the last two of known ones (B, T, K, 4).
+    """Continue the last two of known boxes (B, T, K, 4) at constant velocity, as (B, steps, K, 4).
 
     With a single known box they stay where they are.
     """
@@ -490,7 +490,7 @@ class Rpin(VisionModel):
         return {"loss": self._published(imagined, boxes[:, -1:], targets)}
 
     def baseline(self, batch: Batch) -> Tensor:
-        """Return the loss of boxes that move on at constant velocity."""
+        """Return the loss of boxes at constant velocity."""
         boxes, targets = self._task(batch)
         predicted = constant_velocity(boxes, targets.boxes.shape[1])
         if self.settings.outputs == "boxes":

@@ -205,7 +205,7 @@ class Decoder(nn.Module):
         initialize(self)
 
     def forward(self, codes: Tensor, skips: Sequence[Tensor]) -> Tensor:
-        """Return pictures; ``skips`` are ordered as the `Encoder` returns them."""
+        """Return pictures; ``skips`` are in the order of `Encoder`."""
         values = self.first(codes[:, :, None, None])
         for stage, skip in zip(self.stages, reversed(skips), strict=True):
             values = stage(torch.cat([self.enlarge(values), skip], 1))

@@ -5,9 +5,7 @@ A model needs no base class. This one writes what most networks would write alik
 
 from __future__ import annotations
 
-import hashlib
 import inspect
-import json
 import marshal
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -17,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from physion.clips.batch import Provenance, Spec
+from physion.core.files import json_digest
 from physion.core.seeds import stable_hash
 from physion.models.interface import Model
 from physion.models.user_files import FileLoader
@@ -68,12 +67,14 @@ def initial_weights(*key: str | int) -> Iterator[None]:
 
 def digest_of(settings: Any, weights: Iterable[tuple[str, Tensor]] = ()) -> str:
     """Return the hexadecimal SHA-256 of JSON settings and of named weights."""
-    sha = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode())
-    for name, value in weights:
-        array = value.detach().cpu().contiguous()
-        sha.update(f"{name} {array.dtype} {tuple(array.shape)}".encode())
-        sha.update(array.reshape(-1).view(torch.uint8).numpy().tobytes())
-    return sha.hexdigest()
+
+    def parts() -> Iterator[bytes]:
+        for name, value in weights:
+            array = value.detach().cpu().contiguous()
+            yield f"{name} {array.dtype} {tuple(array.shape)}".encode()
+            yield array.reshape(-1).view(torch.uint8).numpy().tobytes()
+
+    return json_digest(settings, parts())
 
 
 def source_of(kind: type) -> str:

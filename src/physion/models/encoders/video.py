@@ -38,7 +38,7 @@ from physion.models.encoders.weights import (
     read_state_dict,
     weights_sha256,
 )
-from physion.models.interface import ModelSettings
+from physion.models.interface import ModelSettings, settings_of_size
 from physion.models.torch_model import TorchModel, digest_of, initial_weights
 from physion.models.vision import normalized_pictures
 
@@ -83,10 +83,7 @@ class VideoSettings(ModelSettings):
     @classmethod
     def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return the settings of a size."""
-        sizes, size = FAMILIES[model].sizes, options.get("size", SMALL)
-        if size not in sizes:
-            raise BadInputError(f"model {model} has the sizes {', '.join(sizes)}, not {size!r}")
-        return sizes[size]
+        return settings_of_size(model, FAMILIES[model].sizes, options.get("size", SMALL))
 
     def __post_init__(self) -> None:
         check_pooling(self.pooling)
@@ -247,7 +244,7 @@ _VERSION = 1
 
 
 class VideoEncoder(TorchModel):
-    """Frozen video encoder; its protocols are *observed* and *full*."""
+    """Frozen transformer on 16 frames of a video; its protocols are *observed* and *full*."""
 
     decision = "logistic"
 
@@ -307,13 +304,3 @@ class VideoEncoder(TorchModel):
             encoder_pretraining_seed=str(self.settings.seed) if self.init == RANDOM else "",
             versions=f"torch {torch.__version__}, transformers {transformers.__version__}",
         )
-
-
-def videomae(settings: VideoSettings) -> VideoEncoder:
-    """Build VideoMAE, a transformer on 16 frames."""
-    return VideoEncoder(settings)
-
-
-def vjepa2(settings: VideoSettings) -> VideoEncoder:
-    """Build V-JEPA 2, a transformer on 16 frames."""
-    return VideoEncoder(settings)

@@ -13,7 +13,7 @@ import os
 import pickle
 import socket
 import sys
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -30,6 +30,7 @@ from torch.nn import functional
 
 from physion.core.errors import BadInputError, MissingExtraError, UnknownNameError
 from physion.core.files import file_sha256
+from physion.models.checkpoint import compare_tensors
 from physion.models.torch_model import initial_weights
 
 # Features that keep positions: the last feature map of an encoder, averaged in a small grid.
@@ -131,7 +132,7 @@ def load_fitting(
     where: str,
     name: str,
 ) -> None:
-    """Load ``state`` into ``network``; its tensors must fit the network.
+    """Load ``state`` into ``network``; their tensors must be the same.
 
     Counters of batches, which only training uses, may be missing.
 
@@ -150,23 +151,16 @@ def load_fitting(
         If tensors are missing, unexpected, or of another shape. Some of each are named.
     """
     expected = network.state_dict()
-    missing = [key for key in expected.keys() - state.keys() if not _counts_batches(key)]
-    other = [key for key in expected if key in state and state[key].shape != expected[key].shape]
-    unexpected = [key for key in state if key not in expected and key not in unused]
-    order = {key: index for index, key in enumerate(expected)}
-    differences = [
-        _some("missing", [repr(key) for key in sorted(missing, key=order.__getitem__)]),
-        _some("unexpected", [repr(key) for key in unexpected]),
-        _some(
-            "of another shape",
-            [f"{k!r} {tuple(state[k].shape)} for {tuple(expected[k].shape)}" for k in other],
-        ),
-    ]
-    if any(differences):
+    counters = {key for key in expected if key.endswith("num_batches_tracked")}
+    differences = compare_tensors(
+        {key: value for key, value in state.items() if key in expected or key not in unused},
+        {key: value for key, value in expected.items() if key in state or key not in counters},
+        types=False,
+    )
+    if differences:
         raise BadInputError(
-            f"{where} does not fit encoder {name!r}: its tensors differ, "
-            f"{', '.join(text for text in differences if text)}; "
-            "is it the state dict of another network?"
+            f"{where} does not fit encoder {name!r}: {differences}; is it the state dict of "
+            "another network?"
         )
     kept = {key: value for key, value in state.items() if key in expected}
     try:
@@ -196,18 +190,6 @@ def _check_exists(path: Path) -> None:
 
 def _wrapped(content: dict[str, Any]) -> dict[str, Any] | None:
     return next((content[k] for k in _WRAPPERS if isinstance(content.get(k), dict)), None)
-
-
-def _counts_batches(key: str) -> bool:
-    return key.endswith("num_batches_tracked")
-
-
-def _some(what: str, names: Sequence[str]) -> str:
-    """Return the number of names and the first three, or nothing if there are none."""
-    if not names:
-        return ""
-    more = ", ..." if len(names) > 3 else ""
-    return f"{len(names)} {what} ({', '.join(names[:3])}{more})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,8 +237,8 @@ class WeightsPackage:
         found = weights_sha256(path)
         if found != self.sha256:
             raise BadInputError(
-                f"{path} was changed: its SHA-256 is {found[:12]}..., package {self.name} "
-                f"is {self.sha256[:12]}...; {self._again}"
+                f"{path} was changed: its SHA-256 is {found[:12]}..., and "
+                f"{self.sha256[:12]}... in package {self.name}; {self._again}"
             )
         return read_state_dict(path)
 
@@ -392,7 +374,7 @@ class EncoderWeights:
 
     @property
     def tag(self) -> str:
-        """The tag of timm's weights; empty for weights of another source, and for ``imagenet``."""
+        """The tag of timm's weights; empty for another source, and for ``imagenet``."""
         return self.source.removeprefix(TIMM) if self.source.startswith(TIMM) else ""
 
     @property
@@ -530,8 +512,8 @@ def _check_belongs(name: str, package: WeightsPackage) -> None:
 def _tag(name: str, weights: EncoderWeights) -> str:
     """Return the tag of timm's weights that are wanted, empty for weights of another source.
 
-    Raises `BadInputError` if timm has none, or if its first ones are not for ImageNet
-    classification but ``imagenet`` is wanted.
+    Raises `BadInputError` if timm has none, or if ``imagenet`` is wanted but its
+    first ones are not of ImageNet classification.
     """
     if not weights.downloaded:
         return ""

@@ -33,7 +33,7 @@ F64 = NDArray[np.float64]
 _FINE = 3
 """Candidates per distance of neighbouring points."""
 _KEPT = 8192
-"""Shapes whose points are kept, about 5 kB each: several models ask for the points of all trials in
+"""Shapes whose points are kept, about 5 kB each: several models ask for the shapes of all trials in
 turn."""
 
 

@@ -9,8 +9,8 @@ With the last two states of an object, centre c and rotation R, its velocity and
 
     v = c1 - c0,    w = log(R1 R0^T)
 
-and if it moves on like this (*drift*), a particle at offset r from its centre moves in the next
-step by
+and if it keeps this motion (*drift*), a particle at offset r from its centre moves in the next step
+by
 
     u = v + (exp(w) - 1) r
 
@@ -38,7 +38,7 @@ from physion.models.particles.bodies import (
     rotation_from_vector,
     vector_from_rotation,
 )
-from physion.models.particles.neighbours import swept_edges, swept_edges_on_device
+from physion.models.particles.neighbours import swept_edges
 
 # Particles of several scenes as one set of tensors, and the state of their objects.
 #
@@ -207,10 +207,10 @@ class Drift:
 class Graph:
     """Inputs of a network, float32: N nodes, E edges, K objects.
 
-    Nodes are the particles of all objects that can move, and the particles of kinematic bodies that
-    have an edge: the others would change nothing. For DPI-Net, whose bodies move as wholes, they
-    are the particles of cloths, and of bodies only those that have an edge or, if the body can
-    move, come nearer to the floor than the radius in the step.
+    Nodes are the particles of all objects that can move, and the ones of kinematic bodies that have
+    an edge: the others would change nothing. For DPI-Net, whose bodies move as wholes, they are
+    the particles of cloths, and of bodies only those that have an edge or, if the body can move,
+    come nearer to the floor than the radius in the step.
 
     - ``particles``: P. ``rows`` (N,): particle of each node. ``owners`` (N,): its object.
     - ``receivers``, ``senders`` (E,): nodes.
@@ -290,13 +290,10 @@ def make_graph(
     swept : bool
         Whether particles that come within the radius during the step are neighbours too.
     near_only : bool
-        Whether the graph is DPI-Net's, which leaves out particles far from everything.
+        Whether the graph is for DPI-Net, and leaves out particles far from everything.
     """
     moves = drift.moves if swept else torch.zeros_like(drift.moves)
-    on_cpu = moves.device.type == "cpu"
-    outer = (outer_edges if on_cpu else outer_edges_on_device)(
-        layout, drift.positions, moves, radius
-    )
+    outer = outer_edges(layout, drift.positions, moves, radius)
     pairs = torch.cat([outer, layout.links], dim=1)
     used = (layout.kinds != KINEMATIC)[layout.owners]
     if near_only:
@@ -327,23 +324,17 @@ def outer_edges(layout: SceneLayout, positions: Tensor, moves: Tensor, radius: f
     """Return the swept pairs (2, E) of particles of different objects, by `neighbours`.
 
     One of the two objects can move. Both directions, sorted by receiver, then sender; `neighbours`
-    says what is swept by ``moves`` (P, 3), metres in the step.
+    says what is swept by ``moves`` (P, 3), metres in the step. The search is on the CPU.
     """
-    receivers, senders = swept_edges(
-        positions.numpy(), moves.numpy(), layout.starts, layout.scene_array, layout.moves, radius
+    edges = swept_edges(
+        positions.cpu().numpy(),
+        moves.cpu().numpy(),
+        layout.starts,
+        layout.scene_array,
+        layout.moves,
+        radius,
     )
-    return torch.from_numpy(np.stack([receivers, senders]))
-
-
-def outer_edges_on_device(
-    layout: SceneLayout, positions: Tensor, moves: Tensor, radius: float
-) -> Tensor:
-    """Return what `outer_edges` returns, by `cell_list`, on the device of the positions."""
-    owners = layout.owners
-    pairs = torch.stack(swept_edges_on_device(positions, moves, layout.scene[owners], radius))
-    first, second = owners[pairs]
-    free = layout.kinds != KINEMATIC
-    return pairs[:, (first != second) & (free[first] | free[second])]
+    return torch.from_numpy(np.stack(edges)).to(positions.device)
 
 
 def _node_inputs(
@@ -439,7 +430,7 @@ class JoinedInputs(nn.Sequential):
     """`mlp` of several inputs side by side.
 
     The first layer is the sum of a product for each input. So nothing is copied into one matrix,
-    and what many rows share is multiplied once.
+    and rows that are used several times are multiplied once.
     """
 
     def __init__(self, inputs: int, width: int) -> None:

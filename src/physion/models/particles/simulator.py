@@ -1,8 +1,8 @@
 """Learned simulators of particles: GNS, GNS-RANSAC and DPI-Net.
 
 Of every object a simulator knows the last two poses, of a cloth the last two positions of its
-particles. If it keeps moving as it did, a particle at x moves by u (`networks`). The network
-predicts what is added to this motion:
+particles. If it keeps its motion, a particle at x moves by u (`networks`). The network predicts
+what is added to this motion:
 
 - GNS: a change a of the displacement of every particle, x' = x + u + a. Bodies are kept rigid by
   the rigid motion that fits the x' of their particles best; GNS-RANSAC fits only those particles
@@ -41,8 +41,8 @@ from physion.clips.batch import (
 )
 from physion.core.errors import BadInputError
 from physion.core.seeds import generator
-from physion.models.baselines.motion import FAR
 from physion.models.checkpoint import load_named
+from physion.models.gaps import FAR
 from physion.models.interface import RANDOM, LearnsFrom, SizedSettings, Sizes, TrainingSettings
 from physion.models.noisy_simulation import best_threshold
 from physion.models.particles.bodies import (
@@ -213,7 +213,7 @@ _PAPER_TRAINING = replace(
 
 
 def training_of(settings: ParticleSettings) -> TrainingSettings:
-    """Return optimiser and schedule; the small size's made the shipped weights."""
+    """Return optimiser and schedule; the small size made the shipped weights."""
     if settings.size != "small":
         return _PAPER_TRAINING
     small = _SMALL_TRAINING
@@ -281,45 +281,6 @@ def join_futures(
     return [joined[row : row + samples] for row in range(0, len(joined), samples)]
 
 
-def smallest_gaps(
-    motions: Sequence[Motion],
-    futures: Sequence[Futures],
-    settings: ParticleSettings,
-    *,
-    first: int,
-    touch: F64,
-) -> F64:
-    """Return the smallest gaps (B, S) of agent and patient, metres, less ``touch``.
-
-    After a contact that was observed, by the rule of the label, they are -`FAR`, below every
-    threshold that a decision can fit.
-
-    Parameters
-    ----------
-    motions, futures
-        Observed motion and futures of each trial.
-    settings
-        Settings of the search for the smallest distance.
-    first
-        Row of the motions from which they count, frame 44.
-    touch
-        Distances (2,) at which two bodies, and a cloth and a body, touch, metres.
-    """
-    gaps = np.zeros((len(motions), len(futures[0])))
-    for row, (motion, own) in enumerate(zip(motions, futures, strict=True)):
-        for column, (particles, poses) in enumerate(own):
-            later = later_poses(poses, first)
-            distance = smallest_distance(
-                motion.scene, particles, later, settings.gap_spacing, settings.gap_limit
-            )
-            pair = [particles.agent, particles.patient]
-            soft = min(pair) >= 0 and CLOTH in particles.kinds[pair]
-            gaps[row, column] = distance - touch[int(soft)]
-        if label_contact(motion.scene, motion.trajectory).observed:
-            gaps[row] = -FAR
-    return gaps
-
-
 def shown_particles(futures: Sequence[Futures], observed: int) -> dict[str, NDArray[np.generic]]:
     """Return the particles of the frames after the first ``observed`` ones.
 
@@ -361,7 +322,9 @@ _INLIER = 0.1
 
 
 class ParticleSimulator(TorchModel):
-    """Model that learns how particles move, and imagines by moving them step by step.
+    """Graph network that learns how particles move, and imagines by moving them step by step.
+
+    GNS, GNS-RANSAC or DPI-Net, by the name in the settings.
 
     ``touch`` (2,): metres; agent and patient touch if they come at most this close, two bodies and
     a cloth and a body. It is fitted after training (`calibrate`) and stored with the weights.
@@ -463,7 +426,7 @@ class ParticleSimulator(TorchModel):
         All steps but the first start from what the network predicted, without gradient.
         """
         settings = self.settings
-        window = self._read(batch)
+        window = read_window(batch, self.settings.sampling, self.device)
         if not self.training:
             # A validation is without noise, as the loss of the trivial predictor is.
             return {"loss": self._loss(window, window.later[:1])}
@@ -472,7 +435,7 @@ class ParticleSimulator(TorchModel):
 
     def baseline(self, batch: Batch) -> Tensor:
         """Return the loss of a prediction in which every object keeps its velocity."""
-        window = self._read(batch)
+        window = read_window(batch, self.settings.sampling, self.device)
         drift = drift_of(window.layout, window.before, window.now)
         return self._error(window.layout, window.later[0], drift.positions + drift.moves)
 
@@ -497,9 +460,8 @@ class ParticleSimulator(TorchModel):
 
         It counts steps that are imagined and the time between them; see `gaps` for a contact that
         was observed. With the argument ``show`` above 0, ``shown`` holds the imagined particles
-        (B, S, F, P, 3) and the object of each, ``things`` (B, P), its index in `Scene.names`; NaN
-        and -1 where a trial has fewer frames or particles than another. The frames are 44 + s,
-        44 + 2 s, ... with the stride s.
+        and their objects (`shown_particles`). The frames are 44 + s, 44 + 2 s, ... with the stride
+        s.
         """
         if context.state is None:
             raise BadInputError("a particle model imagines from motions, which the batch lacks")
@@ -560,12 +522,11 @@ class ParticleSimulator(TorchModel):
         if not isinstance(self.network, MessageNetwork):
             state = self._move_objects(layout, now, drift, graph)
             return state.positions(layout), state
-        changes = self._changes(graph)
+        changes = self._of_particles(graph, cast("Tensor", self.network(graph)))
         goal = drift.positions + drift.moves + changes
         with torch.no_grad():
             rotations, centers = self._fit(layout, goal, robust=robust)
-            # Fewer than three particles determine no rotation: such a body keeps rotating as it
-            # did.
+            # Fewer than three particles determine no rotation: such a body keeps its spin.
             few = (_counts(layout) < 3)[:, None, None]
             spun = rotation_from_vector(drift.spin) @ now.rotations
             rotations = torch.where(few, spun, rotations)
@@ -589,17 +550,25 @@ class ParticleSimulator(TorchModel):
         )
 
     def gaps(self, motions: Sequence[Motion], futures: Sequence[Futures]) -> F64:
-        """Return the smallest gaps (B, S) of agent and patient, less ``touch``.
+        """Return the smallest gaps (B, S) of agent and patient, metres, less ``touch``.
 
         They count from frame 44 on. After a contact that was observed, by the rule of the label,
         they are -`FAR`, below every threshold that a decision can fit.
         """
-        touch = self.touch.cpu().numpy()
-        first = self.spec.context - 1
-        return smallest_gaps(motions, futures, self.settings, first=first, touch=touch)
-
-    def _read(self, batch: Batch) -> Window:
-        return read_window(batch, self.settings.sampling, self.device)
+        settings, touch = self.settings, self.touch.cpu().numpy()
+        gaps = np.zeros((len(motions), len(futures[0])))
+        for row, (motion, own) in enumerate(zip(motions, futures, strict=True)):
+            for column, (particles, poses) in enumerate(own):
+                later = later_poses(poses, self.spec.context - 1)
+                distance = smallest_distance(
+                    motion.scene, particles, later, settings.gap_spacing, settings.gap_limit
+                )
+                pair = [particles.agent, particles.patient]
+                soft = min(pair) >= 0 and CLOTH in particles.kinds[pair]
+                gaps[row, column] = distance - touch[int(soft)]
+            if label_contact(motion.scene, motion.trajectory).observed:
+                gaps[row] = -FAR
+        return gaps
 
     def _graph(self, layout: SceneLayout, drift: Drift) -> Graph:
         settings = self.settings
@@ -607,10 +576,6 @@ class ParticleSimulator(TorchModel):
         return make_graph(
             layout, drift, settings.radius, self._unit, swept=settings.swept, near_only=near_only
         )
-
-    def _changes(self, graph: Graph) -> Tensor:
-        """Return the changes of displacements (P, 3) that GNS predicts, metres."""
-        return self._of_particles(graph, cast("Tensor", self.network(graph)))
 
     def _of_particles(self, graph: Graph, values: Tensor) -> Tensor:
         """Return values of nodes (N, 3), in units of changes, as metres of particles (P, 3)."""
@@ -667,18 +632,3 @@ def _made_again(
 def _softened(squares: Tensor, knee: float) -> Tensor:
     """Return 2 k^2 (sqrt(1 + s / k^2) - 1): about s for s << k^2, about 2 k sqrt(s) beyond."""
     return 2 * knee**2 * ((1 + squares / knee**2).sqrt() - 1)
-
-
-def gns(settings: ParticleSettings) -> ParticleSimulator:
-    """Build a graph network simulator (GNS)."""
-    return ParticleSimulator(settings)
-
-
-def gns_ransac(settings: ParticleSettings) -> ParticleSimulator:
-    """Build a GNS that keeps bodies rigid by a robust fit."""
-    return ParticleSimulator(settings)
-
-
-def dpi(settings: ParticleSettings) -> ParticleSimulator:
-    """Build DPI-Net, a graph network that passes messages through roots of objects."""
-    return ParticleSimulator(settings)
