@@ -493,7 +493,7 @@ def test_evaluation_trains_the_encoder_of_each_fold_and_reads_its_features(tmp_p
 
 NAMES = ("pEffNetLite0-mlp", "pEffNetLite0-lstm")
 OPTIONS: dict[str, Any] = {"image_size": 64, "context": 3, "future": 4, "hidden": 256}
-TRAINED, TESTED = 400, 100
+TRAINED, TESTED = 200, 60
 
 
 def encoded(source: SquaresSource) -> Batch:
@@ -521,10 +521,9 @@ def testing(source: SquaresSource) -> Batch:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("name", NAMES)
 def test_the_next_feature_is_nearer_than_the_last_one(
-    source: SquaresSource, training: NDArray[np.float32], testing: Batch, name: str, seed: int
+    source: SquaresSource, training: NDArray[np.float32], testing: Batch, name: str
 ) -> None:
     """Untrained dynamics repeat the last feature."""
 
@@ -532,13 +531,13 @@ def test_the_next_feature_is_nearer_than_the_last_one(
         assert list(trials) == list(source.trials)
         return training
 
-    model: Any = build_model(name, **OPTIONS, seed=seed)
+    model: Any = build_model(name, **OPTIONS)
     trained = train_model(
         model,
         source,
         source.trials,
-        settings=dataclasses.replace(model.training_settings, steps=300),
-        seed=seed,
+        settings=dataclasses.replace(model.training_settings, steps=200),
+        seed=0,
         name="all",
         folder=None,
         features=features,
@@ -546,6 +545,6 @@ def test_the_next_feature_is_nearer_than_the_last_one(
     )
     with torch.no_grad():
         error, last = float(model.loss(testing)["loss"]), float(model.baseline(testing))
-    print(f"{model.name()}, seed {seed}: {error / last:.3f} of the error of the last feature")
+    print(f"{model.name()}: {error / last:.3f} of the error of the last feature")
     assert error < 0.95 * last
     assert trained.validation < trained.baseline

@@ -34,9 +34,10 @@ from physion.clips.batch import Batch, Provenance, Rollout
 from physion.core.errors import BadInputError
 from physion.core.seeds import generator
 from physion.models.checkpoint import load_named
-from physion.models.interface import Sizes, TrainingSettings
+from physion.models.interface import Sizes
 from physion.models.torch_model import initial_weights
 from physion.models.vision import (
+    PICTURE_TRAINING,
     PictureModel,
     PictureSettings,
     context_pictures,
@@ -114,17 +115,7 @@ class Op3Settings(PictureSettings):
             )
 
 
-SMALL_TRAINING = TrainingSettings(
-    steps=1500,
-    batch=8,
-    learning_rate=1e-3,
-    schedule="cosine",
-    warmup=100,
-    clip=5.0,
-    validate_every=500,
-    log_every=50,
-    checkpoint_every=500,
-)
+SMALL_TRAINING = replace(PICTURE_TRAINING, steps=1500, batch=8, clip=5.0)
 # Published for Physion, before the paper: 300 epochs, whose length is not known.
 PAPER_TRAINING = replace(
     SMALL_TRAINING, steps=180_000, batch=16, learning_rate=3e-4, schedule="constant", warmup=0,

@@ -32,9 +32,10 @@ from torch import Tensor, nn
 from physion.clips.batch import Batch, Provenance, Rollout
 from physion.core.errors import BadInputError
 from physion.models.checkpoint import load_named
-from physion.models.interface import Sizes, TrainingSettings
+from physion.models.interface import Sizes
 from physion.models.torch_model import initial_weights
 from physion.models.vision import (
+    PICTURE_TRAINING,
     PictureModel,
     PictureSettings,
     context_pictures,
@@ -98,17 +99,7 @@ class SvgSettings(PictureSettings):
         self.at_least(2, "past", "context")
 
 
-SMALL_TRAINING = TrainingSettings(
-    steps=3000,
-    batch=16,
-    learning_rate=1e-3,
-    schedule="cosine",
-    warmup=100,
-    clip=1.0,
-    validate_every=500,
-    log_every=50,
-    checkpoint_every=500,
-)
+SMALL_TRAINING = replace(PICTURE_TRAINING, steps=3000, batch=16, clip=1.0)
 # Published for Physion, before the paper: 300 epochs of 600 steps.
 PAPER_TRAINING = replace(
     SMALL_TRAINING, steps=180_000, batch=40, learning_rate=2e-3, schedule="constant", warmup=0,

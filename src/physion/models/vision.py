@@ -276,6 +276,13 @@ class PictureSettings(VisionSettings):
         self.at_least(1, "image_size", "past", "imagined", "stride", "context", "samples")
 
 
+PICTURE_TRAINING = TrainingSettings(
+    learning_rate=1e-3, schedule="cosine", warmup=100, validate_every=500, log_every=50,
+    checkpoint_every=500,
+)  # fmt: skip
+"""Training of the small sizes; number of steps, batch and clipping are each model's own."""
+
+
 class PictureModel(VisionModel):
     """Model that is trained to predict pictures in 0..1, and imagines several futures.
 
