@@ -54,8 +54,8 @@ def test_points_lie_on_the_box_with_its_corners_and_normals() -> None:
 def test_points_cover_every_shape(name: str) -> None:
     """No point of the surface is farther than the spacing from a particle."""
     points, normals = surface_points(name, (0.3, 0.3, 0.3), 0.1, 10_000)
-    fine, _ = surface_points(name, (0.3, 0.3, 0.3), 0.02, 10_000)
-    assert cKDTree(points).query(fine)[0].max() <= 0.1 + 0.02
+    fine, _ = surface_points(name, (0.3, 0.3, 0.3), 0.04, 10_000)
+    assert cKDTree(points).query(fine)[0].max() <= 0.1 + 0.04
     assert len(points) == 1 or cKDTree(points).query(points, 2)[0][:, 1].min() >= 0.0999
     assert np.isfinite(normals).all()
 
