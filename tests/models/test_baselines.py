@@ -66,18 +66,22 @@ def test_digest_and_provenance_follow_the_settings(name: str) -> None:
         build_model(name, sampels=1)
 
 
-def test_baselines_that_look_at_no_trial_say_so() -> None:
-    stated = {name: build_model(name).provenance().inputs for name in [*OTHERS, "chance"]}
+def test_baselines_say_what_they_see_and_answer_from_the_observed_part() -> None:
+    models = {name: build_model(name) for name in [*OTHERS, "chance"]}
+    stated = {name: model.provenance().inputs for name, model in models.items()}
     assert {name: words for name, words in stated.items() if words} == {"chance": "base rate"}
+    answering = {name: model.answers for name, model in models.items() if model.answers}
+    known = ("state-classifier", "already-touched", "chance")
+    assert answering == dict.fromkeys(known, "observed")
 
 
-@pytest.mark.parametrize(
-    ("name", "protocol"),
-    [("chance", "observed"), ("state-classifier", "observed"), ("already-touched", "observed")],
-)
-def test_answers_are_given_under_their_protocol(name: str, protocol: str) -> None:
-    model = build_model(name)
-    assert any(can(model, what) for what in ("predict", "fit")) and model.answers == protocol
+def test_chance_is_the_rate_of_succession() -> None:
+    """(k + 1) / (n + 2) for k contacts among n trials (Laplace)."""
+    batch = batch_of([crossing()] * 4)
+    fitted = build_model("chance").fit(batch, np.array([True, True, False, True]), 0)
+    assert fitted.predict(batch).tolist() == pytest.approx([4 / 6] * 4)
+    nothing = build_model("chance").fit(batch.select([]), np.zeros(0, bool), 0)
+    assert nothing.predict(batch.select([0])).tolist() == [0.5]
 
 
 @pytest.mark.parametrize("name", [n for n in OTHERS if not can(build_model(n), "encode")])
@@ -103,18 +107,13 @@ def test_noise_after_the_observed_part_changes_no_answer(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["state-classifier", "already-touched", "constant-motion"])
-def test_trials_without_motion_are_named(name: str) -> None:
+def test_trials_without_motion_or_observed_part_are_named(name: str) -> None:
     model, batch = seen_by(name)
     movie = crossing(name="movie_0001", agent=(float("nan"), 0.0, 0.0))
     with pytest.raises(BadInputError, match="'movie_0001' was imported without motion"):
         answers(model, batch_of([crossing(name="crossing_1_0000"), movie]))
     with pytest.raises(BadInputError, match=f"{name} needs motions"):
         answers(model, Batch(("a",), batch.frames[:1], batch.valid[:1]))
-
-
-@pytest.mark.parametrize("name", ["state-classifier", "already-touched", "constant-motion"])
-def test_trials_that_end_in_the_observed_part_are_refused(name: str) -> None:
-    model, _ = seen_by(name)
     with pytest.raises(BadInputError, match="'short' has 44 frames, fewer than"):
         answers(model, batch_of([crossing(name="short", frames=44)]))
 
