@@ -112,7 +112,7 @@ def test_training_continues_from_the_previous_checkpoint_or_afresh(
     assert equal_weights(model, expected)
     assert len(trained.notes) == len(damaged) + 1
     start = "step 10" if len(damaged) == 1 else "the beginning"
-    assert "cannot be read" in trained.notes[0] and f"goes on from {start}" in trained.notes[-1]
+    assert "cannot be read" in trained.notes[0] and f"continues from {start}" in trained.notes[-1]
     assert {path.name for path in folder.glob("*.damaged")} == {f"{n}.damaged" for n in damaged}
     whole = next((tmp_path / "whole").iterdir())
     for name in (WEIGHTS, "metrics.jsonl"):

@@ -112,7 +112,7 @@ def test_two_states_tell_a_velocity() -> None:
     assert seen[0].flatten(1).tolist() == [[3.0, 2.0], [4.0, 1.0]]
 
 
-def test_a_future_goes_on_from_the_last_two_states() -> None:
+def test_a_future_starts_from_the_last_two_states() -> None:
     """With a transition that predicts the last change again, states lie on a line."""
     model = model_of(slots=2, slot_size=3)
 

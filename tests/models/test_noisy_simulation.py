@@ -119,7 +119,7 @@ def fraction(simulation: NoisySimulation, trial: Scene, truth: Trajectory) -> fl
     return float(found.contact.mean())
 
 
-def test_the_fraction_of_contacts_is_that_of_a_straight_line_with_noise() -> None:
+def test_the_fraction_of_contacts_has_a_closed_form_for_straight_lines() -> None:
     """Ball and box touch if they pass each other closer than 0.5 m. With noise of their places
     only, the lateral distance d has the standard deviation 0.1 sqrt(2), and
 
@@ -341,7 +341,7 @@ def test_lapses_are_answers_at_random() -> None:
     assert found[0.4] == pytest.approx(0.8, abs=0.04) and found[1.0] == pytest.approx(0.5, abs=0.05)
 
 
-def test_noise_is_that_of_the_platform_independent_functions() -> None:
+def test_noise_comes_from_the_platform_independent_functions() -> None:
     trial = scene()
     question = observed(trial)
     config = NoisySimulationSettings(position=0.1, velocity=0.3, mass=0.2)

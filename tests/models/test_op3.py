@@ -252,7 +252,7 @@ def test_futures_follow_from_seed_and_name_of_the_trial() -> None:
     assert torch.allclose(masks.sum(3), torch.ones(3, 3, 3, 16, 16), atol=1e-5)
 
 
-def test_a_future_goes_on_from_samples_with_noise_of_their_own() -> None:
+def test_every_step_of_a_future_starts_from_samples_with_noise_of_their_own() -> None:
     """Step by step: the dynamics see z = mean + sqrt(softplus(raw) + 1e-5) noise of that step, and
     the features hold the mean."""
     model = tiny()
@@ -305,7 +305,7 @@ def test_the_loss_is_by_pixel_with_beta_times_the_divergence() -> None:
     assert losses[0]["kl"] > 0.1
 
 
-def test_masks_of_seen_frames_are_those_of_their_refined_slots() -> None:
+def test_masks_of_seen_frames_belong_to_their_refined_slots() -> None:
     model = tiny()
     context = context_of(model, 2)
     shown = model.imagine(context, 3, 7, show=1.0).shown

@@ -138,7 +138,7 @@ def test_a_frame_is_decoded_with_the_activations_of_a_seen_one(skip: Any, rows: 
     assert all(torch.allclose(seen, inner[:, last], atol=1e-4) for seen in decoder.seen[1:])
 
 
-def test_the_loss_is_that_of_the_equations() -> None:
+def test_the_loss_follows_the_equations() -> None:
     """With a gray decoder the error is known, and the weight of the divergence is beta.
 
     The divergence is KL(posterior || prior) = (log(w / v) + (v + (m - n)^2) / w - 1) / 2 by

@@ -201,7 +201,7 @@ def test_a_rollout_starts_from_the_last_two_observed_states(stride: int) -> None
     assert start.steps == 15 // stride
 
 
-def test_the_noise_of_a_future_is_that_of_its_velocities() -> None:
+def test_futures_have_noise_of_the_stated_size_on_their_velocities() -> None:
     start = start_of(1.0)
     moved, turned = [], []
     for seed in range(400):
