@@ -14,7 +14,11 @@ import pandas as pd
 import pytest
 
 from physion.cli.main import main
+from physion.cli.output import print_scores
 from physion.data.official import official as physion_official
+from physion.report.compare import compare
+from physion.report.inputs import ReportInputs
+from physion.report.scores import scores
 from physion.trials.files import TrialPaths
 from physion.trials.index import COLUMNS
 
@@ -76,6 +80,30 @@ def test_two_columns_are_enough_and_the_terminal_shows_the_results(
     found = json.loads(capsys.readouterr().out)
     own = [row for row in found["scores"] if row["model"] == "good" and row["scenario"] == "mean"]
     assert own[0]["accuracy"] == 1 and own[0]["kind"] == "model" and own[0]["kappa"] is None
+
+
+def test_page_and_terminal_show_the_same_average(capsys: pytest.CaptureFixture[str]) -> None:
+    """Two stimuli of each scenario leave no r by scenario, so that only the pooled one is known."""
+    labels = physion_official().labels
+    stems = ("pilot_it2_drop", "pilot_it2_collision", "pilot_it2_rollingSliding_simple_box")
+    names = [name for stem in stems for name in [n for n in labels if n.startswith(stem)][:2]]
+    few = {name: 0.3 + 0.1 * k for k, name in enumerate(names)}
+    for given, first, other in (
+        (few, "All stimuli pooled", "Mean over scenarios"),
+        ({name: 0.2 + 0.5 * labels[name] for name in labels}, "Mean over scenarios",
+         "All stimuli pooled"),
+    ):  # fmt: skip
+        result = compare({"m": given}, humans="official")
+        assert isinstance(result.inputs, ReportInputs)
+        print_scores(result)
+        assert first.lower() in capsys.readouterr().out
+        page = str(scores(result.inputs.comparison))
+        assert page.index(first) < page.index(other)
+        stimuli = result.inputs.comparison.stimuli
+        if given is few:
+            r = np.corrcoef(stimuli["p_contact"], stimuli["p_yes"])[0, 1]
+            shown = result.summary.set_index("model")["r with people"]
+            assert shown["m"].startswith(f"{r:.3f}")
 
 
 @pytest.mark.slow

@@ -5,13 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from physion.analysis.people.responses import (
-    SESSION_COLUMNS,
-    TRIAL_COLUMNS,
-    Responses,
-    check_table,
-    clean,
-)
+from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS, Responses, clean
+from physion.analysis.tables import check_table
 
 PRACTICE = 10
 

@@ -17,7 +17,6 @@ from physion.analysis.comparison import Comparison, compare_scores
 from physion.analysis.intervals import Bootstrap
 from physion.analysis.model_tests import (
     MixedTable,
-    calibration_scores,
     fits_of_models,
     fits_of_people,
     paired_measures,
@@ -38,6 +37,7 @@ from physion.analysis.scores import (
     released_r_zone,
     with_kind,
 )
+from physion.analysis.statistics.regression import calibration_table
 from physion.analysis.tables import check_excluded_names, name_models, require_columns
 from physion.core.errors import BadInputError
 
@@ -143,7 +143,7 @@ class ComparisonResults:
     - ``comparison_all``: the comparison with all complete sessions, including flagged ones.
     - ``paired``: from `paired_tests`, all scenarios pooled; None for one model.
     - ``paired_measures``: from `paired_measures`; None for one model or no people.
-    - ``calibration``: from `calibration_scores`.
+    - ``calibration``: from `calibration_table`.
     - ``mixed``: from `mixed_fits`.
     - ``warnings``: what may make the results wrong, one sentence each.
     """
@@ -241,7 +241,7 @@ def all_results(
         comparison_all=whole,
         paired=paired_tests(pooled, draws) if several else None,
         paired_measures=paired_measures(pooled, draws) if several and main.has_people else None,
-        calibration=calibration_scores(pooled),
+        calibration=calibration_table(list(pooled.names), pooled.p_contact, pooled.label),
         mixed=(*about_people, *fits_of_models(main)),
         warnings=(*(people.warnings if people else ()), *main.warnings),
     )

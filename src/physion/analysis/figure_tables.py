@@ -75,7 +75,7 @@ def kappa_table(comparison: Comparison, with_people: PeopleComparison) -> pd.Dat
     Columns: `MEASURE_COLUMNS`. Intervals draw people and stimuli.
     """
     rows = with_people.scores[with_people.scores["measure"] == "kappa"].rename(
-        columns={"model": "model", "scenario": "panel", "low_both": "low", "high_both": "high"}
+        columns={"scenario": "panel", "low_both": "low", "high_both": "high"}
     )[["panel", "model", "value", "low", "high", "reason"]]
     readouts = comparison.scores.drop_duplicates("model").set_index("model")["readout"]
     rows = rows[rows["model"].isin([*comparison.names, *COMPUTED])]

@@ -28,7 +28,6 @@ from physion.analysis.statistics.paired import (
     mcnemar_exact,
     paired_difference,
 )
-from physion.analysis.statistics.regression import calibration_table
 from physion.analysis.tables import MEAN, POOLED, in_order
 from physion.core.errors import PhysionError
 
@@ -141,11 +140,6 @@ def paired_tests(
     return table
 
 
-def calibration_scores(pooled: PooledStimuli) -> pd.DataFrame:
-    """Return `calibration_table` of every model against the official outcomes."""
-    return calibration_table(list(pooled.names), pooled.p_contact, pooled.label)
-
-
 COLUMNS = ("scenario", "measure", "first", "second", "stimuli", "difference", "low", "high", "p",
            "p_holm", "p_bh")  # fmt: skip
 
@@ -204,11 +198,11 @@ def _difference(
     draws: Bootstrap,
     permutations: int,
 ) -> Difference:
-    right = pooled.correct[np.ix_(pair, shared)] == 1
-    label = pooled.label[shared]
+    both, label = list(pair), pooled.label[shared]
+    right = pooled.correct[both][:, shared] == 1
     return paired_difference(
         measure,
-        pooled.p_contact[np.ix_(pair, shared)],
+        pooled.p_contact[both][:, shared],
         np.where(right, label, 1 - label),
         pooled.p_yes[shared],
         np.unique(pooled.scenario, return_inverse=True)[1][shared],

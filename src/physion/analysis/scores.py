@@ -192,6 +192,22 @@ def _record(
     return record
 
 
+def shown_average(scores: pd.DataFrame) -> str:
+    """Return which average is shown first: `MEAN`, or `POOLED` if that has more numbers.
+
+    Scenarios of few stimuli leave no mean. ``scores``: a table with ``kind``, ``scenario``,
+    ``accuracy`` and ``r``, in which the models decide, if there are any.
+    """
+    models = scores[scores["kind"] == "model"]
+    rows = scores if models.empty else models
+    known = rows[["accuracy", "r"]].notna().sum(axis=1).groupby(rows["scenario"]).sum()
+    return POOLED if known.get(POOLED, 0) > known.get(MEAN, 0) else MEAN
+
+
+AVERAGES = {MEAN: "mean over scenarios", POOLED: "all stimuli pooled"}
+"""Words for the averages."""
+
+
 def people_table(
     people: pd.DataFrame, zone: pd.DataFrame | None, level: float = 0.95
 ) -> pd.DataFrame:

@@ -16,14 +16,11 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import check_digest, digest_path
 from physion.core.names import OFFICIAL_SCENARIOS, SCENARIOS, canonical_name, scenario_of
-
-Array = npt.NDArray[np.float64]
 
 
 def read_csv(path: Path, columns: Iterable[str] = ()) -> pd.DataFrame:
@@ -117,6 +114,11 @@ FLAGS = {
     **dict.fromkeys(("false", "0", "0.0", "no"), False),
 }
 """Words for True and False in a table, in any case."""
+
+
+SCENARIO = must("scenario", "choice", "Scenario, by our name or the official one",
+                choices=(*SCENARIOS, *OFFICIAL_SCENARIOS))  # fmt: skip
+"""Column of the eight scenarios in a released table."""
 
 
 def data_dictionary(columns: Sequence[Column]) -> list[dict[str, Any]]:
@@ -242,21 +244,6 @@ def require_columns(table: pd.DataFrame, columns: Iterable[str], where: str) -> 
     if missing:
         result = ", ".join(map(str, table.columns[:12]))
         raise BadInputError(f"{where} lacks the column(s) {', '.join(missing)}; it has: {result}")
-
-
-def as_numbers(values: pd.Series, low: float, high: float, where: str) -> Array:
-    """Return ``values`` as finite float64 in [low, high]; `BadInputError` names the first other
-    one.
-    """
-    numbers: Array = np.asarray(pd.to_numeric(values, errors="coerce"), dtype=np.float64)
-    good = np.isfinite(numbers) & (numbers >= low) & (numbers <= high)
-    if not good.all():
-        row = int(np.flatnonzero(~good)[0])
-        raise BadInputError(
-            f"{where}: row {row + 1} of column {values.name!r} holds {values.iloc[row]!r}; "
-            f"expected a number from {low:g} to {high:g}"
-        )
-    return numbers
 
 
 def refuse_duplicates(names: pd.Series, where: str) -> None:
@@ -556,21 +543,22 @@ def read_humans(folder: Path, dominoes: DominoesLook = "plain") -> pd.DataFrame:
     return humans.drop(columns="order").reset_index(drop=True)
 
 
+HUMANS: tuple[Column, ...] = (
+    must("stimulus", "text", "Name of the trial", also=("stim_ID",)),
+    must("accuracy", "number", "Fraction of right answers", low=0, high=1, also=("correct",)),
+    must("count", "number", "People", low=1, high=1e9, also=("c",)),
+)
+"""One row per stimulus; the other headers are the official ones."""
+
+
 def _read_file(path: Path, scenario: str, redyellow: bool) -> pd.DataFrame:
-    raw = read_csv(path, ("stim_ID", "correct", "c"))
+    rows = check_table(read_csv(path), HUMANS, str(path))
     # Either file can contain rows of the older experiment, so the names of the stimuli count too.
-    red = raw["stim_ID"].str.contains("-redyellow") | redyellow
-    table = pd.DataFrame(
-        {
-            "stimulus": raw["stim_ID"].map(canonical_name),
-            "scenario": scenario_name(scenario),
-            "accuracy": as_numbers(raw["correct"], 0, 1, str(path)),
-            "count": as_numbers(raw["c"], 1, 1e9, str(path)),
-            "redyellow": red,
-        }
-    )
-    refuse_duplicates(table["stimulus"], str(path))
-    return table
+    red = rows["stimulus"].str.contains("-redyellow") | redyellow
+    names = rows["stimulus"].map(canonical_name)
+    refuse_duplicates(names, str(path))
+    table = rows.assign(stimulus=names, scenario=scenario_name(scenario), redyellow=red)
+    return table[["stimulus", "scenario", "accuracy", "count", "redyellow"]]
 
 
 def _choose_look(table: pd.DataFrame, dominoes: DominoesLook, folder: Path) -> pd.DataFrame:
@@ -615,14 +603,13 @@ def read_human_zone(path: Path) -> pd.DataFrame:
     Columns: ``scenario`` (ours), ``low``, ``high``: the 2.5th and the 97.5th percentile of the
     accuracies of single participants, which per-stimulus tables do not contain.
     """
-    raw = read_csv(path, ("scenario", "pct_2.5", "pct_97.5"))
-    zone = pd.DataFrame(
-        {
-            "scenario": raw["scenario"].map(scenario_name),
-            "low": as_numbers(raw["pct_2.5"], 0, 1, str(path)),
-            "high": as_numbers(raw["pct_97.5"], 0, 1, str(path)),
-        }
+    columns = (
+        SCENARIO,
+        must("low", "number", "2.5th percentile", low=0, high=1, also=("pct_2.5",)),
+        must("high", "number", "97.5th percentile", low=0, high=1, also=("pct_97.5",)),
     )
+    zone = check_table(read_csv(path), columns, str(path))
+    zone = zone.assign(scenario=zone["scenario"].replace(OFFICIAL_SCENARIOS))
     refuse_duplicates(zone["scenario"], str(path))
     return zone
 

@@ -132,11 +132,10 @@ def counted(number: int, singular: str, plural: str = "") -> str:
 
 def print_scores(result: CompareResult) -> None:
     """Print the table of results of a comparison: people, models, baselines."""
-    from physion.analysis.tables import MEAN
+    from physion.analysis.scores import AVERAGES
 
-    over = "mean over scenarios" if result.summary_of == MEAN else "all stimuli pooled"
-    title = f"People and models, {over}, with 95 % intervals"
-    print_line(text_table(result.summary, title) + "\n")
+    title = f"People and models, {AVERAGES[result.summary_of]}, with 95 % intervals"
+    console.print(text_table(result.summary, title) + "\n", markup=False, soft_wrap=True)
 
 
 def text_table(table: pd.DataFrame, title: str = "") -> str:

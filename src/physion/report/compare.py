@@ -26,6 +26,7 @@ from physion.analysis.people.results import (
     rules_called,
 )
 from physion.analysis.rollout_errors import read_rollout_errors, rollout_error_table
+from physion.analysis.scores import AVERAGES, shown_average
 from physion.analysis.tables import (
     LABELS_FILE,
     MEAN,
@@ -106,14 +107,8 @@ class CompareResult:
 
     @property
     def summary_of(self) -> str:
-        """Scenario of the rows of ``summary``: `MEAN`, or `POOLED` where that has more numbers."""
-        kinds = self.scores[self.scores["kind"] == "model"]
-        rows = self.scores if kinds.empty else kinds
-        mean, pooled = (
-            int(rows.loc[rows["scenario"] == name, ["accuracy", "r"]].notna().sum().sum())
-            for name in (MEAN, POOLED)
-        )
-        return POOLED if pooled > mean else MEAN
+        """Scenario of the rows of ``summary``, from `shown_average`."""
+        return shown_average(self.scores)
 
     def report(self, folder: Path | str, **page: Any) -> Path:
         """Write page, tables and figures to ``folder``; return the path of the page.
@@ -147,8 +142,7 @@ class CompareResult:
 
     def _heading(self) -> str:
         names = [name for name in self.scores["scenario"].unique() if name not in (MEAN, POOLED)]
-        over = "mean over scenarios" if self.summary_of == MEAN else "all stimuli pooled"
-        return f"{', '.join(names)}; {over}; 95 % intervals"
+        return f"{', '.join(names)}; {AVERAGES[self.summary_of]}; 95 % intervals"
 
 
 def _with_interval(row: pd.Series, name: str) -> str:

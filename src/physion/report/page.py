@@ -9,7 +9,8 @@ import pandas as pd
 
 from physion.analysis.comparison import Comparison
 from physion.analysis.people.results import PeopleResults
-from physion.analysis.tables import MEAN, POOLED, in_order
+from physion.analysis.scores import AVERAGES, shown_average
+from physion.analysis.tables import MEAN, in_order
 from physion.core.html import Markup, joined
 from physion.report import html, scores
 from physion.report import people as people_parts
@@ -136,7 +137,7 @@ def _answer(comparison: Comparison) -> str:
     for name, text in (("accuracy", "Most accurate"), ("r", "Most like people")):
         if name not in models or (name == "r" and not comparison.has_people):
             continue
-        for which, over in ((MEAN, "mean over scenarios"), (POOLED, "all stimuli pooled")):
+        for which in sorted(AVERAGES, key=lambda name: name != shown_average(scores)):
             rows = models[models["scenario"] == which].dropna(subset=[name])
             if len(rows):
                 best = rows.loc[rows[name].idxmax()]
@@ -145,7 +146,7 @@ def _answer(comparison: Comparison) -> str:
                 label, column = other[name]
                 known = column in rows and pd.notna(best[column])
                 beyond = f"; {label} {html.number(best[column])}" if known else ""
-                words.append(f"{text}: {best['model']} ({value}{beyond}; {over}).")
+                words.append(f"{text}: {best['model']} ({value}{beyond}; {AVERAGES[which]}).")
                 break
     return " ".join(words)
 

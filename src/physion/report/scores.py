@@ -11,7 +11,7 @@ from physion.analysis.comparison import SETTING, Comparison
 from physion.analysis.metrics import BEYOND_OUTCOME, Metric, score_metrics
 from physion.analysis.mixed.result import effect_name
 from physion.analysis.model_tests import MixedTable, permutations_of
-from physion.analysis.scores import TWO_PEOPLE
+from physion.analysis.scores import AVERAGES, TWO_PEOPLE, shown_average
 from physion.analysis.tables import MEAN, POOLED, in_order
 from physion.core.html import Markup, joined
 from physion.report.html import (
@@ -106,12 +106,11 @@ _BEYOND = (
 
 
 def scores(comparison: Comparison) -> Markup:
-    """Return all tables of scores: mean over scenarios and pooled, beyond the outcome, later."""
+    """Return all tables of scores: averages, beyond the outcome, later contacts."""
     plain = shown_metrics(comparison, beyond=False)
     parts = [
         paragraph(_BASELINES) if comparison.has_people else Markup(),
-        scores_table(comparison.all_scores, MEAN, plain, "Mean over scenarios"),
-        _pooled(comparison, plain),
+        *_averages(comparison, plain),
     ]
     if comparison.has_people:
         parts += [heading("Beyond the outcome"), paragraph(_BEYOND), *_beyond(comparison)]
@@ -119,19 +118,21 @@ def scores(comparison: Comparison) -> Markup:
     return joined(parts)
 
 
-def _pooled(comparison: Comparison, metrics: Sequence[Metric]) -> Markup:
-    """Return the pooled scores, which are open at first where few stimuli leave no mean."""
+def _averages(comparison: Comparison, metrics: Sequence[Metric]) -> list[Markup]:
+    """Return the average that is shown first, as on the terminal, then the other one, closed."""
     scores = comparison.all_scores
-    mean = scores[(scores["scenario"] == MEAN) & (scores["kind"] == "model")]
-    lacking = bool(mean[[metric.name for metric in metrics]].isna().all(axis=1).all())
-    return details("All stimuli pooled", scores_table(scores, POOLED, metrics), lacking)
+    first = shown_average(scores)
+    (other,) = set(AVERAGES) - {first}
+    return [
+        scores_table(scores, first, metrics, AVERAGES[first].capitalize()),
+        details(AVERAGES[other].capitalize(), scores_table(scores, other, metrics)),
+    ]
 
 
 def _beyond(comparison: Comparison) -> list[Markup]:
     beyond = shown_metrics(comparison, beyond=True)
     tables = [
-        scores_table(comparison.all_scores, MEAN, beyond, "Mean over scenarios"),
-        _pooled(comparison, beyond),
+        *_averages(comparison, beyond),
     ]
     for metric in score_metrics():
         if metric.name in BEYOND_OUTCOME:
@@ -154,7 +155,9 @@ def _later(comparison: Comparison) -> Markup:
         ("accuracy", "human_accuracy", *_LIKENESS, *BEYOND_OUTCOME) if several else ("accuracy",)
     )
     chosen = [metric for metric in score_metrics() if metric.name in names]
-    return paragraph(words) + scores_table(comparison.later, MEAN, chosen, "Mean over scenarios")
+    first = shown_average(comparison.later)
+    caption = AVERAGES[first].capitalize()
+    return paragraph(words) + scores_table(comparison.later, first, chosen, caption)
 
 
 def shown_metrics(comparison: Comparison, beyond: bool) -> list[Metric]:

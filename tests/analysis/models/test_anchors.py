@@ -22,6 +22,7 @@ from physion.analysis.scores import (
     MAJORITY,
     OUTCOME,
     TWO_PEOPLE,
+    baseline_stimuli,
     kind_of,
 )
 from physion.analysis.tables import MEAN, POOLED, read_humans, read_labels
@@ -75,6 +76,8 @@ def test_the_outcome_is_right_and_its_kappa_matches_the_table_of_answers() -> No
     p_yes = np.where(truth == 1, right, 1 - right)
     assert row["accuracy"] == 1 and row["human_accuracy"] == pytest.approx(right.mean())
     assert row["r"] == pytest.approx(np.corrcoef(truth, p_yes)[0, 1])
+    rows = baseline_stimuli(compared().stimuli)
+    np.testing.assert_allclose(rows.loc[rows["model"] == OUTCOME, "gap"], truth - p_yes)
     # As single answers of 20 people to each stimulus, and the outcome 20 times.
     said = np.concatenate([np.arange(20) < round(20 * p) for p in p_yes])
     expected = cohen_kappa_score(np.repeat(truth == 1, 20), said)

@@ -95,6 +95,8 @@ def test_scores_match_the_joined_rows() -> None:
     pooled = score(found.scores, "m · observed", POOLED)
     assert pooled["r"] == pytest.approx(np.corrcoef(p, p_yes)[0, 1])
     assert pooled["rmsd"] == pytest.approx(np.sqrt(np.mean((p - p_yes) ** 2)))
+    stimuli = found.stimuli.set_index("stimulus").loc[given["Stimulus Name"]]
+    np.testing.assert_allclose(stimuli["gap"], p - p_yes)
     mean = score(found.scores, "m · observed", MEAN)
     by_scenario = found.scores[found.scores["scenario"].isin(SCENARIOS)]
     for key in ("accuracy", "human_accuracy", "r", "rmsd", "ceiling"):

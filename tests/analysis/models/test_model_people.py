@@ -10,14 +10,23 @@ import pandas as pd
 import pytest
 from sklearn.metrics import cohen_kappa_score
 
-from physion.analysis.compare import PeopleComparison, compare_everywhere
+from physion.analysis.compare import (
+    PeopleComparison,
+    all_results,
+    compare_everywhere,
+    tidy_scores,
+)
 from physion.analysis.intervals import Bootstrap, Variance, degrees_of_freedom
 from physion.analysis.metrics import measure_metrics, metrics
 from physion.analysis.people.effects import difficulty_third, r_by_third
 from physion.analysis.people.measures import ScenarioAnswers, answers_of, split_halves
+from physion.analysis.people.results import analyse_people
 from physion.analysis.sample import Resampled
 from physion.analysis.scores import (
+    MAJORITY,
+    OUTCOME,
     RELEASED_R,
+    TWO_PEOPLE,
     Models,
     human_zones,
     measure_models,
@@ -28,9 +37,11 @@ from physion.analysis.scores import (
     released_zone,
     sample_of_models,
     sampling_variances,
+    shown_average,
 )
 from physion.analysis.statistics import agreement
 from physion.analysis.statistics.agreement import correctness
+from physion.analysis.tables import MEAN, POOLED
 from physion.core.errors import BadInputError
 from support.simulated_people import study
 
@@ -382,3 +393,42 @@ def test_r_within_thirds_matches_their_stimuli(answers: ScenarioAnswers, models:
         assert row.r == pytest.approx(expected, abs=1e-9, nan_ok=True)
         assert row.stimuli == (third == row.third).sum()
     assert table["stimuli"].sum() == 25 * 5 and (table["model"] == -1).sum() == 3
+
+
+# --- one table of everything ----------------------------------------------------------------------
+
+
+def test_the_tidy_table_takes_intervals_about_people_and_stimuli_where_it_has_them() -> None:
+    people = analyse_people(study(people=8, stimuli=16, scenarios=("collide", "roll"), seed=2),
+                            bootstrap=FEW)  # fmt: skip
+    stimuli = people.tables["by_stimulus"]["stimulus"]
+    p = np.random.default_rng(0).random(len(stimuli))
+    given = pd.DataFrame({"model": "m", "stimulus": stimuli, "p_contact": p})
+    results = all_results(given, people=people, bootstrap=FEW)
+    table = tidy_scores(results).set_index(["model", "scenario"])
+    assert table.index.get_level_values("model").unique().tolist() == [TWO_PEOPLE, "m", OUTCOME,
+                                                                       MAJORITY]  # fmt: skip
+    assert results.beside is not None
+    measured = results.beside.scores.set_index(["model", "scenario", "measure"])
+    plain = results.comparison.all_scores.set_index(["model", "scenario"])
+    for scenario in ("collide", "roll", MEAN):
+        row = table.loc[("m", scenario)]
+        assert row["interval"] == "people and stimuli"
+        for name in ("accuracy", "r", "kappa", "rmsd"):
+            one = measured.loc[("m", scenario, name)]
+            assert row[[name, f"{name}_low", f"{name}_high"]].tolist() == pytest.approx(
+                one[["value", "low_both", "high_both"]].tolist()
+            ), (scenario, name)
+    pooled = table.loc[("m", POOLED)]
+    assert pooled["interval"] == "stimuli" and np.isnan(pooled["kappa"])
+    assert pooled["r_low"] == plain.loc[("m", POOLED), "r_low"]
+
+
+def test_the_average_with_more_numbers_is_shown() -> None:
+    table = pd.DataFrame(
+        {"kind": ["people", "model", "people", "model"], "scenario": [MEAN, MEAN, POOLED, POOLED],
+         "accuracy": 0.7, "r": [0.5, 0.5, 0.5, 0.5]}
+    )  # fmt: skip
+    assert shown_average(table) == MEAN
+    assert shown_average(table.assign(r=[0.5, np.nan, np.nan, 0.5])) == POOLED  # models decide
+    assert shown_average(table[table["kind"] == "people"].assign(r=[np.nan, 0.5])) == POOLED

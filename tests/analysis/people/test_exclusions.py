@@ -206,6 +206,32 @@ def test_the_sets_differ_where_the_released_code_did() -> None:
     assert flag_sessions(found, code)["low_accuracy"].tolist() == by_mean.tolist()
 
 
+def test_centre_and_spread_come_from_complete_sessions_only() -> None:
+    """Four broken-off sessions, slow and wrong, would hide a poor one and a slow one."""
+    rights = {f"c{k:02d}": 36 - 2 * (k % 2) for k in range(16)} | {"poor": 28, "slow": 35}
+    rights |= {f"broken{k}": 5 for k in range(4)}
+    sessions = {name: [True] * n + [False] * (40 - n) for name, n in rights.items()}
+    sessions = {name: given[: 39 if "broken" in name else 40] for name, given in sessions.items()}
+    found = with_answers(sessions, [True] * 40)
+    log_rt = {name: 7.0 + 0.1 * (k % 2) for k, name in enumerate(rights)}
+    log_rt |= {"slow": 7.4} | {f"broken{k}": 9.0 for k in range(4)}
+    found = replace(found, trials=found.trials.assign(log_rt=found.trials["session"].map(log_rt)))
+    complete = [name for name in rights if "broken" not in name]
+    accuracy = pd.Series({name: np.mean(given) for name, given in sessions.items()})
+    times = pd.Series(log_rt)
+    for rules, centre, ddof in ((PREREGISTERED, np.median, 1), (OFFICIAL_CODE, np.mean, 0)):
+        flags = flag_sessions(found, rules).set_index("session")
+        assert set(flags.index[flags["incomplete"]]) == {f"broken{k}" for k in range(4)}
+        whole = accuracy[complete].to_numpy()
+        limit = centre(whole) - 3 * np.std(whole, ddof=ddof)
+        assert flags["low_accuracy"].to_dict() == (accuracy < limit).to_dict()
+        assert flags.loc["poor", "low_accuracy"] and not flags.loc["slow", "low_accuracy"]
+        whole = times[complete].to_numpy()
+        limit = np.median(whole) + 3 * np.std(whole, ddof=ddof)
+        assert flags["slow"].to_dict() == (times > limit).to_dict()
+        assert flags.loc["slow", "slow"] and not flags.loc["poor", "slow"]
+
+
 def test_incomplete_and_repeated_sessions_are_flagged() -> None:
     label = [True] * 40
     found = with_answers(

@@ -171,7 +171,7 @@ def test_both_looks_of_dominoes(tmp_path: Path) -> None:
 
 def test_an_absent_look_is_named(tmp_path: Path) -> None:
     folder_with(tmp_path, red=HEADER + "d-redyellow_1,.4,10\n")
-    with pytest.raises(BadInputError, match="look 'redyellow' alone"):
+    with pytest.raises(BadInputError, match="look 'redyellow' only"):
         read_humans(tmp_path)
     with pytest.raises(BadInputError, match="choose plain"):
         read_humans(tmp_path, dominoes="blue")  # type: ignore[arg-type]

@@ -11,7 +11,6 @@ import pytest
 
 from physion.analysis.people.measures import answers_of, mean_over_people
 from physion.analysis.people.responses import (
-    CONFLICT,
     COPY,
     EXCLUDED,
     LEDGE,
@@ -20,13 +19,11 @@ from physion.analysis.people.responses import (
     SESSION_COLUMNS,
     SIMULATED,
     TRIAL_COLUMNS,
-    UNKNOWN,
     check_labels,
-    check_table,
-    data_dictionary,
     read_official_responses,
     read_responses,
 )
+from physion.analysis.tables import check_table, data_dictionary
 from physion.core.errors import BadInputError
 from support.simulated_people import as_responses, simulate_study, study
 
@@ -148,30 +145,14 @@ def test_copies_and_missing_answers_are_dropped_and_counted(
     assert len(found.trials) == 3 * 16 - 2
 
 
-def test_two_different_answers_to_one_stimulus_are_refused_or_counted(
-    tables: tuple[pd.DataFrame, pd.DataFrame], tmp_path: Path
+def test_two_different_answers_to_one_stimulus_are_refused(
+    tables: tuple[pd.DataFrame, pd.DataFrame],
 ) -> None:
     trials = tables[0]
-    again = trials.iloc[[12]].assign(trial=99, rt_ms=5000.0)
-    path = tmp_path / "trials.csv"
-    pd.concat([again, trials]).to_csv(path, index=False)
-    with pytest.raises(BadInputError, match="two answers"):
-        read_responses(path)
-    found = read_responses(path, conflicts="drop")
-    assert counts(found.dropped) == {CONFLICT: (1, 1)}
-    assert 99 not in set(found.trials["trial"])  # the first by order of answering stays
-
-
-def test_unknown_stimuli_are_refused_or_counted(
-    tables: tuple[pd.DataFrame, pd.DataFrame], tmp_path: Path
-) -> None:
-    path = tmp_path / "trials.csv"
-    tables[0].to_csv(path, index=False)
-    known = set(tables[0]["stimulus"]) - {"collide_003"}
-    with pytest.raises(BadInputError, match="'collide_003' is not known"):
-        read_responses(path, known=known)
-    found = read_responses(path, known=known, unknown="drop")
-    assert counts(found.dropped) == {UNKNOWN: (3, 3)}
+    for changed in ({"trial": 99}, {"stimulus": "collide_099"}):
+        again = trials.iloc[[12]].assign(rt_ms=5000.0, **changed)
+        with pytest.raises(BadInputError, match=r"two answers to trial .*keep one row"):
+            as_responses(pd.concat([again, trials]))
 
 
 def test_simulated_participants_are_left_out_and_counted(
@@ -270,21 +251,18 @@ def test_official_columns_are_read_with_the_official_offset(tmp_path: Path) -> N
     assert rows["stimulus"].tolist() == [NAMES[1], NAMES[0], NAMES[0], NAMES[1]]
     assert rows["buttons"].tolist() == ["yes-no"] * 2 + ["no-yes"] * 2
     assert rows["participant"].tolist() == ["p", "p", "q", "q"]
-    later = read_official_responses([test], rt_offset_ms=3500)
-    assert later.test["rt_ms"].iloc[1] == 0 and np.isnan(later.test["log_rt"].iloc[1])
 
 
 def test_official_files_of_any_name_know_their_scenario_by_their_stimuli(tmp_path: Path) -> None:
     path = official_file(tmp_path, "a.csv", condition=["prediction", "prediction"] * 2)
     assert set(read_official_responses([path]).trials["scenario"]) == {"collide"}
     strange = official_file(tmp_path, "b.csv", stim_ID=["x_0001", "x_0002"] * 2)
-    with pytest.raises(BadInputError, match="name the scenario"):
+    with pytest.raises(BadInputError, match="name it human_responses-SCENARIO"):
         read_official_responses([strange])
-    named = read_official_responses([strange], scenario="towers")
-    assert set(named.trials["scenario"]) == {"support"}
+    named = strange.rename(tmp_path / "human_responses-towers_pilot.csv")
+    assert set(read_official_responses([named]).trials["scenario"]) == {"support"}
     with pytest.raises(BadInputError, match="'rt' holds"):
-        read_official_responses([official_file(tmp_path, "c.csv", rt=["soon"] * 4)],
-                                scenario="drop")  # fmt: skip
+        read_official_responses([official_file(tmp_path, "c.csv", rt=["soon"] * 4)])
     with pytest.raises(BadInputError, match="no file"):
         read_official_responses([])
 

@@ -105,6 +105,12 @@ def test_accuracies_match_plain_grouping(made: Responses) -> None:
     assert (row["zone_low"], row["zone_high"]) == pytest.approx(np.percentile(own, [2.5, 97.5]))
     assert table.loc["mean", "accuracy"] == pytest.approx(table["accuracy"].iloc[:2].mean())
     assert "not one sample" in table.loc["mean", "reason"]
+    assert row["sd"] == pytest.approx(own.std(ddof=1)) and row["df"] == 23
+    drawn = {name: FEW.weights(f"people of {name}", 24) @ plain[plain.index.str.startswith(name)]
+             / 24 for name in ("collide", "roll")}  # fmt: skip
+    for where, values in (("roll", drawn["roll"]), ("mean", np.mean(list(drawn.values()), axis=0))):
+        ends = table.loc[where, "accuracy_low"], table.loc[where, "accuracy_high"]
+        assert ends == pytest.approx(np.percentile(values, [2.5, 97.5]))
 
 
 def test_the_interval_of_people_has_the_width_of_the_standard_error() -> None:
@@ -119,7 +125,7 @@ def test_the_interval_of_people_has_the_width_of_the_standard_error() -> None:
 def test_people_who_are_too_few_or_too_alike_get_reasons(made: Responses) -> None:
     one = made.test[made.test["session"] == "roll-s001"]
     row = accuracy_by_scenario(one, FEW).iloc[0]
-    assert np.isnan(row["accuracy_low"]) and "one person alone" in row["reason"]
+    assert np.isnan(row["accuracy_low"]) and "only one person" in row["reason"]
     alike = agreement_by_scenario(one, FEW, halves=10)
     assert alike["mean"].isna().all() and alike["reason"].str.contains("no pair").all()
     same = made.test.assign(yes=True)
@@ -149,17 +155,9 @@ def test_pairs_are_summarised_as_they_are(made: Responses) -> None:
     assert halves["mean"] < whole["mean"] and halves["values"] == 50
 
 
-@settings(deadline=None)
-@given(st.floats(-0.99, 1), st.floats(1, 5))
-def test_spearman_brown_lengthens_and_shortens(r: float, factor: float) -> None:
-    longer = float(spearman_brown(r, factor))
-    if np.isnan(longer):
-        assert 1 + (factor - 1) * r <= 1e-12
-        return
-    assert longer == pytest.approx(factor * r / (1 + (factor - 1) * r))
-    if r > 0:
-        assert r - 1e-12 <= longer <= 1 + 1e-12
-        assert float(spearman_brown(longer, 1 / factor)) == pytest.approx(r)
+def test_spearman_brown_doubles_the_number_of_people() -> None:
+    r = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+    np.testing.assert_allclose(spearman_brown(r), [np.nan, -2.0, 0.0, 2 / 3, 1.0])
 
 
 def test_halves_of_people_give_what_their_number_makes_likely() -> None:
@@ -273,6 +271,42 @@ def test_a_liking_for_yes_and_for_the_left_are_distinguished(made: Responses) ->
     found = side_bias(lefty, FEW).set_index("scenario")
     assert (found["left_low"] > 0.55).all() and (found["p"] < 1e-3).all()
     assert found["left"].to_numpy() == pytest.approx([0.7, 0.7], abs=0.05)
+
+
+def test_biases_are_means_over_people_by_hand(made: Responses) -> None:
+    test = made.test.drop(index=made.test.index[[3, 40]])
+    rows = test[test["scenario"] == "collide"]
+    z, yes, base = [], [], []
+    for _, own in rows.groupby("session"):
+        touch, said = own["label"].to_numpy(bool), own["yes"].to_numpy(bool)
+        rates = [(said[part].sum() + 0.5) / (part.sum() + 1) for part in (touch, ~touch)]
+        z.append(stats.norm.ppf(rates))
+        yes.append(said.mean())
+        base.append(touch.mean())
+    hit, alarm = np.array(z).T
+    found = yes_bias(test, FEW).set_index("scenario").loc["collide"]
+    expected = {"d_prime": hit - alarm, "criterion": -(hit + alarm) / 2,
+                "bias": np.array(yes) - np.array(base)}  # fmt: skip
+    for name, values in expected.items():
+        assert found[name] == pytest.approx(values.mean())
+        drawn = FEW.weights("people of collide", 24) @ values / 24
+        ends = found[f"{name}_low"], found[f"{name}_high"]
+        assert ends == pytest.approx(np.percentile(drawn, [2.5, 97.5]))
+    groups = [own["yes"].mean() for _, own in rows.groupby("session")]
+    order = rows.groupby("session")["buttons"].first().eq("yes-no").to_numpy()
+    left, right = np.array(groups)[order], np.array(groups)[~order]
+    side = side_bias(test, FEW).set_index("scenario").loc["collide"]
+    assert side["left"] == pytest.approx((left.mean() + 1 - right.mean()) / 2)
+    assert side["p"] == pytest.approx(stats.ttest_ind(left, right, equal_var=False).pvalue)
+
+
+def test_halves_of_the_trials_part_in_the_middle(made: Responses) -> None:
+    """30 trials: numbers 0 to 14, and 15 to 29."""
+    rows = made.test[made.test["scenario"] == "roll"]
+    found = learning(rows).iloc[0]
+    assert rows["trial"].max() == 29
+    assert found["first_half"] == pytest.approx(rows[rows["trial"] < 15]["correct"].mean())
+    assert found["second_half"] == pytest.approx(rows[rows["trial"] >= 15]["correct"].mean())
 
 
 def test_biases_that_cannot_be_known_say_why(made: Responses) -> None:

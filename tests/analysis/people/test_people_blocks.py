@@ -10,14 +10,9 @@ import pytest
 from physion.analysis.check import check_responses
 from physion.analysis.people.exclusions import expected_by_session, flag_sessions
 from physion.analysis.people.measures import accuracy_by_scenario
-from physion.analysis.people.responses import (
-    TRIAL_COLUMNS,
-    check_table,
-    clean,
-    scenario_set,
-    scenarios_in,
-)
+from physion.analysis.people.responses import TRIAL_COLUMNS, clean, scenario_set, scenarios_in
 from physion.analysis.people.results import analyse_people
+from physion.analysis.tables import check_table
 from physion.core.errors import BadInputError
 
 BLOCKS = {"collide": 6, "support": 6}

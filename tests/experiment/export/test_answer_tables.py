@@ -10,7 +10,8 @@ import pytest
 import sqlalchemy as sa
 from pandas.testing import assert_frame_equal
 
-from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS, check_table
+from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS
+from physion.analysis.tables import check_table
 from physion.core.errors import PhysionError, UnknownNameError
 from physion.experiment.experimenter.progress import StudyProgress
 from physion.experiment.export import tables as trial_rows

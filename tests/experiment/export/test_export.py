@@ -12,8 +12,8 @@ import sqlalchemy as sa
 from pandas.testing import assert_frame_equal
 
 from physion.analysis.people.exclusions import flag_sessions, read_expected
-from physion.analysis.people.responses import check_table, read_responses
-from physion.analysis.tables import read_table
+from physion.analysis.people.responses import read_responses
+from physion.analysis.tables import check_table, read_table
 from physion.cli.experiment import export as experiment_export
 from physion.cli.help import EXAMPLES
 from physion.cli.main import main

@@ -279,12 +279,12 @@ def below_chance_level(by_stimulus: pd.DataFrame, level: float = 0.05) -> pd.Dat
     )
 
 
-def difficulty_third(accuracy: npt.ArrayLike, edges: tuple[float, float] = EDGES) -> pd.Series:
+def difficulty_third(accuracy: npt.ArrayLike) -> pd.Series:
     """Return ``hard`` up to the first edge, ``easy`` from the second, ``chance`` between; NaN stays
     NaN.
     """
     values = np.asarray(accuracy, dtype=np.float64)
-    names = np.select([values <= edges[0], values >= edges[1]], ["hard", "easy"], "chance")
+    names = np.select([values <= EDGES[0], values >= EDGES[1]], ["hard", "easy"], "chance")
     return pd.Series(names, dtype=object).where(np.isfinite(values), np.nan)
 
 

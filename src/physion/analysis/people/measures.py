@@ -336,16 +336,14 @@ def split_halves(yes: Array, halves: int = HALVES, seed: int = 0) -> Array:
     return correlate_rows(mean_over_people(yes, first), mean_over_people(yes, 1 - first))
 
 
-def spearman_brown(r: npt.ArrayLike, factor: float = 2.0) -> Array:
-    """Return the expected r of groups ``factor`` times as large, by Spearman and Brown.
+def spearman_brown(r: npt.ArrayLike) -> Array:
+    """Return the expected r of groups twice as large: 2 r / (1 + r), by Spearman and Brown.
 
-    NaN for r of -1 / (factor - 1) or less. A negative r has no meaning for two halves, but is not
-    clipped.
+    A negative r has no meaning for two halves, but is not clipped; NaN for r of -1.
     """
     values = np.asarray(r, dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
-        below = 1 + (factor - 1) * values
-        return np.where(below > 0, factor * values / below, np.nan)
+        return np.where(values > -1, 2 * values / (1 + values), np.nan)
 
 
 # Statistics of single stimuli as items of a test: difficulty, and whether they measure the same.

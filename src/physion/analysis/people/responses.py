@@ -17,10 +17,9 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.tables import Column as Column
-from physion.analysis.tables import check_table as check_table
-from physion.analysis.tables import data_dictionary as data_dictionary
 from physion.analysis.tables import (
+    Column,
+    check_table,
     in_order,
     must,
     read_csv,
@@ -171,14 +170,11 @@ SESSION_COLUMNS: tuple[Column, ...] = (
 """One row per session; demographics are asked at its end, so that they are empty in broken ones."""
 
 
-Refuse = Literal["refuse", "drop"]
 Participants = Literal["people", "simulated", "all"]
 """Whose sessions are kept: of people, of simulated participants, or of both."""
 
 NO_ANSWER = "no answer was given"
 COPY = "exact copy of another row"
-CONFLICT = "another row of the same session is about the same stimulus"
-UNKNOWN = "stimulus is not known"
 SIMULATED = "session of a simulated participant"
 PERSON = "session of a person, in a rehearsal"
 REHEARSAL = "Rehearsal: participants are simulated, so no number here is about people"
@@ -259,9 +255,6 @@ def read_responses(
     trials: Path,
     sessions: Path | None = None,
     *,
-    known: Collection[str] | None = None,
-    unknown: Refuse = "refuse",
-    conflicts: Refuse = "refuse",
     participants: Participants = "people",
 ) -> Responses:
     """Read the responses of our experiment's export.
@@ -270,12 +263,6 @@ def read_responses(
     ----------
     trials, sessions
         CSV or parquet files with `TRIAL_COLUMNS` and `SESSION_COLUMNS`.
-    known
-        Names of the stimuli that may occur; None: any.
-    unknown
-        What to do with other stimuli.
-    conflicts
-        What to do with a second answer of one session to one stimulus (``drop`` keeps the first).
     participants
         Whose sessions to keep; the others are dropped and counted.
 
@@ -288,10 +275,7 @@ def read_responses(
     people = None
     if sessions is not None:
         people = check_table(read_table(sessions, ()), SESSION_COLUMNS, str(sessions))
-    cleaned = clean(
-        table, people, where=str(trials), known=known, unknown=unknown, conflicts=conflicts
-    )
-    return _of_kind(cleaned, participants, str(trials))
+    return _of_kind(clean(table, people, where=str(trials)), participants, str(trials))
 
 
 def _of_kind(cleaned: Responses, kind: Participants, where: str) -> Responses:
@@ -323,9 +307,6 @@ def clean(
     sessions: pd.DataFrame | None = None,
     *,
     where: str = "responses",
-    known: Collection[str] | None = None,
-    unknown: Refuse = "refuse",
-    conflicts: Refuse = "refuse",
 ) -> Responses:
     """Return the responses of a table that `check_table` has typed; see `read_responses`.
 
@@ -345,8 +326,7 @@ def clean(
     if cleaned.trials.empty:
         raise BadInputError(f"{where} holds no answer")
     cleaned = _without(cleaned, cleaned.trials.duplicated(), "reading", COPY)
-    cleaned = _known(cleaned, known, unknown, where)
-    cleaned = _one_answer_each(cleaned, conflicts, where)
+    _refuse_two_answers(cleaned.trials, where)
     return replace(cleaned, trials=_derived(cleaned.trials, where))
 
 
@@ -415,34 +395,16 @@ def scenarios_in(name: str) -> list[str]:
     return name.split(SEVERAL)
 
 
-def _known(
-    cleaned: Responses, known: Collection[str] | None, unknown: Refuse, where: str
-) -> Responses:
-    if known is None:
-        return cleaned
-    names = {canonical_name(name) for name in known}
-    is_unknown = ~cleaned.trials["stimulus"].isin(names)
-    if is_unknown.any() and unknown == "refuse":
-        first = cleaned.trials.loc[is_unknown, "stimulus"].iloc[0]
-        raise BadInputError(
-            f"{where}: stimulus {first!r} is not known "
-            f"({int(is_unknown.sum())} such rows); give all stimuli, or ask to drop unknown ones"
-        )
-    return _without(cleaned, is_unknown, "reading", UNKNOWN)
-
-
-def _one_answer_each(cleaned: Responses, conflicts: Refuse, where: str) -> Responses:
-    rows = cleaned.trials.sort_values("trial", kind="stable")
-    second = rows.duplicated(["session", "phase", "stimulus"])
-    second |= rows.duplicated(["session", "phase", "trial"])
-    second = second.reindex(cleaned.trials.index)
-    if second.any() and conflicts == "refuse":
-        row = cleaned.trials[second].iloc[0]
+def _refuse_two_answers(trials: pd.DataFrame, where: str) -> None:
+    """Refuse a session with two answers to one stimulus, or at one place in its order."""
+    second = trials.duplicated(["session", "phase", "stimulus"])
+    second |= trials.duplicated(["session", "phase", "trial"])
+    if second.any():
+        row = trials[second].iloc[0]
         raise BadInputError(
             f"{where}: session {row['session']!r} has two answers to trial {row['trial']} "
-            f"({row['stimulus']!r}, {row['phase']}); clean the file, or ask to keep the first"
+            f"({row['stimulus']!r}, {row['phase']}); keep one row"
         )
-    return _without(cleaned, second, "reading", CONFLICT)
 
 
 def _derived(trials: pd.DataFrame, where: str) -> pd.DataFrame:
@@ -529,12 +491,9 @@ def check_labels(responses: Responses, labels: Mapping[str, bool]) -> None:
 # and ``familiarization_human_responses-...`` (10 trials). Their ``rt`` starts before the cue.
 
 RT_OFFSET_MS = 2500.0
-"""What the study takes off ``rt``. The cue of 2000 ms and 1500 ms of movie come before the buttons,
-so that about 1000 ms of waiting remain in its response times: they compare with each other, not
-with response times of our experiment (`BUTTONS_OFFSET_MS` would)."""
-
-BUTTONS_OFFSET_MS = 3500.0
-"""Cue and movie by the study's plan: the response time from about the moment of the buttons on."""
+"""What the study subtracts from ``rt``. The cue of 2000 ms and 1500 ms of movie come before the
+buttons, so that about 1000 ms of waiting remain in its response times: they compare with each
+other, not with response times of our experiment."""
 
 COLUMNS = ("gameID", "trialNum", "stim_ID", "response", "target_hit_zone_label", "rt")
 """Columns that must be there; ``prolificIDAnon`` (or ``prolificID``), ``correct``, ``choices``,
@@ -544,30 +503,22 @@ _STUDY = re.compile(r"human_responses-(?P<study>[a-zA-Z]+)")
 _PEOPLE = ("prolificIDAnon", "prolificID")
 
 
-def read_official_responses(
-    files: Sequence[Path],
-    *,
-    scenario: str | None = None,
-    rt_offset_ms: float = RT_OFFSET_MS,
-    known: Collection[str] | None = None,
-    unknown: Refuse = "refuse",
-    conflicts: Refuse = "refuse",
-) -> Responses:
+def read_official_responses(files: Sequence[Path]) -> Responses:
     """Read responses from the raw files of the study, test and familiarization together.
 
-    The scenario of a file is ``scenario``, else as in its name, else as in its stimuli. A
-    session is a ``gameID``; its participant is the Prolific id if there is one. ``rt_offset_ms`` is
-    subtracted from ``rt``. The other parameters: see `read_responses`.
+    The scenario of a file is the one in its name, else the one of its stimuli. A session is a
+    ``gameID``; its participant is the Prolific id if there is one. `RT_OFFSET_MS` is subtracted
+    from ``rt``.
     """
     if not files:
         raise BadInputError("no file of responses was given")
-    raw = pd.concat([_file(path, scenario, rt_offset_ms) for path in files], ignore_index=True)
+    raw = pd.concat([_file(path) for path in files], ignore_index=True)
     where = f"{files[0]}" if len(files) == 1 else f"{files[0]} and {len(files) - 1} more"
     table = check_table(raw, TRIAL_COLUMNS, where)
-    return clean(table, where=where, known=known, unknown=unknown, conflicts=conflicts)
+    return clean(table, where=where)
 
 
-def _file(path: Path, scenario: str | None, offset: float) -> pd.DataFrame:
+def _file(path: Path) -> pd.DataFrame:
     """Read one file into our columns; text stays text."""
     raw = read_csv(path, COLUMNS)
     condition = raw["condition"] if "condition" in raw else pd.Series("prediction", index=raw.index)
@@ -581,14 +532,14 @@ def _file(path: Path, scenario: str | None, offset: float) -> pd.DataFrame:
         {
             "participant": _participant(raw),
             "session": raw["gameID"],
-            "scenario": scenario or _scenario(path, raw["stim_ID"]),
+            "scenario": _scenario(path, raw["stim_ID"]),
             "stimulus": raw["stim_ID"].map(canonical_name),
             "phase": np.where(is_practice, "familiarization", "test"),
             "trial": position,
             "response": raw["response"].str.lower().where(raw["response"].str.lower() != "nan", ""),
             "label": raw["target_hit_zone_label"],
             "simulated": False,
-            "rt_ms": _response_time(raw["rt"], offset, path),
+            "rt_ms": _response_time(raw["rt"], path),
         }
     )
     if "correct" in raw:
@@ -612,19 +563,20 @@ def _scenario(path: Path, stimuli: pd.Series) -> str:
     scenarios = {scenario_of(canonical_name(name)) for name in stimuli.unique()} - {None}
     if len(scenarios) != 1:
         raise BadInputError(
-            f"{path}: neither its name nor its stimuli say which scenario it is; name the scenario"
+            f"{path}: neither its name nor its stimuli say which scenario it is; name it "
+            "human_responses-SCENARIO-....csv"
         )
     return str(scenarios.pop())
 
 
-def _response_time(rt: pd.Series, offset: float, path: Path) -> pd.Series:
+def _response_time(rt: pd.Series, path: Path) -> pd.Series:
     known = ~rt.str.lower().isin(("", "nan"))
     numbers = pd.to_numeric(rt.where(known), errors="coerce")
     broken = known & ~np.isfinite(numbers)
     if broken.any():
         row = int(np.flatnonzero(broken)[0])
         raise BadInputError(f"{path}: row {row + 1} of column 'rt' holds {rt.iloc[row]!r}")
-    return numbers - offset
+    return numbers - RT_OFFSET_MS
 
 
 def _buttons(choices: str) -> str:

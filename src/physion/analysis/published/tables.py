@@ -14,7 +14,7 @@ figure, statements about people, and the supplementary figures.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import lcm
@@ -33,14 +33,16 @@ from physion.analysis.statistics.agreement import correlation_from_sums
 from physion.analysis.tables import (
     MEAN,
     READOUTS,
-    as_numbers,
+    SCENARIO,
+    Column,
+    check_table,
+    must,
     read_csv,
     read_humans,
     refuse_duplicates,
-    scenario_name,
 )
-from physion.core.errors import BadInputError, UnknownNameError
-from physion.core.names import SCENARIOS, is_ledge
+from physion.core.errors import BadInputError
+from physion.core.names import OFFICIAL_SCENARIOS, SCENARIOS, is_ledge
 
 MODELS = {
     "SVG": "SVG",
@@ -75,15 +77,51 @@ TRAININGS = {"all": "all", "all_but_this": "all-but", "same": "only"}
 STIMULI, LEDGES = 150, 56
 """Stimuli per scenario that people saw; stimuli of Roll with a ledge (not released)."""
 
-_KEY = ["scenario", "ModelID"]
-_FACTS = (
-    "Model",
-    "Readout Type",
-    "Dynamics Training Dataset Type",
-    "Encoder Training Seed",
-    "Dynamics Training Seed",
-    "Visual encoder architecture",
+
+def _one_of(name: str, header: str, about: str, names: Mapping[str, str]) -> Column:
+    return must(name, "choice", about, choices=tuple(map(str.lower, names)), also=(header,))
+
+
+_RUN_COLUMNS = (
+    SCENARIO,
+    must("run", "text", "Model, protocol, readout and file", also=("ModelID",)),
+    _one_of("model", "Model", "Name of the model", MODELS),
 )
+ACCURACIES: tuple[Column, ...] = (
+    *_RUN_COLUMNS,
+    _one_of("readout", "Readout Type", "What the readout saw", READOUT_NAMES),
+    _one_of("training", "Dynamics Training Dataset Type", "Scenarios of the training", TRAININGS),
+    Column("seed", "integer", "Seed of the encoder; empty: it was not trained", required=True,
+           low=0, also=("Encoder Training Seed",)),
+    Column("dynamics_seed", "integer", "Seed of the dynamics", required=True, low=0,
+           also=("Dynamics Training Seed",)),
+    Column("encoder", "text", "Its architecture", required=True,
+           also=("Visual encoder architecture",)),
+    must("accuracy", "number", "Fraction of right answers", low=0, high=1,
+         also=("model_correct",)),
+)  # fmt: skip
+"""Columns of ``model_human_accuracies.csv``."""
+
+KAPPAS: tuple[Column, ...] = (
+    *_RUN_COLUMNS,
+    must("kappa_low", "number", "2.5th percentile", low=-1, high=1, also=("Cohens_k_lb",)),
+    must("kappa", "number", "Median", low=-1, high=1, also=("Cohens_k_med",)),
+    must("kappa_high", "number", "97.5th percentile", low=-1, high=1, also=("Cohens_k_ub",)),
+    must("kappa_stimuli", "integer", "Stimuli", low=1, also=("num_datapoints",)),
+)
+"""Columns of ``model_human_CohensK.csv``: kappa with participants."""
+
+PEOPLE = {
+    "human_accuracy_by_scenario.csv": {
+        "accuracy": "obs_mean", "accuracy_low": "ci_lb", "accuracy_high": "ci_ub",
+        "zone_low": "pct_2.5", "zone_high": "pct_97.5"},
+    "human_pairwiseCohensKs_by_scenario.csv": {
+        "kappa_low": "corr_lb", "kappa": "corr_med", "kappa_high": "corr_ub"},
+    "human_pairwiseCorrs_by_scenario.csv": {
+        "half_r": "r_mean", "half_r_low": "r_lb", "half_r_high": "r_ub"},
+}  # fmt: skip
+"""Files of people by scenario, and their columns by ours."""
+
 _RUN = re.compile(r"_readout_[A-D]_(?P<file>.*)$")
 
 
@@ -175,69 +213,48 @@ def in_paper_order(table: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:
 
 
 def _read_runs(results: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
-    accuracies = results / "model_human_accuracies.csv"
-    kappas = results / "model_human_CohensK.csv"
-    measured = ("Cohens_k_lb", "Cohens_k_med", "Cohens_k_ub", "num_datapoints")
-    left = read_csv(accuracies, (*_KEY, *_FACTS, "model_correct"))
-    right = read_csv(kappas, (*_KEY, "Model", *measured))
-    for table, path in ((left, accuracies), (right, kappas)):
-        refuse_duplicates(table["scenario"] + " / " + table["ModelID"], str(path))
-        models = _named(table["Model"].str.strip(), MODELS, str(path))
-        _check_whole(models, table["scenario"].map(scenario_name), path)
-    where = str(accuracies)
+    paths = results / "model_human_accuracies.csv", results / "model_human_CohensK.csv"
+    left, right = (
+        _read_released(path, columns)
+        for path, columns in zip(paths, (ACCURACIES, KAPPAS), strict=True)
+    )
+    for table, path in ((left, paths[0]), (right, paths[1])):
+        refuse_duplicates(table["scenario"] + " / " + table["run"], str(path))
+        _check_whole(table["model"], table["scenario"], path)
+    seeds = left["seed"].where(left["seed"].notna(), left["dynamics_seed"])
+    if seeds.isna().any():
+        row = int(np.flatnonzero(seeds.isna())[0])
+        raise BadInputError(f"{paths[0]}: row {row + 1} has no seed of encoder or dynamics")
     runs = pd.DataFrame(
         {
-            "scenario": left["scenario"].map(scenario_name),
-            "model": _named(left["Model"].str.strip(), MODELS, where),
-            "readout": _named(left["Readout Type"], READOUT_NAMES, where),
-            "training": _named(left["Dynamics Training Dataset Type"], TRAININGS, where),
-            "seed": _seeds(left, where),
-            "file": left["ModelID"].map(_file_of),
-            "encoder": left["Visual encoder architecture"],
-            "accuracy": as_numbers(left["model_correct"], 0, 1, where),
-            "key": left["scenario"] + " / " + left["ModelID"],
+            **{name: left[name] for name in ("scenario", "model", "readout", "training")},
+            "seed": seeds.astype(int),
+            "file": left["run"].map(_file_of),
+            "encoder": left["encoder"],
+            "accuracy": left["accuracy"],
+            "run": left["run"],
         }
     )
-    agreed = _kappas(right, str(kappas))
-    joined = runs.merge(agreed, on="key", how="inner", validate="one_to_one")
+    agreed = right.drop(columns="model").astype({"kappa_stimuli": int})
+    joined = runs.merge(agreed, on=["scenario", "run"], how="inner", validate="one_to_one")
     unmatched = [
         (path.name, "no row of the same run in the other table", len(table) - len(joined))
-        for path, table in ((accuracies, left), (kappas, right))
+        for path, table in zip(paths, (left, right), strict=True)
     ]
     dropped = pd.DataFrame(unmatched, columns=["table", "reason", "rows"])
     if joined.empty:
-        raise BadInputError(f"{accuracies} and {kappas} have no run in common")
-    table = joined.drop(columns="key")
+        raise BadInputError(f"{paths[0]} and {paths[1]} have no run in common")
+    table = joined.drop(columns="run")
     return in_paper_order(table, ["model", "scenario"]), dropped[dropped["rows"] > 0]
 
 
-def _kappas(table: pd.DataFrame, where: str) -> pd.DataFrame:
-    return pd.DataFrame(
-        {
-            "key": table["scenario"] + " / " + table["ModelID"],
-            "kappa_low": as_numbers(table["Cohens_k_lb"], -1, 1, where),
-            "kappa": as_numbers(table["Cohens_k_med"], -1, 1, where),
-            "kappa_high": as_numbers(table["Cohens_k_ub"], -1, 1, where),
-            "kappa_stimuli": as_numbers(table["num_datapoints"], 1, 1e6, where).astype(int),
-        }
-    )
-
-
-def _named(values: pd.Series, names: dict[str, str], where: str) -> pd.Series:
-    result = values.map(names)
-    if result.isna().any():
-        row = int(np.flatnonzero(result.isna())[0])
-        unknown = UnknownNameError(str(values.name), str(values.iloc[row]), names)
-        raise BadInputError(f"{where}: row {row + 1} of column {values.name!r}: {unknown}")
-    return result
-
-
-def _seeds(table: pd.DataFrame, where: str) -> pd.Series:
-    """Return the seed of the encoder, or of the dynamics if the encoder was not trained."""
-    encoder_seed = table["Encoder Training Seed"]
-    texts = encoder_seed.where(encoder_seed.str.strip() != "", table["Dynamics Training Seed"])
-    numbers = as_numbers(texts.rename("Encoder Training Seed"), 0, 1e9, where)
-    return pd.Series(numbers.astype(int), index=table.index)
+def _read_released(path: Path, columns: Sequence[Column]) -> pd.DataFrame:
+    """Read a released table with the names of the paper in place of its words."""
+    table = check_table(read_csv(path), columns, str(path))
+    for name, names in (("model", MODELS), ("readout", READOUT_NAMES), ("training", TRAININGS)):
+        if name in table:
+            table[name] = table[name].map({word.lower(): ours for word, ours in names.items()})
+    return table.assign(scenario=table["scenario"].replace(OFFICIAL_SCENARIOS))
 
 
 def _file_of(run: str) -> str:
@@ -246,32 +263,18 @@ def _file_of(run: str) -> str:
 
 
 def _read_people(results: Path) -> pd.DataFrame:
-    right = _by_scenario(
-        results / "human_accuracy_by_scenario.csv",
-        {"obs_mean": "accuracy", "ci_lb": "accuracy_low", "ci_ub": "accuracy_high",
-         "pct_2.5": "zone_low", "pct_97.5": "zone_high"},
-    )  # fmt: skip
-    kappa = _by_scenario(
-        results / "human_pairwiseCohensKs_by_scenario.csv",
-        {"corr_lb": "kappa_low", "corr_med": "kappa", "corr_ub": "kappa_high"},
-    )
-    halves = _by_scenario(
-        results / "human_pairwiseCorrs_by_scenario.csv",
-        {"r_mean": "half_r", "r_lb": "half_r_low", "r_ub": "half_r_high"},
-    )
-    people = right.join(kappa, how="outer").join(halves, how="outer")
+    tables = []
+    for name, headers in PEOPLE.items():
+        numbers = [must(ours, "number", "", low=-1, high=1, also=(theirs,))
+                   for ours, theirs in headers.items()]  # fmt: skip
+        table = _read_released(results / name, (SCENARIO, *numbers))
+        refuse_duplicates(table["scenario"], str(results / name))
+        tables.append(table.set_index("scenario"))
+    people = pd.concat(tables, axis=1)
     if people.isna().any(axis=None):
         name = people.index[people.isna().any(axis=1)][0]
         raise BadInputError(f"{results}: not every table of people has scenario {name!r}")
     return in_paper_order(people.rename_axis("scenario").reset_index(), ["scenario"])
-
-
-def _by_scenario(path: Path, columns: dict[str, str]) -> pd.DataFrame:
-    raw = read_csv(path, ("scenario", *columns))
-    scenario = raw["scenario"].map(scenario_name)
-    refuse_duplicates(scenario, str(path))
-    values = {ours: as_numbers(raw[theirs], -1, 1, str(path)) for theirs, ours in columns.items()}
-    return pd.DataFrame(values, index=pd.Index(scenario))
 
 
 # Published table of model accuracies by scenario, next to the setting that readers expect.

@@ -22,7 +22,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from sqlalchemy import Connection, Engine, select
 
-from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS, Column
+from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS
+from physion.analysis.tables import Column
 from physion.core.errors import PhysionError, UnknownNameError
 from physion.core.names import canonical_name
 from physion.experiment.store.database import ANSWERS, EVENTS, PRACTICE_REPEATS, SESSIONS, STUDIES
