@@ -111,7 +111,7 @@ def test_readout_labels_are_refused_as_labels(official: Path) -> None:
         read_labels(official / "stimuli" / "readout_labels.csv")
 
 
-# --- names -----------------------------------------------------------------------------------
+# --- names --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -144,7 +144,7 @@ def test_stimulus_list(tmp_path: Path) -> None:
         read_stimulus_list(tmp_path / "none.txt")
 
 
-# --- reading ---------------------------------------------------------------------------------
+# --- reading --------------------------------------------------------------------------------
 
 
 def test_fraction_of_yes_follows_from_accuracy_and_label(tmp_path: Path) -> None:

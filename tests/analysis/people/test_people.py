@@ -36,6 +36,7 @@ from physion.analysis.people.measures import (
     accuracy_by_stimulus,
     agreement_by_scenario,
     answers_of,
+    item_statistics,
     spearman_brown,
     split_halves,
 )
@@ -76,7 +77,7 @@ def official_people(official: Path) -> pd.DataFrame:
     return with_labels(read_humans(official / "humans"), labels)
 
 
-# --- accuracy -----------------------------------------------------------------------------------
+# --- accuracy --------------------------------------------------------------------------------
 
 
 def test_accuracies_match_plain_grouping(made: Responses) -> None:
@@ -140,7 +141,7 @@ def test_people_who_are_too_few_or_too_alike_get_reasons(made: Responses) -> Non
         accuracy_by_scenario(made.test.iloc[:0])
 
 
-# --- agreement ----------------------------------------------------------------------------------
+# --- agreement --------------------------------------------------------------------------------
 
 
 def test_pairs_are_summarised_as_they_are(made: Responses) -> None:
@@ -492,3 +493,33 @@ def test_dropping_rows_leaves_other_stimuli_as_they_were(made: Responses) -> Non
     part = replace(made, trials=made.trials[made.trials["stimulus"] != "roll_003"])
     fewer = accuracy_by_stimulus(part.test, FEW).set_index("stimulus")
     pd.testing.assert_frame_equal(fewer, whole.drop("roll_003"))
+
+
+# --- items --------------------------------------------------------------------------------
+
+
+def test_item_rest_is_the_correlation_with_the_other_answers() -> None:
+    test = study(people=15, stimuli=12, scenarios=("drop",), seed=4).test
+    test = test.drop(index=test.index[[3, 40]])
+    table = item_statistics(test).set_index("stimulus")
+    wide = test.pivot(index="session", columns="stimulus", values="correct").astype(float)
+    for name in wide.columns:
+        own = wide[name].dropna()
+        rest = wide.drop(columns=name).mean(axis=1).loc[own.index]
+        row = table.loc[name]
+        assert row["difficulty"] == pytest.approx(own.mean()) and row["people"] == len(own)
+        if own.nunique() > 1:
+            assert row["item_rest"] == pytest.approx(np.corrcoef(own, rest)[0, 1])
+        else:
+            assert np.isnan(row["item_rest"]) and "all answers" in row["reason"]
+
+
+def test_a_stimulus_that_goes_against_ability_is_below_zero() -> None:
+    test = study(people=60, stimuli=25, scenarios=("drop",), seed=1, ability_sd=1.5).test.copy()
+    ability = test.groupby("session")["correct"].transform("mean")
+    odd = test["stimulus"] == test["stimulus"].iloc[0]
+    right = ability[odd] < ability.median()
+    test.loc[odd, "yes"] = test.loc[odd, "label"] == right
+    table = item_statistics(test).set_index("stimulus")["item_rest"]
+    assert table[test["stimulus"].iloc[0]] < -0.4
+    assert table.drop(test["stimulus"].iloc[0]).mean() > 0.1

@@ -55,7 +55,7 @@ def pooled(p: Array, seed: int = 0, scenarios: int = 2) -> PooledStimuli:
     return PooledStimuli(names, p, correct, label, rng.random(n), scenario)
 
 
-# --- corrections ---------------------------------------------------------------------------------
+# --- corrections --------------------------------------------------------------------------------
 
 
 def step_down(p: Array) -> Array:

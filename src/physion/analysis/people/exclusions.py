@@ -357,46 +357,7 @@ def streak_limit(trials: int, percentile: float = 97.5) -> int:
     return 0
 
 
-# --- rules: each takes the table of measures and gives a flag a session ------------------------
-
-
-def flag_streak(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
-    """Flag a streak of one answer that is longer than the limit for the session's trials."""
-    if rules.streak_percentile is None:
-        return pd.Series(False, index=measures.index)
-    limits = [streak_limit(int(n), rules.streak_percentile) for n in measures["trials"]]
-    return measures["longest_streak"] > pd.Series(limits, index=measures.index)
-
-
-def flag_alternation(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
-    """Flag at least ``alternation`` alternating answers in a row."""
-    limit = np.inf if rules.alternation is None else rules.alternation
-    which = "longest_alternation" + ("_from_first" if rules.alternation_phase else "")
-    return measures[which] >= limit
-
-
-def flag_familiarization(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
-    """Flag too few correct practice trials; without recorded practice a session is not flagged."""
-    limit = -np.inf if rules.familiarization_share is None else rules.familiarization_share
-    fraction = measures["familiarization_correct"] / measures["familiarization_trials"]
-    return fraction <= limit + 1e-9  # so that 3 of 10 counts as 0.3
-
-
-def flag_low_accuracy(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
-    """Flag an accuracy far below the other sessions of the scenario."""
-    if rules.accuracy_sd is None:
-        return pd.Series(False, index=measures.index)
-    base = _reference(measures, "accuracy", rules.accuracy_centre, rules.ddof)
-    return measures["accuracy"] < base["centre"] - rules.accuracy_sd * base["sd"]
-
-
-def flag_slow(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
-    """Flag log response times far above the other sessions of the scenario."""
-    if rules.rt_sd is None:
-        return pd.Series(False, index=measures.index)
-    column = f"{rules.rt_summary}_log_rt"
-    base = _reference(measures, column, "median", rules.ddof)
-    return measures[column] > base["centre"] + rules.rt_sd * base["sd"]
+# --- rules: from the table of measures to a flag of each session --------------------------------
 
 
 def flag_incomplete(measures: pd.DataFrame) -> pd.Series:
@@ -404,14 +365,34 @@ def flag_incomplete(measures: pd.DataFrame) -> pd.Series:
     return (measures["missing"] > 0) | (measures["trials"] == 0)
 
 
-def flag_repeated(measures: pd.DataFrame) -> pd.Series:
-    """Flag every session of a participant in a scenario except the first complete one.
-
-    Sessions count in the order in which they began. If none is complete, the first is kept.
-    """
+def _by_thresholds(measures: pd.DataFrame, rules: ExclusionRules) -> dict[str, pd.Series]:
+    """Return the flags of the rules of the preregistration; absent for a rule that is off."""
+    flags = {}
+    if rules.streak_percentile is not None:
+        limits = [streak_limit(int(n), rules.streak_percentile) for n in measures["trials"]]
+        flags["streak"] = measures["longest_streak"] > pd.Series(limits, index=measures.index)
+    if rules.alternation is not None:
+        which = "longest_alternation" + ("_from_first" if rules.alternation_phase else "")
+        flags["alternation"] = measures[which] >= rules.alternation
+    if rules.familiarization_share is not None:
+        # Without recorded practice the fraction is NaN, and a session is not flagged.
+        fraction = measures["familiarization_correct"] / measures["familiarization_trials"]
+        limit = rules.familiarization_share + 1e-9  # so that 3 of 10 counts as 0.3
+        flags["familiarization"] = fraction <= limit
+    if rules.accuracy_sd is not None:
+        base = _reference(measures, "accuracy", rules.accuracy_centre, rules.ddof)
+        flags["low_accuracy"] = (
+            measures["accuracy"] < base["centre"] - rules.accuracy_sd * base["sd"]
+        )
+    if rules.rt_sd is not None:
+        column = f"{rules.rt_summary}_log_rt"
+        base = _reference(measures, column, "median", rules.ddof)
+        flags["slow"] = measures[column] > base["centre"] + rules.rt_sd * base["sd"]
     incomplete = flag_incomplete(measures)
+    # Sessions count in the order in which they began; if none is complete, the first is kept.
     ordered = measures.assign(_incomplete=incomplete).sort_values("_incomplete", kind="stable")
-    return ordered.duplicated(["participant", "scenario"]).reindex(measures.index)
+    repeated = ordered.duplicated(["participant", "scenario"]).reindex(measures.index)
+    return flags | {"incomplete": incomplete, "repeated": repeated}
 
 
 def flag_from_server(responses: Responses, measures: pd.DataFrame, column: str) -> pd.Series:
@@ -454,19 +435,12 @@ def flag_sessions(
     deviations come from the scenario's complete sessions, whether another rule flags them or not.
     """
     measures = session_measures(responses, expected)
-    flags = {
-        "streak": flag_streak(measures, rules),
-        "alternation": flag_alternation(measures, rules),
-        "familiarization": flag_familiarization(measures, rules),
-        "low_accuracy": flag_low_accuracy(measures, rules),
-        "slow": flag_slow(measures, rules),
-        "incomplete": flag_incomplete(measures),
-        "repeated": flag_repeated(measures),
-        "implausible": flag_from_server(responses, measures, "implausible"),
-        "replayed": flag_from_server(responses, measures, "replayed"),
-        "failed_checks": flag_from_server(responses, measures, "failed_checks"),
+    found = _by_thresholds(measures, rules) | {
+        name: flag_from_server(responses, measures, name)
+        for name in ("implausible", "replayed", "failed_checks")
     }
-    table = measures.assign(**{name: flag.astype(bool) for name, flag in flags.items()})
+    never = pd.Series(False, index=measures.index)
+    table = measures.assign(**{name: found.get(name, never).astype(bool) for name in RULES})
     return table.assign(flagged=table[list(RULES)].any(axis=1))
 
 
@@ -565,25 +539,27 @@ def count_flags(flags: pd.DataFrame) -> pd.DataFrame:
 
 
 def with_and_without(
-    responses: Responses,
-    flags: pd.DataFrame,
-    analyse: Callable[[Responses], pd.DataFrame],
+    responses: Responses, flags: pd.DataFrame, analyse: Callable[[Responses], pd.DataFrame]
 ) -> pd.DataFrame:
     """Apply an analysis once without and once with the flagged sessions.
 
     ``analyse`` maps `Responses` to a table. The first column of the result, ``sessions``, is
     ``unflagged`` (the main analysis) or ``complete`` (all complete first sessions).
     """
-    complete = set(flags.loc[~flags["incomplete"] & ~flags["repeated"], "session"])
-    sets = {"unflagged": set(flags.loc[~flags["flagged"], "session"]), "complete": complete}
     parts = []
-    for name, sessions in sets.items():
-        if not sessions:
+    for name, sessions in (("unflagged", ~flags["flagged"]), ("complete", whole_sessions(flags))):
+        kept = set(flags.loc[sessions, "session"])
+        if not kept:
             raise BadInputError(f"no session is {name}: the analysis has nothing to work on")
-        table = analyse(responses.keep_sessions(sessions, f"not {name}"))
+        table = analyse(responses.keep_sessions(kept, f"not {name}"))
         table.insert(0, "sessions", name)
         parts.append(table)
     return pd.concat(parts, ignore_index=True)
+
+
+def whole_sessions(flags: pd.DataFrame) -> pd.Series:
+    """Return which sessions are complete and the first of their participant."""
+    return ~flags["incomplete"] & ~flags["repeated"]
 
 
 def flag_effect(

@@ -46,37 +46,15 @@ TRIAL_COLUMNS: tuple[Column, ...] = (
     must("scenario", "text", "Scenario of the trial"),
     must("stimulus", "text", "Name of the trial that was shown"),
     must("phase", "choice", "With feedback (familiarization) or without (test)", choices=PHASES),
-    must(
-        "trial",
-        "integer",
-        "Place in the order of its phase in the session, from 0; attention "
-        "checks, which are not in this table, have places too",
-        low=0,
-    ),
-    Column(
-        "response",
-        "choice",
-        "Will the agent touch the patient? Empty: no answer was given",
-        choices=("yes", "no"),
-        required=True,
-    ),
+    must("trial", "integer", "Place in the order of its phase in the session, from 0; attention "
+         "checks, which are not in this table, have places too", low=0),
+    Column("response", "choice", "Will the agent touch the patient? Empty: no answer was given",
+           choices=("yes", "no"), required=True),
     must("label", "flag", "Does the agent touch the patient?"),
     must("simulated", "flag", "Made by a program for piloting: no person"),
-    Column(
-        "rt_ms",
-        "number",
-        "Response time: from the moment the buttons are enabled to the answer",
-        unit="ms",
-        low=-DAY_MS,
-        high=DAY_MS,
-        required=True,
-    ),
-    Column(
-        "buttons",
-        "choice",
-        "The two buttons from left to right",
-        choices=("yes-no", "no-yes"),
-    ),
+    Column("rt_ms", "number", "Response time: from the moment the buttons are enabled to the "
+           "answer", unit="ms", low=-DAY_MS, high=DAY_MS, required=True),
+    Column("buttons", "choice", "The two buttons from left to right", choices=("yes-no", "no-yes")),
     Column("correct", "flag", "response equals label; recomputed, and refused if it contradicts"),
     Column("input", "choice", "How the answer was given", choices=("mouse", "touch", "keyboard")),
     Column("look", "choice", "Colours of the stimulus", choices=("free", "redyellow")),
@@ -89,34 +67,19 @@ TRIAL_COLUMNS: tuple[Column, ...] = (
     Column("visibility_changes", "integer", "How often the page was hidden or shown again", low=0),
     Column("window_width", "integer", "Inner width of the window", unit="px", low=0),
     Column("window_height", "integer", "Inner height of the window", unit="px", low=0),
-    Column(
-        "break_ms",
-        "number",
-        "Duration of the break before the trial; empty: there was none",
-        unit="ms",
-        low=0,
-        high=DAY_MS,
-    ),
+    Column("break_ms", "number", "Duration of the break before the trial; empty: there was none",
+           unit="ms", low=0, high=DAY_MS),
     Column("resumed", "flag", "The page was loaded anew while this trial was the next one"),
-    Column(
-        "showings", "integer", "How often the movie was shown, over all loads of the page", low=0
-    ),
-    Column(
-        "void",
-        "choice",
-        "What interrupted the movie, so that the answer does not count: the "
-        "page was hidden, a dialog open, or the window too small; empty: nothing",
-        choices=("hidden", "dialog", "window"),
-    ),
+    Column("showings", "integer", "How often the movie was shown, over all loads of the page",
+           low=0),
+    Column("void", "choice", "What interrupted the movie, so that the answer does not count: the "
+           "page was hidden, a dialog open, or the window too small; empty: nothing",
+           choices=("hidden", "dialog", "window")),
     Column("answered_at", "time", "When the server stored the answer"),
-    Column(
-        "block",
-        "integer",
-        "Index of the block in a session of several scenarios, from 0; empty: a session of one",
-        low=0,
-    ),
+    Column("block", "integer", "Index of the block in a session of several scenarios, from 0; "
+           "empty: a session of one", low=0),
     Column("condition", "text", "Between-subject condition of the session; empty: there is none"),
-)
+)  # fmt: skip
 """One row per participant and trial."""
 
 SESSION_COLUMNS: tuple[Column, ...] = (

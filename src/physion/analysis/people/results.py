@@ -32,6 +32,7 @@ from physion.analysis.people.exclusions import (
     drop_unexpected,
     flag_effect,
     flag_sessions,
+    whole_sessions,
     with_and_without,
     without_flagged,
 )
@@ -201,7 +202,10 @@ def analyse_people(
     check_excluded(flags, accept_rules, expected)
     shown = drop_unexpected(responses, expected).drop_void()
     shown = shown.drop_stimuli(exclude, exclude_ledge)
-    kept, whole = _sets(shown, flags)
+    kept = without_flagged(shown, flags)
+    whole = shown.keep_sessions(
+        set(flags.loc[whole_sessions(flags), "session"]), "session is incomplete or repeated"
+    )
     tables = {"flags": flags, "flag_counts": count_flags(flags)}
     tables["flag_effects"] = _flag_effects(shown, flags)
     tables["with_and_without"] = with_and_without(
@@ -228,15 +232,6 @@ def analyse_people(
     stimuli = frozenset(responses.trials["stimulus"])
     confirmed = describe_confirmed(flags, accept_rules)
     return PeopleResults(kept, whole, rules, tables, warnings, stimuli, confirmed)
-
-
-def _sets(shown: Responses, flags: pd.DataFrame) -> tuple[Responses, Responses]:
-    """Return the responses without flagged sessions, and of all complete first sessions."""
-    whole = set(flags.loc[~flags["incomplete"] & ~flags["repeated"], "session"])
-    return (
-        without_flagged(shown, flags),
-        shown.keep_sessions(whole, "session is incomplete or repeated"),
-    )
 
 
 def _flag_effects(responses: Responses, flags: pd.DataFrame) -> pd.DataFrame:

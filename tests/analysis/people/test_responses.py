@@ -1,4 +1,4 @@
-"""Participant-level responses: what is read, what is refused, what is dropped and counted."""
+"""Responses: what is read, refused, dropped and counted; sessions of blocks; checks of files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis.people.measures import answers_of, mean_over_people
+from physion.analysis.check import check_responses
+from physion.analysis.people.exclusions import expected_by_session, flag_sessions
+from physion.analysis.people.measures import accuracy_by_scenario, answers_of, mean_over_people
 from physion.analysis.people.responses import (
     COPY,
     EXCLUDED,
@@ -20,10 +22,15 @@ from physion.analysis.people.responses import (
     SIMULATED,
     TRIAL_COLUMNS,
     check_labels,
+    clean,
     read_official_responses,
     read_responses,
+    scenario_set,
+    scenarios_in,
 )
+from physion.analysis.people.results import analyse_people
 from physion.analysis.tables import check_table, data_dictionary
+from physion.cli.main import main
 from physion.core.errors import BadInputError
 from support.simulated_people import as_responses, simulate_study, study
 
@@ -50,7 +57,7 @@ def test_a_stimulus_in_two_scenarios_is_one_clear_error() -> None:
     assert as_responses(trials, sessions).dropped.empty
 
 
-# --- reading ------------------------------------------------------------------------------------
+# --- reading --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
@@ -267,7 +274,7 @@ def test_official_files_of_any_name_know_their_scenario_by_their_stimuli(tmp_pat
         read_official_responses([])
 
 
-# --- arrays -------------------------------------------------------------------------------------
+# --- arrays --------------------------------------------------------------------------------
 
 
 def test_answers_as_arrays_hold_what_the_rows_say() -> None:
@@ -290,3 +297,186 @@ def test_answers_as_arrays_hold_what_the_rows_say() -> None:
     np.testing.assert_allclose(mean_over_people(answers.yes, weights)[0], np.nanmean(drawn, axis=0))
     with pytest.raises(BadInputError, match="no answer"):
         answers_of(test, "drape")
+
+
+# --- blocks --------------------------------------------------------------------------------
+
+BLOCKS = {"collide": 6, "support": 6}
+
+
+def session_rows(person: int, answered: int = 12) -> list[dict[str, object]]:
+    """Return the answers of a person, whose blocks begin with either scenario in turn."""
+    order = list(BLOCKS) if person % 2 else list(BLOCKS)[::-1]
+    found: list[dict[str, object]] = []
+    for block, scenario in enumerate(order):
+        for index in range(BLOCKS[scenario]):
+            label = index % 2 == 0
+            right = (person * 7 + index * 5 + block) % 4 != 0
+            found.append({
+                "participant": f"p{person}", "session": f"s{person}", "scenario": scenario,
+                "stimulus": f"{scenario}_{index}", "phase": "test", "trial": len(found),
+                "response": "yes" if label == right else "no", "label": label,
+                "simulated": False, "rt_ms": 400 + 10 * index + person, "block": block,
+            })  # fmt: skip
+    return found[:answered]
+
+
+def table(rows: list[dict[str, object]]) -> pd.DataFrame:
+    return check_table(pd.DataFrame(rows), TRIAL_COLUMNS, "here")
+
+
+def sessions_of(people: range) -> pd.DataFrame:
+    orders = {0: "support collide", 1: "collide support"}
+    return pd.DataFrame(
+        {
+            "participant": [f"p{person}" for person in people],
+            "session": [f"s{person}" for person in people],
+            "scenario": [orders[person % 2] for person in people],
+            "simulated": False,
+        }
+    )
+
+
+def test_a_session_of_several_blocks_is_one_session_in_any_order() -> None:
+    people = range(8)
+    rows = [row for person in people for row in session_rows(person)]
+    for sessions in (None, sessions_of(people)):
+        responses = clean(table(rows), sessions)
+        assert set(responses.sessions["scenario"]) == {"support + collide"}
+        flags = flag_sessions(responses)
+        assert len(flags) == 8 and not flags["repeated"].any() and not flags["incomplete"].any()
+        assert list(flags["trials"]) == [12] * 8 and list(flags["expected"]) == [12] * 8
+    assert scenario_set(["collide", "support"]) == "support + collide"
+    assert scenarios_in("support + collide") == ["support", "collide"]
+
+
+def test_a_session_that_ended_in_its_first_block_is_incomplete() -> None:
+    rows = [row for person in range(8) for row in session_rows(person, 6 if person == 3 else 12)]
+    responses = clean(table(rows), sessions_of(range(8)))
+    flags = flag_sessions(responses).set_index("session")
+    assert list(flags.index[flags["incomplete"]]) == ["s3"]
+    assert flags.loc["s3", "missing"] == 6
+
+
+def test_the_list_of_a_session_names_the_stimuli_drawn_for_it() -> None:
+    rows = [row for person in range(8) for row in session_rows(person)]
+    rows = [row for row in rows if row["stimulus"] != f"collide_{int(str(row['session'])[1:]) % 6}"]
+    responses = clean(table(rows), sessions_of(range(8)))
+    drawn = {
+        str(name): frozenset(part["stimulus"]) for name, part in responses.test.groupby("session")
+    }
+    assert not flag_sessions(responses, expected=drawn)["incomplete"].any()
+    drawn["s2"] |= {"collide_2"}
+    flags = flag_sessions(responses, expected=drawn).set_index("session")
+    assert list(flags.index[flags["incomplete"]]) == ["s2"]
+    by_scenario = {"collide": frozenset({"collide_0"}), "support": frozenset({"support_0"})}
+    both = expected_by_session(responses, by_scenario)
+    assert both["s0"] == {"collide_0", "support_0"}
+
+
+def test_two_scenarios_without_blocks_are_still_an_error() -> None:
+    rows = session_rows(1)
+    with pytest.raises(BadInputError, match="two scenarios"):
+        clean(table([{**row, "block": None} for row in rows]))
+    with pytest.raises(BadInputError, match="two scenarios"):
+        clean(table([{**row, "block": 0} for row in rows]))
+    without = table(rows).drop(columns="block")
+    with pytest.raises(BadInputError, match="two scenarios"):
+        clean(without)
+    other = sessions_of(range(1, 2)).assign(scenario="collide drop")
+    with pytest.raises(BadInputError, match="missing from the sessions table"):
+        clean(table(rows), other)
+
+
+def test_all_analyses_take_sessions_of_several_blocks(tmp_path: Path) -> None:
+    people = range(12)
+    rows = [row for person in people for row in session_rows(person)]
+    ages = sessions_of(people).assign(age=[20 + person for person in people])
+    results = analyse_people(clean(table(rows), ages))
+    by_scenario = results.tables["by_scenario"].set_index("scenario")
+    assert by_scenario.loc["collide", "people"] == by_scenario.loc["support", "people"] == 12
+    background = results.tables["background_tests"].set_index("question")
+    assert background.loc["age", "sessions"] == 12, "a session counts once"
+    pd.DataFrame(rows).to_csv(tmp_path / "trials.csv", index=False)
+    sessions_of(people).to_csv(tmp_path / "sessions.csv", index=False)
+    checked, _ = check_responses([tmp_path / "trials.csv"], tmp_path / "sessions.csv")
+    assert checked.errors == 0 and checked.people == {"collide": 12, "support": 12}
+
+
+def test_sessions_are_drawn_with_all_their_scenarios() -> None:
+    """People who are good in one scenario are good in the other: their mean varies more."""
+    rows = []
+    for person in range(40):
+        for row in session_rows(person):
+            right = person % 2 == 0
+            label = bool(row["label"])
+            rows.append({**row, "response": "yes" if label == right else "no"})
+    test = clean(table(rows)).test
+    mean = accuracy_by_scenario(test).set_index("scenario").loc["mean"]
+    assert mean["people"] == 40 and mean["accuracy"] == 0.5
+    # The mean of 40 people who are right always or never has a standard error of 0.079.
+    assert 0.13 < mean["accuracy_high"] - 0.5 < 0.18
+    apart = test.assign(session=test["session"] + test["scenario"])
+    independent = accuracy_by_scenario(apart).set_index("scenario").loc["mean"]
+    assert independent["people"] == 80
+    assert 0.09 < independent["accuracy_high"] - 0.5 < 0.13
+
+
+# --- checks --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    trials, _ = simulate_study(people=6, stimuli=12, scenarios=("drop",), seed=3)
+    path = tmp_path / "trials.csv"
+    trials.to_csv(path, index=False)
+    return path
+
+
+def test_a_good_file_has_no_error_and_its_people_are_counted(file: Path) -> None:
+    checked, responses = check_responses([file])
+    assert checked.errors == 0 and checked.people == {"drop": 6} and responses is not None
+    assert checked.rows == len(pd.read_csv(file))
+
+
+def test_what_would_be_left_out_is_a_warning(file: Path) -> None:
+    table = pd.read_csv(file)
+    table.loc[table.index[-1], "response"] = ""
+    table.loc[table["session"] == "drop-s000", "rt_ms"] = None
+    rare = table[table["session"] == "drop-s001"].iloc[[-1]].assign(stimulus="drop_999", trial=99)
+    pd.concat([table, rare]).to_csv(file, index=False)
+    checked, _ = check_responses([file])
+    text = " ".join(map(str, checked.faults))
+    assert checked.errors == 0
+    for words in ("no answer", "response time", "fewer than 2 answers, such as drop_999"):
+        assert words in text, words
+
+
+def test_errors_name_the_place_and_outcomes_are_compared(file: Path) -> None:
+    checked, _ = check_responses([file], labels={"drop_000": False})
+    assert checked.errors == 1 and "drop_000" in str(checked.faults[0])
+    table = pd.read_csv(file)
+    table["response"] = table["response"].mask(table.index == 5, "maybe")
+    table.to_csv(file, index=False)
+    checked, responses = check_responses([file])
+    assert checked.errors == 1 and "response" in str(checked.faults[0]) and responses is None
+
+
+def test_the_verb_checks_responses_and_predictions_against_them(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = pd.read_csv(file)
+    test = table[table["phase"] == "test"].drop_duplicates("stimulus")
+    label = test.set_index("stimulus")["label"]
+    rows = pd.DataFrame({"Model": "m", "Readout Type": "B", "Predicted Prob_true": 0.7,
+                         "Predicted Outcome": True, "Actual Outcome": label.to_numpy(),
+                         "Recorded Outcome": ~label.to_numpy(), "Readout Test Data": "drop",
+                         "Stimulus Name": label.index})  # fmt: skip
+    rows.to_csv(tmp_path / "m.csv", index=False)
+    assert main(["compare", "--check", "--responses", str(file), "--json"]) == 0
+    (found,) = json.loads(capsys.readouterr().out)
+    assert found["people"] == {"drop": 6} and found["errors"] == 0
+    command = ["compare", "--check", str(tmp_path / "m.csv"), "--responses", str(file), "--json"]
+    assert main(command) == 1
+    _, predictions = json.loads(capsys.readouterr().out)
+    assert predictions["errors"] > 0
