@@ -709,22 +709,24 @@ def _first(patterns: tuple[re.Pattern[str], ...], text: str) -> float:
     return float("nan")
 
 
+ATTRIBUTE_TABLE: tuple[Column, ...] = (
+    must("stimulus", "text", "Name of the trial", also=("trial",)),
+    must("scenario", "text", "Scenario of the trial"),
+    Column("configuration", "text", "Name of the settings that the trial was drawn from"),
+    Column("room", "text", "Room of the trial"),
+    *(Column(name, "number", f"Number of {name}", low=0) for name in ATTRIBUTES),
+)
+"""One row per stimulus of one's own, such as the index of a dataset."""
+
+
 def attributes_from_table(table: pd.DataFrame, where: str = "table of attributes") -> pd.DataFrame:
-    """Return the attributes of a table with ``stimulus``, ``scenario`` and any of `ATTRIBUTES`."""
-    require_columns(table, ["stimulus", "scenario"], where)
-    given = [name for name in ATTRIBUTES if name in table]
-    if not given:
+    """Return the attributes of a table of `ATTRIBUTE_TABLE` with any of `ATTRIBUTES`."""
+    rows = check_table(table, ATTRIBUTE_TABLE, where)
+    if not set(ATTRIBUTES) & set(rows):
         raise BadInputError(f"{where} has none of the columns {', '.join(ATTRIBUTES)}")
-    result = table[["stimulus", "scenario"]].assign(configuration="", room="", source="table")
-    result["stimulus"] = result["stimulus"].map(canonical_name)
-    for name in ("configuration", "room"):
-        if name in table:
-            result[name] = table[name]
-    for name in ATTRIBUTES:
-        numbers = pd.to_numeric(table[name], errors="coerce") if name in table else np.nan
-        result[name] = numbers
-    refuse_duplicates(result["stimulus"], where)
-    return result[list(COLUMNS)].reset_index(drop=True)
+    rows = rows.assign(stimulus=rows["stimulus"].map(canonical_name), source="table")
+    refuse_duplicates(rows["stimulus"], where)
+    return rows.reindex(columns=list(COLUMNS)).fillna({"configuration": "", "room": ""})
 
 
 def better_attributes(first: pd.DataFrame, second: pd.DataFrame) -> pd.DataFrame:

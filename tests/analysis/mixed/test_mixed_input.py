@@ -192,18 +192,3 @@ def test_unknown_terms_have_no_joint_test(table: pd.DataFrame) -> None:
 def test_the_summary_says_what_was_fitted(table: pd.DataFrame) -> None:
     text = fit_linear(f"log_rt ~ scenario + {CROSSED}", table).summary()
     assert "240 rows (0 left out)" in text and "residual" in text and "converged" in text
-
-
-@pytest.mark.parametrize("wrong", [{"scenarios": 9}, {"stimuli": 0}, {"skipped": 1.0}])
-def test_impossible_designs_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(BadInputError):
-        AnswerDesign(**wrong)  # type: ignore[arg-type]
-
-
-def test_simulated_answers_are_a_function_of_the_seed() -> None:
-    design = AnswerDesign(2, 5, 6)
-    pd.testing.assert_frame_equal(simulate_answers(design, 3), simulate_answers(design, 3))
-    assert not simulate_answers(design, 3).equals(simulate_answers(design, 4))
-    assert simulate_answers(design)["participant"].nunique() == 10
-    crossed = simulate_answers(AnswerDesign(2, 5, 6, crossed=True))
-    assert crossed["participant"].nunique() == 5 and len(crossed) == 60

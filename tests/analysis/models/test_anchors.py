@@ -295,16 +295,6 @@ def test_without_people_there_is_no_baseline() -> None:
     assert list(found.all_scores["model"].unique()) == ["m · observed"]
 
 
-def test_the_order_of_rows_changes_no_baseline() -> None:
-    given = pd.concat([predictions(), predictions("other", 2)])
-    plain = compared(given)
-    mixed = compare_scores(
-        given.sample(frac=1, random_state=3), humans().sample(frac=1, random_state=4), LABELS,
-        bootstrap=QUICK,
-    )  # fmt: skip
-    pd.testing.assert_frame_equal(plain.baselines, mixed.baselines)
-
-
 # --- contacts in the observed part ---------------------------------------------------------------
 
 

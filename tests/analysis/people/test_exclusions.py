@@ -413,11 +413,6 @@ def test_regressions_that_cannot_be_say_why(rows: dict[str, list[float]], words:
     assert found["b"].isna().all() and words in found["reason"].iloc[0]
 
 
-def test_every_rule_has_its_column() -> None:
-    flags = flag_sessions(study(people=5, stimuli=10, scenarios=("drop",)))
-    assert all(flags[rule].dtype == bool for rule in (*RULES, "flagged"))
-
-
 # --- completeness --------------------------------------------------------------------------------
 
 QUICK = Bootstrap(resamples=20)

@@ -396,10 +396,12 @@ def test_names_with_their_correction_say_what_the_metadata_say(
 
 
 def test_attributes_from_tables_and_bad_names() -> None:
-    table = pd.DataFrame({"stimulus": ["a_img", "b"], "scenario": "drop", "occluders": ["1", "x"]})
-    found = attributes_from_table(table)
+    table = pd.DataFrame({"stimulus": ["a_img", "b"], "scenario": "drop", "occluders": ["1", ""]})
+    found = attributes_from_table(table.rename(columns={"stimulus": "trial"}))
     assert found["stimulus"].tolist() == ["a", "b"] and found["occluders"].iloc[0] == 1
     assert np.isnan(found["occluders"].iloc[1]) and found["elements"].isna().all()
+    with pytest.raises(BadInputError, match="row 2 of column 'occluders' holds 'x'"):
+        attributes_from_table(table.assign(occluders=["1", "x"]))
     with pytest.raises(BadInputError, match="none of the columns"):
         attributes_from_table(table[["stimulus", "scenario"]])
     with pytest.raises(BadInputError, match="no official name"):

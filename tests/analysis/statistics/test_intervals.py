@@ -165,17 +165,6 @@ def test_seeds_and_strata_differ() -> None:
     assert not np.array_equal(weights, Bootstrap(resamples=5).weights("link", 30))
 
 
-@settings(max_examples=40)
-@given(
-    hnp.arrays(np.float64, st.integers(8, 40), elements=st.integers(0, 1000).map(lambda k: k / 1e3))
-)
-def test_the_interval_of_a_mean_of_symmetric_values_holds_the_mean(half: np.ndarray) -> None:
-    values = np.concatenate([half, 1 - half])
-    bootstrap = Bootstrap(resamples=400)
-    low, high = bootstrap.interval(bootstrap.weights("x", len(values)) @ values / len(values))
-    assert low - 1e-9 <= values.mean() <= high + 1e-9
-
-
 def test_width_matches_the_normal_interval() -> None:
     values = np.random.default_rng(0).random(400)
     bootstrap = Bootstrap(resamples=4000)

@@ -46,18 +46,6 @@ def test_every_pair_is_as_scikit_learn_has_it(values: Array) -> None:
             assert found[i, j] == pytest.approx(expected, abs=1e-12, nan_ok=True)
 
 
-@settings(deadline=None)
-@given(answers)
-def test_kappa_is_symmetric_bounded_and_blind_to_the_names_of_the_answers(values: Array) -> None:
-    found = kappa.pairwise_kappa(values)
-    assert np.array_equal(found, found.T, equal_nan=True)
-    defined = found[np.isfinite(found)]
-    assert ((defined >= -1) & (defined <= 1)).all()
-    np.testing.assert_allclose(kappa.pairwise_kappa(1 - values), found, atol=1e-12)
-    own = np.diag(found)
-    assert (own[np.isfinite(own)] == 1).all()
-
-
 def test_kappa_without_variation() -> None:
     assert np.isnan(kappa.cross_kappa([1, 1, 1], [1, 1, 1])).all()
     # A constant answer and one that varies: no agreement beyond chance, and defined.

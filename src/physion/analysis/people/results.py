@@ -151,10 +151,7 @@ def read_attributes(path: Path) -> pd.DataFrame:
     Columns: ``stimulus`` (or ``trial``), ``scenario``, any of `ATTRIBUTES`.
     """
     file = path / "index.parquet" if path.is_dir() else path
-    table = read_table(file, ())
-    if "stimulus" not in table and "trial" in table:
-        table = table.rename(columns={"trial": "stimulus"})
-    return attributes_from_table(table, str(file))
+    return attributes_from_table(read_table(file), str(file))
 
 
 def analyse_people(
