@@ -76,10 +76,6 @@ def test_two_columns_are_enough_and_the_terminal_shows_the_results(
     ]  # fmt: skip
     assert rows[1][2] == "1.000 [1.000, 1.000]" and rows[1][1:] == rows[2][1:]
     assert lines[-1] == f"report: {tmp_path / 'out' / 'report.html'}"
-    assert main([*command, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    own = [row for row in found["scores"] if row["model"] == "good" and row["scenario"] == "mean"]
-    assert own[0]["accuracy"] == 1 and own[0]["kind"] == "model" and own[0]["kappa"] is None
 
 
 def test_page_and_terminal_show_the_same_average(capsys: pytest.CaptureFixture[str]) -> None:
@@ -111,10 +107,17 @@ def test_files_with_official_headers_write_the_report(
     official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = predictions(official, tmp_path / "m.csv")
-    command = ["compare", str(file), "--humans", str(official / "humans")]
+    command = ["compare", str(file), "--humans", str(official / "humans"), "--json"]
     assert main([*command, "--out", str(tmp_path / "report")]) == 0
-    assert "report:" in capsys.readouterr().out
-    assert (tmp_path / "report" / "tables" / "comparison.csv").is_file()
+    found = json.loads(capsys.readouterr().out)
+    assert Path(found["report"]).is_file()
+    (row,) = (one for one in found["scores"] if one["base_model"] == "m"
+              and one["scenario"] == "mean")  # fmt: skip
+    table = pd.read_csv(tmp_path / "report" / "tables" / "comparison.csv")
+    own = table[(table["base_model"] == "m") & (table["scenario"] == "mean")]
+    assert row["kind"] == "model" and row["kappa"] is None
+    assert row["accuracy"] == pytest.approx(own["accuracy"].item())
+    assert row["accuracy"] == pytest.approx(0.8, abs=0.03)
 
 
 def test_without_files_it_says_so(capsys: pytest.CaptureFixture[str]) -> None:
@@ -184,20 +187,15 @@ def test_every_option_of_a_comparison_reaches_the_report(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     own = own_study(tmp_path)
+    plain = compare(own.predictions, responses=own.responses, resamples=60)
+    assert plain.people is not None
+    tables, methods = plain.people.tables, plain.inputs.methods
+    assert tables["flags"].query("incomplete")["session"].tolist() == ["drop-p0"]
+    words = "sessions answered: collide 16, drop 16; 1 session lacked some"
+    assert words in methods["Trials of a whole session"]
+    assert tables["hypotheses"].query("hypothesis == 'H1'")["reason"].ne("").all()
     command = ["compare", str(own.predictions), "--responses", str(own.responses), "--json"]
     command += ["--resamples", "60", "--out", str(tmp_path / "report")]
-    assert main(command) == 0
-    plain = json.loads(capsys.readouterr().out)
-    assert Path(plain["report"]).is_file()
-    flags = {row["session"]: row["incomplete"] for row in plain["people_flags"]}
-    assert [session for session, flag in flags.items() if flag] == ["drop-p0"]
-    intervals = plain["methods"]["Intervals of people's accuracy and agreement"]
-    assert "60 resamples, seed 0" in intervals
-    assert (
-        "sessions answered: collide 16, drop 16; 1 session lacked some"
-        in (plain["methods"]["Trials of a whole session"])
-    )
-    assert all(row["reason"] for row in plain["people_hypotheses"] if row["hypothesis"] == "H1")
     command += ["--expected", str(own.expected), "--attributes", str(own.dataset)]
     command += ["--dataset", str(own.dataset), "--rules", "official-code", "--seed", "5"]
     command += ["--trial-pages"]
@@ -208,7 +206,8 @@ def test_every_option_of_a_comparison_reaches_the_report(
         "study's list: collide 16, drop 12 to 16" in (found["methods"]["Trials of a whole session"])
     )
     assert "official-code" in found["methods"]["People"]
-    assert "seed 5" in found["methods"]["Intervals of people's accuracy and agreement"]
+    intervals = found["methods"]["Intervals of people's accuracy and agreement"]
+    assert "60 resamples, seed 5" in intervals
     slopes = {row["hypothesis"]: row for row in found["people_hypotheses"]
               if row["scenario"] == "all"}  # fmt: skip
     assert slopes["H1"]["b"] is not None and slopes["H2"]["b"] is not None

@@ -72,7 +72,7 @@ def score_table(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
     # Sorted, so that rounding does not depend on the order of the files.
     ordered = stimuli.sort_values("stimulus", kind="stable")
     parts = [
-        _agent_rows(rows, level, _of_models, _why_undefined)
+        _scenario_rows(rows, level, _of_models, _why_undefined)
         for _, rows in ordered.groupby("model", sort=False)
     ]
     table = pd.concat(parts, ignore_index=True)
@@ -89,10 +89,10 @@ def two_people_table(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame
     defined for two people are NaN.
     """
     ordered = stimuli.sort_values("stimulus", kind="stable")
-    return _agent_rows(ordered, level, _of_two_people, _why_no_pair)
+    return _scenario_rows(ordered, level, _of_two_people, _why_no_pair)
 
 
-def _agent_rows(rows: pd.DataFrame, level: float, scores: Compute, why: Explain) -> pd.DataFrame:
+def _scenario_rows(rows: pd.DataFrame, level: float, scores: Compute, why: Explain) -> pd.DataFrame:
     names = in_order(rows["scenario"])
     parts = [rows[rows["scenario"] == name] for name in names]
     weights, strata = delete_one([len(part) for part in parts])

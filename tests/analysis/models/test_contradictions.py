@@ -15,7 +15,6 @@ from physion.analysis.comparison import check_coverage
 from physion.analysis.tables import check_predictions, name_models
 from physion.cli.main import main
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.report.compare import compare
 
 QUICK = Bootstrap(resamples=20)
 STEM = "pilot_it2_drop_simple_box"
@@ -149,12 +148,10 @@ def test_a_cut_official_table_is_reported_on_page_and_terminal(
         {"Model": "m", "Readout Type": "B", "Predicted Outcome": truth, "Actual Outcome": truth,
          "Predicted Prob_true": truth * 0.8 + 0.1, "Stimulus Name": drop}
     )  # fmt: skip
-    result = compare(write(tmp_path, table), humans=people, resamples=20)
-    page = result.report(tmp_path / "out")
-    text = page.read_text(encoding="utf-8")
-    assert "<strong>Warnings</strong>" in text and "drop: 30 of 150 stimuli" in text
-    command = ["compare", str(tmp_path / "m.csv"), "--humans", str(people)]
+    command = ["compare", str(write(tmp_path, table)), "--humans", str(people)]
     command += ["--out", str(tmp_path / "out"), "--resamples", "20"]
     assert main(command) == 0
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "physion: warning: drop: 30 of 150 stimuli" in error
+    text = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "<strong>Warnings</strong>" in text and "drop: 30 of 150 stimuli" in text
