@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import special, stats
 
 from physion.analysis import Bootstrap, compare_scores, read_predictions
 from physion.analysis.compare import all_results
@@ -103,6 +104,29 @@ def test_scores_match_the_joined_rows() -> None:
         assert mean[key] == pytest.approx(by_scenario[key].mean())
     intervals = found.scores[["accuracy_low", "accuracy", "accuracy_high"]].to_numpy()
     assert (np.diff(intervals, axis=1) >= 0).all()
+
+
+def test_intervals_of_accuracy_match_the_formula_in_each_scenario_and_the_mean() -> None:
+    """By the logit: the jackknife variance of a fraction a of n is a (1 - a) / (n - 1)."""
+    people = pd.concat(
+        [humans(20).query("scenario == 'collide'"), humans(9).query("scenario == 'drop'")]
+    )
+    found = compare_scores(predictions(people), people, labels(people), bootstrap=QUICK).scores
+    rows = {name: score(found, "m · observed", name) for name in ("collide", "drop", MEAN)}
+    a = np.array([rows[name]["accuracy"] for name in SCENARIOS])
+    df = np.array([19.0, 8.0])
+    variance = a * (1 - a) / df
+    assert variance.min() > 0 and variance[0] != pytest.approx(variance[1])
+    total = variance.sum()
+    expected = {
+        "collide": (a[0], variance[0], df[0]),
+        "drop": (a[1], variance[1], df[1]),
+        MEAN: (a.mean(), total / 4, total**2 / np.sum(variance**2 / df)),
+    }
+    for name, (value, own, free) in expected.items():
+        reach = stats.t.ppf(0.975, free) * np.sqrt(own) / (value * (1 - value))
+        ends = special.expit(special.logit(value) + np.array([-reach, reach]))
+        assert rows[name][["accuracy_low", "accuracy_high"]].tolist() == pytest.approx(ends), name
 
 
 def test_the_mean_counts_scenarios_and_the_pool_counts_stimuli() -> None:
