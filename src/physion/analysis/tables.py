@@ -726,7 +726,8 @@ def attributes_from_table(table: pd.DataFrame, where: str = "table of attributes
         raise BadInputError(f"{where} has none of the columns {', '.join(ATTRIBUTES)}")
     rows = rows.assign(stimulus=rows["stimulus"].map(canonical_name), source="table")
     refuse_duplicates(rows["stimulus"], where)
-    return rows.reindex(columns=list(COLUMNS)).fillna({"configuration": "", "room": ""})
+    absent = [name for name in ("configuration", "room") if name not in rows]
+    return rows.assign(**dict.fromkeys(absent, "")).reindex(columns=list(COLUMNS))
 
 
 def better_attributes(first: pd.DataFrame, second: pd.DataFrame) -> pd.DataFrame:
