@@ -247,8 +247,9 @@ def _read_runs(results: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     table = joined.drop(columns="run")
     return in_paper_order(table, ["model", "scenario"]), dropped[dropped["rows"] > 0]
 
+
+def _read_released(path: Path, columns: Sequence[Column]) -> pd.DataFrame:
     """Read a released table, with the names of the paper for models, readouts and trainings."""
-    """Read a released table with the names of the paper in place of its words."""
     table = check_table(read_csv(path), columns, str(path))
     for name, names in (("model", MODELS), ("readout", READOUT_NAMES), ("training", TRAININGS)):
         if name in table:
