@@ -13,6 +13,7 @@ import pytest
 
 from physion.cli.main import main
 from physion.core.errors import UnknownNameError
+from physion.core.seeds import generator
 from physion.experiment.protocol import TrialMedia
 from physion.experiment.server_process import ServerProcess
 from physion.experiment.simulated import (
@@ -78,16 +79,17 @@ def test_people_are_right_as_often_as_they_should_be_and_slower_where_it_is_hard
 
 
 def test_answers_follow_the_rasch_model_and_log_normal_times() -> None:
-    people = [SimulatedPerson(0, number) for number in range(400)]
-    stimuli = [_stimulus(number, number % 2 == 0) for number in range(100)]
+    people = [SimulatedPerson(0, number) for number in range(200)]
+    stimuli = [_stimulus(number, number % 2 == 0) for number in range(60)]
     chance = np.array([[p.probability_correct(s) for s in stimuli] for p in people])
     log_odds = np.log(chance / (1 - chance))
     # The sum of a person and a stimulus: differences of people are the same for all stimuli.
     ability = log_odds[:, :1] - log_odds[:1, :1]
     np.testing.assert_allclose(log_odds - ability, np.broadcast_to(log_odds[:1], chance.shape))
-    assert np.std(log_odds[:, 0]) == pytest.approx(0.35, rel=0.12)  # standard error 3.5 %
-    assert np.std(log_odds[0]) == pytest.approx(1.3, rel=0.25)  # standard error 7 %
-    assert log_odds.mean() == pytest.approx(1.2, abs=0.4)  # standard error 0.13
+    assert np.std(log_odds[:, 0]) == pytest.approx(0.35, rel=0.15)  # standard error 5 %
+    assert np.std(log_odds[0]) == pytest.approx(1.3, rel=0.3)  # standard error 9 %
+    easiness = [generator("easiness", s.stimulus).normal(0, 1.3) for s in stimuli]
+    assert (log_odds - easiness).mean() == pytest.approx(1.2, abs=0.075)  # standard error 0.025
     # A bias towards yes does not change how often both outcomes together are right.
     rt = np.array([[p.predict(s).rt_ms for s in stimuli] for p in people])
     rest = np.log(rt) - 0.4 * (1 - chance)

@@ -49,7 +49,7 @@ def stimuli_lists(draw: st.DrawFn) -> list[Stimulus]:
 
 @given(stimuli_lists())
 @settings(
-    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 def test_what_is_written_is_read_back(tmp_path: Path, stimuli: list[Stimulus]) -> None:
     path = tmp_path / "stimuli.csv"
