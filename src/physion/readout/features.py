@@ -8,7 +8,6 @@ files are a cache: one that is damaged is deleted and made again.
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import itertools
 import json
 import math
@@ -27,7 +26,7 @@ from physion.clips.source import ObservedSource, Part
 from physion.compute.local import SerialExecutor
 from physion.compute.tasks import Executor, Progress, tracked
 from physion.core.errors import BadInputError, PhysionError
-from physion.core.files import write_atomic
+from physion.core.files import digest_of, write_atomic
 from physion.models.build import OutOfMemoryError
 from physion.models.interface import Model, ask
 from physion.models.user_files import LoadedFiles
@@ -639,7 +638,7 @@ class FeatureStore:
         if self._folder is None:
             return None
         identity = [_VERSION, digest, key, trial, work.part, work.settings]
-        name = hashlib.sha256(json.dumps(identity).encode()).hexdigest()
+        name = digest_of(json.dumps(identity))
         return self._folder / work.part / digest[:16] / name[:2] / f"{name}.safetensors"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ import pandas as pd
 
 from physion.analysis.comparison import Comparison
 from physion.analysis.tables import in_order
+from physion.core.files import digest_of
 from physion.core.html import Markup, joined, macros_of
 from physion.report.html import (
     MACROS,
@@ -384,7 +384,7 @@ def page_name(stimulus: str) -> str:
     safe = re.sub(r"[^A-Za-z0-9_-]+", "-", stimulus)[:100]
     if safe == stimulus and stimulus != "index":
         return f"{stimulus}.html"
-    return f"{safe}-{hashlib.sha256(stimulus.encode()).hexdigest()[:12]}.html"
+    return f"{safe}-{digest_of(stimulus)[:12]}.html"
 
 
 def trial_pages(inputs: ReportInputs) -> Iterator[tuple[str, str]]:

@@ -8,7 +8,6 @@ server. Passwords are checked one at a time, 50 ms each; a proxy limits the rate
 from __future__ import annotations
 
 import asyncio
-import hashlib
 import secrets
 import time
 from collections import OrderedDict
@@ -20,6 +19,7 @@ from urllib.parse import parse_qsl, urlsplit
 from starlette.requests import Request
 from starlette.responses import Response
 
+from physion.core.files import digest_of
 from physion.experiment.study.identity import Secrets, check_password
 
 PATH = "/experimenter"
@@ -133,7 +133,7 @@ def _hashed(request: Request) -> str:
 
 
 def _hash(token: str) -> str:
-    return hashlib.sha256(token.encode("utf-8", "replace")).hexdigest()
+    return digest_of(token.encode("utf-8", "replace"))
 
 
 async def read_form(request: Request) -> dict[str, str] | None:

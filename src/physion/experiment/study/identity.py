@@ -16,7 +16,7 @@ from pathlib import Path
 from secrets import token_hex, token_urlsafe
 
 from physion.core.errors import BadInputError
-from physion.core.files import read_plain, write_atomic
+from physion.core.files import digest_of, read_plain, write_atomic
 from physion.core.settings import parse_json, read_settings
 
 SECRET_FILE = "secret.json"
@@ -130,7 +130,7 @@ def hash_token(token: str) -> str:
 
     Tokens are random, so no key is needed to keep them from being guessed.
     """
-    return hashlib.sha256(token.encode("utf-8", "replace")).hexdigest()
+    return digest_of(token.encode("utf-8", "replace"))
 
 
 def new_session() -> str:

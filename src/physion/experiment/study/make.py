@@ -8,7 +8,6 @@ so they reveal neither the stimulus nor its outcome.
 
 from __future__ import annotations
 
-import hashlib
 import io
 import itertools
 from collections.abc import Mapping, Sequence
@@ -20,7 +19,7 @@ from PIL import Image
 
 from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError
-from physion.core.files import new_folder, read_plain, write_atomic
+from physion.core.files import digest_of, new_folder, read_plain, write_atomic
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.settings import format_settings
 from physion.experiment.study.stimuli import (
@@ -163,7 +162,7 @@ def _read(source: StimulusSource, name: str) -> bytes:
     path = source.files[name]
     content = read_plain(path, MAX_MOVIE_BYTES)
     wanted = source.digests.get(name)
-    if wanted is not None and hashlib.sha256(content).hexdigest() != wanted:
+    if wanted is not None and digest_of(content) != wanted:
         raise BadInputError(
             f"{path} does not have the SHA-256 in its dataset's index; run physion verify"
         )
@@ -248,7 +247,7 @@ def clean_map(content: bytes, size: tuple[int, int], path: Path) -> bytes:
 
 def _store(folder: Path, content: bytes, ending: str) -> str:
     """Write a file named by its SHA-256 unless it exists; return its path within the study."""
-    name = f"{MEDIA_FOLDER}/{hashlib.sha256(content).hexdigest()}{ending}"
+    name = f"{MEDIA_FOLDER}/{digest_of(content)}{ending}"
     path = folder / name
     if path.is_symlink() or not path.is_file() or path.read_bytes() != content:
         write_atomic(path, content)

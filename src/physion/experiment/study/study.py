@@ -23,7 +23,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from physion.core.errors import BadInputError
-from physion.core.files import check_plain, read_ids, read_plain, write_atomic
+from physion.core.files import check_plain, digest_of, read_ids, read_plain, write_atomic
 from physion.core.names import canonical_name
 from physion.experiment.study.settings import (
     ALL_SCENARIOS,
@@ -118,7 +118,7 @@ def load_study(folder: Path | str) -> Study:
         written.append(text_file)
         consent = read_consent_file(folder / TEXTS_FOLDER, language)
         if consent is not None:
-            files[language] = hashlib.sha256(consent).hexdigest()
+            files[language] = digest_of(consent)
             written.append(consent)
     allow_list = study.recruitment.allow_list
     listed = folder / STIMULI_FILE

@@ -8,7 +8,6 @@ a client reaches the file system.
 from __future__ import annotations
 
 import gzip
-import hashlib
 from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import Response
 
-from physion.core.files import read_plain
+from physion.core.files import digest_of, read_plain
 
 MAX_MEDIA_BYTES = 64 * 2**20
 """Size limit of one movie or map."""
@@ -116,7 +115,7 @@ def read_page_file(path: Path) -> PageFile:
         content=content,
         packed=packed if len(packed) < 0.9 * len(content) else None,
         media_type=MEDIA_TYPES[path.suffix],
-        etag=f'"{hashlib.sha256(content).hexdigest()[:32]}"',
+        etag=f'"{digest_of(content)[:32]}"',
     )
 
 
