@@ -302,6 +302,7 @@ def test_tables_say_what_is_in_the_trial(dataset: Path) -> None:
     ball = dict(zip(tables["Bodies"]["header"], tables["Bodies"]["rows"][0], strict=True))
     assert ball["role"] == "agent" and ball["mass (kg)"] == "1.25"
     assert ball["scale"] == "0.5, 0.5, 0.5" and ball["static friction"] == "0.5"
+    assert ball["dynamic friction"] == "0.4" and ball["restitution"] == "0.3"
     assert [row[9] for row in tables["Bodies"]["rows"]] == ["free", "fixed", "scenery"]
     assert tables["Pushes"]["rows"] == [["ball", "3, 4, 0", "5", "centre of mass", "7"]]
     facts = {row[0]: row[1] for row in tables["Trial"]["rows"]}

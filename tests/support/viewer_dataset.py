@@ -9,7 +9,7 @@ import numpy as np
 
 from physion.physics.labels import label_contact
 from physion.physics.trajectory import Contacts, Trajectory
-from physion.scenes.scene import Body, Camera, Cloth, Look, Push, Roles, Scene
+from physion.scenes.scene import Body, Camera, Cloth, Look, Push, Roles, Scene, SurfaceMaterial
 from physion.trials.files import Metadata, TrialPaths, encode_png, write_files
 from physion.trials.index import build_index, write_index
 from physion.trials.trial_file import TrialWriter
@@ -44,7 +44,9 @@ PLANS = (
 
 def make_scene(plan: Plan) -> Scene:
     """A ball above a wide plate, or a cloth in place of the ball, and a prop to look at."""
-    ball = Body("ball" + plan.foreign, "sphere", (0, 0, 1.0), (0.5, 0.5, 0.5), mass=1.25)
+    rough = SurfaceMaterial(static_friction=0.5, dynamic_friction=0.4, restitution=0.3)
+    name = "ball" + plan.foreign
+    ball = Body(name, "sphere", (0, 0, 1.0), (0.5, 0.5, 0.5), mass=1.25, contact=rough)
     plate = Body("plate", "cube", (0, 0, 0), (1.5, 1.5, 0.2), kinematic=True)
     blue = Look((0.1, 0.2, 0.8))
     vase = Body("vase", "prop:vase", (-1.2, 0.6, 0), (0.5, 0.5, 0.5), scenery=True, look=blue)
