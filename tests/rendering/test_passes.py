@@ -166,7 +166,7 @@ def test_sphere_depth_silhouette_and_normals() -> None:
     assert angle.max() < 1.0
 
 
-def test_normals_of_a_stretched_and_turned_ball_are_those_of_an_ellipsoid() -> None:
+def test_normals_of_a_stretched_and_turned_ball_match_an_ellipsoid() -> None:
     """The gradient of x²/a² + y²/b² + z²/c² in the body's axes."""
     half, turn = np.array([0.5, 0.25, 0.35]), (0.8, 0.36, 0.0, 0.48)
     scene = scene_of(
