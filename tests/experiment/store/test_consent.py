@@ -10,7 +10,7 @@ import pytest
 
 from physion.experiment.protocol import Completion, Device, Enter, Event, Events, SessionEnd
 from physion.experiment.store.database import METADATA, RAW_IDS, SESSIONS, STUDIES
-from physion.experiment.store.lab import forget_sessions, set_paused
+from physion.experiment.store.lab import set_paused
 from physion.experiment.store.store import Refused, Store
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.settings import EarlyEnd
@@ -127,13 +127,6 @@ def test_the_memory_of_visitors_is_bounded(store: Store, monkeypatch: pytest.Mon
     assert [run(store.state(token)).stage for token in tokens[1:]] == ["consent"] * 3
 
 
-def test_entries_are_counted_whether_people_agree_or_not(store: Store) -> None:
-    for number in range(5):
-        token = enter(store, f"person {number}")
-        page(store, token, "consent", agreed=number % 2 == 0)
-    assert (store.entries(60.0), store.entries(-1.0)) == (5, 0)
-
-
 def _agreed() -> object:
     from physion.experiment.protocol import PageDone
 
@@ -154,21 +147,6 @@ def test_going_on_has_no_ending(store: Store) -> None:
         with pytest.raises(Refused) as caught:
             store.ending(token)
         assert caught.value.code == "wrong_stage"
-
-
-def test_deleted_data_cannot_be_taken_up_again(
-    small_study: Study, small_secrets: Secrets, tmp_path: Path
-) -> None:
-    store = open_store(small_study, small_secrets, tmp_path)
-    token = begin(store, "Ada", source="prolific", scenario="drop")
-    reference = run(store.state(token)).reference
-    store.close()
-    forget_sessions(tmp_path, [reference])
-    store = open_store(small_study, small_secrets, tmp_path)
-    assert refusal(store.enter(come("Ada"))).code == "already_took_part"
-    (session,) = rows(store, SESSIONS)
-    assert session.closed_at is not None and rows(store, RAW_IDS) == []
-    store.close()
 
 
 @pytest.fixture

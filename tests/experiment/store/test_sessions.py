@@ -160,20 +160,6 @@ def test_the_scenario_with_fewest_sessions_comes_first_until_the_study_is_full(
     assert finished == {"drop": 4, "collide": 4}
 
 
-def test_an_abandoned_session_is_not_counted_and_may_be_continued(store: Store) -> None:
-    tokens = [begin(store, f"p{i}", scenario="drop") for i in range(3)]
-    for token in tokens:
-        walk(store, token, "test")
-    assert refusal(store.enter(request("late", scenario="drop"))).code == "held"
-    _let_time_pass(store, "p0", ACTIVE_WITHIN - 30)
-    assert refusal(store.enter(request("late", scenario="drop"))).code == "held"
-    _let_time_pass(store, "p0", 60)
-    walk(store, begin(store, "late", scenario="drop"), "test")
-    assert refusal(store.enter(request("later", scenario="drop"))).code == "held"
-    for token in (*tokens, begin(store, "p0")):
-        walk(store, token, "done")
-
-
 def _let_time_pass(store: Store, person: str, seconds: float = ACTIVE_WITHIN + 1) -> None:
     """Make a session inactive, as if its last request and answer were long ago."""
     own = SESSIONS.c.participant == participant_hash(store.secrets, "link", person)

@@ -92,59 +92,39 @@ def changed(**values: Any) -> bytes:
 BODIES = {
     "nothing": b"",
     "no JSON": b"response=yes",
-    "half": changed()[:-5],
     "null": b"null",
-    "a list": b"[]",
-    "a number": b"1",
-    "a text": b'"x"',
     "invalid UTF-8": changed().replace(b"yes", b"y\xffs"),
-    "UTF-16": changed().decode().encode("utf-16"),
     "packed": gzip.compress(changed()),
     "deep": DEEP.encode(),
     "deep in details": changed().replace(b'"details": {', b'"details": {"x": ' + b"[" * 5000),
     "NaN": changed(rt_ms=float("nan")),
     "Infinity": changed(rt_ms=float("inf")),
-    "minus Infinity": changed(rt_ms=float("-inf")),
     "beyond a double": changed().replace(b"812.5", b"1e999"),
     "NaN in details": changed(details={"x": float("nan")}),
     "beyond a double in details": changed(details={"x": 12321}).replace(b"12321", b"1e999"),
     "a huge number": changed(rt_ms=10**400),
     "digits beyond reading": changed().replace(b"812.5", b"1" * 10_000),
     "NUL": changed(details={"x": "a\x00b"}),
-    "NUL in a key": changed(details={"a\x00": 1}),
     "half a character": changed(details={"x": "\ud800"}),
-    "half a character as key": changed(details={"\udfff": 1}),
 }
 VALUES: dict[str, dict[str, Any]] = {
     "negative time": {"rt_ms": -1},
     "time beyond a day": {"rt_ms": 86_400_001},
     "time as text": {"rt_ms": "812.5"},
     "time as bool": {"rt_ms": True},
-    "no time": {"rt_ms": None},
-    "negative fixation": {"fixation_ms": -0.001},
     "huge cue": {"cue_ms": 1e300},
     "negative trial": {"trial": -1},
-    "half a trial": {"trial": 0.5},
-    "trial as text": {"trial": "0"},
-    "trial beyond all": {"trial": 10**15},
     "unknown phase": {"phase": "demo"},
     "unknown response": {"response": "maybe"},
-    "response in capitals": {"response": "YES"},
     "unknown input": {"input": "<script>"},
-    "short key": {"key": "short"},
-    "key with more than letters": {"key": "abcdefgh'--"},
     "key with an end of line": {"key": "abcdefgh\n"},
     "long key": {"key": "a" * 65},
-    "negative frames": {"frames_shown": -5},
     "huge window": {"window_width": 10**9},
     "too many details": {"details": {str(number): 0 for number in range(31)}},
     "too long details": {"details": {"x": "y" * 17_000}},
     "a long name in details": {"details": {"n" * 201: 1}},
-    "details as a list": {"details": [1]},
     "a stimulus": {"stimulus": "collide_tiny_tes_0000"},
-    "a session": {"session": "0" * 32},
     "correct": {"correct": True},
-    "a script as name": {"<script>alert(1)</script>": 1},
 }
 
 
@@ -171,13 +151,6 @@ class TestAnswers:
         """This also blocks forms of other sites, which can only send these content types."""
         assert_refused(post(tester, "/api/answers", changed(), kind))
         assert tester.state()["trial"] == 0
-
-    @pytest.mark.parametrize("trial", [1, 2, 3, 99_999])
-    def test_trials_that_are_not_next(self, tester: Person, trial: int) -> None:
-        refusal = tester.answer(trial, status=409)
-        assert refusal["error"] == "out_of_order" and refusal["state"]["trial"] == 0
-        refusal = tester.answer(trial, "familiarization", status=409)
-        assert refusal["error"] == "out_of_order"
 
     def test_refusals_repeat_no_value(self, tester: Person) -> None:
         marker = "<b>marker</b>" + "m" * 10_000
@@ -349,20 +322,6 @@ class TestBodies:
         assert answer.startswith(b"HTTP/1.1 413") or not answer
         assert sent < 9_000_000  # data in the system's buffers have not been read by the server
 
-    @pytest.mark.parametrize("length", ["-1", "1e9", "99999999999999999999", "0x10", "abc", "5, 6"])
-    def test_invalid_lengths_are_refused(self, port: int, length: str) -> None:
-        answer = exchange(port, head(f"Content-Length: {length}"), b"xxxxx")
-        assert answer.startswith((b"HTTP/1.1 400", b"HTTP/1.1 413"))
-
-    def test_a_length_that_is_too_small_gives_no_second_request(self, port: int) -> None:
-        answer = exchange(port, head("Content-Length: 4"), b"xxxx" + b"y" * 100_000)
-        assert answer.count(b"HTTP/1.1 422") <= 1 and answer.count(b"HTTP/1.1 400") == 1
-
-    def test_websockets_are_refused(self, port: int) -> None:
-        lines = ("Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13",
-                 "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "Content-Length: 0")  # fmt: skip
-        assert exchange(port, head(*lines)).startswith(b"HTTP/1.1 422")
-
 
 class TestRawRequests:
     """Raw requests that no client library sends, on a real server."""
@@ -373,24 +332,6 @@ class TestRawRequests:
         answer = exchange(port, b"GET " + path.encode() + rest)
         assert answer.startswith((b"HTTP/1.1 404", b"HTTP/1.1 400", b"HTTP/1.1 303"))
         assert b"root:" not in answer and b"import" not in answer and b"hash_key" not in answer
-
-    @pytest.mark.parametrize("words", [
-        b"\x00" * 100, b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03", b"GET\r\n\r\n",
-        b"GET / HTTP/9.9\r\n\r\n", b"GET /\xff\xfe HTTP/1.1\r\nHost: x\r\n\r\n",
-        b"GET / HTTP/1.1\r\nBad Header\r\n\r\n", b"GET / HTTP/1.1\r\n: x\r\n\r\n",
-        b"POST /api/enter HTTP/1.1\r\nHost: x\r\nContent-Length: 5\r\n"
-        b"Transfer-Encoding: chunked\r\n\r\n0\r\n\r\n",
-        b"POST /api/enter HTTP/1.1\r\nHost: x\r\nContent-Length: 5\r\nContent-Length: 6\r\n\r\n{}",
-        b"POST /api/enter HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n\r\n",
-        b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n",
-    ])  # fmt: skip
-    def test_malformed_http(self, site: Served, port: int, words: bytes) -> None:
-        before = counts(site)
-        answer = exchange(port, words)
-        assert b"Traceback" not in answer and not answer.startswith(b"HTTP/1.1 200")
-        assert counts(site) == before
-        alive = exchange(port, b"GET /api/health HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
-        assert alive.endswith(b'{"ok":true}')
 
     def test_a_name_cannot_inject_a_header(self, port: int) -> None:
         start = b"GET /api/texts/x%0d%0aSet-Cookie:%20a=b HTTP/1.1\r\nHost: x\r\n"
@@ -404,11 +345,6 @@ class TestRawRequests:
                 b"X-Forwarded-Host: evil.example\r\nX-Forwarded-For: 1.1.1.1\r\n\r\n"
             )  # fmt: skip
             assert b"evil.example" not in answer
-
-    def test_an_absolute_url_is_read_as_its_path(self, port: int) -> None:
-        answer = exchange(port, b"GET http://evil.example/static/../wire.py HTTP/1.1\r\n"
-                                b"Host: x\r\nConnection: close\r\n\r\n")  # fmt: skip
-        assert answer.startswith((b"HTTP/1.1 404", b"HTTP/1.1 400"))
 
 
 JSON = st.recursive(
@@ -431,10 +367,3 @@ def test_any_json_is_a_message_or_refused(values: dict[str, Any], whole: bool) -
     with contextlib.suppress(Refused):
         json.loads(encode_details(message))
     assert 0 <= message.rt_ms <= wire.DAY_MS
-
-
-@settings(max_examples=100, deadline=None)
-@given(st.binary(max_size=200))
-def test_any_bytes_are_refused(body: bytes) -> None:
-    with pytest.raises(BadBodyError):
-        parse_message(body, wire.Answer)
