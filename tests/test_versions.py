@@ -13,6 +13,7 @@ from physion.cli.main import main
 from physion.clips.batch import Provenance
 from physion.core.html import Markup
 from physion.core.version import MADE_WITH, __version__
+from physion.readout.decisions import Decided
 from physion.readout.tables import ScenarioPredictions, make_table
 from physion.report.html import render_document
 from physion.report.viewer.build import render_viewer
@@ -35,7 +36,8 @@ def test_pages_name_the_version() -> None:
 )
 def test_each_row_of_predictions_names_the_version(stated: str, written: str) -> None:
     trials = ("a", "b")
-    part = ScenarioPredictions("drop", "observed", trials, np.array([0.2, 0.7]), 1.0, 4, -1, "")
+    decided = Decided(np.array([0.2, 0.7]), 1.0)
+    part = ScenarioPredictions("drop", "observed", trials, decided, 4, -1, "")
     index = pd.DataFrame(
         {"trial": trials, "contact": True, "observed_contact": False, "recorded_contact": None}
     )

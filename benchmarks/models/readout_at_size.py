@@ -60,8 +60,7 @@ def run_readout(folder: Path) -> dict[str, Any]:
     """Return time, memory and accuracy of the readout."""
     wall, cpu = time.perf_counter(), time.process_time()
     rows: list[Any] = [
-        open_features(folder / f"{trial}.safetensors", {"trial": str(trial)})
-        for trial in range(FIT + TEST)
+        open_features(folder / f"{trial}.safetensors") for trial in range(FIT + TEST)
     ]
     features = StoredFeatures([str(trial) for trial in range(FIT + TEST)], rows)
     outcomes = np.load(folder / "outcomes.npy")

@@ -118,7 +118,7 @@ def test_a_training_that_is_killed_ends_with_the_same_bytes(dots: Dataset, tmp_p
     )  # fmt: skip
     end = time.monotonic() + 120
     while running.poll() is None and time.monotonic() < end:
-        if list((tmp_path / "parts").rglob("previous.safetensors")):
+        if list((tmp_path / "parts").rglob("checkpoint.safetensors")):
             break
         time.sleep(0.01)
     running.send_signal(signal.SIGKILL)

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from physion.cli.model_options import parse_options
 from physion.core.errors import BadInputError, PhysionError
+from physion.core.settings import parse_pairs
 from physion.models.build import (
     build_model,
     build_untrained,
@@ -43,7 +43,7 @@ from support.tiny_models import UNTRAINED, tiny
 )
 def test_values_of_another_type_are_one_line(option: str, says: str) -> None:
     with pytest.raises(BadInputError, match=says) as error:
-        build_model("noisy-simulation", **parse_options((option,)))
+        build_model("noisy-simulation", **parse_pairs((option,), "--option"))
     assert "\n" not in str(error.value) and len(str(error.value)) < 300
 
 
@@ -162,5 +162,5 @@ def test_python_may_give_tuples_numbers_of_numpy_and_whole_numbers() -> None:
 
 def test_nesting_without_end_takes_a_moment() -> None:
     start = time.process_time()
-    assert parse_options(("a=" + "[" * 100_000,))["a"].startswith("[[")
+    assert parse_pairs(("a=" + "[" * 100_000,), "--option")["a"].startswith("[[")
     assert time.process_time() - start < 5

@@ -16,7 +16,7 @@ from physion.compute.local import LocalExecutor, SerialExecutor
 from physion.core.errors import BadInputError, PhysionError
 from physion.models import Batch
 from physion.readout.logistic import LogisticSettings
-from physion.readout.settings import EvaluationSettings, HarnessSettings
+from physion.readout.settings import EvaluationSettings, TrainSettings
 from physion.trials.dataset import Dataset
 from physion.trials.making.plan import GenerateSettings
 from support.moving_dots import make_dots
@@ -68,7 +68,7 @@ def test_evaluation_finds_what_was_trained_before(made: Dataset, tmp_path: Path)
     model: Any = physion.build_model(f"{EXAMPLES / 'my_dynamics.py'}:MyDynamics", channels=4)
     initial = model.digest()
     few = {"steps": 5}
-    settings = HarnessSettings(folds=2, accelerator="cpu")
+    settings = TrainSettings(folds=2, accelerator="cpu")
     trained = physion.train(model, made, tmp_path, options=few, settings=settings).trained
     assert len(trained) == 2 and not any(result.loaded for result in trained)
     assert model.digest() == initial, "the weights stay the initial ones"

@@ -14,9 +14,8 @@ from physion.compute.local import LocalExecutor, SerialExecutor
 from physion.compute.tasks import Executor, TaskOutcome
 from physion.core.errors import BadInputError, PhysionError
 from physion.models.checkpoint import read_checkpoint
-from physion.readout.cells import choose_models
 from physion.readout.logistic import LogisticSettings
-from physion.readout.settings import EvaluationSettings, HarnessSettings
+from physion.readout.settings import EvaluationSettings, TrainSettings, choose_models
 from physion.trials.dataset import Dataset
 from support import cell_models
 from support.moving_dots import make_dots
@@ -25,7 +24,7 @@ FILE = cell_models.__file__
 IMAGINING, FAILS = f"{FILE}:Imagining", f"{FILE}:FailsOnDrop"
 UNTRAINED = f"{FILE}:NothingToTrain"
 EVERY = ("all", "all-but", "only")
-CPU = HarnessSettings(accelerator="cpu")
+CPU = TrainSettings(accelerator="cpu")
 QUICK = EvaluationSettings(accelerator="cpu", logistic=LogisticSettings(grid=(1e-2, 1.0)))
 
 
@@ -100,7 +99,7 @@ def test_a_training_that_is_missing_or_was_changed_is_done_again(
 
 def test_other_inputs_are_another_training(dots: Dataset, tmp_path: Path) -> None:
     def place(**changes: Any) -> Path:
-        settings = HarnessSettings(accelerator="cpu", **changes.pop("settings", {}))
+        settings = TrainSettings(accelerator="cpu", **changes.pop("settings", {}))
         (one,) = physion.train(
             IMAGINING, changes.pop("dataset", dots), tmp_path, options=changes, settings=settings,
             dry_run=True,
@@ -192,7 +191,7 @@ def test_a_mistake_is_found_before_anything_is_done(dots: Dataset, tmp_path: Pat
         ({"options": {"steps": "many"}}, "steps"),
         ({"protocols": "al-but"}, "all-but"),
         ({"scenario": "drop"}, "a scenario needs"),
-        ({"seeds": 0}, "1 seed or more"),
+        ({"seeds": 0}, "seeds must be at least 1"),
     ):
         with pytest.raises(PhysionError, match=message):
             train(IMAGINING, **given)

@@ -9,6 +9,7 @@ from physion.core.errors import BadInputError
 from physion.readout.decisions import (
     GapDecision,
     NoiseDecision,
+    TouchDecision,
     best_threshold,
     decisions,
     fit_arguments,
@@ -102,3 +103,17 @@ def test_only_contacts_have_no_threshold() -> None:
     contacts = {NO_ARGUMENTS: Outcomes(np.array([[True]]), None)}
     with pytest.raises(BadInputError, match="use the decision 'noise'"):
         GapDecision().decide(contacts, np.array([True]), contacts)
+
+
+def test_touching_needs_no_fit_and_counts_futures() -> None:
+    """P = (k + 1/2) / (S + 1) for k of S futures; a gap of 0 touches."""
+    decide = TouchDecision().decide
+    near = gaps([0.0, -0.1, 0.2], [0.1, 0.2, 0.3], [0.0, 0.0, 0.0])
+    decided = decide(near, np.array([True, True, True]), near)
+    assert decided.probability == pytest.approx([2.5 / 4, 0.5 / 4, 3.5 / 4])
+    assert decided.train_accuracy == pytest.approx(2 / 3) and decided.fitted == {}
+    seen = {NO_ARGUMENTS: Outcomes(np.array([[True], [False]]), np.array([[0.3], [-0.3]]))}
+    assert decide(seen, np.array([True, False]), seen).probability.tolist() == [1.0, 0.0]
+    nothing = {NO_ARGUMENTS: Outcomes(None, np.zeros((0, 3)))}
+    none = decide(nothing, np.zeros(0, bool), near)
+    assert np.isnan(none.train_accuracy)

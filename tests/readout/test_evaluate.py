@@ -9,17 +9,33 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import torch
+from sklearn.linear_model import LogisticRegression
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 
 from physion.analysis.tables import check_predictions
+from physion.clips.batch import Batch, Provenance, Rollout, Spec
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.models import build_model, models
+from physion.models.interface import TrainingSettings
+from physion.readout.decisions import Decided
 from physion.readout.evaluate import Evaluation, evaluate
 from physion.readout.logistic import LogisticSettings
 from physion.readout.settings import EvaluationSettings
-from physion.readout.tables import COLUMNS, MEAN, read_table, summarise_accuracy, write_table
+from physion.readout.tables import (
+    COLUMNS,
+    MEAN,
+    ScenarioPredictions,
+    make_table,
+    read_table,
+    summarise_accuracy,
+    write_table,
+)
 from physion.trials.dataset import Dataset
 from support.moving_dots import make_dots
 from support.tiny_models import TINY
+from support.trained_models import NextBrightness
 
 QUICK = EvaluationSettings(accelerator="cpu", logistic=LogisticSettings(grid=(1e-4, 1e-2, 1.0)))
 OPTIONS: dict[str, Any] = {**TINY, "steps": 20}
@@ -189,6 +205,157 @@ def test_tables_survive_their_file(done: Evaluation, tmp_path: Path) -> None:
     write_table(done.predictions, tmp_path / "t.csv")
     read = read_table(tmp_path / "t.csv")
     pd.testing.assert_frame_equal(read, done.predictions, check_exact=True)
+
+
+OBSERVED, LATER, FUTURES = (32, 38, 44), (50, 56, 62, 68), 2
+"""Frames of a clip of six frames' stride whose context ends at frame 44, by hand."""
+
+
+def values_of(*key: Any) -> np.ndarray:
+    """Return two random numbers that belong to a trial and a frame."""
+    return np.random.default_rng([ord(c) for c in repr(key)]).normal(size=2)
+
+
+class Known:
+    """Model with features that are known by trial and frame, and imagined ones by seed and step."""
+
+    spec = Spec(image_size=4, context=3, future=4, context_at="end")
+    samples, decision = FUTURES, "logistic"
+
+    def provenance(self) -> Provenance:
+        return Provenance("known", "none")
+
+    def digest(self) -> str:
+        return "1" * 64
+
+    def encode(self, batch: Any) -> np.ndarray:
+        rows = zip(batch.trials, batch.frames.tolist(), strict=True)
+        features = [[values_of(trial, frame) for frame in frames] for trial, frames in rows]
+        return np.array(features, np.float32)
+
+    def imagine(self, context: Any, samples: int, seed: int) -> Rollout:
+        futures = [
+            [
+                [values_of(trial, "future", seed, k, step) for step in range(4)]
+                for k in range(samples)
+            ]
+            for trial in context.trials
+        ]
+        return Rollout(features=np.array(futures, np.float32))
+
+
+def test_each_readout_is_scikit_learns_on_the_frames_that_it_may_see(
+    dots: Dataset, tmp_path: Path
+) -> None:
+    settings = EvaluationSettings(logistic=LogisticSettings(grid=(0.5,)))
+    table = evaluate(Known(), dots, tmp_path, settings, seed=7).predictions
+    index = dots.index.set_index("trial")
+    pieces: dict[str, list[tuple[Any, ...]]] = {
+        "observed": [(frame,) for frame in OBSERVED],
+        "observed+simulated": [
+            *((frame,) for frame in OBSERVED),
+            *(("future", 7, k, step) for k in range(FUTURES) for step in range(4)),
+        ],
+        "full": [(frame,) for frame in (*OBSERVED, *LATER)],
+    }
+    assert set(table["readout"]) == set(pieces)
+    for (readout, scenario), rows in table.groupby(["readout", "scenario"]):
+
+        def features(trials: Any, keys: Any = pieces[str(readout)]) -> np.ndarray:
+            flat = [np.concatenate([values_of(trial, *key) for key in keys]) for trial in trials]
+            return np.array(flat, np.float32).astype(np.float64)
+
+        of_scenario = index[index["scenario"] == scenario]
+        fit = of_scenario[of_scenario["split"] == "readout"]
+        tested = of_scenario[of_scenario["split"] == "testing"]
+        assert list(rows["stimulus"]) == sorted(tested.index)
+        oracle = make_pipeline(
+            StandardScaler(), LogisticRegression(C=0.5, tol=1e-10, max_iter=100_000)
+        ).fit(features(fit.index), fit["contact"])
+        expected = oracle.predict_proba(features(rows["stimulus"]))[:, 1]
+        assert rows["p_contact"].to_numpy() == pytest.approx(expected, abs=1e-5), readout
+        right = oracle.score(features(tested.index), tested["contact"])
+        assert rows["test_accuracy"].unique() == pytest.approx([right])
+        assert rows["train_accuracy"].unique() == pytest.approx(
+            [oracle.score(features(fit.index), fit["contact"])]
+        )
+        assert set(rows["readout_c"]) == {0.5} and set(rows["fit_trials"]) == {COUNTS["readout"]}
+
+
+class Remembers(NextBrightness):
+    """Network that answers with the fraction of its training trials that belong to Drop."""
+
+    answers, calibration_trials = "observed", 100
+
+    def __init__(self) -> None:
+        super().__init__(settings=TrainingSettings(steps=2, batch=2, held_out=0.0))
+        self.fraction = torch.nn.Buffer(torch.zeros(()))
+
+    def calibrate(self, whole: Batch) -> None:
+        self.fraction.fill_(sum(t.startswith("drop") for t in whole.trials) / len(whole))
+
+    def predict(self, batch: Batch) -> np.ndarray:
+        return np.full(len(batch), float(self.fraction))
+
+
+def test_a_scenario_is_predicted_by_the_dynamics_that_its_protocol_trained(
+    dots: Dataset, tmp_path: Path
+) -> None:
+    settings = replace(QUICK, readouts=("observed",), protocols=("all", "all-but", "only"))
+    table = evaluate(Remembers(), dots, tmp_path, settings).predictions
+    drop = table.groupby(["protocol", "scenario"])["p_contact"].unique().map(list).to_dict()
+    assert drop == {
+        ("all", "collide"): [0.5], ("all", "drop"): [0.5],
+        ("all-but", "collide"): [1.0], ("all-but", "drop"): [0.0],
+        ("only", "collide"): [0.0], ("only", "drop"): [1.0],
+    }  # fmt: skip
+
+
+class Fitted:
+    """Model that is fitted by itself, and answers with what it was given."""
+
+    spec = Spec(inputs=("rgb",), image_size=4, context=1, future=0, context_at="end")
+    answers = "observed"
+
+    def __init__(self, p: float = 0.0) -> None:
+        self.p = p
+
+    def provenance(self) -> Provenance:
+        return Provenance("fitted", "none")
+
+    def digest(self) -> str:
+        return "2" * 64
+
+    def fit(self, batch: Any, labels: np.ndarray, seed: int) -> Fitted:
+        assert batch.frames.tolist() == [[44]] * len(labels), "only the observed part"
+        truth = [int(trial[-4:]) % 2 == 0 for trial in batch.trials]
+        assert all("_readout_" in trial for trial in batch.trials) and list(labels) == truth
+        return Fitted(seed / 16)
+
+    def predict(self, batch: Any) -> np.ndarray:
+        assert batch.frames.tolist() == [[44]] * len(batch)
+        return np.full(len(batch), self.p)
+
+
+def test_one_half_is_no_contact_and_a_fit_gets_the_seed(dots: Dataset, tmp_path: Path) -> None:
+    half = evaluate(Fitted(), dots, tmp_path, seed=8)
+    assert set(half.predictions["p_contact"]) == {0.5}
+    # Half of the trials have no contact: they are right, the others are wrong.
+    assert set(half.scores["accuracy"]) == {0.5}
+    contact = half.predictions["outcome"]
+    for rows, right in ((half.predictions[~contact], 1.0), (half.predictions[contact], 0.0)):
+        assert set(summarise_accuracy(rows)["accuracy"]) == {right}
+        part = [
+            ScenarioPredictions(
+                "drop", "observed", tuple(rows["stimulus"]),
+                Decided(np.full(len(rows), 0.5), 1.0), 0, -1, "",
+            )
+        ]  # fmt: skip
+        assert set(make_table(part, Provenance("m", "none"), dots.index)["test_accuracy"]) == {
+            right
+        }
+    above = evaluate(Fitted(), dots, tmp_path, seed=9).predictions
+    assert set(above["p_contact"]) == {9 / 16} and set(above["train_accuracy"]) == {0.5}
 
 
 def rows_of(hits: dict[str, list[bool]], seed: int = 0, **changes: str) -> pd.DataFrame:

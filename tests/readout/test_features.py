@@ -144,24 +144,24 @@ def test_features_match_the_model_and_are_computed_once(
     tmp_path: Path, kind: Any, part: Any
 ) -> None:
     model, movies = kind(), Movies()
-    in_memory = FeatureStore(None, batch=2).encoded(model, movies, TRIALS, part)
+    at_once = FeatureStore(tmp_path / "all", batch=2).encoded(model, movies, TRIALS, part)
     frames = {"context": 3, "later": 4, "whole": 7}[part]
-    assert in_memory.shape == (5, frames, 5 if kind is Network else 12)
+    assert at_once.shape == (5, frames, 5 if kind is Network else 12)
     batch = getattr(movies, part)(TRIALS)
     if kind is Network:
         with torch.inference_mode():
             expected = model.layer(torch.tensor(batch.rgb).flatten(2).float() / 255).numpy()
     else:
         expected = model.encode(batch)
-    assert in_memory.array() == pytest.approx(expected, abs=1e-6)
-    store = FeatureStore(tmp_path, batch=2)
+    assert at_once.array() == pytest.approx(expected, abs=1e-6)
+    store = FeatureStore(tmp_path / "parts", batch=2)
     first = store.encoded(model, movies, TRIALS[:3], part)
-    assert len(files(tmp_path)) == 3
+    assert len(files(tmp_path / "parts")) == 3
     movies.read.clear()
     again = store.encoded(model, movies, [TRIALS[4], TRIALS[1], TRIALS[4], TRIALS[0]], part)
     assert movies.read == [(TRIALS[4],)], "what is stored is not computed again"
-    assert (again.array() == in_memory.array()[[4, 1, 4, 0]]).all()
-    assert (first.array() == in_memory.array()[:3]).all()
+    assert (again.array() == at_once.array()[[4, 1, 4, 0]]).all()
+    assert (first.array() == at_once.array()[:3]).all()
     assert again.array().dtype == np.float32
 
 
@@ -175,7 +175,7 @@ def test_features_after_training_are_never_those_from_before(tmp_path: Path) -> 
     movies.read.clear()
     after = store.encoded(model, movies, TRIALS, "context").array()
     assert movies.read and not np.isclose(after, before).any()
-    fresh = FeatureStore(None).encoded(model, movies, TRIALS, "context").array()
+    fresh = FeatureStore(tmp_path / "fresh").encoded(model, movies, TRIALS, "context").array()
     assert (after == fresh).all()
     model.load_state_dict(weights)
     movies.read.clear()
@@ -224,7 +224,7 @@ def test_dynamics_change_what_is_imagined_and_not_what_is_encoded(tmp_path: Path
         return found.features(), found.outcomes()
 
     features, outcomes = imagined()
-    context = FeatureStore(None).encoded(model, movies, TRIALS, "context").array()[1:]
+    context = FeatureStore(tmp_path / "fresh").encoded(model, movies, TRIALS, "context").array()[1:]
     with torch.inference_mode():
         last = model.dynamics(torch.tensor(context[:, -1])).numpy()
     expected = [last * step + sample for sample in range(3) for step in range(1, 5)]
@@ -258,7 +258,6 @@ def test_dynamics_change_what_is_imagined_and_not_what_is_encoded(tmp_path: Path
         lambda whole: (8).to_bytes(8, "little") + b"[" * 8 + whole[16:],
         lambda whole: (100_000).to_bytes(8, "little") + b"[" * 100_000,
         lambda whole: whole.replace(b'"F32"', b'"F16"'),
-        lambda whole: whole.replace(b"[3,12]", b"[3,-1]"),
     ],
 )
 def test_a_broken_file_is_written_anew(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
@@ -279,21 +278,14 @@ def test_a_file_that_is_deleted_while_in_use_is_an_error(tmp_path: Path) -> None
         features.array()
 
 
-def test_files_are_safetensors_with_aligned_float32(tmp_path: Path) -> None:
-    model = Numpy()
-    features = FeatureStore(tmp_path).encoded(model, Movies(), TRIALS[:1], "context").array()
+def test_files_are_safetensors(tmp_path: Path) -> None:
+    features = FeatureStore(tmp_path).encoded(Numpy(), Movies(), TRIALS[:1], "context").array()
     (path,) = files(tmp_path)
     with safe_open(path, "numpy") as file:
-        assert (file.get_tensor("features") == features[0]).all()
-    start = 8 + int.from_bytes(path.read_bytes()[:8], "little")
-    assert start % 64 == 0
-    assert (np.memmap(path, np.float32, "r", start, (3, 12)) == features[0]).all()
+        assert (file.get_tensor("features") == features[0].reshape(-1)).all()
 
 
-def test_what_was_written_before_a_failure_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("physion.readout.features._WRITE_TRIALS", 2)
+def test_what_was_written_before_a_failure_is_kept(tmp_path: Path) -> None:
     model, movies, store = Numpy(), Movies(), FeatureStore(tmp_path, batch=1)
     good = model.give
 
@@ -356,29 +348,30 @@ def flat(pixels: Any) -> Any:
         (lambda x: None, "NoneType"),
     ],
 )
-def test_features_of_another_shape_or_type_are_refused(give: Any, got: str) -> None:
+def test_features_of_another_shape_or_type_are_refused(tmp_path: Path, give: Any, got: str) -> None:
     with pytest.raises(BadInputError) as caught:
-        FeatureStore(None, batch=2).encoded(Numpy(give), Movies(), TRIALS, "context")
+        FeatureStore(tmp_path, batch=2).encoded(Numpy(give), Movies(), TRIALS, "context")
     assert str(caught.value) == (
         f"model 'plain': encode gave features as {got}, expected float32 (2, 3, any)"
     )
 
 
-def test_features_of_unequal_trials_are_refused() -> None:
+def test_features_of_unequal_trials_are_refused(tmp_path: Path) -> None:
     sizes = iter([12, 12, 6])
     model = Numpy(lambda x: flat(x)[..., : next(sizes)])
-    shapes = r"'link_1' have shape .3, 6., but 'roll_1' has .3, 12."
-    with pytest.raises(BadInputError, match=shapes):
-        FeatureStore(None, batch=2).encoded(model, Movies(), TRIALS, "context")
+    with pytest.raises(
+        BadInputError, match=r"'link_1' have shape .3, 6., but 'roll_1' has .3, 12."
+    ):
+        FeatureStore(tmp_path, batch=2).encoded(model, Movies(), TRIALS, "context")
 
 
-def test_fewer_steps_are_for_models_that_combine_frames() -> None:
+def test_fewer_steps_are_for_models_that_combine_frames(tmp_path: Path) -> None:
     model = Numpy(lambda x: flat(x).mean(axis=1, keepdims=True))
     model.spec = Spec(image_size=2, context=3, future=4, framewise=False)
-    assert FeatureStore(None).encoded(model, Movies(), TRIALS, "context").shape == (5, 1, 12)
+    assert FeatureStore(tmp_path).encoded(model, Movies(), TRIALS, "context").shape == (5, 1, 12)
     model.give = lambda x: np.concatenate([flat(x)] * 2, axis=1)
     with pytest.raises(BadInputError, match="6 time steps for clips of 3 frames"):
-        FeatureStore(None).encoded(model, Movies(), TRIALS, "context")
+        FeatureStore(tmp_path / "more").encoded(model, Movies(), TRIALS, "context")
 
 
 class Dreamer(Numpy):
@@ -404,9 +397,9 @@ class Dreamer(Numpy):
         ({"rollout": 3}, "imagine gave int, expected Rollout"),
     ],
 )
-def test_wrong_rollouts_are_refused(given: Any, message: str) -> None:
+def test_wrong_rollouts_are_refused(tmp_path: Path, given: Any, message: str) -> None:
     with pytest.raises(BadInputError) as caught:
-        FeatureStore(None, batch=5).imagined(
+        FeatureStore(tmp_path, batch=5).imagined(
             Dreamer(**given), Movies(), TRIALS, samples=2, seed=0, arguments={}
         )
     assert message in str(caught.value)
@@ -425,58 +418,45 @@ def test_only_outcomes_are_stored_too(tmp_path: Path) -> None:
     assert len(movies.read) == 2
 
 
-def fill_memory(pixels: Any) -> Any:
-    return np.ones(2**50)
+def exhausted(what: str, tmp_path: Path, batch: int) -> None:
+    """Use up memory: numpy's or torch's, a device's, while reading, or while imagining."""
+
+    def encode(batch: Batch) -> Any:
+        if what == "device":
+            raise torch.OutOfMemoryError("CUDA: tried to get 20.00 MiB")
+        return torch.ones(2**50) if what == "torch" else np.ones(2**50)
+
+    def context(trials: Sequence[str]) -> Batch:
+        raise MemoryError
+
+    model: Any = Network() if what in ("torch", "device") else Dreamer()
+    movies: Any = Movies()
+    store = FeatureStore(tmp_path, batch=batch)
+    if what == "reading":
+        movies.context = context
+    if what == "imagining":
+        model.imagine = lambda context, samples, seed: np.ones(2**50)
+        store.imagined(model, movies, TRIALS, samples=2, seed=0, arguments={})
+    else:
+        model.encode = encode
+        store.encoded(model, movies, TRIALS, "context")
 
 
-class HugeNetwork(Network):
-    def encode(self, batch: Batch) -> Any:
-        return torch.ones(2**50)
+@pytest.mark.parametrize("what", ["numpy", "torch", "device", "reading", "imagining"])
+def test_memory_used_up_names_the_setting_to_lower(what: str, tmp_path: Path) -> None:
+    with pytest.raises(OutOfMemoryError, match=r"3 clips .*lower --encoder-batch, now 3"):
+        exhausted(what, tmp_path, 3)
+    advice = "use a smaller image_size or size of the model, or fewer"
+    with pytest.raises(OutOfMemoryError, match=advice):
+        exhausted(what, tmp_path, 1)
 
 
-class FullDevice(Network):
-    def encode(self, batch: Batch) -> Any:
-        raise torch.OutOfMemoryError("CUDA: tried to get 20.00 MiB")
-
-
-@pytest.mark.parametrize("model", [Numpy(fill_memory), HugeNetwork(), FullDevice()])
-def test_memory_used_up_names_the_setting_to_lower(model: Any) -> None:
-    with pytest.raises(OutOfMemoryError, match=r"3 clips of 3 frames .* --encoder-batch, now 3"):
-        FeatureStore(None, batch=3).encoded(model, Movies(), TRIALS, "context")
-    with pytest.raises(
-        OutOfMemoryError, match="use a smaller image_size or size of the model, or fewer"
-    ):
-        FeatureStore(None, batch=1).encoded(model, Movies(), TRIALS, "context")
-
-
-def test_memory_used_up_by_reading_names_the_setting_to_lower() -> None:
-    class Large(Movies):
-        def context(self, trials: Sequence[str]) -> Batch:
-            raise MemoryError
-
-    for batch, advice in ((3, "lower --encoder-batch, now 3"), (1, "use a smaller image_size")):
-        expected = f"reading {batch} clips at a time ran out of memory; {advice}"
-        with pytest.raises(OutOfMemoryError, match=expected):
-            FeatureStore(None, batch=batch).encoded(Network(), Large(), TRIALS, "context")
-
-
-def test_memory_used_up_by_imagining_names_the_setting_to_lower() -> None:
-    class Vivid(Dreamer):
-        def imagine(self, context: Batch, samples: int, seed: int) -> Any:
-            return np.ones(2**50)
-
-    for batch, advice in ((3, "lower --encoder-batch, now 3"), (1, "size of the model, or fewer")):
-        store = FeatureStore(None, batch=batch)
-        with pytest.raises(OutOfMemoryError, match=f"imagine ran out of memory .* {advice}"):
-            store.imagined(Vivid(), Movies(), TRIALS, samples=2, seed=0, arguments={})
-
-
-def test_what_a_model_raises_names_model_method_and_line() -> None:
+def test_what_a_model_raises_names_model_method_and_line(tmp_path: Path) -> None:
     def divide(pixels: Any) -> Any:
         return 1 // 0
 
     with pytest.raises(BadInputError) as caught:
-        FeatureStore(None).encoded(Numpy(divide), Movies(), TRIALS, "context")
+        FeatureStore(tmp_path).encoded(Numpy(divide), Movies(), TRIALS, "context")
     line = divide.__code__.co_firstlineno + 1
     assert "model 'plain': encode raised ZeroDivisionError" in str(caught.value)
     assert f"({Path(__file__).name}, line {line})" in str(caught.value)
@@ -484,21 +464,21 @@ def test_what_a_model_raises_names_model_method_and_line() -> None:
     absent: Any = Network()
     absent.encode = None
     with pytest.raises(BadInputError, match="has no method encode"):
-        FeatureStore(None).encoded(absent, Movies(), TRIALS, "context")
+        FeatureStore(tmp_path).encoded(absent, Movies(), TRIALS, "context")
 
 
-def test_every_part_of_a_network_is_in_its_mode_again() -> None:
+def test_every_part_of_a_network_is_in_its_mode_again(tmp_path: Path) -> None:
     model = Network()
     model.train()
     model.dropout.eval()
-    FeatureStore(None).encoded(model, Movies(), TRIALS, "context")
+    FeatureStore(tmp_path).encoded(model, Movies(), TRIALS, "context")
     assert model.training and model.layer.training and not model.dropout.training
     assert torch.is_grad_enabled() and not torch.is_inference_mode_enabled()
 
 
-def test_later_frames_need_a_whole_source() -> None:
+def test_later_frames_need_a_whole_source(tmp_path: Path) -> None:
     observed: Any = ObservedMovies(Movies())
-    store = FeatureStore(None)
+    store = FeatureStore(tmp_path)
     assert store.encoded(Numpy(), observed, TRIALS, "context").shape == (5, 3, 12)
     for part in ("later", "whole"):
         with pytest.raises(BadInputError, match=f"no part '{part}'"):
@@ -507,7 +487,7 @@ def test_later_frames_need_a_whole_source() -> None:
 
 def test_bad_folders_batches_and_digests_are_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="at least 1, not 0"):
-        FeatureStore(None, batch=0)
+        FeatureStore(tmp_path, batch=0)
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(BadInputError, match="cannot be stored in"):
         FeatureStore(tmp_path / "file").encoded(Numpy(), Movies(), TRIALS, "context")
@@ -584,9 +564,9 @@ class Counts:
         return Rollout(gap=gaps * arguments.get("factor", 1.0))
 
 
-def test_trials_that_fail_cost_no_other_trial() -> None:
+def test_trials_that_fail_cost_no_other_trial(tmp_path: Path) -> None:
     names = ["a", "bb", "bad", "ccc", "odd", "dddd"]
-    store, model = FeatureStore(None), Counts()
+    store, model = FeatureStore(tmp_path), Counts()
     source: Any = Source(names)
     found = store.imagined(
         model, source, names, samples=1, seed=0, arguments={"factor": (1.0, 2.0)}, together=3
@@ -611,7 +591,7 @@ def test_a_pickled_particle_model_is_the_same(name: str, weights: str) -> None:
 
 
 @pytest.mark.slow
-def test_particle_models_imagine_the_same_in_processes() -> None:
+def test_particle_models_imagine_the_same_in_processes(tmp_path: Path) -> None:
     motions = []
     for seed in range(3):
         scene = replace(sample_scene("collide", seed), ending=Ending(60, 60))
@@ -621,7 +601,7 @@ def test_particle_models_imagine_the_same_in_processes() -> None:
     model: Any = build_model("dpi")
     assert model.trials_together > 1
     found = [
-        FeatureStore(None, executor=executor).imagined(
+        FeatureStore(tmp_path / type(executor).__name__, executor=executor).imagined(
             model, source, names, samples=1, seed=0, arguments={}, together=2
         )[()]
         for executor in (SerialExecutor(), LocalExecutor(2))

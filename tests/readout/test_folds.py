@@ -61,13 +61,6 @@ def test_every_tested_trial_is_predicted_once_by_what_never_saw_it(
         assert scenarios == set(fold.training.trained)
 
 
-def test_splits_are_used_as_they_are_meant() -> None:
-    (only,) = plan_folds(index({"training": 3, "readout": 2, "testing": 2}), Protocol.ALL, 5, 0)
-    assert only.number == -1
-    assert all("_training_" in trial for trial in only.train)
-    assert all("_readout_" in trial for split in only.scenarios for trial in split.fit)
-
-
 def test_a_readout_trial_with_the_physics_of_a_tested_one_is_not_used() -> None:
     table = index({"training": 3, "readout": 3, "testing": 2})
     table.loc[table["trial"] == "drop_readout_1", "digest"] = "droptesting0"
@@ -102,11 +95,61 @@ def test_nothing_to_test_and_impossible_plans_are_refused() -> None:
         plan_folds(index({"testing": 9}, ("drop",)), Protocol.ALL_BUT, 5, 0)
 
 
-@pytest.mark.parametrize("protocol", list(Protocol))
-@pytest.mark.parametrize("counts", [{"training": 3, "readout": 4, "testing": 5}, {"testing": 10}])
-def test_trainings_match_an_evaluation(protocol: Protocol, counts: dict[str, int]) -> None:
-    table = index(counts)
-    assert training_folds(table, protocol, 5, 3) == plan_folds(table, protocol, 5, 3)
+HAND: dict[str, dict[str, list[str]]] = {
+    "all": {"all": ["drop", "link", "roll"]},
+    "all-but": {
+        "no_drop": ["link", "roll"], "no_link": ["drop", "roll"], "no_roll": ["drop", "link"],
+    },
+    "only": {"drop": ["drop"], "link": ["link"], "roll": ["roll"]},
+}  # fmt: skip
+"""Scenarios that train each set of dynamics, by protocol, from the paper."""
+TESTED = {
+    "all": ["drop", "link", "roll"], "no_drop": ["drop"], "no_link": ["link"], "no_roll": ["roll"],
+    "drop": ["drop"], "link": ["link"], "roll": ["roll"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("protocol", ["all", "all-but", "only"])
+@pytest.mark.parametrize("split", ["training", "readout"])
+def test_each_protocol_trains_and_tests_what_the_paper_says(protocol: str, split: str) -> None:
+    """Dynamics are trained on the split training, or readout where there is none."""
+    counts = {"training": 2, "readout": 2, "testing": 2} if split == "training" else {
+        "readout": 2, "testing": 2,
+    }  # fmt: skip
+    table = index(counts, ("roll", "drop", "link"))
+    for plan in (plan_folds, training_folds):
+        folds = {f.training.name: f for f in plan(table, Protocol(protocol), 5, 0)}
+        assert list(folds) == list(HAND[protocol])
+        for name, fold in folds.items():
+            trained = [f"{s}_{split}_{i}" for s in HAND[protocol][name] for i in range(2)]
+            assert list(fold.train) == trained and fold.number == -1
+            parts = [(part.scenario, part.fit, part.test) for part in fold.scenarios]
+            assert parts == [
+                (s, (f"{s}_readout_0", f"{s}_readout_1"), (f"{s}_testing_0", f"{s}_testing_1"))
+                for s in TESTED[name]
+            ]
+            if protocol != "all":
+                (tested,) = TESTED[name]
+                assert select_scenario(list(folds.values()), tested) == [fold]
+
+
+@pytest.mark.parametrize("protocol", ["all", "all-but", "only"])
+def test_a_cross_validation_trains_and_fits_on_all_other_groups(protocol: str) -> None:
+    table = index({"testing": 6}, ("drop", "roll"))
+    group = assign_folds(table, 3, 0)
+    folds = plan_folds(table, Protocol(protocol), 3, 0)
+    assert len(folds) == 3 * (1 if protocol == "all" else 2)
+    assert sorted(group.values()) == [0] * 4 + [1] * 4 + [2] * 4
+    other = {"drop": "roll", "roll": "drop"}
+    for fold in folds:
+        for part in fold.scenarios:
+            trains = {"all": ["drop", "roll"], "all-but": [other[part.scenario]],
+                      "only": [part.scenario]}[protocol]  # fmt: skip
+            trials = {s: [f"{s}_testing_{i}" for i in range(6)] for s in other}
+            assert list(part.test) == [t for t in trials[part.scenario] if group[t] == fold.number]
+            assert list(part.fit) == [t for t in trials[part.scenario] if group[t] != fold.number]
+            known = [t for s in trains for t in trials[s] if group[t] != fold.number]
+            assert list(fold.train) == known
 
 
 @pytest.mark.parametrize(("counts", "split"), [({"training": 3, "readout": 2}, "training"),
@@ -125,15 +168,11 @@ def test_without_testing_trials_all_of_a_split_are_trained_on(
         training_folds(index({"familiarization": 3}), Protocol.ALL, 5, 0)
 
 
-def test_one_scenario_can_be_chosen() -> None:
+def test_a_scenario_that_is_not_there_is_refused() -> None:
     table = index({"training": 3, "readout": 2, "testing": 2})
-    only, but, every = (plan_folds(table, p, 5, 0) for p in
-                        (Protocol.ONLY, Protocol.ALL_BUT, Protocol.ALL))  # fmt: skip
-    (fold,) = select_scenario(only, Protocol.ONLY, "roll")
-    assert {trial.partition("_")[0] for trial in fold.train} == {"roll"}
-    (fold,) = select_scenario(but, Protocol.ALL_BUT, "roll")
-    assert {trial.partition("_")[0] for trial in fold.train} == {"drop"}
-    with pytest.raises(UnknownNameError, match="roll"):
-        select_scenario(only, Protocol.ONLY, "rlol")
-    with pytest.raises(BadInputError, match="protocol all-but or only"):
-        select_scenario(every, Protocol.ALL, "roll")
+    for protocol in Protocol:
+        with pytest.raises(UnknownNameError, match="roll"):
+            select_scenario(plan_folds(table, protocol, 5, 0), "rlol")
+    (fold,) = select_scenario(plan_folds(table, Protocol.ALL, 5, 0), "roll")
+    assert [part.scenario for part in fold.scenarios] == ["roll"]
+    assert fold.training.trained == ("drop", "roll")

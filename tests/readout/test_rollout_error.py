@@ -94,6 +94,27 @@ def test_constant_motion_has_no_error_by_constant_velocity_and_standing_still_a_
     assert table["constant_velocity_error"].to_numpy() == pytest.approx(beyond, abs=1e-5)
 
 
+def test_errors_of_an_accelerated_motion_are_closed_forms() -> None:
+    """A fall z = -a t^2 / 2 and an imagined one that is late by a step, in frames t."""
+    a, late = 1e-4, STRIDE
+    motion = true_motion()
+    trajectory = motion.trajectory
+    positions = trajectory.positions.copy()
+    positions[:, 0, 2] = -a * np.arange(len(positions)) ** 2 / 2
+    changed = Motion(motion.scene, dataclasses.replace(trajectory, positions=positions))
+    particles, poses = start_of(changed, range(2, FRAMES, STRIDE))
+    held = np.maximum(np.arange(len(poses.centers)) - (np.arange(len(poses.centers)) > NOW), 0)
+    slow = Poses(poses.centers[held], poses.rotations[held], poses.loose[held])
+    table = motion_error(changed, particles, slow, STRIDE, 15)
+    t = 44 + np.arange(3, 16, 3)
+    assert table["error"].to_numpy() == pytest.approx(a * (t**2 - (t - late) ** 2) / 2, rel=1e-3)
+    # Constant velocity: the last observed step, from frame 41 to frame 44, goes on.
+    step = a * (44**2 - 41**2) / 2
+    constant = np.abs(a * t**2 / 2 - (a * 44**2 / 2 + step * np.arange(1, 6)))
+    found = table["constant_velocity_error"].to_numpy()
+    assert found == pytest.approx(constant, rel=1e-3, abs=1e-7)
+
+
 def test_cloth_counts_by_the_mean_of_its_particles() -> None:
     motion = true_motion(3)
     particles, poses = start_of(motion, range(2, 45, STRIDE))

@@ -252,31 +252,3 @@ def test_other_state_models_are_shown_only_the_observed_part(tmp_path: Path) -> 
     assert set(table["inputs"]) == {"state"}, "what its Spec asks for"
     with pytest.raises(BadInputError, match="not a probability"):
         evaluate(Oracle(1.5), shelf, tmp_path / "b")
-
-
-@pytest.mark.slow
-def test_evaluation_of_generated_trials(tmp_path: Path) -> None:
-    """Generated trials, evaluated with an encoder and with simulations."""
-    from physion.compute.local import LocalExecutor, SerialExecutor
-    from physion.trials.dataset import Dataset
-    from physion.trials.making.generate import make_trials
-    from physion.trials.making.plan import GenerateSettings, plan_dataset
-
-    tasks = plan_dataset("road", ("drop",), {"readout": 4, "testing": 3})
-    report = make_trials(
-        tmp_path / "data", tasks, GenerateSettings(width=64, height=64), executor=SerialExecutor()
-    )
-    assert not report.failed
-    dataset = Dataset(tmp_path / "data")
-    options: dict[str, Any] = {
-        "encoder": "test_vit", "image_size": 64, "weights": "random", "hidden": 16,
-        "steps": 10,
-    }  # fmt: skip
-    config = EvaluationSettings(accelerator="cpu")
-    seen = evaluate("frozen-encoder", dataset, tmp_path / "out", options=options, settings=config)
-    assert len(seen.predictions) == 9
-    simulated = evaluate("noisy-simulation", dataset, tmp_path / "out",
-        options={"samples": 5, "scales": (0.2, 1.0)}, executor=LocalExecutor(2),
-    )  # fmt: skip
-    assert simulated.problems == {} and len(simulated.predictions) == 3
-    assert simulated.predictions["p_contact"].between(0, 1).all()

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import struct
+import sys
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from contextlib import closing
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +17,7 @@ import torch
 from lightning_fabric import Fabric
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import ReduceLROnPlateau
 
 from physion.clips.batch import Batch
 from physion.core.errors import BadInputError, PhysionError
@@ -24,12 +29,15 @@ from physion.training.devices import Devices, make_fabric
 from physion.training.loop import (
     CARD,
     CHECKPOINT,
+    EVENTS,
     METRICS,
-    PREVIOUS,
+    MetricsLog,
+    Plateau,
     TrainingStoppedError,
-    read_metrics,
+    learning_rate,
 )
 from physion.training.train import TrainedModel, train_model
+from physion.training.windows import ClipWindows, step_request
 from support.trained_models import QUICK, MovingValues, NextBrightness, equal_weights
 
 CPU = make_fabric(Devices("cpu"))
@@ -206,6 +214,92 @@ def test_frames_of_feature_windows_match_the_features() -> None:
     run(Checked("features"), source=source, settings=replace(QUICK, steps=3))
 
 
+def test_the_rate_rises_linearly_and_is_constant_afterwards() -> None:
+    settings = TrainingSettings(steps=20, learning_rate=0.5, warmup=4)
+    rates = [learning_rate(settings, step) for step in range(7)]
+    assert rates == pytest.approx([0.125, 0.25, 0.375, 0.5, 0.5, 0.5, 0.5])
+    assert learning_rate(settings, 10, factor=0.5) == pytest.approx(0.25)
+
+
+def test_the_cosine_goes_from_the_base_rate_to_zero() -> None:
+    settings = TrainingSettings(steps=14, learning_rate=2.0, warmup=4, schedule="cosine")
+    rates = [learning_rate(settings, step) for step in range(4, 15)]
+    assert rates[0] == 2.0 and rates[5] == pytest.approx(1.0) and rates[10] == pytest.approx(0.0)
+    assert (np.diff(rates) < 0).all()
+
+
+@pytest.mark.parametrize("patience", [0, 1, 3])
+def test_the_plateau_follows_torch(patience: int) -> None:
+    settings = TrainingSettings(
+        schedule="plateau", plateau_patience=patience, plateau_factor=0.8, learning_rate=1.0
+    )
+    weight = torch.nn.Parameter(torch.zeros(1))
+    optimizer = torch.optim.SGD([weight], lr=1.0)
+    reference = ReduceLROnPlateau(optimizer, factor=0.8, patience=patience)
+    losses = np.random.default_rng(patience).integers(1, 30, 60) / 10
+    losses[10:14] = losses[9] * (1 - 0.5e-4)  # improvements that are too small to count
+    plateau, rates = Plateau(), []
+    for loss in losses:
+        reference.step(float(loss))
+        plateau.update(float(loss), settings)
+        # As it is stored in a checkpoint.
+        plateau = Plateau(**json.loads(json.dumps(asdict(plateau))))
+        assert learning_rate(settings, 5, plateau.factor) == pytest.approx(
+            optimizer.param_groups[0]["lr"]
+        )
+        rates.append(plateau.factor)
+    assert len(set(rates)) > 3
+
+
+class Sum(NextBrightness):
+    """Network whose loss is the sum of its weights: Adam then moves each by the learning rate."""
+
+    def loss(self, batch: Batch) -> dict[str, Tensor]:
+        return {"loss": sum((p.sum() for p in self.net.parameters()), torch.zeros(()))}
+
+
+@pytest.mark.parametrize(
+    ("changes", "rates"),
+    [
+        ({"steps": 1, "warmup": 4}, [0.1]),
+        ({"steps": 6, "warmup": 4}, [0.1, 0.2, 0.3, 0.4, 0.4, 0.4]),
+        ({"steps": 5, "warmup": 1, "schedule": "cosine"}, [0.4, 0.4, 0.34142136, 0.2, 0.05857864]),
+        ({"steps": 2, "accumulate": 2}, [0.4, 0.4]),
+    ],
+)
+def test_every_step_has_the_rate_of_its_number(changes: Any, rates: list[float]) -> None:
+    model = Sum()
+    before = [value.detach().clone() for value in model.net.parameters()]
+    run(model, settings=replace(QUICK, learning_rate=0.4, held_out=0.0, **changes))
+    for first, last in zip(before, model.net.parameters(), strict=True):
+        assert (first - last.detach()).numpy() == pytest.approx(sum(rates), rel=1e-5)
+
+
+def test_a_validation_is_the_mean_over_clips_not_over_batches() -> None:
+    """Five trials in batches of two: the last batch has one clip, which counts as any other."""
+    model, source = NextBrightness(), MovingValues(count=20)
+    result = run(model, None, replace(QUICK, steps=4, batch=2, held_out=0.25), source)
+    asked = ((lambda b: model.loss(b)["loss"]), model.baseline)
+    reads = list(source.read)
+    # The last reads are those of the model's validation, then of the baseline's.
+    for read, ask, found in zip(
+        (reads[5:8], reads[8:]), asked, (result.validation, result.baseline),
+        strict=True,
+    ):  # fmt: skip
+        assert sorted(len(trials) for trials, _ in read) == [1, 2, 2]
+        with torch.no_grad():
+            batches = [
+                [
+                    float(ask(source.window([t], [s], 4).to("cpu")))
+                    for t, s in zip(*one, strict=True)
+                ]
+                for one in read
+            ]
+        assert found == pytest.approx(np.mean([x for batch in batches for x in batch]), rel=1e-5)
+        of_batches = np.mean([np.mean(batch) for batch in batches])
+        assert found != pytest.approx(of_batches, rel=1e-3), "the difference can be seen"
+
+
 def test_validation_does_not_change_what_is_learnt() -> None:
     models = [NextBrightness(dropout=0.2) for _ in range(2)]
     for model, every in zip(models, (1, 40), strict=True):
@@ -213,12 +307,24 @@ def test_validation_does_not_change_what_is_learnt() -> None:
     assert equal_weights(*models)
 
 
-def test_accumulated_batches_are_one_large_batch() -> None:
-    losses = []
-    for batch, parts in ((8, 1), (4, 2), (2, 4)):
-        settings = replace(QUICK, batch=batch, accumulate=parts)
-        losses.append(run(NextBrightness(), settings=settings).loss)
-    assert losses[1:] == pytest.approx(losses[:1] * 2, rel=1e-5)
+def test_steps_are_those_of_plain_torch_with_all_settings() -> None:
+    """Betas, weight decay, clipping, warm-up, cosine, and a batch of two accumulated parts."""
+    settings = replace(ALL_AT_ONCE, steps=6, warmup=2, held_out=0.0, betas=(0.7, 0.8), clip=0.02)
+    model, plain, source = NextBrightness(), NextBrightness(), MovingValues()
+    run(model, settings=settings, source=source)
+    windows = ClipWindows(source, source.trials, 4)
+    plain.prepare(windows.sample(0).to("cpu"))
+    optimizer = torch.optim.AdamW(plain.parameters(), betas=(0.7, 0.8), weight_decay=0.1)
+    for step, rate in enumerate((0.5, 1.0, 1.0, 0.85355339, 0.5, 0.14644661)):
+        optimizer.param_groups[0]["lr"] = 0.01 * rate
+        optimizer.zero_grad()
+        batch = windows.read(step_request(windows, 16, 0, step)).to("cpu")
+        plain.loss(batch)["loss"].backward()  # type: ignore[no-untyped-call]
+        norm = nn.utils.clip_grad_norm_(plain.parameters(), 0.02)
+        assert norm > 0.02, "it is clipped"
+        optimizer.step()
+    for one, other in zip(model.parameters(), plain.parameters(), strict=True):
+        assert one.detach().numpy() == pytest.approx(other.detach().numpy(), rel=1e-4, abs=1e-6)
 
 
 def test_the_optimiser_keeps_its_moments(tmp_path: Path) -> None:
@@ -228,8 +334,6 @@ def test_the_optimiser_keeps_its_moments(tmp_path: Path) -> None:
     tensors, metadata = read_checkpoint(next(tmp_path.rglob(CHECKPOINT)))
     steps = [v for k, v in tensors.items() if k.startswith("optimizer/") and k.endswith("/step")]
     assert [float(value) for value in steps] == [20.0] * 4 and metadata["step"] == 20
-    _, previous = read_checkpoint(next(tmp_path.rglob(PREVIOUS)))
-    assert previous["step"] == 10
 
 
 class Poisoned(NextBrightness):
@@ -425,18 +529,104 @@ def test_half_precision_trains(tmp_path: Path) -> None:
     assert result.loss != exact.loss and result.loss < 2 * exact.loss + 0.01
 
 
+def read_metrics(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / METRICS).read_text().splitlines()]
+
+
 def test_metrics_hold_the_means_of_intervals_and_the_validations(tmp_path: Path) -> None:
-    folder = run(NextBrightness(), tmp_path, replace(QUICK, steps=25)).folder
-    assert folder is not None
-    lines = read_metrics(folder)
-    train = [line for line in lines if "train/loss" in line]
-    assert [line["step"] for line in train] == [10, 20, 25]
-    assert [line["step"] for line in lines if "validation/loss" in line] == [20, 25]
-    assert set(train[0]) == {"step", "train/loss", "train/bias", "learning_rate"}
-    each = run(NextBrightness(), tmp_path, replace(QUICK, steps=25, log_every=1), seed=0)
-    assert each.loaded  # of the same weights: only the number of lines differs
-    other = run(NextBrightness(), None, replace(QUICK, steps=5))
-    assert np.isfinite(other.loss)
+    lines = []
+    for every in (1, 10):
+        settings = replace(QUICK, steps=25, warmup=40, log_every=every)
+        folder = run(NextBrightness(), tmp_path / str(every), settings).folder
+        assert folder is not None
+        lines.append(read_metrics(folder))
+    single, means = ([line for line in found if "train/loss" in line] for found in lines)
+    assert [line["step"] for line in means] == [10, 20, 25] and len(single) == 25
+    for line, steps in zip(means, (single[:10], single[10:20], single[20:]), strict=True):
+        for name in ("train/loss", "train/bias"):
+            assert line[name] == pytest.approx(np.mean([one[name] for one in steps]))
+        # The rate of the last step of the interval, which is counted from 1.
+        assert line["learning_rate"] == pytest.approx(0.01 * line["step"] / 40)
+    assert [line["step"] for line in lines[1] if "validation/loss" in line] == [20, 25]
+    assert set(means[0]) == {"step", "train/loss", "train/bias", "learning_rate"}
+
+
+def write(folder: Path, start: int, steps: list[int]) -> None:
+    with closing(MetricsLog(folder, start)) as log:
+        for step in steps:
+            log.write(step, {"train/loss": step / 10, "learning_rate": 1e-3})
+
+
+def events(folder: Path) -> list[tuple[int, str, float]]:
+    """Return step, name and value of all scalars, read as TensorBoard reads them."""
+    event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2")
+    from tensorboardX.record_writer import masked_crc32c
+
+    found = []
+    for path in sorted((folder / EVENTS).iterdir()):
+        content, position = path.read_bytes(), 0
+        while position < len(content):
+            (length,) = struct.unpack_from("<Q", content, position)
+            header, data = content[position : position + 8], content[position + 12 :][:length]
+            assert struct.unpack_from("<I", content, position + 8)[0] == masked_crc32c(header)
+            assert struct.unpack_from("<I", content, position + 12 + length)[0] == masked_crc32c(
+                data
+            )
+            event = event_pb2.Event.FromString(data)
+            found += [(event.step, v.tag, v.simple_value) for v in event.summary.value]
+            position += 16 + length
+    return found
+
+
+def test_lines_are_appended_and_not_written_again(tmp_path: Path) -> None:
+    write(tmp_path, 0, [10, 20])
+    inode = (tmp_path / METRICS).stat().st_ino
+    write(tmp_path, 20, [30])
+    assert (tmp_path / METRICS).stat().st_ino == inode
+    assert [line["step"] for line in read_metrics(tmp_path)] == [10, 20, 30]
+    assert read_metrics(tmp_path)[0] == {"step": 10, "train/loss": 1.0, "learning_rate": 1e-3}
+
+
+@pytest.mark.parametrize("rest", ["", '{"step": 40, "train/lo', "\0\0\0", '{"step": "x"}\n'])
+def test_lines_after_the_checkpoint_are_cut(tmp_path: Path, rest: str) -> None:
+    write(tmp_path, 0, [10, 20, 25, 30])
+    with (tmp_path / METRICS).open("a") as file:
+        file.write(rest)
+    write(tmp_path, 20, [25, 30, 40])
+    assert [line["step"] for line in read_metrics(tmp_path)] == [10, 20, 25, 30, 40]
+
+
+def test_a_new_training_starts_with_an_empty_file(tmp_path: Path) -> None:
+    write(tmp_path, 0, [10])
+    write(tmp_path, 0, [5])
+    assert [line["step"] for line in read_metrics(tmp_path)] == [5]
+
+
+def test_values_that_are_not_finite_are_null(tmp_path: Path) -> None:
+    with closing(MetricsLog(tmp_path, 0)) as log:
+        log.write(1, {"train/part": float("nan"), "train/loss": 0.5})
+    assert read_metrics(tmp_path) == [{"step": 1, "train/part": None, "train/loss": 0.5}]
+
+
+def test_tensorboard_reads_the_same_numbers_once_each(tmp_path: Path) -> None:
+    write(tmp_path, 0, [10, 20, 25])
+    write(tmp_path, 20, [30])
+    found = events(tmp_path)
+    expected = [
+        (line["step"], name, pytest.approx(value))
+        for line in read_metrics(tmp_path)
+        for name, value in line.items()
+        if name != "step"
+    ]
+    assert found == expected and len(found) == 6
+
+
+def test_without_the_extra_there_are_no_event_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
+    write(tmp_path, 0, [10])
+    assert [path.name for path in tmp_path.iterdir()] == [METRICS]
 
 
 def test_the_model_card_tells_what_the_model_is(tmp_path: Path) -> None:

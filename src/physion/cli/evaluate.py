@@ -7,20 +7,19 @@ done again, and one evaluation that fails does not stop the others.
 from __future__ import annotations
 
 import json as json_module
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from physion.cli.model_options import choose_models, split_names
-from physion.cli.output import Stages, print_line, print_warnings, text_table
+from physion.cli.output import Stages, print_line, print_plan, print_warnings, text_table
 from physion.compute.run_tasks import ExecutorSettings
 from physion.core.errors import BadInputError
-from physion.core.settings import read_pairs
+from physion.core.settings import read_pairs, split_names
 from physion.readout.evaluate import EvaluatedModel, Evaluation, evaluate
 from physion.readout.logistic import LogisticSettings
-from physion.readout.settings import EvaluationSettings
+from physion.readout.settings import EvaluationSettings, options_by_model
 from physion.trials.dataset import Dataset
 
 LOGISTIC = "logistic."
@@ -35,15 +34,6 @@ class Options:
     """Names of models with commas (physion ls models lists them), or FILE.py:Class."""
     dataset: Annotated[Path, tyro.conf.Positional]
     """Folder of a dataset."""
-    protocols: Annotated[str, tyro.conf.arg(aliases=("--protocol",))] = "all"
-    """Scenarios that train a model: all, all-but one, or only the tested one; several with
-    commas."""
-    scenario: str = ""
-    """Tested scenario, under all-but and only; default: all of them."""
-    seeds: int = 1
-    """Number of evaluations, with seeds from --seed on."""
-    seed: int = 0
-    """First seed: of initial weights, folds and training."""
     out: Path = Path("runs/models")
     """Folder for predictions and caches."""
     option: tuple[str, ...] = ()
@@ -53,9 +43,7 @@ class Options:
     settings: Annotated[EvaluationSettings, tyro.conf.arg(name="")] = field(
         default_factory=EvaluationSettings
     )
-    """Readouts, decision, cross-validation and device."""
-    rollout_error: bool = False
-    """Also write how far imagined motion is from the true one over time, for particle models."""
+    """Protocols, seeds, readouts, decision, cross-validation and device."""
     compute: Annotated[ExecutorSettings, tyro.conf.arg(name="")] = field(
         default_factory=ExecutorSettings
     )
@@ -76,15 +64,11 @@ def main(options: Options) -> int:
     logistic = read_pairs(LogisticSettings, fitted, "--option logistic")
     with Stages() as stages:
         done = evaluate(
-            choose_models(split_names(options.models, "model"), of_models),
+            options_by_model(split_names(options.models, "model"), of_models),
             Dataset(options.dataset, verify=options.verify),
             options.out,
-            protocols=split_names(options.protocols, "training protocol"),
-            scenario=options.scenario,
-            seeds=options.seeds,
-            seed=options.seed,
-            settings=replace(options.settings, logistic=logistic),
-            rollout_errors=options.rollout_error,
+            options.settings,
+            logistic=logistic,
             executor=options.compute.open(),
             progress=stages,
             dry_run=options.dry_run,
@@ -104,16 +88,7 @@ def _print(done: Evaluation, options: Options) -> None:
         print(json_module.dumps(values))
         return
     if options.dry_run:
-        import pandas as pd
-
-        rows = [
-            {"model": one.model, "protocol": one.protocol, "seed": one.seed,
-             "done": "yes" if one.done else "no", "predictions": one.path}
-            for one in done.evaluated
-        ]  # fmt: skip
-        print_line(text_table(pd.DataFrame(rows, dtype=object)))
-        left = sum(not one.done for one in done.evaluated)
-        print_line(f"{left} of {len(rows)} evaluations to do")
+        print_plan(done.evaluated, ["model", "protocol", "seed", "done", "path"], "evaluations")
         return
     for where, reason in done.problems.items():
         print_line(f"no prediction: {where}: {reason}")
@@ -132,10 +107,10 @@ def _print(done: Evaluation, options: Options) -> None:
 def _print_people(done: Evaluation) -> None:
     """Print how similar the predictions are to people's, of official stimuli that people saw."""
     import physion
-    from physion.analysis.tables import read_predictions
+    from physion.core.names import canonical_name
     from physion.data.official import official
 
-    if not set(read_predictions(done.paths)["stimulus"]) & set(official().labels):
+    if not set(map(canonical_name, done.predictions["stimulus"])) & set(official().labels):
         return
     try:
         result = physion.compare(done.paths, humans="official")

@@ -8,9 +8,9 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import (
@@ -117,6 +117,17 @@ def print_warnings(warnings: Iterable[str]) -> None:
     """Print each warning as a line on standard error."""
     for warning in warnings:
         print(f"physion: warning: {warning}", file=sys.stderr)
+
+
+def print_plan(cells: Sequence[Any], columns: Sequence[str], what: str) -> None:
+    """Print fields of what is to be done as a table, and how many of them are not done."""
+    import pandas as pd
+
+    rows = [[getattr(cell, name) for name in columns] for cell in cells]
+    table = pd.DataFrame(rows, columns=list(columns), dtype=object)
+    table["done"] = table["done"].map({True: "yes", False: "no"})
+    print_line(text_table(table))
+    print_line(f"{sum(not cell.done for cell in cells)} of {len(cells)} {what} to do")
 
 
 def write_text(path: Path, text: str) -> None:

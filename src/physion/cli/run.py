@@ -12,23 +12,35 @@ import os
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from physion.cli.model_options import choose_models, split_names
 from physion.cli.output import Stages, print_line, print_scores, print_warnings
+from physion.compute.local import LocalExecutor
 from physion.core.errors import BadInputError
-from physion.data.official import PACKAGED
+from physion.core.names import canonical_name
+from physion.core.seeds import stable_hash
+from physion.core.settings import split_names
+from physion.data.official import PACKAGED, find_official, humans_folder, read_official_trials
+from physion.readout.evaluate import Evaluation, evaluate
+from physion.readout.settings import EvaluationSettings, choose_models, options_by_model
+from physion.scenes.tdw.read_logs import ImportedTrial, TrialSet
+from physion.trials.dataset import Dataset
+from physion.trials.making.generate import make_trials
+from physion.trials.making.plan import (
+    GenerateSettings,
+    TrialTask,
+    check_names,
+    plan_dataset,
+    plan_scenes,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from physion.readout.evaluate import Evaluation
     from physion.report.compare import CompareResult
-    from physion.scenes.tdw.read_logs import ImportedTrial, TrialSet
-    from physion.trials.making.plan import TrialTask
 
 OFFICIAL_MODELS = (
     "pEffNetLite0-mlp",
@@ -87,19 +99,37 @@ class Options:
 def main(options: Options) -> int:
     """Run the whole pipeline, or what is missing of it; return 1 if something failed."""
     started = time.monotonic()
-    options = _complete(options)
-    assert options.out is not None, "completed"
+    humans = _humans(options)
+    out = options.out or Path("runs") / ("sampled" if options.sampled else "official")
     models = model_options(options)
-    check_models(models)
-    plan = (
-        plan_sampled(options.limit)
-        if options.sampled
-        else plan_official(options.scenes, options.humans, options.limit)
-    )
-    failures = [*plan.failures, *write_trials(options, plan.tasks)]
-    done = predict(options, models)
-    failures += [f"{where}: {why}" for where, why in {**done.problems, **done.failed}.items()]
-    page, result = write_report(options, plan, done)
+    for chosen in choose_models(models):
+        # So that a wrong name or a missing library fails before trials are made.
+        chosen.build(0)
+    if options.sampled:
+        plan = plan_sampled(options.limit)
+    else:
+        plan = plan_official(options.scenes, humans, options.limit)
+    executor = LocalExecutor(workers=options.workers)
+    with Stages() as stages:
+        settings = GenerateSettings(
+            width=options.size, height=options.size, look="redyellow", jitters=0,
+            engine=options.engine,
+        )  # fmt: skip
+        trials = make_trials(
+            out / "trials", plan.tasks, settings, executor=executor, progress=stages
+        )
+    with Stages() as stages:
+        done = evaluate(
+            models,
+            out / "trials",
+            out / "models",
+            EvaluationSettings(encoder_batch=options.encoder_batch),
+            executor=executor,
+            progress=stages,
+        )
+    reasons = {**trials.failed, **done.problems, **done.failed}
+    failures = [*plan.failures, *(f"{where}: {why}" for where, why in reasons.items())]
+    page, result = write_report(options, out, humans, plan.recorded, done)
     if options.json:
         rows = json_module.loads(result.scores.to_json(orient="records"))
         answer = {"report": str(page), "scores": rows, "failures": failures}
@@ -113,21 +143,17 @@ def main(options: Options) -> int:
     return 1 if failures else 0
 
 
-def _complete(options: Options) -> Options:
-    """Return the options with what follows from others; raise `BadInputError` if they disagree."""
-    from physion.data.official import find_official, humans_folder
-
+def _humans(options: Options) -> Path | None:
+    """Return the folder of people's answers; raise `BadInputError` if options disagree."""
     if options.sampled and options.humans is not None:
         raise BadInputError("--humans does not apply to --sampled: nobody has seen these scenes")
     least = 1 if options.sampled else 0
     if options.limit is not None and options.limit < least:
         raise BadInputError(f"--limit must be at least {least}, not {options.limit}")
-    out = options.out or Path("runs") / ("sampled" if options.sampled else "official")
     humans = options.humans
     if not options.sampled and humans is None and find_official(options.scenes) is not None:
         humans = options.scenes
-    humans = None if humans is None else humans_folder(humans)
-    return replace(options, out=out, humans=humans)
+    return None if humans is None else humans_folder(humans)
 
 
 def model_options(options: Options) -> dict[str, dict[str, Any]]:
@@ -142,72 +168,21 @@ def model_options(options: Options) -> dict[str, dict[str, Any]]:
         **{name: {"samples": 20, "engine": options.engine} for name in SIMULATIONS},
     }
     known = {name: {**TRAINING, **presets.get(name, {})} for name in names}
-    return choose_models(names, options.option, known)
+    return options_by_model(names, options.option, known)
 
 
-def check_models(models: Mapping[str, Mapping[str, Any]]) -> None:
-    """Build every model, so that a wrong name or a missing library fails before trials are made."""
-    from physion.readout.cells import choose_models as choose
-
-    for chosen in choose(models):
-        chosen.build(0)
-
-
-def predict(options: Options, models: Mapping[str, Mapping[str, Any]]) -> Evaluation:
-    """Write the predictions of every model."""
-    from physion.compute.local import LocalExecutor
-    from physion.readout.evaluate import evaluate
-    from physion.readout.settings import EvaluationSettings
-
-    assert options.out is not None, "completed"
-    with Stages() as stages:
-        return evaluate(
-            models,
-            options.out / "trials",
-            options.out / "models",
-            settings=EvaluationSettings(encoder_batch=options.encoder_batch),
-            executor=LocalExecutor(workers=options.workers),
-            progress=stages,
-        )
-
-
-def write_trials(options: Options, tasks: list[TrialTask]) -> list[str]:
-    """Simulate, label, render and store missing trials; return the failures."""
-    from physion.compute.local import LocalExecutor
-    from physion.trials.making.generate import make_trials
-    from physion.trials.making.plan import GenerateSettings
-
-    assert options.out is not None, "completed"
-    with Stages() as stages:
-        report = make_trials(
-            options.out / "trials",
-            tasks,
-            GenerateSettings(
-                width=options.size,
-                height=options.size,
-                look="redyellow",
-                jitters=0,
-                engine=options.engine,
-            ),
-            executor=LocalExecutor(workers=options.workers),
-            progress=stages,
-        )
-    return [f"{name}: {reason}" for name, reason in report.failed.items()]
-
-
-def write_report(options: Options, plan: RunPlan, done: Evaluation) -> tuple[Path, CompareResult]:
+def write_report(
+    options: Options, out: Path, humans: Path | None, recorded: Mapping[str, bool], done: Evaluation
+) -> tuple[Path, CompareResult]:
     """Write the report; return its page and the comparison."""
-    from physion.core.names import canonical_name
     from physion.report.compare import compare
     from physion.report.html import movies_of
-    from physion.trials.dataset import Dataset
 
-    assert options.out is not None, "completed"
-    dataset = Dataset(options.out / "trials")
-    recorded = {canonical_name(name): contact for name, contact in plan.recorded.items()}
-    result = compare(done.paths, humans=options.humans, labels=recorded or None)
+    dataset = Dataset(out / "trials")
+    labels = {canonical_name(name): contact for name, contact in recorded.items()}
+    result = compare(done.paths, humans=humans, labels=labels or None)
     page = result.report(
-        options.out / "report",
+        out / "report",
         methods=methods(options, dataset.index),
         movies=movies_of(dataset.folder),
         question="Will the red object touch the yellow one?",
@@ -253,8 +228,6 @@ class RunPlan:
 
 def plan_sampled(limit: int | None) -> RunPlan:
     """Plan a small set of sampled trials: testing, and twice as many for the readout."""
-    from physion.trials.making.plan import plan_dataset
-
     count = LIMIT if limit is None else limit
     tasks = plan_dataset("sampled", SAMPLED_SCENARIOS, {"readout": 2 * count, "testing": count})
     return RunPlan(tasks, {}, [])
@@ -267,9 +240,6 @@ def plan_official(scenes: Path, humans: Path | None, limit: int | None) -> RunPl
     others are fitted. 0 takes all.
     """
     from physion.analysis.tables import read_humans
-    from physion.core.names import canonical_name
-    from physion.data.official import read_official_trials
-    from physion.trials.making.plan import check_names, plan_scenes
 
     limit = LIMIT if limit is None else limit or None
     seen = set(read_humans(humans)["stimulus"]) if humans is not None else None
@@ -313,8 +283,6 @@ def balanced_trials(trials: Iterable[ImportedTrial], limit: int | None) -> list[
     The choice depends on names and outcomes only; a larger limit includes the trials of a smaller
     one. Without a limit all trials are returned.
     """
-    from physion.core.seeds import stable_hash
-
     groups: dict[str, list[ImportedTrial]] = defaultdict(list)
     for trial in sorted(trials, key=lambda trial: stable_hash("limit", trial.scene.name)):
         groups[trial.scene.scenario].append(trial)

@@ -15,10 +15,10 @@ from typing import Annotated, Any
 
 import tyro
 
-from physion.cli.model_options import choose_models, split_names
-from physion.cli.output import Stages, print_line, text_table
+from physion.cli.output import Stages, print_line, print_plan
 from physion.compute.run_tasks import ExecutorSettings
-from physion.readout.settings import HarnessSettings
+from physion.core.settings import split_names
+from physion.readout.settings import TrainSettings, options_by_model
 from physion.readout.train import Trainings, train
 from physion.trials.dataset import Dataset
 
@@ -31,27 +31,15 @@ class Options:
     """Names of models with commas (physion ls models lists them), or FILE.py:Class."""
     dataset: Annotated[Path, tyro.conf.Positional]
     """Folder of a dataset."""
-    protocols: Annotated[str, tyro.conf.arg(aliases=("--protocol",))] = "all"
-    """Scenarios that train a model: all, all-but one, or only one; several with commas."""
-    scenario: str = ""
-    """Scenario that all-but leaves out, or the one of only; default: one training for each."""
-    seeds: int = 1
-    """Number of trainings of each set, with seeds from --seed on."""
-    seed: int = 0
-    """First seed: of initial weights, folds and batches."""
     out: Path = Path("runs/models")
     """Folder for trainings and features, as for physion evaluate."""
     option: tuple[str, ...] = ()
     """Settings of the models or of their training as NAME=VALUE, such as size=paper steps=500
     batch=16 learning_rate=1e-3; of one of several models as MODEL:NAME=VALUE."""
-    settings: Annotated[HarnessSettings, tyro.conf.arg(name="")] = field(
-        default_factory=HarnessSettings
+    settings: Annotated[TrainSettings, tyro.conf.arg(name="")] = field(
+        default_factory=TrainSettings
     )
-    """Folds, batches and accelerator."""
-    devices: int = 1
-    """Devices of each node, among which every batch is divided."""
-    nodes: int = 1
-    """Nodes; the same command is started on each, as Lightning describes."""
+    """Protocols, seeds, folds, batches and devices."""
     compute: Annotated[ExecutorSettings, tyro.conf.arg(name="")] = field(
         default_factory=ExecutorSettings
     )
@@ -69,16 +57,10 @@ def main(options: Options) -> int:
     """Train what is missing; return 1 if a training of several failed."""
     with Stages() as stages:
         done = train(
-            choose_models(split_names(options.models, "model"), options.option),
+            options_by_model(split_names(options.models, "model"), options.option),
             Dataset(options.dataset, verify=options.verify),
             options.out,
-            protocols=split_names(options.protocols, "training protocol"),
-            scenario=options.scenario,
-            seeds=options.seeds,
-            seed=options.seed,
-            settings=options.settings,
-            devices=options.devices,
-            nodes=options.nodes,
+            options.settings,
             executor=None if options.compute.executor == "local" else options.compute.open(),
             progress=stages,
             dry_run=options.dry_run,
@@ -95,14 +77,7 @@ def _print(done: Trainings, options: Options) -> None:
         print(json_module.dumps(_values(done)))
         return
     if options.dry_run:
-        import pandas as pd
-
-        rows = [dataclasses.asdict(one) for one in done.planned]
-        table = pd.DataFrame(rows, dtype=object)
-        table["done"] = table["done"].map({True: "yes", False: "no"})
-        print_line(text_table(table.rename(columns={"name": "trained on"})))
-        left = sum(not one.done for one in done.planned)
-        print_line(f"{left} of {len(done.planned)} trainings to do")
+        print_plan(done.planned, ["model", "name", "seed", "folder", "done"], "trainings")
         return
     for trained in done.trained:
         for note in trained.notes:

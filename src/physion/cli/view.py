@@ -10,10 +10,10 @@ from typing import Annotated
 
 import tyro
 
-from physion.cli.model_options import parse_options
 from physion.cli.output import Stages, print_line
 from physion.clips.imagined import Imagine
 from physion.core.errors import BadInputError
+from physion.core.settings import parse_pairs
 from physion.report.viewer.build import ViewerOptions, build_viewer
 from physion.trials.dataset import Dataset
 
@@ -80,7 +80,7 @@ def _imagine(options: Options, stages: Stages) -> Imagine | None:
         raise BadInputError(
             "--predictions are shown in trials with details: --details must be at least 1"
         )
-    chosen = parse_options(options.option)
+    chosen = parse_pairs(options.option, "--option")
     return imagine_with(
         Dataset(options.folder, verify=options.verify), options.predictions, chosen, stages
     )

@@ -140,8 +140,23 @@ def read_settings(
     return typing.cast("T", value)
 
 
+def split_names(texts: str | Iterable[str], what: str) -> list[str]:
+    """Return the names in lists with commas, each once; `BadInputError` if there is none."""
+    listed = [texts] if isinstance(texts, str) else list(texts)
+    found = [name.strip() for text in listed for name in text.split(",")]
+    names = [name for name in dict.fromkeys(found) if name]
+    if not names:
+        raise BadInputError(f"{','.join(listed)!r} names no {what}")
+    return names
+
+
 def read_pairs(kind: type[T], pairs: Iterable[str], where: str) -> T:
-    """Build ``kind`` from texts NAME=VALUE of the command line, as `read_settings` does.
+    """Build ``kind`` from texts NAME=VALUE of the command line, as `read_settings` does."""
+    return read_settings(kind, parse_pairs(pairs, where), where)
+
+
+def parse_pairs(pairs: Iterable[str], where: str) -> dict[str, Any]:
+    """Return the values of texts NAME=VALUE of the command line by name.
 
     A value that is not JSON is a text. A name with a dot, as in ``sbatch.account=physics``, sets an
     entry of a mapping, whose values are texts.
@@ -164,7 +179,7 @@ def read_pairs(kind: type[T], pairs: Iterable[str], where: str) -> T:
             values[name] = json.loads(text)
         except (ValueError, RecursionError):
             values[name] = text
-    return read_settings(kind, values, where)
+    return values
 
 
 def check_keys(

@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any, Literal, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,43 +82,28 @@ def fraction_of_futures(touches: Booleans) -> NDArray[np.float64]:
     return count if samples == 1 else (count + 0.5) / (samples + 1)
 
 
-class FeatureDecision(Protocol):
-    """Decision on features.
+@dataclass(frozen=True)
+class Decision:
+    """Base class of decisions; a class that is not derived from it works as well.
 
-    ``labels``: outcomes that it is fitted on: ``simulated``, of the trials as they were made, or
-    ``recorded``, which prefers the outcomes of the official recording.
+    - ``settings``: of the logistic regression.
+    - ``input``: what it receives. ``features``: a list of parts of the features of trials, each an
+      array (n, T, D) or `StoredFeatures`, which are joined in time. ``rollouts``: a mapping from
+      sets of arguments to `Outcomes`.
+    - ``labels``: outcomes that it is fitted on: ``simulated``, of the trials as they were made, or
+      ``recorded``, which prefers the outcomes of the official recording.
     """
 
-    input: Literal["features"]
-    labels: Literal["simulated", "recorded"]
+    settings: LogisticSettings = field(default_factory=LogisticSettings)
+    input: ClassVar[str] = "rollouts"
+    labels: ClassVar[str] = "simulated"
 
-    def decide(self, fit: Sequence[Any], labels: Booleans, test: Sequence[Any]) -> Decided:
-        """Fit on the parts of the features of n trials and decide on the features of m other ones.
-
-        Every part is an array (n, T, D) or stored features; parts are joined in time.
-        """
-        ...
+    def decide(self, fit: Any, labels: Booleans, test: Any) -> Decided:
+        """Fit on n trials with their labels (n,), and decide on m others."""
+        raise NotImplementedError
 
 
-class RolloutDecision(Protocol):
-    """Decision on imagined gaps or contacts, for one or several sets of arguments."""
-
-    input: Literal["rollouts"]
-    labels: Literal["simulated", "recorded"]
-
-    def decide(
-        self,
-        fit: Mapping[Arguments, Outcomes],
-        labels: Booleans,
-        test: Mapping[Arguments, Outcomes],
-    ) -> Decided:
-        """Fit on the outcomes of n trials with each set of arguments; decide on m others."""
-        ...
-
-
-DecisionFactory = Callable[[LogisticSettings], FeatureDecision | RolloutDecision]
-
-decisions: Registry[DecisionFactory] = Registry(
+decisions: Registry[Callable[[LogisticSettings], Decision]] = Registry(
     "decision",
     {
         "logistic": "physion.readout.decisions:LogisticDecision",
@@ -135,25 +120,21 @@ decisions: Registry[DecisionFactory] = Registry(
 # which the model itself says that objects touch, and the likeliest level of noise.
 
 
-@dataclass(frozen=True)
-class GapDecision:
+Futures = Mapping[Arguments, Outcomes]
+
+
+def _accuracy(probability: NDArray[np.float64], labels: Booleans) -> float:
+    return float(np.mean((probability > 0.5) == labels)) if len(labels) else math.nan
+
+
+class GapDecision(Decision):
     """Threshold on the gap, in metres, that is right for most of the fit trials.
 
-    P(contact) as in `fraction_of_futures`, where a gap of at most the threshold is a contact.
-    Thresholds that are right equally often leave the one that is
-    closest to 0; without fit trials it is 0.
+    P(contact) is `fraction_of_futures` with a gap of at most the threshold. Among thresholds that
+    are right equally often it is the closest to 0; without fit trials it is 0.
     """
 
-    settings: LogisticSettings = field(default_factory=LogisticSettings)
-    input: Literal["rollouts"] = "rollouts"
-    labels: Literal["simulated", "recorded"] = "simulated"
-
-    def decide(
-        self,
-        fit: Mapping[Arguments, Outcomes],
-        labels: NDArray[np.bool_],
-        test: Mapping[Arguments, Outcomes],
-    ) -> Decided:
+    def decide(self, fit: Futures, labels: Booleans, test: Futures) -> Decided:
         """Fit the threshold on the gaps (n, S) of the fit trials and apply it to the others."""
         (arguments,) = fit
         near, tested = fit[arguments].gap, test[arguments].gap
@@ -163,64 +144,38 @@ class GapDecision:
                 "use the decision 'noise'"
             )
         threshold = best_threshold(np.median(near, axis=1), labels)
-        predicted = fraction_of_futures(near <= threshold) > 0.5
-        accuracy = float(np.mean(predicted == labels)) if len(labels) else float("nan")
-        return Decided(
-            fraction_of_futures(tested <= threshold),
-            accuracy,
-            fitted={**dict(arguments), "gap": threshold},
-        )
+        accuracy = _accuracy(fraction_of_futures(near <= threshold), labels)
+        probability = fraction_of_futures(tested <= threshold)
+        return Decided(probability, accuracy, fitted={**dict(arguments), "gap": threshold})
 
 
-@dataclass(frozen=True)
-class TouchDecision:
-    """Fraction of futures with a contact, or a gap of at most 0 (`fraction_of_futures`).
+class TouchDecision(Decision):
+    """Fraction of futures with a contact, or a gap of at most 0; nothing is fitted."""
 
-    Nothing is fitted.
-    """
-
-    settings: LogisticSettings = field(default_factory=LogisticSettings)
-    input: Literal["rollouts"] = "rollouts"
-    labels: Literal["simulated", "recorded"] = "simulated"
-
-    def decide(
-        self,
-        fit: Mapping[Arguments, Outcomes],
-        labels: NDArray[np.bool_],
-        test: Mapping[Arguments, Outcomes],
-    ) -> Decided:
+    def decide(self, fit: Futures, labels: Booleans, test: Futures) -> Decided:
         """Decide on the futures of the tested trials; the fit trials only give the accuracy."""
         (arguments,) = test
-        known = fraction_of_futures(fit[arguments].touches()) > 0.5
-        accuracy = float(np.mean(known == labels)) if len(labels) else float("nan")
+        accuracy = _accuracy(fraction_of_futures(fit[arguments].touches()), labels)
         probability = fraction_of_futures(test[arguments].touches())
         return Decided(probability, accuracy, fitted=dict(arguments))
 
 
-@dataclass(frozen=True)
-class NoiseDecision:
+class NoiseDecision(Decision):
     """Fraction of simulations with a contact, at the arguments with the highest likelihood.
 
     It is fitted on recorded outcomes where there are any: compared with the outcomes of its own
     engine, a simulation would always fit best without noise.
     """
 
-    settings: LogisticSettings = field(default_factory=LogisticSettings)
-    input: Literal["rollouts"] = "rollouts"
-    labels: Literal["simulated", "recorded"] = "recorded"
+    labels: ClassVar[str] = "recorded"
 
-    def decide(
-        self,
-        fit: Mapping[Arguments, Outcomes],
-        labels: NDArray[np.bool_],
-        test: Mapping[Arguments, Outcomes],
-    ) -> Decided:
+    def decide(self, fit: Futures, labels: Booleans, test: Futures) -> Decided:
         """Choose the arguments on the fit trials and return the fractions of the others."""
         fractions = {arguments: outcomes.fractions() for arguments, outcomes in fit.items()}
         samples = {arguments: outcomes.samples for arguments, outcomes in test.items()}
         chosen = fit_arguments(fractions, samples, labels)
-        accuracy = np.mean((fractions[chosen] > 0.5) == labels) if len(labels) else float("nan")
-        return Decided(test[chosen].fractions(), float(accuracy), fitted=dict(chosen))
+        accuracy = _accuracy(fractions[chosen], labels)
+        return Decided(test[chosen].fractions(), accuracy, fitted=dict(chosen))
 
 
 def log_likelihood(fractions: NDArray[Any], samples: int, outcomes: NDArray[Any]) -> float:
@@ -262,15 +217,12 @@ def fit_arguments(
 # Decision on features: L2 logistic regression, exact or as released.
 
 
-@dataclass(frozen=True)
-class LogisticDecision:
+class LogisticDecision(Decision):
     """Logistic regression on standardised features of all frames (`physion.readout.logistic`)."""
 
-    settings: LogisticSettings = field(default_factory=LogisticSettings)
-    input: Literal["features"] = "features"
-    labels: Literal["simulated", "recorded"] = "simulated"
+    input: ClassVar[str] = "features"
 
-    def decide(self, fit: Sequence[Any], labels: NDArray[np.bool_], test: Sequence[Any]) -> Decided:
+    def decide(self, fit: Sequence[Any], labels: Booleans, test: Sequence[Any]) -> Decided:
         """Fit on the parts ``fit`` and return the probabilities of the parts ``test``."""
         fitted = fit_readout(fit, labels, test, self.settings)
         return Decided(

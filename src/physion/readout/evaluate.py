@@ -6,9 +6,10 @@ What is done is known from the name of the table, which holds a hash of all its 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,17 +20,23 @@ import pandas as pd
 from physion.clips.batch import Provenance
 from physion.compute.local import LocalExecutor, SerialExecutor
 from physion.compute.tasks import Executor, Progress, tracked
-from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.errors import BadInputError
 from physion.core.files import is_whole
 from physion.core.version import __version__
 from physion.models.interface import Model, TrainingSettings, ask, can
-from physion.readout.cells import Cell, Cells, Models, choose_models, open_dataset
 from physion.readout.decisions import Readout, decisions
-from physion.readout.folds import Fold, Protocol, plan_folds, select_scenario
+from physion.readout.folds import Protocol, plan_folds, select_scenario
 from physion.readout.model_calls import check_identity, is_network
 from physion.readout.predictor import Predictor, Way, choose_readouts
-from physion.readout.rollout_error import check_moves_objects, rollout_error
-from physion.readout.settings import EvaluationSettings
+from physion.readout.settings import (
+    Cell,
+    EvaluationSettings,
+    Models,
+    choose_models,
+    open_dataset,
+    plan_cells,
+    run_cells,
+)
 from physion.readout.tables import (
     ScenarioPredictions,
     file_name,
@@ -44,8 +51,13 @@ NOTHING_TO_FIT = "no trial to fit|one answer only"
 """Notes of `physion.readout.logistic.fit_readout` where it predicts the base rate."""
 _VERSION = 6
 """To be increased with every change that can alter the table of an evaluation."""
-_NOT_HASHED = ("encoder_batch", "accelerator")
-"""Settings of where and how an evaluation runs."""
+_NOT_HASHED = ("protocols", "seeds", "encoder_batch", "accelerator", "rollout_errors")
+"""Settings of where and how an evaluation runs, or of others than this one."""
+_HASHED_COLUMNS = [
+    "trial", "scenario", "split", "contact", "digest", "movie_sha256", "observed_movie_sha256",
+    "recorded_contact", "observed_contact",
+]  # fmt: skip
+"""Columns of the index that a table depends on."""
 
 
 @dataclass(frozen=True)
@@ -120,17 +132,13 @@ def evaluate(
     models: Models,
     dataset: Dataset | Path | str,
     out: Path | str = "runs/models",
-    *,
-    protocols: Sequence[str] | str = ("all",),
-    scenario: str = "",
-    seeds: int = 1,
-    seed: int = 0,
-    options: Mapping[str, Any] | None = None,
     settings: EvaluationSettings | None = None,
-    rollout_errors: bool = False,
+    *,
+    options: Mapping[str, Any] | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
     dry_run: bool = False,
+    **changes: Any,
 ) -> Evaluation:
     """Train models and their readouts, and predict every testing trial of a dataset.
 
@@ -144,22 +152,12 @@ def evaluate(
         readout trials the testing trials are cross-validated.
     out
         Output folder. Tables go to ``predictions/<model>-<hash>.csv``, caches to ``features/`` and
-        ``training/``. A table whose inputs are the same is not made again.
-    protocols
-        Scenarios that train a model: ``all``, ``all-but`` the tested one, or ``only`` the tested
-        one. A model that is not trained is evaluated once. Weights that ship belong to ``all``;
-        under the other protocols such a model is trained from random weights.
-    scenario
-        Tested scenario, under all-but and only; by default all of them.
-    seeds, seed
-        Number of seeds, and the first: of initial weights, folds and training.
+        ``training/``, errors of imagined motion (`rollout_error`) to ``rollout-errors/``. A table
+        whose inputs are the same is not made again.
+    settings
+        Protocols, seeds, readouts, decision, cross-validation and device.
     options
         Fields of the settings of the models, or of their training (`TrainingSettings`).
-    settings
-        Readouts, decision, cross-validation and device.
-    rollout_errors
-        Also write the errors of imagined motion over time (`rollout_error`) to
-        ``rollout-errors/``, in a file of the same name; for models that move objects.
     executor
         A `LocalExecutor` runs the simulations of one evaluation after the other; any other runs the
         evaluations, each a task. By default all run in this process.
@@ -167,6 +165,8 @@ def evaluate(
         Called after every finished item.
     dry_run
         Only say what would be evaluated, and what is done.
+    **changes
+        Fields of `EvaluationSettings` to replace in ``settings``, such as ``seeds=3``.
 
     Returns
     -------
@@ -181,37 +181,25 @@ def evaluate(
         If a model cannot be built, or the only evaluation fails: a readout does not fit the model,
         the model raises or returns something wrong, or no trial could be predicted.
     """
-    opened = open_dataset(dataset)
-    settings = settings if settings is not None else EvaluationSettings()
+    settings = dataclasses.replace(settings or EvaluationSettings(), **changes)
     for name in settings.readouts:
         Readout.named(name)
     if settings.decision:
         decisions.get(settings.decision)
-
-    def trains(model: Any) -> bool:
-        return _is_trained(model, settings)
-
-    cells = Cells(
+    cells = plan_cells(
         choose_models(models, options),
-        protocols,
-        seeds,
-        seed,
-        trains,
+        settings,
+        functools.partial(_is_trained, settings=settings),
         every_seed=settings.untrained,
     )
-    elsewhere: Executor | None = None
-    if executor is not None and not isinstance(executor, LocalExecutor | SerialExecutor):
-        # Its processes may have another working directory.
-        opened, out = Dataset(opened.folder.absolute(), verify=opened.verify), Path(out).absolute()
-        elsewhere, executor = None if dry_run else executor, None
-    work = _EvaluationWork(opened, Path(out), scenario, settings, rollout_errors)
-
-    def here(cell: Cell) -> EvaluatedModel:
-        job = work.job(cell, cells.model(cell), executor, progress)
-        return job.planned() if dry_run else job.do()
-
-    evaluated, failed = cells.run(here, work, Path(out), "evaluations", elsewhere, progress)
-    return Evaluation(evaluated, failed)
+    elsewhere = None if isinstance(executor, LocalExecutor | SerialExecutor) else executor
+    if elsewhere is None or dry_run:
+        work = _Evaluate(open_dataset(dataset, None), Path(out), settings)
+        here = functools.partial(work, executor=executor, progress=progress, dry_run=dry_run)
+        return Evaluation(*run_cells(cells, here, Path(out), "evaluations", None, progress))
+    # Its processes may have another working directory.
+    there = _Evaluate(open_dataset(dataset, elsewhere), Path(out).absolute(), settings)
+    return Evaluation(*run_cells(cells, there, Path(out), "evaluations", elsewhere, progress))
 
 
 def _is_trained(model: Any, settings: EvaluationSettings) -> bool:
@@ -226,166 +214,102 @@ def _is_trained(model: Any, settings: EvaluationSettings) -> bool:
 
 
 @dataclass(frozen=True)
-class _EvaluationWork:
+class _Evaluate:
     """Function that evaluates a cell, with all that a process needs for it."""
 
     dataset: Dataset
     out: Path
-    scenario: str
     settings: EvaluationSettings
-    rollout_errors: bool
 
-    def __call__(self, cell: Cell) -> EvaluatedModel:
-        model = cell.chosen.build(cell.seed, untrained=cell.untrained)
-        return self.job(cell, model, None, None).do()
-
-    def job(
+    def __call__(
         self,
         cell: Cell,
-        model: Any,
-        executor: Executor | None,
-        progress: Progress | None,
-    ) -> _Job:
-        """Return the evaluation of a cell with its model."""
-        return _Job(
-            model=model,
+        executor: Executor | None = None,
+        progress: Progress | None = None,
+        *,
+        dry_run: bool = False,
+    ) -> EvaluatedModel:
+        """Predict every testing trial, unless that is done."""
+        model, settings, index = cell.take_model(), self.settings, self.dataset.index
+        training = cell.chosen.settings_of(model) if cell.protocol is not None else None
+        ways = choose_readouts(model, settings.readouts, settings.decision)
+        provenance = check_identity(model)
+        if not provenance.inputs:
+            provenance = dataclasses.replace(provenance, inputs=", ".join(model.spec.inputs))
+        path = self._table(cell, model, training, provenance, ways)
+        errors_path = self.out / "rollout-errors" / path.name if settings.rollout_errors else None
+        if errors_path is not None:
+            from physion.readout.rollout_error import check_moves_objects, rollout_error
+
+            check_moves_objects(model)
+        done = is_whole(path) and (errors_path is None or is_whole(errors_path))
+        protocol = cell.protocol.value if cell.protocol is not None else ""
+        evaluated = EvaluatedModel(
+            provenance.model, protocol, cell.seed, path, errors_path, done, {}
+        )
+        if done or dry_run:
+            return evaluated
+        protocol_of_folds = cell.protocol or Protocol.ALL
+        folds = select_scenario(
+            plan_folds(index, protocol_of_folds, settings.folds, cell.seed), settings.scenario
+        )
+        predictor = Predictor(
+            self.dataset,
+            model,
+            ways,
+            settings,
+            training=training,
             protocol=cell.protocol,
             seed=cell.seed,
-            training=cell.chosen.settings_of(model) if cell.protocol is not None else None,
-            work=self,
+            folder=self.out,
             executor=executor,
             progress=progress,
-        )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Job:
-    """Evaluation of a built model under one protocol with one seed."""
-
-    model: Model
-    protocol: Protocol | None
-    seed: int
-    training: TrainingSettings | None
-    work: _EvaluationWork
-    executor: Executor | None
-    progress: Progress | None
-
-    @cached_property
-    def ways(self) -> dict[Readout, Way]:
-        """Readouts, and the way of each."""
-        settings = self.work.settings
-        return choose_readouts(self.model, settings.readouts, settings.decision)
-
-    def planned(self) -> EvaluatedModel:
-        """Return where the table is, or will be."""
-        name = self._name  # which checks what the model says of itself
-        path = self._path()
-        errors = self.work.out / "rollout-errors" / path.name if self.work.rollout_errors else None
-        if errors is not None:
-            check_moves_objects(self.model)
-        done = is_whole(path) and (errors is None or is_whole(errors))
-        protocol = self.protocol.value if self.protocol is not None else ""
-        return EvaluatedModel(name, protocol, self.seed, path, errors, done, {})
-
-    def do(self) -> EvaluatedModel:
-        """Predict every testing trial, unless that is done."""
-        planned = self.planned()
-        if planned.done:
-            return planned
-        settings = self.work.settings
-        folds = self._folds()
-        predictor = Predictor(
-            self.work.dataset,
-            self.model,
-            self.ways,
-            settings,
-            training=self.training,
-            protocol=self.protocol,
-            seed=self.seed,
-            folder=self.work.out,
-            executor=self.executor,
-            progress=self.progress,
         )
         predictions: list[ScenarioPredictions] = []
         errors: list[pd.DataFrame] = []
         try:
-            for fold in tracked(folds, "folds", len(folds), self.progress):
+            for fold in tracked(folds, "folds", len(folds), progress):
                 predictions += predictor.predict(fold)
-                if self.work.rollout_errors:
+                if errors_path is not None:
                     # Now, since the model has the weights that were trained for this fold.
                     tested = [t for split in fold.scenarios for t in split.test]
                     known = [t for t in tested if t not in predictor.problems]
-                    errors.append(
-                        rollout_error(self.work.dataset, self.model, known, progress=self.progress)
-                    )
+                    errors.append(rollout_error(self.dataset, model, known, progress=progress))
         finally:
             predictor.restore()
-        table = make_table(predictions, self._provenance, self.work.dataset.index)
+        table = make_table(predictions, provenance, index)
         if table.empty:
             reason = next(iter(predictor.problems.values()), "there is no trial to predict")
-            raise BadInputError(f"{self._name} predicts no trial: {reason}")
-        path, of_motion = planned.path, planned.rollout_errors
+            raise BadInputError(f"{provenance.model} predicts no trial: {reason}")
         if predictor.problems:
             # Another name than a complete table has, so that the next run retries these trials.
             path = path.with_suffix(".partial.csv")
         write_table(table, path)
-        if of_motion is not None:
-            of_motion = of_motion.with_name(path.name)
-            write_table(pd.concat(errors, ignore_index=True).round(6), of_motion)
+        if errors_path is not None:
+            errors_path = errors_path.with_name(path.name)
+            write_table(pd.concat(errors, ignore_index=True).round(6), errors_path)
+        problems = dict(predictor.problems)
         return dataclasses.replace(
-            planned, path=path, rollout_errors=of_motion, problems=dict(predictor.problems)
+            evaluated, path=path, rollout_errors=errors_path, problems=problems
         )
 
-    def _folds(self) -> list[Fold]:
-        """Return the folds; of a model that is not trained, with the chosen scenario only."""
-        folds_of, scenario = self.work.settings.folds, self.work.scenario
-        if self.protocol is not None:
-            folds = plan_folds(self.work.dataset.index, self.protocol, folds_of, self.seed)
-            return select_scenario(folds, self.protocol, scenario)
-        folds = plan_folds(self.work.dataset.index, Protocol.ALL, folds_of, self.seed)
-        if not scenario:
-            return folds
-        known = {split.scenario for fold in folds for split in fold.scenarios}
-        if scenario not in known:
-            raise UnknownNameError("scenario of the dataset", scenario, known)
-        return [
-            dataclasses.replace(
-                fold, scenarios=tuple(s for s in fold.scenarios if s.scenario == scenario)
-            )
-            for fold in folds
-        ]
-
-    @cached_property
-    def _provenance(self) -> Provenance:
-        """Provenance of the model, with the inputs of its `Spec` if it names no others."""
-        known = check_identity(self.model)
-        return dataclasses.replace(known, inputs=known.inputs or ", ".join(self.model.spec.inputs))
-
-    @property
-    def _name(self) -> str:
-        return self._provenance.model
-
-    def _path(self) -> Path:
+    def _table(
+        self,
+        cell: Cell,
+        model: Model,
+        training: TrainingSettings | None,
+        provenance: Provenance,
+        ways: Mapping[Readout, Way],
+    ) -> Path:
         """Return the table, named by a hash of trials, labels, model, settings and code."""
-        settings = dataclasses.asdict(self.work.settings)
-        settings |= {"readouts": [r.value for r in self.ways], "scenario": self.work.scenario}
-        settings |= {"protocol": self.protocol and self.protocol.value, "seed": self.seed}
-        options = dataclasses.asdict(chosen) if (chosen := ask(self.model, "settings")) else {}
-        training = dataclasses.asdict(self.training) if self.training is not None else {}
+        settings = dataclasses.asdict(self.settings) | {"readouts": [r.value for r in ways]}
+        settings |= {"protocol": cell.protocol and cell.protocol.value, "seed": cell.seed}
         kept = {name: value for name, value in settings.items() if name not in _NOT_HASHED}
-        provenance = dataclasses.asdict(self._provenance)
-        return table_path(
-            self.work.out,
-            self._name,
-            [_VERSION, __version__, kept, provenance, options, training, self.model.digest()],
-            self.work.dataset.index,
-        )
-
-
-def table_path(out: Path, model: str, inputs: Iterable[Any], index: pd.DataFrame) -> Path:
-    """Return the path of a table of predictions, whose name has a hash of all its inputs."""
-    columns = ["trial", "scenario", "split", "contact", "digest", "movie_sha256"]
-    columns += ["observed_movie_sha256", "recorded_contact", "observed_contact"]
-    sha = hashlib.sha256(json.dumps(list(inputs), sort_keys=True, default=str).encode())
-    sha.update(index[columns].to_csv(index=False).encode())
-    return out / "predictions" / f"{file_name(model)}-{sha.hexdigest()[:12]}.csv"
+        options = dataclasses.asdict(chosen) if (chosen := ask(model, "settings")) else {}
+        of_training = dataclasses.asdict(training) if training is not None else {}
+        facts = dataclasses.asdict(provenance)
+        inputs = [_VERSION, __version__, kept, facts, options, of_training, model.digest()]
+        sha = hashlib.sha256(json.dumps(inputs, sort_keys=True, default=str).encode())
+        sha.update(self.dataset.index[_HASHED_COLUMNS].to_csv(index=False).encode())
+        name = f"{file_name(provenance.model)}-{sha.hexdigest()[:12]}.csv"
+        return self.out / "predictions" / name

@@ -8,18 +8,19 @@ files are a cache: one that is damaged is deleted and made again.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import json
-import math
-import mmap
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
 
 from physion.clips.batch import Batch, Rollout
 from physion.clips.source import ObservedSource, Part
@@ -38,138 +39,63 @@ from physion.readout.model_calls import (
     to_array,
 )
 
-# Files: safetensors, whose raw arrays can be memory-mapped. They are the length of the header (8
-# bytes, little-endian), a JSON header, and the arrays one after the other.
-
-_DTYPES: dict[str, np.dtype[Any]] = {
-    "F32": np.dtype("<f4"),
-    "F64": np.dtype("<f8"),
-    "BOOL": np.dtype("?"),
-}
-_NAMES = {dtype: name for name, dtype in _DTYPES.items()}
-_ALIGNMENT = 64
-"""The arrays start at a multiple of this many bytes."""
-_LENGTH = 8
-"""Bytes of the length of the header."""
-
-
-class FeatureArrays(Protocol):
-    """Arrays of one trial, by name, in a file or in memory."""
-
-    @property
-    def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        """Shapes of the arrays."""
-        ...
-
-    def read(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
-        """Return values ``start`` to ``stop`` of the flattened array ``name``."""
-        ...
-
-
-@dataclass(frozen=True, eq=False)
-class ArraysInMemory:
-    """Arrays of one trial that are not stored."""
-
-    arrays: Mapping[str, NDArray[Any]]
-
-    @property
-    def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        """Shapes of the arrays."""
-        return {name: value.shape for name, value in self.arrays.items()}
-
-    def read(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
-        """Return values ``start`` to ``stop`` of the flattened array ``name``."""
-        return self.arrays[name].reshape(-1)[start:stop]
-
 
 @dataclass(frozen=True)
 class FeatureFile:
-    """File with arrays of one trial.
-
-    ``dtypes``, ``shapes`` and ``offsets`` are of the arrays, by name; offsets in bytes.
-    """
+    """Safetensors file with the arrays of one trial, flattened; ``shapes`` holds their shapes."""
 
     path: Path
-    dtypes: Mapping[str, np.dtype[Any]]
     shapes: Mapping[str, tuple[int, ...]]
-    offsets: Mapping[str, int]
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
         """Return values ``start`` to ``stop`` of the flattened array ``name``.
 
-        The file is mapped for the time of the call only: Python keeps a file descriptor for every
-        map, and thousands of trials are read at a time. Raises `BadInputError` if it was deleted
-        or cut since it was opened.
+        The file is open for the time of the call only, since thousands of trials are read at a
+        time. Raises `BadInputError` if it was deleted or cut since it was opened.
         """
-        dtype, size = self.dtypes[name], math.prod(self.shapes[name])
-        stop = size if stop is None else min(stop, size)
-        if stop <= start:
-            return np.zeros(0, dtype)
-        offset = self.offsets[name] + start * dtype.itemsize
         try:
-            with (
-                self.path.open("rb") as file,
-                mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as memory,
-            ):
-                return np.frombuffer(memory, dtype, stop - start, offset).copy()
-        except (OSError, ValueError) as error:
+            with safe_open(self.path, "numpy") as file:
+                values: NDArray[Any] = file.get_slice(name)[start:stop]
+                return values
+        except (OSError, SafetensorError) as error:
             raise BadInputError(
                 f"features {self.path} cannot be read ({error}); run again"
             ) from None
 
+    def array(self, name: str) -> NDArray[Any]:
+        """Return the array ``name``."""
+        return self.read(name).reshape(self.shapes[name])
 
-def write_features(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays (float32, float64 or bool) to a file such that no reader sees a part of it.
+
+def write_features(path: Path, arrays: Mapping[str, NDArray[Any]]) -> FeatureFile:
+    """Write arrays to a file such that no reader sees a part of it.
 
     Raises `BadInputError` if it cannot be written, for example because the disk is full.
     """
-    values = {
-        name: np.ascontiguousarray(value, _DTYPES[_NAMES[value.dtype]])
-        for name, value in arrays.items()
-    }
-    content: dict[str, Any] = {}
-    start = 0
-    for name, value in values.items():
-        stop = start + value.nbytes
-        dtype = _NAMES[value.dtype]
-        content[name] = {"dtype": dtype, "shape": list(value.shape), "data_offsets": [start, stop]}
-        start = stop
-    head = json.dumps(content, separators=(",", ":")).encode()
-    head += b" " * (-(_LENGTH + len(head)) % _ALIGNMENT)
-    data = [len(head).to_bytes(_LENGTH, "little"), head, *(v.tobytes() for v in values.values())]
+    shapes = {name: value.shape for name, value in arrays.items()}
+    flat = {name: np.ascontiguousarray(value).reshape(-1) for name, value in arrays.items()}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, b"".join(data))
+        write_atomic(path, save(flat, {"shapes": json.dumps(shapes)}))
     except OSError as error:
         raise BadInputError(
             f"features cannot be stored in {path.parent} ({error.strerror}); free space there, or "
             "choose another folder"
         ) from error
+    return FeatureFile(path, shapes)
 
 
 def open_features(path: Path) -> FeatureFile | None:
     """Return the file at ``path``; None if there is none, or if it is damaged, and deleted."""
-    try:
-        with path.open("rb") as file:
-            length = int.from_bytes(file.read(_LENGTH), "little")
-            size = file.seek(0, 2)
-            file.seek(_LENGTH)
-            content = json.loads(file.read(min(length, size)))
-        shapes = {name: tuple(item["shape"]) for name, item in content.items()}
-        dtypes = {name: _DTYPES[item["dtype"]] for name, item in content.items()}
-        first = _LENGTH + length
-        offsets = {name: first + item["data_offsets"][0] for name, item in content.items()}
-        ends = [first + item["data_offsets"][1] for item in content.values()]
-        sizes = [math.prod(shapes[name]) * dtypes[name].itemsize for name in content]
-        starts = [end - bytes_of for end, bytes_of in zip(ends, sizes, strict=True)]
-        if starts != list(offsets.values()) or max(ends) != size:
-            raise ValueError("the arrays do not fill the file")
-    except OSError:
+    if not path.is_file():
         return None
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    try:
+        with safe_open(path, "numpy") as file:
+            shapes = json.loads(file.metadata()["shapes"])
+    except (OSError, SafetensorError, ValueError, KeyError, TypeError):
         path.unlink(missing_ok=True)
         return None
-    return FeatureFile(path, dtypes, shapes, offsets)
+    return FeatureFile(path, {name: tuple(shape) for name, shape in shapes.items()})
 
 
 # Features of trials that are read from their files piece by piece.
@@ -181,14 +107,14 @@ FEATURES = "features"
 
 
 class StoredFeatures:
-    """Features (n, T', D) float32 of n trials, in files that are memory-mapped or in memory.
+    """Features (n, T', D) float32 of n trials, in files of which pieces are read.
 
     Parameters
     ----------
     trials
         Names (n).
     rows
-        For every trial the file or arrays with its features (T', D).
+        For every trial the file with its features (T', D).
 
     Raises
     ------
@@ -196,7 +122,7 @@ class StoredFeatures:
         If the shapes of two trials differ.
     """
 
-    def __init__(self, trials: Sequence[str], rows: Sequence[FeatureArrays]) -> None:
+    def __init__(self, trials: Sequence[str], rows: Sequence[FeatureFile]) -> None:
         self.trials = tuple(trials)
         self._rows = tuple(rows)
         shapes = [row.shapes[FEATURES] for row in self._rows]
@@ -349,7 +275,7 @@ class Imagined:
     """What a model imagined of n trials with one set of arguments."""
 
     model: str
-    rows: Mapping[str, FeatureArrays]
+    rows: Mapping[str, FeatureFile]
 
     @property
     def trials(self) -> tuple[str, ...]:
@@ -371,7 +297,10 @@ class Imagined:
         if not rows:
             return Outcomes(np.zeros((0, 1), np.bool_), np.zeros((0, 1), np.float64))
         names = set.intersection(*(set(row.shapes) for row in rows))
-        gap, contact = (_stack(rows, name) if name in names else None for name in (GAP, CONTACT))
+        gap, contact = (
+            np.stack([row.array(name) for row in rows]) if name in names else None
+            for name in (GAP, CONTACT)
+        )
         if gap is None and contact is None:
             raise BadInputError(f"model {self.model!r}: imagine gave neither gap nor contact")
         return Outcomes(contact, gap)
@@ -384,11 +313,8 @@ def all_arguments(arguments: Mapping[str, Sequence[float]]) -> list[Arguments]:
     return [tuple(zip(names, chosen, strict=True)) for chosen in itertools.product(*values)]
 
 
-_VERSION = "2"
+_VERSION = "3"
 """To be increased with every change that can alter what is stored of a clip and model."""
-_WRITE_TRIALS, _WRITE_BYTES = 32, 2**26
-"""Trials, or bytes, after which features are written. The digest is asked before each writing,
-which for a large network takes as long as encoding some clips."""
 IMAGINED = "imagined"
 
 
@@ -410,16 +336,14 @@ class FeatureStore:
     Parameters
     ----------
     folder
-        Folder of the files; None keeps features in memory.
+        Folder of the files.
     batch
         Clips that a model receives at a time, the *encoder batch*.
     executor
         Runs models whose futures are imagined in processes.
     """
 
-    def __init__(
-        self, folder: Path | None, *, batch: int = 4, executor: Executor | None = None
-    ) -> None:
+    def __init__(self, folder: Path, *, batch: int = 4, executor: Executor | None = None) -> None:
         if batch < 1:
             raise BadInputError(f"the encoder batch must be at least 1, not {batch}")
         self._folder, self._batch = folder, batch
@@ -526,7 +450,7 @@ class FeatureStore:
                 IMAGINED, model.digest, compute, model_name(model), IMAGINED, settings
             )
         if together:
-            request = _Request(LoadedFiles(), model, None, samples, seed, ())
+            request = functools.partial(_Request, LoadedFiles(), model, samples, seed)
             by_value = self._rows_of_processes(works, request, source, trials, together, progress)
         else:
             by_value = {v: self._rows(w, source, trials, progress) for v, w in works.items()}
@@ -541,7 +465,7 @@ class FeatureStore:
         source: ObservedSource,
         trials: Sequence[str],
         progress: Progress | None,
-    ) -> dict[str, FeatureArrays]:
+    ) -> dict[str, FeatureFile]:
         """Return the arrays of every trial, read where they are stored, and computed elsewhere."""
         digest = _ask_digest(work)
         part: Any = "context" if work.part == IMAGINED else work.part
@@ -551,43 +475,35 @@ class FeatureStore:
         }
         rows = _stored(paths)
         missing = [trial for trial in paths if trial not in rows]
-        for computed in self._compute(work, missing, progress):
-            if _ask_digest(work) != digest:
-                raise BadInputError(
-                    f"model {work.model!r}: its digest changed while it computed {work.what}; "
-                    "its methods must leave weights and settings as they are"
-                )
-            for trial, arrays in computed.items():
-                rows[trial] = _write(paths[trial], arrays)
+        groups = [tuple(missing[i : i + self._batch]) for i in range(0, len(missing), self._batch)]
+        changed = False
+        try:
+            for group in tracked(groups, work.what, len(groups), progress if groups else None):
+                for trial, arrays in zip(group, work.compute(group), strict=True):
+                    rows[trial] = write_features(paths[trial], arrays)
+        finally:  # so that features of other weights are never left under this digest
+            changed = bool(missing) and _ask_digest(work) != digest
+            for trial in missing if changed else ():
+                paths[trial].unlink(missing_ok=True)
+        if changed:
+            raise BadInputError(
+                f"model {work.model!r}: its digest changed while it computed {work.what}; "
+                "its methods must leave weights and settings as they are"
+            )
         return rows
-
-    def _compute(
-        self, work: _Work, trials: Sequence[str], progress: Progress | None
-    ) -> Iterator[dict[str, Arrays]]:
-        """Yield the arrays of ``trials``, as many at a time as are written together."""
-        groups = [tuple(trials[i : i + self._batch]) for i in range(0, len(trials), self._batch)]
-        pending: dict[str, Arrays] = {}
-        for group in tracked(groups, work.what, len(groups), progress if groups else None):
-            pending |= zip(group, work.compute(group), strict=True)
-            size = sum(value.nbytes for arrays in pending.values() for value in arrays.values())
-            if len(pending) >= _WRITE_TRIALS or size >= _WRITE_BYTES:
-                yield pending
-                pending = {}
-        if pending:
-            yield pending
 
     def _rows_of_processes(
         self,
         works: Mapping[Arguments, _Work],
-        request: _Request,
+        request: Callable[[Arguments, Batch], _Request],
         source: ObservedSource,
         trials: Sequence[str],
         together: int,
         progress: Progress | None,
-    ) -> dict[Arguments, dict[str, FeatureArrays]]:
+    ) -> dict[Arguments, dict[str, FeatureFile]]:
         """Return the arrays of every trial with all arguments, computed by the executor."""
         digest = _ask_digest(next(iter(works.values())))
-        paths: dict[Arguments, dict[str, Path | None]] = {value: {} for value in works}
+        paths: dict[Arguments, dict[str, Path]] = {value: {} for value in works}
         for trial in dict.fromkeys(trials):
             try:
                 key = source.key(trial, "context")
@@ -605,18 +521,20 @@ class FeatureStore:
                 if group not in read:
                     read[group] = list(self._contexts(source, group))
                 for context in read[group]:
-                    arguments = " ".join(f"{argument}={level:g}" for argument, level in value)
+                    arguments = " ".join(f"{name}={level:g}" for name, level in value)
                     name = f"{context.trials[0]} {arguments}".strip()
-                    requests[name] = dataclasses.replace(request, context=context, arguments=value)
-        done, total = 0, sum(len(asked.trials) for asked in requests.values())
+                    requests[name] = request(value, context)
+        done, total = 0, sum(len(asked.context) for asked in requests.values())
         for outcome in self._executor.map(_imagine_request, requests):
             asked = requests[outcome.key]
-            for row, trial in enumerate(asked.trials):
+            for row, trial in enumerate(asked.context.trials):
                 made = outcome.error if outcome.error else outcome.value[row]
                 if isinstance(made, str):
                     self.problems[trial] = made
                 else:
-                    found[asked.arguments][trial] = _write(paths[asked.arguments][trial], made)
+                    found[asked.arguments][trial] = write_features(
+                        paths[asked.arguments][trial], made
+                    )
                 done += 1
                 if progress is not None:
                     progress("rollouts", done, total)
@@ -633,10 +551,8 @@ class FeatureStore:
                 for trial in trials:
                     yield from self._contexts(source, (trial,))
 
-    def _path(self, work: _Work, digest: str, key: str, trial: str) -> Path | None:
+    def _path(self, work: _Work, digest: str, key: str, trial: str) -> Path:
         """Return the file of a trial, named by all that its arrays depend on."""
-        if self._folder is None:
-            return None
         identity = [_VERSION, digest, key, trial, work.part, work.settings]
         name = digest_of(json.dumps(identity))
         return self._folder / work.part / digest[:16] / name[:2] / f"{name}.safetensors"
@@ -651,15 +567,10 @@ class _Request:
 
     files: LoadedFiles
     model: Any
-    context: Batch | None
     samples: int
     seed: int
     arguments: Arguments
-
-    @property
-    def trials(self) -> tuple[str, ...]:
-        """Names of the trials."""
-        return self.context.trials if self.context is not None else ()
+    context: Batch
 
 
 def _imagine_request(request: _Request) -> list[Arrays | str]:
@@ -668,7 +579,6 @@ def _imagine_request(request: _Request) -> list[Arrays | str]:
     If trials cannot be imagined together they are imagined one by one.
     """
     context = request.context
-    assert context is not None, "set for every group of trials"
     try:
         arguments = dict(request.arguments)
         return [*imagine_clips(request.model, context, request.samples, request.seed, arguments)]
@@ -681,20 +591,10 @@ def _imagine_request(request: _Request) -> list[Arrays | str]:
         return [made for single in singles for made in _imagine_request(single)]
 
 
-def _stored(paths: Mapping[str, Path | None]) -> dict[str, FeatureArrays]:
+def _stored(paths: Mapping[str, Path]) -> dict[str, FeatureFile]:
     """Return what is stored, by trial."""
-    opened = ((trial, open_features(path)) for trial, path in paths.items() if path is not None)
-    return {trial: arrays for trial, arrays in opened if arrays is not None}
-
-
-def _write(path: Path | None, arrays: Arrays) -> FeatureArrays:
-    if path is None:
-        return ArraysInMemory(arrays)
-    write_features(path, arrays)
-    stored = open_features(path)
-    if stored is None:
-        raise BadInputError(f"features {path} differ from what was written; check the disk")
-    return stored
+    opened = ((trial, open_features(path)) for trial, path in paths.items())
+    return {trial: file for trial, file in opened if file is not None}
 
 
 def _read_clips(read: Callable[[tuple[str, ...]], Batch], group: tuple[str, ...]) -> Batch:
@@ -717,8 +617,3 @@ def _ask_digest(work: _Work) -> str:
             "digits"
         )
     return digest
-
-
-def _stack(rows: Sequence[FeatureArrays], name: str) -> NDArray[Any]:
-    """Return one array of all trials."""
-    return np.stack([row.read(name).reshape(row.shapes[name]) for row in rows])

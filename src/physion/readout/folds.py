@@ -7,7 +7,7 @@ the tested one, or *only* the tested one.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import pandas as pd
@@ -48,15 +48,6 @@ class TrainingSet:
     tested: tuple[str, ...]
 
 
-def set_name(protocol: Protocol, scenario: str) -> str:
-    """Return the name of the `TrainingSet` of a tested scenario."""
-    return {
-        Protocol.ALL: "all",
-        Protocol.ALL_BUT: f"no_{scenario}",
-        Protocol.ONLY: scenario,
-    }[protocol]
-
-
 def training_sets(protocol: Protocol, scenarios: Sequence[str]) -> list[TrainingSet]:
     """Return the trainings that a protocol needs: one in all, or one per scenario."""
     names = tuple(sorted(set(scenarios)))
@@ -65,12 +56,11 @@ def training_sets(protocol: Protocol, scenarios: Sequence[str]) -> list[Training
     if protocol is Protocol.ALL:
         return [TrainingSet("all", names, names)]
     if protocol is Protocol.ONLY:
-        return [TrainingSet(set_name(protocol, name), (name,), (name,)) for name in names]
+        return [TrainingSet(name, (name,), (name,)) for name in names]
     if len(names) < 2:
         raise BadInputError(f"all-but needs two scenarios or more; there is only {names[0]!r}")
     return [
-        TrainingSet(set_name(protocol, name), tuple(n for n in names if n != name), (name,))
-        for name in names
+        TrainingSet(f"no_{name}", tuple(n for n in names if n != name), (name,)) for name in names
     ]
 
 
@@ -174,26 +164,21 @@ def training_folds(index: pd.DataFrame, protocol: Protocol, folds: int, seed: in
     return [Fold(s, _trials(pool, s.trained), (), -1) for s in sets]
 
 
-def select_scenario(folds: Sequence[Fold], protocol: Protocol, scenario: str) -> list[Fold]:
-    """Return the folds whose training set is for one tested scenario; all if it is empty.
+def select_scenario(folds: Sequence[Fold], scenario: str) -> list[Fold]:
+    """Return the folds in which a scenario is tested, without the other scenarios; all if empty.
 
-    Raises
-    ------
-    BadInputError
-        If a scenario is chosen for the protocol all.
-    UnknownNameError
-        If the scenario has no training set.
+    Raises `UnknownNameError` if the scenario is not tested.
     """
     if not scenario:
         return list(folds)
-    if protocol is Protocol.ALL:
-        raise BadInputError("a scenario needs the protocol all-but or only")
-    wanted = set_name(protocol, scenario)
-    names = {fold.training.name for fold in folds}
-    if wanted not in names:
-        known = {name.removeprefix(set_name(protocol, "")) for name in names}
+    known = {tested for fold in folds for tested in fold.training.tested}
+    if scenario not in known:
         raise UnknownNameError("scenario of the dataset", scenario, known)
-    return [fold for fold in folds if fold.training.name == wanted]
+    return [
+        replace(fold, scenarios=tuple(s for s in fold.scenarios if s.scenario == scenario))
+        for fold in folds
+        if scenario in fold.training.tested
+    ]
 
 
 def assign_folds(table: pd.DataFrame, folds: int, seed: int) -> Mapping[str, int]:

@@ -128,25 +128,6 @@ class Fit:
     others: Rows
 
 
-def gram(features: Parts, fitted: Rows) -> Array:
-    """Return inner products (n, k) of all trials with the ``fitted`` ones, standardised by these.
-
-    Parameters
-    ----------
-    features
-        Features of n trials.
-    fitted
-        Row numbers (k) of the trials that set mean and standard deviation of every feature.
-        Features that are constant among them are ignored.
-    """
-    table = JoinedFeatures(features)
-    others = np.setdiff1d(np.arange(table.shape[0]), fitted)
-    ((within, across),) = grams([table], [Fit(fitted, others)])
-    out = np.empty((table.shape[0], len(fitted)))
-    out[fitted], out[others] = within, across
-    return out
-
-
 def grams(tables: Sequence[JoinedFeatures], fits: Sequence[Fit]) -> list[tuple[Array, Array]]:
     """Return the Gram matrices of several fits.
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from physion.clips.batch import Batch
@@ -17,17 +18,17 @@ from physion.clips.source import ObservedSource, WholeSource
 from physion.compute.tasks import Executor, Progress
 from physion.core.errors import BadInputError
 from physion.models.interface import Model, TrainingSettings, ask, can
-from physion.readout.decisions import (
-    Decided,
-    FeatureDecision,
-    Readout,
-    RolloutDecision,
-    decisions,
-)
+from physion.readout.decisions import Decided, Decision, Readout, decisions
 from physion.readout.features import Arguments, FeatureStore, Imagined, StoredFeatures
 from physion.readout.folds import Fold, Protocol, ScenarioSplit
 from physion.readout.logistic import LogisticSettings
-from physion.readout.model_calls import call_model, check_finite, is_network, to_array
+from physion.readout.model_calls import (
+    call_model,
+    check_finite,
+    is_network,
+    model_name,
+    to_array,
+)
 from physion.readout.settings import EvaluationSettings
 from physion.readout.tables import ScenarioPredictions, describe_labels
 from physion.readout.train import Trainer
@@ -51,21 +52,18 @@ def decision_name(model: Model, wanted: str = "") -> str:
     return ask(model, "decision") or ("logistic" if can(model, "encode") else "gap")
 
 
-def build_decision(
-    model: Model, wanted: str, settings: LogisticSettings
-) -> FeatureDecision | RolloutDecision:
+def build_decision(model: Model, wanted: str, settings: LogisticSettings) -> Decision:
     """Return the decision of a model; raise `BadInputError` if it does not fit the model."""
     name = decision_name(model, wanted)
     decision = decisions.get(name)(settings)
-    if decision.input == "features" and not can(model, "encode"):
+    method, others = {
+        "features": ("encode", "decision gap or noise"),
+        "rollouts": ("imagine", "decision logistic"),
+    }[decision.input]
+    if not can(model, method):
         raise BadInputError(
-            f"decision {name!r} needs features, but model {model.provenance().model} has no "
-            "method encode; use the decision gap or noise"
-        )
-    if decision.input == "rollouts" and not can(model, "imagine"):
-        raise BadInputError(
-            f"decision {name!r} needs rollouts, but model {model.provenance().model} has no "
-            "method imagine; use the decision logistic"
+            f"decision {name!r} needs {decision.input}, but model {model_name(model)} has no "
+            f"method {method}; use the {others}"
         )
     return decision
 
@@ -81,16 +79,14 @@ def ways(model: Model, decision: str = "") -> dict[Readout, Way]:
         if model.spec.future:
             found[Readout.FULL] = Way.FEATURES
     if can(model, "imagine"):
-        by_features = (
-            decisions.get(decision_name(model, decision))(LogisticSettings()).input == "features"
-        )
-        found[Readout.OBSERVED_SIMULATED] = Way.FEATURES if by_features else Way.ROLLOUTS
+        needs = decisions.get(decision_name(model, decision))(LogisticSettings()).input
+        found[Readout.OBSERVED_SIMULATED] = Way.FEATURES if needs == "features" else Way.ROLLOUTS
     if can(model, "predict") or can(model, "fit"):
         found[Readout.named(ask(model, "answers"))] = Way.ANSWERS
     if not found:
         raise BadInputError(
-            f"{_name(model)} has none of the methods encode, imagine, predict and fit, so that it "
-            "cannot be evaluated"
+            f"{model_name(model)} has none of the methods encode, imagine, predict and fit, so "
+            "that it cannot be evaluated"
         )
     return {readout: found[readout] for readout in Readout if readout in found}
 
@@ -105,17 +101,15 @@ def choose_readouts(model: Model, names: tuple[str, ...], decision: str = "") ->
     impossible = [readout.value for readout in requested if readout not in possible]
     if impossible:
         raise BadInputError(
-            f"{_name(model)} does not support the readout {', '.join(impossible)}; "
+            f"{model_name(model)} does not support the readout {', '.join(impossible)}; "
             f"supported: {', '.join(readout.value for readout in possible)}"
         )
     return {r: way for r, way in possible.items() if not requested or r in requested}
 
 
-def _name(model: Any) -> str:
-    return str(model.provenance().model)
-
-
 _UNKNOWN = float("nan")
+_Made = tuple[Decided, tuple[str, ...], tuple[str, ...]]
+"""What was decided, and the fit and tested trials of which that could be done."""
 _ANSWER_TRIALS = 16
 """Trials of which a model is asked at a time."""
 
@@ -142,7 +136,7 @@ class Predictor:
     protocol, seed
         Training protocol, None if the model is not trained, and seed.
     folder
-        Output folder; None keeps nothing.
+        Output folder.
     executor
         Runs simulations; by default they run in this process.
     progress
@@ -156,24 +150,28 @@ class Predictor:
         ways: Mapping[Readout, Way],
         settings: EvaluationSettings,
         *,
+        folder: Path,
         training: TrainingSettings | None = None,
         protocol: Protocol | None = None,
         seed: int = 0,
-        folder: Path | None = None,
         executor: Executor | None = None,
         progress: Progress | None = None,
     ) -> None:
         self.dataset, self.model, self.ways, self.settings = dataset, model, ways, settings
         self.seed, self.progress = seed, progress
         self._protocol = protocol
-        index = dataset.index
-        self._simulated = dict(zip(index["trial"], index["contact"].astype(bool), strict=True))
+        index = dataset.index.set_index("trial")
         known = index["recorded_contact"]
-        outcomes = known.fillna(index["contact"]).astype(bool)
-        self._outcomes = dict(zip(index["trial"], outcomes, strict=True))
-        self._recorded = dict(zip(index["trial"], known.notna(), strict=True))
-        features = folder / "features" if folder is not None else None
-        self._store = FeatureStore(features, batch=settings.encoder_batch, executor=executor)
+        self._labels = pd.DataFrame(
+            {
+                "simulated": index["contact"].astype(bool),
+                "recorded": known.fillna(index["contact"]).astype(bool),
+                "known": known.notna(),
+            }
+        )
+        self._store = FeatureStore(
+            folder / "features", batch=settings.encoder_batch, executor=executor
+        )
         self.problems: dict[str, str] = self._store.problems
         """Reasons of trials that could not be predicted, by name."""
         self._trainer: Trainer | None = None
@@ -187,7 +185,7 @@ class Predictor:
                     self._whole,
                     self._store,
                     training,
-                    folder / "training" if folder is not None else None,
+                    folder / "training",
                     make_fabric(Devices(settings.accelerator), training.precision),
                     progress,
                 )
@@ -229,64 +227,50 @@ class Predictor:
         way: Way,
         losses: tuple[float, float],
     ) -> ScenarioPredictions:
+        decision = None
         if way is Way.ANSWERS:
-            decided, fit, test, labels = self._answer(split, readout)
-        elif way is Way.FEATURES:
-            decided, fit, test, labels = self._decide_on_features(split, readout)
+            decided, fit, test = self._answer(split, readout)
         else:
-            decided, fit, test, labels = self._decide_on_rollouts(split)
-        fits = way is not Way.ANSWERS or can(self.model, "fit")
+            decision = build_decision(self.model, self.settings.decision, self.settings.logistic)
+            decide = self._decide_on_features if way is Way.FEATURES else self._decide_on_rollouts
+            decided, fit, test = decide(decision, split, readout)
+        if decision is None and not can(self.model, "fit"):
+            fit = ()
+        recorded = decision is None or decision.labels == "recorded"
+        # Weights that were never trained, since the user wants it so.
+        learns = can(self.model, "loss") and not ask(self.model, "trained")
+        untrained = self.settings.untrained and learns
+        trained = self._trainer is not None
         return ScenarioPredictions(
             scenario=split.scenario,
             readout=readout.value,
             trials=test,
-            probability=decided.probability,
-            train_accuracy=decided.train_accuracy,
-            fit_trials=len(fit) if fits else 0,
+            decided=decided,
+            fit_trials=len(fit),
             fold=fold.number,
-            fit_labels=self._describe(fit, labels) if fits else "",
-            decision=""
-            if way is Way.ANSWERS
-            else decision_name(self.model, self.settings.decision),
-            protocol=self._protocol.value if self._trainer is not None and self._protocol else "",
-            seed=str(self.seed) if self._trainer is not None or self._untrained else "",
-            c=decided.c,
-            cv_accuracy=decided.cv_accuracy,
-            fitted=decided.fitted,
+            fit_labels=describe_labels([recorded and self._labels["known"][t] for t in fit]),
+            decision="" if decision is None else decision_name(self.model, self.settings.decision),
+            protocol=self._protocol.value if trained and self._protocol else "",
+            seed=str(self.seed) if trained or untrained else "",
             validation_loss=losses[0],
             copy_last_loss=losses[1],
-            note=self._note(decided.note),
+            note="; ".join(filter(None, ("untrained" if untrained else "", decided.note))),
         )
 
-    def _note(self, note: str) -> str:
-        return "; ".join(part for part in ("untrained" if self._untrained else "", note) if part)
-
-    @property
-    def _untrained(self) -> bool:
-        """Whether the model has weights that were never trained, since the user wants it so."""
-        learns = can(self.model, "loss") and not ask(self.model, "trained")
-        return self.settings.untrained and learns
-
-    def _describe(self, fit: Sequence[str], labels: str) -> str:
-        return describe_labels([labels == "recorded" and self._recorded[trial] for trial in fit])
-
-    def _labels(self, trials: Sequence[str], kind: str) -> NDArray[np.bool_]:
-        known = self._outcomes if kind == "recorded" else self._simulated
-        return np.array([known[trial] for trial in trials], np.bool_)
+    def _labels_of(self, trials: Sequence[str], kind: str) -> NDArray[np.bool_]:
+        return self._labels[kind].loc[list(trials)].to_numpy(bool)
 
     def _decide_on_features(
-        self, split: ScenarioSplit, readout: Readout
-    ) -> tuple[Decided, tuple[str, ...], tuple[str, ...], str]:
-        decision = build_decision(self.model, self.settings.decision, self.settings.logistic)
-        assert decision.input == "features", "the way says so"
+        self, decision: Decision, split: ScenarioSplit, readout: Readout
+    ) -> _Made:
         trials = [*split.fit, *split.test]
         parts = self._parts(trials, readout)
         rows = np.arange(len(trials))
         count = len(split.fit)
         fit = [part.select(rows[:count]) for part in parts]
         test = [part.select(rows[count:]) for part in parts]
-        labels = self._labels(split.fit, decision.labels)
-        return decision.decide(fit, labels, test), split.fit, split.test, decision.labels
+        labels = self._labels_of(split.fit, decision.labels)
+        return decision.decide(fit, labels, test), split.fit, split.test
 
     def _parts(self, trials: Sequence[str], readout: Readout) -> list[StoredFeatures]:
         """Return the features that a decision gets under a readout; they are joined in time."""
@@ -310,7 +294,7 @@ class Predictor:
         simulated = imagined.features()
         if simulated is None:
             raise BadInputError(
-                f"model {self.model.provenance().model!r}: imagine gave no features, which the "
+                f"model {model_name(self.model)!r}: imagine gave no features, which the "
                 f"decision {decision_name(self.model, self.settings.decision)!r} needs"
             )
         return [context, simulated]
@@ -337,11 +321,7 @@ class Predictor:
             progress=self.progress,
         )
 
-    def _decide_on_rollouts(
-        self, split: ScenarioSplit
-    ) -> tuple[Decided, tuple[str, ...], tuple[str, ...], str]:
-        decision = build_decision(self.model, self.settings.decision, self.settings.logistic)
-        assert decision.input == "rollouts", "the way says so"
+    def _decide_on_rollouts(self, decision: Decision, split: ScenarioSplit, _: Readout) -> _Made:
         found = self._imagined([*split.fit, *split.test])
         fit = tuple(trial for trial in split.fit if trial not in self.problems)
         test = tuple(trial for trial in split.test if trial not in self.problems)
@@ -349,15 +329,13 @@ class Predictor:
             reason = self.problems[split.fit[0]]
             raise BadInputError(f"no trial of {split.scenario} to fit on was imagined: {reason}")
         if not test:
-            return Decided(np.empty(0), _UNKNOWN), fit, test, decision.labels
-        labels = self._labels(fit, decision.labels)
+            return Decided(np.empty(0), _UNKNOWN), fit, test
+        labels = self._labels_of(fit, decision.labels)
         near = {arguments: imagined.outcomes(fit) for arguments, imagined in found.items()}
         tested = {arguments: imagined.outcomes(test) for arguments, imagined in found.items()}
-        return decision.decide(near, labels, tested), fit, test, decision.labels
+        return decision.decide(near, labels, tested), fit, test
 
-    def _answer(
-        self, split: ScenarioSplit, readout: Readout
-    ) -> tuple[Decided, tuple[str, ...], tuple[str, ...], str]:
+    def _answer(self, split: ScenarioSplit, readout: Readout) -> _Made:
         """Ask the model itself, after it was fitted on the fit trials if it can be."""
         source: Any = self._whole if readout.sees_future else self._observed
         read = source.whole if readout.sees_future else source.context
@@ -365,39 +343,29 @@ class Predictor:
         accuracy = _UNKNOWN
         if can(self.model, "fit"):
             fit_batch = read(split.fit)
-            labels = self._labels(split.fit, "recorded")
+            labels = self._labels_of(split.fit, "recorded")
             asked = call_model(self.model, "fit", fit_batch, labels, self.seed)
             if len(labels):
                 accuracy = float(np.mean((self._probability(asked, fit_batch) > 0.5) == labels))
         predicted: dict[str, float] = {}
         for start in range(0, len(split.test), _ANSWER_TRIALS):
             group = split.test[start : start + _ANSWER_TRIALS]
-            try:
-                answers = self._probability(asked, read(group))
-            except BadInputError as error:
-                if len(group) == 1:
-                    self.problems[group[0]] = str(error)
-                    continue
-                answers = self._one_by_one(asked, read, group)
-            predicted |= {
-                trial: float(p) for trial, p in zip(group, answers, strict=True) if np.isfinite(p)
-            }
+            predicted |= self._ask(asked, read, group)
             if self.progress is not None:
-                self.progress(
-                    "trials", min(start + _ANSWER_TRIALS, len(split.test)), len(split.test)
-                )
+                self.progress("trials", start + len(group), len(split.test))
         probability = np.array(list(predicted.values()), np.float64)
-        return Decided(probability, accuracy), split.fit, tuple(predicted), "recorded"
+        return Decided(probability, accuracy), split.fit, tuple(predicted)
 
-    def _one_by_one(self, asked: Any, read: Any, group: Sequence[str]) -> NDArray[np.float64]:
-        """Return the answers for a group of which a trial fails; NaN for those that do."""
-        answers = np.full(len(group), np.nan)
-        for row, trial in enumerate(group):
-            try:
-                answers[row] = self._probability(asked, read([trial]))[0]
-            except BadInputError as error:
-                self.problems[trial] = str(error)
-        return answers
+    def _ask(self, asked: Any, read: Any, group: Sequence[str]) -> dict[str, float]:
+        """Return the answers by trial; if a trial fails, the others are asked for one by one."""
+        try:
+            answers = self._probability(asked, read(group))
+        except BadInputError as error:
+            if len(group) > 1:
+                return {t: p for one in group for t, p in self._ask(asked, read, [one]).items()}
+            self.problems[group[0]] = str(error)
+            return {}
+        return dict(zip(group, answers.tolist(), strict=True))
 
     def _probability(self, asked: Any, batch: Batch) -> NDArray[np.float64]:
         what, kinds = "predict gave probabilities", ("float64", "float32")
@@ -408,7 +376,7 @@ class Predictor:
         outside = np.flatnonzero((values < 0) | (values > 1))
         if len(outside):
             raise BadInputError(
-                f"model {self.model.provenance().model!r}, trial "
+                f"model {model_name(self.model)!r}, trial "
                 f"{batch.trials[outside[0]]!r}: predict gave {values[outside[0]]}, not a "
                 "probability"
             )

@@ -9,13 +9,13 @@ For a trial, object i with centre c_i, and a step of s frames, k steps after fra
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from physion.clips.batch import LAST_OBSERVED, Motion, Spec
+from physion.clips.batch import LAST_OBSERVED, Motion
 from physion.clips.clips import observed_source, whole_source
 from physion.compute.tasks import Progress
 from physion.core.errors import BadInputError
@@ -42,25 +42,13 @@ _TRIALS = 16
 F64 = NDArray[np.float64]
 
 
-@runtime_checkable
-class MovesObjects(Protocol):
-    """Model that gives the imagined motion of objects, as `ParticleSimulator.futures`."""
+def check_moves_objects(model: Model) -> Any:
+    """Return the model; raise `BadInputError` if it gives no motion of objects.
 
-    @property
-    def spec(self) -> Spec:
-        """What the model asks for; ``stride`` is the step of its motions."""
-        ...
-
-    def futures(
-        self, motions: Sequence[Motion], samples: int, seed: int
-    ) -> Sequence[Sequence[tuple[SceneParticles, Poses]]]:
-        """Return particles and motion from frame 44 % stride on, by motion and sample."""
-        ...
-
-
-def check_moves_objects(model: Model) -> MovesObjects:
-    """Return the model; raise `BadInputError` if it gives no motion of objects."""
-    if not isinstance(model, MovesObjects):
+    A model that does has the method ``futures(motions, samples, seed)`` of `ParticleSimulator`,
+    which returns particles and motion from frame 44 % stride on, by motion and sample.
+    """
+    if not callable(getattr(model, "futures", None)):
         raise BadInputError(
             f"model {model_name(model)!r} imagines no motion of objects, so that its rollout has "
             "no error; choose a particle model such as dpi, or leave --rollout-error away"

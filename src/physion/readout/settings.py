@@ -1,20 +1,47 @@
-"""Settings of evaluations and trainings."""
+"""What is evaluated or trained: settings, models with their options, and all cells of these.
+
+A cell is a model under one training protocol with one seed. Settings of a model and of its training
+are options of the model: ``options={"steps": 500}``.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from physion.core.errors import BadInputError
+from physion.compute.local import SerialExecutor
+from physion.compute.run_tasks import run_tasks
+from physion.compute.tasks import Executor, Progress
+from physion.core.errors import BadInputError, PhysionError
+from physion.core.settings import field_types, parse_pairs, read_settings, split_names
+from physion.models.build import build_model, build_untrained, option_names
+from physion.models.interface import Model, TrainingSettings, ask, can
+from physion.models.user_files import is_file_name
+from physion.readout.folds import Protocol
 from physion.readout.logistic import LogisticSettings
+from physion.readout.model_calls import is_network
+from physion.trials.dataset import Dataset
 
 
 @dataclass(frozen=True, kw_only=True)
 class HarnessSettings:
     """Settings that evaluations and trainings have in common."""
 
+    protocols: Annotated[tuple[str, ...], tyro.conf.arg(aliases=("--protocol",))] = ("all",)
+    """Scenarios that train a model: all, all-but the tested one, or only the tested one; several
+    with commas. Weights that ship saw all: under the others such a model starts from random ones.
+    A model that is not trained is evaluated once."""
+    scenario: str = ""
+    """Tested scenario; default: all of them. A training needs it for all-but or only one."""
+    seeds: int = 1
+    """Number of seeds, from --seed on."""
+    seed: int = 0
+    """First seed: of initial weights, folds and training."""
     folds: int = 5
     """Folds of the cross-validation of a dataset without a readout split."""
     encoder_batch: int = 4
@@ -25,11 +52,25 @@ class HarnessSettings:
     """Device of the networks, by Lightning's name: auto, cpu, cuda, ..."""
 
     def __post_init__(self) -> None:
-        if self.encoder_batch < 1 or self.folds < 2:
+        if self.encoder_batch < 1 or self.folds < 2 or self.seeds < 1:
             raise BadInputError(
-                f"encoder_batch must be at least 1 and folds at least 2, not "
-                f"{self.encoder_batch} and {self.folds}"
+                "encoder_batch and seeds must be at least 1 and folds at least 2, not "
+                f"{self.encoder_batch}, {self.seeds} and {self.folds}"
             )
+
+    def chosen_protocols(self) -> list[Protocol]:
+        """Return the protocols, each once; raise `UnknownNameError` for one that is unknown."""
+        return [Protocol.named(name) for name in split_names(self.protocols, "training protocol")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainSettings(HarnessSettings):
+    """Settings of trainings."""
+
+    devices: int = 1
+    """Devices of each node, among which every batch is divided."""
+    nodes: int = 1
+    """Nodes; the same command is started on each, as Lightning describes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +84,256 @@ class EvaluationSettings(HarnessSettings):
     own."""
     untrained: bool = False
     """Leave the weights of the model as they are; the table says untrained."""
+    rollout_errors: Annotated[bool, tyro.conf.arg(aliases=("--rollout-error",))] = False
+    """Also write how far imagined motion is from the true one over time, for particle models."""
     logistic: Annotated[LogisticSettings, tyro.conf.Suppress] = field(
         default_factory=LogisticSettings
     )
     """Settings of the logistic regression."""
+
+
+R = TypeVar("R")
+
+Models = str | Model | Sequence[str | Model] | Mapping[str, Mapping[str, Any]]
+"""Models by name, ``FILE.py:Class``, or built: one or several; or names with options of their own.
+"""
+SEED, WEIGHTS = "seed", "weights"
+"""Options of models: seed of the initial weights, and trained weights."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChosenModel:
+    """Model of an evaluation or training, and the options that a user sets.
+
+    - ``model``: its name, or the model itself. ``options``: fields of its settings.
+    - ``training``: fields of `TrainingSettings` that replace the model's.
+    """
+
+    model: str | Model
+    options: Mapping[str, Any]
+    training: Mapping[str, Any]
+
+    @property
+    def name(self) -> str:
+        """Name in messages."""
+        return self.model if isinstance(self.model, str) else self.model.provenance().model
+
+    def build(self, seed: int, *, untrained: bool = False) -> Any:
+        """Return the model; ``seed``: of its initial weights if it has one.
+
+        With ``untrained``, a model whose weights ship starts from random ones.
+        """
+        if not isinstance(self.model, str):
+            return self.model
+        options = dict(self.options)
+        if SEED in option_names(self.model):
+            options.setdefault(SEED, seed)
+        return (build_untrained if untrained else build_model)(self.model, **options)
+
+    def comes_trained(self, model: Any) -> bool:
+        """Return whether a built model has trained weights that the user did not ask for."""
+        named = isinstance(self.model, str) and WEIGHTS not in self.options
+        return named and can(model, "loss") and bool(ask(model, "trained"))
+
+    def settings_of(self, model: Any) -> TrainingSettings | None:
+        """Return the settings of the training of a built model; None if it does not learn."""
+        if not (is_network(model) and can(model, "loss")):
+            return None
+        own: TrainingSettings = ask(model, "training_settings")
+        return dataclasses.replace(own, **self.training)
+
+
+def choose_models(models: Models, options: Mapping[str, Any] | None = None) -> list[ChosenModel]:
+    """Return the models of an evaluation or training, each with its options.
+
+    Parameters
+    ----------
+    models
+        Models, or names with options of their own.
+    options
+        Options of every model: fields of its settings, or of `TrainingSettings`.
+
+    Raises
+    ------
+    BadInputError
+        If there is no model, an option has a wrong type, or a model that is built gets options that
+        do not belong to a training.
+    """
+    own: Mapping[Any, Mapping[str, Any]] = models if isinstance(models, Mapping) else {}
+    listed = [models] if isinstance(models, str) or hasattr(models, "provenance") else list(models)
+    if not listed:
+        raise BadInputError("no model is named")
+    given = {**(options or {})}
+    return [_choose(model, {**given, **(own[model] if own else {})}) for model in listed]
+
+
+def _choose(model: Any, options: Mapping[str, Any]) -> ChosenModel:
+    kinds = field_types(TrainingSettings)
+    # An argument of a user's class may have the name of a setting of the training.
+    own = option_names(model) if isinstance(model, str) and is_file_name(model) else ()
+    training = {
+        name: read_settings(kinds[name], v, f"option {name} of the training")
+        for name, v in options.items()
+        if name in kinds and name not in own
+    }
+    TrainingSettings(**training)  # which refuses values out of range
+    rest = {name: value for name, value in options.items() if name not in training}
+    if rest and not isinstance(model, str):
+        raise BadInputError("options are for a model that is given by its name; this one is built")
+    return ChosenModel(model, rest, training)
+
+
+def options_by_model(
+    models: Sequence[str],
+    pairs: Sequence[str],
+    presets: Mapping[str, Mapping[str, Any]] | None = None,
+) -> dict[str, dict[str, Any]]:
+    """Return the options of every model from pairs of the command line.
+
+    A pair is ``NAME=VALUE`` for all models, or ``MODEL:NAME=VALUE`` for one; ``presets`` are used
+    where ``pairs`` set nothing. Raises `BadInputError` for what is no pair, or given twice.
+    """
+    own: dict[str, list[str]] = {name: [] for name in models}
+    for pair in pairs:
+        named = [name for name in models if pair.startswith(f"{name}:")]
+        for name in named or models:
+            own[name].append(pair.removeprefix(f"{name}:"))
+    known = presets or {}
+    return {name: {**known.get(name, {}), **parse_pairs(own[name], "--option")} for name in models}
+
+
+def open_dataset(dataset: Dataset | Path | str, executor: Executor | None) -> Dataset:
+    """Return the dataset, with an absolute path for processes of ``executor``."""
+    opened = Dataset(Path(dataset)) if isinstance(dataset, str | Path) else dataset
+    if executor is None:
+        return opened
+    return Dataset(opened.folder.absolute(), verify=opened.verify)
+
+
+@dataclass(eq=False)
+class Cell:
+    """A model with a training protocol and a seed.
+
+    ``protocol`` is None if the model is not trained. ``untrained``: its weights ship, but the
+    training starts from random ones.
+    """
+
+    chosen: ChosenModel
+    protocol: Protocol | None
+    seed: int
+    untrained: bool = False
+    built: Any = field(default=None, repr=False)
+
+    @property
+    def label(self) -> str:
+        """Model, protocol and seed, as text."""
+        protocol = f", {self.protocol.value}" if self.protocol is not None else ""
+        return f"{self.chosen.name}{protocol}, seed {self.seed}"
+
+    def take_model(self) -> Any:
+        """Return the model. The cell does not keep it, so that not all are in memory."""
+        model, self.built = self.built, None
+        return model or self.chosen.build(self.seed, untrained=self.untrained)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "built": None}
+
+
+def plan_cells(
+    models: Sequence[ChosenModel],
+    settings: HarnessSettings,
+    trains: Callable[[Any], bool],
+    *,
+    every_seed: bool = False,
+    untrained: bool = False,
+) -> list[Cell]:
+    """Return the cells of all models, protocols and seeds.
+
+    Parameters
+    ----------
+    models
+        Models. Each is built once now, so that mistakes are found before anything is done.
+    settings
+        Protocols and seeds.
+    trains
+        Whether a built model is trained; one that is not has a single cell.
+    every_seed
+        Whether also a model that is not trained has a cell for each seed.
+    untrained
+        Whether models whose weights ship start from random ones.
+
+    Raises
+    ------
+    UnknownNameError
+        For an unknown protocol, model or option.
+    BadInputError
+        If a model cannot be built, or two cells have the same name.
+    """
+    protocols, first = settings.chosen_protocols(), settings.seed
+    built = [model.build(first, untrained=untrained) for model in models]
+    cells: list[Cell] = []
+    for seed in range(first, first + settings.seeds):
+        for model, example in zip(models, built, strict=True):
+            ready = example if seed == first else None
+            if trains(example):
+                cells += [Cell(model, p, seed, untrained) for p in protocols]
+                cells[-len(protocols)].built = ready
+                continue
+            # Weights that ship were trained on all scenarios.
+            anew = protocols if model.comes_trained(example) and not every_seed else []
+            once = Protocol.ALL in protocols or not anew
+            network = can(example, "loss") and not ask(example, "trained")
+            if once and (seed == first or (every_seed and network)):
+                cells.append(Cell(model, None, seed, built=ready))
+            cells += [Cell(model, p, seed, untrained=True) for p in anew if p is not Protocol.ALL]
+    labels = [cell.label for cell in cells]
+    twice = [label for label in labels if labels.count(label) > 1]
+    if twice:
+        raise BadInputError(f"{twice[0]} is asked for twice; models need names of their own")
+    return cells
+
+
+def run_cells(
+    cells: Sequence[Cell],
+    function: Callable[[Cell], R],
+    folder: Path,
+    what: str,
+    executor: Executor | None,
+    progress: Progress | None,
+) -> tuple[list[R], dict[str, str]]:
+    """Do all cells; one that fails does not stop the others.
+
+    Parameters
+    ----------
+    cells, function
+        Cells, and the function that does one.
+    folder, what
+        Output folder and label of the progress.
+    executor
+        Does the cells; this process without one.
+    progress
+        Called after each.
+
+    Returns
+    -------
+    results, failed
+        Results in the order of the cells, and the reasons of failures by label.
+
+    Raises
+    ------
+    PhysionError
+        If the only cell fails, or nothing more can be written.
+    """
+    if executor is None and len(cells) == 1:
+        return [function(cells[0])], {}
+    results, failed = run_tasks(
+        function,
+        {cell.label: cell for cell in cells},
+        folder=folder,
+        what=what,
+        executor=executor or SerialExecutor(),
+        progress=progress,
+    )
+    if failed and len(cells) == 1:
+        raise PhysionError(next(iter(failed.values())))
+    return list(results.values()), failed

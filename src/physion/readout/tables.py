@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 
 from physion.clips.batch import Provenance
 from physion.core.files import write_with_digest
 from physion.core.version import MADE_WITH
+from physion.readout.decisions import Decided
 
 COLUMNS = (
     "model", "readout", "protocol", "init", "seed", "stimulus", "scenario", "p_contact", "outcome",
@@ -61,22 +62,22 @@ _DTYPES = {
 
 @dataclass(frozen=True)
 class ScenarioPredictions:
-    """Predictions of one scenario under one readout in one fold; arrays are over ``trials``."""
+    """Predictions of one scenario under one readout in one fold.
+
+    ``decided`` holds P(contact) of ``trials`` and what was fitted; the other fields are columns of
+    the table.
+    """
 
     scenario: str
     readout: str
     trials: tuple[str, ...]
-    probability: np.ndarray
-    train_accuracy: float
+    decided: Decided
     fit_trials: int
     fold: int
     fit_labels: str
     protocol: str = ""
     seed: str = ""
     decision: str = ""
-    c: float = float("nan")
-    cv_accuracy: float = float("nan")
-    fitted: Mapping[str, float] = field(default_factory=dict)
     validation_loss: float = float("nan")
     copy_last_loss: float = float("nan")
     note: str = ""
@@ -99,47 +100,40 @@ def make_table(
 ) -> pd.DataFrame:
     """Return the sorted table of predictions."""
     truth = index.set_index("trial")
-    versions = provenance.versions
-    if "physion " not in versions:
-        versions = f"{versions}, {MADE_WITH}" if versions else MADE_WITH
+    facts = dataclasses.asdict(provenance)
+    if "physion " not in facts["versions"]:
+        facts["versions"] = ", ".join(filter(None, (facts["versions"], MADE_WITH)))
     rows = []
     for part in predictions:
-        for trial, p in zip(part.trials, part.probability, strict=True):
+        decided = part.decided
+        shared = facts | {
+            "readout": part.readout,
+            "protocol": part.protocol,
+            "seed": part.seed,
+            "scenario": part.scenario,
+            "decision": part.decision,
+            "train_accuracy": decided.train_accuracy,
+            "cv_accuracy": decided.cv_accuracy,
+            "fit_labels": part.fit_labels,
+            "fit_trials": part.fit_trials,
+            "fold": part.fold,
+            "readout_c": decided.c,
+            "noise_scale": decided.fitted.get("scale", float("nan")),
+            "gap_threshold": decided.fitted.get("gap", float("nan")),
+            "validation_loss": part.validation_loss,
+            "copy_last_loss": part.copy_last_loss,
+            "note": part.note,
+        }
+        for trial, p in zip(part.trials, decided.probability, strict=True):
             recorded = truth["recorded_contact"][trial]
             rows.append(
-                {
-                    "model": provenance.model,
-                    "readout": part.readout,
-                    "protocol": part.protocol,
-                    "init": provenance.init,
-                    "seed": part.seed,
+                shared
+                | {
                     "stimulus": trial,
-                    "scenario": part.scenario,
                     "p_contact": float(p),
                     "outcome": bool(truth["contact"][trial]),
                     "recorded_outcome": "" if pd.isna(recorded) else bool(recorded),
                     "observed_contact": bool(truth["observed_contact"][trial]),
-                    "inputs": provenance.inputs,
-                    "decision": part.decision,
-                    "train_accuracy": part.train_accuracy,
-                    "cv_accuracy": part.cv_accuracy,
-                    "fit_labels": part.fit_labels,
-                    "fit_trials": part.fit_trials,
-                    "fold": part.fold,
-                    "readout_c": part.c,
-                    "noise_scale": part.fitted.get("scale", float("nan")),
-                    "gap_threshold": part.fitted.get("gap", float("nan")),
-                    "validation_loss": part.validation_loss,
-                    "copy_last_loss": part.copy_last_loss,
-                    "encoder_type": provenance.encoder_type,
-                    "encoder_pretraining_task": provenance.encoder_pretraining_task,
-                    "encoder_pretraining_dataset": provenance.encoder_pretraining_dataset,
-                    "encoder_pretraining_seed": provenance.encoder_pretraining_seed,
-                    "encoder_training_task": provenance.encoder_training_task,
-                    "dynamics_type": provenance.dynamics_type,
-                    "dynamics_training_task": provenance.dynamics_training_task,
-                    "note": part.note,
-                    "versions": versions,
                 }
             )
     table = pd.DataFrame(rows, columns=list(COLUMNS))

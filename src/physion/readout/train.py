@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,12 +16,19 @@ from numpy.typing import NDArray
 from physion.clips.clips import whole_source
 from physion.clips.source import WholeSource
 from physion.compute.tasks import Executor, Progress
-from physion.core.errors import MissingExtraError
+from physion.core.errors import BadInputError, MissingExtraError
 from physion.models.interface import TrainingSettings
-from physion.readout.cells import Cell, Cells, Models, choose_models, open_dataset
 from physion.readout.features import FeatureStore
-from physion.readout.folds import Fold, select_scenario, training_folds
-from physion.readout.settings import HarnessSettings
+from physion.readout.folds import Fold, Protocol, select_scenario, training_folds
+from physion.readout.settings import (
+    Cell,
+    Models,
+    TrainSettings,
+    choose_models,
+    open_dataset,
+    plan_cells,
+    run_cells,
+)
 from physion.trials.dataset import Dataset
 
 if TYPE_CHECKING:
@@ -54,41 +62,27 @@ class Trainings:
     failed: Mapping[str, str]
 
 
+@dataclass(eq=False)
 class Trainer:
     """One model with its initial weights, which is trained on one set of trials after the other.
 
-    Parameters
-    ----------
-    model
-        `Learns` and a torch ``Module``.
-    source
-        Source of clips with the model's ``spec``.
-    store
-        Store of the features that models are trained on.
-    settings
-        Optimiser and schedule.
-    folder
-        Folder of all trainings; None keeps nothing.
-    fabric
-        Devices.
-    progress
-        Called after every step.
+    - ``source``: clips with the model's ``spec``. ``store``: features that models are trained on.
+    - ``settings``: optimiser and schedule. ``folder``: of all trainings. ``fabric``: devices.
+    - ``progress``: called after every step.
     """
 
-    def __init__(
-        self,
-        model: Any,
-        source: WholeSource,
-        store: FeatureStore,
-        settings: TrainingSettings,
-        folder: Path | None,
-        fabric: Fabric,
-        progress: Progress | None = None,
-    ) -> None:
-        self.model, self.settings, self._folder = model, settings, folder
-        self._source, self._store, self._fabric = source, store, fabric
-        self._progress = progress if fabric.is_global_zero else None
-        self._initial = copy.deepcopy(model.state_dict())
+    model: Any
+    source: WholeSource
+    store: FeatureStore
+    settings: TrainingSettings
+    folder: Path
+    fabric: Fabric
+    progress: Progress | None = None
+
+    def __post_init__(self) -> None:
+        self._initial = copy.deepcopy(self.model.state_dict())
+        if not self.fabric.is_global_zero:
+            self.progress = None
 
     def train(self, fold: Fold, seed: int) -> TrainedModel:
         """Train the model from its initial weights on the training trials of a fold, in place."""
@@ -97,15 +91,15 @@ class Trainer:
         self.restore()
         return train_model(
             self.model,
-            self._source,
+            self.source,
             fold.train,
             seed=seed,
             name=fold.training.name,
-            folder=self._folder,
+            folder=self.folder,
             settings=self.settings,
             features=self._features,
-            fabric=self._fabric,
-            progress=self._progress,
+            fabric=self.fabric,
+            progress=self.progress,
         )
 
     def plan(self, fold: Fold, seed: int) -> PlannedTraining:
@@ -113,9 +107,8 @@ class Trainer:
         from physion.models.checkpoint import WEIGHTS
         from physion.training.train import training_inputs, training_path
 
-        assert self._folder is not None, "what is planned is kept"
-        inputs = training_inputs(self.model, self._source, fold.train, self.settings, seed)
-        path = training_path(self._folder, self.model, fold.training.name, inputs)
+        inputs = training_inputs(self.model, self.source, fold.train, self.settings, seed)
+        path = training_path(self.folder, self.model, fold.training.name, inputs)
         model = self.model.provenance().model
         done = (path / WEIGHTS).is_file()
         return PlannedTraining(model, fold.training.name, seed, path, done)
@@ -125,7 +118,7 @@ class Trainer:
         self.model.load_state_dict(self._initial)
 
     def _features(self, trials: Sequence[str]) -> NDArray[np.float32]:
-        stored = self._store.encoded(self.model, self._source, trials, "whole", self._progress)
+        stored = self.store.encoded(self.model, self.source, trials, "whole", self.progress)
         return stored.array()
 
 
@@ -133,18 +126,13 @@ def train(
     models: Models,
     dataset: Dataset | Path | str,
     out: Path | str = "runs/models",
+    settings: TrainSettings | None = None,
     *,
-    protocols: Sequence[str] | str = ("all",),
-    scenario: str = "",
-    seeds: int = 1,
-    seed: int = 0,
     options: Mapping[str, Any] | None = None,
-    settings: HarnessSettings | None = None,
-    devices: int = 1,
-    nodes: int = 1,
     executor: Executor | None = None,
     progress: Progress | None = None,
     dry_run: bool = False,
+    **changes: Any,
 ) -> Trainings:
     """Train models without labels, as `evaluate` would, which then finds the results.
 
@@ -159,25 +147,18 @@ def train(
     out
         Output folder of `evaluate`; each training has a folder in ``training/``, whose name has a
         hash of all that determines the weights. What was trained before is not trained again.
-    protocols
-        Scenarios that train a model: ``all``, ``all-but`` one, or ``only`` one.
-    scenario
-        Scenario that all-but leaves out, or the one of only; by default one training for each.
-    seeds, seed
-        Number of seeds, and the first: of initial weights, folds and batches.
+    settings
+        Protocols, seeds, folds and devices.
     options
         Fields of the settings of the models, or of their training (`TrainingSettings`).
-    settings
-        Folds, batches and accelerator.
-    devices, nodes
-        Devices of each node among which every batch is divided, and nodes, on each of which the
-        same command is started, as Lightning describes.
     executor
         Runs the cells of models, protocols and seeds; by default this process, one by one.
     progress
         Called after every step.
     dry_run
         Only say what would be trained, and what is done.
+    **changes
+        Fields of `TrainSettings` to replace in ``settings``, such as ``seeds=3``.
 
     Returns
     -------
@@ -194,35 +175,28 @@ def train(
         from physion.training.train import check_trainable
     except ModuleNotFoundError as error:
         raise MissingExtraError("training", "models") from error
-    opened = open_dataset(dataset)
-    settings = settings if settings is not None else HarnessSettings()
-    chosen = choose_models(models, options)
-    cells = Cells(chosen, protocols, seeds, seed, lambda _: True, untrained=True)
-    for cell in cells.cells:
-        if cell.seed == seed:
-            check_trainable(cells.model(cell))
-            _folds(opened, cell, scenario, settings)
-    if executor is not None:  # whose processes may have another working directory
-        opened, out = Dataset(opened.folder.absolute(), verify=opened.verify), Path(out).absolute()
-    work = _TrainingWork(opened, Path(out), scenario, settings, devices, nodes)
 
-    def here(cell: Cell) -> list[Any]:
-        return work.do(cell, cells.model(cell), progress, dry_run=dry_run)
+    def trains(model: Any) -> bool:
+        check_trainable(model)
+        return True
 
-    if devices * nodes > 1 or dry_run:
+    settings = dataclasses.replace(settings or TrainSettings(), **changes)
+    cells = plan_cells(choose_models(models, options), settings, trains, untrained=True)
+    out = Path(out) if executor is None else Path(out).absolute()
+    work = _Train(open_dataset(dataset, executor), out, settings)
+    for cell in cells:
+        work.folds(cell)  # which refuses a dataset without the trials that are needed
+    if dry_run:
+        planned = [one for cell in cells for one in work(cell, dry_run=True)]
+        return Trainings([], planned, {})
+    failed: dict[str, str] = {}
+    if settings.devices * settings.nodes > 1:
         # A failure ends the run: the processes on other devices would wait for this one.
-        lists = [here(cell) for cell in cells.cells]
-        failed: dict[str, str] = {}
+        lists = [work(cell, progress) for cell in cells]
     else:
-        lists, failed = cells.run(here, work, Path(out), "trainings", executor, progress)
-    made = [one for of_cell in lists for one in of_cell]
-    return Trainings([], made, failed) if dry_run else Trainings(made, [], failed)
-
-
-def _folds(dataset: Dataset, cell: Cell, scenario: str, settings: HarnessSettings) -> list[Fold]:
-    assert cell.protocol is not None, "all models are trained"
-    folds = training_folds(dataset.index, cell.protocol, settings.folds, cell.seed)
-    return select_scenario(folds, cell.protocol, scenario)
+        do = work if executor is not None else functools.partial(work, progress=progress)
+        lists, failed = run_cells(cells, do, out, "trainings", executor, progress)
+    return Trainings([one for of_cell in lists for one in of_cell], [], failed)
 
 
 @functools.cache
@@ -234,47 +208,42 @@ def _open_devices(accelerator: str, devices: int, nodes: int, precision: str) ->
 
 
 @dataclass(frozen=True)
-class _TrainingWork:
+class _Train:
     """Function that trains a cell, with all that a process needs for it."""
 
     dataset: Dataset
     out: Path
-    scenario: str
-    settings: HarnessSettings
-    devices: int
-    nodes: int
+    settings: TrainSettings
 
-    def __call__(self, cell: Cell) -> list[Any]:
-        model = cell.chosen.build(cell.seed, untrained=True)
-        return self.do(cell, model, None)
-
-    def do(
-        self,
-        cell: Cell,
-        model: Any,
-        progress: Progress | None,
-        *,
-        dry_run: bool = False,
+    def __call__(
+        self, cell: Cell, progress: Progress | None = None, *, dry_run: bool = False
     ) -> list[Any]:
         """Train a model on every fold, or only plan it; it has its initial weights afterwards."""
+        model, settings = cell.take_model(), self.settings
         training = cell.chosen.settings_of(model)
         assert training is not None, "checked before"
-        fabric = _open_devices(
-            self.settings.accelerator, self.devices, self.nodes, training.precision
-        )
         trainer = Trainer(
             model,
-            whole_source(self.dataset, model.spec, rendered=self.settings.rendered),
-            FeatureStore(self.out / "features", batch=self.settings.encoder_batch),
+            whole_source(self.dataset, model.spec, rendered=settings.rendered),
+            FeatureStore(self.out / "features", batch=settings.encoder_batch),
             training,
             self.out / "training",
-            fabric,
+            _open_devices(
+                settings.accelerator, settings.devices, settings.nodes, training.precision
+            ),
             progress,
         )
-        folds = _folds(self.dataset, cell, self.scenario, self.settings)
-        if dry_run:
-            return [trainer.plan(fold, cell.seed) for fold in folds]
+        do = trainer.plan if dry_run else trainer.train
         try:
-            return [trainer.train(fold, cell.seed) for fold in folds]
+            return [do(fold, cell.seed) for fold in self.folds(cell)]
         finally:
             trainer.restore()
+
+    def folds(self, cell: Cell) -> list[Fold]:
+        """Return the folds whose dynamics are trained."""
+        assert cell.protocol is not None, "all models are trained"
+        index, settings = self.dataset.index, self.settings
+        folds = training_folds(index, cell.protocol, settings.folds, cell.seed)
+        if settings.scenario and cell.protocol is Protocol.ALL:
+            raise BadInputError("a scenario needs the protocol all-but or only")
+        return select_scenario(folds, settings.scenario)

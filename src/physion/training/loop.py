@@ -12,9 +12,8 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import torch
@@ -24,7 +23,7 @@ from torch import Tensor, nn
 from physion.clips.batch import Batch
 from physion.clips.movies import background
 from physion.core.errors import BadInputError, PhysionError
-from physion.core.files import has_digest, remove_leftovers, write_atomic
+from physion.core.files import has_digest, write_atomic
 from physion.core.seeds import stable_hash
 from physion.models.build import describe_raised, is_out_of_memory
 from physion.models.checkpoint import (
@@ -189,18 +188,6 @@ class Plateau:
         if self.waited > settings.plateau_patience:
             self.factor, self.waited = self.factor * settings.plateau_factor, 0
 
-    def state(self) -> dict[str, Any]:
-        """Return the state as JSON values."""
-        return {"factor": self.factor, "best": self.best, "waited": self.waited}
-
-    @classmethod
-    def of(cls, state: Mapping[str, Any]) -> Plateau:
-        """Return the plateau with a stored `state`."""
-        best = state["best"]
-        return cls(
-            float(state["factor"]), None if best is None else float(best), int(state["waited"])
-        )
-
 
 # How far a training is: what a checkpoint holds in addition to weights and optimiser.
 
@@ -222,30 +209,10 @@ class TrainingState:
     validation: float = math.nan
     baseline: float = math.nan
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the state as JSON values."""
-        return {
-            "step": self.step,
-            "recent": self.recent,
-            "plateau": self.plateau.state(),
-            "loss": _finite(self.loss),
-            "validation": _finite(self.validation),
-            "baseline": _finite(self.baseline),
-        }
-
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> TrainingState:
-        """Return the state with the given JSON values."""
-        losses = {
-            name: math.nan if values[name] is None else float(values[name])
-            for name in ("loss", "validation", "baseline")
-        }
-        plateau = Plateau.of(values["plateau"])
-        return cls(int(values["step"]), list(values["recent"]), plateau, **losses)
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+        """Return the state with the given fields, as `dataclasses.asdict` gives them."""
+        return cls(**{**values, "plateau": Plateau(**values["plateau"])})
 
 
 # Metrics of a training: ``metrics.jsonl``, to which lines are appended, and TensorBoard events.
@@ -254,7 +221,7 @@ METRICS, EVENTS = "metrics.jsonl", "events"
 
 
 class MetricsLog:
-    """Log of the metrics of a training, one JSON object a line, in the order of steps.
+    """Log of the metrics of a training, one JSON object per line, in the order of steps.
 
     It is opened at a step: later lines, of a training that was stopped after its checkpoint, are
     removed, so that a resumed training neither repeats nor loses a line. If the extra
@@ -295,15 +262,8 @@ class MetricsLog:
         if self._events is not None:
             self._events.flush()
 
-    def __enter__(self) -> MetricsLog:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Close the files."""
         self._file.close()
         if self._events is not None:
             self._events.close()
@@ -313,11 +273,6 @@ class MetricsLog:
             for name, value in line.items():
                 if name != "step" and value is not None:
                     self._events.add_scalar(name, value, int(line["step"]))
-
-
-def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """Return the lines of ``metrics.jsonl`` in the folder of a training."""
-    return [json.loads(line) for line in (folder / METRICS).read_text().splitlines()]
 
 
 def _lines_until(path: Path, step: int) -> list[str]:
@@ -347,12 +302,9 @@ def _open_events(folder: Path) -> Any:
     return SummaryWriter(str(folder))
 
 
-# Folder of one training: checkpoints while it runs, weights and model card when it is done.
+# Folder of one training: a checkpoint while it runs, weights and model card when it is done.
 
-CHECKPOINT, PREVIOUS = "checkpoint.safetensors", "previous.safetensors"
-CARD = "model_card.md"
-_DAMAGED = ".damaged"
-"""Suffix of damaged files that were set aside."""
+CHECKPOINT, CARD = "checkpoint.safetensors", "model_card.md"
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,85 +317,51 @@ class CheckpointContent:
 
 
 class TrainingFolder:
-    """Files of one training.
+    """Files of one training, in the folder ``path``, whose name holds a hash of all inputs.
 
-    While it runs there are two checkpoints, so that one remains if the other is damaged. When it
-    is done, only the weights are written, without the state of the optimiser, and the checkpoints
-    are deleted.
-
-    Parameters
-    ----------
-    path
-        The folder; it need not exist.
-    config
-        JSON values of everything that determines the weights. Files of another config are refused.
+    When the training is done, the weights are written without the state of the optimiser, and the
+    checkpoint is deleted. A damaged file is deleted, and ``notes`` says so.
     """
 
-    def __init__(self, path: Path, config: Mapping[str, Any]) -> None:
-        self.path, self._config = path, config
+    def __init__(self, path: Path) -> None:
+        self.path = path
         self.notes: list[str] = []
-        """What was found damaged, in sentences."""
-        self._damaged: list[Path] = []
 
     def finished(self) -> CheckpointContent | None:
         """Return the trained model, if there is one.
 
         Weights without a digest file come from a process that was killed before it had written
-        all; its checkpoints are still there.
+        all; its checkpoint is still there.
         """
         return self._read(WEIGHTS) if has_digest(self.path / WEIGHTS) else None
 
     def resumable(self) -> CheckpointContent | None:
-        """Return the newest whole checkpoint, if there is one.
+        """Return the checkpoint, if there is one.
 
         Raises `BadInputError` if it was written by other versions of the libraries, with which the
         results would be a mixture.
         """
-        found = self._read(CHECKPOINT) or self._read(PREVIOUS)
+        found = self._read(CHECKPOINT)
         if found is not None:
             check_same(found.path, "version", found.metadata["versions"], versions())
-        if self._damaged:
-            start = f"step {found.metadata['step']}" if found is not None else "the beginning"
-            self.notes.append(f"training continues from {start}")
         return found
 
-    def clean(self) -> None:
-        """Create the folder, set damaged files aside, delete what an interrupted writer left."""
-        self.path.mkdir(parents=True, exist_ok=True)
-        remove_leftovers(self.path)
-        for path in self._damaged:
-            path.replace(path.with_name(path.name + _DAMAGED))
-
-    def save(self, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
-        """Write a checkpoint and keep the one before."""
-        path = self.path / CHECKPOINT
-        if path.is_file():
-            path.replace(self.path / PREVIOUS)
-        write_checkpoint(path, tensors, metadata)
-
     def finish(self, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any], card: str) -> None:
-        """Write the trained model and its card, and delete the checkpoints."""
+        """Write the trained model and its card, and delete the checkpoint."""
         write_atomic(self.path / CARD, card.encode())
         write_checkpoint(self.path / WEIGHTS, tensors, metadata, kept=True)
-        self.remove_checkpoints()
-
-    def remove_checkpoints(self) -> None:
-        """Delete the checkpoints of a training that is done."""
-        for name in (CHECKPOINT, PREVIOUS):
-            (self.path / name).unlink(missing_ok=True)
+        (self.path / CHECKPOINT).unlink(missing_ok=True)
 
     def _read(self, name: str) -> CheckpointContent | None:
         path = self.path / name
         if not path.is_file():
             return None
         try:
-            tensors, metadata = read_checkpoint(path)
+            return CheckpointContent(path, *read_checkpoint(path))
         except DamagedFileError as error:
-            self.notes.append(f"{error}; it is set aside as {name}{_DAMAGED}")
-            self._damaged.append(path)
+            path.unlink(missing_ok=True)
+            self.notes.append(f"{error}; it is deleted, and training starts from the beginning")
             return None
-        check_same(path, "config", metadata["config"], self._config)
-        return CheckpointContent(path, tensors, metadata)
 
 
 _AHEAD = 8
@@ -481,7 +399,7 @@ class TrainingLoop:
     folder
         Where checkpoints and metrics are kept; None keeps nothing.
     describe
-        Returns the metadata of a checkpoint, to which the state is added.
+        Metadata of a checkpoint, to which the state is added.
     progress
         Called after every step.
     """
@@ -541,7 +459,7 @@ class TrainingLoop:
         with ExitStack() as stack:
             log = None
             if self._folder is not None:
-                log = stack.enter_context(MetricsLog(self._folder.path, state.step))
+                log = stack.enter_context(closing(MetricsLog(self._folder.path, state.step)))
             requests = self._requests(state.step)
             ahead = min(max(2, os.cpu_count() or 1), _AHEAD)
             batches: Any = background(requests, self._data.training.read, ahead=ahead)
@@ -559,7 +477,7 @@ class TrainingLoop:
         return {
             **self._describe,
             "step": self.state.step,
-            "state": self.state.to_json(),
+            "state": asdict(self.state),
             "precision": self._fabric.strategy.precision.state_dict(),
         }
 
@@ -623,11 +541,11 @@ class TrainingLoop:
             self._validate(log, last)
         if saves:
             self._check_weights()
-            if log is not None and self._folder is not None and not last:
+            if log is not None:
                 log.sync()
-                self._folder.save(tensors_of(self._model, self._optimizer), self.metadata())
-            elif log is not None:
-                log.sync()
+            if self._folder is not None and not last:
+                tensors = tensors_of(self._model, self._optimizer)
+                write_checkpoint(self._folder.path / CHECKPOINT, tensors, self.metadata())
 
     def _read_losses(self) -> None:
         """Move the losses of the last steps from the device, and stop at one that is not finite."""

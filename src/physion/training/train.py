@@ -22,7 +22,7 @@ from torch import nn
 from physion.clips.source import WholeSource
 from physion.compute.tasks import Progress
 from physion.core.errors import BadInputError
-from physion.core.files import folder_lock, json_digest
+from physion.core.files import folder_lock, json_digest, remove_leftovers
 from physion.core.seeds import generator, stable_hash
 from physion.models.build import OutOfMemoryError, is_out_of_memory
 from physion.models.checkpoint import (
@@ -35,6 +35,7 @@ from physion.models.checkpoint import (
 from physion.models.interface import TrainingSettings, ask, can
 from physion.training.devices import Devices, make_fabric, memory_advice, move_to_device
 from physion.training.loop import (
+    CHECKPOINT,
     TrainingData,
     TrainingFolder,
     TrainingLoop,
@@ -130,7 +131,7 @@ class TrainedModel:
     - ``loss``: mean of the last ``log_every`` steps. ``validation``: of held-out trials, and
       ``baseline`` of a predictor that has learnt nothing; NaN if there is none.
     - ``config_hash``: of everything that determines the weights.
-    - ``loaded``: whether it was there already. ``notes``: files that were found damaged.
+    - ``loaded``: whether it was there before. ``notes``: files that were found damaged.
     """
 
     model: str
@@ -193,7 +194,7 @@ def train_model(
     Raises
     ------
     BadInputError
-        If the model cannot be trained, or a stored training differs from this one.
+        If the model cannot be trained, or a checkpoint is of other versions of the libraries.
     TrainingStoppedError
         If a loss or weight is not finite.
     OutOfMemoryError
@@ -208,14 +209,14 @@ def train_model(
     config_hash = json_digest(config)
     kept = None
     if folder is not None:
-        kept = TrainingFolder(training_path(folder, model, name, config), config)
+        kept = TrainingFolder(training_path(folder, model, name, config))
     move_to_device(fabric, model)
     done = kept.finished() if kept is not None else None
     if kept is not None and done is not None:
         load_tensors(done.path, done.tensors, model)
         model.eval()
-        if fabric.is_global_zero:
-            kept.remove_checkpoints()
+        if fabric.is_global_zero:  # a process that was killed may have left it
+            (kept.path / CHECKPOINT).unlink(missing_ok=True)
         state = TrainingState.of(done.metadata["state"])
         return _result(model, name, seed, kept, state, config_hash, True)
     metadata = {
@@ -229,7 +230,7 @@ def train_model(
         stored = kept.resumable() if kept is not None else None
         fabric.barrier()
         if kept is not None and fabric.is_global_zero:
-            kept.clean()
+            remove_leftovers(kept.path)
         fabric.barrier()
         data = _windows(model, source, trials, settings, seed, features, fabric)
         if stored is None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,27 +34,6 @@ class Request:
         size = len(self.trials) // parts
         chosen = slice(index * size, (index + 1) * size)
         return Request(self.trials[chosen], self.starts[chosen])
-
-
-class Windows(Protocol):
-    """Windows of training clips, drawn from some trials."""
-
-    @property
-    def trials(self) -> tuple[str, ...]:
-        """Trials from which windows are drawn."""
-        ...
-
-    def starts(self, trials: Sequence[int], rng: np.random.Generator) -> NDArray[np.int64]:
-        """Return random starts of windows of the trials with the given row numbers."""
-        ...
-
-    def read(self, request: Request) -> Batch:
-        """Return the windows of a request."""
-        ...
-
-    def sample(self, seed: int) -> Batch:
-        """Return the clips from which a model sets its statistics."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -166,6 +144,9 @@ class FeatureWindows:
         return Batch(
             self.trials, self._frames[rows], self._valid[rows], features=self._features[rows]
         )
+
+
+Windows = ClipWindows | FeatureWindows
 
 
 def hold_out(count: int, fraction: float, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
