@@ -307,7 +307,7 @@ def test_validation_does_not_change_what_is_learnt() -> None:
     assert equal_weights(*models)
 
 
-def test_steps_are_those_of_plain_torch_with_all_settings() -> None:
+def test_steps_match_plain_torch_with_all_settings() -> None:
     """Betas, weight decay, clipping, warm-up, cosine, and a batch of two accumulated parts."""
     settings = replace(ALL_AT_ONCE, steps=6, warmup=2, held_out=0.0, betas=(0.7, 0.8), clip=0.02)
     model, plain, source = NextBrightness(), NextBrightness(), MovingValues()
