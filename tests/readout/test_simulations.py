@@ -126,7 +126,7 @@ def fitted_scale(shelf: Any, model: Any, folder: Path) -> tuple[float, np.ndarra
     predictor = Predictor(shelf, model, ways, EvaluationSettings(), folder=folder)
     (fold,) = plan_folds(shelf.index, Protocol.ALL, 5, 0)
     (answers,) = predictor.predict(fold)
-    return answers.fitted["scale"], answers.probability
+    return answers.decided.fitted["scale"], answers.decided.probability
 
 
 @pytest.mark.parametrize("column", ["contact", "recorded_contact"])

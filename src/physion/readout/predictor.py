@@ -258,7 +258,8 @@ class Predictor:
         )
 
     def _labels_of(self, trials: Sequence[str], kind: str) -> NDArray[np.bool_]:
-        return self._labels[kind].loc[list(trials)].to_numpy(bool)
+        labels: NDArray[np.bool_] = self._labels[kind].loc[list(trials)].to_numpy(bool)
+        return labels
 
     def _decide_on_features(
         self, decision: Decision, split: ScenarioSplit, readout: Readout
