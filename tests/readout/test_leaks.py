@@ -40,7 +40,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     tasks = plan_dataset("leaks", ("collide",), {"training": 2, "readout": 4, "testing": 2})
     settings = GenerateSettings(width=64, height=64, look="redyellow", jitters=0)
     assert not make_trials(folder, tasks, settings, executor=SerialExecutor()).failed
-    return Dataset(folder)
+    dataset = Dataset(folder)
+    fitted = dataset.index[dataset.index["split"] == "readout"]["contact"]
+    assert fitted.nunique() == 2, "otherwise a readout would say the same of every trial"
+    return dataset
 
 
 @pytest.fixture(scope="module")

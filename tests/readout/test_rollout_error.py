@@ -188,9 +188,6 @@ def test_what_cannot_have_an_error_is_refused(dataset: Dataset) -> None:
 
 def test_evaluate_writes_them_next_to_the_predictions(dataset: Dataset, tmp_path: Path) -> None:
     config = EvaluationSettings(untrained=True, folds=2, accelerator="cpu")
-    without = evaluate("dpi", dataset, tmp_path, settings=config)
-    assert without.evaluated[0].rollout_errors is None
-    assert not (tmp_path / "rollout-errors").exists()
     result = evaluate("dpi", dataset, tmp_path, settings=config, rollout_errors=True)
     errors = result.evaluated[0].rollout_errors
     assert errors == tmp_path / "rollout-errors" / result.paths[0].name

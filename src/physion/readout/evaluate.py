@@ -232,8 +232,8 @@ class _Evaluate:
         """Predict every testing trial, unless that is done."""
         model, settings, index = cell.take_model(), self.settings, self.dataset.index
         training = cell.chosen.settings_of(model) if cell.protocol is not None else None
-        ways = choose_readouts(model, settings.readouts, settings.decision)
         provenance = check_identity(model)
+        ways = choose_readouts(model, settings.readouts, settings.decision)
         if not provenance.inputs:
             provenance = dataclasses.replace(provenance, inputs=", ".join(model.spec.inputs))
         path = self._table(cell, model, training, provenance, ways)
