@@ -97,6 +97,11 @@ def test_gaps_of_several_samples_give_probabilities() -> None:
     one = GapDecision().decide(gaps([0.1], [0.6]), np.array([True, False]), gaps([0.2], [0.5]))
     assert one.probability.tolist() == [1.0, 0.0]
     assert one.fitted["gap"] == pytest.approx(0.35)
+    # Medians 0.1 and 0.3, neither the smallest gap nor the mean, of three futures each.
+    three = gaps([0.0, 0.1, 0.9], [0.2, 0.3, 0.35])
+    assert GapDecision().decide(three, np.array([True, False]), three).fitted == {
+        "gap": pytest.approx(0.2)
+    }
 
 
 def test_only_contacts_have_no_threshold() -> None:
