@@ -96,6 +96,13 @@ def test_scores_match_the_joined_rows() -> None:
     pooled = score(found.scores, "m · observed", POOLED)
     assert pooled["r"] == pytest.approx(np.corrcoef(p, p_yes)[0, 1])
     assert pooled["rmsd"] == pytest.approx(np.sqrt(np.mean((p - p_yes) ** 2)))
+    own = found.people.set_index("scenario").loc["collide"]
+    assert own["base_rate"] == pytest.approx(truth[collide].mean()) and own["people"] == 20
+    assert own["yes"] == pytest.approx(p_yes[collide].mean())
+    assert own["accuracy"] == pytest.approx(people["accuracy"][collide].mean())
+    noise, total = np.mean(p_yes[collide] * (1 - p_yes[collide]) / 19), p_yes[collide].var(ddof=1)
+    assert own["reliability"] == pytest.approx(1 - noise / total)
+    assert own["ceiling"] == pytest.approx(np.sqrt(1 - noise / total))
     stimuli = found.stimuli.set_index("stimulus").loc[given["Stimulus Name"]]
     np.testing.assert_allclose(stimuli["gap"], p - p_yes)
     mean = score(found.scores, "m · observed", MEAN)
