@@ -13,10 +13,11 @@ from physion.analysis.metrics import all_metrics, metrics
 from physion.analysis.model_tests import PooledStimuli, paired_measures
 from physion.analysis.rollout_errors import CONSTANT_VELOCITY, rollout_error_table
 from physion.analysis.sample import Resampled, Sample
-from physion.analysis.scores import sample_of_models, sampling_variances, score_table
+from physion.analysis.scores import score_table
 from physion.analysis.statistics.agreement import correlate_resampled
 from physion.analysis.statistics.regression import reliability_curve
 from physion.analysis.tables import MEAN, POOLED
+from physion.analysis.with_participants import sample_of_models, sampling_variances
 from physion.core.seeds import generator
 
 LEFT_OUT = ("accuracy_simulated", "r_same", "euclid_over_n")

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from physion.analysis.people.measures import ScenarioAnswers
 from physion.analysis.sample import Resampled
-from physion.analysis.scores import Models
+from physion.analysis.with_participants import Models
 from physion.core.seeds import generator
 
 F64 = NDArray[np.float64]

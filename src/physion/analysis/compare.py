@@ -25,8 +25,10 @@ from physion.analysis.model_tests import (
 )
 from physion.analysis.people.measures import HALVES, accuracy_by_stimulus, all_answers, split_halves
 from physion.analysis.people.results import PeopleResults
-from physion.analysis.scores import (
-    TWO_PEOPLE,
+from physion.analysis.scores import TWO_PEOPLE, with_kind
+from physion.analysis.statistics.regression import calibration_table
+from physion.analysis.tables import check_excluded_names, name_models, require_columns
+from physion.analysis.with_participants import (
     add_baselines,
     human_zones,
     mean_measures,
@@ -35,10 +37,7 @@ from physion.analysis.scores import (
     model_pairs,
     models_of,
     released_r_zone,
-    with_kind,
 )
-from physion.analysis.statistics.regression import calibration_table
-from physion.analysis.tables import check_excluded_names, name_models, require_columns
 from physion.core.errors import BadInputError
 
 # All models compared with all participants: every scenario, their mean, and what was excluded.

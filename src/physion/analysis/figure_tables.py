@@ -16,10 +16,11 @@ from physion.analysis.compare import PeopleComparison
 from physion.analysis.comparison import Comparison
 from physion.analysis.intervals import jackknife, mean_of, variance_of_mean
 from physion.analysis.people.effects import THIRDS, below_chance_level, difficulty_third, r_by_third
-from physion.analysis.scores import COMPUTED, baseline_stimuli, kind_of, released_zone
+from physion.analysis.scores import COMPUTED, baseline_stimuli, kind_of
 from physion.analysis.statistics.agreement import correlate_resampled, correlate_rows
 from physion.analysis.statistics.regression import brier, reliability_curve
 from physion.analysis.tables import ALL_BUT, MEAN, ONLY, POOLED, READOUTS, in_order
+from physion.analysis.with_participants import released_zone
 from physion.core.names import OFFICIAL_SCENARIOS, SCENARIOS
 
 Array = npt.NDArray[np.float64]

@@ -2,9 +2,9 @@
 
 A metric is one entry: a function that is decorated with `register_metric`, of three arrays or of a
 `Sample`. The tables of scores (`scores.score_table`), of measures with single participants
-(`scores.measure_table`) and the report ask this registry, so that a new metric appears in all of
-them. ``docs/how-to/add-a-metric.md`` shows how to add one. The tables have the order below:
-correct answers, signal detection, likeness to the average person, likeness beyond the outcome,
+(`with_participants.measure_table`) and the report ask this registry, so that a new metric appears
+in all of them. ``docs/how-to/add-a-metric.md`` shows how to add one. The tables have the order
+below: correct answers, signal detection, likeness to the average person, likeness beyond the outcome,
 likeness to single participants.
 """
 

@@ -22,11 +22,12 @@ from physion.analysis.people.effects import difficulty_third, r_by_third
 from physion.analysis.people.measures import ScenarioAnswers, answers_of, split_halves
 from physion.analysis.people.results import analyse_people
 from physion.analysis.sample import Resampled
-from physion.analysis.scores import (
-    MAJORITY,
-    OUTCOME,
+from physion.analysis.scores import MAJORITY, OUTCOME, TWO_PEOPLE, shown_average
+from physion.analysis.statistics import agreement
+from physion.analysis.statistics.agreement import correctness
+from physion.analysis.tables import MEAN, POOLED
+from physion.analysis.with_participants import (
     RELEASED_R,
-    TWO_PEOPLE,
     Models,
     human_zones,
     measure_models,
@@ -37,11 +38,7 @@ from physion.analysis.scores import (
     released_zone,
     sample_of_models,
     sampling_variances,
-    shown_average,
 )
-from physion.analysis.statistics import agreement
-from physion.analysis.statistics.agreement import correctness
-from physion.analysis.tables import MEAN, POOLED
 from physion.core.errors import BadInputError
 from support.simulated_people import study
 

@@ -28,7 +28,6 @@ from scipy import stats
 from physion.analysis.intervals import Bootstrap, wilson
 from physion.analysis.people.effects import below_chance_level
 from physion.analysis.people.measures import spearman_brown
-from physion.analysis.scores import released_zone
 from physion.analysis.statistics.agreement import correlation_from_sums
 from physion.analysis.tables import (
     MEAN,
@@ -41,6 +40,7 @@ from physion.analysis.tables import (
     read_humans,
     refuse_duplicates,
 )
+from physion.analysis.with_participants import released_zone
 from physion.core.errors import BadInputError
 from physion.core.names import OFFICIAL_SCENARIOS, SCENARIOS, is_ledge
 
