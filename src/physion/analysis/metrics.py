@@ -4,8 +4,8 @@ A metric is one entry: a function that is decorated with `register_metric`, of t
 `Sample`. The tables of scores (`scores.score_table`), of measures with single participants
 (`with_participants.measure_table`) and the report ask this registry, so that a new metric appears
 in all of them. ``docs/how-to/add-a-metric.md`` shows how to add one. The tables have the order
-below: correct answers, signal detection, likeness to the average person, likeness beyond the outcome,
-likeness to single participants.
+below: correct answers, signal detection, likeness to the average person, beyond the outcome, and to
+single participants.
 """
 
 from __future__ import annotations
