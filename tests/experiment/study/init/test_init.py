@@ -65,10 +65,14 @@ def test_another_seed_chooses_otherwise(dataset: Path) -> None:
     # Of three trials with contact (even numbers) and three without; nine pairs.
     assert len(pairs) >= 5
     assert {(int(b[-1]) - int(a[-1])) % 6 for a, b in pairs} > {1}
-    all_of_them = [
-        tuple(s.stimulus for s in choose_trials(dataset, test=6, seed=seed).sources)
-        for seed in range(10)
-    ]
+    whole = [choose_trials(dataset, test=6, seed=seed).sources for seed in range(10)]
+    all_of_them = [tuple(s.stimulus for s in sources) for sources in whole]
+    # Which places have contact is drawn too: 20 patterns of the six test trials of a scenario.
+    patterns = {
+        tuple(s.label for s in sources if (s.scenario, s.phase) == ("roll", "test"))
+        for sources in whole
+    }
+    assert len(patterns) >= 4
     assert len(set(all_of_them)) == 10 and len({frozenset(names) for names in all_of_them}) == 1
 
 
