@@ -432,7 +432,7 @@ def test_each_person_is_paid_for_the_own_session(tmp_path: Path) -> None:
     settings = {"bonus": Bonus(per_correct=0.25, above=0.5), "participants": 9, "test": 4}
     with lab(tmp_path, **ONE | settings) as found:
         done = {person: finish(found, person, right) for person, right in
-                (("w-ada", 4), ("w-bo", 3), ("w-cy", 1), ("w-di", 2))}  # fmt: skip
+                (("w-ada", 4), ("w-bo", 3), ("w-cy", 1), ("w-di", 4))}  # fmt: skip
         walk(found.store, begin(found.store, "w-late", source="mturk"), "feedback")
         gone = walk(found.store, begin(found.store, "w-gone", source="mturk"), "test")
         run(found.store.page(gone, PageDone(page="withdraw")))
@@ -442,7 +442,7 @@ def test_each_person_is_paid_for_the_own_session(tmp_path: Path) -> None:
             row["id"]: row for row in csv.DictReader(io.StringIO(visitor.see("/payments.csv").text))
         }
         bonus = {"w-ada": "0.50", "w-bo": "0.25", "w-cy": "0.00", "w-di": "0.00"}
-        right = {"w-ada": 4, "w-bo": 3, "w-cy": 1, "w-di": 2}
+        right = {"w-ada": 4, "w-bo": 3, "w-cy": 1, "w-di": 4}
         assert set(cells) == set(done)
         for person, row in done.items():
             paid = cells[person]
