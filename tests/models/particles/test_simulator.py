@@ -87,17 +87,18 @@ def last_states(model: ParticleSimulator, *motions: Motion):  # type: ignore[no-
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_shift_along_the_floor_shifts_the_prediction(name: str, collide: Motion) -> None:
+def test_a_shift_of_scene_and_floor_shifts_the_prediction(name: str, collide: Motion) -> None:
     model = model_of(name)
     layout, before, now = last_states(model, collide, motion("drape", 1))
-    shift = torch.tensor([3.7, -1.9, 0.0], dtype=torch.float64)
+    shift = torch.tensor([3.7, -1.9, 0.4], dtype=torch.float64)
+    raised = replace(layout, floor=layout.floor + 0.4)
 
     def moved(state: ObjectState) -> ObjectState:
         return ObjectState(state.centers + shift, state.rotations, state.loose + shift)
 
     with torch.no_grad():
         after = model.step(layout, before, now).positions(layout)
-        shifted = model.step(layout, moved(before), moved(now)).positions(layout)
+        shifted = model.step(raised, moved(before), moved(now)).positions(layout)
         alone = silent(name).step(layout, before, now).positions(layout)
     assert (shifted - shift - after).abs().max() < 1e-6
     for scene in (0, 1):
@@ -416,6 +417,16 @@ def test_what_an_event_put_somewhere_did_not_go_there(collide: Motion) -> None:
     assert np.array_equal(start.poses.centers[-2, own], start.poses.centers[-1, own])
     read = read_window(window(moved, start=39), model.settings.sampling, model.device)
     assert len(read.layout.kinds) == len(start.particles.kinds) - 1
+
+
+def test_gaps_count_from_frame_44() -> None:
+    """Unit cubes pass each other at 5 cm in frame 22; in frame 44 they are 2 m apart, and part."""
+    path = np.zeros((45, 2, 3))
+    path[:, 0, 0], path[:, 0, 1] = (np.arange(45) - 22) * 3 / 22, 1.05
+    whole = (1.0, 1.0, 1.0)
+    passing = Motion(scene_of(body("a", scale=whole), body("b", scale=whole)), trajectory_of(path))
+    gap = silent("dpi").imagine(observed(passing), 1, 0).gap
+    assert gap[0, 0] == pytest.approx(np.hypot(2.0, 0.05), abs=2e-3)
 
 
 def test_an_observed_contact_is_a_yes() -> None:
