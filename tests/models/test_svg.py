@@ -168,6 +168,25 @@ def test_the_loss_follows_the_equations() -> None:
     assert losses["loss"].item() == pytest.approx(expected.item(), rel=1e-6)
 
 
+def test_the_posterior_sees_the_predicted_frame_and_the_prior_does_not() -> None:
+    model = tiny().train()
+    batch = squares(2, model.window, model.spec)
+    later = batch.rgb.clone()
+    later[:, -1] = 255 - later[:, -1]
+    seen: dict[str, list[Tensor]] = {"posterior": [], "prior": []}
+    for name, found in seen.items():
+        getattr(model, name).register_forward_hook(
+            lambda _, inputs, out, found=found: found.append(out[0])
+        )
+    for rgb in (batch.rgb, later):
+        model.loss(with_arrays(batch, rgb=rgb))
+    before, after = seen["posterior"]
+    assert before.shape[1] == model.window - 1
+    assert torch.allclose(before[:, :-1], after[:, :-1], atol=1e-5)
+    assert (before[:, -1] - after[:, -1]).abs().max() > 1e-4
+    assert torch.allclose(*seen["prior"], atol=1e-5)
+
+
 def test_moving_pixels_have_a_weight_in_training() -> None:
     batch = squares(2, 5, tiny().spec)
     pictures = batch.rgb.permute(0, 1, 4, 2, 3).float() / 255
