@@ -285,7 +285,9 @@ def test_edges_know_the_closest_approach(
     radius, unit = 0.2, 0.02
     own = scene_particles(scene_of(body("a"), body("b")), Sampling(limit=1))
     layout = join_scenes([own], CPU)
-    now = join_poses([poses((0.0, 0.0, 1.0), (0.15, 0.06, 1.0))], 0, CPU)
+    motion = poses((0.0, 0.0, 1.0), (0.15, 0.06, 1.0))
+    motion.rotations[:, 1] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    now = join_poses([motion], 0, CPU)
     before = replace(now, centers=now.centers - torch.tensor([[0.0] * 3, [speed, 0.0, 0.0]]))
     graph = make_graph(layout, drift_of(layout, before, now), radius, unit, swept=True)
     assert (graph.receivers.tolist(), graph.senders.tolist()) == ([0, 1], [1, 0])
