@@ -193,7 +193,10 @@ def test_the_fit_finds_the_motion() -> None:
     shape, points, owners, rotation, shift = bodies(0, 0.0)
     found, moved = fit_rigid(shape, points, owners, 3)
     assert torch.allclose(found, rotation) and torch.allclose(moved, shift)
-    assert torch.allclose(torch.det(found), torch.ones(3, dtype=torch.float64))
+    # What is mirrored is rotated, too, as well as it can be.
+    mirrored, _ = fit_rigid(shape, points * torch.tensor([1.0, 1.0, -1.0]), owners, 3)
+    for rotations in (found, mirrored):
+        assert torch.allclose(torch.det(rotations), torch.ones(3, dtype=torch.float64))
 
 
 def test_no_other_motion_fits_better() -> None:
