@@ -261,6 +261,26 @@ def test_futures_follow_from_seed_and_name_of_the_trial() -> None:
     assert rgb.shape == (3, 3, 3, 16, 16, 3) and rgb.dtype == torch.uint8
 
 
+class ShowsLatents(nn.Module):
+    """Predictor whose codes are the values of z, twice."""
+
+    def forward(self, inputs: Tensor, state: Any = None) -> tuple[Tensor, Any]:
+        return torch.cat([inputs[..., -3:]] * 2, -1), state
+
+
+def test_every_step_of_a_future_has_noise_of_its_own() -> None:
+    """With priors N(0, 1), z of frame t are the numbers t - 1, after the 3 of seen frames."""
+    model = tiny()
+    model.predictor = ShowsLatents()  # type: ignore[assignment]
+    with torch.no_grad():
+        for weight in (*model.prior.parameters(), *model.posterior.parameters()):
+            weight.zero_()
+        context = context_of(model)
+        codes = model.imagine(context, 2, 7).features
+    noise = model.imagined_noise(context.trials, 7, (2, 6, 3)).view(2, 2, 6, 3)
+    assert torch.allclose(codes[..., :3], noise[:, :, 3:].float(), atol=1e-6)
+
+
 @pytest.mark.parametrize("skip", ["last", "before"])
 def test_a_future_matches_the_equations(skip: Any) -> None:
     """Step by step, with z at the means: the variances are close to 0."""
