@@ -252,3 +252,21 @@ def test_other_state_models_are_shown_only_the_observed_part(tmp_path: Path) -> 
     assert set(table["inputs"]) == {"state"}, "what its Spec asks for"
     with pytest.raises(BadInputError, match="not a probability"):
         evaluate(Oracle(1.5), shelf, tmp_path / "b")
+
+
+class Labelled(Oracle):
+    """State model that keeps the labels that it is fitted on."""
+
+    def fit(self, batch: Batch, labels: Any, seed: int) -> Any:
+        self.labels = dict(zip(batch.trials, labels.tolist(), strict=True))
+        return self
+
+
+def test_a_model_is_fitted_on_recorded_outcomes(tmp_path: Path) -> None:
+    shelf: Any = Shelf()
+    model = Labelled()
+    table = evaluate(model, shelf, tmp_path).predictions
+    assert model.labels == {f"collide_readout_{i}": i % 2 == 0 for i in range(12)}
+    simulated = shelf.index.set_index("trial")["contact"]
+    assert any(simulated[trial] != label for trial, label in model.labels.items())
+    assert set(table["fit_labels"]) == {"recorded"} and set(table["fit_trials"]) == {12}
