@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from physion.numerics.elementary import exp, power
 from physion.numerics.linear_algebra import apply, norm, unit
-from physion.rendering.rasterizer import BLOCK, LIGHT, DepthMap, Records
+from physion.rendering.rasterizer import (
+    BLOCK,
+    LIGHT,
+    DepthMap,
+    Records,
+    mark_neighbours,
+    rasterize_depth,
+    restore_blocks,
+)
 from physion.rendering.rooms import Room
 from physion.rendering.shading import TONES, WHITEST
 from physion.scenes.scene import Scene
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
 U8 = NDArray[np.uint8]
 
 SHADOW_TEXEL = 0.016
@@ -38,15 +45,46 @@ SRGB_OFFSET, SRGB_GAMMA = 0.055, 2.4
 """Offset and exponent of the sRGB curve beyond the line."""
 
 
-class StaticDepthMap(NamedTuple):
-    """The part of a `DepthMap` that is the same in every frame: what never moves."""
+class StaticDepthMap:
+    """A `DepthMap` of what never moves, and a working copy for the moving bodies of one frame.
 
-    matrix: F64
-    depth: F32
+    Parameters
+    ----------
+    matrix
+        As in `DepthMap`.
+    size
+        Texels along each side, a multiple of `BLOCK`.
+    """
 
-    def with_moving(self, depth: F32) -> DepthMap:
-        """Return the map of one frame; ``depth`` is a copy of this one with the moving objects."""
-        return DepthMap(self.matrix, depth, _occupied_blocks(depth))
+    def __init__(self, matrix: F64, size: int) -> None:
+        self.matrix = matrix
+        self._static = np.full((size, size), np.inf, np.float32)
+        self._depth = self._static.copy()
+        self._drawn = np.zeros((size // BLOCK, size // BLOCK), np.bool_)
+        self._occupied = np.zeros_like(self._drawn)
+
+    def draw_static(self, vertices: F64, faces: I32, first: int, last: int) -> None:
+        """Draw the triangles ``first:last`` of what never moves; vertices (V, 3) in the world."""
+        drawn = np.zeros_like(self._drawn)
+        rasterize_depth(self._to_texels(vertices), faces, first, last, self._static, drawn)
+        mark_neighbours(drawn, self._occupied)
+        self._depth[...] = self._static
+
+    def with_moving(self, vertices: F64, faces: I32, first: int) -> DepthMap:
+        """Return the map of one frame, in which the triangles from ``first`` on move.
+
+        The next call changes its ``depth``.
+        """
+        restore_blocks(self._static, self._depth, self._drawn)
+        points = self._to_texels(vertices)
+        rasterize_depth(points, faces, first, len(faces), self._depth, self._drawn)
+        moved = np.zeros_like(self._drawn)
+        mark_neighbours(self._drawn, moved)
+        return DepthMap(self.matrix, self._depth, self._occupied | moved, moved)
+
+    def _to_texels(self, vertices: F64) -> F64:
+        """Return texel x, texel y and depth in metres (V, 3) of world points (V, 3)."""
+        return apply(self.matrix[:, :3], vertices) + self.matrix[:, 3]
 
 
 def empty_maps(scene: Scene, room: Room) -> tuple[StaticDepthMap, StaticDepthMap]:
@@ -116,17 +154,7 @@ def _empty_map(axes: F64, center: F64, half: float, texel: float) -> StaticDepth
     matrix[:2, :3] = axes[:2] / texel
     matrix[:2, 3] = 0.5 * size - apply(matrix[:2, :3], center)
     matrix[2, :3] = axes[2]
-    return StaticDepthMap(matrix, np.full((size, size), np.inf, np.float32))
-
-
-def _occupied_blocks(depth: F32) -> NDArray[np.bool_]:
-    """Return which blocks of a depth map, or one of their eight neighbours, hold anything."""
-    rows, columns = (size // BLOCK for size in depth.shape)
-    used = np.isfinite(depth).reshape(rows, BLOCK, -1).any(axis=1)
-    used = used.reshape(rows, columns, BLOCK).any(axis=2)
-    wide = np.pad(used, 1)
-    wide = wide[:-2] | wide[1:-1] | wide[2:]
-    return np.asarray(wide[:, :-2] | wide[:, 1:-1] | wide[:, 2:])
+    return StaticDepthMap(matrix, size)
 
 
 def tone_table(exposure: float) -> U8:

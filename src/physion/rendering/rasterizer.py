@@ -41,6 +41,8 @@ NOTHING = -1
 """Triangle id of a sample that no triangle covers."""
 SHORTEST_NORMAL = 1e-12
 """Length below which an interpolated normal is not scaled up to one."""
+BLOCK = 8
+"""Texels along the side of a block of a `DepthMap`."""
 
 
 class Triangles(NamedTuple):
@@ -69,10 +71,12 @@ class VisibilityBuffer(NamedTuple):
 
     - ``triangle_ids`` (H, W, S) int32: index of the triangle, or `NOTHING`.
     - ``inverse_depth`` (H, W, S) float32: 1 / depth in 1/m; 0 where there is nothing.
+    - ``drawn`` (H, W) bool: pixels of which `rasterize` has changed a sample.
     """
 
     triangle_ids: I32
     inverse_depth: F32
+    drawn: Bools
 
 
 class GeometryBuffers(NamedTuple):
@@ -232,10 +236,26 @@ def rasterize(
                         if d > buffer.inverse_depth[row, column, s] and farthest <= d <= nearest:
                             buffer.inverse_depth[row, column, s] = d
                             buffer.triangle_ids[row, column, s] = t
+                            buffer.drawn[row, column] = True
 
 
 @kernel
-def rasterize_depth(points: F64, faces: I32, first: int, last: int, depth: F32) -> None:
+def restore_pixels(static: VisibilityBuffer, buffer: VisibilityBuffer) -> None:
+    """Take back what was drawn over ``static``: ``buffer`` is its copy again."""
+    height, width, samples = buffer.triangle_ids.shape
+    for row in range(height):
+        for column in range(width):
+            if buffer.drawn[row, column]:
+                buffer.drawn[row, column] = False
+                for s in range(samples):
+                    buffer.triangle_ids[row, column, s] = static.triangle_ids[row, column, s]
+                    buffer.inverse_depth[row, column, s] = static.inverse_depth[row, column, s]
+
+
+@kernel
+def rasterize_depth(
+    points: F64, faces: I32, first: int, last: int, depth: F32, drawn: Bools
+) -> None:
     """Lower a depth map to the smallest depth of the triangles ``first:last``.
 
     Parameters
@@ -248,6 +268,8 @@ def rasterize_depth(points: F64, faces: I32, first: int, last: int, depth: F32) 
         Range of triangles.
     depth
         (H, W) in metres, updated at texel centres (index + 0.5).
+    drawn
+        (H / `BLOCK`, W / `BLOCK`), set to true for blocks in which a texel was lowered.
 
     Notes
     -----
@@ -280,6 +302,31 @@ def rasterize_depth(points: F64, faces: I32, first: int, last: int, depth: F32) 
                 z = np.float32(z0 + b1 * (z1 - z0) + b2 * (z2 - z0))
                 if z < depth[row, column]:
                     depth[row, column] = z
+                    drawn[row // BLOCK, column // BLOCK] = True
+
+
+@kernel
+def restore_blocks(static: F32, depth: F32, drawn: Bools) -> None:
+    """Take back what was drawn over the depth map ``static``: ``depth`` is its copy again."""
+    for i in range(drawn.shape[0]):
+        for j in range(drawn.shape[1]):
+            if drawn[i, j]:
+                drawn[i, j] = False
+                for row in range(i * BLOCK, (i + 1) * BLOCK):
+                    for column in range(j * BLOCK, (j + 1) * BLOCK):
+                        depth[row, column] = static[row, column]
+
+
+@kernel
+def mark_neighbours(blocks: Bools, marked: Bools) -> None:
+    """Mark the true blocks of a map and their eight neighbours, whatever was marked before."""
+    rows, columns = blocks.shape
+    for i in range(rows):
+        for j in range(columns):
+            if blocks[i, j]:
+                for row in range(max(i - 1, 0), min(i + 2, rows)):
+                    for column in range(max(j - 1, 0), min(j + 2, columns)):
+                        marked[row, column] = True
 
 
 @kernel
@@ -382,8 +429,6 @@ def shows_back(edges: F64, t: int) -> bool:
 #     SIGGRAPH.
 # Bunnell, M. (2005). Dynamic ambient occlusion and indirect lighting. GPU Gems 2.
 
-BLOCK = 8
-"""Texels along the side of a block of `DepthMap.occupied`."""
 SHADOW_RADIUS = 2
 """Texels of the shadow map on each side of the nearest one that a lookup averages."""
 SHADOW_AREA = float((2 * SHADOW_RADIUS + 1) * (2 * SHADOW_RADIUS + 1))
@@ -403,11 +448,30 @@ class DepthMap(NamedTuple):
     - ``depth`` (H, W) float32: metres; infinity where there is nothing.
     - ``occupied`` (H / BLOCK, W / BLOCK) bool: blocks of texels in which, or in a neighbour of
       which, there is anything. Elsewhere a lookup is skipped.
+    - ``moved``, of the same shape: blocks in which, or in a neighbour of which, something that
+      moves is nearest. Elsewhere a lookup gives the same in every frame.
     """
 
     matrix: F64
     depth: F32
-    occupied: NDArray[np.bool_]
+    occupied: Bools
+    moved: Bools
+
+
+@kernel
+def block_index(depth_map: DepthMap, px: float, py: float, pz: float, radius: int) -> int:
+    """Return the block, counted row by row, that a lookup at a world point begins with.
+
+    With ``radius`` texels on each side, at most `BLOCK`, the lookup reads only this block and its
+    neighbours. -1 for a lookup that leaves the map, which reads nothing.
+    """
+    m = depth_map.matrix
+    x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3] - 0.5
+    y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3] - 0.5
+    height, width = depth_map.depth.shape
+    if x < radius or y < radius or x >= width - radius - 1 or y >= height - radius - 1:
+        return -1
+    return (int(y) // BLOCK) * (width // BLOCK) + int(x) // BLOCK
 
 
 @kernel

@@ -20,10 +20,8 @@ from physion.rendering.light import StaticDepthMap, empty_maps, pack_light, tone
 from physion.rendering.rasterizer import (
     CAMERA,
     NOTHING,
-    POINT,
     SAMPLES,
     SURFACE,
-    DepthMap,
     DepthRange,
     GeometryBuffers,
     LightMaps,
@@ -34,10 +32,10 @@ from physion.rendering.rasterizer import (
     VisibilityBuffer,
     fill_geometry_buffers,
     rasterize,
-    rasterize_depth,
+    restore_pixels,
 )
 from physion.rendering.rooms import Room, rooms
-from physion.rendering.shading import shade, shade_static_points
+from physion.rendering.shading import KeptPixels, keep_nothing, shade
 from physion.rendering.triangles import Assembly, assemble, hide_absent, pose_meshes
 from physion.scenes.scene import Scene
 
@@ -151,7 +149,8 @@ class Renderer:
         self._shadow, self._occlusion = self._draw_static_maps()
         self._static_points = self._to_pixels(self._static_vertices)
         self._static_buffer = self._draw_static()
-        self._shaded: Records | None = None
+        self._buffer = VisibilityBuffer(*(array.copy() for array in self._static_buffer))
+        self._kept_pixels: KeptPixels | None = None
         self._static_geometry: GeometryBuffers | None = None
 
     @property
@@ -172,29 +171,23 @@ class Renderer:
             )
 
     def _draw_static_maps(self) -> tuple[StaticDepthMap, StaticDepthMap]:
-        """Return shadow and occlusion map with what never moves."""
-        maps = empty_maps(self.scene, self.room)
-        for static in maps:
-            self._draw_map(static.depth, static.matrix, self._static_vertices, False)
-        return maps
-
-    def _draw_map(self, depth: F32, matrix: F64, vertices: F64, moving: bool) -> None:
-        """Draw the moving bodies, or the static ones without the room, into a depth map."""
-        assembly = self._assembly
-        points = apply(matrix[:, :3], vertices) + matrix[:, 3]
+        """Return shadow and occlusion map with what never moves, without the room."""
+        maps, assembly = empty_maps(self.scene, self.room), self._assembly
         first, last = assembly.room_triangles, assembly.first_triangle
-        if moving:
-            first, last = assembly.first_triangle, len(assembly.faces)
-        rasterize_depth(points, assembly.faces, first, last, depth)
+        for static in maps:
+            static.draw_static(self._static_vertices, assembly.faces, first, last)
+        return maps
 
     def _draw_static(self) -> VisibilityBuffer:
         """Return the visibility buffer of what never moves."""
         shape = (self.height, self.width, len(SAMPLES))
         triangle_ids = np.full(shape, NOTHING, np.int32)
-        buffer = VisibilityBuffer(triangle_ids, np.zeros(shape, np.float32))
+        drawn = np.zeros(shape[:2], np.bool_)
+        buffer = VisibilityBuffer(triangle_ids, np.zeros(shape, np.float32), drawn)
         last = self._assembly.first_triangle
         static = self._triangles._replace(faces=self._triangles.faces[:last])
         rasterize(self._static_points, static, 0, self._depths, buffer)
+        drawn[...] = False
         return buffer
 
     @property
@@ -235,14 +228,15 @@ class Renderer:
         vertices += self._static_vertices
         normals += self._static_normals
         points = self._moved_points(vertices)
-        static = self._static_buffer
-        buffer = VisibilityBuffer(static.triangle_ids.copy(), static.inverse_depth.copy())
+        buffer = self._buffer
+        restore_pixels(self._static_buffer, buffer)
         rasterize(points, self._triangles, assembly.first_triangle, self._depths, buffer)
-        ids = buffer.triangle_ids
-        color = self._shade(ids, vertices, normals) if "color" in passes else None
+        color = self._shade(vertices, normals) if "color" in passes else None
         if not set(passes) - {"color"}:
             return Frame(color=color)
-        geometry = self._fill_geometry(ids, points, normals, frame, "flow" in passes)
+        geometry = self._fill_geometry(
+            buffer.triangle_ids, points, normals, frame, "flow" in passes
+        )
         return Frame(
             color=color,
             depth=geometry.depth if "depth" in passes else None,
@@ -256,26 +250,20 @@ class Renderer:
         for frame in range(len(self.trajectory)):
             yield self.render(frame, passes)
 
-    def _shade(self, triangle_ids: I32, vertices: F64, normals: F32) -> U8:
-        """Return the colour pass (H, W, 3) of a frame."""
-        inputs, first = self._inputs, self._assembly.first_triangle
+    def _shade(self, vertices: F64, normals: F32) -> U8:
+        """Return the colour pass (H, W, 3) of the frame that was drawn last."""
+        inputs, assembly = self._inputs, self._assembly
+        faces, first = assembly.faces, assembly.first_triangle
         inputs.surfaces["normals"][first:] = normals[first:]
-        if self._shaded is None:
-            self._shaded = np.zeros(self.height * self.width + 1, POINT)
-            static_ids = self._static_buffer.triangle_ids
-            shade_static_points(static_ids, self._kept_triangles, inputs, self._shaded)
+        if self._kept_pixels is None:
+            self._kept_pixels = keep_nothing(self.height, self.width)
         maps = LightMaps(
-            self._with_moving(self._shadow, vertices), self._with_moving(self._occlusion, vertices)
+            self._shadow.with_moving(vertices, faces, first),
+            self._occlusion.with_moving(vertices, faces, first),
         )
         colors = np.empty((self.height, self.width, 3), np.uint8)
-        shade(triangle_ids, self._kept_triangles, inputs, maps, self._shaded, colors)
+        shade(self._buffer, self._kept_triangles, inputs, maps, self._kept_pixels, colors)
         return colors
-
-    def _with_moving(self, static: StaticDepthMap, vertices: F64) -> DepthMap:
-        """Return a depth map of one frame: what never moves, and the moving bodies."""
-        depth = static.depth.copy()
-        self._draw_map(depth, static.matrix, vertices, True)
-        return static.with_moving(depth)
 
     def _fill_geometry(
         self, triangle_ids: I32, points: F64, normals: F32, frame: int, flow: bool

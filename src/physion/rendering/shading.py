@@ -8,8 +8,9 @@ to the camera is
 
 with the terms of `_shade_point`, whose equations stand below; ``lit`` is the fraction of the
 directional light that shadows leave, and ``room`` the ambient occlusion near the room's walls.
-Everything but ``lit`` and the occlusion under objects depends on the point alone.
-It is therefore kept for surfaces that never move.
+Everything but ``lit`` and the occlusion under objects depends on the point only, and is kept for
+surfaces that never move. Where a pixel shows nothing else, and no moving body is near the parts of
+the depth maps that it reads, its colour is kept too.
 
 References
 ----------
@@ -19,7 +20,7 @@ Heckbert, P. (1989). Fundamentals of texture mapping and image warping. MSc thes
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,16 +28,22 @@ from numpy.typing import NDArray
 from physion.numerics.elementary import coarse_log2_of, exp_of
 from physion.numerics.kernel import kernel
 from physion.rendering.rasterizer import (
+    OCCLUSION_RADIUS,
+    POINT,
     SAMPLES,
+    SHADOW_RADIUS,
     LightMaps,
     Records,
     ShadingInputs,
+    VisibilityBuffer,
     barycentric,
+    block_index,
     lit_fraction,
     occluded_fraction,
 )
 from physion.rendering.textures.atlas import mip_level, sample_texture
 
+Bools = NDArray[np.bool_]
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 U8 = NDArray[np.uint8]
@@ -358,55 +365,102 @@ def _tone(tones: U8, light: float) -> int:
     return int(tones[int(min(index, TONES - 1.0))])
 
 
-@kernel
-def shade_static_points(
-    triangle_ids: I32, static: int, inputs: ShadingInputs, points: Records
-) -> None:
-    """Shade the centres of all pixels that show one of the first ``static`` triangles.
+class KeptPixels(NamedTuple):
+    """What `shade` keeps from frame to frame of pixels that show only what never moves.
 
-    Entry i * W + j of ``points`` is the pixel in row i and column j of
-    ``triangle_ids`` (H, W, S); the entries of other pixels stay as they are.
+    All of it depends on the scene only, and it is filled in whatever frame needs it first.
+
+    - ``points`` (H * W + 1,) of `physion.rendering.rasterizer.POINT`: the surface at the centre of
+      pixel i * W + j, in row i and column j. The last one is overwritten.
+    - ``shaded`` (H * W,) bool: whether it is there.
+    - ``surfaces`` (H, W) uint8: number of surfaces that the pixel shows; 0 as long as the lookups
+      are not known.
+    - ``shadow_blocks``, ``occlusion_blocks`` (H, W, S) int32: the `block_index` of the lookup of
+      each surface in the two depth maps; -1 for none.
+    - ``colored`` (H, W) bool, ``colors`` (H, W, 3) uint8: the colour while no moving body is near
+      the blocks, and whether it is there.
     """
-    height, width, _ = triangle_ids.shape
-    for row in range(height):
-        for column in range(width):
-            t = triangle_ids[row, column, 0]
-            if 0 <= t < static:
-                x, y = column + 0.5 + SAMPLES[0, 0], row + 0.5 + SAMPLES[0, 1]
-                _shade_point(t, x, y, inputs, points, row * width + column)
+
+    points: Records
+    shaded: Bools
+    surfaces: U8
+    shadow_blocks: I32
+    occlusion_blocks: I32
+    colored: Bools
+    colors: U8
+
+
+def keep_nothing(height: int, width: int) -> KeptPixels:
+    """Return a `KeptPixels` in which nothing is known yet."""
+    blocks = (height, width, len(SAMPLES))
+    return KeptPixels(
+        points=np.zeros(height * width + 1, POINT),
+        shaded=np.zeros(height * width, np.bool_),
+        surfaces=np.zeros((height, width), np.uint8),
+        shadow_blocks=np.full(blocks, -1, np.int32),
+        occlusion_blocks=np.full(blocks, -1, np.int32),
+        colored=np.zeros((height, width), np.bool_),
+        colors=np.zeros((height, width, 3), np.uint8),
+    )
+
+
+@kernel
+def _moved_over(
+    kept: KeptPixels, row: int, column: int, shadow_moved: Bools, occlusion_moved: Bools
+) -> bool:
+    """Whether a moving body is near one of the blocks that a pixel's lookups read."""
+    for s in range(kept.surfaces[row, column]):
+        block = kept.shadow_blocks[row, column, s]
+        if block >= 0 and shadow_moved[block]:
+            return True
+        block = kept.occlusion_blocks[row, column, s]
+        if block >= 0 and occlusion_moved[block]:
+            return True
+    return False
 
 
 @kernel
 def shade(
-    triangle_ids: I32,
+    buffer: VisibilityBuffer,
     static: int,
     inputs: ShadingInputs,
     maps: LightMaps,
-    points: Records,
+    kept: KeptPixels,
     colors: U8,
 ) -> None:
     """Shade every pixel of a visibility buffer.
 
     Parameters
     ----------
-    triangle_ids
-        (H, W, S) triangle of each sample, or `NOTHING`.
+    buffer
+        What each pixel shows.
     static
-        Triangles before this index never move. Where the centre of a pixel shows one of them, its
-        shading is read from ``points``; that gives the same numbers as shading it again.
+        Triangles before this index never move. What depends on them only is read from ``kept``
+        where it is there, and kept where it is not; that gives the same bytes as shading again.
+        With 0 nothing is kept.
     inputs, maps
         The scene, and its depth maps in this frame.
-    points
-        (H * W + 1,) of `physion.rendering.rasterizer.POINT`, filled by `shade_static_points`. The
-        last one is overwritten.
+    kept
+        Read and filled in.
     colors
         (H, W, 3) uint8, written: sRGB.
     """
+    triangle_ids = buffer.triangle_ids
     height, width, samples = triangle_ids.shape
     light, groups, tones = inputs.lights[0], inputs.groups, inputs.tones
     shadow, occlusion = maps.shadow, maps.occlusion
+    shadow_moved, occlusion_moved = shadow.moved.ravel(), occlusion.moved.ravel()
+    points = kept.points
     for row in range(height):
         for column in range(width):
+            still = static > 0 and not buffer.drawn[row, column]
+            known = still and kept.colored[row, column]
+            if known and not _moved_over(kept, row, column, shadow_moved, occlusion_moved):
+                for k in range(3):
+                    colors[row, column, k] = kept.colors[row, column, k]
+                continue
+            new = still and kept.surfaces[row, column] == 0
+            surfaces = 0
             red, green, blue = 0.0, 0.0, 0.0
             todo = (1 << samples) - 1  # bit mask of the samples not yet shaded
             for s in range(samples):
@@ -428,16 +482,17 @@ def shade(
                 p = row * width + column
                 if s > 0 or t >= static:
                     p = height * width
+                if p == height * width or not kept.shaded[p]:
                     x, y = column + 0.5 + SAMPLES[s, 0], row + 0.5 + SAMPLES[s, 1]
                     _shade_point(t, x, y, inputs, points, p)
+                    if p < height * width:
+                        kept.shaded[p] = True
                 point = points[p]
                 px, py, pz = point.position[0], point.position[1], point.position[2]
-                lit = lit_fraction(
-                    shadow,
-                    px + SHADOW_OFFSET * point.normal[0],
-                    py + SHADOW_OFFSET * point.normal[1],
-                    pz + SHADOW_OFFSET * point.normal[2],
-                )
+                sx = px + SHADOW_OFFSET * point.normal[0]
+                sy = py + SHADOW_OFFSET * point.normal[1]
+                sz = pz + SHADOW_OFFSET * point.normal[2]
+                lit = lit_fraction(shadow, sx, sy, sz)
                 lit = 1.0 - light.shadow_strength * (1.0 - lit)
                 levelness = point.levelness
                 if levelness > 0.0:
@@ -446,6 +501,19 @@ def shade(
                 red += weight * (point.ambient[0] + lit * point.direct[0])
                 green += weight * (point.ambient[1] + lit * point.direct[1])
                 blue += weight * (point.ambient[2] + lit * point.direct[2])
+                if new:
+                    block = block_index(shadow, sx, sy, sz, SHADOW_RADIUS)
+                    kept.shadow_blocks[row, column, surfaces] = block
+                    if levelness > 0.0:
+                        block = block_index(occlusion, px, py, pz, OCCLUSION_RADIUS)
+                        kept.occlusion_blocks[row, column, surfaces] = block
+                    surfaces += 1
             colors[row, column, 0] = _tone(tones, red)
             colors[row, column, 1] = _tone(tones, green)
             colors[row, column, 2] = _tone(tones, blue)
+            if new:
+                kept.surfaces[row, column] = surfaces
+            if still and not _moved_over(kept, row, column, shadow_moved, occlusion_moved):
+                kept.colored[row, column] = True
+                for k in range(3):
+                    kept.colors[row, column, k] = colors[row, column, k]
