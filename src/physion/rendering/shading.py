@@ -492,8 +492,12 @@ def shade(
                 sx = px + SHADOW_OFFSET * point.normal[0]
                 sy = py + SHADOW_OFFSET * point.normal[1]
                 sz = pz + SHADOW_OFFSET * point.normal[2]
-                lit = lit_fraction(shadow, sx, sy, sz)
-                lit = 1.0 - light.shadow_strength * (1.0 - lit)
+                direct = point.direct
+                turned_away = direct[0] == 0.0 and direct[1] == 0.0 and direct[2] == 0.0
+                lit = 1.0  # of no light
+                if not turned_away:
+                    lit = lit_fraction(shadow, sx, sy, sz)
+                    lit = 1.0 - light.shadow_strength * (1.0 - lit)
                 levelness = point.levelness
                 if levelness > 0.0:
                     occluded = occluded_fraction(occlusion, px, py, pz)
@@ -502,8 +506,9 @@ def shade(
                 green += weight * (point.ambient[1] + lit * point.direct[1])
                 blue += weight * (point.ambient[2] + lit * point.direct[2])
                 if new:
-                    block = block_index(shadow, sx, sy, sz, SHADOW_RADIUS)
-                    kept.shadow_blocks[row, column, surfaces] = block
+                    if not turned_away:
+                        block = block_index(shadow, sx, sy, sz, SHADOW_RADIUS)
+                        kept.shadow_blocks[row, column, surfaces] = block
                     if levelness > 0.0:
                         block = block_index(occlusion, px, py, pz, OCCLUSION_RADIUS)
                         kept.occlusion_blocks[row, column, surfaces] = block
