@@ -133,13 +133,16 @@ class Renderer:
         self._projection = view.to_pixels
         self._assembly = a = assemble(scene, self.room)
         self._kept_triangles = a.first_triangle if settings.keep_static else 0
-        self._static_vertices, self._static_normals = pose_meshes(a, scene, trajectory, 0, False)
+        # Of vertices and normals, all those that never move are written here and stay.
+        self._vertices = np.zeros((a.vertex_count, 3))
+        self._normals = np.zeros((len(a.faces), 3, 3), np.float32)
+        pose_meshes(a, scene, trajectory, 0, False, self._vertices, self._normals)
         edges = np.zeros((len(a.faces), 3, 3))
         self._triangles = Triangles(a.faces, a.two_sided, edges)
         self._inputs = ShadingInputs(
             camera=_pack_camera(view),
             edges=edges,
-            surfaces=_pack_surfaces(a, self._static_normals),
+            surfaces=_pack_surfaces(a, self._normals),
             groups=a.groups,
             materials=a.materials,
             atlas=a.atlas,
@@ -147,7 +150,7 @@ class Renderer:
             tones=tone_table(self.room.exposure),
         )
         self._shadow, self._occlusion = self._draw_static_maps()
-        self._static_points = self._to_pixels(self._static_vertices)
+        self._static_points = self._to_pixels(self._vertices)
         self._static_buffer = self._draw_static()
         self._buffer = VisibilityBuffer(*(array.copy() for array in self._static_buffer))
         self._kept_pixels: KeptPixels | None = None
@@ -175,7 +178,7 @@ class Renderer:
         maps, assembly = empty_maps(self.scene, self.room), self._assembly
         first, last = assembly.room_triangles, assembly.first_triangle
         for static in maps:
-            static.draw_static(self._static_vertices, assembly.faces, first, last)
+            static.draw_static(self._vertices, assembly.faces, first, last)
         return maps
 
     def _draw_static(self) -> VisibilityBuffer:
@@ -223,10 +226,9 @@ class Renderer:
             raise BadInputError(f"frame {frame} of a trajectory of {count} frames does not exist")
         frame %= count
         assembly = self._assembly
-        vertices, normals = pose_meshes(assembly, self.scene, self.trajectory, frame, True)
+        vertices, normals = self._vertices, self._normals
+        pose_meshes(assembly, self.scene, self.trajectory, frame, True, vertices, normals)
         hide_absent(assembly, self.scene, frame, vertices)
-        vertices += self._static_vertices
-        normals += self._static_normals
         points = self._moved_points(vertices)
         buffer = self._buffer
         restore_pixels(self._static_buffer, buffer)
@@ -289,7 +291,8 @@ class Renderer:
         following = frame + 1
         flow = flow and following < len(self.trajectory)
         if flow:
-            vertices, _ = pose_meshes(assembly, self.scene, self.trajectory, following, True)
+            vertices = np.zeros_like(self._vertices)
+            pose_meshes(assembly, self.scene, self.trajectory, following, True, vertices)
             motion = motion._replace(next_points=self._moved_points(vertices))
         static = self._static_geometry
         out = GeometryBuffers(

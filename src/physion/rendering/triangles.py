@@ -10,12 +10,14 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from physion.numerics.elementary import arccos, cos
-from physion.numerics.linear_algebra import apply, dot, norm, unit
+from physion.numerics.kernel import kernel
+from physion.numerics.linear_algebra import cross, dot, norm, unit
 from physion.numerics.rotations import rotation_matrices
 from physion.physics.trajectory import Trajectory
 from physion.rendering.light import to_linear
@@ -416,10 +418,25 @@ def _room_part(panels: tuple[Panel, ...], table: _MaterialTable) -> MeshPart:
     )
 
 
+@kernel
+def _rotate(rotation: F64, points: Any, out: Any) -> None:
+    """Write the rotated points (P, 3) to ``out`` (P, 3)."""
+    for i in range(len(points)):
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        for k in range(3):
+            out[i, k] = (rotation[k, 0] * x + rotation[k, 1] * y) + rotation[k, 2] * z
+
+
 def pose_meshes(
-    assembly: Assembly, scene: Scene, trajectory: Trajectory, frame: int, moving: bool
-) -> tuple[F64, F32]:
-    """Return the vertices and normals in the world in one frame, also of absent bodies.
+    assembly: Assembly,
+    scene: Scene,
+    trajectory: Trajectory,
+    frame: int,
+    moving: bool,
+    vertices: F64,
+    normals: F32 | None = None,
+) -> None:
+    """Write the vertices and normals in the world in one frame, also of absent bodies.
 
     Parameters
     ----------
@@ -428,15 +445,10 @@ def pose_meshes(
     frame
         Index of the frame.
     moving
-        Whether the moving meshes are posed, or the others.
-
-    Returns
-    -------
+        Whether the moving meshes are posed, or the others; the entries of the rest stay.
     vertices, normals
-        (V, 3) metres and (T, 3, 3) of each corner; zero for the meshes that are not posed.
+        (V, 3) metres and, where asked for, (T, 3, 3) of each corner, written.
     """
-    vertices = np.zeros((assembly.vertex_count, 3))
-    normals = np.zeros((len(assembly.faces), 3, 3), np.float32)
     bodies, offset = len(scene.bodies), 0
     rotations = rotation_matrices(trajectory.rotations[frame])
     for instance in assembly.instances:
@@ -445,18 +457,23 @@ def pose_meshes(
         count = len(part.vertices)
         if wanted and index == ROOM:
             vertices[instance.vertices] = part.vertices
-            normals[instance.triangles] = part.normals
+            if normals is not None:
+                normals[instance.triangles] = part.normals
         elif wanted and index < bodies:
             position = trajectory.positions[frame, index].astype(np.float64)
-            vertices[instance.vertices] = apply(rotations[index], part.vertices) + position
-            normals[instance.triangles] = apply(rotations[index], part.normals)
+            placed = vertices[instance.vertices]
+            _rotate(rotations[index], part.vertices, placed)
+            placed += position
+            if normals is not None:
+                corners = normals[instance.triangles].reshape(-1, 3)
+                _rotate(rotations[index], part.normals.reshape(-1, 3), corners)
         elif wanted:
             cloth = trajectory.cloth_vertices[frame, offset : offset + count].astype(np.float64)
             vertices[instance.vertices] = cloth
-            normals[instance.triangles] = _sheet_normals(cloth)
+            if normals is not None:
+                normals[instance.triangles] = _sheet_normals(cloth)
         if index >= bodies:
             offset += count
-    return vertices, normals
 
 
 def hide_absent(assembly: Assembly, scene: Scene, frame: int, vertices: F64) -> None:
@@ -482,7 +499,7 @@ def _sheet_normals(vertices: F64) -> F32:
     side = math.isqrt(len(vertices))
     p = vertices.reshape(side, side, 3)
     a, b, c, d = p[:-1, :-1], p[1:, :-1], p[1:, 1:], p[:-1, 1:]
-    left, right = np.cross(b - a, c - a), np.cross(c - a, d - a)
+    left, right = cross(b - a, c - a), cross(c - a, d - a)
     total = np.zeros_like(p)
     total[:-1, :-1] += left + right
     total[1:, :-1] += left
