@@ -310,7 +310,7 @@ def test_every_shape_is_closed(name: str) -> None:
         inverse = np.zeros(ids.shape, np.float32)
         sides = np.full(len(faces), two_sided)
         triangles = Triangles(faces, sides, np.zeros((len(faces), 3, 3)))
-        buffer = VisibilityBuffer(ids, inverse)
+        buffer = VisibilityBuffer(ids, inverse, np.zeros(ids.shape[:2], bool))
         rasterize(homogeneous, triangles, 0, DepthRange(0.1, 100.0), buffer)
         pictures.append(inverse)
     assert (pictures[0] > 0).sum() > 2000
@@ -331,7 +331,8 @@ def test_a_triangle_through_the_camera_plane_hides_what_is_behind_it() -> None:
     inverse = np.zeros(ids.shape, np.float32)
     faces = np.array([[0, 1, 2]], np.int32)
     triangles = Triangles(faces, np.ones(1, bool), np.zeros((1, 3, 3)))
-    rasterize(homogeneous, triangles, 0, DepthRange(0.1, 100.0), VisibilityBuffer(ids, inverse))
+    buffer = VisibilityBuffer(ids, inverse, np.zeros(ids.shape[:2], bool))
+    rasterize(homogeneous, triangles, 0, DepthRange(0.1, 100.0), buffer)
     eye = np.array([0.0, 0.0, 1.0])
     ray = view.unproject(pixel_centers(64, 64), np.ones((64, 64))) - eye
     with np.errstate(divide="ignore", invalid="ignore"):

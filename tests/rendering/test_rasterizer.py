@@ -49,7 +49,8 @@ def draw(
     count = len(faces)
     triangles = Triangles(faces, np.full(count, two_sided), np.zeros((count, 3, 3)))
     shape = (SIZE, SIZE, len(SAMPLES))
-    buffer = VisibilityBuffer(np.full(shape, NOTHING, np.int32), np.zeros(shape, np.float32))
+    ids, drawn = np.full(shape, NOTHING, np.int32), np.zeros(shape[:2], bool)
+    buffer = VisibilityBuffer(ids, np.zeros(shape, np.float32), drawn)
     rasterize(points, triangles, 0, depths, buffer)
     return triangles, buffer
 
@@ -174,7 +175,11 @@ def test_depth_map_of_a_tilted_plane() -> None:
     plane = np.column_stack([corners, 1 + 0.1 * corners[:, 0] + 0.2 * corners[:, 1]])
     faces = np.array([[0, 1, 2], [0, 3, 2]], np.int32)
     depth = np.full((SIZE, SIZE), 9.0, np.float32)
-    rasterize_depth(plane, faces, 0, 2, depth)
+    drawn = np.zeros((SIZE // BLOCK, SIZE // BLOCK), bool)
+    rasterize_depth(plane, faces, 0, 2, depth, drawn)
+    lowered = (depth < 9.0).reshape(SIZE // BLOCK, BLOCK, -1, BLOCK).any(axis=(1, 3))
+    np.testing.assert_array_equal(drawn, lowered)
+    assert drawn.any() and not drawn.all()
     x, y = np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5)
     np.testing.assert_allclose(depth, np.minimum(1 + 0.1 * x + 0.2 * y, 9.0), rtol=1e-6)
 
@@ -188,7 +193,7 @@ def depth_map(depth: NDArray[np.float64] | float, occupied: bool = True) -> Dept
     """Return a map whose texel coordinates and depth are the world's x, y and z."""
     matrix = np.eye(3, 4)
     texels = np.array(np.broadcast_to(depth, (MAP_SIZE, MAP_SIZE)), np.float32)
-    return DepthMap(matrix, texels, np.full((4, 4), occupied))
+    return DepthMap(matrix, texels, np.full((4, 4), occupied), np.zeros((4, 4), bool))
 
 
 def half_blocked(column: int, depth: float = 0.0) -> DepthMap:

@@ -16,7 +16,6 @@ from physion.rendering.rasterizer import (
     LIGHT,
     MATERIAL,
     NOTHING,
-    POINT,
     SAMPLES,
     SURFACE,
     DepthMap,
@@ -38,9 +37,9 @@ from physion.rendering.shading import (
     corner_occlusion,
     fresnel,
     highlight,
+    keep_nothing,
     lambert,
     shade,
-    shade_static_points,
     texture_footprint,
     window_fraction,
 )
@@ -79,7 +78,7 @@ def material_of(**fields: object) -> NDArray[np.void]:
 
 def plane(
     angle: float, light: NDArray[np.void], material: NDArray[np.void]
-) -> tuple[ShadingInputs, NDArray[np.int32]]:
+) -> tuple[ShadingInputs, VisibilityBuffer]:
     """Return a large plane through the origin, tilted by ``angle``, seen from straight above.
 
     Its texture coordinates are metres.
@@ -92,9 +91,11 @@ def plane(
     triangles = Triangles(np.array([[0, 1, 2]], np.int32), np.zeros(1, bool), np.zeros((1, 3, 3)))
     shape = (SIZE, SIZE, len(SAMPLES))
     ids = np.full(shape, NOTHING, np.int32)
-    buffer = VisibilityBuffer(ids, np.zeros(shape, np.float32))
+    nearness, drawn = np.zeros(shape, np.float32), np.zeros(shape[:2], bool)
+    buffer = VisibilityBuffer(ids, nearness, drawn)
     rasterize(points, triangles, 0, DepthRange(0.01, 100.0), buffer)
-    assert ids[MIDDLE, MIDDLE, 0] == 0
+    assert ids[MIDDLE, MIDDLE, 0] == 0 and drawn[MIDDLE, MIDDLE]
+    drawn[...] = False
     surfaces = np.zeros(1, SURFACE)
     surfaces["normals"], surfaces["uv"] = along(angle), corners
     camera = np.zeros(1, CAMERA)
@@ -109,29 +110,32 @@ def plane(
         lights=light,
         tones=np.round(np.linspace(0.0, WHITEST * BYTES, TONES)).astype(np.uint8),
     )
-    return inputs, ids
+    return inputs, buffer
+
+
+def shaded_points(inputs: ShadingInputs, buffer: VisibilityBuffer) -> NDArray[np.void]:
+    """Return the `POINT` of each pixel of a plane that never moves."""
+    known, colors = keep_nothing(SIZE, SIZE), np.zeros((SIZE, SIZE, 3), np.uint8)
+    shade(buffer, 1, inputs, LightMaps(flat_map(np.inf), flat_map(np.inf)), known, colors)
+    return known.points[:-1]
 
 
 def shaded(angle: float, light: NDArray[np.void] | None = None, **material: object) -> np.void:
     """Return the `POINT` in the middle of the picture of a plane, which is the origin."""
     light = light_from() if light is None else light
-    inputs, ids = plane(angle, light, material_of(**material))
-    points = np.zeros(SIZE * SIZE + 1, POINT)
-    shade_static_points(ids, 1, inputs, points)
-    return points[MIDDLE * SIZE + MIDDLE]
+    inputs, buffer = plane(angle, light, material_of(**material))
+    return shaded_points(inputs, buffer)[MIDDLE * SIZE + MIDDLE]
 
 
 def test_the_point_is_where_the_ray_meets_the_plane() -> None:
-    inputs, ids = plane(0.6, light_from(), material_of())
-    points = np.zeros(SIZE * SIZE + 1, POINT)
-    shade_static_points(ids, 1, inputs, points)
-    covered = ids[..., 0].ravel() == 0
-    assert covered.all()
-    np.testing.assert_allclose(points["position"][:-1] @ along(0.6), 0.0, atol=1e-5)
-    pixels, _ = VIEW.project(points["position"][:-1])
+    inputs, buffer = plane(0.6, light_from(), material_of())
+    assert (buffer.triangle_ids[..., 0] == 0).all()
+    points = shaded_points(inputs, buffer)
+    np.testing.assert_allclose(points["position"] @ along(0.6), 0.0, atol=1e-5)
+    pixels, _ = VIEW.project(points["position"])
     centers = np.stack(np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5), axis=-1)
     np.testing.assert_allclose(pixels, centers.reshape(-1, 2), atol=1e-3)
-    np.testing.assert_allclose(points["normal"][:-1], [along(0.6)] * SIZE**2, atol=1e-6)
+    np.testing.assert_allclose(points["normal"], [along(0.6)] * SIZE**2, atol=1e-6)
 
 
 @pytest.mark.parametrize("light", [0.0, 0.4])
@@ -236,23 +240,25 @@ def flat_map(depth: float) -> DepthMap:
     """Return a map of the ground around the origin, 0.25 m a texel, seen from above."""
     size = 8 * BLOCK
     matrix = np.array([[4.0, 0, 0, size / 2], [0, 4.0, 0, size / 2], [0, 0, -1.0, 0]])
-    return DepthMap(matrix, np.full((size, size), depth, np.float32), np.ones((8, 8), bool))
+    everywhere, nowhere = np.ones((8, 8), bool), np.zeros((8, 8), bool)
+    return DepthMap(matrix, np.full((size, size), depth, np.float32), everywhere, nowhere)
 
 
 @pytest.mark.parametrize("kept", [0, 1])
 def test_shadow_takes_its_fraction_only_of_the_direct_light(kept: int) -> None:
     """Also where the shading of static surfaces is read (``kept`` 1) instead of made."""
     light = light_from(ambient=0.8, shadow_strength=0.75, background=(1.0, 2.0, 3.0))
-    inputs, ids = plane(0.0, light, material_of())
-    ids[0] = NOTHING
-    points = np.zeros(SIZE * SIZE + 1, POINT)
-    shade_static_points(ids, kept, inputs, points)
+    inputs, buffer = plane(0.0, light, material_of())
+    buffer.triangle_ids[0] = NOTHING
     nothing = flat_map(np.inf)
     # A surface is looked up 3 cm above itself: it throws no shadow on itself, nor does what is
     # nearer than that. Depths of the map are heights with the sign reversed.
     for blocker, direct in ((np.inf, 1.0), (-1.0, 0.25), (0.0, 1.0), (-0.02, 1.0), (-0.04, 0.25)):
-        colors = np.zeros((SIZE, SIZE, 3), np.uint8)
-        shade(ids, kept, inputs, LightMaps(flat_map(blocker), nothing), points, colors)
+        colors, maps = np.zeros((SIZE, SIZE, 3), np.uint8), LightMaps(flat_map(blocker), nothing)
+        known = keep_nothing(SIZE, SIZE)
+        for _ in range(1 + kept):
+            shade(buffer, kept, inputs, maps, known, colors)
+        assert known.colored.all() == bool(kept)
         expected = round(BYTES * (0.5 * 0.8 + 0.5 * direct))
         assert np.abs(colors[1:].astype(int) - expected).max() <= 1
         np.testing.assert_array_equal(colors[0], [[BYTES, 2 * BYTES, 3 * BYTES]] * SIZE)
@@ -260,11 +266,10 @@ def test_shadow_takes_its_fraction_only_of_the_direct_light(kept: int) -> None:
 
 def test_occlusion_under_objects_takes_its_fraction_of_all_light() -> None:
     light = light_from(ambient=0.8, occlusion_strength=0.6)
-    inputs, ids = plane(0.0, light, material_of())
-    points = np.zeros(SIZE * SIZE + 1, POINT)
+    inputs, buffer = plane(0.0, light, material_of())
     colors = np.zeros((SIZE, SIZE, 3), np.uint8)
     maps = LightMaps(flat_map(np.inf), flat_map(0.0))
-    shade(ids, 0, inputs, maps, points, colors)
+    shade(buffer, 0, inputs, maps, keep_nothing(SIZE, SIZE), colors)
     assert abs(int(colors[MIDDLE, MIDDLE, 0]) - BYTES * 0.4 * 0.5 * 1.8) <= 1
 
 
