@@ -474,6 +474,8 @@ def pose_meshes(
                 normals[instance.triangles] = _sheet_normals(cloth)
         if index >= bodies:
             offset += count
+        if wanted and normals is not None:
+            normals[instance.triangles] += np.float32(0.0)  # turns -0 into 0
 
 
 def hide_absent(assembly: Assembly, scene: Scene, frame: int, vertices: F64) -> None:
