@@ -152,7 +152,8 @@ class Renderer:
         self._shadow, self._occlusion = self._draw_static_maps()
         self._static_points = self._to_pixels(self._vertices)
         self._static_buffer = self._draw_static()
-        self._buffer = VisibilityBuffer(*(array.copy() for array in self._static_buffer))
+        ids, nearness, drawn = self._static_buffer
+        self._buffer = VisibilityBuffer(ids.copy(), nearness.copy(), drawn.copy())
         self._kept_pixels: KeptPixels | None = None
         self._static_geometry: GeometryBuffers | None = None
 
