@@ -471,7 +471,7 @@ def block_index(depth_map: DepthMap, px: float, py: float, pz: float, radius: in
     height, width = depth_map.depth.shape
     if x < radius or y < radius or x >= width - radius - 1 or y >= height - radius - 1:
         return -1
-    return (int(y) // BLOCK) * (width // BLOCK) + int(x) // BLOCK
+    return int(int(y) // BLOCK * (width // BLOCK) + int(x) // BLOCK)
 
 
 @kernel
