@@ -27,7 +27,7 @@ from physion.experiment.study.study import Study
 from support.experiment.serving import QuickServer, stored_answers, stored_sessions
 from support.experiment.tiny_study import make_tiny_study
 
-KILLS = 25
+KILLS = 50
 PHASES = {"familiarization": 3, "test": 12}
 LONGEST_RUN_S = 0.4
 """Longest time in seconds between the start of the server and a kill."""
