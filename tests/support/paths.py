@@ -7,5 +7,5 @@ from pathlib import Path
 
 TESTS = Path(__file__).parents[1]
 ROOT = TESTS.parent
-FIND_TESTS = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), str(ROOT)])}
-"""Lets a new process import ``support`` and ``tests``."""
+FIND_TESTS = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (ROOT / "src", TESTS, ROOT)))}
+"""Lets a new process import ``support``, ``tests`` and the package of this checkout."""
