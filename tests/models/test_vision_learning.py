@@ -118,9 +118,9 @@ def test_boxes_of_falling_squares_are_nearer_than_at_constant_velocity() -> None
 # trained here. For RPIN, whose boxes come from the motions of trials, these are exchanged too.
 
 NAMES = ("cswm", "svg", "op3", "rpin")
-OPTIONS: dict[str, dict[str, Any]] = {"op3": {"slots": 3, "seed_steps": 1}}
+OPTIONS: dict[str, dict[str, Any]] = {"op3": {"slots": 3}}
 """Options by model; with fewer slots OP3 is quicker."""
-COUNTS = {"readout": 16, "testing": 48}
+COUNTS = {"readout": 24, "testing": 48}
 CHANCE = 0.217
 """Three standard errors of the accuracy of guessing 48 trials."""
 

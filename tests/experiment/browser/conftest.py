@@ -1,4 +1,4 @@
-"""One browser, and one study on one server, for all tests of this folder."""
+"""One browser, and one study on one server, for each file of tests in this folder."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from support.experiment.browser import MTURK, chromium, driver, firefox, served
 __all__ = ["chromium", "driver", "firefox"]
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Study, str]]:
     """A study of one practice trial and three test trials, and the URL of its server."""
     settings: dict[str, Any] = {

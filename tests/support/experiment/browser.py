@@ -49,8 +49,8 @@ hidden => {
 """Function of the page that hides it, or shows it again, as far as its scripts can tell."""
 
 
-# One for all tests of a folder: while it runs, its event loop blocks this thread for others.
-@pytest.fixture(scope="package")
+# One for each file of tests: while it runs, its event loop blocks this thread for others.
+@pytest.fixture(scope="module")
 def driver() -> Iterator[Any]:
     """Playwright; skips the tests if it is not installed."""
     if importlib.util.find_spec("playwright") is None:
@@ -59,7 +59,7 @@ def driver() -> Iterator[Any]:
         yield playwright
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def chromium(driver: Any) -> Iterator[Any]:
     """A running Chromium; skips the tests if there is none."""
     browser = driver.chromium.launch(
@@ -69,7 +69,7 @@ def chromium(driver: Any) -> Iterator[Any]:
     browser.close()
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def firefox(driver: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """A running Firefox; `firefox_bridge` stands between it and Playwright."""
     bridge = Path(__file__).with_name("firefox_bridge.py")
