@@ -20,20 +20,17 @@ import sys
 from pathlib import Path
 
 from physion.compute.tasks import processor_and_cores
+from physion.scenes.sampling.build import scenarios
 
 RESULTS = Path(__file__).parents[1] / "results"
 HERE = Path(__file__).parents[2] / "src"
 WORK = """
 import json, sys, time
-from physion.scenes.sampling.build import scenarios
-from physion.physics.engine import simulate
+from physion import sample_scene, simulate
 from physion.rendering.renderer import Renderer
-from physion.core.seeds import trial_seed
 times = {}
-for scenario in sorted(scenarios.names()):
-    chosen = scenarios.get(scenario)
-    scenes = [chosen.sample(chosen.params(), trial_seed("speed", scenario, "testing", i))
-              for i in range(int(sys.argv[1]))]
+for scenario in sys.argv[2:]:
+    scenes = [sample_scene(scenario, i) for i in range(int(sys.argv[1]))]
     simulate(scenes[0], frames=30)
     start = time.process_time()
     motions = [simulate(scene, frames=150) for scene in scenes]
@@ -54,7 +51,7 @@ print(json.dumps(times))
 def measure(source: Path, seeds: int) -> dict[str, tuple[float, float]]:
     """Seconds of physics and of rendering by scenario, from a process of one checkout."""
     done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", WORK, str(seeds)],
+        [sys.executable, "-W", "ignore", "-c", WORK, str(seeds), *sorted(scenarios.names())],
         env={**os.environ, "PYTHONPATH": str(source)},
         stdout=subprocess.PIPE,
         check=True,
