@@ -132,6 +132,7 @@ def _cache_files(folder: Path) -> set[str]:
     return {path.name for path in (folder / "__pycache__").iterdir() if path.name[:5] == "step."}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("files", [1, 2])
 def test_a_worker_killed_between_two_files_leaves_no_older_code(tmp_path: Path, files: int) -> None:
     assert _run_step(tmp_path, 1) == "2 0"
@@ -141,6 +142,7 @@ def test_a_worker_killed_between_two_files_leaves_no_older_code(tmp_path: Path, 
     assert _run_step(tmp_path, 5) == "6 1"
 
 
+@pytest.mark.slow
 def test_an_older_worker_that_ends_later_leaves_no_older_code(tmp_path: Path) -> None:
     """Numba's own files have one name for all sources, so the last writer would win."""
     assert _run_step(tmp_path, 1) == "2 0"

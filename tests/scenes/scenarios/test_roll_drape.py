@@ -229,6 +229,7 @@ def test_probes_of_collisions_are_tumbled_and_start_above_the_floor() -> None:
 # Drape.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", published("drape"), ids=lambda preset: preset.name)
 def test_drape_is_drawn_as_the_official_scenes(official: Path, preset: Preset) -> None:
     real = official_scenes(official, "drape", preset)
@@ -283,6 +284,7 @@ def test_cloth_is_the_agent_and_nothing_meets_on_the_floor() -> None:
             assert max(map(abs, project_to_image(scene.camera, point))) < 1
 
 
+@pytest.mark.slow
 def test_third_anchor_has_its_probability() -> None:
     scenes = [draw("drape", drape.DrapeParameters(), index) for index in range(300)]
     extra = [body(s, "anchor_extra") for s in scenes if "anchor_extra" in s.names()]
