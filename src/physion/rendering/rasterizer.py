@@ -460,10 +460,10 @@ class DepthMap(NamedTuple):
 
 @kernel
 def block_index(depth_map: DepthMap, px: float, py: float, pz: float, radius: int) -> int:
-    """Return the block, counted row by row, that a lookup at a world point begins with.
+    """Return the block, counted row by row, in which a world point is looked up.
 
-    With ``radius`` texels on each side, at most `BLOCK`, the lookup reads only this block and its
-    neighbours. -1 for a lookup that leaves the map, which reads nothing.
+    A lookup that reads ``radius`` texels on each side of the point, at most `BLOCK`, reads only
+    this block and its eight neighbours. -1 if it would leave the map: then it reads nothing.
     """
     m = depth_map.matrix
     x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3] - 0.5

@@ -51,6 +51,7 @@ from support.experiment.store_walk import (
     enter,
     give,
     open_store,
+    opened,
     page,
     refusal,
     request,
@@ -71,9 +72,7 @@ def checked(tmp_path_factory: pytest.TempPathFactory) -> Study:
 
 @pytest.fixture
 def checked_store(checked: Study, database: Path) -> Iterator[Store]:
-    opened = open_store(checked, Secrets.load(checked.folder), database)
-    yield opened
-    opened.close()
+    yield from opened(checked, database)
 
 
 def order_of(store: Store, name: str) -> tuple[Stimulus, ...]:
@@ -164,9 +163,7 @@ def checking(tmp_path: Path) -> Study:
 
 @pytest.fixture
 def checking_store(checking: Study, database: Path) -> Iterator[Store]:
-    opened = open_store(checking, Secrets.load(checking.folder), database)
-    yield opened
-    opened.close()
+    yield from opened(checking, database)
 
 
 def test_a_wrong_answer_shows_the_instructions_again(checking_store: Store) -> None:
@@ -244,9 +241,7 @@ def practising(tmp_path_factory: pytest.TempPathFactory) -> Study:
 
 @pytest.fixture
 def practice_store(practising: Study, database: Path) -> Iterator[Store]:
-    opened = open_store(practising, Secrets.load(practising.folder), database)
-    yield opened
-    opened.close()
+    yield from opened(practising, database)
 
 
 def practise(store: Store, token: str, name: str, *responses: str) -> SessionState:
@@ -407,9 +402,7 @@ def asking(tmp_path: Path) -> Study:
 
 @pytest.fixture
 def asking_store(asking: Study, database: Path) -> Iterator[Store]:
-    opened = open_store(asking, Secrets.load(asking.folder), database)
-    yield opened
-    opened.close()
+    yield from opened(asking, database)
 
 
 def test_own_questions_come_in_place_of_demographics(asking_store: Store) -> None:

@@ -30,6 +30,7 @@ from support.experiment.store_walk import (
     enter,
     give,
     open_store,
+    opened,
     page,
     refusal,
     request,
@@ -54,9 +55,7 @@ def blocks_study(tmp_path_factory: pytest.TempPathFactory) -> Study:
 
 @pytest.fixture
 def blocks_store(blocks_study: Study, database: Path) -> Iterator[Store]:
-    opened = open_store(blocks_study, Secrets.load(blocks_study.folder), database)
-    yield opened
-    opened.close()
+    yield from opened(blocks_study, database)
 
 
 def test_a_session_has_practice_and_test_of_each_block(blocks_store: Store) -> None:
@@ -223,9 +222,7 @@ def groups(tmp_path_factory: pytest.TempPathFactory) -> Study:
 
 @pytest.fixture
 def groups_store(groups: Study, database: Path) -> Iterator[Store]:
-    opened = open_store(groups, Secrets.load(groups.folder), database)
-    yield opened
-    opened.close()
+    yield from opened(groups, database)
 
 
 def conditions_of(store: Store) -> Counter[str]:

@@ -126,6 +126,13 @@ def open_store(study: Study, secrets: Secrets, folder: Path) -> Store:
     return Store.open(replace(study, folder=folder), secrets)
 
 
+def opened(study: Study, folder: Path) -> Iterator[Store]:
+    """Open a store like `open_store`, with the study's own secrets; close it after the test."""
+    store = open_store(study, Secrets.load(study.folder), folder)
+    yield store
+    store.close()
+
+
 @pytest.fixture
 def database(tmp_path: Path) -> Path:
     """Folder of the database of `store`."""
@@ -135,8 +142,6 @@ def database(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def store(small_study: Study, small_secrets: Secrets, database: Path) -> Iterator[Store]:
+def store(small_study: Study, database: Path) -> Iterator[Store]:
     """A store on an empty database."""
-    opened = open_store(small_study, small_secrets, database)
-    yield opened
-    opened.close()
+    yield from opened(small_study, database)
