@@ -34,6 +34,11 @@ def files_of(out: Path) -> dict[str, bytes]:
     return {str(path.relative_to(out)): path.read_bytes() for path in paths}
 
 
+def trained(out: Path) -> set[Path]:
+    """Return the folders of trainings that have ended: their weights have a digest file."""
+    return {path.parent for path in out.rglob("model.safetensors.sha256")}
+
+
 def command(*arguments: str) -> list[str]:
     return [sys.executable, "-m", "physion.cli.main", "train", *arguments, *CPU]
 
@@ -243,16 +248,16 @@ def test_what_is_interrupted_continues_and_a_second_run_trains_nothing(
     )  # fmt: skip
     end = time.monotonic() + 600
     while running.poll() is None and time.monotonic() < end:
-        if list(tmp_path.rglob("model.safetensors")) and list(
-            tmp_path.rglob("checkpoint.safetensors")
-        ):
+        # Without their digest file, weights do not count: their training goes on.
+        checkpoints = {path.parent for path in tmp_path.rglob("checkpoint.safetensors")}
+        if (done := trained(tmp_path)) and checkpoints - done:
             break
         time.sleep(0.01)
     running.send_signal(signal.SIGINT)
     assert running.wait() == 130
-    done = len(list(tmp_path.rglob("model.safetensors")))
-    assert 1 <= done < 3
-    for before in (done, 3):
+    already = len(trained(tmp_path))
+    assert 1 <= already < 3
+    for before in (already, 3):
         again = subprocess.run(
             command(model, *parts), env=environment(), check=False, capture_output=True, text=True
         )
