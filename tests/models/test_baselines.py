@@ -129,8 +129,8 @@ def gap(motion: Motion, **options: Any) -> float:
 
 
 def test_gap_after_the_time_that_is_looked_ahead() -> None:
-    # Unit cubes, centres 5 m apart, approaching at 2 m/s.
-    assert gap(crossing(), frames=106) == pytest.approx(5 - 1 - 2 * 1.06, abs=TOLERANCE)
+    # Unit cubes, centres 5 m apart, approaching at 2 m/s; by default up to frame 150.
+    assert gap(crossing()) == pytest.approx(5 - 1 - 2 * 0.01 * (150 - 44), abs=TOLERANCE)
     assert gap(crossing(), frames=199) == pytest.approx(0.02, abs=TOLERANCE)
     assert gap(crossing(), frames=201) == 0
 
@@ -167,6 +167,18 @@ def test_spinning_bodies_sweep_with_their_corners(height: float) -> None:
     )  # fmt: skip
     sideways, above = 1.6 - 0.1 - math.hypot(1, 0.1), max(height - 0.2, 0.0)
     assert gap(motion) == pytest.approx(math.hypot(sideways, above), abs=TOLERANCE)
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_bodies_spin_in_the_sense_of_their_spin(sense: float) -> None:
+    """In 0.5 s a bar of 2 x .2 m turns by 0.5: its corner comes near a cube, or parts from it."""
+    bodies = (
+        Body("agent", "cube", (0.0, 0.0, 0.0), (2.0, 0.2, 0.2)),
+        Body("patient", "cube", (0.9, 1.0, 0.0), (0.2, 0.2, 0.2)),
+    )
+    motion = crossing(bodies=bodies, velocity=(0.0, 0.0, 0.0), spin=(0.0, 0.0, sense))
+    corner = math.sin(0.5) + 0.1 * math.cos(0.5) if sense > 0 else 0.1
+    assert gap(motion, frames=50) == pytest.approx(0.9 - corner, abs=TOLERANCE)
 
 
 def test_bodies_spin_about_their_centre_of_mass() -> None:

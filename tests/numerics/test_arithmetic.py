@@ -160,6 +160,10 @@ def test_normal_numbers_have_the_moments_and_tails_of_their_distribution() -> No
     assert flat.mean() == pytest.approx(0, abs=0.01) and flat.std() == pytest.approx(1, abs=0.01)
     assert (flat**4).mean() == pytest.approx(3, abs=0.1)
     assert (np.abs(flat) > 3).mean() == pytest.approx(0.0027, abs=0.0006)
+    # They are made in pairs, one number of each in the first half and one in the second.
+    first, second = flat.reshape(2, -1)
+    assert np.corrcoef(first, second)[0, 1] == pytest.approx(0, abs=0.015)
+    assert np.corrcoef(first**2, second**2)[0, 1] == pytest.approx(0, abs=0.015)
     again = standard_normal(np.random.default_rng(4), (500, 401))
     assert np.array_equal(draws, again)
     assert standard_normal(np.random.default_rng(4), 0).shape == (0,)

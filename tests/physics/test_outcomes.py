@@ -92,12 +92,21 @@ def test_the_table_counts_what_it_says() -> None:
         replay("b", True, False),
         replay("c", True, True, simulated_frame=9),
         replay("d", False, False),
+        replay("e", True, True, simulated_frame=40),
     ]
     (row,) = summarise(replays)
-    assert (row.trials, row.base_rate, row.agreement) == (4, 0.75, 0.75)
-    assert row.frame_difference == 2  # of 3 and 1
+    assert (row.trials, row.base_rate, row.agreement) == (5, 0.8, 0.8)
+    assert row.frame_difference == 3  # the median of 3, 1 and 30
     assert row.milliseconds == pytest.approx(100) and row.real_time == pytest.approx(10)
     assert math.isnan(row.auc) and math.isnan(row.ceiling)
+
+
+def test_cloth_that_comes_nearer_touches_more_often() -> None:
+    """Of four pairs of a recorded contact and a miss, the contact is nearer in three."""
+    gaps = {-0.01: True, 0.05: True, 0.03: False, 0.2: False}
+    replays = [replay(f"{d}", touches, True, distance=d) for d, touches in gaps.items()]
+    assert summarise(replays)[0].auc == 0.75
+    assert math.isnan(summarise([*replays, replay("no cloth", True, True)])[0].auc)
 
 
 def test_jittered_runs_give_the_ceiling() -> None:

@@ -218,6 +218,7 @@ def test_the_robust_fit_ignores_outliers_and_says_which() -> None:
     spoilt = points.clone()
     wrong = [0, 3, 7, 20, 30, 40]
     spoilt[wrong] += torch.tensor([0.8, -0.5, 0.3], dtype=torch.float64)
+    spoilt[7] = points[7] + torch.tensor([0.0, 0.0, 0.02], dtype=torch.float64)
     draws = torch.rand(16, 4, generator=torch.Generator().manual_seed(0))
     found, moved, inliers = fit_robust(shape, spoilt, owners, 3, 0.01, draws)
     assert torch.allclose(found, rotation) and torch.allclose(moved, shift)

@@ -198,11 +198,17 @@ def test_default_parameters_are_used_and_recorded() -> None:
     assert scene.parameters["height"] == [1.25, 1.5]
 
 
-def test_camera_that_cannot_see_the_agent_is_an_error() -> None:
-    far = Body("far", "cube", (0.0, 40.0, 0.0))
-    rule = CameraRule((1.0, 1.0), (45.0, 45.0), (1.0, 1.0))
-    with pytest.raises(BadSceneError, match=r"^no camera shows far: [^\d]*$"):
-        place_camera(np.random.default_rng(0), rule, 0.5, (far,))
+def test_camera_shows_what_is_inside_its_field_of_view_or_is_an_error() -> None:
+    # It looks along -y from a distance of the square root of 2, with 55 degrees from side to side.
+    side = math.sqrt(2) * math.tan(math.radians(55 / 2))
+    rule = CameraRule((1.0, 1.0), (45.0, 45.0), (0.0, 0.0))
+    for x in (-0.97 * side, 0.97 * side):
+        near = Body("near", "cube", (x, 0.0, 0.0), (0.1, 0.1, 0.1))
+        place_camera(np.random.default_rng(0), rule, 0.0, (near,))
+    for x, y in ((-side, 0.0), (side, 0.0), (0.0, 40.0)):
+        far = Body("far", "cube", (x, y, 0.0), (0.1, 0.1, 0.1))
+        with pytest.raises(BadSceneError, match=r"^no camera shows far: [^\d]*$"):
+            place_camera(np.random.default_rng(0), rule, 0.0, (far,))
 
 
 def test_scenery_does_not_overlap_or_is_an_error() -> None:
