@@ -256,13 +256,17 @@ def test_the_first_sentence_names_the_best(inputs: ReportInputs, page: str) -> N
 
 
 def test_people_on_predicted_stimuli(inputs: ReportInputs, page: str) -> None:
-    table = find(page, "People on the stimuli that any model predicts / People")
+    table = find(page, "People on the stimuli that any model predicts / People; intervals of the "
+                 "accuracy by drawing stimuli, and by drawing participants")  # fmt: skip
     check(table, inputs.comparison.people, {
         "scenario": "scenario", "stimuli": ("stimuli", count), "people": ("people", fixed(0)),
         "base rate": ("base_rate", fixed(2)), "say yes": ("yes", fixed(2)),
         "accuracy": own("accuracy"), "reliability": ("reliability", fixed(3)),
         "ceiling of r": ("ceiling", fixed(3)),
     })  # fmt: skip
+    drawn = table.column("participants drawn", 0)
+    for cell, row in zip(drawn, inputs.comparison.people.to_dict("records"), strict=True):
+        assert cell == f"{row['bootstrap_low']:.2f} to {row['bootstrap_high']:.2f}"
     assert inputs.comparison.people["yes"].ne(inputs.comparison.people["base_rate"]).all()
 
 

@@ -21,10 +21,11 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from physion.analysis import Comparison, figure_tables
+from physion.analysis.comparison import ANOTHER
 from physion.analysis.model_tests import fits_of_models
 from physion.analysis.people.effects import below_chance_level
 from physion.analysis.scores import COMPUTED
-from physion.analysis.tables import MEAN
+from physion.analysis.tables import MEAN, name_models
 from physion.core.names import SCENARIOS
 from physion.report import html as blocks
 from physion.report import people, scores
@@ -34,6 +35,7 @@ from physion.report.figures.by_stimulus import (
     SQUARE,
     calibration_figure,
     difficulty_figure,
+    misleading_plot,
     response_time_figure,
     scatter_figure,
 )
@@ -41,6 +43,7 @@ from physion.report.figures.theme import make_plots
 from physion.report.figures.training import generalization_figure, grouped_figure
 from physion.report.html import Picture, number
 from physion.report.inputs import ReportInputs
+from physion.trials.video import encode_movie
 from support.paths import ROOT
 
 Maker = Callable[..., Comparison]
@@ -188,6 +191,78 @@ def test_thirds_show_what_halves_of_people_reach(make_comparison: Maker) -> None
     place = list(table["people"].notna()).index(True)
     value = table["people"].iloc[place]
     assert any(np.allclose(line.get_xdata(), value) for line in figure.axes[place].lines)
+
+
+def test_the_zone_of_r_is_of_halves_of_the_people(make_comparison: Maker) -> None:
+    comparison = make_comparison()
+    zones = pd.DataFrame(
+        [(scenario, "r", of, low, low + 0.1) for scenario in ("collide", "drop")
+         for of, low in (("participants", 0.3), ("halves", 0.7 + 0.1 * (scenario == "drop")))],
+        columns=["scenario", "measure", "of", "low", "high"],
+    )  # fmt: skip
+    table = figure_tables.r_table(comparison, zones).drop_duplicates("panel").set_index("panel")
+    assert table.loc["collide", ["zone_low", "zone_high"]].tolist() == pytest.approx([0.7, 0.8])
+    assert table.loc["drop", "zone"] == figure_tables.HALVES
+    assert table.loc[MEAN, ["zone_low", "zone_high"]].tolist() == pytest.approx([0.75, 0.85])
+
+
+# --- people against models ----------------------------------------------------------------------
+
+
+def test_people_stand_against_every_model_by_scenario(make_comparison: Maker) -> None:
+    comparison = make_comparison()
+    table = figure_tables.people_and_models_table(comparison, comparison.models)
+    own = comparison.stimuli[comparison.stimuli["scenario"] == "drop"]
+    for model, rows in own.groupby("model"):
+        row = table[(table["model"] == model) & (table["scenario"] == "drop")].iloc[0]
+        assert row["accuracy"] == pytest.approx((rows["predicted"] == rows["label"]).mean())
+        assert row["people"] == pytest.approx(rows["human_accuracy"].mean())
+    figure = model_and_people_figure(table)
+    assert len(figure.axes) >= 2
+    for axis, model in zip(figure.axes, comparison.models, strict=False):
+        rows = table[table["model"] == model]
+        points = [np.asarray(line.get_xydata())[0].tolist() for line in axis.lines[1:]]
+        assert points == rows[["accuracy", "people"]].to_numpy().tolist()
+
+
+def test_right_answers_are_the_probability_of_the_recorded_outcome(make_comparison: Maker) -> None:
+    comparison = make_comparison()
+    table = figure_tables.right_answers_table(comparison, comparison.names[:1])
+    rows = comparison.stimuli[comparison.stimuli["model"] == comparison.names[0]]
+    expected = [p if label else 1 - p
+                for p, label in zip(rows["p_contact"], rows["label"], strict=True)]  # fmt: skip
+    assert table["p_right"].tolist() == pytest.approx(expected)
+    plots = {plot.name: plot for plot in make_plots(ReportInputs(comparison))}
+    figure = plots["right_answers"].draw(table, theme.LIGHT)
+    points = np.vstack([np.asarray(line.get_xydata()) for line in figure.axes[0].lines[1:]])
+    shift = SQUARE * (table["scenario"] == "drop")
+    found = sorted(map(tuple, np.round(points, 9)))
+    drawn = np.column_stack([table["p_right"] + shift, table["human_accuracy"]])
+    assert found == sorted(map(tuple, np.round(drawn, 9)))
+    assert figure.get_supylabel() == "accuracy of people"
+
+
+def test_frames_are_of_the_stimuli_that_mislead_people_most(tmp_path: Path) -> None:
+    names = [f"s{k}" for k in range(6)]
+    rows = pd.DataFrame({"scenario": "drop", "stimulus": names, "count": 100,
+                         "accuracy": [0.3, 0.1, 0.9, 0.2, 0.25, 0.05]})  # fmt: skip
+    movies = {}
+    for place, name in enumerate(names[:5]):  # of s5, the worst, there is no movie
+        movie = np.full((50, 32, 32, 3), 40 * place, np.uint8)
+        movie[45:] = 250
+        movies[name] = tmp_path / f"{name}.mp4"
+        movies[name].write_bytes(encode_movie(movie))
+    plot = misleading_plot(below_chance_level(rows), movies)
+    assert plot is not None
+    assert plot.table["shown"].tolist() == [0, 1, 0, 2, 3, 0]
+    figure = plot.draw(plot.table, theme.LIGHT)
+    pictures = [axis.images[0].get_array() for axis in figure.axes if axis.images]
+    means = [float(np.mean(picture)) for picture in pictures]  # type: ignore[arg-type]
+    assert means == pytest.approx([40, 250, 120, 250, 160, 250], abs=4)
+    words = [axis.get_title(loc="left") for axis in figure.axes]
+    assert words[:3] == ["drop, 5 of 6", "10% of 100 right", "end"]
+    assert misleading_plot(below_chance_level(rows), {}) is None
+    assert misleading_plot(below_chance_level(rows.assign(accuracy=0.9)), movies) is None
 
 
 # --- marks stand where the table says -----------------------------------------------------------
@@ -342,7 +417,8 @@ def test_one_condition_makes_no_figure(make_comparison: Maker) -> None:
     assert figure_tables.effects_table(comparison, predictions).empty
     assert figure_tables.generalization_table(comparison, predictions).empty
     names = {plot.name for plot in make_plots(ReportInputs(comparison, predictions=predictions))}
-    assert names == {"accuracy", "r", "scatter", "thirds", "calibration", "difficulty"}
+    assert names == {"accuracy", "r", "people_and_models", "scatter", "right_answers", "thirds",
+                     "calibration", "difficulty"}  # fmt: skip
 
 
 def test_a_figure_without_a_value_is_left_out(
@@ -373,6 +449,40 @@ def test_generalization_is_relative_to_people(make_comparison: Maker) -> None:
     assert set(table["trained"]) == {"all", "collide"} and len(table) == 4
     words = [t.get_text() for t in generalization_figure(table).axes[0].texts]
     assert len(words) == 4 and all(word[0] in "+−0" for word in words)
+
+
+def test_a_training_on_one_scenario_is_a_row_of_the_heat_map(make_comparison: Maker) -> None:
+    """Protocol one: the column names the training scenario, whatever the tested one."""
+    comparison = make_comparison()
+    made = comparison.stimuli.drop(columns=["base_model", "scenario"])
+    parts = []
+    for place, scenario in enumerate(("collide", "drop")):
+        own = made[made["model"] == comparison.names[place]]
+        parts.append(own.assign(model="m", readout="full", protocol="one",
+                                dynamics_training_dataset=scenario))  # fmt: skip
+    rows = name_models(
+        pd.concat(parts, ignore_index=True)[
+            ["model", "readout", "protocol", "dynamics_training_dataset", "stimulus", "p_contact"]
+        ]
+    )
+    assert list(rows["model"].unique()) == [f"m · full · trained on {name}"
+                                            for name in ("collide", "drop")]  # fmt: skip
+    stimuli = comparison.stimuli.merge(
+        pd.DataFrame({"model": comparison.names, "named": rows["model"].unique()}), on="model"
+    )
+    stimuli = stimuli.assign(model=stimuli["named"], base_model="m", readout="full")
+    comparison = dataclasses.replace(comparison, stimuli=stimuli)
+    table = figure_tables.generalization_table(comparison, rows)
+    assert table[["trained", "tested"]].to_numpy().tolist() == [
+        ["collide", "collide"], ["collide", "drop"], ["drop", "collide"], ["drop", "drop"]
+    ]  # fmt: skip
+    for row in table.itertuples():
+        own = stimuli[(stimuli["model"] == f"m · full · trained on {row.trained}")
+                      & (stimuli["scenario"] == row.tested)]  # fmt: skip
+        right = (own["predicted"] == own["label"]).mean()
+        assert row.difference == pytest.approx(right - own["human_accuracy"].mean())
+    effects = figure_tables.effects_table(comparison, rows)
+    assert effects["group"].tolist() == [figure_tables.ONLY, ANOTHER]
 
 
 def numbered(axis: Axes, which: str) -> tuple[bool, bool]:

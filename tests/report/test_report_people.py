@@ -35,6 +35,8 @@ from support.small_study import (
 
 pytestmark = pytest.mark.slow
 
+OF_MODELS = ("mixed_models", "mixed_readouts")
+
 
 def page_text(folder: Path, **options: Any) -> str:
     """Return the text of the page without figures, which are slow to draw."""
@@ -60,8 +62,9 @@ def text_of(page: Path) -> str:
 
 def test_every_figure_has_its_files(report: Path) -> None:
     stems = {path.stem for path in (report.parent / "figures").iterdir()}
-    assert stems == {"accuracy", "r", "kappa", "effects", "scatter", "thirds", "calibration",
-                     "difficulty", "response_time"}  # fmt: skip
+    assert stems == {"accuracy", "r", "kappa", "effects", "people_and_models", "scatter",
+                     "right_answers", "thirds", "calibration", "difficulty",
+                     "response_time"}  # fmt: skip
     for stem in stems:
         for kind in ("svg", "pdf", "png", "csv"):
             assert (report.parent / "figures" / f"{stem}.{kind}").stat().st_size > 100
@@ -275,10 +278,18 @@ def test_only_people(report: Path, tmp_path: Path) -> None:
     assert "15 participants on 32 stimuli of 2 scenarios (collide, drop)" in text
     assert "Flagged and left out: 1 of 16 sessions" in text
     assert "60 resamples, seed 0" in text
-    assert "model" not in text.lower()
-    # The same numbers as beside models.
-    for table in (report.parent / "tables").glob("people_*.csv"):
+    assert "model" not in text.lower().partition(" mixed models ")[0].replace("mixed models", "")
+    # The same numbers as beside models, with the preregistered mixed models of single answers.
+    of_people = [
+        path
+        for path in (report.parent / "tables").iterdir()
+        if path.stem.startswith(("people_", "mixed_")) and path.stem not in OF_MODELS
+    ]
+    names = {"scenarios", "h1", "h2", "h3", "h4", "h1_slopes", "response_times", "flagged"}
+    assert {f"mixed_{name}" for name in names} <= {path.stem for path in of_people}
+    for table in of_people:
         assert (tmp_path / "one" / "tables" / table.name).read_bytes() == table.read_bytes()
+    assert "Do people differ between scenarios?" in text
     figures = {path.name for path in (tmp_path / "one" / "figures").iterdir()}
     assert figures == {f"{name}.{kind}" for name in ("difficulty", "response_time")
                        for kind in ("svg", "pdf", "png", "csv")}  # fmt: skip

@@ -26,6 +26,7 @@ from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, plan_scenes
 from physion.trials.official.export_folder import export_official
 from physion.trials.share.card import write_card
+from physion.trials.state import DRAWN
 from support.hand_made import make_by_hand, make_scene
 
 
@@ -49,6 +50,21 @@ def test_the_index_comes_back_with_its_types(finished: Path, tmp_path: Path) -> 
     )
     write_index(tmp_path, table)
     assert (tmp_path / "index.parquet").read_bytes() == (finished / "index.parquet").read_bytes()
+
+
+def test_an_index_without_what_was_drawn_is_read_and_made_again(
+    finished: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "set"
+    make(folder)
+    whole = read_index(folder)
+    assert whole["drawn_room"].notna().all() and whole["drawn_agent_mass"].notna().all()
+    write_index(folder, whole.drop(columns=list(DRAWN)))
+    table = read_index(folder)
+    assert {name: str(table[name].dtype) for name in COLUMNS} == dict(COLUMNS)
+    assert table[list(DRAWN)].isna().all(axis=None)
+    make(folder)
+    pd.testing.assert_frame_equal(read_index(folder), whole)
 
 
 def test_every_flipped_bit_is_noticed(finished: Path, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from physion.core.errors import BadInputError
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
 from physion.rendering.renderer import Renderer
+from physion.scenes.sampling.sample import sample_scene
 from physion.scenes.scene import (
     Body,
     Camera,
@@ -264,3 +265,41 @@ def test_cloths_are_kept_apart() -> None:
     trial = Trial(stored.pack(), "two cloths")
     np.testing.assert_array_equal(state.centroids(trial)[:, 3], np.full((60, 3), 7.0))
     assert (state.world_vertices(trial, 3)["second"] == 7).all()
+
+
+def test_what_was_drawn_lies_in_the_ranges_of_the_parameters() -> None:
+    scenes = [sample_scene("collide", seed) for seed in range(6)]
+    found = [state.drawn_values(scene) for scene in scenes]
+    for scene, values in zip(scenes, found, strict=True):
+        assert set(values) == set(state.DRAWN)
+        ranges = scene.parameters
+        target = scene.bodies[scene.index(scene.roles.agent)]
+        assert values["drawn_agent_mass"] == target.mass
+        assert values["drawn_agent_shape"] in ranges["target"]["shapes"]
+        assert values["drawn_probe_static_friction"] == pytest.approx(0.4)
+        low, high = ranges["push"]["speed"]
+        assert low <= float(str(values["drawn_push_speed"])) <= high
+        heading = float(str(values["drawn_push_heading"]))
+        assert ranges["push"]["heading_deg"][0] <= heading <= ranges["push"]["heading_deg"][1]
+        x, y, _ = scene.camera.position
+        assert values["drawn_camera_distance"] == pytest.approx(math.hypot(x, y))
+        assert values["drawn_camera_azimuth"] == pytest.approx(math.degrees(math.atan2(y, x)))
+        agent, patient = (scene.bodies[scene.index(name)].position
+                          for name in (scene.roles.agent, scene.roles.patient))  # fmt: skip
+        assert values["drawn_distance"] == pytest.approx(math.dist(agent[:2], patient[:2]))
+    assert len({values["drawn_push_speed"] for values in found}) == 6
+    assert found[0]["drawn_blocks"] == 0 and found[0]["drawn_cloth_bend"] is None
+
+
+def test_blocks_and_cloth_are_drawn_values_too() -> None:
+    row = sample_scene("dominoes", 0, preset="default_boxroom")
+    values = state.drawn_values(row)
+    blocks = [body for body in row.bodies if body.name.startswith("middle_")]
+    assert values["drawn_blocks"] == len(blocks) > 0
+    assert values["drawn_block_mass"] == pytest.approx(np.mean([body.mass for body in blocks]))
+    sheet = sample_scene("drape", 0)
+    values = state.drawn_values(sheet)
+    assert values["drawn_agent_mass"] == sheet.cloths[0].mass
+    assert values["drawn_cloth_bend"] == sheet.cloths[0].bend
+    assert values["drawn_agent_shape"] is None and values["drawn_probe_mass"] is None
+    assert values["drawn_push_speed"] is None

@@ -6,7 +6,7 @@ with single participants (`compare_everywhere`), tests, calibration and mixed mo
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,13 +19,14 @@ from physion.analysis.model_tests import (
     MixedTable,
     fits_of_models,
     fits_of_people,
+    group_contrasts,
     paired_measures,
     paired_tests,
     pool_comparison,
 )
 from physion.analysis.people.measures import HALVES, accuracy_by_stimulus, all_answers, split_halves
 from physion.analysis.people.results import PeopleResults
-from physion.analysis.scores import TWO_PEOPLE, with_kind
+from physion.analysis.scores import TWO_PEOPLE, against_people, with_kind
 from physion.analysis.statistics.regression import calibration_table
 from physion.analysis.tables import check_excluded_names, name_models, require_columns
 from physion.analysis.with_participants import (
@@ -80,7 +81,7 @@ def compare_everywhere(
     test
         Test rows of `Responses`.
     bootstrap
-        Level of the intervals, and seed of the halves.
+        Level of the intervals, draws of participants, and seed of the halves.
     halves
         Number of random splits of the people into halves.
     """
@@ -96,9 +97,7 @@ def compare_everywhere(
         subset = rows[rows["scenario"] == answers.scenario]
         models, unmatched = models_of(subset, answers, names)
         dropped.append(unmatched.assign(scenario=answers.scenario))
-        measured.append(
-            measure_models(add_baselines(models, answers), answers, two_people=TWO_PEOPLE)
-        )
+        measured.append(measure_models(add_baselines(models, answers), answers, TWO_PEOPLE, draws))
         zones.append(human_zones(answers, split_halves(answers.yes, halves, draws.seed)))
         pairs.append(model_pairs(models, answers).assign(scenario=answers.scenario))
     zone = pd.concat(zones, ignore_index=True)
@@ -143,7 +142,8 @@ class ComparisonResults:
     - ``paired``: from `paired_tests`, all scenarios pooled; None for one model.
     - ``paired_measures``: from `paired_measures`; None for one model or no people.
     - ``calibration``: from `calibration_table`.
-    - ``mixed``: from `mixed_fits`.
+    - ``mixed``: from `fits_of_people` and `fits_of_models`.
+    - ``contrasts``: from `group_contrasts`; None if no grouping was given.
     - ``warnings``: what may make the results wrong, one sentence each.
     """
 
@@ -156,6 +156,7 @@ class ComparisonResults:
     paired_measures: pd.DataFrame | None = None
     calibration: pd.DataFrame | None = None
     mixed: tuple[MixedTable, ...] = ()
+    contrasts: pd.DataFrame | None = None
     warnings: tuple[str, ...] = ()
 
 
@@ -167,6 +168,7 @@ def all_results(
     people: PeopleResults | None = None,
     zone: pd.DataFrame | None = None,
     zone_origin: str = "",
+    groups: Sequence[str] = (),
     exclude: Iterable[str] = (),
     exclude_ledge: bool = True,
     bootstrap: Bootstrap | None = None,
@@ -181,6 +183,8 @@ def all_results(
         Averages of people, recorded outcomes and the human zone, as in `compare_scores`.
     people
         From `people.results.analyse_people`, in place of ``humans``, ``labels`` and ``zone``.
+    groups
+        Columns of ``predictions`` by which models are compared in groups.
     exclude, exclude_ledge, bootstrap
         As in `compare_scores`.
 
@@ -241,7 +245,8 @@ def all_results(
         paired=paired_tests(pooled, draws) if several else None,
         paired_measures=paired_measures(pooled, draws) if several and main.has_people else None,
         calibration=calibration_table(list(pooled.names), pooled.p_contact, pooled.label),
-        mixed=(*about_people, *fits_of_models(main)),
+        mixed=(*about_people, *fits_of_models(main, predictions)),
+        contrasts=group_contrasts(main, predictions, groups) if groups else None,
         warnings=(*(people.warnings if people else ()), *main.warnings),
     )
 
@@ -252,7 +257,7 @@ def tidy_scores(results: ComparisonResults) -> pd.DataFrame:
     Columns as `Comparison.all_scores`, with ``kind`` *people* for one person with another, who come
     first; ``kappa`` with its interval, which needs single participants; and ``interval``: what the
     intervals of the row are about, *people and stimuli*, or *stimuli* where only averages of people
-    are known and in row `POOLED`.
+    are known and in row `POOLED`; and the columns of `against_people`, empty in rows of people.
     """
     table = results.comparison.all_scores
     kind = table["kind"].mask(table["model"] == TWO_PEOPLE, "people")
@@ -270,5 +275,8 @@ def tidy_scores(results: ComparisonResults) -> pd.DataFrame:
             given = {name: "value", f"{name}_low": "low_both", f"{name}_high": "high_both"}
             for column, of in given.items():
                 table[column] = np.where(known, own[of].to_numpy(np.float64), table[column])
+    if results.comparison.has_people:
+        table = against_people(table, results.comparison.people)
+        table.loc[table["kind"] == "people", ["reliably", "people_interval"]] = ""
     rank = table["kind"].map({"people": 0, "model": 1, "baseline": 2})
     return table.iloc[np.argsort(rank.to_numpy(), kind="stable")].reset_index(drop=True)

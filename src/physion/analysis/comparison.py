@@ -18,9 +18,15 @@ from scipy import stats
 from physion.analysis.intervals import Bootstrap
 from physion.analysis.people.responses import EXCLUDED, LEDGE
 from physion.analysis.scores import baseline_scores, kind_of, people_table, score_table, with_kind
-from physion.analysis.tables import in_order, name_models, with_labels
+from physion.analysis.tables import MEAN, ONLY, in_order, name_models, with_labels
 from physion.core.errors import BadInputError
-from physion.core.names import canonical_name, is_ledge, scenario_of
+from physion.core.names import (
+    OFFICIAL_SCENARIOS,
+    SCENARIOS,
+    canonical_name,
+    is_ledge,
+    scenario_of,
+)
 
 # Checks of tables that contradict each other: errors where sure, else warnings.
 
@@ -206,6 +212,44 @@ def later_scores(stimuli: pd.DataFrame, level: float = 0.95) -> tuple[pd.DataFra
     return pd.concat([part for part in parts if len(part)], ignore_index=True), words
 
 
+ANOTHER = "another scenario"
+"""Training of a model on scenarios without the tested one, other than all of those (`ALL_BUT`)."""
+
+
+def with_training(comparison: Comparison, predictions: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of models in ``comparison.stimuli`` with the scenarios of their training.
+
+    ``predictions``: from `name_models`. Added columns: ``trained``, a scenario (several are joined
+    by ``+``) or the protocol; ``training``, in relation to the tested scenario: *all*, `ALL_BUT`,
+    `ONLY`, `ANOTHER`, or as it was given.
+    """
+    given = pd.Series("", index=predictions.index, dtype=object)
+    for column in ("dynamics_training_dataset", "protocol", "encoder_training_dataset"):
+        if column in predictions:
+            given = given.where(given != "", predictions[column])
+    subset = predictions[["model", "stimulus"]].assign(trained=given)
+    chosen = comparison.stimuli[comparison.stimuli["model"].isin(comparison.models)]
+    rows = chosen.merge(subset, on=["model", "stimulus"], how="left")
+    ours = rows["trained"].map(_our_scenarios)
+    rows["trained"] = ours.where(ours != ONLY, rows["scenario"])
+    rows["training"] = [
+        _in_relation(str(trained), str(tested))
+        for trained, tested in zip(rows["trained"], rows["scenario"], strict=True)
+    ]
+    return rows
+
+
+def _our_scenarios(trained: object) -> str:
+    return "+".join(OFFICIAL_SCENARIOS.get(one.lower(), one) for one in str(trained).split("+"))
+
+
+def _in_relation(trained: str, tested: str) -> str:
+    if trained == tested:
+        return ONLY
+    parts = set(trained.split("+"))
+    return ANOTHER if parts <= set(SCENARIOS) and tested not in parts else trained
+
+
 NO_LABEL = "no official outcome is known"
 NOT_SEEN = "people did not see it"
 NOT_PREDICTED = "the model does not predict it"
@@ -293,8 +337,7 @@ def compare_scores(
         Official outcome by stimulus. For a stimulus without one ``recorded_outcome`` of the
         predictions counts and, without people, the simulated outcome.
     zone
-        Table from `read_human_zone` or from the accuracies of single participants, with
-        ``scenario``, ``low`` and ``high``.
+        Table from `read_human_zone` or `PeopleResults.zone`.
     zone_origin
         Source of the zone as text.
     participants
@@ -451,7 +494,8 @@ def _whole(
     zone: pd.DataFrame | None, people: pd.DataFrame, stimuli: pd.DataFrame
 ) -> pd.DataFrame | None:
     """Return ``zone`` for scenarios with all stimuli: it does not hold for a part of them."""
-    missing = people[~people["stimulus"].isin(stimuli["stimulus"])]["scenario"]
+    missing = set(people[~people["stimulus"].isin(stimuli["stimulus"])]["scenario"])
+    missing |= {MEAN} if missing else set()
     return zone if zone is None else zone[~zone["scenario"].isin(missing)]
 
 

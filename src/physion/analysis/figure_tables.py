@@ -13,7 +13,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from physion.analysis.compare import PeopleComparison
-from physion.analysis.comparison import Comparison
+from physion.analysis.comparison import ANOTHER, Comparison, with_training
 from physion.analysis.intervals import jackknife, mean_of, variance_of_mean
 from physion.analysis.people.effects import THIRDS, below_chance_level, difficulty_third, r_by_third
 from physion.analysis.scores import COMPUTED, baseline_stimuli, kind_of
@@ -21,7 +21,7 @@ from physion.analysis.statistics.agreement import correlate_resampled, correlate
 from physion.analysis.statistics.regression import brier, reliability_curve
 from physion.analysis.tables import ALL_BUT, MEAN, ONLY, POOLED, READOUTS, in_order
 from physion.analysis.with_participants import released_zone
-from physion.core.names import OFFICIAL_SCENARIOS, SCENARIOS
+from physion.core.names import SCENARIOS
 
 Array = npt.NDArray[np.float64]
 
@@ -46,8 +46,6 @@ GROUPED_COLUMNS = ("panel", "model", "group", "value", "low", "high", "people", 
 GENERALIZATION_COLUMNS = ("model", "trained", "tested", "stimuli", "accuracy", "people",
                           "difference")  # fmt: skip
 
-ANOTHER = "another scenario"
-
 
 def accuracy_table(comparison: Comparison) -> pd.DataFrame:
     """Return accuracy by scenario and model, with people; `MEASURE_COLUMNS`."""
@@ -58,11 +56,11 @@ def accuracy_table(comparison: Comparison) -> pd.DataFrame:
 def r_table(comparison: Comparison, zones: pd.DataFrame | None = None) -> pd.DataFrame:
     """Return Pearson's r with the average person; the dashed line is its noise ceiling.
 
-    Columns: `MEASURE_COLUMNS`. ``zones`` (`human_zones`): the range of single participants
-    with the average of the others; in the mean the paper's band, as in `released_r_zone`.
+    Columns: `MEASURE_COLUMNS`. ``zones`` (`human_zones`): the range of r between random halves of
+    the people; in the mean the mean of its bounds, as in `released_r_zone`.
     """
     people = comparison.people.set_index("scenario")[["ceiling"]].set_axis(["people"], axis=1)
-    people = _with_zone(people, zones, "r", released=False)
+    people = _with_zone(people, zones, "r", "halves")
     if zones is not None and MEAN in people.index:
         halves = zones[(zones["measure"] == "r") & (zones["of"] == "halves")]
         people.loc[MEAN, ["zone_low", "zone_high"]] = halves[["low", "high"]].mean().tolist()
@@ -86,7 +84,7 @@ def kappa_table(comparison: Comparison, with_people: PeopleComparison) -> pd.Dat
     people = subset.set_index("scenario")[["mean"]].set_axis(["people"], axis=1)
     if len(people) > 1:
         people.loc[MEAN] = people["people"].mean()
-    people = _with_zone(people, zones, "kappa", released=True)
+    people = _released(_with_zone(people, zones, "kappa", "participants"))
     return _measure(rows, people, "people with people")
 
 
@@ -126,17 +124,17 @@ def _released(people: pd.DataFrame) -> pd.DataFrame:
 
 
 def _with_zone(
-    people: pd.DataFrame, zones: pd.DataFrame | None, measure: str, released: bool
+    people: pd.DataFrame, zones: pd.DataFrame | None, measure: str, of: str
 ) -> pd.DataFrame:
     people = people.assign(zone_low=np.nan, zone_high=np.nan, zone="")
     if zones is None:
         return people
-    subset = zones[(zones["measure"] == measure) & (zones["of"] == "participants")]
+    subset = zones[(zones["measure"] == measure) & (zones["of"] == of)]
     for _, row in subset.iterrows():
         if row["scenario"] in people.index and np.isfinite(row["low"]):
             people.loc[row["scenario"], ["zone_low", "zone_high"]] = row["low"], row["high"]
-            people.loc[row["scenario"], "zone"] = PARTICIPANTS
-    return _released(people) if released else people
+            people.loc[row["scenario"], "zone"] = {"halves": HALVES}.get(of, PARTICIPANTS)
+    return people
 
 
 def _measure(rows: pd.DataFrame, people: pd.DataFrame, people_is: str) -> pd.DataFrame:
@@ -161,6 +159,29 @@ def scatter_table(comparison: Comparison, models: Sequence[str]) -> pd.DataFrame
     columns = ["model", "scenario", "stimulus", "p_yes", "p_contact", "label", "simulated"]
     rows = comparison.stimuli[comparison.stimuli["model"].isin(models)]
     return rows[columns].reset_index(drop=True)
+
+
+def people_and_models_table(comparison: Comparison, models: Sequence[str]) -> pd.DataFrame:
+    """Return the accuracy of each model, and of people on the same stimuli, by scenario.
+
+    Columns: ``model``, ``scenario`` (with `MEAN`), ``accuracy``, ``people``, in the order of
+    ``models``.
+    """
+    rows = comparison.scores.rename(columns={"human_accuracy": "people"})
+    rows = rows[(rows["scenario"] != POOLED) & rows["model"].isin(models)]
+    return rows[["model", "scenario", "accuracy", "people"]].reset_index(drop=True)
+
+
+def right_answers_table(comparison: Comparison, models: Sequence[str]) -> pd.DataFrame:
+    """Return the accuracy of people and models by stimulus; one row per model and stimulus.
+
+    ``p_right``: the probability that the model gives to the recorded outcome, which is its accuracy
+    if it answers only 0 or 1; ``human_accuracy``: the fraction of people who are right.
+    """
+    columns = ["model", "scenario", "stimulus", "human_accuracy", "p_right", "label", "simulated"]
+    rows = comparison.stimuli[comparison.stimuli["model"].isin(models)]
+    p = rows["p_contact"]
+    return rows.assign(p_right=p.where(rows["label"], 1 - p))[columns].reset_index(drop=True)
 
 
 def difficulty_table(comparison: Comparison, by_stimulus: pd.DataFrame | None) -> pd.DataFrame:
@@ -272,7 +293,7 @@ def effects_table(
     has one training protocol (*all* if it occurs), the panel of trainings one readout. A panel is
     absent if no model has two conditions. Intervals are about other stimuli.
     """
-    rows = _with_training(comparison, predictions)
+    rows = with_training(comparison, predictions)
     if len(rows.drop_duplicates(["readout", "training"])) < 2:
         return pd.DataFrame(columns=list(GROUPED_COLUMNS))
     trainings = [str(name) for name in rows["training"].unique()]
@@ -297,24 +318,6 @@ def effects_table(
 
 
 _READOUT_ORDER = tuple(READOUTS[letter] for letter in "CBA")
-
-
-def _with_training(comparison: Comparison, predictions: pd.DataFrame) -> pd.DataFrame:
-    """Return the stimuli of the models with ``trained`` (as in the predictions) and
-    ``training``.
-    """
-    result = pd.Series("", index=predictions.index, dtype=object)
-    for column in ("protocol", "encoder_training_dataset"):
-        if column in predictions:
-            result = result.where(result != "", predictions[column])
-    subset = predictions[["model", "stimulus"]].assign(trained=result)
-    chosen = comparison.stimuli[comparison.stimuli["model"].isin(comparison.models)]
-    rows = chosen.merge(subset, on=["model", "stimulus"], how="left")
-    ours = rows["trained"].map(lambda name: OFFICIAL_SCENARIOS.get(str(name).lower(), name))
-    rows["trained"] = ours.where(ours != ONLY, rows["scenario"])
-    rows["training"] = rows["trained"].where(~rows["trained"].isin(SCENARIOS), ANOTHER)
-    rows["training"] = rows["training"].mask(rows["trained"] == rows["scenario"], ONLY)
-    return rows
 
 
 def _most_common(values: pd.Series) -> str:
@@ -354,10 +357,9 @@ def generalization_table(comparison: Comparison, predictions: pd.DataFrame) -> p
     scenario than it was trained on, the diagonal becomes one row `ONLY`. Without people the
     difference is to 0.5, the accuracy of guessing, and ``people`` is NaN.
     """
-    rows = _with_training(comparison, predictions)
-    parts = {*SCENARIOS, ALL_BUT}
+    rows = with_training(comparison, predictions)
     several = rows.groupby(["base_model", "readout"])["training"].nunique().max() > 1
-    if not set(rows["trained"]) & parts or not several:
+    if not set(rows["training"]) & {ONLY, ALL_BUT, ANOTHER} or not several:
         return pd.DataFrame(columns=list(GENERALIZATION_COLUMNS))
     if not (rows["training"] == ANOTHER).any():
         rows["trained"] = rows["training"]  # nothing off the diagonal: one row is enough

@@ -323,8 +323,8 @@ _SCALES: dict[Scale, Callable[[float], Scaled]] = {
 # Bootstrap intervals by drawing people, or whatever else is independent, with replacement.
 #
 # For means and agreement of people, as preregistered. What depends on the noise of people's
-# averages, such as a model's r or RMSD, has the intervals of `jackknife`, since drawing people
-# again adds their noise a second time.
+# averages, such as a model's r or RMSD, has the intervals of `jackknife` in the first place, since
+# drawing people again adds their noise a second time; the preregistered one stands next to them.
 
 
 @dataclass(frozen=True)
@@ -352,7 +352,7 @@ class Bootstrap:
         Draws in which the statistic is undefined are left out; NaN, NaN if less than half remain.
         """
         defined = draws[np.isfinite(draws)]
-        if 2 * len(defined) < len(draws):
+        if not len(defined) or 2 * len(defined) < len(draws):
             return float("nan"), float("nan")
         tail = 50 * (1 - self.level)
         low, high = np.percentile(defined, [tail, 100 - tail])

@@ -2,12 +2,14 @@
 
 Pairs of models are compared on the stimuli of all scenarios together: McNemar's test of accuracy
 and permutations of r (`paired_tests`), differences of every measure with intervals
-(`paired_measures`). `fits_of_people` and `fits_of_models` are the mixed models of the report.
+(`paired_measures`). `fits_of_people` and `fits_of_models` are the mixed models of the report;
+`group_contrasts` compares groups of models by such models.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -15,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.comparison import Comparison
+from physion.analysis.comparison import Comparison, with_training
 from physion.analysis.intervals import Bootstrap
 from physion.analysis.mixed.fit import fit_linear, fit_logistic
 from physion.analysis.mixed.result import MixedFit, effect_name
@@ -29,7 +31,7 @@ from physion.analysis.statistics.paired import (
     paired_difference,
 )
 from physion.analysis.tables import MEAN, POOLED, in_order
-from physion.core.errors import PhysionError
+from physion.core.errors import BadInputError, PhysionError
 
 Array = npt.NDArray[np.float64]
 
@@ -288,6 +290,7 @@ def fits_of_people(people: PeopleResults) -> list[MixedTable]:
         own = formula.replace("(1|participant)", f"(1 + {hypothesis.predictor}|participant)")
         about = f"{key} with a slope of {hypothesis.predictor} for each participant"
         fits.append(_fitted(f"{key.lower()}_slopes", about, own, fitter, rows))
+    fits.append(_attributes(people, rows, scenario))
     fits.append(_response_times(people, scenario))
     flagged = people.tables["flags"].set_index("session")["flagged"]
     whole = people.whole.test
@@ -297,6 +300,29 @@ def fits_of_people(people: PeopleResults) -> list[MixedTable]:
         _fitted("flagged", about, f"correct ~ flagged + {scenario}{CROSSED}", fit_logistic, whole)
     )
     return fits
+
+
+def _attributes(people: PeopleResults, rows: pd.DataFrame, scenario: str) -> MixedTable:
+    """Fit the linear combination of attributes that `regress_attributes` found by stimulus.
+
+    ``rows``: single answers, from `answer_rows`; ``scenario``: its term in the formula. Numbers are
+    in standard deviations over stimuli.
+    """
+    effects = people.tables["attribute_effects"]
+    together = effects[(effects["fit"] == "together") & effects["b"].notna()]
+    if scenario:
+        together = together[together["scenario"] == "all"]
+    about = "Attributes of stimuli together, exploratory, in standard deviations (logistic)"
+    names = list(dict.fromkeys(together["attribute"]))
+    plain = {name: re.sub(r"\W", "_", name) for name in names}
+    formula = " + ".join([f"correct ~ {' + '.join(plain.values()) or '1'}", f"{scenario}{CROSSED}"])
+    if not names:
+        return MixedTable("attributes", about, formula, None, "no attribute is known and varies")
+    by_stimulus = rows.drop_duplicates("stimulus")[names].select_dtypes("number")
+    scaled = {name: (rows[name] - by_stimulus[name].mean()) / by_stimulus[name].std()
+              for name in by_stimulus}  # fmt: skip
+    used = rows.assign(**scaled).rename(columns=plain)
+    return _fitted("attributes", about, formula, fit_logistic, used)
 
 
 def _response_times(people: PeopleResults, scenario: str) -> MixedTable:
@@ -317,22 +343,38 @@ def _response_times(people: PeopleResults, scenario: str) -> MixedTable:
     return _fitted("response_times", about, formula, fit_linear, rows)
 
 
-def fits_of_models(comparison: Comparison) -> list[MixedTable]:
-    """Fit linear models of accuracy by model and scenario, as the study compared models.
+def accuracy_rows(comparison: Comparison, predictions: pd.DataFrame | None) -> pd.DataFrame:
+    """Return the accuracy of each model in each scenario, for mixed models.
 
-    Coefficients are differences to the model, and the readout, that comes first in the files. Each
-    row is the accuracy of one model in one scenario.
+    Columns: ``model``, ``base_model``, ``readout``, ``scenario``, ``accuracy``, and ``training``
+    from `with_training` (NaN for what was not trained, or without ``predictions``).
     """
     scores = comparison.scores
     rows = scores[~scores["scenario"].isin([MEAN, POOLED])]
+    rows = rows[["model", "base_model", "readout", "scenario", "accuracy"]]
+    if predictions is None:
+        return rows.assign(training=np.nan)
+    trained = with_training(comparison, predictions)[["model", "scenario", "training"]]
+    trained = trained.drop_duplicates(["model", "scenario"]).replace({"training": {"": np.nan}})
+    return rows.merge(trained, on=["model", "scenario"], how="left")
+
+
+def fits_of_models(
+    comparison: Comparison, predictions: pd.DataFrame | None = None
+) -> list[MixedTable]:
+    """Fit linear models of accuracy by model and scenario, as the study compared models.
+
+    Coefficients are differences to the model, readout and training that comes first in the files.
+    Each row is the accuracy of one model in one scenario. As in the study, the readout and the
+    training that are not tested have random intercepts. ``predictions``: from `name_models`, for
+    the training.
+    """
+    rows = accuracy_rows(comparison, predictions)
     if len(comparison.names) < 2 or rows["scenario"].nunique() < 2:
         return []
-    rows = rows[["model", "base_model", "readout", "scenario", "accuracy"]]
     # The first in the files, not in the alphabet, is the base level.
-    rows = rows.assign(
-        model=pd.Categorical(rows["model"], categories=comparison.names),
-        readout=pd.Categorical(rows["readout"], categories=rows["readout"].unique()),
-    )
+    for column in ("model", "readout", "training"):
+        rows[column] = pd.Categorical(rows[column], categories=rows[column].dropna().unique())
     fits = [
         _fitted(
             "models",
@@ -344,16 +386,101 @@ def fits_of_models(comparison: Comparison) -> list[MixedTable]:
             "model",
         )
     ]
-    if rows["readout"].nunique() > 1 and rows["base_model"].nunique() > 1:
-        first = rows["readout"].cat.categories[0]
-        fits.append(
-            _fitted(
-                "readouts",
-                f"Does the readout matter? Linear, against {first}, the first in the files",
-                "accuracy ~ readout + (1|scenario) + (1|model)",
-                fit_linear,
-                rows,
-                "readout",
+    for name, tested, other in (
+        ("readouts", "readout", "training"),
+        ("trainings", "training", "readout"),
+    ):
+        known = rows[rows[tested].notna()]
+        if known[tested].nunique() > 1 and known["base_model"].nunique() > 1:
+            first = rows[tested].cat.categories[0]
+            fits.append(
+                _fitted(
+                    name,
+                    f"Does the {tested} matter? Linear, against {first}, the first in the files",
+                    f"accuracy ~ {tested} + {_random(known, other, 'base_model')}",
+                    fit_linear,
+                    known,
+                    tested,
+                )
             )
-        )
     return fits
+
+
+def _random(rows: pd.DataFrame, *columns: str) -> str:
+    """Return random intercepts of the scenario, and of the columns with several values."""
+    several = [name for name in columns if rows[name].notna().all() and rows[name].nunique() > 1]
+    return " + ".join(f"(1|{name})" for name in ("scenario", *several))
+
+
+CONTRAST_COLUMNS = ("column", "first", "second", "models_first", "models_second", "b", "se", "t",
+                    "df", "p", "p_holm", "low", "high", "formula", "reason")  # fmt: skip
+
+
+def group_contrasts(
+    comparison: Comparison, predictions: pd.DataFrame, columns: Sequence[str]
+) -> pd.DataFrame:
+    """Compare groups of models in accuracy, as the Results section of the study does.
+
+    Parameters
+    ----------
+    comparison, predictions
+        Scores of models, and the rows that they are of, from `name_models`.
+    columns
+        Columns of ``predictions`` by whose values the models are grouped. Models with an empty
+        value, and baselines, are left out.
+
+    Returns
+    -------
+    `CONTRAST_COLUMNS`, one row for every two groups, twice: with the formula of the study, and, if
+    a group has several models, with a random intercept for each model, so that the test is about
+    other models of such groups. ``b`` is the difference in accuracy, ``first`` less ``second``;
+    ``t``, ``df`` and ``p`` by Satterthwaite; ``p_holm`` corrected over the pairs of one formula.
+
+    Raises
+    ------
+    BadInputError
+        If a column has two values for one model.
+    """
+    rows = accuracy_rows(comparison, predictions)
+    rows = rows[rows["model"].isin(comparison.models)]
+    parts = []
+    for column in columns:
+        by_model = predictions.groupby("model")[column].agg(["nunique", "first"])
+        several = by_model.index[by_model["nunique"] > 1]
+        if len(several):
+            raise BadInputError(f"{column}: {several[0]} has several values; give it one group")
+        group = rows["model"].map(by_model["first"]).replace("", np.nan)
+        known = rows.assign(group=group).dropna(subset=["group"])
+        names = list(known["group"].unique())
+        if len(names) < 2:
+            raise BadInputError(f"{column} has the same value for all models: nothing to compare")
+        known["group"] = pd.Categorical(known["group"], categories=names)
+        models = known.groupby("group", observed=True)["base_model"].nunique()
+        tested = {"readout": ("training",), "protocol": ("readout",)}
+        random = _random(known, *tested.get(column, ("readout", "training")))
+        formulas = [f"accuracy ~ group + {random}"]
+        formulas += [f"{formulas[0]} + (1|base_model)"] if (models > 1).any() else []
+        for formula in formulas:
+            fit = _fitted(column, "", formula, fit_linear, known)
+            table = pd.DataFrame([_pair(fit, names, i, j) for i, j in _pairs(len(names))])
+            table = table.reindex(columns=list(CONTRAST_COLUMNS))
+            for end in ("first", "second"):
+                table[f"models_{end}"] = table[end].map(models)
+            table["p_holm"] = corrected_p(table["p"], "holm")
+            parts.append(table.assign(column=column, formula=formula, reason=fit.reason))
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=CONTRAST_COLUMNS)
+
+
+def _pairs(count: int) -> list[tuple[int, int]]:
+    return list(combinations(range(count), 2))
+
+
+def _pair(model: MixedTable, names: Sequence[str], first: int, second: int) -> dict[str, object]:
+    """Return the difference of two levels of the term ``group``, the first of which is the base."""
+    pair: dict[str, object] = {"first": names[first], "second": names[second]}
+    if model.fit is None:
+        return pair
+    weights = np.zeros(len(names))
+    weights[[first, second]] = 1, -1
+    weights[0] = 0  # the intercept is the first group, to which the other terms are differences
+    return {**pair, **model.fit.contrast(weights)}

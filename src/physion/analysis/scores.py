@@ -180,6 +180,36 @@ def _record(
     return record
 
 
+def against_people(scores: pd.DataFrame, people: pd.DataFrame) -> pd.DataFrame:
+    """Return ``scores`` with how its accuracies compare with people's.
+
+    Parameters
+    ----------
+    scores
+        Table with ``scenario``, ``accuracy``, ``difference_low`` and ``difference_high``.
+    people
+        From `people_table`.
+
+    Returns
+    -------
+    Two columns more, empty where nothing is known. ``reliably``: *better* or *worse* if the
+    interval of the difference to people on the same stimuli excludes 0. ``people_interval``:
+    whether the accuracy is *below*, *inside* or *above* the interval of people's accuracy by
+    drawing participants, as preregistered.
+    """
+    low, high = scores["difference_low"], scores["difference_high"]
+    known = people.set_index("scenario")[list(BOOTSTRAP)].reindex(scores["scenario"])
+    first, last = known.to_numpy(np.float64).T
+    value = scores["accuracy"].to_numpy(np.float64)
+    inside = (value >= first) & (value <= last)
+    return scores.assign(
+        reliably=np.select([low > 0, high < 0], ["better", "worse"], ""),
+        people_interval=np.select(
+            [value < first, inside, value > last], ["below", "inside", "above"], ""
+        ),
+    )
+
+
 def shown_average(scores: pd.DataFrame) -> str:
     """Return which average is shown first: `MEAN`, or `POOLED` if that has more numbers.
 
@@ -196,6 +226,9 @@ AVERAGES = {MEAN: "mean over scenarios", POOLED: "all stimuli pooled"}
 """Words for the averages."""
 
 
+BOOTSTRAP = ("bootstrap_low", "bootstrap_high")
+
+
 def people_table(
     people: pd.DataFrame, zone: pd.DataFrame | None, level: float = 0.95
 ) -> pd.DataFrame:
@@ -206,10 +239,12 @@ def people_table(
     Columns: ``scenario``, ``stimuli``, ``people`` (median number a stimulus), ``base_rate``
     (fraction of stimuli with contact), ``yes`` (mean fraction who say yes), ``accuracy`` with
     ``_low`` and ``_high`` (jackknife over stimuli), ``reliability`` and ``ceiling`` (see
-    `agreement`), and ``zone_low``, ``zone_high``: the middle 95 % of participants if ``zone``
-    contains it, else NaN; always NaN in the mean, since nobody took part in more than one scenario.
+    `agreement`), and, NaN unless ``zone`` contains it, ``bootstrap_low``, ``bootstrap_high``: the
+    interval of the accuracy by drawing participants, as preregistered, and ``zone_low``,
+    ``zone_high``: the middle 95 % of participants, always NaN in the mean, as the people of
+    different scenarios are not one sample.
     """
-    zones = {} if zone is None else zone.set_index("scenario")[["low", "high"]].T.to_dict()
+    zones = {} if zone is None else zone.set_index("scenario").T.to_dict()
     records, variances = [], []
     for name in in_order(people["scenario"]):
         rows = people[people["scenario"] == name].sort_values("stimulus", kind="stable")
@@ -220,6 +255,7 @@ def people_table(
     averaged = ["people", "base_rate", "yes", "accuracy", "reliability", "ceiling"]
     mean = {"scenario": MEAN, "stimuli": len(people), "accuracy_low": low, "accuracy_high": high}
     mean |= {column: float(table[column].mean(skipna=False)) for column in averaged}
+    mean |= {column: zones.get(MEAN, {}).get(column, np.nan) for column in BOOTSTRAP}
     return pd.concat([table, pd.DataFrame([mean])], ignore_index=True)
 
 
@@ -236,6 +272,7 @@ def _people_record(
         "accuracy": float(rows["accuracy"].mean()),
         "accuracy_low": low,
         "accuracy_high": high,
+        **{column: zone.get(column, np.nan) for column in BOOTSTRAP},
         "reliability": agreement.reliability(rows["p_yes"], rows["count"]),
         "ceiling": agreement.ceiling(rows["p_yes"], rows["count"]),
         "zone_low": zone.get("low", np.nan),

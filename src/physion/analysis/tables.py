@@ -337,8 +337,10 @@ PREDICTIONS: tuple[Column, ...] = (
     Column("observed_contact", "flag", "Contact in the observed part", also=("Observed Contact",)),
     Column("inputs", "text", "What the model was given of a trial", also=("Inputs",)),
     Column("init", "text", "Weights that the model started from", also=("Init",)),
-    Column("protocol", "text", "Scenarios of the training: all, all-but, only",
+    Column("protocol", "text", "Scenarios of the training: all, all-but, only, one",
            also=("Dynamics Training Dataset",)),
+    Column("dynamics_training_dataset", "text", "The training scenario of protocol one (several "
+           "are joined by +), whatever the tested one"),
     Column("seed", "text", "Seed of the training", also=("Dynamics Training Seed",)),
     Column("encoder_type", "text", "", also=("Encoder Type",)),
     Column("dynamics_type", "text", "", also=("Dynamics Type",)),
@@ -360,7 +362,7 @@ DATASETS = ("encoder_pretraining_dataset", "encoder_training_dataset", "protocol
 in relation to the tested scenario."""
 
 DISTINGUISHING = (
-    *("protocol", "seed", "init", "encoder_type", "dynamics_type"),
+    *("protocol", "dynamics_training_dataset", "seed", "init", "encoder_type", "dynamics_type"),
     *("encoder_pretraining_task", "encoder_pretraining_dataset", "encoder_pretraining_seed"),
     *("encoder_training_task", "encoder_training_dataset", "encoder_training_seed"),
     *("dynamics_training_task", "readout_training_dataset"),
@@ -423,6 +425,10 @@ def check_predictions(
     return rows
 
 
+_WORDS = {"protocol": "", "dynamics_training_dataset": "trained on "}
+"""Words before the value of a column in the name of a model, where they are not its name."""
+
+
 def name_models(predictions: pd.DataFrame) -> pd.DataFrame:
     """Return ``predictions`` with a unique ``model`` for each row of results, and ``base_model``.
 
@@ -443,8 +449,10 @@ def name_models(predictions: pd.DataFrame) -> pd.DataFrame:
             continue
         values = predictions[column].astype(str)
         several = values.groupby([base, readout]).transform("nunique")
-        words = "" if column == "protocol" else column.replace("_", " ") + " "
+        words = _WORDS.get(column, column.replace("_", " ") + " ")
         added = f" · {words}" + values.where(values != "", "not stated")
+        if column == "dynamics_training_dataset":  # only models of protocol one have it
+            added = added.where(values != "", "")
         model = model.where(several < 2, model + added)
     named = predictions.assign(base_model=base, model=model)
     twice = named[named.duplicated(["model", "stimulus"])]
@@ -598,15 +606,18 @@ def read_labels(path: Path) -> dict[str, bool]:
 
 
 def read_human_zone(path: Path) -> pd.DataFrame:
-    """Read the middle 95 % of participants by scenario from ``human_accuracy_by_scenario.csv``.
+    """Read what only single participants give from ``human_accuracy_by_scenario.csv``.
 
     Columns: ``scenario`` (ours), ``low``, ``high``: the 2.5th and the 97.5th percentile of the
-    accuracies of single participants, which per-stimulus tables do not contain.
+    accuracies of single participants, and ``bootstrap_low``, ``bootstrap_high``, if the file has
+    them: the interval of their mean by drawing participants.
     """
     columns = (
         SCENARIO,
         must("low", "number", "2.5th percentile", low=0, high=1, also=("pct_2.5",)),
         must("high", "number", "97.5th percentile", low=0, high=1, also=("pct_97.5",)),
+        Column("bootstrap_low", "number", "Interval of the mean", low=0, high=1, also=("ci_lb",)),
+        Column("bootstrap_high", "number", "Interval of the mean", low=0, high=1, also=("ci_ub",)),
     )
     zone = check_table(read_csv(path), columns, str(path))
     zone = zone.assign(scenario=zone["scenario"].replace(OFFICIAL_SCENARIOS))
@@ -638,10 +649,11 @@ def with_labels(humans: pd.DataFrame, labels: Mapping[str, bool]) -> pd.DataFram
     return humans.assign(label=label, p_yes=p_yes)
 
 
-# Attributes of stimuli: how many elements, distractors and occluders a scene contains.
+# Attributes of stimuli: how many elements, distractors and occluders a scene contains, and whatever
+# else a table says of it.
 #
 # Two sources, each named in the column ``source``: the official names of stimuli, which contain
-# the counts, and any table with the columns, such as a table of one's own stimuli. A table has
+# the counts, and any table with a row per stimulus, all of whose columns count. A table has
 # precedence over names (`better_attributes`); names that are known to be wrong are corrected
 # (`MISLABELLED`). What a source does not contain is NaN.
 
@@ -719,15 +731,57 @@ ATTRIBUTE_TABLE: tuple[Column, ...] = (
 """One row per stimulus of one's own, such as the index of a dataset."""
 
 
+RESERVED = frozenset(
+    {"accuracy", "accuracy_low", "accuracy_high", "count", "label", "p_yes", "consistency"}
+    | {"mean_log_rt", "participant", "correct", "log_rt"}
+)
+"""Columns of answers, which no attribute may be called."""
+
+INDEX_ATTRIBUTES = ("robust", "agent_fraction", "patient_fraction")
+"""Columns of a dataset's index that are attributes of its trials, like `ATTRIBUTES` and what begins
+with ``drawn_``. All others keep books."""
+
+
 def attributes_from_table(table: pd.DataFrame, where: str = "table of attributes") -> pd.DataFrame:
-    """Return the attributes of a table of `ATTRIBUTE_TABLE` with any of `ATTRIBUTES`."""
+    """Return the attributes of a table of `ATTRIBUTE_TABLE`, with every other column.
+
+    Columns: `COLUMNS`, then the others. Those that hold only numbers, or True and False, are float
+    (NaN if empty); the rest are text (None if empty). Of a dataset's index (known by its column
+    ``scene_digest``) `INDEX_ATTRIBUTES` and what was drawn are taken. Raises `BadInputError` if no
+    attribute is left, or if one has a name in `RESERVED`.
+    """
     rows = check_table(table, ATTRIBUTE_TABLE, where)
-    if not set(ATTRIBUTES) & set(rows):
-        raise BadInputError(f"{where} has none of the columns {', '.join(ATTRIBUTES)}")
+    described = {name for column in ATTRIBUTE_TABLE for name in (column.name, *column.also)}
+    others = [str(name) for name in table if name not in {*described, "source"}]
+    if "scene_digest" in table:
+        others = [n for n in others if n in INDEX_ATTRIBUTES or n.startswith("drawn_")]
+    if taken := sorted(RESERVED & set(others)):
+        raise BadInputError(f"{where}: a column is called {taken[0]!r}, as the answers; rename it")
+    if not {*ATTRIBUTES, "configuration", "room"} & set(rows) and not others:
+        raise BadInputError(f"{where} has no column but the stimulus and its scenario")
+    rows = rows.assign(**{name: _attribute(table[name]) for name in others})
     rows = rows.assign(stimulus=rows["stimulus"].map(canonical_name), source="table")
     refuse_duplicates(rows["stimulus"], where)
     absent = [name for name in ("configuration", "room") if name not in rows]
-    return rows.assign(**dict.fromkeys(absent, "")).reindex(columns=list(COLUMNS))
+    return rows.assign(**dict.fromkeys(absent, "")).reindex(columns=[*COLUMNS, *others])
+
+
+def _attribute(column: pd.Series) -> pd.Series:
+    """Return a column as numbers if all of its cells are some or empty, else as text."""
+    text = column.astype(object).where(column.notna(), "").astype(str).str.strip()
+    text = text.reset_index(drop=True)
+    empty = text == ""
+    flags = text.str.lower().map({"true": "1", "false": "0"})
+    numbers = pd.to_numeric(flags.fillna(text).where(~empty), errors="coerce").astype(np.float64)
+    if np.isfinite(numbers[~empty]).all():
+        return numbers
+    return text.where(~empty, None)
+
+
+def attribute_names(attributes: pd.DataFrame) -> list[str]:
+    """Return the columns that hold attributes, the name of the configuration last."""
+    names = [str(name) for name in attributes if name not in ("stimulus", "scenario", "source")]
+    return sorted(names, key=lambda name: name == "configuration")
 
 
 def better_attributes(first: pd.DataFrame, second: pd.DataFrame) -> pd.DataFrame:

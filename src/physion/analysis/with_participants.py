@@ -26,7 +26,12 @@ from physion.analysis.intervals import (
     second_order,
 )
 from physion.analysis.metrics import measure_metrics, metrics
-from physion.analysis.people.measures import ScenarioAnswers, difference_of_pairs, mean_over_people
+from physion.analysis.people.measures import (
+    ScenarioAnswers,
+    difference_of_pairs,
+    draws_of_people,
+    mean_over_people,
+)
 from physion.analysis.sample import RESAMPLED, Resampled, Sample
 from physion.analysis.scores import MAJORITY, OUTCOME, not_given
 from physion.analysis.statistics import agreement
@@ -313,7 +318,7 @@ def add_baselines(models: Models, answers: ScenarioAnswers) -> Models:
 
 TABLE_COLUMNS = (
     *("model", "scenario", "measure", "stimuli", "value"),
-    *(f"{end}_{what}" for what in RESAMPLED for end in ("low", "high")),
+    *(f"{end}_{what}" for what in (*RESAMPLED, "bootstrap") for end in ("low", "high")),
     *("pair_low", "pair_median", "pair_high", "undefined", "reason"),
 )
 
@@ -326,7 +331,8 @@ class Measured:
     - ``values[measure]``; ``reasons[measure]``: why the value is NaN;
     - ``variances[what][measure]`` for each of `RESAMPLED`, absent if the measure does not
       depend on what is drawn;
-    - ``by_participant[measure]`` (people,), for measures with a value for each participant.
+    - ``by_participant[measure]`` (people,), for measures with a value for each participant;
+    - ``draws[measure]`` (resamples,): the values with participants drawn with replacement.
     """
 
     model: str
@@ -336,18 +342,32 @@ class Measured:
     reasons: dict[str, str]
     variances: dict[Resampled, dict[str, Variance]]
     by_participant: dict[str, Array]
+    draws: dict[str, Array]
 
 
 def measure_models(
-    models: Models, answers: ScenarioAnswers, two_people: str = ""
+    models: Models,
+    answers: ScenarioAnswers,
+    two_people: str = "",
+    bootstrap: Bootstrap | None = None,
 ) -> list[Measured]:
-    """Compute every measure of every model, and its sampling variances.
+    """Compute every measure of every model, and how it varies with other people and stimuli.
 
-    ``two_people``: name of a further row, at the end, with the measures of one person with another
-    that are defined; empty: there is none.
+    Parameters
+    ----------
+    models, answers
+        Models and people of one scenario.
+    two_people
+        Name of a further row, at the end, with the measures of one person with another that are
+        defined; empty: there is none.
+    bootstrap
+        Draws of participants, the same for every statistic of the scenario.
     """
     sample = sample_of_models(models, answers)
     chosen = measure_metrics()
+    weights = draws_of_people(answers, bootstrap or Bootstrap())
+    drawn = sample_of_models(models, answers, None, weights, "people")
+    draws = {m.name: m(drawn) for m in chosen if "people" in m.resampled}
     values = {metric.name: metric(sample)[0] for metric in chosen}
     each = {m.name: m.by_participant(sample) for m in chosen if m.by_participant is not None}
     variances = {
@@ -369,6 +389,7 @@ def measure_models(
                 reasons={measure: _why(measure, k, models, answers) for measure in undefined},
                 variances={what: _of_model(found, k) for what, found in variances.items()},
                 by_participant={measure: value[:, k] for measure, value in each.items()},
+                draws={measure: value[:, k] for measure, value in draws.items()},
             )
         )
     return [*rows, _two_people(two_people, models, answers, sample)] if two_people else rows
@@ -397,6 +418,7 @@ def _two_people(name: str, models: Models, answers: ScenarioAnswers, sample: Sam
             for what in RESAMPLED
         },
         by_participant={},
+        draws={},
     )
 
 
@@ -404,9 +426,11 @@ def measure_table(measured: Sequence[Measured], level: float = 0.95) -> pd.DataF
     """Return one row per model and measure.
 
     Columns: ``model``, ``scenario``, ``measure``, ``stimuli``, ``value``; ``low`` and ``high`` with
-    ``_people``, ``_stimuli``, ``_both`` (interval by what is drawn, at this ``level``); for
-    measures by participant also ``pair_low``, ``pair_median``, ``pair_high`` (percentiles over
-    participants) and ``undefined`` (participants for whom it is NaN); ``reason``.
+    ``_people``, ``_stimuli``, ``_both`` (interval by what is drawn, at this ``level``) and
+    ``_bootstrap`` (percentiles over draws of participants, as preregistered; the noise of their
+    averages counts twice in it); for measures by participant also ``pair_low``, ``pair_median``,
+    ``pair_high`` (percentiles over participants) and ``undefined`` (participants for whom it is
+    NaN); ``reason``.
     """
     records = []
     for one in measured:
@@ -415,6 +439,8 @@ def measure_table(measured: Sequence[Measured], level: float = 0.95) -> pd.DataF
             record, reasons = _interval_columns(measure, value, variances, level)
             if measure in one.reasons:
                 reasons.insert(0, one.reasons[measure])
+            ends = Bootstrap(level=level).interval(one.draws.get(measure, np.empty(0)))
+            record |= dict(zip(("low_bootstrap", "high_bootstrap"), ends, strict=True))
             if measure in one.by_participant:
                 found = distribution(one.by_participant[measure])
                 record |= {f"pair_{end}": found[end] for end in ("low", "median", "high")}
@@ -453,7 +479,8 @@ def _mean(rows: Sequence[Measured]) -> Measured:
             if all(measure in one.variances[what] for one in rows):
                 variances[what][measure] = mean_of([one.variances[what][measure] for one in rows])
     stimuli = sum(one.stimuli for one in rows)
-    return Measured(rows[0].model, MEAN, stimuli, values, reasons, variances, {})
+    draws = {name: np.mean([one.draws[name] for one in rows], axis=0) for name in rows[0].draws}
+    return Measured(rows[0].model, MEAN, stimuli, values, reasons, variances, {}, draws)
 
 
 def _interval_columns(

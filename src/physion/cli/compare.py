@@ -67,6 +67,9 @@ class Options:
     given, by official names."""
     rollout_errors: tuple[Path, ...] = ()
     """Files of evaluate --rollout-error: a figure of the errors of imagined motion over time."""
+    groups: tuple[str, ...] = ()
+    """Compare groups of models by these columns of the predictions, such as encoder_type, or by the
+    columns of a CSV file with model and any others."""
     exclude: Path | None = None
     """File of stimuli to exclude, one per line."""
     fitted: Path | None = None
@@ -116,6 +119,7 @@ def _compare(options: Options) -> int:
         simulated=options.simulated,
         where=options.where,
         attributes=options.attributes,
+        groups=options.groups,
         exclude=options.exclude or (),
         rollout_errors=options.rollout_errors,
         resamples=options.resamples,
@@ -266,7 +270,8 @@ def _print_published(results: PublishedResults) -> None:
         _show(TITLES[name], tables[name])
     _print_regressions(tables["regressions"])
     _say(words["regressions"])
-    people = ["scenario", "accuracy", "zone_low", "zone_high", "kappa", "half_r", "half_r_full"]
+    people = ["scenario", "accuracy", "accuracy_low", "accuracy_high", "printed", "zone_low"]
+    people += ["zone_high", "kappa", "half_r", "half_r_full"]
     counts = ["participants", "stimuli", "below_chance"]
     _show(TITLES["people"], tables["people"][[*people, *counts]])
     _show(TITLES["people_claims"], tables["people_claims"])

@@ -18,7 +18,11 @@ from physion.core.version import MADE_WITH
 from physion.report.figures import theme
 from physion.report.figures.by_stimulus import CAPTION as DIFFICULTY
 from physion.report.figures.by_stimulus import RESPONSE_TIME_CAPTION as RESPONSE_TIME
-from physion.report.figures.by_stimulus import difficulty_figure, response_time_figure
+from physion.report.figures.by_stimulus import (
+    difficulty_figure,
+    misleading_plot,
+    response_time_figure,
+)
 from physion.report.figures.theme import Plot, make_plots
 from physion.report.html import (
     Picture,
@@ -77,19 +81,22 @@ def mark_rehearsal(table: pd.DataFrame) -> pd.DataFrame:
 
 def build_people_report(report: PeopleReport, folder: Path) -> Path:
     """Write a report about people without predictions, as `build_report`; return the page."""
-    tables = {f"people_{name}": t for name, t in report.people.tables.items() if len(t.columns)}
-    plots = people_plots(report.people)
+    tables = report.tables()
+    plots = people_plots(report.people, report.movies)
     shown = _write_parts(folder, tables, plots, bool(report.people.mark))
     numbers = _numbers(people_methods(report), report.people.warnings, tables)
     return _write_pages(folder, numbers, (), render_people_page(report, shown, folder))
 
 
-def people_plots(people: PeopleResults) -> list[Plot]:
-    """Return the figures: difficulty of stimuli and, if times are known, response times."""
+def people_plots(people: PeopleResults, movies: Mapping[str, Path]) -> list[Plot]:
+    """Return the figures: difficulty of stimuli, frames of those that mislead people, and, if times
+    are known, response times.
+    """
     by_stimulus = people.tables["by_stimulus"]
     rows = by_stimulus.sort_values(["scenario", "stimulus"], kind="stable")
     tail = below_chance_level(rows.reset_index(drop=True))
-    plots = [Plot("difficulty", DIFFICULTY, tail, difficulty_figure)]
+    frames = misleading_plot(tail, movies)
+    plots = [Plot("difficulty", DIFFICULTY, tail, difficulty_figure), *([frames] if frames else [])]
     times = response_time_table(by_stimulus)
     if times["mean_log_rt"].notna().any():
         plots.append(Plot("response_time", RESPONSE_TIME, times, response_time_figure))

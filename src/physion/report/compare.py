@@ -16,6 +16,7 @@ import pandas as pd
 from physion.analysis.compare import all_results, tidy_scores
 from physion.analysis.comparison import check_coverage
 from physion.analysis.intervals import Bootstrap
+from physion.analysis.model_tests import fits_of_people
 from physion.analysis.people.exclusions import PREREGISTERED, Expected, find_expected, read_expected
 from physion.analysis.people.responses import Participants, check_labels, keep_where
 from physion.analysis.people.results import (
@@ -42,9 +43,11 @@ from physion.analysis.tables import (
     read_humans,
     read_labels,
     read_stimulus_list,
+    read_table,
+    refuse_duplicates,
     require_columns,
 )
-from physion.core.errors import BadInputError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.data.official import find_official
 from physion.report.build import build_people_report, build_report
 from physion.report.html import plural
@@ -165,6 +168,7 @@ def compare(
     simulated: bool = False,
     where: Sequence[str] = (),
     attributes: Path | pd.DataFrame | None = None,
+    groups: Sequence[str | Path | pd.DataFrame] = (),
     exclude: Path | Iterable[str] = (),
     ledge: bool = False,
     dominoes: DominoesLook = "plain",
@@ -208,6 +212,9 @@ def compare(
         Values that the sessions must have, such as ``condition=fast``.
     attributes
         Elements, distractors and occluders of one's own stimuli: a table, its file, or a dataset.
+    groups
+        What groups of models are compared by: columns of the predictions, and tables (or their CSV
+        files) with ``model`` and any further columns, all of which count.
     exclude
         Stimuli to exclude, or a file with one per line.
     ledge
@@ -243,14 +250,15 @@ def compare(
         draws = Bootstrap(resamples, seed=seed)
     except ValueError as error:
         raise BadInputError(f"resamples {resamples}: {error}") from error
-    rows = _rows(predictions)
+    rows, grouped = _rows(predictions, groups)
     files = [Path(responses)] if isinstance(responses, str | Path) else [*map(Path, responses)]
     if rows is None and not files:
         raise BadInputError(
             "no predictions: give some, or responses for an analysis of people (--responses)"
         )
-    if rows is None and rollout_errors:
-        raise BadInputError("rollout errors are about predictions: give some")
+    if rows is None and (rollout_errors or groups):
+        what = "rollout errors" if rollout_errors else "groups of models"
+        raise BadInputError(f"{what} are about predictions: give some")
     errors = read_rollout_errors(rollout_errors) if rollout_errors else None
     excluded = read_stimulus_list(exclude) if isinstance(exclude, Path) else list(exclude)
     settings: dict[str, Any] = {
@@ -268,8 +276,10 @@ def compare(
         if rows is None:
             check_excluded_names(excluded, people.stimuli)
             methods |= {"Intervals": _describe_intervals(draws)}
-            return CompareResult(_scores_of_people(people), people, PeopleReport(people, methods))
-        results = all_results(rows, people=people, **settings)
+            fits = tuple(fits_of_people(people))
+            page = PeopleReport(people, fits, methods)
+            return CompareResult(_scores_of_people(people), people, page)
+        results = all_results(rows, people=people, groups=grouped, **settings)
     else:
         assert rows is not None
         about = (sessions, expected, attributes)
@@ -282,7 +292,7 @@ def compare(
         methods = dict(averages.methods)
         results = all_results(
             rows, averages.people, averages.labels, zone=averages.zone,
-            zone_origin=averages.zone_origin, **settings,
+            zone_origin=averages.zone_origin, groups=grouped, **settings,
         )  # fmt: skip
         results = replace(results, warnings=(*results.warnings, *averages.warnings))
     inputs = ReportInputs.of(
@@ -295,24 +305,64 @@ def compare(
     return CompareResult(tidy_scores(results), results.people, inputs)
 
 
-def _rows(predictions: Predictions | Sequence[Predictions]) -> pd.DataFrame | None:
-    """Return all predictions as one table with unique names of models; None if there is none."""
+def _rows(
+    predictions: Predictions | Sequence[Predictions],
+    groups: Sequence[str | Path | pd.DataFrame],
+) -> tuple[pd.DataFrame | None, list[str]]:
+    """Return all predictions as one table with unique names of models, and the columns of groups.
+
+    The table is None if there is none.
+    """
     if isinstance(predictions, Mapping | pd.DataFrame | Path | str):
         given: Sequence[Predictions] = [predictions]
     else:
         given = predictions
-    tables = []
+    tables, raw = [], []
     for one in given:
         if isinstance(one, Mapping):
             for model, values in one.items():
                 columns = {"stimulus": list(values), "p_contact": list(values.values())}
-                tables.append(check_predictions(pd.DataFrame(columns), model, model))
+                raw.append(pd.DataFrame(columns))
+                tables.append(check_predictions(raw[-1], model, model))
         elif isinstance(one, pd.DataFrame):
+            raw.append(one)
             tables.append(check_predictions(one))
         else:
             path = Path(one)
-            tables.append(check_predictions(read_csv(path), str(path), path.stem))
-    return name_models(pd.concat(tables, ignore_index=True)) if tables else None
+            raw.append(read_csv(path))
+            tables.append(check_predictions(raw[-1], str(path), path.stem))
+    if not tables:
+        return None, []
+    return _with_groups(name_models(pd.concat(tables, ignore_index=True)), raw, groups)
+
+
+def _with_groups(
+    rows: pd.DataFrame, raw: Sequence[pd.DataFrame], groups: Sequence[str | Path | pd.DataFrame]
+) -> tuple[pd.DataFrame, list[str]]:
+    """Return named predictions with the columns of groups as text, and their names.
+
+    ``raw``: the tables that the rows were read from, in their order.
+    """
+    extra = pd.concat(raw, ignore_index=True) if groups else pd.DataFrame()
+    names = []
+    for group in groups:
+        if isinstance(group, pd.DataFrame) or Path(group).suffix in (".csv", ".parquet"):
+            table = group if isinstance(group, pd.DataFrame) else read_table(Path(group), ["model"])
+            require_columns(table, ["model"], "the table of groups")
+            refuse_duplicates(table["model"], "the table of groups")
+            own = table.set_index("model")
+            for name in own:
+                by_name = rows["model"].map(own[name])
+                rows = rows.assign(**{name: by_name.fillna(rows["base_model"].map(own[name]))})
+            names += list(own)
+        elif str(group) in rows:
+            names.append(str(group))
+        elif str(group) in extra:
+            rows = rows.assign(**{str(group): extra[str(group)].to_numpy()})
+            names.append(str(group))
+        else:
+            raise UnknownNameError("column of the predictions", str(group), [*extra, *rows])
+    return rows.assign(**{n: rows[n].fillna("").astype(str) for n in names}), names
 
 
 def _by_model(rows: pd.DataFrame, column: str) -> dict[str, str]:

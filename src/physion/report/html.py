@@ -186,6 +186,11 @@ def interval(row: pd.Series, key: str, low: str = "", high: str = "", digits: in
     return Markup(MACROS.with_small(number(row[key], digits), spread(*bounds, digits=digits)))
 
 
+def compared(cell: str, reliably: str) -> Markup:
+    """Return a cell in bold if it is reliably *better* than people, in italics if *worse*."""
+    return Markup(MACROS.compared(cell, reliably))
+
+
 def spread(low: float, high: float, digits: int = 2) -> str:
     """Return the bounds of an interval as text."""
     if pd.isna(low):

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from physion.analysis.compare import ComparisonResults
+from physion.analysis.compare import ComparisonResults, tidy_scores
+from physion.analysis.model_tests import MixedTable
 from physion.analysis.people.results import PeopleResults
 
 EXPECTED_METHODS = ("Engine", "Renderer", "Readout", "Encoder weights", "Noise of the simulation")
@@ -64,7 +65,7 @@ class ReportInputs(ComparisonResults):
         """Every table by the name of its file."""
         comparison = self.comparison
         found: dict[str, pd.DataFrame | None] = {
-            "comparison": self._with_init(comparison.all_scores),
+            "comparison": self._with_init(self._against_people()),
             "comparison_later": self._with_init(comparison.later)
             if len(comparison.later)
             else None,
@@ -74,6 +75,7 @@ class ReportInputs(ComparisonResults):
             "left_out": comparison.dropped,
             "paired_tests": self.paired,
             "paired_measures": self.paired_measures,
+            "group_contrasts": self.contrasts,
             "calibration_scores": self.calibration,
             "comparison_with_flagged": None
             if self.comparison_all is None
@@ -86,11 +88,18 @@ class ReportInputs(ComparisonResults):
                 "model_pairs": self.beside.pairs,
                 "left_out_beside_people": self.beside.dropped,
             }
-        for fit in self.mixed:
-            found[f"mixed_{fit.name}"] = fit.table()
+        found |= _mixed_tables(self.mixed)
         if self.people is not None:
-            found |= {f"people_{name}": table for name, table in self.people.tables.items()}
+            found |= _people_tables(self.people)
         return {name: t for name, t in found.items() if t is not None and len(t.columns)}
+
+    def _against_people(self) -> pd.DataFrame:
+        """Return all scores with the columns of `against_people`, as `tidy_scores` has them."""
+        table, columns = self.comparison.all_scores, ["reliably", "people_interval"]
+        if not self.comparison.has_people:
+            return table
+        marks = tidy_scores(self).set_index(["model", "scenario"])[columns]
+        return table.join(marks, on=["model", "scenario"])
 
     def _with_init(self, scores: pd.DataFrame) -> pd.DataFrame:
         """Return scores with the column ``init``, the weights of each model, after the readout."""
@@ -105,12 +114,27 @@ class PeopleReport:
     """Results about people with the settings of their page, which needs no predictions.
 
     - ``people``: every analysis of them.
+    - ``mixed``: from `fits_of_people`.
     - ``methods``: settings made outside the analysis, as text.
     - ``movies``: movie by stimulus, to which the page links.
     - ``title``: the heading.
     """
 
     people: PeopleResults
+    mixed: tuple[MixedTable, ...] = ()
     methods: Mapping[str, str] = field(default_factory=dict)
     movies: Mapping[str, Path] = field(default_factory=dict)
     title: str = "People on physical prediction"
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """Every table by the name of its file."""
+        found = {**_mixed_tables(self.mixed), **_people_tables(self.people)}
+        return {name: table for name, table in found.items() if len(table.columns)}
+
+
+def _mixed_tables(fits: Sequence[MixedTable]) -> dict[str, pd.DataFrame]:
+    return {f"mixed_{fit.name}": fit.table() for fit in fits}
+
+
+def _people_tables(people: PeopleResults) -> dict[str, pd.DataFrame]:
+    return {f"people_{name}": table for name, table in people.tables.items()}

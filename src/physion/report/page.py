@@ -102,9 +102,12 @@ def _summary(inputs: ReportInputs) -> Markup:
     ]
     if comparison.has_people:
         mean = comparison.people.set_index("scenario").loc[MEAN]
+        drawn = html.spread(mean["bootstrap_low"], mean["bootstrap_high"], 3)
+        known = pd.notna(mean["bootstrap_low"])
         words.append(
-            f"People: mean accuracy {mean['accuracy']:.3f} over scenarios, about "
-            f"{mean['people']:.0f} participants per stimulus."
+            f"People: mean accuracy {mean['accuracy']:.3f} over scenarios"
+            + (f" ({drawn} by drawing participants, as preregistered)" if known else "")
+            + f", about {mean['people']:.0f} participants per stimulus."
         )
     else:
         words.append("No answers of people were given: this page is about models only.")
@@ -164,7 +167,7 @@ def _figures(section: str, shown: Mapping[str, Markup], below: Mapping[str, Mark
 def _by_scenario(inputs: ReportInputs, shown: Mapping[str, Markup]) -> Markup:
     comparison = inputs.comparison
     below = {
-        "accuracy": html.details("Accuracy as a table", scores.matrix(comparison, "accuracy")),
+        "accuracy": html.details("Accuracy as a table", scores.accuracies(inputs)),
         "kappa": people_parts.measures(inputs),
     }
     if comparison.has_people:
@@ -238,6 +241,7 @@ def render_people_page(report: PeopleReport, pictures: Sequence[Picture], folder
             shown + people_parts.fooled_by(people.tables["by_stimulus"], links),
         ),
         Section("Sessions left out", people_parts.sessions_only(people)),
+        Section("Mixed models", scores.mixed_models(report.mixed)),
         Section("How this was made", html.definition_list(people_methods(report))),
         Section("What was left out", people_parts.dropped(people)),
     ]

@@ -41,7 +41,8 @@ _NO_ZONE = "known only of scenarios of which all stimuli that single participant
 
 def averages(comparison: Comparison) -> Markup:
     """Return the table of people by scenario."""
-    header = ["scenario", "stimuli", "people", "base rate", "say yes", "accuracy", "zone"]
+    header = ["scenario", "stimuli", "people", "base rate", "say yes", "accuracy"]
+    header += ["participants drawn", "zone"]
     rows = []
     for _, row in comparison.people.assign(reason="").iterrows():
         zone = f"{number(row['zone_low'])} to {number(row['zone_high'])}"
@@ -53,12 +54,16 @@ def averages(comparison: Comparison) -> Markup:
                 number(row["base_rate"]),
                 number(row["yes"]),
                 interval(row, "accuracy"),
+                spread(row["bootstrap_low"], row["bootstrap_high"])
+                if np.isfinite(row["bootstrap_low"])
+                else undefined(_NO_ZONE),
                 zone if np.isfinite(row["zone_low"]) else undefined(_NO_ZONE),
                 number(row["reliability"], 3),
                 number(row["ceiling"], 3),
             ]
         )
-    return table([*header, "reliability", "ceiling of r"], rows, "People")
+    words = "People; intervals of the accuracy by drawing stimuli, and by drawing participants"
+    return table([*header, "reliability", "ceiling of r"], rows, words)
 
 
 MORE = "every scenario, and why an interval is missing, is in tables/measures.csv"
@@ -312,7 +317,41 @@ def _hypotheses(results: PeopleResults) -> Markup:
     )
     main = rows[rows["scenario"] == "all"] if (rows["scenario"] == "all").any() else rows
     whole = details("By scenario", rows_table(rows, columns)) if len(main) < len(rows) else ""
-    return paragraph(words) + rows_table(main, columns) + whole
+    return paragraph(words) + rows_table(main, columns) + whole + _attributes(tables)
+
+
+def _attributes(tables: Mapping[str, pd.DataFrame]) -> Markup:
+    """Return accuracy by every attribute, by itself and together, over all scenarios."""
+    rows = tables["attribute_effects"]
+    main = rows[rows["scenario"] == "all"] if (rows["scenario"] == "all").any() else rows
+    columns = [
+        PageColumn("attribute", "attribute", "text"),
+        PageColumn("level", "level", "text"),
+        PageColumn("scenario", "scenario", "text"),
+        PageColumn("stimuli", "stimuli", "count"),
+        PageColumn("b", "b", "interval", 3, "low", "high"),
+        PageColumn("by one sd", "b_sd", digits=3),
+        PageColumn("t", "t"),
+        PageColumn("p, all levels", "p_term", "p"),
+        PageColumn("Holm", "p_holm", "p"),
+        PageColumn("R²", "r2"),
+    ]
+    parts = []
+    for fit, words in (
+        ("single", "Each attribute by itself"),
+        ("together", "All attributes together: their linear combination"),
+    ):
+        own = main[main["fit"] == fit]
+        parts.append(rows_table(own, columns, f"{words}; every scenario: {_ATTRIBUTE_EFFECTS}"))
+    words = (
+        "Exploratory, as preregistered: people's accuracy on a stimulus by every attribute that is "
+        "known, with an intercept for each scenario and standard errors HC3; R² of the differences "
+        "within scenarios; p corrected over the attributes by Holm."
+    )
+    return details("Accuracy by attributes of stimuli", joined([paragraph(words), *parts]))
+
+
+_ATTRIBUTE_EFFECTS = "tables/people_attribute_effects.csv"
 
 
 def measures(inputs: ReportInputs) -> Markup:
@@ -333,6 +372,9 @@ def measures(inputs: ReportInputs) -> Markup:
         ),
         PageColumn("people drawn", "value", "interval", 3, "low_people", "high_people"),
         PageColumn("stimuli drawn", "value", "interval", 3, "low_stimuli", "high_stimuli"),
+        PageColumn(
+            "bootstrap of people", "value", "interval", 3, "low_bootstrap", "high_bootstrap"
+        ),
         PageColumn("lowest 2.5 % of people", "zone_low", digits=3),
         PageColumn("highest 2.5 %", "zone_high", digits=3),
         PageColumn("in zone", "in_zone", "text"),

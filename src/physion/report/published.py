@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,8 +31,10 @@ from physion.report.html import (
     MACROS,
     PageColumn,
     Section,
+    compared,
     details,
     figure,
+    interval,
     number,
     p_value,
     paragraph,
@@ -196,10 +199,17 @@ def _accuracies(results: PublishedResults) -> Markup:
     ):
         wide = grid(rows, column)
         names = [name for name in wide.columns if name != "model"]
+        marks = _reliably(rows) if column == "published" else {}
         cells = [
-            [str(row["model"]), *(number(row[name], 3) for name in names)]
+            [
+                str(row["model"]),
+                *(compared(number(row[n], 3), marks.get((row["model"], n), "")) for n in names),
+            ]
             for _, row in wide.iterrows()
         ]
+        if column == "published":
+            cells.insert(0, _people_row(results.tables["people"], names))
+            caption += _MARKED
         parts.append(table(["model", *names], cells, caption))
     columns = [
         PageColumn("model", "model", "text"),
@@ -217,6 +227,23 @@ def _accuracies(results: PublishedResults) -> Markup:
     ]
     parts.append(details("Every value with its interval", rows_table(rows, columns)))
     return joined(parts)
+
+
+_MARKED = (
+    "; italics: reliably worse than people, bold: reliably better: the interval by the paper's way "
+    "and the bootstrap of people do not overlap"
+)
+
+
+def _reliably(rows: pd.DataFrame) -> dict[tuple[str, str], str]:
+    marks: dict[tuple[str, str], str] = rows.set_index(["model", "scenario"])["reliably"].to_dict()
+    return marks
+
+
+def _people_row(people: pd.DataFrame, names: Sequence[str]) -> list[str]:
+    """Return the accuracy of people by scenario, with the interval by drawing participants."""
+    rows = people.set_index("scenario").loc[list(names)]
+    return ["people", *(interval(row, "accuracy", digits=3) for _, row in rows.iterrows())]
 
 
 def _panel(rows: pd.DataFrame, measure: str) -> Markup:
@@ -275,7 +302,10 @@ def _regressions(results: PublishedResults) -> Markup:
 def _people(rows: pd.DataFrame, claims: pd.DataFrame, description: str) -> Markup:
     columns = [
         PageColumn("scenario", "scenario", "text"),
-        PageColumn("accuracy", "accuracy", "interval", 3, "zone_low", "zone_high"),
+        PageColumn("accuracy (participants drawn)", "accuracy", "interval", 3),
+        PageColumn("printed", "printed", digits=3),
+        PageColumn("zone from", "zone_low", digits=3),
+        PageColumn("to", "zone_high", digits=3),
         PageColumn("kappa", "kappa", "interval", 3, "kappa_low", "kappa_high"),
         PageColumn("r of halves", "half_r", "interval", 3),
         PageColumn("stepped up", "half_r_full", digits=3),
@@ -292,7 +322,10 @@ def _people(rows: pd.DataFrame, claims: pd.DataFrame, description: str) -> Marku
     return (
         paragraph(description)
         + rows_table(
-            rows, columns, "Small print: the zones (2.5 to 97.5 %); in the mean the paper's"
+            rows,
+            columns,
+            "Printed: the row of people in the paper's table. Zones are 2.5 to 97.5 % of "
+            "participants, or of pairs (kappa); in the mean the paper's",
         )
         + rows_table(claims, said, "What the paper says of people")
     )

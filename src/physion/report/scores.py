@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
+from physion.analysis.compare import tidy_scores
 from physion.analysis.comparison import SETTING, Comparison
 from physion.analysis.metrics import BEYOND_OUTCOME, Metric, score_metrics
 from physion.analysis.mixed.result import effect_name
@@ -18,6 +19,7 @@ from physion.report.html import (
     BASELINES,
     MACROS,
     PageColumn,
+    compared,
     definition_list,
     details,
     heading,
@@ -234,8 +236,44 @@ def _describe_model(row: pd.Series) -> str:
     return str(row["base_model"]) + str(row["model"]).removeprefix(head)
 
 
-def matrix(comparison: Comparison, key: str) -> Markup:
-    """Return a score by model (rows) and scenario (columns), people on top, baselines below."""
+RELIABLY = (
+    "Bold: reliably better than people; italics: reliably worse, that is, the interval of the "
+    "difference on the same stimuli excludes 0. Column reliably of tables/comparison.csv; "
+    "people_interval there says whether a model is below, inside or above people's interval by "
+    "drawing participants, as preregistered."
+)
+"""Caption of the table of accuracies by scenario, if people are known."""
+
+
+def accuracies(inputs: ReportInputs) -> Markup:
+    """Return accuracy by model and scenario, with what is reliably better or worse than people."""
+    if not inputs.comparison.has_people:
+        return matrix(inputs.comparison, "accuracy")
+    rows = tidy_scores(inputs)
+    marks = rows.set_index(["model", "scenario"])["reliably"].to_dict()
+    return matrix(inputs.comparison, "accuracy", marks, RELIABLY)
+
+
+def matrix(
+    comparison: Comparison,
+    key: str,
+    reliably: Mapping[tuple[str, str], str] | None = None,
+    caption: str = "",
+) -> Markup:
+    """Return a score by model (rows) and scenario (columns), people on top, baselines below.
+
+    Parameters
+    ----------
+    comparison
+        Scores of models and baselines.
+    key
+        Name of the metric.
+    reliably
+        *better* or *worse* by model and scenario, which marks the cell.
+    caption
+        Text above the table.
+    """
+    marks = reliably or {}
     columns = [*in_order(comparison.stimuli["scenario"]), MEAN, POOLED]
     first = []
     if comparison.has_people and key in _PEOPLE:
@@ -246,11 +284,13 @@ def matrix(comparison: Comparison, key: str) -> Markup:
         if model == TWO_PEOPLE and (key in _PEOPLE or subset[key].isna().all()):
             continue
         cells = [
-            interval(subset.loc[name], key) if name in subset.index else undefined("no predictions")
+            compared(interval(subset.loc[name], key), marks.get((str(model), name), ""))
+            if name in subset.index
+            else undefined("no predictions")
             for name in columns
         ]
         lines[subset["kind"].iloc[0]].append([str(model), *cells])
-    return table(["", *columns], lines["model"], below=(BASELINES, lines["baseline"]))
+    return table(["", *columns], lines["model"], caption, (BASELINES, lines["baseline"]))
 
 
 _PEOPLE = {"accuracy": "people", "r": "ceiling"}
@@ -288,19 +328,49 @@ def tests(inputs: ReportInputs) -> Markup:
         parts += [heading("Models against each other"), _paired(inputs.paired)]
     if inputs.paired_measures is not None and len(inputs.paired_measures):
         parts.append(_paired_measures(inputs.paired_measures))
+    if inputs.contrasts is not None and len(inputs.contrasts):
+        parts += [heading("Groups of models"), _contrasts(inputs.contrasts)]
     if inputs.mixed:
-        parts.append(heading("Mixed models"))
-        parts.append(paragraph(_MIXED))
-        parts += [_mixed(model) for model in inputs.mixed]
+        parts += [heading("Mixed models"), mixed_models(inputs.mixed), paragraph(_SHARED)]
     return joined(parts)
+
+
+def mixed_models(fits: Sequence[MixedTable]) -> Markup:
+    """Return every mixed model, or the reason why there is none."""
+    return joined([paragraph(_MIXED), *(_mixed(model) for model in fits)])
+
+
+def _contrasts(rows: pd.DataFrame) -> Markup:
+    """Return the differences of every two groups of models."""
+    columns = [
+        PageColumn("grouped by", "column", "text"),
+        PageColumn("first", "first", "text"),
+        PageColumn("second", "second", "text"),
+        PageColumn("first less second", "b", "interval", 3, "low", "high"),
+        PageColumn("SE", "se", digits=3),
+        PageColumn("t", "t"),
+        PageColumn("df", "df", digits=1),
+        PageColumn("p", "p", "p"),
+        PageColumn("Holm", "p_holm", "p"),
+        PageColumn("formula", "formula", "text"),
+    ]
+    words = (
+        "Differences in accuracy between groups of models, by linear mixed models of accuracies by "
+        "scenario, as in the study's Results. With an intercept of each model (base_model) the "
+        "test is about other models of such groups; without it, as in the study, about these."
+    )
+    return paragraph(words) + rows_table(rows, columns)
 
 
 _MIXED = (
     "Random intercepts and slopes as the formula says. Logistic models: maximum likelihood by "
     "Laplace approximation, Wald z. Linear models: restricted maximum likelihood, t with degrees "
-    "of freedom by Satterthwaite. b of a logistic model is in log odds. Rows of one model and "
-    "scenario that differ in readout or training share their stimuli, which the models of "
-    "accuracies do not know: their p are too small; the paired tests above do without that."
+    "of freedom by Satterthwaite. b of a logistic model is in log odds."
+)
+_SHARED = (
+    "Rows of one model and scenario that differ in readout or training share their stimuli, which "
+    "the models of accuracies do not know: their p are too small; the paired tests above do "
+    "without that."
 )
 
 

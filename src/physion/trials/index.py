@@ -15,6 +15,7 @@ from physion.core.errors import BadInputError
 from physion.core.files import check_digest, digest_of, read_plain, write_with_digest
 from physion.scenes.scene import Scene
 from physion.trials.files import FILES, INDEX, MAX_FILE_BYTES, SAFE_NAME, TrialPaths, find_trials
+from physion.trials.state import DRAWN, drawn_values
 from physion.trials.trial_file import Trial
 
 # Columns of the index of a dataset: name, type and meaning of each, in their stored order.
@@ -71,6 +72,7 @@ _FACTS: Mapping[str, IndexColumn] = {
 
 INDEX_COLUMNS: Mapping[str, IndexColumn] = {
     **_FACTS,
+    **{name: IndexColumn(*column) for name, column in DRAWN.items()},
     **{
         f"{file}{suffix}": IndexColumn(dtype, meaning)
         for file, content in FILES.items()
@@ -126,6 +128,7 @@ def index_row(paths: TrialPaths, opened: Trial | None = None) -> dict[str, Any]:
         "min_distance": labels.min_distance,
         "robust": labels.robust,
         **_elements(scene, imported=meta.seed is None),
+        **drawn_values(scene),
         "agent_fraction": float(trial.pixel_fractions[scene.index(scene.roles.agent)]),
         "patient_fraction": float(trial.pixel_fractions[scene.index(scene.roles.patient)]),
     }
@@ -164,6 +167,7 @@ def build_index(
         The index, and messages by name of the trial.
     """
     old = {} if known is None else {row["trial"]: row for row in known.to_dict("records")}
+    old = {trial: row for trial, row in old.items() if has_drawn(row)}
     rows: dict[str, dict[str, Any]] = {}
     problems = {}
     for paths in find_trials(folder):
@@ -193,6 +197,11 @@ def has_sizes(row: Mapping[Any, Any], paths: TrialPaths) -> bool:
         return all(files[name].stat().st_size == size for name, size in sizes.items())
     except OSError:
         return False
+
+
+def has_drawn(row: Mapping[Any, Any]) -> bool:
+    """Return whether a row has the values of `DRAWN`, which older indexes lack."""
+    return not pd.isna(row["drawn_room"])
 
 
 def same_value(one: Any, other: Any) -> bool:
@@ -254,8 +263,11 @@ def _read_columns(path: Path, content: bytes) -> pd.DataFrame:
         # Otherwise text of invalid bytes would be an error where it is first used.
         stored.validate(full=True)
         missing = [name for name in COLUMNS if name not in stored.column_names]
-        if missing:
+        if set(missing) - set(DRAWN):
             raise BadInputError(f"{path} lacks the columns {missing}; {_AGAIN}")
+        for name in missing:
+            stored = stored.append_column(name, pa.nulls(len(stored)))
+        stored = stored.select(list(COLUMNS)) if missing else stored
         for name, dtype in COLUMNS.items():
             _check_type(path, stored.column(name), name, dtype)
         table: pd.DataFrame = stored.to_pandas()

@@ -13,6 +13,8 @@ participants that predict. docs/reference/trial-files.md has examples.
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,10 +23,12 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from physion.core.errors import BadInputError
+from physion.numerics.elementary import arctan2
+from physion.numerics.linear_algebra import norm
 from physion.numerics.rotations import rotate_vectors
 from physion.physics.rigid.bodies import collision_hulls, hull_mass
 from physion.rendering.camera import intrinsics, view_matrix
-from physion.scenes.scene import FRAME_TIME, Body, Cloth, SurfaceMaterial, Vec3
+from physion.scenes.scene import FRAME_TIME, Body, Cloth, Scene, SurfaceMaterial, Vec3
 from physion.trials.trial_file import Trial, mesh_of
 
 Floats = NDArray[np.float32]
@@ -224,6 +228,96 @@ def pushes(trial: Trial) -> pd.DataFrame:
         for push in scene.pushes
     ]
     return pd.DataFrame(rows, columns=[*names, "speed"])
+
+
+ROLES = ("agent", "patient", "probe")
+DRAWN = {
+    **{
+        f"drawn_{role}_{name}": (dtype, f"{what} of the {role}{unit}")
+        for role in ROLES
+        for name, dtype, what, unit in (
+            ("shape", "string", "shape", "; cloth has none"),
+            ("width", "Float64", "scale along its own x axis", ", about m"),
+            ("depth", "Float64", "scale along its own y axis", ", about m"),
+            ("height", "Float64", "scale along its own z axis", ", about m"),
+            ("mass", "Float64", "mass", ", kg"),
+            ("static_friction", "Float64", "static friction", ""),
+            ("dynamic_friction", "Float64", "dynamic friction", ""),
+            ("restitution", "Float64", "restitution", ""),
+        )
+    },
+    "drawn_blocks": ("Int64", "bodies that take part, without agent, patient and probe"),
+    "drawn_block_mass": ("Float64", "their mean mass, kg"),
+    "drawn_block_friction": ("Float64", "their mean static friction"),
+    "drawn_distance": ("Float64", "horizontal distance from agent to patient in frame 0, m"),
+    "drawn_agent_lift": ("Float64", "height of the agent above the floor in frame 0, m"),
+    "drawn_push_speed": ("Float64", "speed that the first push would give to a free body, m/s"),
+    "drawn_push_heading": ("Float64", "direction of the first push, degrees from +x to +y"),
+    "drawn_push_frame": ("Int64", "frame of the first push"),
+    "drawn_cloth_stretch": ("Float64", "stiffness of the cloth against stretching, 0 to 1"),
+    "drawn_cloth_bend": ("Float64", "stiffness of the cloth against bending, 0 to 1"),
+    "drawn_camera_distance": ("Float64", "horizontal distance of the camera from the centre, m"),
+    "drawn_camera_height": ("Float64", "height of the camera above the floor, m"),
+    "drawn_camera_azimuth": ("Float64", "direction of the camera, degrees from +x to +y"),
+    "drawn_room": ("string", "room"),
+}
+"""Type and meaning of each value of `drawn_values`, a column of the index."""
+
+
+def drawn_values(scene: Scene) -> dict[str, float | int | str | None]:
+    """Return the values of this scene that its preset leaves to chance, with the keys of `DRAWN`.
+
+    `Scene.parameters` holds the ranges that they were drawn from. None: the scene has no such
+    thing, for example no probe. A primitive is where its bottom face is.
+    """
+    roles = scene.roles
+    things: dict[str, Body | Cloth] = {body.name: body for body in scene.bodies}
+    things |= {cloth.name: cloth for cloth in scene.cloths}
+    values: dict[str, float | int | str | None] = dict.fromkeys(DRAWN)
+    named = {role: things.get(getattr(roles, role) or "") for role in ROLES}
+    for role, thing in named.items():
+        if thing is None:
+            continue
+        size = thing.scale if isinstance(thing, Body) else thing.size
+        own = zip(("width", "depth", "height", "mass"), (*size, thing.mass), strict=True)
+        values |= {f"drawn_{role}_{name}": value for name, value in own}
+        if isinstance(thing, Body):
+            surface = dataclasses.asdict(thing.contact)
+            values |= {f"drawn_{role}_{name}": value for name, value in surface.items()}
+            values[f"drawn_{role}_shape"] = thing.shape
+    taken = {getattr(roles, role) for role in ROLES}
+    blocks = [body for body in scene.bodies if not body.scenery and body.name not in taken]
+    values["drawn_blocks"] = len(blocks)
+    if blocks:
+        values["drawn_block_mass"] = _mean([body.mass for body in blocks])
+        values["drawn_block_friction"] = _mean([body.contact.static_friction for body in blocks])
+    agent, patient = things[roles.agent], things[roles.patient]
+    apart = np.subtract(agent.position, patient.position)[:2]
+    values["drawn_distance"] = float(norm(apart))
+    values["drawn_agent_lift"] = agent.position[2] - scene.floor
+    if scene.pushes:
+        first = scene.pushes[0]
+        mass = things[first.body].mass
+        values["drawn_push_speed"] = float(norm(np.array(first.impulse))) / mass
+        values["drawn_push_heading"] = _degrees(*first.impulse[:2])
+        values["drawn_push_frame"] = first.frame
+    if scene.cloths:
+        values["drawn_cloth_stretch"] = scene.cloths[0].stretch
+        values["drawn_cloth_bend"] = scene.cloths[0].bend
+    x, y, z = scene.camera.position
+    values["drawn_camera_distance"] = float(norm(np.array([x, y])))
+    values["drawn_camera_height"] = z - scene.floor
+    values["drawn_camera_azimuth"] = _degrees(x, y)
+    values["drawn_room"] = scene.room
+    return values
+
+
+def _mean(values: Sequence[float]) -> float:
+    return math.fsum(values) / len(values)
+
+
+def _degrees(x: float, y: float) -> float:
+    return math.degrees(arctan2(y, x))
 
 
 def _cloth_parts(trial: Trial) -> list[Floats]:

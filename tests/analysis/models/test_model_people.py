@@ -22,7 +22,7 @@ from physion.analysis.people.effects import difficulty_third, r_by_third
 from physion.analysis.people.measures import ScenarioAnswers, answers_of, split_halves
 from physion.analysis.people.results import analyse_people
 from physion.analysis.sample import Resampled
-from physion.analysis.scores import MAJORITY, OUTCOME, TWO_PEOPLE, shown_average
+from physion.analysis.scores import MAJORITY, OUTCOME, TWO_PEOPLE, against_people, shown_average
 from physion.analysis.statistics import agreement
 from physion.analysis.statistics.agreement import correctness
 from physion.analysis.tables import MEAN, POOLED
@@ -63,7 +63,7 @@ def models(answers: ScenarioAnswers) -> Models:
 
 
 def measures(models: Models, answers: ScenarioAnswers) -> pd.DataFrame:
-    return measure_table(measure_models(models, answers))
+    return measure_table(measure_models(models, answers, bootstrap=FEW))
 
 
 def plain(
@@ -356,6 +356,44 @@ def test_all_scenarios_and_their_mean() -> None:
     pd.testing.assert_frame_equal(found.scores, again.scores)
 
 
+def test_the_preregistered_bootstrap_draws_participants(
+    answers: ScenarioAnswers, models: Models
+) -> None:
+    draws = Bootstrap(resamples=300, seed=4)
+    rows = measure_table(measure_models(models, answers, "", draws)).set_index(["model", "measure"])
+    weights = draws.weights(f"people of {answers.scenario}", len(answers.sessions))
+    values: dict[str, list[float]] = {"r": [], "rmsd": [], "difference": []}
+    predicted, p = models.predicted[1], models.p_contact[1]
+    for drawn in weights.astype(int):
+        yes = np.repeat(answers.yes, drawn, axis=0)
+        mean = np.nanmean(yes, axis=0)
+        right = np.where(answers.label == 1, mean, 1 - mean)
+        values["r"].append(np.corrcoef(p, mean)[0, 1])
+        values["rmsd"].append(np.sqrt(np.mean((p - mean) ** 2)))
+        values["difference"].append(np.mean(predicted == answers.label) - right.mean())
+    for measure, of_draws in values.items():
+        row = rows.loc[("chance", measure)]
+        expected = np.percentile(of_draws, [2.5, 97.5])
+        assert row[["low_bootstrap", "high_bootstrap"]].tolist() == pytest.approx(expected.tolist())
+    assert np.isnan(rows.loc[("chance", "accuracy"), "low_bootstrap"])  # no people enter
+
+
+def test_reliably_better_or_worse_than_people() -> None:
+    people = pd.DataFrame(
+        {"scenario": ["drop", "roll", MEAN], "bootstrap_low": [0.6, np.nan, np.nan],
+         "bootstrap_high": [0.7, np.nan, np.nan]}
+    )  # fmt: skip
+    scores = pd.DataFrame(
+        {"scenario": ["drop", "drop", "drop", "roll", "drop"],
+         "accuracy": [0.55, 0.6, 0.8, 0.9, np.nan],
+         "difference_low": [-0.2, -0.1, 0.01, 0.1, np.nan],
+         "difference_high": [-0.01, 0.05, 0.2, 0.3, np.nan]}
+    )  # fmt: skip
+    found = against_people(scores, people)
+    assert found["reliably"].tolist() == ["worse", "", "better", "better", ""]
+    assert found["people_interval"].tolist() == ["below", "inside", "above", "", ""]
+
+
 def test_what_is_missing_somewhere_is_counted_and_undefined_there() -> None:
     _, predictions, test = everywhere()
     constant = predictions["stimulus"].str.startswith("roll")
@@ -416,6 +454,17 @@ def test_the_tidy_table_takes_intervals_about_people_and_stimuli_where_it_has_th
             assert row[[name, f"{name}_low", f"{name}_high"]].tolist() == pytest.approx(
                 one[["value", "low_both", "high_both"]].tolist()
             ), (scenario, name)
+    shown = people.tables["by_scenario"].set_index("scenario")
+    averages = results.comparison.people.set_index("scenario")
+    for scenario in ("collide", "roll", MEAN):
+        ends = averages.loc[scenario, ["bootstrap_low", "bootstrap_high"]].tolist()
+        assert ends == shown.loc[scenario, ["accuracy_low", "accuracy_high"]].tolist()
+        row = table.loc[("m", scenario)]
+        place = ["below", "inside", "above"][int(row["accuracy"] >= ends[0])
+                                             + int(row["accuracy"] > ends[1])]  # fmt: skip
+        assert row["people_interval"] == place
+        better, worse = row["difference_low"] > 0, row["difference_high"] < 0
+        assert row["reliably"] == ("better" if better else "worse" if worse else "")
     pooled = table.loc[("m", POOLED)]
     assert pooled["interval"] == "stimuli" and np.isnan(pooled["kappa"])
     assert pooled["r_low"] == plain.loc[("m", POOLED), "r_low"]

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
+from statsmodels.stats.multitest import multipletests
 
 from physion.analysis.intervals import Bootstrap
 from physion.analysis.people.effects import (
@@ -25,6 +26,7 @@ from physion.analysis.people.effects import (
     below_chance_level_p,
     difficulty_third,
     learning,
+    regress_attributes,
     regress_hypotheses,
     side_bias,
     with_attributes,
@@ -51,6 +53,7 @@ from physion.analysis.statistics.agreement import (
 from physion.analysis.tables import (
     ATTRIBUTES,
     MISLABELLED,
+    attribute_names,
     attributes_from_names,
     attributes_from_table,
     better_attributes,
@@ -402,12 +405,100 @@ def test_attributes_from_tables_and_bad_names() -> None:
     assert np.isnan(found["occluders"].iloc[1]) and found["elements"].isna().all()
     with pytest.raises(BadInputError, match="row 2 of column 'occluders' holds 'x'"):
         attributes_from_table(table.assign(occluders=["1", "x"]))
-    with pytest.raises(BadInputError, match="none of the columns"):
+    with pytest.raises(BadInputError, match="has no column"):
         attributes_from_table(table[["stimulus", "scenario"]])
     with pytest.raises(BadInputError, match="no official name"):
         attributes_from_names(["collide_0001"])
     with pytest.raises(BadInputError, match="stands in two rows"):
         attributes_from_names(["test13_0011", "test13_0011_img"])
+
+
+def test_every_column_of_a_table_is_an_attribute() -> None:
+    table = pd.DataFrame(
+        {"stimulus": ["a", "b", "c"], "scenario": "drop", "jitter": ["0.5", "", "2"],
+         "tilted": [True, False, True], "shape": ["cone", "", "cube"]}
+    )  # fmt: skip
+    found = attributes_from_table(table)
+    names = ["elements", "distractors", "occluders", "room", "jitter", "tilted", "shape"]
+    assert attribute_names(found) == [*names, "configuration"]
+    assert found["jitter"].tolist() == pytest.approx([0.5, np.nan, 2], nan_ok=True)
+    assert found["tilted"].tolist() == [1.0, 0.0, 1.0]
+    assert found["shape"].tolist()[::2] == ["cone", "cube"] and found["shape"].isna()[1]
+    with pytest.raises(BadInputError, match="'label', as the answers; rename it"):
+        attributes_from_table(table.assign(label=1))
+    # Of the index of a dataset what was drawn counts, and not what keeps books.
+    index = table.assign(scene_digest="x", seed="1", frames=9, robust=1.0, drawn_agent_mass=2.0)
+    names = attribute_names(attributes_from_table(index))
+    assert {"robust", "drawn_agent_mass"} <= set(names)
+    assert not {"jitter", "seed", "frames", "scene_digest"} & set(names)
+
+
+def robust_slope(x: np.ndarray, y: np.ndarray, scenario: np.ndarray) -> tuple[float, float]:
+    """Least squares with an intercept for each scenario, and HC3, written out."""
+    design = np.column_stack([x, *(scenario == name for name in np.unique(scenario))]).astype(float)
+    bread = np.linalg.inv(design.T @ design)
+    b = bread @ design.T @ y
+    leverage = np.einsum("ij,jk,ik->i", design, bread, design)
+    scaled = design * ((y - design @ b) / (1 - leverage))[:, None]
+    return b[0], np.sqrt((bread @ scaled.T @ scaled @ bread)[0, 0])
+
+
+def test_accuracy_by_attributes_single_and_together() -> None:
+    generator = np.random.default_rng(1)
+    stimuli = stimuli_table(0, -0.05)
+    stimuli["mass"] = 100 + generator.normal(size=120)
+    stimuli["shape"] = generator.choice(["cone", "cube", "pipe"], 120)
+    stimuli["accuracy"] += 0.04 * (stimuli["mass"] - 100) + 0.2 * (stimuli["shape"] == "cube")
+    stimuli = stimuli.assign(double=2 * stimuli["mass"], constant=3.0, configuration="c")
+    stimuli.loc[:9, "distractors"] = np.nan
+    names = ["occluders", "mass", "shape", "distractors", "double", "constant", "elements",
+             "configuration"]  # fmt: skip
+    table = regress_attributes(stimuli, names)
+    assert list(table["scenario"].unique()) == ["drop", "link", "roll", "all"]
+    single = table[(table["scenario"] == "all") & (table["fit"] == "single")].set_index("attribute")
+    x, y, scenario = (stimuli[name].to_numpy() for name in ("mass", "accuracy", "scenario"))
+    row = single.loc["mass"]
+    assert (row["b"], row["se"]) == pytest.approx(robust_slope(x, y, scenario))
+    apart = stimuli["mass"] - stimuli.groupby("scenario")["mass"].transform("mean")
+    assert row["b_sd"] == pytest.approx(row["b"] * np.sqrt((apart**2).sum() / 117))
+    within = y - stimuli.groupby("scenario")["accuracy"].transform("mean")
+    assert row["r2"] == pytest.approx(np.corrcoef(apart, within)[0, 1] ** 2)
+    assert row["p_term"] == pytest.approx(row["p"]) and row["df"] == 120 - 4
+    shape = single.loc["shape"]
+    assert shape["level"].tolist() == ["cube", "pipe"] and shape["p_term"].nunique() == 1
+    assert shape["p_term"].iloc[0] < 0.001 and shape["p"].iloc[1] > 0.01
+    assert single.loc["distractors", ["stimuli", "left_out"]].tolist() == [110, 10]
+    assert (
+        single.loc["constant", "reason"] == single.loc["configuration", "reason"] == "does not vary"
+    )
+    assert single.loc["elements", "reason"] == "not known"
+    tested = single[~single.index.duplicated()]["p_term"].dropna()
+    assert single.loc["mass", "p_holm"] == pytest.approx(multipletests(tested, method="holm")[1][
+        list(tested.index).index("mass")])  # fmt: skip
+    both = table[(table["scenario"] == "all") & (table["fit"] == "together")]
+    both = both.set_index("attribute")
+    assert "follows from other" in both.loc["double", "reason"]
+    assert "configuration" not in both.index
+    known = stimuli[stimuli["distractors"].notna()]
+    design = pd.get_dummies(known[["occluders", "mass", "shape", "distractors", "scenario"]],
+                            columns=["shape", "scenario"], dtype=float)  # fmt: skip
+    design = design.drop(columns="shape_cone")
+    fit = sm.OLS(known["accuracy"], design).fit(cov_type="HC3", use_t=True)
+    for name in ("occluders", "mass", "distractors"):
+        assert both.loc[name, "b"] == pytest.approx(fit.params[name])
+        assert both.loc[name, "se"] == pytest.approx(fit.bse[name])
+    assert both.loc["shape", "b"].tolist() == pytest.approx(
+        fit.params[["shape_cube", "shape_pipe"]].tolist()
+    )
+
+
+def test_attributes_that_say_too_much_are_refused_with_a_reason() -> None:
+    stimuli = stimuli_table(0, 0.0).assign(name=[f"n{k}" for k in range(120)])
+    table = regress_attributes(stimuli, ["name"])
+    assert table["b"].isna().all() and table["reason"].eq("too few stimuli for it").all()
+    flat = regress_attributes(stimuli.assign(accuracy=0.5), ["occluders"])
+    assert flat["reason"].eq("accuracy does not vary").all()
+    assert regress_attributes(stimuli, []).empty
 
 
 def stimuli_table(seed: int, effect: float) -> pd.DataFrame:

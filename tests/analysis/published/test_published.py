@@ -292,8 +292,30 @@ def test_people_next_to_the_paper(results: PublishedResults) -> None:
     assert table["accuracy"].between(table["zone_low"], table["zone_high"]).all()
     assert (table["accuracy"] - table["accuracy_by_stimulus"]).abs().max() < 0.006
     assert (table["half_r_full"] > table["half_r"]).all()
+    # The printed row of people: within their bootstrap in every scenario but Roll.
+    printed = table["printed"].drop("mean")
+    assert printed["roll"] == 0.883 and round(table.loc["roll", "accuracy"], 3) == 0.871
+    assert printed.index[~table["printed_inside"].drop("mean").astype(bool)].tolist() == ["roll"]
+    assert (printed - table["accuracy"]).drop("roll").abs().max() < 0.0025
+    assert "roll" in claims["people in the table of accuracies"]
     half = table.loc["drop", "half_r"]
     assert table.loc["drop", "half_r_full"] == pytest.approx(2 * half / (1 + half))
+
+
+def test_differences_are_reliable_where_intervals_are_disjoint(
+    official: Path, results: PublishedResults
+) -> None:
+    table = results.tables["accuracies"]
+    file = pd.read_csv(official / "results" / "human_accuracy_by_scenario.csv")
+    known = file.set_index(file["scenario"].replace(OFFICIAL_SCENARIOS))
+    for row in table.itertuples():
+        low, high = known.loc[row.scenario, ["ci_lb", "ci_ub"]]
+        expected = "better" if row.paper_low > high else "worse" if row.paper_high < low else ""
+        assert row.reliably == expected
+    vision = table[~table["model"].isin(["GNS", "GNS-R", "DPI"])]
+    assert vision.loc[vision["scenario"] == "roll", "reliably"].eq("worse").all()
+    gns = table.set_index(["model", "scenario"]).loc[("GNS", "link")]
+    assert gns["published"] > gns["people"]
 
 
 def test_every_table_has_a_title_and_nothing_is_empty(results: PublishedResults) -> None:

@@ -71,6 +71,15 @@ class MixedFit:
     level: float
     _df: DegreesOfFreedom | None = field(default=None, repr=False)
 
+    def contrast(self, weights: npt.ArrayLike) -> pd.Series:
+        """Test a linear combination of the fixed effects, with the columns of ``table``.
+
+        ``weights``: of each fixed effect, in the order of the table.
+        """
+        one = np.atleast_2d(np.asarray(weights, dtype=np.float64))
+        b = self.table["b"].to_numpy(dtype=np.float64)
+        return _estimates(one, b, self.covariance, self._df, self.level).iloc[0]
+
     @property
     def parameters(self) -> int:
         """Number of parameters: fixed effects, variances with the residual one, correlations."""
@@ -159,24 +168,8 @@ def collect(
     For each group: ``roots``, a matrix B with the covariance B B' of its effects; ``singular``,
     whether that is singular; ``effects`` (levels, k).
     """
-    variance = np.diag(covariance)
-    # If the search failed, the curvature can be negative: no standard error then.
-    se = np.sqrt(np.where(variance > 0, variance, np.nan))
-    each = np.full(len(b), np.inf) if df is None else np.array([df(one) for one in np.eye(len(b))])
-    statistic = b / se
-    reach = stats.t.ppf(0.5 + level / 2, each) * se
-    table = pd.DataFrame(
-        {
-            "term": design.names,
-            "b": b,
-            "se": se,
-            "z" if df is None else "t": statistic,
-            "df": each,
-            "p": 2 * stats.t.sf(np.abs(statistic), each),
-            "low": b - reach,
-            "high": b + reach,
-        }
-    )
+    table = _estimates(np.eye(len(b)), b, covariance, df, level)
+    table.insert(0, "term", design.names)
     random, correlations = _random_tables(design, roots)
     if residual is not None:
         random.loc[len(random)] = ["residual", "", len(design.y), residual]
@@ -202,6 +195,29 @@ def collect(
         terms=dict(design.terms),
         level=level,
         _df=df,
+    )
+
+
+def _estimates(
+    contrasts: Array, b: Array, covariance: Array, df: DegreesOfFreedom | None, level: float
+) -> pd.DataFrame:
+    """Return value, standard error, test and interval of each linear combination of ``b``."""
+    variance = np.einsum("ij,jk,ik->i", contrasts, covariance, contrasts)
+    # If the search failed, the curvature can be negative: no standard error then.
+    se = np.sqrt(np.where(variance > 0, variance, np.nan))
+    each = np.array([np.inf if df is None else df(one) for one in contrasts])
+    value = contrasts @ b
+    reach = stats.t.ppf(0.5 + level / 2, each) * se
+    return pd.DataFrame(
+        {
+            "b": value,
+            "se": se,
+            "z" if df is None else "t": value / se,
+            "df": each,
+            "p": 2 * stats.t.sf(np.abs(value / se), each),
+            "low": value - reach,
+            "high": value + reach,
+        }
     )
 
 

@@ -2,12 +2,13 @@
 
 - response bias and side bias, learning over the trials, accuracy by background;
 - difficulty of stimuli: below chance, hard, at chance, easy;
-- `regress_hypotheses`: the four preregistered hypotheses about attributes of stimuli.
+- `regress_hypotheses`: the four preregistered hypotheses about attributes of stimuli, and
+  `regress_attributes`: accuracy by any attributes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,7 +28,7 @@ from physion.analysis.people.measures import (
 from physion.analysis.statistics.agreement import correlate_rows, pearson, z_rates
 from physion.analysis.statistics.paired import corrected_p
 from physion.analysis.statistics.regression import clustered_logit
-from physion.analysis.tables import ATTRIBUTES, in_order, require_columns
+from physion.analysis.tables import RESERVED, attribute_names, in_order, require_columns
 from physion.core.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
@@ -397,9 +398,9 @@ COLUMNS = (
 
 
 def with_attributes(by_stimulus: pd.DataFrame, attributes: pd.DataFrame) -> pd.DataFrame:
-    """Return ``by_stimulus`` with the columns of `ATTRIBUTES`, NaN if unknown."""
+    """Return ``by_stimulus`` with the attributes, NaN if unknown."""
     require_columns(by_stimulus, ["stimulus", "scenario", "accuracy"], "the table by stimulus")
-    columns = ["stimulus", *ATTRIBUTES]
+    columns = ["stimulus", *attribute_names(attributes)]
     return by_stimulus.merge(attributes[columns], on="stimulus", how="left", validate="one_to_one")
 
 
@@ -407,10 +408,11 @@ def answer_rows(test: pd.DataFrame, stimuli: pd.DataFrame) -> pd.DataFrame:
     """Return single answers with the attributes of their stimuli, for mixed models.
 
     ``stimuli``: from `with_attributes`. Columns: ``participant``, ``scenario``, ``stimulus``,
-    ``correct``, ``log_rt``, ``accuracy`` (of the stimulus, over all people), `ATTRIBUTES`.
+    ``correct``, ``log_rt``, ``accuracy`` (of the stimulus, over all people), and the attributes.
     """
     columns = ["participant", "scenario", "stimulus", "correct", "log_rt"]
-    own = stimuli[["stimulus", "accuracy", *ATTRIBUTES]]
+    known = RESERVED - {"accuracy"} | {"scenario"}
+    own = stimuli[[name for name in stimuli if name not in known]]
     return test[columns].merge(own, on="stimulus", how="left", validate="many_to_one")
 
 
@@ -456,8 +458,7 @@ def _record(hypothesis: Hypothesis, name: str, rows: pd.DataFrame, level: float)
     x, y = (_within(used, c) for c in (hypothesis.predictor, hypothesis.outcome))
     if np.allclose(y, 0):
         return {**record, "reason": "the outcome does not vary"}
-    of_scenario = used.groupby("scenario")["scenario"].transform("size").to_numpy(dtype=np.float64)
-    record |= _slope(x, y, of_scenario, level)
+    record |= within_scenarios(used, {"x": x[:, None]}, hypothesis.outcome, level)[0].iloc[0]
     record["r"] = pearson(x, y)
     record["spearman"] = float(stats.spearmanr(x, y).statistic)
     record["as_predicted"] = _verdict(record, hypothesis.sign, level)
@@ -476,26 +477,164 @@ def _within(rows: pd.DataFrame, column: str) -> Array:
     """Subtract the mean of its scenario from a column: equivalent to an intercept for each
     scenario.
     """
-    values = rows[column].astype(np.float64)
-    return np.asarray(values - values.groupby(rows["scenario"]).transform("mean"))
+    return _centred(rows[column].to_numpy(np.float64), rows["scenario"])
 
 
-def _slope(x: Array, y: Array, of_scenario: Array, level: float) -> dict[str, float]:
-    """Fit least squares through the origin of centred values, with the HC3 standard error.
+def _centred(values: Array, scenario: pd.Series) -> Array:
+    column = pd.Series(values, index=scenario.index)
+    return np.asarray(column - column.groupby(scenario).transform("mean"))
 
-    ``of_scenario``: number of stimuli of each stimulus' scenario, whose subtracted mean adds 1 /
-    of_scenario to the leverage.
+
+def within_scenarios(
+    rows: pd.DataFrame, terms: Mapping[str, Array], outcome: str, level: float = 0.95
+) -> tuple[pd.DataFrame, dict[str, float]]:
+    """Fit least squares with an intercept for each scenario, and HC3 standard errors.
+
+    Parameters
+    ----------
+    rows
+        Stimuli with ``scenario`` and the ``outcome``.
+    terms
+        Columns (n, k) by the name of their term, without missing values.
+    outcome
+        Column to explain.
+    level
+        Level of the intervals.
+
+    Returns
+    -------
+    table, fit
+        One row per column: ``b``, ``se``, ``t``, ``df``, ``p``, ``low``, ``high`` and ``p_term``
+        (F test of all columns of the term); and ``r2``, ``r2_adjusted`` (of the differences within
+        scenarios) and ``p_fit`` (F test of all terms).
     """
-    squares = float(np.sum(x * x))
-    b = float(np.sum(x * y)) / squares
-    residuals = y - b * x
-    leverage = x * x / squares + 1 / of_scenario
-    meat = float(np.sum((x * residuals / (1 - leverage)) ** 2))
-    se, df = np.sqrt(meat) / squares, len(x) - round(float(np.sum(1 / of_scenario))) - 1
-    t = b / se if se > 0 else np.nan
-    half = float(stats.t.ppf(0.5 + level / 2, df)) * se
-    return {"b": b, "se": float(se), "t": float(t), "df": df, "low": b - half, "high": b + half,
-            "p": float(2 * stats.t.sf(abs(t), df))}  # fmt: skip
+    from statsmodels.regression.linear_model import OLS  # half a second to import
+
+    x = np.hstack(list(terms.values()))
+    intercepts = pd.get_dummies(rows["scenario"]).to_numpy(np.float64)
+    y = rows[outcome].to_numpy(np.float64)
+    fit = OLS(y, np.hstack([x, intercepts])).fit(cov_type="HC3", use_t=True)
+    k, all_columns = x.shape[1], np.eye(x.shape[1] + intercepts.shape[1])
+    low, high = fit.conf_int(1 - level)[:k].T
+    table = pd.DataFrame(
+        {"b": fit.params[:k], "se": fit.bse[:k], "t": fit.tvalues[:k], "df": fit.df_resid,
+         "p": fit.pvalues[:k], "low": low, "high": high}
+    )  # fmt: skip
+    ends = np.cumsum([columns.shape[1] for columns in terms.values()])
+    tests = [fit.f_test(all_columns[end - columns.shape[1] : end]).pvalue
+             for end, columns in zip(ends, terms.values(), strict=True)]  # fmt: skip
+    table["p_term"] = np.repeat(tests, [columns.shape[1] for columns in terms.values()])
+    unexplained = float(fit.ssr) / float(np.sum(_within(rows, outcome) ** 2))
+    adjusted = unexplained * (fit.df_resid + k) / fit.df_resid
+    p_fit = float(fit.f_test(all_columns[:k]).pvalue)
+    return table, {"r2": 1 - unexplained, "r2_adjusted": 1 - adjusted, "p_fit": p_fit}
+
+
+# Accuracy by every attribute of stimuli, exploratory: each by itself, and all of them together.
+
+ATTRIBUTE_COLUMNS = (
+    "scenario", "fit", "attribute", "level", "stimuli", "left_out", "b", "b_sd", "se", "t", "df",
+    "p", "low", "high", "p_term", "p_holm", "r2", "r2_adjusted", "p_fit", "reason",
+)  # fmt: skip
+
+
+def regress_attributes(
+    stimuli: pd.DataFrame, names: Sequence[str], level: float = 0.95
+) -> pd.DataFrame:
+    """Regress people's accuracy on each attribute, and on all together, by scenario and over all.
+
+    Parameters
+    ----------
+    stimuli
+        From `with_attributes`.
+    names
+        Columns with attributes: numbers, or text, whose values are categories.
+    level
+        Level of the intervals.
+
+    Returns
+    -------
+    `ATTRIBUTE_COLUMNS`. ``fit``: *single*, or *together*: the linear combination of all attributes
+    that vary among the stimuli for which they are all known, without the ``configuration``, which
+    stands for all of them. A category has a row for each ``level`` but the first, its base. ``b``:
+    change of accuracy by one unit, and ``b_sd`` by one standard deviation within scenarios;
+    ``p_term``: test of all levels; ``p_holm``: corrected over the attributes of the same scenario
+    and fit; ``r2``, ``r2_adjusted``, ``p_fit``: of the whole fit, see `within_scenarios`;
+    ``reason``: why there is no number, such as an attribute that follows from the others.
+    """
+    scenarios = in_order(stimuli["scenario"])
+    parts = [(name, stimuli[stimuli["scenario"] == name]) for name in scenarios]
+    parts += [("all", stimuli)] if len(scenarios) > 1 else []
+    found = []
+    for scenario, rows in parts:
+        fits = [("single", [name]) for name in names]
+        fits.append(("together", [name for name in names if name != "configuration"]))
+        tables = [_attribute_fit(rows, chosen, level).assign(fit=fit) for fit, chosen in fits]
+        for own in (pd.concat(tables[:-1]), tables[-1]) if names else ():
+            each = own.drop_duplicates("attribute").set_index("attribute")["p_term"]
+            holm = pd.Series(corrected_p(each, "holm"), index=each.index)
+            found.append(own.assign(scenario=scenario, p_holm=own["attribute"].map(holm)))
+    table = pd.concat(found, ignore_index=True) if found else pd.DataFrame()
+    return table.reindex(columns=list(ATTRIBUTE_COLUMNS))
+
+
+def _attribute_fit(rows: pd.DataFrame, names: Sequence[str], level: float) -> pd.DataFrame:
+    """Return one row per column of the attributes, or one with the reason why there is none."""
+    reasons: dict[str, str] = {}
+    values = rows[list(names)]
+    values = values.mask(values == "")
+    for name in names:
+        if values[name].isna().all():
+            reasons[name] = "not known"
+        elif values[name].groupby(rows["scenario"]).nunique().max() < 2:
+            reasons[name] = "does not vary"
+    used = rows[values.drop(columns=list(reasons)).notna().all(axis=1)]
+    levels: list[tuple[str, str]] = []
+    terms: dict[str, Array] = {}
+    basis = pd.get_dummies(used["scenario"]).to_numpy(np.float64)
+    for name in [name for name in names if name not in reasons]:
+        columns = _columns(used[name])
+        own = columns.to_numpy(np.float64)
+        apart = np.column_stack([_centred(column, used["scenario"]) for column in own.T])
+        size = np.std(apart, axis=0)
+        wider = np.hstack([basis, apart / np.where(size > 0, size, 1.0)])
+        if len(used) < 2 * wider.shape[1] + 1:
+            reasons[name] = "too few stimuli for it"
+        elif np.linalg.matrix_rank(wider) < wider.shape[1]:
+            reasons[name] = "follows from other attributes, or does not vary, where all are known"
+        else:
+            basis, terms[name] = wider, own
+            levels += [(name, str(column)) for column in columns]
+    if terms and np.allclose(_within(used, "accuracy"), 0):
+        reasons, terms = dict.fromkeys(names, "accuracy does not vary"), {}
+    records = [{"attribute": name, "stimuli": len(used), "left_out": len(rows) - len(used),
+                "reason": reason} for name, reason in reasons.items()]  # fmt: skip
+    missing = pd.DataFrame(records).assign(p_term=np.nan)
+    if not terms:
+        return missing
+    table, fit = within_scenarios(used, terms, "accuracy", level)
+    spread = [
+        float(np.std(_centred(column, used["scenario"]), ddof=used["scenario"].nunique()))
+        for columns in terms.values()
+        for column in columns.T
+    ]
+    table = table.assign(
+        attribute=[name for name, _ in levels],
+        level=[value for _, value in levels],
+        stimuli=len(used),
+        left_out=len(rows) - len(used),
+        b_sd=table["b"] * spread,
+        reason=np.where(np.isfinite(table["se"]), "", "a stimulus has a value of its own"),
+        **fit,
+    )
+    return pd.concat([table, missing], ignore_index=True)
+
+
+def _columns(values: pd.Series) -> pd.DataFrame:
+    """Return a number as one column, and a category as one column for each value but the first."""
+    if pd.api.types.is_numeric_dtype(values):
+        return pd.DataFrame({"": values.astype(np.float64)})
+    return pd.get_dummies(values.astype(str)).iloc[:, 1:]
 
 
 def _confounded(hypothesis: Hypothesis, rows: pd.DataFrame) -> str:

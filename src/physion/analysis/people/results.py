@@ -13,6 +13,7 @@ from physion.analysis.people.effects import (
     accuracy_by_background,
     background,
     learning,
+    regress_attributes,
     regress_hypotheses,
     side_bias,
     with_attributes,
@@ -54,6 +55,7 @@ from physion.analysis.people.responses import (
 )
 from physion.analysis.tables import (
     ATTRIBUTES,
+    attribute_names,
     attributes_from_names,
     attributes_from_table,
     better_attributes,
@@ -79,8 +81,8 @@ class PeopleResults:
       (`people.accuracy_by_...`), ``items`` (`item_statistics`);
     - ``agreement``: agreement among people (`agreement_by_scenario`);
     - ``yes_bias``, ``side_bias``, ``learning``, ``background``, ``background_tests``;
-    - ``attributes`` of the stimuli that people answered, and ``hypotheses``
-      (`regress_hypotheses`);
+    - ``attributes`` of the stimuli that people answered, ``hypotheses`` (`regress_hypotheses`) and
+      ``attribute_effects`` (`regress_attributes`);
     - ``left_out``: dropped answers, with their reasons.
 
     ``warnings``: what may make the results wrong, one sentence each; ``stimuli``: names of all
@@ -107,12 +109,13 @@ class PeopleResults:
         return {str(s): bool(v) for s, v in zip(rows["stimulus"], rows["label"], strict=True)}
 
     def zone(self) -> pd.DataFrame:
-        """Return the middle 95 % of participants by scenario, as `analysis.compare` takes it."""
-        table = self.tables["by_scenario"]
-        rows = table[table["zone_low"].notna()]
-        return rows[["scenario", "zone_low", "zone_high"]].set_axis(
-            ["scenario", "low", "high"], axis=1
-        )
+        """Return the middle 95 % of participants, and the interval of their mean, by scenario.
+
+        Columns as in `read_human_zone`, with a row for the mean over scenarios.
+        """
+        columns = ["scenario", "zone_low", "zone_high", "accuracy_low", "accuracy_high"]
+        names = ["scenario", "low", "high", "bootstrap_low", "bootstrap_high"]
+        return self.tables["by_scenario"][columns].set_axis(names, axis=1)
 
 
 def read_any_responses(
@@ -146,9 +149,7 @@ def rules_called(name: str) -> ExclusionRules:
 
 def read_attributes(path: Path) -> pd.DataFrame:
     """Read the attributes of one's own stimuli: a table (CSV or parquet), or a dataset or its
-    index.
-
-    Columns: ``stimulus`` (or ``trial``), ``scenario``, any of `ATTRIBUTES`.
+    index; see `attributes_from_table`.
     """
     file = path / "index.parquet" if path.is_dir() else path
     return attributes_from_table(read_table(file), str(file))
@@ -220,8 +221,10 @@ def analyse_people(
     tables["background"] = background(kept.sessions)
     tables["background_tests"] = accuracy_by_background(kept.test, kept.sessions)
     tables["attributes"] = _attributes(tables["by_stimulus"]["stimulus"], attributes)
-    tables["hypotheses"] = regress_hypotheses(
-        with_attributes(tables["by_stimulus"], tables["attributes"])
+    stimuli_with_attributes = with_attributes(tables["by_stimulus"], tables["attributes"])
+    tables["hypotheses"] = regress_hypotheses(stimuli_with_attributes)
+    tables["attribute_effects"] = regress_attributes(
+        stimuli_with_attributes, attribute_names(tables["attributes"])
     )
     tables["left_out"] = pd.concat([kept.dropped, missing_times(kept)], ignore_index=True)
     mark = (REHEARSAL,) if responses.simulated_sessions else ()

@@ -298,7 +298,9 @@ def accuracy_table(tables: PublishedTables, bootstrap: Bootstrap | None = None) 
     Columns: ``model``, ``scenario``; ``published`` with ``published_low``, ``published_high``
     (bootstrap over the rows that it averages: variation with other protocols and seeds, not with
     other stimuli) and ``paper_low``, ``paper_high`` (`paper_intervals`), ``rows`` (number of rows),
-    ``without_copies`` (the mean with *observed* once);
+    ``without_copies`` (the mean with *observed* once); ``people`` with ``people_low`` and
+    ``people_high`` (bootstrap over participants), and ``reliably``: *better* or *worse* where the
+    interval by the paper's way and people's do not overlap, else empty;
     ``expected`` with ``expected_low``, ``expected_high`` (Wilson's 95 % interval: other stimuli of
     the kind), ``runs`` (seeds averaged in it), ``stimuli`` (tested; see `count_tested`),
     ``difference`` (expected - published).
@@ -308,6 +310,7 @@ def accuracy_table(tables: PublishedTables, bootstrap: Bootstrap | None = None) 
     counts = count_tested(tables.runs)
     once = tables.distinct
     by_paper = paper_intervals(tables, draws)
+    people = tables.people.set_index("scenario")
     records = []
     for (model, scenario), rows in tables.runs.groupby(["model", "scenario"], sort=False):
         values = rows["accuracy"].to_numpy(dtype=np.float64)
@@ -318,6 +321,10 @@ def accuracy_table(tables: PublishedTables, bootstrap: Bootstrap | None = None) 
         expected = float(cell.mean()) if len(cell) else float("nan")
         stimuli = counts[(model, scenario)]
         expected_low, expected_high = wilson(expected, stimuli, level)
+        right, worst, best = people.loc[
+            scenario, ["accuracy", "accuracy_low", "accuracy_high"]
+        ]  # fmt: skip
+        paper_low, paper_high = by_paper[(model, scenario)]
         records.append(
             {
                 "model": model,
@@ -325,8 +332,12 @@ def accuracy_table(tables: PublishedTables, bootstrap: Bootstrap | None = None) 
                 "published": float(values.mean()),
                 "published_low": low,
                 "published_high": high,
-                "paper_low": by_paper[(model, scenario)][0],
-                "paper_high": by_paper[(model, scenario)][1],
+                "paper_low": paper_low,
+                "paper_high": paper_high,
+                "people": right,
+                "people_low": worst,
+                "people_high": best,
+                "reliably": "better" if paper_low > best else "worse" if paper_high < worst else "",
                 "rows": len(rows),
                 "without_copies": float(own["accuracy"].mean()),
                 "expected": expected,
@@ -542,6 +553,12 @@ def _mean(values: pd.Series, measure: str, draws: Bootstrap) -> dict[str, float]
 
 # Statements of the paper about people, and what the released tables of people contain.
 
+PRINTED = {
+    "dominoes": 0.693, "support": 0.763, "collide": 0.809, "contain": 0.767,
+    "drop": 0.744, "link": 0.643, "roll": 0.883, "drape": 0.678,
+}  # fmt: skip
+"""Accuracy of people as the row of people in the paper's table of accuracies has it."""
+
 RECRUITED = 800
 PEOPLE_EXCLUDED = 112
 THIRDS = ((0.0, 1 / 3, "hard", 0.10), (1 / 3, 2 / 3, "chance", 0.22), (2 / 3, 1.0, "easy", 0.68))
@@ -551,8 +568,10 @@ THIRDS = ((0.0, 1 / 3, "hard", 0.10), (1 / 3, 2 / 3, "chance", 0.22), (2 / 3, 1.
 def people_by_scenario(tables: PublishedTables, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
     """Return one row per scenario, then the mean over scenarios.
 
-    Columns as in `PublishedTables.people`; ``half_r_full`` (split-half r corrected by Spearman
-    and Brown to all of the people: 2 r / (1 + r); the released numbers are not corrected);
+    Columns as in `PublishedTables.people`; ``printed`` (`PRINTED`) and ``printed_inside`` (whether
+    it lies in the interval ``accuracy_low``, ``accuracy_high`` of the released accuracy);
+    ``half_r_full`` (split-half r corrected by Spearman and Brown to all of the people:
+    2 r / (1 + r); the released numbers are not corrected);
     ``stimuli`` and ``participants`` of the tables by stimulus, ``accuracy_by_stimulus`` (their
     mean; a laxer exclusion than ``accuracy``), ``below_chance`` (stimuli on which p + 1.96 sqrt(p
     (1 - p) / n) < 0.5). In the row of the mean ``zone_low`` and ``zone_high``, likewise of kappa,
@@ -574,6 +593,9 @@ def people_by_scenario(tables: PublishedTables, bootstrap: Bootstrap | None = No
         )
     )
     table = tables.people.merge(own, left_on="scenario", right_index=True, how="left")
+    printed = table["scenario"].map(PRINTED)
+    table["printed"] = printed
+    table["printed_inside"] = printed.between(table["accuracy_low"], table["accuracy_high"])
     table.insert(
         table.columns.get_loc("half_r_high") + 1,
         "half_r_full",
@@ -585,6 +607,7 @@ def people_by_scenario(tables: PublishedTables, bootstrap: Bootstrap | None = No
 def _mean_row(table: pd.DataFrame, draws: Bootstrap) -> dict[str, object]:
     row: dict[str, object] = {"scenario": MEAN}
     averaged = ["half_r", "half_r_low", "half_r_high", "half_r_full", "accuracy_by_stimulus"]
+    averaged += ["printed"]
     row |= {name: float(table[name].mean()) for name in averaged}
     row |= {name: int(table[name].sum()) for name in ("stimuli", "participants", "below_chance")}
     for name, low, high in (
@@ -638,7 +661,25 @@ def people_claims(tables: PublishedTables) -> pd.DataFrame:
                 f"{int(found.sum())} of {len(own)} stimuli, Roll's ledges left out",
             )
         )
+    rows.append(_printed_row(tables.people))
     return pd.DataFrame(rows, columns=["claim", "printed", "ours", "note"])
+
+
+def _printed_row(people: pd.DataFrame) -> tuple[str, str, str, str]:
+    """Return which printed accuracies of people lie outside the interval of the released ones."""
+    rows = people.assign(printed=people["scenario"].map(PRINTED))
+    outside = rows[~rows["printed"].between(rows["accuracy_low"], rows["accuracy_high"])]
+    rest = rows.drop(index=outside.index)
+    apart = (rest["printed"] - rest["accuracy"]).abs().max()
+    named = list(outside.itertuples(index=False))
+    return (
+        "people in the table of accuracies",
+        ", ".join(f"{row.scenario} {row.printed:.3f}" for row in named),
+        ", ".join(f"{row.scenario} {row.accuracy:.3f}" for row in named),
+        "outside the interval by drawing participants ("
+        + ", ".join(f"{row.accuracy_low:.3f} to {row.accuracy_high:.3f}" for row in named)
+        + f"); the other {len(rest)} scenarios differ by at most {apart:.3f}",
+    )
 
 
 # Supplementary figures of the paper from its released tables, and how kappa follows accuracy.

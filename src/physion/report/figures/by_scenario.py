@@ -208,9 +208,10 @@ def correlation(inputs: ReportInputs) -> Plot | None:
     )
     if zones is not None:
         caption += (
-            " Grey: the middle 95 % of single participants, each with the average of the others; "
-            "they answer yes or no, which lowers r, so that a model can exceed them. Hatched, in "
-            "the mean: the band of the paper, r between random halves of the people."
+            " Grey: the middle 95 % of r between random halves of the people, as in the paper; "
+            "hatched, in the mean: the mean of its bounds over scenarios. Single participants, "
+            "each with the average of the others, reach less, as they answer only yes or no: see "
+            "tables/zones.csv."
         )
     table = tables.r_table(inputs.comparison, zones)
     return Plot("r", caption, table, partial(measure_figure, measure="r"))
@@ -288,35 +289,58 @@ def draw_rollout_error(table: pd.DataFrame, theme: Theme) -> Figure:
     return figure
 
 
-# --- accuracy of one model against people, one point per scenario -------------------------------
+# --- accuracy of models against people, one point per scenario ----------------------------------
 
 NEAR = (0.04, 0.015)
 """Differences of accuracy below which a name to the right of a point meets the next point."""
 
 
+@register_figure(
+    "people_and_models", section=BY_SCENARIO, heading="People against models", order=33
+)
+def people_and_models(inputs: ReportInputs) -> Plot | None:
+    """Return the accuracies of people against each model's, by scenario."""
+    comparison = inputs.comparison
+    if not comparison.has_people or comparison.stimuli["scenario"].nunique() < 2:
+        return None
+    caption = (
+        "Accuracy of people against the accuracy of each model, one point per scenario, on the "
+        "stimuli that both answered; hollow: the mean. Below the diagonal the model is more "
+        "accurate than people."
+    )
+    table = tables.people_and_models_table(comparison, inputs.scatter_models())
+    return Plot("people_and_models", caption, table, model_and_people_figure)
+
+
 def model_and_people_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
-    """Draw the accuracy of people against the accuracy of a model by scenario, with the diagonal.
+    """Draw the accuracy of people against the accuracy of each model by scenario, with the
+    diagonal.
 
     ``table``: ``model``, ``scenario`` (with the mean, which is hollow), ``accuracy``, ``people``.
+    One panel per model.
     """
+    models = list(table["model"].unique())
     values = table[["accuracy", "people"]]
     low = min(0.5, float(values.min(axis=None)) - 0.02)
     high = min(1.0, float(values.max(axis=None)) + 0.05)
     with matplotlib.rc_context(style(theme)):
-        figure, (axis,) = panels(1, 2, (5.5, 4.6), above=0)
-        axis.plot([low, high], [low, high], color=theme.faint, linewidth=1, zorder=0)
-        for name, x, y in table[["scenario", "accuracy", "people"]].itertuples(index=False):
-            mean = name == MEAN
-            axis.plot(x, y, marker="o", markersize=7, color=theme.palette[0],
-                      markerfacecolor="none" if mean else theme.palette[0])  # fmt: skip
-            left = _has_neighbour(table, x, y)
-            axis.annotate(name, (x, y), (-6 if left else 6, 4), textcoords="offset points",
-                          ha="right" if left else "left", fontsize=8.5)  # fmt: skip
-        axis.set_xlim(low, high)
-        axis.set_ylim(low, high)
-        axis.set_aspect("equal")
-        axis.set_xlabel(f"accuracy of {label(str(table['model'].iloc[0]))}")
-        axis.set_ylabel("accuracy of people")
+        columns = 2 if len(models) == 1 else 3
+        figure, axes = panels(len(models), columns, (11 / columns, 9.2 / columns), above=0)
+        for axis, model in zip(axes, models, strict=True):
+            rows = table[table["model"] == model]
+            axis.plot([low, high], [low, high], color=theme.faint, linewidth=1, zorder=0)
+            for name, x, y in rows[["scenario", "accuracy", "people"]].itertuples(index=False):
+                mean = name == MEAN
+                axis.plot(x, y, marker="o", markersize=6, color=theme.palette[0],
+                          markerfacecolor="none" if mean else theme.palette[0])  # fmt: skip
+                left = _has_neighbour(rows, x, y)
+                axis.annotate(name, (x, y), (-6 if left else 6, 4), textcoords="offset points",
+                              ha="right" if left else "left", fontsize=8)  # fmt: skip
+            axis.set_xlim(low, high)
+            axis.set_ylim(low, high)
+            axis.set_aspect("equal")
+            axis.set_xlabel(f"accuracy of {label(str(model), 40)}")
+            axis.set_ylabel("accuracy of people")
     return figure
 
 

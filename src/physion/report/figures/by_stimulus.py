@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -17,6 +19,7 @@ from matplotlib.patches import Patch
 from physion.analysis import figure_tables as tables
 from physion.analysis.statistics.agreement import pearson
 from physion.analysis.tables import in_order
+from physion.core.errors import BadInputError
 from physion.report.figures.by_scenario import measure_figure
 from physion.report.figures.theme import (
     BY_STIMULUS,
@@ -33,6 +36,7 @@ from physion.report.figures.theme import (
 )
 from physion.report.html import number
 from physion.report.inputs import ReportInputs
+from physion.scenes.scene import OBSERVED_FRAMES
 
 SQUARE = 1.16
 """Distance between the left edges of two scenarios' squares; a square is 1 wide."""
@@ -56,26 +60,59 @@ def scatter(inputs: ReportInputs) -> Plot | None:
     return Plot("scatter", caption, tables.scatter_table(comparison, shown), scatter_figure)
 
 
-def scatter_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
-    """Draw P(contact) of each model against the fraction of people who say yes, by stimulus.
+@register_figure(
+    "right_answers", section=BY_STIMULUS, heading="Accuracy of people and models", order=65
+)
+def right_answers(inputs: ReportInputs) -> Plot | None:
+    """Return the accuracies of people against each model's, by stimulus."""
+    comparison, shown = inputs.comparison, inputs.scatter_models()
+    if not comparison.has_people:
+        return None
+    caption = (
+        "Accuracy of people against the accuracy of each model (rows), by scenario; one point for "
+        "each stimulus. Of a model it is the probability that it gives to the recorded outcome, so "
+        "0 or 1 if it predicts without doubt."
+    )
+    table = tables.right_answers_table(comparison, shown)
+    axes = ("p_right", "human_accuracy", "accuracy of the model", "accuracy of people")
+    return Plot("right_answers", caption, table, partial(scatter_figure, axes=axes))
 
-    ``table``: see `figure_tables.scatter_table`. One panel per model, in it one square per
-    scenario, so that no colour is needed; hollow points are stimuli whose simulated outcome is not
-    the official one.
+
+P_AND_YES = ("p_yes", "p_contact", "fraction of people who say yes", "P(contact) of the model")
+
+
+def scatter_figure(
+    table: pd.DataFrame, theme: Theme = LIGHT, *, axes: tuple[str, str, str, str] = P_AND_YES
+) -> Figure:
+    """Draw two values from 0 to 1 of models and people against each other, by stimulus.
+
+    One panel per model, in it one square per scenario, so that no colour is needed; hollow points
+    are stimuli whose simulated outcome is not the official one.
+
+    Parameters
+    ----------
+    table
+        See `figure_tables.scatter_table` and `figure_tables.right_answers_table`.
+    theme
+        Colours.
+    axes
+        Column of the table to the right, column upwards, and their labels.
     """
+    right, up, *words = axes
     models = list(table["model"].unique())
     scenarios = in_order(table["scenario"])
     columns = max(1, min(4, 8 // len(scenarios)))
     width = 11 / columns
     height = (width - 0.4) / (SQUARE * len(scenarios))
     with matplotlib.rc_context(style(theme)):
-        figure, axes = panels(
+        figure, places = panels(
             len(models), columns, (width, height + 0.52), above=0.4, sharex=True, sharey=True
         )
-        for axis, model in zip(axes, models, strict=True):
-            _squares(axis, table[table["model"] == model], scenarios, theme)
-        figure.supxlabel("fraction of people who say yes", fontsize=10)
-        figure.supylabel("P(contact) of the model", fontsize=10)
+        points = table.assign(x=table[right], y=table[up])
+        for axis, model in zip(places, models, strict=True):
+            _squares(axis, points[points["model"] == model], scenarios, theme)
+        figure.supxlabel(words[0], fontsize=10)
+        figure.supylabel(words[1], fontsize=10)
         if (table["label"] != table["simulated"]).any():
             legend(figure, _scatter_handles(theme), 2)
     return figure
@@ -87,18 +124,18 @@ def _squares(axis: Axes, rows: pd.DataFrame, scenarios: Sequence[str], theme: Th
     frame = np.array([(0, 0), (1, 1), (np.nan, np.nan), (0, 1), (0, 0), (1, 0), (np.nan, np.nan)])
     lines = np.concatenate([frame + np.array([x, 0]) for x in left])
     axis.plot(*lines.T, color=theme.faint, linewidth=0.8, zorder=0)
-    x = rows["p_yes"] + rows["scenario"].map(dict(zip(scenarios, left, strict=True)))
+    x = rows["x"] + rows["scenario"].map(dict(zip(scenarios, left, strict=True)))
     changed = rows["label"] != rows["simulated"]
     for hollow in (False, True):
         if (changed == hollow).any():
             # A line with markers is fast to draw and small in SVG.
-            axis.plot(x[changed == hollow], rows["p_contact"][changed == hollow],
+            axis.plot(x[changed == hollow], rows["y"][changed == hollow],
                       **_point(hollow, theme))  # fmt: skip
     for index, scenario in zip(left, scenarios, strict=True):
         subset = rows[rows["scenario"] == scenario]
-        words = f"{scenario}, {_describe_r(subset['p_contact'], subset['p_yes'])}"
+        words = f"{scenario}, {_describe_r(subset['x'], subset['y'])}"
         axis.text(index, 1.05, words, fontsize=7.5, va="bottom")
-    pooled = f"{_describe_r(rows['p_contact'], rows['p_yes'])} pooled, {len(rows)} stimuli"
+    pooled = f"{_describe_r(rows['x'], rows['y'])} pooled, {len(rows)} stimuli"
     join = ", " if len(scenarios) > 3 else "\n"
     axis.set_title(f"{label(rows['model'].iloc[0], 90)}{join}{pooled}", fontsize=8.5, loc="left",
                    pad=15)  # fmt: skip
@@ -293,6 +330,112 @@ def _tail_colour(index: int, theme: Theme) -> str:
 
 def _tail_hatch(index: int) -> str:
     return {0: "", 4: HATCHES[1], 5: HATCHES[3]}[index]
+
+
+# --- the stimuli that mislead people most, as frames ----------------------------------------------
+
+SHOWN_MISLEADING = 3
+"""Stimuli of a scenario whose frames are drawn."""
+
+_FRAME_SIDE = 160
+"""Height and width of a drawn frame in pixels."""
+
+MISLEADING_CAPTION = (
+    "Stimuli that people get wrong more often than by guessing, of each scenario the ones with the "
+    "lowest accuracy: the last frame that people saw before they answered, and the last frame of "
+    "the movie. Left: the accuracy of people on all stimuli of the scenario; filled: those below "
+    "chance by the study's rule or an exact test corrected for the number of stimuli."
+)
+
+
+@register_figure(
+    "misleading", section=BY_STIMULUS, heading="Frames of stimuli that mislead people", order=95
+)
+def misleading(inputs: ReportInputs) -> Plot | None:
+    """Return frames of the stimuli on which people are below chance, if their movies are given."""
+    if not inputs.comparison.has_people:
+        return None
+    by_stimulus = None if inputs.people is None else inputs.people.tables["by_stimulus"]
+    return misleading_plot(tables.difficulty_table(inputs.comparison, by_stimulus), inputs.movies)
+
+
+def misleading_plot(difficulty: pd.DataFrame, movies: Mapping[str, Path]) -> Plot | None:
+    """Return the figure of misleading stimuli; None without a movie of any.
+
+    ``difficulty``: from `below_chance_level`; its column ``shown`` says in the figure's table which
+    place a stimulus has, from 1; 0: it is not drawn.
+    """
+    tail = difficulty[difficulty["released"] | difficulty["exact"]]
+    tail = tail.sort_values(["accuracy", "stimulus"])
+    frames = {}
+    shown = pd.Series(0, index=difficulty.index)
+    for _, rows in tail.groupby("scenario"):
+        with_movie = rows.index[rows["stimulus"].isin(set(movies))]
+        for place, row in enumerate(with_movie[:SHOWN_MISLEADING]):
+            stimulus = str(rows["stimulus"][row])
+            found = read_two_frames(movies[stimulus])
+            if found is not None:
+                frames[stimulus] = found
+                shown[row] = place + 1
+    if not frames:
+        return None
+    draw = partial(misleading_figure, frames=frames)
+    return Plot("misleading", MISLEADING_CAPTION, difficulty.assign(shown=shown), draw)
+
+
+def read_two_frames(path: Path) -> npt.NDArray[np.uint8] | None:
+    """Return the last observed and the last frame of a movie; None if it is no movie."""
+    from physion.trials.video import count_frames, read_chosen
+
+    try:
+        last = count_frames(path) - 1
+        at = [min(OBSERVED_FRAMES - 1, last), last]
+        return read_chosen(path, at, size=(_FRAME_SIDE, _FRAME_SIDE))
+    except BadInputError:
+        return None
+
+
+def misleading_figure(
+    table: pd.DataFrame, theme: Theme = LIGHT, *, frames: Mapping[str, npt.NDArray[np.uint8]]
+) -> Figure:
+    """Draw the distribution of people's accuracy and frames of misleading stimuli, by scenario.
+
+    Parameters
+    ----------
+    table
+        See `misleading_plot`.
+    theme
+        Colours.
+    frames
+        Two frames of each stimulus that is shown.
+    """
+    drawn = table[table["shown"] > 0]
+    scenarios = in_order(drawn["scenario"])
+    with matplotlib.rc_context(style(theme)):
+        figure = Figure(figsize=(11, 1.62 * len(scenarios) + 0.3), layout="constrained")
+        grid = figure.add_gridspec(
+            len(scenarios), 1 + 2 * SHOWN_MISLEADING, width_ratios=[1.5] + [1] * 6
+        )
+        for row, scenario in enumerate(scenarios):
+            axis = figure.add_subplot(grid[row, 0])
+            own = table[table["scenario"] == scenario]
+            low = own["accuracy"][own["released"] | own["exact"]]
+            axis.hist(own["accuracy"], list(BINS), color=theme.zone)
+            axis.hist(low, list(BINS), color=theme.palette[5])
+            axis.axvline(0.5, color=theme.ink, linestyle=":", linewidth=1)
+            axis.set_xlim(0, 1)
+            title(axis, f"{scenario}, {len(low)} of {len(own)}")
+            if row == len(scenarios) - 1:
+                axis.set_xlabel("accuracy of people")
+            shown = drawn[drawn["scenario"] == scenario].sort_values("shown")
+            for place, (_, stimulus) in enumerate(shown.iterrows()):
+                for which, picture in enumerate(frames[stimulus["stimulus"]]):
+                    axis = figure.add_subplot(grid[row, 1 + 2 * place + which])
+                    axis.imshow(picture)
+                    axis.set_axis_off()
+                    right = f"{stimulus['accuracy']:.0%} of {stimulus['count']:.0f} right"
+                    axis.set_title(("end", right)[which == 0], fontsize=7.5, loc="left")
+    return figure
 
 
 # --- response times of people against their accuracy --------------------------------------------

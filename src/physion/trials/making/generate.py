@@ -198,13 +198,14 @@ def _note_outcome(folder: Path, outcome: TaskOutcome[Any], job: GenerateJob) -> 
 def _update_index(folder: Path, made: set[str]) -> tuple[pd.DataFrame, dict[str, str]]:
     """Write the index unless it is up to date; return it, and problems by name of the trial.
 
-    It is up to date if it has a digest file, lists exactly the trials of the folder, and none of
-    them is in ``made``.
+    It is up to date if it has a digest file, lists exactly the trials of the folder with what was
+    drawn for each, and none of them is in ``made``.
     """
     there = {(paths.split, paths.trial) for paths in find_trials(folder)}
     index = _known_index(folder)
     listed = set(zip(index["split"], index["trial"], strict=True))
-    if not made and has_digest(folder / INDEX) and listed == there:
+    known = bool(index["drawn_room"].notna().all())
+    if not made and has_digest(folder / INDEX) and listed == there and known:
         return index, {}
     table, problems = build_index(folder, index[~index["trial"].isin(made)])
     write_index(folder, table)

@@ -17,7 +17,7 @@ from physion.core.settings import read_json
 from physion.physics.labels import label_contact
 from physion.scenes.sampling.sample import load_presets
 from physion.trials.files import FILES, SETTINGS, TrialPaths, find_trials
-from physion.trials.index import COLUMNS, index_row, read_index, same_value
+from physion.trials.index import COLUMNS, has_drawn, index_row, read_index, same_value
 from physion.trials.making.choose import BALANCED, robustness, split_of, wanted_contact
 from physion.trials.making.plan import TrialTask
 from physion.trials.trial_file import Trial, geometry_arrays
@@ -172,6 +172,7 @@ def _compare(stored: Mapping[str, Any], paths: TrialPaths, trial: Trial) -> list
         f"{paths.trial}: {name} is {found[name]!s}, the index says {stored[name]!s}"
         for name in COLUMNS
         if not same_value(found[name], stored[name])
+        and (has_drawn(stored) or not name.startswith("drawn_"))
     ]
 
 
