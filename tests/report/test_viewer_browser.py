@@ -360,3 +360,32 @@ def test_imagined_particles_are_shown_next_to_the_true_motion(
     text = browser.ask("document.getElementById('detail').innerText")
     assert "standstill" not in text and "contact" not in text
     assert browser.complaints() == []
+
+
+def test_trials_are_marked_and_the_file_is_offered(browser: Browser, page: Path) -> None:
+    """The page keeps what is typed, and makes the file for the folder of the dataset."""
+    browser.open(page, "#trial=drop_1")
+    assert not browser.ask("document.getElementById('save-marks').checkVisibility()")
+    click(browser, "mark")  # without a reason nothing is marked
+    assert browser.ask("document.activeElement.id") == "reason"
+    typed = json.dumps(' a "block",  flickers ')
+    browser.ask(f"document.getElementById('reason').value = {typed}")
+    click(browser, "mark")
+    badges = "document.getElementById('detail-badges').textContent"
+    assert 'unusable: a "block", flickers' in browser.ask(badges)
+    browser.ask(
+        "window.saved = null; URL.createObjectURL = (blob) => (blob.text().then("
+        "(text) => (window.saved = text)), 'about:blank#'); HTMLAnchorElement.prototype.click = "
+        "function () { window.savedAs = this.download }"
+    )
+    click(browser, "close")
+    assert browser.ask("document.getElementById('save-marks').textContent") == (
+        "Save unusable.csv (1)"
+    )
+    click(browser, "save-marks")
+    browser.until("window.saved !== null")
+    saved = browser.ask("window.saved")
+    assert saved == 'trial,reason\n"drop_1","a ""block"", flickers"\n'
+    assert browser.ask("window.savedAs") == "unusable.csv"
+    browser.open(page, "#trial=drop_0")
+    assert browser.ask("document.getElementById('reason').value") == ""

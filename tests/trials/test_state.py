@@ -303,3 +303,28 @@ def test_blocks_and_cloth_are_drawn_values_too() -> None:
     assert values["drawn_cloth_bend"] == sheet.cloths[0].bend
     assert values["drawn_agent_shape"] is None and values["drawn_probe_mass"] is None
     assert values["drawn_push_speed"] is None
+
+
+def test_objects_beyond_the_edges_of_the_picture() -> None:
+    """The camera looks along -y from 10 m; at the origin it sees 10 tan(fov / 2) to each side."""
+    half = 10 * math.tan(0.25)
+    wide = half * WIDTH / HEIGHT
+    camera = Camera((0.0, 10.0, 0.0), (0.0, 0.0, 0.0), fov=0.5)
+    thin = (0.4, 0.0002, 0.4)  # all vertices at the same depth
+    bodies = (
+        Body("inside", "cube", (0.0, 0.0, -0.2), thin, kinematic=True),
+        Body("cut", "cube", (wide, 0.0, -0.2), thin, kinematic=True),
+        Body("away", "cube", (0.0, 0.0, half + 0.3), thin, kinematic=True),
+        Body("behind", "cube", (0.0, 12.0, 0.0), thin, kinematic=True),
+        Body("drawn", "cube", (9.0, 0.0, 0.0), thin, scenery=True),
+    )
+    scene = Scene(
+        name="edges",
+        scenario="collide",
+        bodies=bodies,
+        roles=Roles("inside", "cut"),
+        camera=camera,
+        ending=Ending(46, 46),
+    )
+    trial = _pack(scene)
+    assert state.outside_picture(trial) == {"cut": 0.5, "away": 1.0, "behind": 1.0}

@@ -45,8 +45,9 @@ class Options:
     """Outcomes: official, or a table (stimulus, contact); default: as in the people's table."""
     sessions: Path | None = None
     """Table of sessions of our export: demographics, order of sessions."""
-    rules: str = "preregistered"
-    """Exclusion rules: preregistered or official-code."""
+    rules: str | None = None
+    """Exclusion rules: preregistered, preregistered-only (without what the experiment's server
+    found) or official-code; if not given, as in the exported study, else preregistered."""
     expected: Path | None = None
     """Table of the stimuli (stimulus) that each session, or each scenario, must have; if not given,
     expected.csv next to the responses, else the stimuli that half of the scenario's sessions
@@ -197,7 +198,7 @@ def _check_responses(
         options.sessions,
         labels,
         None if path is None else read_expected(path),
-        rules_called(options.rules),
+        rules_called(options.rules, options.responses),
     )
     if responses is None:
         return checked, {}

@@ -29,13 +29,18 @@ class Options:
         "physion-particles",
         "physopt",
         "physion-evaluator",
+        "mp4s",
+        "hdf5s",
         "webdataset",
         "gltf",
         "card",
         "result-tables",
     ] = "official"
     """official: HDF5 files, movies and PhysionTest-Core folders of the study; physion-particles,
-    physopt, physion-evaluator: folders that this published code reads; webdataset: tar shards;
+    physopt, physion-evaluator: folders that this published code reads (of physion_evaluator,
+    extract_features.py needs one edit: remove its check of the number of movies, after which it
+    would download others); mp4s, hdf5s: the study's downloads of movies (SlotFormer) and of HDF5
+    files; webdataset: tar shards;
     gltf: one GLB file for each trial, with its motion, for Blender and other 3D programs;
     card: README with Croissant metadata and a table for each split; result-tables: predictions with
     the names of scenarios that the notebooks of the study use."""
@@ -67,7 +72,7 @@ class Options:
 
 CARD_TERMS = ("license", "creator", "version", "url", "published")
 """Options that apply only to a card."""
-HDF5_LAYOUTS = ("official", "physion-particles", "physopt")
+HDF5_LAYOUTS = ("official", "physion-particles", "physopt", "hdf5s")
 """Layouts with official HDF5 files."""
 WHOLE = ("card", "result-tables")
 """Layouts that describe a whole folder."""

@@ -63,17 +63,20 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "experiment init": (
         "physion experiment init study --trials trials --contact ada@example.org --test 80",
         "physion experiment init study --scenes official --contact ada@example.org",
+        "physion experiment init study --trials trials --contact ada@example.org --preset paper",
     ),
     "experiment serve": ("physion experiment serve study --port 8080",),
     "experiment links": ("physion experiment links study --source prolific",),
     "experiment simulate": ("physion experiment simulate study --participants 50",),
     "experiment export": ("physion experiment export study --no-simulated",),
+    "experiment describe": ("physion experiment describe study",),
     "experiment backup": ("physion experiment backup study --out backups",),
     "experiment power": ("physion experiment power --effect 0.1 --people 20 40 --stimuli 60 100",),
     "experiment forget": ("physion experiment forget study --participant 5f0c1e",),
     "view": (
         "physion view trials --scenario collide",
         "physion view trials --predictions gns",
+        'physion view trials --mark "drop_testing_0003=a block flickers"',
     ),
     "export": (
         "physion export trials official-files --layout official",

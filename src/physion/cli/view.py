@@ -16,6 +16,7 @@ from physion.core.errors import BadInputError
 from physion.core.settings import parse_pairs
 from physion.report.viewer.build import ViewerOptions, build_viewer
 from physion.trials.dataset import Dataset
+from physion.trials.unusable import mark_unusable
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,10 @@ class Options:
     predictions: tuple[str, ...] = ()
     """Models whose predictions are shown next to what is true, as particles in 3D, pictures, boxes
     or slots: names (physion ls models) or FILE.py:Class."""
+    mark: tuple[str, ...] = ()
+    """Mark trials as unusable, TRIAL=REASON, in unusable.csv of the dataset; a study made from it
+    takes the next trials of the same preset and outcome. TRIAL= takes a mark back. The page can
+    mark trials too, and offers the file."""
     option: tuple[str, ...] = ()
     """Options of these models as NAME=VALUE, such as samples=8."""
     verify: bool = True
@@ -50,6 +55,8 @@ class Options:
 def main(options: Options) -> int:
     """Write the page and print its size and path."""
     wanted = ViewerOptions(options.trials, options.details, options.scenario, options.split)
+    if options.mark:
+        mark_unusable(Dataset(options.folder, verify=options.verify), _marks(options.mark))
     out = options.out if options.out is not None else options.folder / "view.html"
     with Stages() as stages:
         imagine = _imagine(options, stages)
@@ -65,6 +72,15 @@ def main(options: Options) -> int:
     if options.open:
         webbrowser.open(report.page.resolve().as_uri())
     return 0
+
+
+def _marks(given: tuple[str, ...]) -> dict[str, str]:
+    """Return the reasons by trial."""
+    parts = [text.partition("=") for text in given]
+    for text, (trial, sign, _) in zip(given, parts, strict=True):
+        if not (trial and sign):
+            raise BadInputError(f"--mark takes TRIAL=REASON, not {text!r}")
+    return {trial: reason for trial, _, reason in parts}
 
 
 def _imagine(options: Options, stages: Stages) -> Imagine | None:

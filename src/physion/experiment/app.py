@@ -18,7 +18,7 @@ from physion.core.errors import BadInputError
 from physion.experiment.experimenter.pages import build_router
 from physion.experiment.protocol import Refused
 from physion.experiment.study.media import read_media
-from physion.experiment.study.texts import TEXTS_FOLDER, read_consent_file
+from physion.experiment.study.texts import TEXTS_FOLDER, read_consent_file, read_picture
 from physion.experiment.web.api import BadBodyError, build_api
 from physion.experiment.web.files import PACKAGE, MediaFiles, read_page_file, read_page_files
 from physion.experiment.web.guards import Guards, code_of, refuse
@@ -54,10 +54,15 @@ def build_app(study: Study, secrets: Secrets, store: Store) -> FastAPI:
 
 
 def _serve_pages(app: FastAPI, study: Study) -> None:
-    """Add the routes of the page, its static files and the consent forms."""
+    """Add the routes of the page, its static files, the consent forms and pictures of questions."""
     forms = {
         f"{language}.pdf": read_consent_file(study.folder / TEXTS_FOLDER, language)
         for language in study.consent_files
+    }
+    pictures = {
+        question.picture: read_picture(study.folder / TEXTS_FOLDER, question.picture)
+        for question in study.questions
+        if question.picture
     }
     index = read_page_file(PACKAGE / "pages" / "index.html")
     files = read_page_files(PACKAGE / "static")
@@ -77,6 +82,13 @@ def _serve_pages(app: FastAPI, study: Study) -> None:
         if content is None:
             return refuse("not_found")
         return Response(content, media_type="application/pdf")
+
+    @app.get("/picture/{name}")
+    async def get_picture(request: Request) -> Response:
+        content = pictures.get(request.path_params["name"])
+        if content is None:
+            return refuse("not_found")
+        return Response(content, media_type="image/png")
 
 
 def _serve_media(app: FastAPI, study: Study, secrets: Secrets, store: Store) -> None:

@@ -525,6 +525,8 @@ class AskedQuestion(Message):
     required: bool
     options: list[str]
     steps: int
+    picture: str
+    """Name of its picture below ``/picture/``; empty: it has none."""
 
 
 class CheckedQuestion(Message):
@@ -533,6 +535,13 @@ class CheckedQuestion(Message):
 
     name: str
     options: list[str]
+
+
+class PaidAmount(Message):
+    """What everyone who finishes receives. ``currency``: a code such as USD, or text."""
+
+    amount: float
+    currency: str
 
 
 class PublicStudy(Message):
@@ -544,6 +553,10 @@ class PublicStudy(Message):
     consent_version: str
     consent_files: list[str]
     """Languages in which the consent form can be read as a file, ``/consent/LANGUAGE.pdf``."""
+    payment: PaidAmount | None
+    """None: the consent does not speak of payment."""
+    expected_minutes: int
+    """Expected duration of a session; 0: the page estimates it."""
     scenarios: list[str]
     id_needed: bool
     min_width: int

@@ -17,7 +17,7 @@ from physion.analysis.compare import all_results, tidy_scores
 from physion.analysis.comparison import check_coverage
 from physion.analysis.intervals import Bootstrap
 from physion.analysis.model_tests import fits_of_people
-from physion.analysis.people.exclusions import PREREGISTERED, Expected, find_expected, read_expected
+from physion.analysis.people.exclusions import Expected, find_expected, read_expected
 from physion.analysis.people.responses import Participants, check_labels, keep_where
 from physion.analysis.people.results import (
     PeopleResults,
@@ -162,7 +162,7 @@ def compare(
     responses: str | Path | Sequence[str | Path] = (),
     labels: str | Path | Mapping[str, bool] | None = None,
     sessions: Path | None = None,
-    rules: str = PREREGISTERED.name,
+    rules: str | None = None,
     expected: Path | Expected | None = None,
     accept_rules: Collection[str] = (),
     simulated: bool = False,
@@ -198,7 +198,9 @@ def compare(
     sessions
         Table of sessions of our export, with ``responses``.
     rules
-        Name of the exclusion rules: ``preregistered`` or ``official-code``.
+        Name of the exclusion rules: ``preregistered``, ``preregistered-only`` (without what the
+        experiment's server found) or ``official-code``. None: those in ``study.json`` next to the
+        responses, else ``preregistered``.
     expected
         Stimuli that a session must have, by scenario or by session, or their table. None:
         ``expected.csv`` next to the responses, else the stimuli that half of the scenario's
@@ -456,7 +458,7 @@ def read_outcomes(labels: str | Path | Mapping[str, bool] | None) -> dict[str, b
 def _participants(
     files: Sequence[Path],
     sessions: Path | None,
-    rules: str,
+    rules: str | None,
     labels: str | Path | Mapping[str, bool] | None,
     expected: Path | Expected | None,
     accept_rules: Collection[str],
@@ -508,7 +510,7 @@ def _scores_of_people(people: PeopleResults) -> pd.DataFrame:
 def _read_people(
     responses: Sequence[Path],
     sessions: Path | None,
-    rules: str,
+    rules: str | None,
     labels: Mapping[str, bool] | None,
     excluded: list[str],
     exclude_ledge: bool,
@@ -521,7 +523,7 @@ def _read_people(
     where: Sequence[str] = (),
 ) -> PeopleResults:
     """Read responses and run every analysis of people."""
-    chosen = rules_called(rules)
+    chosen = rules_called(rules, responses)
     read = keep_where(read_any_responses(responses, sessions, participants), where)
     if labels is not None:
         check_labels(read, labels)

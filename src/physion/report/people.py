@@ -575,6 +575,11 @@ def describe_rules(rules: ExclusionRules) -> str:
         words.append(f"accuracy {rules.accuracy_sd:g} sd below the {rules.accuracy_centre}")
     if rules.rt_sd is not None:
         words.append(f"{rules.rt_summary} log response time {rules.rt_sd:g} sd above the median")
+    if rules.server:
+        words.append(
+            "implausible, replayed or failing checks, as the experiment's server found (not "
+            "preregistered)"
+        )
     return (
         f"Rules “{rules.name}”: {'; '.join(words)}; not all trials answered; not the participant's "
         "first session. Rules flag; the main analysis leaves flagged sessions out, and the tables "

@@ -27,7 +27,7 @@ from physion.numerics.elementary import arctan2
 from physion.numerics.linear_algebra import norm
 from physion.numerics.rotations import rotate_vectors
 from physion.physics.rigid.bodies import collision_hulls, hull_mass
-from physion.rendering.camera import intrinsics, view_matrix
+from physion.rendering.camera import View, intrinsics, view_matrix
 from physion.scenes.scene import FRAME_TIME, Body, Cloth, Scene, SurfaceMaterial, Vec3
 from physion.trials.trial_file import Trial, mesh_of
 
@@ -120,6 +120,26 @@ def world_vertices(trial: Trial, frame: int) -> dict[str, Matrix]:
         )
     for cloth, part in zip(trial.scene.cloths, _cloth_parts(trial), strict=True):
         found[cloth.name] = part[frame].astype(np.float64)
+    return found
+
+
+def outside_picture(trial: Trial, frame: int = 0) -> dict[str, float]:
+    """Return which objects reach beyond the edges of the picture in one frame, and how far.
+
+    Values are fractions of an object's vertices outside the picture or behind the camera; objects
+    that are wholly inside are left out, and so is scenery.
+    """
+    view = View(trial.scene.camera, trial.metadata.width, trial.metadata.height)
+    scenery = {body.name for body in trial.scene.bodies if body.scenery}
+    size = np.array([view.width, view.height])
+    found = {}
+    for name, vertices in world_vertices(trial, frame).items():
+        if name in scenery or not np.isfinite(vertices).all():
+            continue
+        pixels, depth = view.project(vertices)
+        inside = ((pixels >= 0) & (pixels <= size)).all(axis=1) & (depth > 0)
+        if not inside.all():
+            found[name] = float(1 - inside.mean())
     return found
 
 

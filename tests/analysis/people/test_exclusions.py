@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import cache
 from itertools import groupby
@@ -39,7 +40,7 @@ from physion.analysis.people.exclusions import (
 )
 from physion.analysis.people.measures import accuracy_by_scenario
 from physion.analysis.people.responses import DROPPED_COLUMNS, VOID, Responses, missing_times
-from physion.analysis.people.results import analyse_people
+from physion.analysis.people.results import analyse_people, rules_called
 from physion.analysis.statistics.regression import clustered_logit
 from physion.core.errors import BadInputError, ExclusionError, UnknownNameError
 from support.simulated_people import as_responses, simulate_study, study
@@ -195,7 +196,11 @@ def test_practice_accuracy_and_response_time_rules() -> None:
 
 
 def test_the_sets_differ_where_the_released_code_did() -> None:
-    assert RULE_SETS == {"preregistered": PREREGISTERED, "official-code": OFFICIAL_CODE}
+    assert {
+        "preregistered": PREREGISTERED,
+        "preregistered-only": replace(PREREGISTERED, name="preregistered-only", server=False),
+        "official-code": OFFICIAL_CODE,
+    } == RULE_SETS
     generator = np.random.default_rng(2)
     label = [bool(x) for x in generator.random(40) < 0.5]
 
@@ -560,6 +565,32 @@ def test_sessions_are_flagged_by_what_the_server_found() -> None:
     assert list(flag_from_server(responses, measures, "replayed")) == [True, False, False]
     old = Responses(TRIALS, SESSIONS[["session"]], NOTHING)
     assert not flag_from_server(old, measures, "implausible").any()
+
+
+def test_only_preregistered_rules_leave_out_nothing_that_the_server_found() -> None:
+    trials, sessions = simulate_study(people=5, stimuli=8, scenarios=("drop",))
+    sessions["implausible"] = ["short", "", "", "", ""]
+    sessions["failed_checks"] = ["", "attention", "", "", ""]
+    responses = as_responses(trials, sessions)
+    both = {rules.name: flag_sessions(responses, rules) for rules in RULE_SETS.values()}
+    strict, only = both["preregistered"], both["preregistered-only"]
+    assert strict["implausible"].sum() == strict["failed_checks"].sum() == 1
+    assert not only[["implausible", "replayed", "failed_checks"]].to_numpy().any()
+    others = [rule for rule in RULES if rule not in ("implausible", "replayed", "failed_checks")]
+    pd.testing.assert_frame_equal(strict[others], only[others])
+
+
+def test_an_exported_study_brings_its_rules(tmp_path: Path) -> None:
+    responses = [tmp_path / "trials.csv"]
+    assert rules_called(None, responses).name == "preregistered"
+    states = [
+        {"settings": {"exclusions": name}} for name in ("official-code", "preregistered-only")
+    ]
+    (tmp_path / "study.json").write_text(json.dumps({"states": states}))
+    assert rules_called(None, responses).name == "preregistered-only"
+    assert rules_called("official-code", responses).name == "official-code"
+    (tmp_path / "study.json").write_text('{"states": [{}]}')
+    assert rules_called(None, responses).name == "preregistered"
 
 
 def test_answers_after_an_interrupted_movie_are_dropped_and_counted() -> None:

@@ -349,6 +349,35 @@ def test_background_is_counted_and_related_to_accuracy(made: Responses) -> None:
     assert alike.set_index("question").loc[["age", "gender"], "reason"].ne("").all()
 
 
+def test_own_questions_are_counted_and_related_to_accuracy(made: Responses) -> None:
+    """A right answer goes with accuracy, a number with nothing, and names stay apart."""
+    accuracy = accuracy_by_participant(made.test).set_index("session")["accuracy"]
+    able = made.sessions["session"].map(accuracy) > accuracy.median()
+    sessions = made.sessions.assign(
+        mental_rotation_right=able,
+        hours=np.arange(48) % 7,
+        games=pd.array(["often", None] * 24, dtype=object),
+    )
+    own = ("mental_rotation_right", "hours", "games")
+    counted = background(sessions, own).set_index(["question", "answer"])["sessions"]
+    assert counted["mental_rotation_right", "True"] == able.sum()
+    assert counted["games", "(none)"] == counted["games", "often"] == 24
+    found = accuracy_by_background(made.test, sessions, own).set_index("question")
+    assert list(found.index[-3:]) == list(own)
+    assert found.loc["mental_rotation_right", "test"] == "kruskal-wallis"
+    relative = accuracy_by_participant(made.test)
+    relative["a"] = relative["accuracy"] - relative.groupby("scenario")["accuracy"].transform(
+        "mean"
+    )
+    by_person = relative.groupby("session")["a"].mean().reindex(sessions["session"])
+    groups = [by_person[able.to_numpy()], by_person[~able.to_numpy()]]
+    assert found.loc["mental_rotation_right", "p"] == pytest.approx(stats.kruskal(*groups).pvalue)
+    assert found.loc["hours", "test"] == "spearman"
+    wanted = stats.spearmanr(sessions["hours"], by_person).statistic
+    assert found.loc["hours", "statistic"] == pytest.approx(wanted)
+    assert found.loc["games", "reason"].startswith("fewer than two groups")
+
+
 # --- attributes and hypotheses ------------------------------------------------------------------
 
 

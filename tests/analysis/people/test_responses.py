@@ -28,7 +28,7 @@ from physion.analysis.people.responses import (
     scenario_set,
     scenarios_in,
 )
-from physion.analysis.people.results import analyse_people
+from physion.analysis.people.results import analyse_people, read_any_responses
 from physion.analysis.tables import check_table, data_dictionary
 from physion.cli.main import main
 from physion.core.errors import BadInputError
@@ -80,6 +80,31 @@ def test_what_was_exported_comes_back(
     assert (joined["correct"] == joined["correct_raw"]).all()
     np.testing.assert_allclose(joined["log_rt"], np.log(joined["rt_ms_raw"]))
     assert found.sessions["age"].dtype == "Int64" and len(found.test) == 18
+
+
+def test_answers_to_own_questions_are_found_next_to_the_export(
+    tables: tuple[pd.DataFrame, pd.DataFrame], tmp_path: Path
+) -> None:
+    trials, sessions = tables
+    trials.to_csv(tmp_path / "trials.csv", index=False)
+    names = sessions["session"].tolist()
+    assert read_any_responses([tmp_path / "trials.csv"]).own == ()
+    own = pd.DataFrame({"session": names[1:], "participant": "p", "age": ["x", "y"],
+                        "mental_rotation_right": [True, False], "hours": [3, 9]})  # fmt: skip
+    own.to_csv(tmp_path / "questions.csv", index=False)
+    found = read_any_responses([tmp_path / "trials.csv"])
+    assert found.own == ("age", "mental_rotation_right", "hours")
+    by_name = found.sessions.set_index("session")["hours"]
+    assert by_name[names[1]] == 3 and by_name[names[2]] == 9 and pd.isna(by_name[names[0]])
+    sessions.to_csv(tmp_path / "sessions.csv", index=False)
+    found = read_any_responses([tmp_path / "trials.csv"], tmp_path / "sessions.csv")
+    assert found.own[0] == "own_age" and "age" in found.sessions
+    many = pd.DataFrame({"session": range(30), "words": [f"words {i}" for i in range(30)]})
+    many.to_csv(tmp_path / "questions.csv", index=False)
+    assert read_any_responses([tmp_path / "trials.csv"]).own == ()  # free texts
+    pd.concat([own, own]).to_csv(tmp_path / "questions.csv", index=False)
+    with pytest.raises(BadInputError, match="two rows"):
+        read_any_responses([tmp_path / "trials.csv"])
 
 
 def test_broken_files_are_refused(tmp_path: Path) -> None:

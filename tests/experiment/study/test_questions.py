@@ -7,9 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from physion.core.errors import BadInputError
+from physion.experiment.study.identity import Secrets
 from physion.experiment.study.settings import (
     Question,
     check_answers,
@@ -19,6 +21,8 @@ from physion.experiment.study.settings import (
     parse_settings,
 )
 from physion.experiment.study.study import load_study
+from physion.experiment.web.api import public_study
+from physion.trials.files import encode_png
 from support.experiment.own_questions import (
     COMPREHENSION,
     COMPREHENSION_TEXTS,
@@ -54,6 +58,12 @@ def test_questions_are_written_and_read_back(tmp_path: Path) -> None:
         ({"name": "games", "kind": "choice", "options": ["one"]}, "games needs options"),
         ({"name": "games", "kind": "scale", "options": ["a", "b"]}, "games has options"),
         ({"name": "games", "kind": "scale", "steps": 1}, "greater than or equal to 2"),
+        ({"name": "games", "kind": "text", "right": "a"}, "no option of it as a choice"),
+        (
+            {"name": "games", "kind": "choice", "options": ["a", "b"], "right": "c"},
+            "right answer c, which is no option",
+        ),
+        ({"name": "games", "kind": "text", "picture": "../a.png"}, "the name of a PNG"),
         ({"name": "session", "kind": "text"}, "a second column session"),
         ({"name": "a_b", "kind": "text"}, "a second column a_b"),
     ],
@@ -69,6 +79,33 @@ def test_what_is_no_question_is_refused(
     texts = [{"name": f"q{number}", "kind": "text"} for number in range(10)]
     with pytest.raises(BadInputError, match="at most 9"):
         parse_settings(tables | {"questions": texts}, tmp_path / "study.toml")
+
+
+def test_a_question_may_have_a_picture_and_a_right_answer(tmp_path: Path) -> None:
+    turned = Question("turned", "choice", options=("a", "b"), picture="turned.png", right="b")
+    texts = """
+[question.turned]
+text = "Which one?"
+alt = "Two figures"
+options = {a = "A", b = "B"}
+"""
+    with pytest.raises(BadInputError, match=r"turned\.png is missing"):
+        make_tiny_study(tmp_path, test=1, familiarization=1, questions=(turned,), more_texts=texts)
+    picture = tmp_path / "texts" / "turned.png"
+    picture.write_bytes(b"GIF89a")
+    with pytest.raises(BadInputError, match="is no PNG file"):
+        load_study(tmp_path)
+    picture.write_bytes(encode_png(np.zeros((2, 2, 3), np.uint8)))
+    study = load_study(tmp_path)
+    assert columns_of(turned) == ("turned", "turned_right")
+    picture.write_bytes(encode_png(np.ones((2, 2, 3), np.uint8)))
+    assert load_study(tmp_path).digest != study.digest  # participants saw another study
+    public = public_study(study, Secrets.load(tmp_path)).model_dump_json()
+    assert '"picture":"turned.png"' in public and "right" not in public
+    path = tmp_path / "texts" / "de.toml"
+    path.write_text(path.read_text().replace('alt = "Two figures"\n', ""))
+    with pytest.raises(BadInputError, match=r"lacks the text question\.turned\.alt"):
+        load_study(tmp_path)
 
 
 def test_valid_answers_are_kept() -> None:

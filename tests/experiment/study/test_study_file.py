@@ -18,6 +18,7 @@ from physion.experiment.study.settings import (
     Bonus,
     Comprehension,
     EarlyEnd,
+    PaymentRule,
     Plausibility,
     Practice,
     Recruitment,
@@ -110,6 +111,12 @@ STUDIES = st.builds(
     stopped=EARLY_ENDS,
     device_refused=EARLY_ENDS,
     full=EARLY_ENDS,
+    payment=st.builds(
+        PaymentRule,
+        amount=st.floats(0, 100),
+        currency=st.sampled_from(["USD", "credit points"]),
+        minutes=st.integers(1, 90),
+    ),
     bonus=st.builds(Bonus, st.floats(0, 10_000), st.floats(0, 1), st.floats(0, 1_000_000)),
 )  # fmt: skip
 
@@ -152,8 +159,10 @@ REFUSED: dict[str, tuple[str, Any, str]] = {
     "half a participant": ("participants", 1.5, "a whole number"),
     "true for a number": ("participants", True, "a whole number"),
     "a negative seed": ("seed", -1, "greater than or equal to 0"),
-    "unknown rules": ("exclusions", "none", "'preregistered' or 'official-code'"),
-    "rules in a list": ("exclusions", ["preregistered"], "'preregistered' or 'official-code'"),
+    "unknown rules": ("exclusions", "none", "'preregistered-only' or 'official-code'"),
+    "rules in a list": ("exclusions", ["preregistered"], "'preregistered-only' or 'official-code'"),
+    "an amount without its time": ("payment.amount", 4, "needs payment.minutes"),
+    "a currency of two lines": ("payment.currency", "a\nb", "one line"),
     "a site with a path": ("embed_from", ["https://a.org/x"], "without a path"),
     "a site without safety": ("embed_from", ["http://a.org"], "https://"),
     "a directive in a site": ("embed_from", ["https://a.org; script-src *"], "without a path"),
@@ -192,6 +201,19 @@ def test_a_bad_value_is_named_with_what_is_allowed(case: str) -> None:
     message = str(raised.value)
     assert message.startswith(f"x/study.toml: {key}") and allowed in message
     assert "\n" not in message
+
+
+def test_a_wage_below_what_the_lab_wants_is_refused() -> None:
+    content = tomllib.loads(format_settings(_study(), Path()))
+    content["payment"] = {"amount": 4, "currency": "EUR", "minutes": 30, "least_per_hour": 12}
+    with pytest.raises(BadInputError) as raised:
+        parse_settings(content, Path("study.toml"))
+    assert "4 EUR for 30 minutes, 8.00 per hour: less than payment.least_per_hour, 12" in str(
+        raised.value
+    )
+    content["payment"]["minutes"] = 20
+    assert parse_settings(content, Path("study.toml")).payment.per_hour == 12
+    assert PaymentRule().per_hour is None
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,9 @@ Sources, at the commits that were read:
 - neuroailab/physics-models 4bc5816: ``physion/data/pydata.py``, ``physion/objective/RPIN.py``,
   ``physion/data_space/data_space.py``, ``configs/pDEIT_MLP/physion.yaml``;
 - neuroailab/physion_evaluator 03924d4: ``dataloader_mp4s.py``, ``extract_features.py``;
-- cogtoolslab/physics-benchmarking-neurips2021 fd02f3f: ``stimuli/generate_metadata.ipynb``.
+- cogtoolslab/physics-benchmarking-neurips2021 fd02f3f: ``stimuli/generate_metadata.ipynb``;
+- pairlab/SlotFormer: ``slotformer/video_prediction/datasets/physion.py``;
+- object_centric_bench: ``datum/physion.py``.
 
 Asserts inside the loaders are theirs. Paths of folders and the transforms of pictures by torch are
 arguments or left out.
@@ -17,6 +19,7 @@ arguments or left out.
 
 from __future__ import annotations
 
+import dataclasses
 import glob
 import io
 import json
@@ -34,8 +37,10 @@ from physion.cli import export as export_verb
 from physion.compute.local import SerialExecutor
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.trials.dataset import Dataset
-from physion.trials.files import TrialPaths
+from physion.trials.files import TrialPaths, write_files
+from physion.trials.index import build_index, write_index
 from physion.trials.official.export_folder import LAYOUTS, evaluator_name, export_official
+from physion.trials.trial_file import TrialWriter
 from physion.trials.video import count_frames, read_frames
 from support.official_hand_made import CLOTH, FRAMES, RIGID, TOUCH
 
@@ -215,6 +220,48 @@ def notebook_table(local_stem: str) -> pd.DataFrame:
     return table.merge(gt, on="stim_ID")
 
 
+def slotformer_items(data_root: str, subset: str, split: str) -> dict[str, int]:
+    """``PhysionSlotsLabelDataset``: folders of frames (movies without ending) with their labels.
+
+    Its lists of files are the argument ``splits``, which it keeps beside its code.
+    """
+    label_fn = {
+        "readout": "PhysionTrainMP4s/readout_labels.csv",
+        "test": "PhysionTestMP4s/labels.csv",
+    }[subset]
+    labels = pd.read_csv(os.path.join(data_root, label_fn))
+    with open(os.path.join(data_root, f"splits/Physion/{subset}_{split}.json")) as f:
+        json_file = json.load(f)
+    items = {}
+    for task in sorted(json_file):
+        for name in json_file[task]:
+            folder = os.path.join(data_root, name[:-4])
+            csv_key = os.path.basename(folder)
+            if subset == "readout" and csv_key.endswith("_img"):
+                csv_key = csv_key[:-4]
+            if subset == "test" and "-redyellow" in csv_key:
+                csv_key = csv_key.replace("-redyellow", "")
+            label = labels[labels["Unnamed: 0"] == csv_key]["ground truth outcome"].item()
+            assert Path(folder + ".mp4").exists()
+            items[folder + ".mp4"] = 1 if label else 0
+    return items
+
+
+def bench_labels(src_dir: Path, scene: str, kind: str, train: bool) -> dict[str, bool]:
+    """``Physion.convert_dataset`` of object_centric_bench: labels of movies by their names."""
+    label_file = src_dir / kind / ("readout_labels.csv" if train else "labels.csv")
+    parts = [row.strip().split(",") for row in label_file.read_text().strip().split("\n")[1:]]
+    label_dict = {row[0].replace("-redyellow", ""): row[1] for row in parts}
+    assert len(label_dict) == len(parts)
+    found = {}
+    folder = f"{scene}_readout_MP4s" if train else f"{scene}/mp4s-redyellow"
+    for src_file in sorted((src_dir / kind).glob(f"{folder}/*.mp4")):
+        lbl_key = src_file.name[: -8 if train else -4].replace("-redyellow", "")
+        assert lbl_key in label_dict
+        found[src_file.name] = label_dict[lbl_key] == "True"
+    return found
+
+
 @pytest.mark.parametrize("images", [True, False])
 def test_physion_particles_reads_its_folder(dataset: Path, tmp_path: Path, images: bool) -> None:
     out = export(dataset, tmp_path / "out", "physion-particles", images=images)
@@ -242,7 +289,7 @@ def test_physopt_reads_its_folders(dataset: Path, tmp_path: Path) -> None:
     assert data.N == 1
     item = data[0]
     trial = Dataset(dataset).trial(RIGID)
-    assert item["stimulus_name"] == RIGID.encode() and item["binary_labels"]
+    assert item["stimulus_name"] == b"collide_testing-redyellow_0003" and item["binary_labels"]
     for row in (0, 24):
         np.testing.assert_array_equal(
             item["images"][row], trial.render(2 * row, look="redyellow").color
@@ -253,12 +300,15 @@ def test_physopt_reads_its_folders(dataset: Path, tmp_path: Path) -> None:
 def test_training_trials_are_divided_and_in_free_colours() -> None:
     layout = LAYOUTS["physopt"]
     trials = [TrialPaths(Path(), "training", "roll", f"roll_training_{i:04d}") for i in range(500)]
-    places = [next(iter(layout.files(paths).items())) for paths in trials]
+    places = [next(iter(layout.files(paths, False).items())) for paths in trials]
     parts = [path.split("/")[1] for path, _ in places]
     assert set(parts) == {"pretraining_train", "pretraining_val"}
     assert 25 <= parts.count("pretraining_val") <= 75
     assert {content.look for _, content in places} == {"free"}
-    assert not layout.files(TrialPaths(Path(), "familiarization", "roll", "roll_0000"))
+    assert not layout.files(TrialPaths(Path(), "familiarization", "roll", "roll_0000"), False)
+    # Every scenario has a trial for validation: its first one, whatever its name.
+    kept = trials[parts.index("pretraining_train")]
+    assert "pretraining_val" in next(iter(layout.files(kept, True)))
 
 
 def test_physion_evaluator_reads_its_movies(dataset: Path, tmp_path: Path) -> None:
@@ -271,6 +321,44 @@ def test_physion_evaluator_reads_its_movies(dataset: Path, tmp_path: Path) -> No
     assert item["indices"] == [0, 15]
     own = read_frames(Dataset(dataset).paths(RIGID).movie)
     np.testing.assert_array_equal(item["video"], own[[0, 15]])
+
+
+def test_slotformer_and_others_read_movies(dataset: Path, tmp_path: Path) -> None:
+    """A test trial as it is, and copies of it as readout and training trials."""
+    out = tmp_path / "out"
+    export(dataset, out, "mp4s")
+    for split in ("readout", "training"):
+        copy = tmp_path / split
+        trial = Dataset(dataset).trial(RIGID)
+        meta = dataclasses.replace(trial.metadata, split=split, movies=False, free_movies=False)
+        paths = TrialPaths(copy, split, "collide", RIGID)
+        writer = TrialWriter(meta, trial.scene, trial.trajectory, trial.labels, trial.ids)
+        write_files(paths, {"trial_file": writer.finish()})
+        write_index(copy, build_index(copy)[0])
+        export(copy, out, "mp4s")
+    test = slotformer_items(str(out), "test", "test")
+    names = ["collide_testing-redyellow_0003_img.mp4", "drape_testing-redyellow_0000_img.mp4"]
+    assert [Path(name).name for name in test] == names
+    assert list(test.values()) == [Dataset(dataset).trial(name).labels.contact for name in
+                                   (RIGID, CLOTH)]  # fmt: skip
+    own = Dataset(dataset).paths(RIGID)
+    assert Path(next(iter(test))).read_bytes() == own.movie.read_bytes()
+    readout = slotformer_items(str(out), "readout", "val")  # the first of a scenario
+    movie = out / "PhysionTrainMP4s/Collide_readout_MP4s" / f"{RIGID}_img.mp4"
+    assert readout == {str(movie): 1}
+    np.testing.assert_array_equal(read_frames(movie), read_frames(own.movie))
+    training = out / "PhysionTrainMP4s/Collide_training_MP4s" / f"{RIGID}_img.mp4"
+    np.testing.assert_array_equal(read_frames(training), read_frames(own.free_movie))
+    assert bench_labels(out, "Collide", "PhysionTrainMP4s", True) == {f"{RIGID}_img.mp4": True}
+    assert bench_labels(out, "Drape", "PhysionTestMP4s", False) == {names[1]: True}
+
+
+def test_hdf5_files_of_the_downloads(dataset: Path, tmp_path: Path) -> None:
+    out = export(dataset, tmp_path / "out", "hdf5s", images=False)
+    assert sorted(path.relative_to(out).as_posix() for path in out.rglob("*.hdf5")) == [
+        f"Collide/hdf5s/{RIGID}.hdf5",
+        f"Drape/hdf5s/{CLOTH}.hdf5",
+    ]
 
 
 @pytest.mark.parametrize(

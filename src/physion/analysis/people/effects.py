@@ -25,6 +25,7 @@ from physion.analysis.people.measures import (
     mean_over_people,
     split_halves,
 )
+from physion.analysis.people.responses import is_number
 from physion.analysis.statistics.agreement import correlate_rows, pearson, z_rates
 from physion.analysis.statistics.paired import corrected_p
 from physion.analysis.statistics.regression import clustered_logit
@@ -164,14 +165,14 @@ def learning(test: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
     return pd.concat(fits, ignore_index=True)
 
 
-def background(sessions: pd.DataFrame) -> pd.DataFrame:
+def background(sessions: pd.DataFrame, own: Sequence[str] = ()) -> pd.DataFrame:
     """Count the answers to the questionnaire: one row per question and answer.
 
-    Columns: ``question``, ``answer`` (``(none)`` if not answered), ``sessions``,
-    ``fraction``.
+    ``own``: columns with answers to the lab's own questions. Columns: ``question``, ``answer``
+    (``(none)`` if not answered), ``sessions``, ``fraction``.
     """
     parts = []
-    for column in _asked(sessions):
+    for column in _asked(sessions, own):
         values = sessions[column].astype(object)
         named = values.where(values.notna() & (values != ""), "(none)")
         counts = named.value_counts(sort=False)
@@ -190,8 +191,11 @@ def background(sessions: pd.DataFrame) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
 
 
-def accuracy_by_background(test: pd.DataFrame, sessions: pd.DataFrame) -> pd.DataFrame:
-    """Test whether accuracy depends on age, gender, education or reported difficulty.
+def accuracy_by_background(
+    test: pd.DataFrame, sessions: pd.DataFrame, own: Sequence[str] = ()
+) -> pd.DataFrame:
+    """Test whether accuracy depends on age, gender, education, reported difficulty or answers to
+    the lab's own questions, such as mental rotation (columns ``own`` of the sessions).
 
     Accuracies are taken relative to the mean of their scenario, since scenarios differ. One row per
     question: ``question``, ``sessions``, ``test`` (``spearman`` for numbers, ``kruskal-wallis`` for
@@ -207,13 +211,15 @@ def accuracy_by_background(test: pd.DataFrame, sessions: pd.DataFrame) -> pd.Dat
     by_person = by_person.groupby("session", as_index=False, sort=False)["relative"].mean()
     joined = by_person.merge(sessions.drop(columns=["participant", "scenario"], errors="ignore"),
                        on="session", how="left")  # fmt: skip
-    return pd.DataFrame([_association(joined, column) for column in _asked(joined)])
+    return pd.DataFrame([_association(joined, column) for column in _asked(joined, own)])
 
 
-def _asked(table: pd.DataFrame) -> list[str]:
-    """Return the columns of `BACKGROUND` that a table has; no condition if all cells are empty."""
+def _asked(table: pd.DataFrame, own: Sequence[str]) -> list[str]:
+    """Return the columns of `BACKGROUND` that a table has, no condition if all cells are empty, and
+    ``own``."""
     known = "condition" in table and (table["condition"].fillna("") != "").any()
-    return [name for name in BACKGROUND if name in table and (name != "condition" or known)]
+    found = [name for name in BACKGROUND if name in table and (name != "condition" or known)]
+    return [*found, *own]
 
 
 def _association(joined: pd.DataFrame, column: str) -> dict[str, Any]:
@@ -221,7 +227,7 @@ def _association(joined: pd.DataFrame, column: str) -> dict[str, Any]:
     rows = joined[values.notna() & (values != "")]
     record: dict[str, Any] = {"question": column, "sessions": len(rows), "test": "", "df": np.nan}
     record |= {"statistic": np.nan, "p": np.nan, "reason": ""}
-    if column in ("age", "difficulty"):
+    if column in ("age", "difficulty") or is_number(joined[column]):
         record["test"] = "spearman"
         numbers = rows[column].astype(np.float64)
         if len(rows) < 3 or numbers.nunique() < 2 or rows["relative"].nunique() < 2:

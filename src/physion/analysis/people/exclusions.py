@@ -284,6 +284,8 @@ RULES = (
 not of the preregistration; the experiment's server finds them: sessions that no person can have
 made, sessions with trials that were shown more often than the study allows, and sessions that
 failed a check of the lab."""
+FROM_SERVER = RULES[-3:]
+"""Rules that are not of the preregistration."""
 
 
 MOST_EXCLUDED = 1 / 3
@@ -306,6 +308,8 @@ class ExclusionRules:
     - ``rt_sd``: standard deviations above the median of the participants' ``rt_summary`` of log
       response times.
     - ``ddof``: 1 divides the sum of squares by n - 1, 0 by n.
+    - ``server``: flag also what the experiment's server found: implausible sessions, replayed
+      trials, failed checks. None of this is in the preregistration.
     """
 
     name: str
@@ -318,10 +322,15 @@ class ExclusionRules:
     rt_sd: float | None = 3.0
     rt_summary: Literal["mean", "median"] = "mean"
     ddof: int = 1
+    server: bool = True
 
 
 PREREGISTERED = ExclusionRules("preregistered")
-"""As preregistered; the text leaves open how a standard deviation is estimated: here with n - 1."""
+"""As preregistered, and what the experiment's server found; the text of the preregistration leaves
+open how a standard deviation is estimated: here with n - 1."""
+
+PREREGISTERED_ONLY = ExclusionRules("preregistered-only", server=False)
+"""Nothing but the rules of the preregistration."""
 
 OFFICIAL_CODE = ExclusionRules(
     "official-code",
@@ -335,7 +344,7 @@ OFFICIAL_CODE = ExclusionRules(
 simulation of 150 tosses and changed between runs."""
 
 RULE_SETS: Mapping[str, ExclusionRules] = {
-    rules.name: rules for rules in (PREREGISTERED, OFFICIAL_CODE)
+    rules.name: rules for rules in (PREREGISTERED, PREREGISTERED_ONLY, OFFICIAL_CODE)
 }
 
 
@@ -435,10 +444,9 @@ def flag_sessions(
     deviations come from the scenario's complete sessions, whether another rule flags them or not.
     """
     measures = session_measures(responses, expected)
-    found = _by_thresholds(measures, rules) | {
-        name: flag_from_server(responses, measures, name)
-        for name in ("implausible", "replayed", "failed_checks")
-    }
+    found = _by_thresholds(measures, rules)
+    if rules.server:
+        found |= {name: flag_from_server(responses, measures, name) for name in FROM_SERVER}
     never = pd.Series(False, index=measures.index)
     table = measures.assign(**{name: found.get(name, never).astype(bool) for name in RULES})
     return table.assign(flagged=table[list(RULES)].any(axis=1))

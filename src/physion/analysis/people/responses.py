@@ -165,11 +165,13 @@ class Responses:
       they began, or else in which they stand in the file. ``scenario`` is a `scenario_set`.
     - ``dropped``: what was left out: ``step``, ``scenario``, ``reason``, ``sessions`` (with at
       least one such row) and ``rows``.
+    - ``own``: columns of ``sessions`` with answers to the lab's own questions.
     """
 
     trials: pd.DataFrame
     sessions: pd.DataFrame
     dropped: pd.DataFrame
+    own: tuple[str, ...] = ()
 
     @property
     def test(self) -> pd.DataFrame:
@@ -239,6 +241,49 @@ def read_responses(
     if sessions is not None:
         people = check_table(read_table(sessions, ()), SESSION_COLUMNS, str(sessions))
     return _of_kind(clean(table, people, where=str(trials)), participants, str(trials))
+
+
+QUESTIONS_FILE = "questions.csv"
+"""File with the answers to the lab's own questions, in the folder of the exported responses."""
+MOST_ANSWERS = 20
+"""Largest number of different answers that are groups of people; more are free texts."""
+
+
+def with_own_questions(responses: Responses, trials: Path) -> Responses:
+    """Return the responses with the answers to the lab's own questions, from the file next to them.
+
+    Free texts are left out. Without the file the responses are returned as they are. Raises
+    `BadInputError` for a session with two rows.
+    """
+    path = trials.parent / QUESTIONS_FILE
+    if not path.is_file() or path.read_bytes().count(b"\n") < 2:
+        return responses  # nobody has answered yet
+    table = read_table(path, ("session",)).apply(_numbers).astype({"session": str})
+    refuse_duplicates(table["session"], str(path))
+    known = set(responses.sessions.columns)
+    own = {
+        name: name if name not in known else f"own_{name}"
+        for name in table.columns.difference(["session", "participant"], sort=False)
+        if is_number(table[name]) or table[name].nunique() <= MOST_ANSWERS
+    }
+    answers = table[["session", *own]].rename(columns=own)
+    joined = responses.sessions.merge(answers, on="session", how="left")
+    return replace(responses, sessions=joined, own=tuple(own.values()))
+
+
+def _numbers(column: pd.Series) -> pd.Series:
+    """Return a column of texts as numbers, if all that are not empty are numbers."""
+    given = column[column != ""]
+    numbers = pd.to_numeric(given, errors="coerce")
+    if column.name == "session" or given.empty or numbers.isna().any():
+        return column
+    return numbers.reindex(column.index)
+
+
+def is_number(column: pd.Series) -> bool:
+    """Return whether a column has numbers, and not only true and false."""
+    kinds = pd.api.types
+    return bool(kinds.is_numeric_dtype(column) and not kinds.is_bool_dtype(column))
 
 
 def _of_kind(cleaned: Responses, kind: Participants, where: str) -> Responses:

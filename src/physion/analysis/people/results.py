@@ -52,6 +52,7 @@ from physion.analysis.people.responses import (
     missing_times,
     read_official_responses,
     read_responses,
+    with_own_questions,
 )
 from physion.analysis.tables import (
     ATTRIBUTES,
@@ -64,7 +65,11 @@ from physion.analysis.tables import (
 )
 from physion.analysis.tables import COLUMNS as ATTRIBUTE_COLUMNS
 from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.files import read_plain
 from physion.core.names import scenario_of
+from physion.core.settings import parse_json
+
+_MAX_BYTES = 100_000_000
 
 
 @dataclass(frozen=True)
@@ -123,6 +128,7 @@ def read_any_responses(
 ) -> Responses:
     """Read the export of our experiment (one file), or raw files of the original study.
 
+    Answers to the lab's own questions are read from `responses.QUESTIONS_FILE` next to it.
     The study's files are recognised by their column ``gameID``; all of their participants are
     people. ``participants``: whose sessions to keep. Raises `BadInputError`.
     """
@@ -137,14 +143,39 @@ def read_any_responses(
         return read_official_responses(files)
     if len(files) != 1:
         raise BadInputError("give one file of responses, or raw files of the original study")
-    return read_responses(files[0], sessions, participants=participants)
+    return with_own_questions(
+        read_responses(files[0], sessions, participants=participants), files[0]
+    )
 
 
-def rules_called(name: str) -> ExclusionRules:
-    """Return the rules of this name; raise `UnknownNameError` with the closest ones."""
+STUDY_FILE = "study.json"
+"""File with the versions of a study, in the folder of its exported responses."""
+
+
+def rules_called(name: str | None, responses: Sequence[Path] = ()) -> ExclusionRules:
+    """Return the rules of this name; raise `UnknownNameError` with the closest ones.
+
+    None: the rules of the study whose export the responses are, else `PREREGISTERED`.
+    """
+    if name is None:
+        name = _rules_of_study(responses) or PREREGISTERED.name
     if name not in RULE_SETS:
         raise UnknownNameError("set of exclusion rules", name, RULE_SETS)
     return RULE_SETS[name]
+
+
+def _rules_of_study(responses: Sequence[Path]) -> str | None:
+    """Return the rules in the latest settings of an exported study; None without the file."""
+    path = next(
+        (p.parent / STUDY_FILE for p in responses if (p.parent / STUDY_FILE).exists()), None
+    )
+    if path is None:
+        return None
+    content = parse_json(read_plain(path, _MAX_BYTES).decode(errors="replace"), str(path))
+    states = content.get("states") if isinstance(content, dict) else None
+    latest = states[-1] if isinstance(states, list) and states else {}
+    settings = latest.get("settings") if isinstance(latest, dict) else None
+    return settings.get("exclusions") if isinstance(settings, dict) else None
 
 
 def read_attributes(path: Path) -> pd.DataFrame:
@@ -218,8 +249,8 @@ def analyse_people(
     tables["yes_bias"] = yes_bias(kept.test, draws)
     tables["side_bias"] = side_bias(kept.test, draws)
     tables["learning"] = learning(kept.test)
-    tables["background"] = background(kept.sessions)
-    tables["background_tests"] = accuracy_by_background(kept.test, kept.sessions)
+    tables["background"] = background(kept.sessions, kept.own)
+    tables["background_tests"] = accuracy_by_background(kept.test, kept.sessions, kept.own)
     tables["attributes"] = _attributes(tables["by_stimulus"]["stimulus"], attributes)
     stimuli_with_attributes = with_attributes(tables["by_stimulus"], tables["attributes"])
     tables["hypotheses"] = regress_hypotheses(stimuli_with_attributes)

@@ -10,6 +10,8 @@
 
 `physion experiment export DIR`: export the answers for the analysis, with a data dictionary.
 
+`physion experiment describe DIR`: write its preregistration and a figure of its trials.
+
 `physion experiment backup DIR`: copy the database, settings and texts while the study is served.
 
 `physion experiment forget DIR`: delete recruiters' ids, or all data of a session.
@@ -35,6 +37,7 @@ SUBVERBS = {
     "export": "physion.cli.experiment.export",
     "simulate": "physion.cli.experiment.simulate",
     "links": "physion.cli.experiment.links",
+    "describe": "physion.cli.experiment.describe",
     "backup": "physion.cli.experiment.backup",
     "forget": "physion.cli.experiment.forget",
     "power": "physion.cli.experiment.power",
@@ -49,7 +52,7 @@ class Options:
     """Options of ``physion experiment`` without a sub-verb."""
 
     words: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """One of init, serve, links, simulate, export, backup, forget, power."""
+    """One of init, serve, links, simulate, export, describe, backup, forget, power."""
 
 
 def main(options: Options) -> int:

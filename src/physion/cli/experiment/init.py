@@ -53,6 +53,11 @@ class Options:
     whole lists."""
     practice: int = 10
     """Familiarization trials drawn from a dataset, half with contact."""
+    preset: Literal["recommended", "paper"] = "recommended"
+    """Settings to begin with: "recommended", or as in the study of the "paper": no breaks, 4 USD
+    for 20 minutes, only preregistered exclusions, a question of mental rotation at the end."""
+    mental_rotation: bool = False
+    """Ask the question of mental rotation also without the preset of the paper."""
     look: Literal["free", "redyellow"] = "free"
     """Colours of trials from a dataset; free in the official study."""
     name: str | None = None
@@ -81,6 +86,7 @@ def main(options: Options) -> int:
 
     require_extra()
     from physion.cli.output import Stages
+    from physion.experiment.export.documents import write_documents
     from physion.experiment.study.identity import read_password
     from physion.experiment.study.make import make_study
 
@@ -97,6 +103,7 @@ def main(options: Options) -> int:
         study = make_study(
             _study(options, chosen.scenarios), chosen.sources, password, progress=stages
         )
+        write_documents(study)
     _print(options, study, chosen, password if file is None else None)
     return 0
 
@@ -199,8 +206,12 @@ def _choose_listed(options: Options) -> StimulusSelection:
 
 def _study(options: Options, scenarios: tuple[str, ...]) -> Study:
     """Return the settings of the new study."""
+    from physion.experiment.study.preset import MENTAL_ROTATION, PAPER
     from physion.experiment.study.study import Study
 
+    chosen = dict(PAPER) if options.preset == "paper" else {}
+    if options.mental_rotation:
+        chosen["questions"] = (MENTAL_ROTATION,)
     return Study(
         folder=options.folder,
         name=options.name or options.folder.resolve().name,
@@ -211,6 +222,7 @@ def _study(options: Options, scenarios: tuple[str, ...]) -> Study:
         languages=options.languages,
         participants=options.participants,
         seed=options.seed,
+        **chosen,
     )
 
 
@@ -238,6 +250,7 @@ def _print(options: Options, study: Study, chosen: StimulusSelection, password: 
     lines = [f"study: {study.folder}"]
     if password is not None:
         lines.append(f"password of the experimenter's pages, shown only now: {password}")
+    lines.append("its preregistration and a figure of its trials: preregistration.md, trial.svg")
     lines.append("next: set the title in study.toml, edit texts/ (the consent!), then run")
     lines.append(f"  physion experiment serve {study.folder}")
     for line in lines:

@@ -30,7 +30,7 @@ from starlette.responses import FileResponse, RedirectResponse, Response
 from physion.core.errors import BadInputError, PhysionError
 from physion.core.html import environment
 from physion.experiment.experimenter.access import HEADERS, PATH, Access, read_form
-from physion.experiment.experimenter.payments import payment_csv, read_payments
+from physion.experiment.experimenter.payments import measured_wage, payment_csv, read_payments
 from physion.experiment.experimenter.progress import (
     ALARM_ENTRIES,
     KINDS,
@@ -299,7 +299,8 @@ class _Pages:
         return self._render(
             "payments.html", here="payments", payments=payments, stored=stored,
             finished=finished, message=message, ids=list(dict.fromkeys(p.raw_id for p in payable)),
-            bonus=bool(self._study.bonus.per_correct),
+            bonus=bool(self._study.bonus.per_correct), rule=self._study.payment,
+            wage=measured_wage(self._study.payment, lines),
         )  # fmt: skip
 
     async def payments_csv(self, request: Request) -> Response:

@@ -8,6 +8,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from statistics import median
 
 from sqlalchemy import Engine, func, select
 
@@ -16,12 +17,12 @@ from physion.experiment.export.descriptions import guard_cell
 from physion.experiment.store.database import RAW_IDS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import completion
-from physion.experiment.study.settings import Bonus
+from physion.experiment.study.settings import Bonus, PaymentRule
 from physion.experiment.study.study import Study
 
 COLUMNS = (
     "source", "id", "reference", "scenario", "state", "finished_at", "test_trials", "correct",
-    "accuracy", "flags", "bonus", "completion_code", "recruiter",
+    "accuracy", "flags", "payment", "bonus", "completion_code", "recruiter",
 )  # fmt: skip
 
 
@@ -38,14 +39,15 @@ class Payment:
         Id at the recruiter, and further parameters of the entry URL.
     code
         Completion code of a finished session.
-    bonus
-        In the lab's currency.
+    amount, bonus
+        In the lab's currency: what everyone who finishes receives, and what right answers add.
     """
 
     line: SessionLine
     raw_id: str
     recruiter: Mapping[str, str]
     code: str | None
+    amount: float
     bonus: float
 
 
@@ -66,7 +68,9 @@ def read_payments(
         if raw is None or (finished and not done):
             continue
         code = completion(study, secrets, line.row, raw).code if done else None
-        payments.append(Payment(line, raw.raw_id, raw.recruiter, code, bonus_of(study.bonus, line)))
+        amount = study.payment.amount if line.state == "finished" else 0.0
+        bonus = bonus_of(study.bonus, line)
+        payments.append(Payment(line, raw.raw_id, raw.recruiter, code, amount, bonus))
     return payments, stored
 
 
@@ -81,6 +85,26 @@ def bonus_of(rule: Bonus, line: SessionLine) -> float:
     counted = max(0.0, line.correct - rule.above * line.trials)
     amount = rule.per_correct * counted
     return round(min(amount, rule.most) if rule.most else amount, 2)
+
+
+@dataclass(frozen=True)
+class Wage:
+    """What the payment is per hour, at the median duration of the finished sessions."""
+
+    sessions: int
+    minutes: float
+    per_hour: float
+    enough: bool
+
+
+def measured_wage(rule: PaymentRule, lines: Sequence[SessionLine]) -> Wage | None:
+    """Return the measured wage without bonus; None without payment or finished sessions."""
+    lasted = [line.minutes for line in lines if line.counts]
+    if not (rule.amount and lasted):
+        return None
+    middle = median(lasted)
+    hourly = 60 * rule.amount / middle if middle else float("inf")
+    return Wage(len(lasted), middle, hourly, hourly >= rule.least_per_hour)
 
 
 def payment_csv(payments: Sequence[Payment]) -> bytes:
@@ -104,6 +128,7 @@ def payment_csv(payments: Sequence[Payment]) -> bytes:
             str(line.correct),
             "" if line.accuracy is None else f"{line.accuracy:.4f}",
             " ".join(line.flags),
+            f"{payment.amount:.2f}",
             f"{payment.bonus:.2f}",
             payment.code or "",
             json.dumps(dict(payment.recruiter), ensure_ascii=False) if payment.recruiter else "",

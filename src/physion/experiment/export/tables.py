@@ -128,7 +128,13 @@ def _columns(question: Question, texts: Mapping[str, str]) -> list[Column]:
         case "choice":
             named = "; ".join(f"{option}: {label}" for option, label in labels.items())
             about = f"{words} ({named})"
-            return [Column(question.name, "choice", about, choices=question.options)]
+            found = [Column(question.name, "choice", about, choices=question.options)]
+            if question.right:
+                correct = (
+                    f"Was the answer to this question {question.right}, which is right? {words}"
+                )
+                found.append(Column(f"{question.name}_right", "flag", correct))
+            return found
     names = zip(columns_of(question), labels.values(), strict=True)
     return [Column(name, "flag", f"{words} Was chosen: {label}") for name, label in names]
 
@@ -157,7 +163,9 @@ def _cells(question: Question, answers: Mapping[str, Any]) -> dict[str, Any]:
     """Return the cells of one question by column; None where it was not asked or not answered."""
     answer = answers.get(question.name)
     if question.kind != "choices":
-        return {question.name: answer}
+        right = None if answer is None else answer == question.right
+        given = {question.name: answer}
+        return given | ({f"{question.name}_right": right} if question.right else {})
     names = zip(columns_of(question), question.options, strict=True)
     return {name: None if answer is None else option in answer for name, option in names}
 

@@ -20,11 +20,8 @@ export function consentPage(context) {
   const { texts, study, state } = context;
   const { t } = bound(texts);
   const { familiarization, test } = state.trials;
-  const values = {
-    trials: familiarization + test,
-    minutes: minutes(study, familiarization, test),
-    contact: study.contact,
-  };
+  const lasting = study.expected_minutes || minutes(study, familiarization, test);
+  const values = { trials: familiarization + test, minutes: lasting, contact: study.contact };
   return (page, done, signal) => {
     const boxes = consentBoxes(texts);
     const decline = async () => {
@@ -34,6 +31,7 @@ export function consentPage(context) {
     page.append(
       el("h1", {}, t("consent.title")),
       ...paragraphs(t("consent.text", values)),
+      ...payment(study, texts, lasting),
       ...consentFile(study, texts),
       ...boxes.elements,
       el("p", { class: "small" }, t("consent.version", { version: study.consent_version })),
@@ -45,6 +43,23 @@ export function consentPage(context) {
       ),
     );
   };
+}
+
+/** Return the paragraph about the payment, with the wage per hour; nothing without payment. */
+function payment({ payment: paid }, texts, lasting) {
+  if (!paid) return [];
+  const amount = money(paid.amount, paid.currency, texts.language);
+  const hourly = money((60 * paid.amount) / lasting, paid.currency, texts.language);
+  return paragraphs(texts.t("consent.payment", { amount, hourly, minutes: lasting }));
+}
+
+/** Format an amount in a language; the currency is a code such as USD, or words. */
+function money(amount, currency, language) {
+  const digits = { minimumFractionDigits: amount % 1 ? 2 : 0, maximumFractionDigits: 2 };
+  if (!/^[A-Z]{3}$/.test(currency)) {
+    return `${new Intl.NumberFormat(language, digits).format(amount)} ${currency}`;
+  }
+  return new Intl.NumberFormat(language, { style: "currency", currency }).format(amount);
 }
 
 /** Return the link to the consent form as a file, if the study has one in this language. */

@@ -297,7 +297,18 @@ export function questionPage({ texts, study }) {
  * @param {(key: string, values?: Record<string, any>) => string} t
  * @returns {Field}
  */
-function fieldOf({ name, kind, required, options, steps }, t) {
+function fieldOf(question, t) {
+  const made = controlOf(question, t);
+  const { name, picture } = question;
+  if (!picture) return made;
+  const image = { src: `/picture/${encodeURIComponent(picture)}`, alt: t(`question.${name}.alt`) };
+  // A fieldset has its question as legend, a text its label.
+  made.element.querySelector("legend, label").after(el("img", { class: "question-picture", ...image }));
+  return made;
+}
+
+/** Create the control of a question. @returns {Field} */
+function controlOf({ name, kind, required, options, steps }, t) {
   const own = (key) => t(`question.${name}.${key}`);
   const words = required ? own("text") : `${own("text")} ${t("questions.optional")}`;
   const needed = required ? t("common.required") : null;

@@ -167,6 +167,12 @@ export interface AskedQuestion {
   required: boolean;
   options: string[];
   steps: number;
+  picture: string;
+}
+
+export interface PaidAmount {
+  amount: number;
+  currency: string;
 }
 
 export interface CheckedQuestion {
@@ -180,6 +186,8 @@ export interface PublicStudy {
   languages: string[];
   consent_version: string;
   consent_files: string[];
+  payment: PaidAmount | null;
+  expected_minutes: number;
   scenarios: string[];
   id_needed: boolean;
   min_width: number;

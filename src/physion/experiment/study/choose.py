@@ -7,7 +7,7 @@ order of the familiarization trials is fixed here and the same for all participa
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -39,12 +39,16 @@ from physion.scenes.tdw.read_logs import ImportedTrial
 from physion.trials.dataset import Dataset
 from physion.trials.files import TrialPaths
 from physion.trials.making.plan import TrialTask, check_names, plan_scenes
+from physion.trials.state import outside_picture
+from physion.trials.unusable import read_unusable
 
 Look = Literal["free", "redyellow"]
 SPLITS = {"familiarization": "familiarization", "test": "testing"}
 """Split of the dataset from which the trials of each phase are drawn."""
 TEST, PRACTICE = 150, 10
 """Test and familiarization trials per session, as in the official study."""
+NAMED = 5
+"""Largest number of trials that a note names."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +95,7 @@ def choose_trials(
         A scenario has no trial with (or without) contact, or trials have no movies in this look.
     """
     opened = Dataset(dataset)
+    unusable = read_unusable(opened)
     tested = set(opened.index["scenario"][opened.index["split"] == SPLITS["test"]])
     if not tested:
         raise BadInputError(f"{dataset} has no testing trials; physion generate makes them")
@@ -101,9 +106,9 @@ def choose_trials(
     sources, notes = [], []
     for name in scenarios or in_paper_order(tested):
         for phase, count in counts.items():
-            rows, note = _draw(opened, name, phase, count, seed)
+            rows, more = _draw(opened, name, phase, count, seed, unusable)
             sources += [_source(opened, row, phase, i, look) for i, row in enumerate(rows)]
-            notes += [note] if note else []
+            notes += more
     return StimulusSelection(tuple(sources), tuple(notes))
 
 
@@ -112,9 +117,9 @@ def choose_familiarization(
 ) -> StimulusSelection:
     """Select the familiarization trials of one scenario only, as `choose_trials` does."""
     opened = Dataset(dataset)
-    rows, note = _draw(opened, scenario, "familiarization", count, seed)
+    rows, notes = _draw(opened, scenario, "familiarization", count, seed, read_unusable(opened))
     sources = [_source(opened, row, "familiarization", i, look) for i, row in enumerate(rows)]
-    return StimulusSelection(tuple(sources), (note,) if note else ())
+    return StimulusSelection(tuple(sources), tuple(notes))
 
 
 def in_paper_order(scenarios: set[str]) -> Iterator[str]:
@@ -132,20 +137,27 @@ def check_even(count: int, option: str) -> None:
 
 
 def _draw(
-    dataset: Dataset, scenario: str, phase: str, count: int, seed: int
-) -> tuple[list[dict[str, Any]], str]:
+    dataset: Dataset,
+    scenario: str,
+    phase: str,
+    count: int,
+    seed: int,
+    unusable: Mapping[str, str],
+) -> tuple[list[dict[str, Any]], list[str]]:
     """Draw ``count`` rows of the index, half of them with contact, in random order.
 
-    Returns the rows, and a note (else an empty text) if fewer trials were available.
+    Returns the rows, and notes: on trials that were replaced because someone marked them as
+    unusable, on fewer trials than wanted, and on objects beyond the edges of the picture.
     """
     check_even(count, "--test" if phase == "test" else "--practice")
     split = SPLITS[phase]
     table = dataset.index
     table = table[(table["split"] == split) & (table["scenario"] == scenario)]
     by_label = [table[table["contact"] == contact] for contact in (True, False)]
-    half = min(count // 2, *map(len, by_label))
+    usable = [int((~rows["trial"].isin(unusable)).sum()) for rows in by_label]
+    half = min(count // 2, *usable)
     if half == 0:
-        lacking = "with" if len(by_label[0]) == 0 else "without"
+        lacking = "with" if usable[0] == 0 else "without"
         imported = dataset.index["recorded_contact"].notna().any()
         advice = (
             "for official scenes give --scenes official in place of --trials"
@@ -154,27 +166,81 @@ def _draw(
             f"--split {split} --count {count}"
         )
         raise BadInputError(
-            f"{dataset.folder} has no {split} trial of {scenario} {lacking} contact; {advice}"
+            f"{dataset.folder} has no {split} trial of {scenario} {lacking} contact"
+            f"{' that is usable' if unusable else ''}; {advice}"
         )
     # Separate random streams for trials with and without contact: adding trials with one label
     # does not change which trials with the other label are drawn.
-    chosen = pd.concat([_sample(group, half, scenario, phase, seed) for group in by_label])
+    notes: list[str] = []
+    chosen = pd.concat(
+        [_sample(group, half, scenario, phase, seed, unusable, notes) for group in by_label]
+    )
     rng = generator("study places", seed, scenario, phase)
     rows = chosen.iloc[rng.permutation(len(chosen))].to_dict("records")
-    note = ""
     if 2 * half < count:
-        note = (
+        notes.append(
             f"{scenario}: {2 * half} {split} trials instead of {count}, since half must have "
             "contact and no more are available"
         )
-    return rows, note
+    return rows, notes + _beyond_the_picture(dataset, scenario, split, rows)
 
 
-def _sample(group: pd.DataFrame, half: int, scenario: str, phase: str, seed: int) -> pd.DataFrame:
-    """Draw ``half`` rows of a table whose rows all have the same contact label."""
+def _sample(
+    group: pd.DataFrame,
+    half: int,
+    scenario: str,
+    phase: str,
+    seed: int,
+    unusable: Mapping[str, str],
+    notes: list[str],
+) -> pd.DataFrame:
+    """Draw ``half`` rows of a table whose rows all have the same contact label.
+
+    In place of an unusable one comes the next in the order of the draw of the same preset or, if
+    there is none, of any preset, so that the other trials stay. ``notes`` get what was replaced.
+    """
     contact = str(bool(group["contact"].iloc[0]))
     rng = generator("study trials", seed, scenario, phase, contact)
-    return group.iloc[rng.permutation(len(group))[:half]]
+    order = group.iloc[rng.permutation(len(group))]
+    bad = order["trial"].isin(unusable).to_numpy()
+    presets = order["preset"].fillna("").astype(str).to_list()
+    names = order["trial"].to_list()
+    spare = [place for place in range(half, len(order)) if not bad[place]]
+    places = []
+    for place in range(half):
+        if bad[place]:
+            same = [other for other in spare if presets[other] == presets[place]]
+            new = (same or spare)[0]
+            spare.remove(new)
+            other = "" if same else f" (of preset {presets[new]}, as {presets[place]} has no more)"
+            reason = unusable[names[place]]
+            notes.append(f"{names[place]} is unusable ({reason}); {names[new]} replaces it{other}")
+            place = new
+        places.append(place)
+    return order.iloc[places]
+
+
+def _beyond_the_picture(
+    dataset: Dataset, scenario: str, split: str, rows: Sequence[Mapping[str, Any]]
+) -> list[str]:
+    """Return a note on trials with an object that is more outside the picture than in it."""
+    found = []
+    names = [str(row["trial"]) for row in rows]
+    for name in names:
+        if not dataset.paths(name).trial_file.is_file():
+            continue  # only its movies are there
+        outside = outside_picture(dataset.trial(name))
+        things = [thing for thing, fraction in outside.items() if fraction > 0.5]
+        if things:
+            found.append(f"{name} ({', '.join(things)})")
+    if not found:
+        return []
+    more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
+    return [
+        f"{scenario}: in {len(found)} {split} trials an object begins mostly outside the picture: "
+        f"{', '.join(found[:NAMED])}{more}; look at them (physion view {dataset.folder}), and mark "
+        "unusable ones there or with --mark TRIAL=REASON"
+    ]
 
 
 def _source(

@@ -21,6 +21,7 @@ from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError
 from physion.core.files import digest_of, new_folder, read_plain, write_atomic
 from physion.experiment.study.identity import Secrets
+from physion.experiment.study.preset import SHIPPED
 from physion.experiment.study.settings import format_settings
 from physion.experiment.study.stimuli import (
     MAX_SIDE,
@@ -31,7 +32,7 @@ from physion.experiment.study.stimuli import (
     write_stimuli,
 )
 from physion.experiment.study.study import STUDY_FILE, Study, load_study, write_settings
-from physion.experiment.study.texts import TEXTS_FOLDER, shipped_file
+from physion.experiment.study.texts import TEXTS_FOLDER, shipped_file, shipped_question
 from physion.scenes.scene import OBSERVED_FRAMES
 from physion.trials.files import encode_png
 from physion.trials.official.movies import SourceMovie
@@ -289,7 +290,7 @@ def make_study(
     check_sources(sources)
     check_distinct_names(((s.scenario, s.stimulus) for s in sources), study.folder / STIMULI_FILE)
     format_settings(study, study.folder / STUDY_FILE)
-    texts = {language: shipped_file(language) for language in study.languages}
+    texts = {language: _texts(study, language) for language in study.languages}
     _check_folder(study.folder)
     with new_folder(study.folder) as part:
         for name in (MEDIA_FOLDER, TEXTS_FOLDER):
@@ -298,10 +299,21 @@ def make_study(
         write_stimuli(part / STIMULI_FILE, list(tracked(rows, "movies", len(sources), progress)))
         for language, content in texts.items():
             write_atomic(part / TEXTS_FOLDER / f"{language}.toml", content)
+        for question in study.questions:
+            if question.name in SHIPPED:
+                picture = shipped_question(question.name, question.picture)
+                write_atomic(part / TEXTS_FOLDER / question.picture, picture)
         write_settings(replace(study, folder=part))
         Secrets.create(part, password)
         made = load_study(part)
     return replace(made, folder=study.folder)
+
+
+def _texts(study: Study, language: str) -> bytes:
+    """Return the text file of a language, with the texts of questions that ship."""
+    named = [question.name for question in study.questions if question.name in SHIPPED]
+    own = [shipped_question(name, f"{language}.toml") for name in named]
+    return b"\n".join([shipped_file(language), *own])
 
 
 def check_sources(sources: Sequence[StimulusSource]) -> None:

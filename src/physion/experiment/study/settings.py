@@ -124,6 +124,10 @@ Code = Annotated[
 Pattern = Annotated[
     str, StringConstraints(max_length=500), AfterValidator(_one_line), AfterValidator(_is_pattern)
 ]
+Picture = Annotated[
+    str,
+    _matching(r"|[A-Za-z0-9][A-Za-z0-9_-]{0,99}\.png", "empty or the name of a PNG, such as a.png"),
+]
 Address = Annotated[str, StringConstraints(max_length=1000), _address()]
 Word = Annotated[
     str, _matching("[a-z][a-z0-9_]{0,39}", "a word of small letters, digits and _, at most 40")
@@ -297,6 +301,29 @@ class EarlyEnd:
 
 
 @dataclass(frozen=True)
+class PaymentRule:
+    """What everyone who finishes receives; the consent says it."""
+
+    amount: Annotated[float, Field(ge=0, le=1_000_000)] = 0.0
+    """Amount; 0: the consent does not speak of payment."""
+    currency: Annotated[
+        str, StringConstraints(min_length=1, max_length=40), AfterValidator(_one_line)
+    ] = "USD"
+    """Currency, by its code such as USD or EUR; or in words, such as credit points."""
+    minutes: Annotated[int, Field(ge=0, le=10_000)] = 0
+    """Expected duration in minutes, which the consent says in place of an estimate; 0: estimate.
+    An amount needs it."""
+    least_per_hour: Annotated[float, Field(ge=0, le=1_000_000)] = 0.0
+    """Smallest wage per hour; a study whose amount for the expected minutes is less is refused. 0:
+    no check."""
+
+    @property
+    def per_hour(self) -> float | None:
+        """The wage per hour at the expected duration; None without amount or duration."""
+        return 60 * self.amount / self.minutes if self.amount and self.minutes else None
+
+
+@dataclass(frozen=True)
 class Bonus:
     """Bonus in the table of payments, for finished sessions."""
 
@@ -325,11 +352,18 @@ class Question:
     """Names of the options of a choice, such as ["never", "often"]."""
     steps: Annotated[int, Field(ge=2, le=11)] = 7
     """Steps of a scale, 2 to 11."""
+    picture: Picture = ""
+    """Name of a PNG in texts/ that is shown with the question; its description, for people who
+    cannot see it, is the text alt."""
+    right: Annotated[str, _matching("|[a-z][a-z0-9_]{0,39}", "empty or an option")] = ""
+    """For a "choice" with one right answer: that option, which is never sent to the browser. The
+    data say who was right in a second column, with _right after the name."""
 
     @property
     def text_keys(self) -> tuple[str, ...]:
         """Keys of its texts."""
-        ends = ("low", "high") if self.kind == "scale" else ()
+        ends = ["low", "high"] if self.kind == "scale" else []
+        ends += ["alt"] if self.picture else []
         options = (f"options.{option}" for option in self.options)
         return tuple(f"question.{self.name}.{key}" for key in ("text", *ends, *options))
 
@@ -413,8 +447,10 @@ class StudySettings:
     orders: Count = 0
     """0: an individual trial order for each participant; otherwise the number of prepared orders,
     used least often first (125 in the official study)."""
-    exclusions: Literal["preregistered", "official-code"] = "preregistered"
-    """Rules by which sessions are flagged: preregistered, official-code."""
+    exclusions: Literal["preregistered", "preregistered-only", "official-code"] = "preregistered"
+    """Rules by which sessions are flagged: "preregistered" (also sessions that the server found
+    implausible, replayed, or failing checks), "preregistered-only" (without these), or
+    "official-code"."""
     percentile_from: Annotated[int, Field(ge=1, le=1_000_000)] = 10
     """Number of other finished participants needed before a percentile is shown."""
     preload: Annotated[int, Field(ge=1, le=1000)] = 8
@@ -444,6 +480,7 @@ class StudySettings:
     """For participants whose device or browser cannot show the movies."""
     full: EarlyEnd = EarlyEnd()
     """For participants who come when the study is full."""
+    payment: PaymentRule = PaymentRule()
     bonus: Bonus = Bonus()
     comprehension_questions: Annotated[tuple[ComprehensionQuestion, ...], Field(max_length=50)] = ()
     """Questions about the instructions: one table [[comprehension_questions]] for each, with the
@@ -491,12 +528,16 @@ RESERVED = ("participant", "participant_id", "session", "session_id", "scenario"
 
 def _faults(settings: StudySettings) -> Iterator[str]:
     """Yield what does not fit together in settings whose values are allowed one by one."""
+    yield from _payment_faults(settings.payment)
     taken: set[str] = set(RESERVED)
     for question in settings.questions:
         name, chosen = question.name, question.kind in ("choice", "choices")
         if chosen and len(question.options) < 2:
             yield (f"the question {name} needs options, at least two, as it is of the kind "
                    f"{question.kind}")  # fmt: skip
+        if question.right and (question.kind != "choice" or question.right not in question.options):
+            yield (f"the question {name} has the right answer {question.right}, which is no option "
+                   "of it as a choice")  # fmt: skip
         if not chosen and question.options:
             yield (f"the question {name} has options; only choice and choices have some, not "
                    f"{question.kind}")  # fmt: skip
@@ -524,6 +565,16 @@ def _faults(settings: StudySettings) -> Iterator[str]:
             if scenario not in settings.scenarios:
                 yield (f"the condition {condition.name} has the scenario {scenario}, which is not "
                        "in scenarios")  # fmt: skip
+
+
+def _payment_faults(payment: PaymentRule) -> Iterator[str]:
+    """Yield what does not fit together in the payment."""
+    if (payment.amount or payment.least_per_hour) and not payment.minutes:
+        yield "payment.amount needs payment.minutes, the time that it is for"
+    elif (payment.per_hour or 0) < payment.least_per_hour:
+        yield (f"payment.amount is {payment.amount:g} {payment.currency} for {payment.minutes} "
+               f"minutes, {payment.per_hour or 0:.2f} per hour: less than payment.least_per_hour, "
+               f"{payment.least_per_hour:g}")  # fmt: skip
 
 
 # --- writing and describing ----------------------------------------------------------------------
@@ -663,9 +714,10 @@ Answer = str | int | list[str] | None
 
 
 def columns_of(question: Question) -> tuple[str, ...]:
-    """Return the columns of a question in the exported data: of ``choices``, one per option."""
+    """Return the columns of a question in the exported data: of ``choices``, one per option; one
+    more if it has a right answer."""
     if question.kind != "choices":
-        return (question.name,)
+        return (question.name, *((f"{question.name}_right",) if question.right else ()))
     return tuple(f"{question.name}_{option}" for option in question.options)
 
 

@@ -33,7 +33,13 @@ from physion.experiment.study.settings import (
     parse_settings,
 )
 from physion.experiment.study.stimuli import PHASES, STIMULI_FILE, Stimulus, read_stimuli
-from physion.experiment.study.texts import TEXTS_FOLDER, parse_bytes, read_consent_file, read_texts
+from physion.experiment.study.texts import (
+    TEXTS_FOLDER,
+    parse_bytes,
+    read_consent_file,
+    read_picture,
+    read_texts,
+)
 
 STUDY_FILE = "study.toml"
 MAX_BYTES = 1_000_000
@@ -120,6 +126,8 @@ def load_study(folder: Path | str) -> Study:
         if consent is not None:
             files[language] = digest_of(consent)
             written.append(consent)
+    pictures = dict.fromkeys(question.picture for question in study.questions if question.picture)
+    written += [read_picture(folder / TEXTS_FOLDER, name) for name in pictures]
     allow_list = study.recruitment.allow_list
     listed = folder / STIMULI_FILE
     check_plain(listed)

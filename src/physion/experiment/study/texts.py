@@ -9,7 +9,8 @@ Some texts may be absent: ``study.title``, in place of the title of ``study.toml
 ``scenario.NAME.KEY`` and ``condition.NAME.KEY``, in place of the text ``KEY`` in the sessions of
 one scenario or condition (the condition comes first). The texts of
 a study's own questions (`questions.Question.text_keys`) are needed in each language. A file
-``consent-LANGUAGE.pdf`` next to the texts is the consent form as a file.
+``consent-LANGUAGE.pdf`` next to the texts is the consent form as a file; pictures of questions are
+PNG files there.
 """
 
 from __future__ import annotations
@@ -105,6 +106,14 @@ def read_consent_file(folder: Path, language: str) -> bytes | None:
     return content
 
 
+def read_picture(folder: Path, name: str) -> bytes:
+    """Return the picture of a question; `BadInputError` if it is missing, a link, or no PNG."""
+    content = read_plain(folder / name, MAX_FILE)
+    if not content.startswith(b"\x89PNG\r\n\x1a\n"):
+        raise BadInputError(f"{folder / name} is no PNG file; replace it")
+    return content
+
+
 def _general_key(key: str, special: Sequence[str]) -> str:
     """Return the key of the text that ``key`` replaces in a scenario or condition, or ``key``.
 
@@ -128,6 +137,12 @@ def shipped_file(language: str) -> bytes:
         raise UnknownNameError("language", language, shipped_languages())
     folder = resources.files("physion.experiment").joinpath(TEXTS_FOLDER)
     return folder.joinpath(f"{language}.toml").read_bytes()
+
+
+def shipped_question(name: str, file: str) -> bytes:
+    """Return a file of a question that ships with the package: its picture, or its texts."""
+    folder = resources.files("physion.experiment").joinpath("questions", name)
+    return folder.joinpath(file).read_bytes()
 
 
 @cache

@@ -23,6 +23,7 @@ from physion.experiment.protocol import (
     Health,
     Message,
     PageDone,
+    PaidAmount,
     PublicStudy,
     Refused,
     Showing,
@@ -36,7 +37,7 @@ from physion.experiment.web.guards import MESSAGES, Reply, describe_faults, refu
 if TYPE_CHECKING:
     from physion.experiment.store.store import Store
     from physion.experiment.study.identity import Secrets
-    from physion.experiment.study.settings import Question
+    from physion.experiment.study.settings import PaymentRule, Question
     from physion.experiment.study.study import Study
 
 
@@ -95,6 +96,8 @@ def public_study(study: Study, secrets: Secrets) -> PublicStudy:
         languages=list(study.languages),
         consent_version=study.consent_version,
         consent_files=sorted(study.consent_files),
+        payment=_paid(study.payment),
+        expected_minutes=study.payment.minutes,
         scenarios=list(study.scenarios),
         id_needed=study.recruitment.id_needed,
         min_width=study.screen.min_width,
@@ -122,9 +125,17 @@ def public_study(study: Study, secrets: Secrets) -> PublicStudy:
     )
 
 
+def _paid(payment: PaymentRule) -> PaidAmount | None:
+    """Return what the consent says of the payment; None if it says nothing."""
+    if not payment.amount:
+        return None
+    return PaidAmount(amount=payment.amount, currency=payment.currency)
+
+
 def _asked(question: Question) -> AskedQuestion:
     """Return what the page needs to ask a question of the lab."""
     values = {**vars(question), "options": list(question.options)}
+    del values["right"]
     return AskedQuestion.model_validate(values)
 
 

@@ -32,6 +32,7 @@ from physion.report.viewer.imagined import pack_imagined
 from physion.trials.dataset import Dataset
 from physion.trials.share.gltf import motion_gltf
 from physion.trials.trial_file import Trial
+from physion.trials.unusable import read_unusable
 
 SCRIPTS = ("scene", "pictures", "detail", "page")
 """Parts of the script; the last one starts it."""
@@ -48,14 +49,24 @@ class TrialData:
     detail: Mapping[str, Any]
 
 
-def render_viewer(title: str, trials: Sequence[TrialData], totals: Mapping[str, int]) -> str:
-    """Return the page as text; ``totals``: trials of each scenario."""
+def render_viewer(
+    title: str,
+    trials: Sequence[TrialData],
+    totals: Mapping[str, int],
+    unusable: Mapping[str, str] | None = None,
+) -> str:
+    """Return the page as text.
+
+    - ``trials``, ``totals``: trials of the page, and the dataset's number by scenario.
+    - ``unusable``: all trials of the dataset that are marked so, with reasons.
+    """
     detailed = any("gltf" in trial.detail for trial in trials)
     look = Markup("\n") + style() + Markup(_part("templates", "viewer.css"))
     # The library is needed only where a trial has a scene in 3D.
     scripts = [_part("viewer", "vendor", "three.min.js")] if detailed else []
     scripts.append(_script())
     blocks = [("cards", [trial.card for trial in trials]), ("totals", totals)]
+    blocks.append(("unusable", unusable or {}))
     for number, trial in enumerate(trials):
         blocks += [(f"movie-{number}", trial.movie), (f"detail-{number}", trial.detail)]
     return environment("physion.report").get_template("viewer.html").render(
@@ -174,12 +185,13 @@ def build_viewer(
     rows = [row for _, row in chosen.iterrows()]
     detailed = [str(row["trial"]) for row in rows if row["detailed"]]
     imagined = imagine(detailed) if imagine is not None else {}
+    marks = read_unusable(dataset)
     found = [
-        _trial_data(dataset, row, options, imagined.get(row["trial"], ()))
+        _trial_data(dataset, row, options, imagined.get(row["trial"], ()), marks)
         for row in tracked(rows, "viewing", len(rows), progress)
     ]
     title = ", ".join(sorted(set(dataset.index["dataset"].astype(str)))) or "no trials"
-    page = render_viewer(title, found, totals).encode()
+    page = render_viewer(title, found, totals, marks).encode()
     try:
         write_atomic(out, page)
     except OSError as error:
@@ -216,7 +228,11 @@ def choose_trials(
 
 
 def _trial_data(
-    dataset: Dataset, row: pd.Series, options: ViewerOptions, imagined: Sequence[ImaginedTrial]
+    dataset: Dataset,
+    row: pd.Series,
+    options: ViewerOptions,
+    imagined: Sequence[ImaginedTrial],
+    marks: Mapping[str, str],
 ) -> TrialData:
     """Return the data of one trial."""
     paths = dataset.paths(row["trial"])
@@ -245,7 +261,8 @@ def _trial_data(
         stored.check()
     movie = viewer_movies.small_movie(paths.movie, trial, options.card_size)
     size = {"width": movie.width, "height": movie.height}
-    return TrialData(viewer_facts.card(trial) | size, movie.as_record(), detail)
+    card = viewer_facts.card(trial, marks.get(row["trial"], "")) | size
+    return TrialData(card, movie.as_record(), detail)
 
 
 def _scene(trial: Trial) -> bytes:

@@ -16,6 +16,7 @@ from physion.report.viewer.movies import thing_colors
 from physion.scenes.scene import Scene
 from physion.scenes.shapes.primitives import shape
 from physion.trials.share.gltf import role_of
+from physion.trials.state import outside_picture
 from physion.trials.trial_file import Trial
 
 Table = dict[str, Any]
@@ -39,8 +40,8 @@ _NAMES = {
 _OUTCOME = ("contact", "first_frame", "observed", "min_distance", "robust", "recorded_contact")
 
 
-def card(trial: Trial) -> dict[str, Any]:
-    """Return what the grid shows and filters by."""
+def card(trial: Trial, unusable: str = "") -> dict[str, Any]:
+    """Return what the grid shows and filters by; ``unusable``: why the trial is, if it is."""
     meta, labels = trial.metadata, trial.labels
     robust = labels.robust
     return {
@@ -56,6 +57,8 @@ def card(trial: Trial) -> dict[str, Any]:
         "observedFrames": meta.observed_frames,
         "rate": meta.playback_rate,
         "frameTime": meta.frame_time,
+        "outside": sorted(outside_picture(trial)),
+        "unusable": unusable,
         "searchText": _search_text(trial),
     }
 

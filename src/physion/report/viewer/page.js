@@ -61,6 +61,8 @@ function badges(card) {
   if (card.robust !== null) add(`robust ${card.robust.toFixed(2)}`, "answer");
   add(card.split, "");
   if (card.preset) add(card.preset, "");
+  if (card.outside.length) add(`beyond the picture: ${card.outside.join(", ")}`, "");
+  if (card.unusable) add(`unusable: ${card.unusable}`, "yes");
   return spans;
 }
 
@@ -111,10 +113,11 @@ class Grid {
     video.muted = true;
     Object.assign(video, { width: card.width, height: card.height });
     const badgeRow = createElement("span", { class: "badges" }, ...badges(card));
+    const refresh = () => badgeRow.replaceChildren(...badges(card));
     const button = createElement("button", { type: "button", class: "card" }, video, createElement("b", {}, card.trial), badgeRow);
     button.onclick = () => this.open(number);
     this.observer.observe(video);
-    const item = { card, number, video, button, element: createElement("li", {}, button) };
+    const item = { card, number, video, button, refresh, element: createElement("li", {}, button) };
     video.item = item;
     return item;
   }
@@ -254,6 +257,7 @@ const show = (number) => {
   grid.setCovered(true);
   document.title = `${cards[number].trial} – ${title}`;
   detail.open(number);
+  showMark();
   setHash(`#trial=${encodeURIComponent(cards[number].trial)}`);
 };
 const grid = new Grid(cards, readData("totals"), show);
@@ -266,6 +270,40 @@ const showNeighbour = (by) => {
 };
 byId("next").onclick = () => showNeighbour(1);
 byId("previous").onclick = () => showNeighbour(-1);
+
+// Marks of unusable trials: a page cannot write files, so it offers the file for the dataset's folder.
+const marks = readData("unusable");
+let unsaved = 0;
+
+const showMark = () => {
+  const { trial } = cards[openTrial];
+  byId("reason").value = marks[trial] ?? "";
+  byId("mark").textContent = marks[trial] ? "Change or clear the mark" : "Mark as unusable";
+};
+byId("mark").onclick = () => {
+  const card = cards[openTrial];
+  const reason = byId("reason").value.trim().replace(/\s+/g, " ");
+  if (!reason && !marks[card.trial]) return byId("reason").focus();
+  if (reason) marks[card.trial] = reason;
+  else delete marks[card.trial];
+  card.unusable = reason;
+  unsaved += 1;
+  grid.items[openTrial].refresh();
+  byId("detail-badges").replaceChildren(...badges(card));
+  byId("save-marks").hidden = false;
+  byId("save-marks").textContent = `Save unusable.csv (${Object.keys(marks).length})`;
+  byId("save-marks").title = "Put the file into the folder of the dataset";
+  showMark();
+};
+byId("save-marks").onclick = () => {
+  const quoted = (text) => `"${text.replaceAll('"', '""')}"`;
+  const rows = Object.entries(marks).sort(([a], [b]) => (a < b ? -1 : 1));
+  const lines = ["trial,reason", ...rows.map((row) => row.map(quoted).join(","))];
+  const href = URL.createObjectURL(new Blob([`${lines.join("\n")}\n`], { type: "text/csv" }));
+  createElement("a", { href, download: "unusable.csv" }).click();
+  unsaved = 0;
+};
+addEventListener("beforeunload", (event) => unsaved && event.preventDefault());
 
 byId("labels").onclick = () => {
   const labelsShown = !grid.labelsShown;

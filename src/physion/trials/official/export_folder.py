@@ -12,7 +12,7 @@ A layout says which files a trial has, and where, and which lists a folder has.
         Dominoes/mp4s/<stimulus>_img.mp4        free colours
         Dominoes/mp4s-redyellow/<config>-redyellow_0000_img.mp4
         configurations/Dominoes/<config>/0000.hdf5      as the generator writes a configuration,
-                                        /0000_img.mp4   every split, in the trial's own look
+                                        /0000_img.mp4   every split
                                         /0000_map.png
                                         /metadata.json
                                         /trial_stats.json
@@ -26,16 +26,35 @@ A layout says which files a trial has, and where, and which lists a folder has.
 ``physopt``
     ``physion_data/<part>/Dominoes/<stimulus>.hdf5`` for neuroailab/physopt-physics-benchmarking
     with neuroailab/physics-models; the folder is the ``basedir``. Parts: ``pretraining_train`` and
-    ``pretraining_val`` (a tenth, by the hash of the name) in free colours from the training split,
-    ``readout_train_redyellow`` from readout, ``readout_test_redyellow`` from testing.
+    ``pretraining_val`` (the first trial of each scenario, and a tenth by the hash of the name) in
+    free colours from the training split, ``readout_train_redyellow`` from readout,
+    ``readout_test_redyellow`` from testing.
 
 ``physion-evaluator``
     ``physion_mp4s/train/<name>.mp4`` (readout split) and ``physion_mp4s/test`` (testing split) with
     ``all_video_labels.json``, for neuroailab/physion_evaluator; the folder is its
     ``data_root_path``. Names have the words by which it finds scenarios; it has no Drape.
 
+``mp4s``
+    The study's downloads of movies, for pairlab/SlotFormer and object_centric_bench;
+    the folder is their ``data_root``::
+
+        PhysionTrainMP4s/Dominoes_training_MP4s/<stimulus>_img.mp4      free colours
+                        /Dominoes_readout_MP4s/<stimulus>_img.mp4       red and yellow
+                        /readout_labels.csv                             <stimulus>, True/False
+        PhysionTestMP4s/Dominoes/maps, mp4s, mp4s-redyellow             as in ``official``
+                       /labels.csv
+        splits/Physion/training_train.json, ...     lists of files, which SlotFormer has in its own
+                                                    folder; validation as in ``physopt``
+
+``hdf5s``
+    The study's downloads of HDF5 files: ``Dominoes/hdf5s/<stimulus>.hdf5`` of the testing split,
+    ``Dominoes_training_HDF5s/<stimulus>.hdf5`` and ``Dominoes_readout_HDF5s`` of the others.
+
 A trial called ``dominoes_testing_0007`` is number 0007 of the configuration ``dominoes_testing``.
-Scenario folders are capitalised, as in the published archives.
+Scenario folders are capitalised, as in the published archives. As there, what has no ``-redyellow``
+in its name shows natural colours, except the readout split, which is red and yellow; so are the
+movies of physion_evaluator, which cannot read names with ``-redyellow``.
 """
 
 from __future__ import annotations
@@ -60,7 +79,7 @@ from physion.core.names import FOLDERS, NAMES, canonical_name, scenario_of
 from physion.core.seeds import stable_hash
 from physion.trials.dataset import Dataset
 from physion.trials.files import IndexedFile, Metadata, TrialPaths, encode_png
-from physion.trials.official.names import redyellow_name, split_name
+from physion.trials.official.names import redyellow_name, shown_name, split_name
 from physion.trials.official.read_file import OfficialFile
 from physion.trials.official.write_file import trial_stats
 from physion.trials.trial_file import Trial
@@ -139,6 +158,46 @@ def write_evaluator_labels(out: Path) -> tuple[Path, dict[str, str]]:
     return folder, failed
 
 
+def write_movie_lists(out: Path) -> tuple[Path, dict[str, str]]:
+    """Write the lists of labels of the layout ``mp4s``, and the lists of files for SlotFormer."""
+    failed: dict[str, str] = {}
+    labels: dict[str, list[tuple[str, str]]] = {"readout": [], "testing": []}
+    files: dict[str, dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
+    for path in sorted(out.glob(f"{RECORDS}/*/*/*.json")):
+        stimulus, folder, split = path.stem, path.parent.name, path.parent.parent.name
+        try:
+            label = bool(json.loads(path.read_bytes())["label"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            failed[str(path.relative_to(out))] = f"{error!r}; delete it to make it again"
+            continue
+        if split in labels:
+            labels[split].append((stimulus, str(label)))
+        subset = {"testing": "test"}.get(split, split)
+        part = "test"
+        if split != CORE_SPLIT:
+            first = not files[f"{subset}_val"][folder]
+            part = "val" if _is_held_out(stimulus, first) else "train"
+        files[f"{subset}_{part}"][folder].append(_shown_movie(split, folder, stimulus))
+    head = ("", "ground truth outcome")
+    written = {
+        "PhysionTrainMP4s/readout_labels.csv": labels["readout"],
+        "PhysionTestMP4s/labels.csv": [(f"{name}_img", label) for name, label in labels["testing"]],
+    }
+    contents = {name: _csv([head, *rows]) for name, rows in written.items() if rows}
+    contents |= {f"splits/Physion/{name}.json": _json(found) for name, found in files.items()}
+    for name, content in contents.items():
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(out / name, content)
+    return out, failed
+
+
+def _shown_movie(split: str, folder: str, stimulus: str) -> str:
+    """Return the path of a movie below the folder of the layout ``mp4s``; red-yellow if tested."""
+    if split == CORE_SPLIT:
+        return f"PhysionTestMP4s/{folder}/mp4s-redyellow/{redyellow_name(stimulus)}_img.mp4"
+    return f"PhysionTrainMP4s/{folder}_{split}_MP4s/{stimulus}_img.mp4"
+
+
 def _json(value: Any) -> bytes:
     return (json.dumps(value, indent=4) + "\n").encode()
 
@@ -152,7 +211,9 @@ def _csv(rows: list[Any]) -> bytes:
 CORE_SPLIT = "testing"
 """Split that PhysionTest-Core consists of."""
 VALIDATION = 10
-"""One of this many training trials is for validation in ``physopt``."""
+"""One of this many training trials is for validation in ``physopt`` and ``mp4s``."""
+RECORDS = "records"
+"""Folder of the layout ``mp4s`` with what its lists need to know of each trial."""
 
 
 class Content(NamedTuple):
@@ -173,10 +234,11 @@ Files = Mapping[str, Content]
 class Layout:
     """A layout: the files of a trial, and the function that writes the lists of a whole folder.
 
+    ``files`` takes the trial's paths, and whether it is the first of its split and scenario.
     ``write_lists`` returns the path of the list, and errors by path of files that it cannot read.
     """
 
-    files: Callable[[TrialPaths], Files]
+    files: Callable[[TrialPaths, bool], Files]
     write_lists: Callable[[Path], tuple[Path, dict[str, str]]]
 
 
@@ -188,27 +250,45 @@ def _folder(paths: TrialPaths) -> str:
     return FOLDERS.get(paths.scenario, paths.scenario)
 
 
-def _official(paths: TrialPaths) -> Files:
-    config, number = split_name(paths.trial)
+def _plain_look(split: str) -> str | None:
+    """Return the look of files whose names say nothing of colours; None is the trial's own."""
+    return None if split == "readout" else "free"
+
+
+def _core(paths: TrialPaths) -> Files:
+    """Return the files of a testing trial in PhysionTest-Core."""
     stimulus, folder = _stimulus(paths), _folder(paths)
-    place = f"configurations/{folder}/{config}/{number}"
-    files = {f"{place}_img.mp4": Content("movie"), f"{place}_map.png": Content("map")}
+    return {
+        f"{folder}/mp4s/{stimulus}_img.mp4": Content("movie", "free"),
+        f"{folder}/mp4s-redyellow/{redyellow_name(stimulus)}_img.mp4": Content(
+            "movie", "redyellow"
+        ),
+        f"{folder}/maps/{stimulus}_map.png": Content("map"),
+    }
+
+
+def _official(paths: TrialPaths, _first: bool) -> Files:
+    config, number = split_name(paths.trial)
+    look = _plain_look(paths.split)
+    place = f"configurations/{_folder(paths)}/{config}/{number}"
+    files = {f"{place}_img.mp4": Content("movie", look), f"{place}_map.png": Content("map")}
     if paths.split == CORE_SPLIT:
-        redyellow = redyellow_name(stimulus)
-        files |= {
-            f"{folder}/mp4s/{stimulus}_img.mp4": Content("movie", "free"),
-            f"{folder}/mp4s-redyellow/{redyellow}_img.mp4": Content("movie", "redyellow"),
-            f"{folder}/maps/{stimulus}_map.png": Content("map"),
-        }
-    return files | {f"{place}.hdf5": Content("state")}
+        files |= _core(paths)
+    return files | {f"{place}.hdf5": Content("state", look)}
 
 
-def _physion_particles(paths: TrialPaths) -> Files:
-    return {f"{paths.split}/{_folder(paths)}/{_stimulus(paths)}.hdf5": Content("state")}
+def _physion_particles(paths: TrialPaths, _first: bool) -> Files:
+    place = f"{paths.split}/{_folder(paths)}/{_stimulus(paths)}.hdf5"
+    return {place: Content("state", _plain_look(paths.split))}
 
 
-def _physopt(paths: TrialPaths) -> Files:
-    held_out = stable_hash("validation", paths.trial) % VALIDATION == 0
+def _is_held_out(trial: str, first: bool) -> bool:
+    """Return whether a training trial is for validation: the first one, and a tenth by its name."""
+    return first or stable_hash("validation", trial) % VALIDATION == 0
+
+
+def _physopt(paths: TrialPaths, first: bool) -> Files:
+    held_out = _is_held_out(paths.trial, first)
     parts = {
         "training": ("pretraining_val" if held_out else "pretraining_train", "free"),
         "readout": ("readout_train_redyellow", "redyellow"),
@@ -217,10 +297,11 @@ def _physopt(paths: TrialPaths) -> Files:
     if paths.split not in parts:
         return {}
     part, look = parts[paths.split]
-    return {f"physion_data/{part}/{_folder(paths)}/{_stimulus(paths)}.hdf5": Content("state", look)}
+    name = shown_name(paths.trial, paths.split, look)
+    return {f"physion_data/{part}/{_folder(paths)}/{name}.hdf5": Content("state", look)}
 
 
-def _physion_evaluator(paths: TrialPaths) -> Files:
+def _physion_evaluator(paths: TrialPaths, _first: bool) -> Files:
     phase = {"readout": "train", "testing": "test"}.get(paths.split)
     if phase is None or paths.scenario == "drape":
         return {}
@@ -229,6 +310,24 @@ def _physion_evaluator(paths: TrialPaths) -> Files:
         f"{folder}/{name}.mp4": Content("movie", "redyellow"),
         f"{folder}/records/{name}.json": Content("record", "redyellow"),
     }
+
+
+def _mp4s(paths: TrialPaths, _first: bool) -> Files:
+    stimulus, folder = _stimulus(paths), _folder(paths)
+    if paths.split == CORE_SPLIT:
+        files = {f"PhysionTestMP4s/{path}": content for path, content in _core(paths).items()}
+    elif paths.split in ("training", "readout"):
+        look = "free" if paths.split == "training" else "redyellow"
+        files = {_shown_movie(paths.split, folder, stimulus): Content("movie", look)}
+    else:
+        return {}
+    return files | {f"{RECORDS}/{paths.split}/{folder}/{stimulus}.json": Content("record")}
+
+
+def _hdf5s(paths: TrialPaths, _first: bool) -> Files:
+    folder = _folder(paths)
+    place = f"{folder}/hdf5s" if paths.split == CORE_SPLIT else f"{folder}_{paths.split}_HDF5s"
+    return {f"{place}/{_stimulus(paths)}.hdf5": Content("state", _plain_look(paths.split))}
 
 
 def evaluator_name(paths: TrialPaths) -> str:
@@ -252,6 +351,8 @@ LAYOUTS: Mapping[str, Layout] = {
     "physion-particles": Layout(_physion_particles, _no_lists),
     "physopt": Layout(_physopt, _no_lists),
     "physion-evaluator": Layout(_physion_evaluator, write_evaluator_labels),
+    "mp4s": Layout(_mp4s, write_movie_lists),
+    "hdf5s": Layout(_hdf5s, _no_lists),
 }
 """Layouts by name."""
 
@@ -337,10 +438,13 @@ def export_official(
         )
     files = {column: source.files(column) for column in ("trial_file", "movie", "free_movie")}
     planned = {}
+    by_position = source.index.sort_values("index")
+    first = set(by_position.groupby(["split", "scenario"])["trial"].first())
     for name in names:
         stored = {column: found[name] for column, found in files.items() if name in found}
         paths = source.paths(name)
-        planned[name] = ExportJob(paths, out, LAYOUTS[layout].files(paths), stored, images)
+        wanted = LAYOUTS[layout].files(paths, name in first)
+        planned[name] = ExportJob(paths, out, wanted, stored, images)
     jobs = {name: job for name, job in planned.items() if job.files}
     notes = _without_place(planned, layout)
     if not jobs:

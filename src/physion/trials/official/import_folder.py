@@ -483,6 +483,8 @@ def import_state(job: ImportJob) -> tuple[str, ...]:
         ids = _import_hdf5_ids(
             file, reader, scene, trajectory, movies.size if movies else UNSEEN_SIZE
         )
+        if file.has(f"{reader.frames[0]}/images/_depth"):
+            motion.depth(trajectory, 0)  # notes how depth is stored
         labelled = motion.labelled_contact
         labels = _labels(job, scene, trajectory, labelled)
         recorded = job.contact if labelled is None else bool(labelled.any())

@@ -35,6 +35,8 @@ between surfaces of this package; it makes each threshold valid for the other's 
 FLOW_FULL = 0.02
 """Motion per frame with full brightness in ``_flow``, as a fraction of the picture's width."""
 
+MARK = "-redyellow"
+"""End of the names of configurations with red agent and yellow patient."""
 _DEPTH_RANGE = 100.0 - 0.1
 _NUMBERED = re.compile(r"(?P<config>.+)_(?P<number>\d{4})$")
 
@@ -51,7 +53,17 @@ def split_name(trial: str) -> tuple[str, str]:
 def redyellow_name(trial: str) -> str:
     """Return the name of the version of a stimulus with red agent and yellow patient."""
     config, number = split_name(trial)
-    return f"{config}-redyellow_{number}"
+    return f"{config.removesuffix(MARK)}{MARK}_{number}"
+
+
+def shown_name(trial: str, split: str, look: str) -> str:
+    """Return the official name of a trial in a look.
+
+    A name without ``-redyellow`` shows the natural colours, except in the readout split, whose
+    published movies are red and yellow under plain names.
+    """
+    marked = look == "redyellow" and split != "readout"
+    return redyellow_name(trial) if marked else "_".join(split_name(trial))
 
 
 def segmentation_colors(count: int) -> Bytes:
@@ -88,20 +100,23 @@ def decode_picture(data: Bytes) -> Bytes:
 
 
 def encode_depth(depth: NDArray[np.floating[Any]]) -> Bytes:
-    """Encode depth (H, W) in metres as the triplets (H, W, 3) of ``_depth``, bottom row first.
+    """Encode depth (H, W) in metres as the triplets (H, W, 3) of ``_depth``, top row first.
+
+    The official writer stores what `TDWUtils.get_shaped_depth_pass` returns, which turns the rows
+    of the raw pass (read in TDW 1.7.16 to 1.8.29), so the stored picture is upright.
 
     The resolution is 6 micrometres. Depth beyond 99.9 m and undefined depth become 99.9 m.
     """
     codes = np.clip(np.nan_to_num(depth, nan=np.inf), 0.0, _DEPTH_RANGE) / _DEPTH_RANGE * 2**24
     codes = np.minimum(np.rint(codes), 2**24 - 1).astype(np.uint32)
     triplets = np.stack([codes >> 16, codes >> 8 & 255, codes & 255], axis=-1)
-    return triplets.astype(np.uint8)[::-1]
+    return triplets.astype(np.uint8)
 
 
-def decode_depth(triplets: Bytes) -> NDArray[np.float64]:
-    """Decode the triplets (H, W, 3) of ``_depth`` to depth (H, W) in metres."""
+def decode_depth(triplets: NDArray[Any]) -> NDArray[np.float64]:
+    """Decode the triplets (H, W, 3) of ``_depth`` to depth (H, W) in metres, rows as stored."""
     weights = _DEPTH_RANGE / 256 / np.array([1.0, 256.0, 65536.0])
-    return np.asarray((triplets[::-1].astype(np.float64) * weights).sum(axis=-1))
+    return np.asarray((triplets.astype(np.float64) * weights).sum(axis=-1))
 
 
 def encode_normals(normals: NDArray[np.floating[Any]], view: NDArray[np.float64]) -> Bytes:

@@ -43,12 +43,13 @@ from physion.scenes.scene import (
 from physion.scenes.shapes.primitives import FALLBACK, prop_for, shape, shapes
 from physion.scenes.tdw.commands import ROOMS as SCENE_ROOMS
 from physion.scenes.tdw.commands import UNSET_MATERIAL, VANISHING_SCALE
-from physion.trials.files import MAX_FRAMES
+from physion.trials.files import MAX_FRAMES, MAX_SIDE
 from physion.trials.official.names import (
     CLOTH_DISTANCE,
     CLOTH_MODEL,
     RAMPS,
     ROOMS,
+    decode_depth,
     decode_picture,
     from_official_camera,
     from_official_rotation,
@@ -600,14 +601,18 @@ def _substitute_prop(model: str) -> str:
 # Motion of an official file (poses, contacts, cloth), read as a `Trajectory`.
 #
 # In official files the number of contact points differs from the number of pairs
-# (docs/official-system.md, section 4.2). If the numbers are equal, points are assigned in order,
-# as this package exports them; otherwise each pair gets the point that is nearest to both of its
-# bounding boxes.
+# (docs/official-system.md, section 4.2). If there are as many points as pairs that touch, they are
+# assigned in order, as this package exports them; otherwise each pair gets the point that is
+# nearest to both of its bounding boxes.
 
 Row = tuple[int, int, int, Floats, Floats]
 """Frame, first and second body, point, normal from first to second."""
 
 MAX_RESOLUTION = 101
+_NEAR = 50.0
+"""Depth in metres from which pixels say nothing about the rows of a picture."""
+_DEPTH_ERROR = 0.1
+"""Median relative error above which a picture is no depth of the scene."""
 _UNKNOWN = np.full(3, np.nan)
 
 
@@ -654,6 +659,49 @@ class MotionReader:
             completed=any(reader.file.number(path, 0) != 0 for path in complete),
             engine=f"imported: {commit if commit.startswith('physion ') else 'TDW'}",
         )
+
+    def depth(self, trajectory: Trajectory, frame: int) -> Floats | None:
+        """Return the depth (H, W) in metres that a frame stores, top row first.
+
+        The official writer stores the top row first; files of earlier versions of this package, and
+        other programs that store TDW's raw pass, the bottom row. Which it is follows from a
+        comparison with what the meshes and the camera of the file show, so no version is asked.
+        None, with a note, if neither fits (`_depth` of the released test files holds colours).
+        """
+        # Imported late: loading the compiled renderer takes time.
+        from physion.rendering.renderer import Renderer
+
+        path = f"{self.reader.frames[frame]}/images/_depth"
+        stored = self._stored_depth(path)
+        if stored is None or max(stored.shape) > MAX_SIDE:
+            self.reader.notes.append("its _depth is no depth and is not read")
+            return None
+        renderer = Renderer(self.scene, trajectory, stored.shape[1], stored.shape[0])
+        drawn = renderer.render(frame, ("depth",)).depth
+        assert drawn is not None, "the renderer left out depth"
+        near = drawn < _NEAR
+        upright, turned = (
+            float(np.median(np.abs(rows[near] / drawn[near] - 1))) if near.any() else np.inf
+            for rows in (stored, stored[::-1])
+        )
+        if min(upright, turned) > _DEPTH_ERROR:
+            self.reader.notes.append("its _depth does not show its scene and is not read")
+            return None
+        if turned < upright:
+            self.reader.notes.append("its _depth has the bottom row first")
+            return stored[::-1]
+        return stored
+
+    def _stored_depth(self, path: str) -> Floats | None:
+        """Return depth (H, W) in metres as stored; None if the array is no depth."""
+        try:
+            return decode_depth(self.reader.file.numbers(path, (None, None, 3)))
+        except BadInputError:
+            try:
+                # Version 1.5 stores metres.
+                return self.reader.file.numbers(path, (None, None))
+            except BadInputError:
+                return None
 
     def _contacts(self, positions: Floats, matrices: Floats) -> Contacts:
         """Return one contact per pair and frame.
@@ -703,11 +751,19 @@ class MotionReader:
                 raise file.bad(
                     f"{at}/collisions/states", f"does not have the {len(pairs)} rows of ids"
                 )
-            for row, (pair, state) in enumerate(zip(pairs, states, strict=True)):
-                a, b = (indices.get(int(id_)) if np.isfinite(id_) else None for id_ in pair)
-                if a is None or b is None or a == b or state.startswith("ex"):
+            touching = [row for row, state in enumerate(states) if not state.startswith("ex")]
+            # Exports of this package have one point for each pair that touches, earlier ones also
+            # for pairs that separate.
+            with_point = range(len(pairs)) if len(contacts) == len(pairs) else touching
+            for row in touching:
+                a, b = (indices.get(int(id_)) if np.isfinite(id_) else None for id_ in pairs[row])
+                if a is None or b is None or a == b:
                     continue
-                chosen = row if len(contacts) == len(pairs) else boxes.nearest(contacts, (a, b))
+                chosen = (
+                    with_point.index(row)
+                    if len(contacts) == len(with_point)
+                    else boxes.nearest(contacts, (a, b))
+                )
                 if chosen is not None:
                     normal, point = swap_axes(contacts[chosen])
                     # Official normals point from the second body to the first.

@@ -1,11 +1,12 @@
 """Export of one trial as an official HDF5 file: static group, frames, and additional fields.
 
-Names, shapes and encodings follow docs/official-system.md, section 4, with gzip only.
-All static arrays have one entry per object (in the originals, masses and frictions lack scenery
-and so do not align with the other arrays). Ids and counts are int64, measures float32. What the
-official layout does not provide is stored under ``physion/``: the scene, labels and metadata as
-JSON, the record for ``metadata.json``, and the flow in pixels (``flow``: (frames, rows, columns,
-2), right and down, half precision).
+Names, shapes, types and encodings follow docs/official-system.md, section 4, with gzip only. Static
+arrays have one entry per object, but masses and frictions end before scenery, which comes last. Ids
+and counts are int64, texts of variable length; colours, masses, frictions and contacts are float64,
+other measures float32, as the official writer makes them. What the official layout does not provide
+is stored under ``physion/``: the scene, labels and metadata as JSON, the record for
+``metadata.json``, and the flow in pixels (``flow``: (frames, rows, columns, 2), right and down,
+half precision).
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from physion.trials.official.names import (
     encode_normals,
     rotation_matrices,
     segmentation_colors,
-    split_name,
+    shown_name,
     swap_angular_velocity,
     swap_axes,
     to_official_camera,
@@ -398,7 +399,7 @@ def official_file(
     meta, scene = trial.metadata, trial.shown(look)
     objects = OfficialObjects(scene, trial.trajectory)
     with in_memory_file() as file:
-        static = _static(trial, objects)
+        static = _static(trial, objects, look or meta.look)
         _write_static(file.create_group("static"), static, objects)
         frames = file.create_group("frames")
         writer = FrameWriter(objects, meta.width, meta.height)
@@ -446,16 +447,15 @@ def _write_frames(
     return ids
 
 
-def _static(trial: Trial, objects: OfficialObjects) -> dict[str, Any]:
+def _static(trial: Trial, objects: OfficialObjects, look: str) -> dict[str, Any]:
     """Return scalars and lists of the static group by name."""
     scene, meta = objects.scene, trial.metadata
     ids, roles = objects.ids, scene.roles
-    config, number = split_name(meta.trial)
     ramps = [body for body in scene.bodies if body.shape in RAMPS]
     things = dict(zip(ids, objects.things, strict=True))
     found: dict[str, Any] = {
         "git_commit": f"physion {__version__}",
-        "stimulus_name": f"{config}_{number}",
+        "stimulus_name": shown_name(meta.trial, meta.split, look),
         "room": ROOMS.get(scene.room, scene.room),
         "seed": 0,
         "randomize": 0,
@@ -466,11 +466,11 @@ def _static(trial: Trial, objects: OfficialObjects) -> dict[str, Any]:
         "probe_id": ids[roles.probe] if roles.probe else NONE,
         "ramp_id": ids[ramps[0].name] if ramps else NONE,
         "ramp_base_id": NONE,
-        "ramp_base_height": np.float32(ramps[0].position[2] - scene.floor if ramps else 0.0),
+        "ramp_base_height": float(ramps[0].position[2] - scene.floor if ramps else 0.0),
         "target_type": model_name(things[roles.agent]),
         "target_rotation": to_official_euler(things[roles.agent].rotation).astype(np.float32),
         "probe_type": model_name(things[roles.probe]) if roles.probe else "",
-        "probe_mass": np.float32(things[roles.probe].mass if roles.probe else 0.0),
+        "probe_mass": float(things[roles.probe].mass if roles.probe else 0.0),
         **_push(objects),
         **{
             kind: [model_name(things[name]) for name in names]
@@ -571,7 +571,7 @@ def _of_stack(objects: OfficialObjects) -> dict[str, Any]:
 def _write_static(group: h5py.Group, static: dict[str, Any], objects: OfficialObjects) -> None:
     for name, value in static.items():
         put(group.id, name, _plain(value))
-    things, count = objects.things, len(objects)
+    things, count, physical = objects.things, len(objects), objects.physical
     contacts = np.array(
         [
             _UNSET_CONTACT
@@ -581,23 +581,23 @@ def _write_static(group: h5py.Group, static: dict[str, Any], objects: OfficialOb
                 thing.contact.dynamic_friction,
                 thing.contact.restitution,
             )
-            for thing in things
+            for thing in physical
         ]
     )
-    scale = swap_axes(objects.scales).astype(np.float32)
+    scale = swap_axes(objects.scales)
     arrays: dict[str, Any] = {
         "object_ids": np.arange(1, count + 1, dtype=np.int64),
-        "model_names": np.array([name.encode() for name in objects.models]),
+        "model_names": _plain(objects.models),
         "object_segmentation_colors": segmentation_colors(count),
         "initial_position": swap_axes([t.position for t in things]).astype(np.float32),
         "initial_rotation": to_official_euler([t.rotation for t in things]).astype(np.float32),
-        "scale": scale,
+        "scale": scale.astype(np.float32),
         **{f"scale_{axis}": scale[:, index] for index, axis in enumerate("xyz")},
-        "color": np.array([thing.look.color for thing in things], np.float32),
-        "mass": np.array([thing.mass for thing in things], np.float32),
-        "static_friction": contacts[:, 0].astype(np.float32),
-        "dynamic_friction": contacts[:, 1].astype(np.float32),
-        "bounciness": contacts[:, 2].astype(np.float32),
+        "color": np.array([thing.look.color for thing in things], np.float64),
+        "mass": np.array([thing.mass for thing in physical], np.float64),
+        "static_friction": contacts[:, 0],
+        "dynamic_friction": contacts[:, 1],
+        "bounciness": contacts[:, 2],
     }
     for name, values in arrays.items():
         put(group.id, name, values)
@@ -613,9 +613,7 @@ def _write_static(group: h5py.Group, static: dict[str, Any], objects: OfficialOb
 
 
 def _plain(value: Any) -> Any:
-    """Return a value for HDF5: texts as bytes, lists of texts as arrays of bytes."""
-    if isinstance(value, str):
-        return np.array(value.encode() or b"\0")
-    if isinstance(value, list):
-        return np.array([text.encode() for text in value], dtype="S64" if not value else None)
+    """Return a value for HDF5: texts and lists of texts as texts of variable length."""
+    if isinstance(value, str | list):
+        return np.array(value, dtype=h5py.string_dtype())
     return value

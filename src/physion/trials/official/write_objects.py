@@ -1,7 +1,8 @@
 """Objects in official files: order, ids, sizes, meshes, cloth, contacts and particles.
 
 Object ids count from 1. The zone comes first, then a ramp, the target and the probe, because
-official readers find target and zone by their position; then all others in the order of the scene.
+official readers find target and zone by their position; then all others in the order of the scene,
+scenery last, because arrays of masses and frictions end before it.
 """
 
 from __future__ import annotations
@@ -53,8 +54,9 @@ class OfficialObjects:
         first = [roles.patient]
         first += [body.name for body in scene.bodies if body.shape in RAMPS][:1]
         first += [roles.agent, *([roles.probe] if roles.probe else [])]
-        names = [*first, *scene.names()]
-        return [scene.index(name) for name in dict.fromkeys(names)]
+        scenery = [body.name for body in scene.bodies if body.scenery]
+        others = [name for name in scene.names() if name not in scenery]
+        return [scene.index(name) for name in dict.fromkeys([*first, *others, *scenery])]
 
     @cached_property
     def ids(self) -> dict[str, int]:
@@ -70,6 +72,11 @@ class OfficialObjects:
         """Body or cloth of each object."""
         everything: list[Body | Cloth] = [*self.scene.bodies, *self.scene.cloths]
         return [everything[index] for index in self.order]
+
+    @property
+    def physical(self) -> list[Body | Cloth]:
+        """The objects that the simulation moves or holds: all but scenery, which comes last."""
+        return [thing for thing in self.things if isinstance(thing, Cloth) or not thing.scenery]
 
     @property
     def models(self) -> list[str]:
@@ -298,7 +305,7 @@ def put(group: Any, name: str, values: Any) -> Any:
     kind = _type(array.dtype)
     made = h5d.create(group, name.encode(), kind, space, layout)
     if array.size:
-        made.write(h5s.ALL, h5s.ALL, array, mtype=kind)
+        made.write(h5s.ALL, h5s.ALL, array, mtype=_type_in_memory(array.dtype))
     return made
 
 
@@ -320,6 +327,12 @@ def put_picture(group: Any, name: str, picture: NDArray[Any], *, shuffle: bool =
 @cache
 def _type(dtype: np.dtype[Any]) -> Any:
     return h5t.py_create(dtype, logical=True)
+
+
+@cache
+def _type_in_memory(dtype: np.dtype[Any]) -> Any:
+    # It differs from the stored type for texts of variable length.
+    return h5t.py_create(dtype)
 
 
 @cache
@@ -360,11 +373,11 @@ def in_memory_file() -> h5py.File:
 
 # Groups ``collisions`` and ``env_collisions`` of the frames of an official file.
 #
-# Unlike in the originals, every contact record has exactly one contact point, the deepest one, at
-# the same position in the list, so that points can be assigned to pairs (the originals have
-# several points per pair, and none for pairs that separate). A pair that separates ("exit")
-# repeats its last point. Normals point as in Unity: from the second object of the record to the
-# first, and from the environment to the object (docs/official-system.md, sections 2.6 and 4.2).
+# Every pair that touches has exactly one contact point, the deepest one, at the same position in
+# the list, so that points can be assigned to pairs (the originals have several points per pair).
+# As in the originals, a pair that separates ("exit") has none; these records come last. Normals
+# point as in Unity: from the second object of the record to the first, and from the environment to
+# the object (docs/official-system.md, sections 2.6 and 4.2).
 
 
 class ContactRecords:
@@ -378,22 +391,34 @@ class ContactRecords:
         rows = np.array([row for rows in pairs for row, _ in rows], np.int64)
         at = np.repeat(np.arange(frames), [len(rows) for rows in pairs])
         outside = np.array([row for rows in environment for row in rows], np.int64)
-        self._pairs = _pair_arrays(objects, rows, at, states)
-        self._environment = _environment_arrays(objects, outside)
+        points = [[row for row, state in rows if state != "exit"] for rows in pairs]
+        touching = np.array([row for rows in points for row in rows], np.int64)
+        pair_ends, point_ends, environment_ends = (
+            np.cumsum([0, *map(len, rows)]) for rows in (pairs, points, environment)
+        )
+        # Arrays of all frames with the end of each frame in them, by group and name.
+        self._groups = {
+            "collisions": {
+                **{
+                    name: (array, pair_ends)
+                    for name, array in _pair_arrays(objects, rows, at, states).items()
+                },
+                "contacts": (_normal_and_point(objects, touching, -1.0), point_ends),
+            },
+            "env_collisions": {
+                name: (array, environment_ends)
+                for name, array in _environment_arrays(objects, outside).items()
+            },
+        }
         # One empty array serves all frames without contacts.
         self._empty: dict[tuple[str, str], Any] = {}
-        self._pair_ends = np.cumsum([0, *map(len, pairs)])
-        self._environment_ends = np.cumsum([0, *map(len, environment)])
 
     def write(self, frame_group: Any, frame: int) -> None:
         """Write both groups of a frame into its group, of h5py's lower layer."""
-        for name, arrays, ends in (
-            ("collisions", self._pairs, self._pair_ends),
-            ("env_collisions", self._environment, self._environment_ends),
-        ):
-            start, end = ends[frame : frame + 2]
+        for name, arrays in self._groups.items():
             group = new_group(frame_group, name)
-            for key, values in arrays.items():
+            for key, (values, ends) in arrays.items():
+                start, end = ends[frame : frame + 2]
                 if start == end and (name, key) in self._empty:
                     link(group, key, self._empty[name, key])
                     continue
@@ -433,7 +458,7 @@ def _rows_by_frame(
 def _pair_arrays(
     objects: OfficialObjects, rows: NDArray[np.int64], at: NDArray[np.int64], states: list[str]
 ) -> Mapping[str, NDArray[Any]]:
-    """Return the arrays of ``collisions`` of all frames, one row each; ``at`` is the frame."""
+    """Return the arrays of ``collisions`` with one row per record; ``at`` is the frame."""
     contacts = objects.trajectory.contacts
     bodies = contacts.bodies[rows].reshape(-1, 2)
     velocities = np.pad(
@@ -443,9 +468,8 @@ def _pair_arrays(
     relative = velocities[at, bodies[:, 1]] - velocities[at, bodies[:, 0]]
     return {
         "object_ids": _official_ids(objects)[bodies],
-        "relative_velocities": swap_axes(relative).astype(np.float32),
+        "relative_velocities": swap_axes(relative),
         "states": np.array(states, "S5"),
-        "contacts": _normal_and_point(objects, rows, -1.0),
     }
 
 
@@ -459,12 +483,10 @@ def _environment_arrays(
     }
 
 
-def _normal_and_point(
-    objects: OfficialObjects, rows: NDArray[np.int64], sign: float
-) -> NDArray[np.float32]:
+def _normal_and_point(objects: OfficialObjects, rows: NDArray[np.int64], sign: float) -> Floats:
     contacts = objects.trajectory.contacts
     both = np.stack([sign * contacts.normal[rows], contacts.point[rows]], axis=1)
-    return np.asarray(swap_axes(both).astype(np.float32).reshape(-1, 2, 3))
+    return np.asarray(swap_axes(both).reshape(-1, 2, 3))
 
 
 def _official_ids(objects: OfficialObjects) -> NDArray[np.int64]:

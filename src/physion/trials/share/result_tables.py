@@ -45,6 +45,9 @@ OFFICIAL_COLUMNS = tuple(_OURS)
 """Official columns in their order."""
 NEEDED = frozenset({"model", "stimulus", "scenario", "p_contact", "outcome", "readout"})
 """Columns by which a CSV file is recognised as a table of predictions."""
+NO_DATASET = "none"
+"""Data set of a model that was not trained on any."""
+_DATASETS = ("Encoder Training Dataset", "Dynamics Training Dataset", "Readout Train Data")
 _READOUTS = {"full": "A", "observed+simulated": "B", "observed": "C"}
 """Official letter of a readout."""
 
@@ -107,4 +110,6 @@ def _official_text(path: Path) -> str | None:
     official["Dynamics Training Dataset"] = protocol.mask(
         protocol == "all-but", "no_" + scenario
     ).mask(protocol == "only", scenario)
+    # pandas reads an empty column as numbers, into which the notebooks cannot write their texts.
+    official[list(_DATASETS)] = official[list(_DATASETS)].replace("", NO_DATASET)
     return str(official.to_csv(index=False, lineterminator="\n"))

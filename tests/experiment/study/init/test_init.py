@@ -24,8 +24,10 @@ from physion.experiment.study import make as study_folder
 from physion.experiment.study.choose import choose_familiarization, choose_trials
 from physion.experiment.study.identity import Secrets, check_password
 from physion.experiment.study.make import StimulusSource, import_stimulus, make_study
+from physion.experiment.study.preset import MENTAL_ROTATION
 from physion.experiment.study.study import Study, load_study
 from physion.trials.index import read_index, write_index
+from physion.trials.unusable import mark_unusable
 from physion.trials.video import read_frames
 from support.experiment.tiny_dataset import is_marked, make_tiny_dataset
 from support.experiment.tiny_study import CONTACT, OBSERVED, make_tiny_study, read_number
@@ -74,6 +76,48 @@ def test_another_seed_chooses_otherwise(dataset: Path) -> None:
     }
     assert len(patterns) >= 4
     assert len(set(all_of_them)) == 10 and len({frozenset(names) for names in all_of_them}) == 1
+
+
+def _draw_of_roll(folder: Path, test: int) -> list[str]:
+    chosen = choose_trials(folder, scenarios=["roll"], test=test, practice=2)
+    return [source.stimulus for source in chosen.sources if source.phase == "test"]
+
+
+def test_an_unusable_trial_is_replaced_by_the_next_of_its_preset_and_outcome(
+    tmp_path: Path,
+) -> None:
+    """Of twelve trials, of which even numbers have contact, two of one kind share a preset."""
+    dataset = make_tiny_dataset(tmp_path, scenarios=("roll",), test=12)
+    before = _draw_of_roll(tmp_path, 4)
+    bad = next(name for name in before if int(name[-2:]) % 2 == 0)
+    others = [f"roll_testing_{number:04d}" for number in range(10, -1, -2)]
+    wanted = next(name for name in others if name not in before)
+    table = read_index(tmp_path)
+    table.loc[table["trial"].isin([bad, wanted]), "preset"] = "other"
+    write_index(tmp_path, table)
+    mark_unusable(dataset, {bad: "a block flickers"})
+    chosen = choose_trials(tmp_path, scenarios=["roll"], test=4, practice=2)
+    after = [source.stimulus for source in chosen.sources if source.phase == "test"]
+    # It stands in the place of the other one: nothing else changes.
+    assert [wanted if name == bad else name for name in before] == after
+    assert f"{bad} is unusable (a block flickers); {wanted} replaces it" in chosen.notes
+
+
+def test_without_another_of_the_preset_any_replaces_it_and_it_is_said(tmp_path: Path) -> None:
+    dataset = make_tiny_dataset(tmp_path, scenarios=("roll",), test=6)
+    table = read_index(tmp_path)
+    before = _draw_of_roll(tmp_path, 4)
+    bad = next(name for name in before if int(name[-2:]) % 2 == 0)
+    table.loc[table["trial"] == bad, "preset"] = "rare"
+    write_index(tmp_path, table)
+    mark_unusable(dataset, {bad: "clips"})
+    chosen = choose_trials(tmp_path, scenarios=["roll"], test=4, practice=2)
+    assert any("of preset none, as rare has no more" in note for note in chosen.notes)
+    chosen = choose_trials(tmp_path, scenarios=["roll"], test=6, practice=2)
+    test = [source for source in chosen.sources if source.phase == "test"]
+    # Of three with contact one is unusable, so two of either outcome are left.
+    assert bad not in {source.stimulus for source in test}
+    assert Counter(source.label for source in test) == {True: 2, False: 2}
 
 
 def test_where_fewer_are_there_it_says_so(dataset: Path) -> None:
@@ -243,6 +287,29 @@ def test_the_command_makes_a_study(
     assert f"physion experiment serve {folder}" in out
     assert "roll: 6 testing trials instead of 150" in out
     assert "collide: 6 test and 4 familiarization trials" in out
+
+
+def test_the_preset_of_the_paper(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "study"
+    words = ["--trials", str(dataset), "--preset", "paper"]
+    assert main(["experiment", "init", *CONTACT, str(folder), *words]) == 0
+    study = load_study(folder)
+    assert study.timing.break_every == 0 and not study.timing.fixation_in_familiarization
+    assert study.exclusions == "preregistered-only"
+    assert (study.payment.amount, study.payment.currency, study.payment.per_hour) == (4, "USD", 12)
+    assert study.questions == (MENTAL_ROTATION,)
+    for language in ("en", "de"):
+        assert study.texts[language]["question.mental_rotation.text"]
+    assert (folder / "texts/mental_rotation.png").read_bytes().startswith(b"\x89PNG")
+    plan = (folder / "preregistration.md").read_text()
+    assert "`mental_rotation` (right or wrong)" in plan and (folder / "trial.svg").is_file()
+    capsys.readouterr()
+    plain = ["--trials", str(dataset), "--mental-rotation"]
+    assert main(["experiment", "init", *CONTACT, str(tmp_path / "b"), *plain]) == 0
+    study = load_study(tmp_path / "b")
+    assert study.questions == (MENTAL_ROTATION,) and study.timing.break_every == 25
 
 
 def test_the_command_takes_a_password_and_prints_json(
