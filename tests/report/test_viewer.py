@@ -161,7 +161,7 @@ def test_foreign_text_cannot_leave_its_block(tmp_path: Path) -> None:
     page = Page(tmp_path / "v.html")
     assert "img" not in {tag for tag, _ in page.tags}
     assert [a.get("id") for t, a in page.tags if t == "script"] == [
-        *("cards", "totals", "movie-0", "detail-0"),
+        *("cards", "totals", "unusable", "movie-0", "detail-0"),
         *(None, None),
     ]
     assert page.blocks["title"] == "by-hand" + EVIL
@@ -385,3 +385,18 @@ def test_sizes_are_even_and_keep_the_shape() -> None:
     assert fitted(640, 480, 128) == (128, 96)
     assert fitted(1000, 3, 160) == (160, 2)
     assert fitted(64, 32, 128) == (64, 32)
+
+
+def test_the_verb_marks_trials_and_the_page_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = make_dataset(tmp_path / "set", (Plan("drop_0"), Plan("drop_1")))
+    words = ["view", str(folder), "--details", "0", "--mark"]
+    assert cli([*words, "drop_1=a block = flickers"]) == 0
+    page = Page(folder / "view.html")
+    cards = {card["trial"]: card["unusable"] for card in page.json("cards")}
+    assert cards == {"drop_0": "", "drop_1": "a block = flickers"}
+    assert page.json("unusable") == {"drop_1": "a block = flickers"}
+    capsys.readouterr()
+    assert cli([*words, "drop_1"]) == 2
+    assert "--mark takes TRIAL=REASON, not 'drop_1'" in capsys.readouterr().err

@@ -273,7 +273,6 @@ byId("previous").onclick = () => showNeighbour(-1);
 
 // Marks of unusable trials: a page cannot write files, so it offers the file for the dataset's folder.
 const marks = readData("unusable");
-let unsaved = 0;
 
 const showMark = () => {
   const { trial } = cards[openTrial];
@@ -287,7 +286,7 @@ byId("mark").onclick = () => {
   if (reason) marks[card.trial] = reason;
   else delete marks[card.trial];
   card.unusable = reason;
-  unsaved += 1;
+  window.onbeforeunload = (event) => event.preventDefault(); // asks before marks are lost
   grid.items[openTrial].refresh();
   byId("detail-badges").replaceChildren(...badges(card));
   byId("save-marks").hidden = false;
@@ -301,9 +300,8 @@ byId("save-marks").onclick = () => {
   const lines = ["trial,reason", ...rows.map((row) => row.map(quoted).join(","))];
   const href = URL.createObjectURL(new Blob([`${lines.join("\n")}\n`], { type: "text/csv" }));
   createElement("a", { href, download: "unusable.csv" }).click();
-  unsaved = 0;
+  window.onbeforeunload = null;
 };
-addEventListener("beforeunload", (event) => unsaved && event.preventDefault());
 
 byId("labels").onclick = () => {
   const labelsShown = !grid.labelsShown;
