@@ -55,7 +55,7 @@ OFFICIAL = {"PHYSION_OFFICIAL": str(ROOT.parent / "shared" / "official")}
 STAGES = {"everyday": "not slow and not alone", "slow": "slow", "digests": "not alone"}
 """Tests of each stage, by their marks."""
 MISSED = ("digests", "not noticed", "invalid")
-FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
+FAILED = re.compile(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", re.MULTILINE)
 TIME_LIMIT = 1800
 """Seconds of one stage. A test that never ends has noticed the defect."""
 ALL_PASSED, SOME_FAILED, NONE_FOUND = 0, 1, 5

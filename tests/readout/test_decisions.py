@@ -85,6 +85,7 @@ def test_the_threshold_separates_gaps_and_stays_near_zero() -> None:
     labels = np.array([True, True, False, False])
     assert best_threshold(near, labels) == pytest.approx(0.125)
     assert best_threshold(near, ~labels) == 0.0, "none is right more often than the contact itself"
+    assert best_threshold(near, labels[[0, 2, 1, 3]]) == pytest.approx(0.035), "or 0.3: as good"
     assert best_threshold(near[:0], labels[:0]) == 0.0
     assert best_threshold(np.array([np.inf, -0.1]), np.array([False, True])) == 0.0
 

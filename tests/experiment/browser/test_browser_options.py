@@ -218,7 +218,7 @@ def test_a_session_with_all_optional_parts(chromium: Any, rich: tuple[Study, str
     assert [trial for trial, rest in rests.items() if rest is not None] == [2, 4]
     assert all(700 <= rests[trial] < 60_000 for trial in (2, 4))
     assert {event.data["trial"] for event in events if event.kind == "break"} == {2, 4}
-    assert session.own_answers == OWN_ANSWERS | {"devices": ["phone", "computer"], "fun": None}
+    assert session.own_answers == OWN_ANSWERS | {"devices": ["phone", "console"], "fun": None}
     assert session.implausible is None and session.finished_at is not None
 
 
@@ -257,7 +257,7 @@ def answer_own_questions(visit: Visit) -> None:
     visit.picture("missing")
     page.fill("#q-strategy", OWN_ANSWERS["strategy"])
     page.get_by_label("Often").check()
-    for device in ("Telephone", "Computer"):
+    for device in ("Telephone", "Console"):
         page.get_by_label(device).check()
     page.get_by_role("radiogroup", name="How sure were you?").get_by_label("4").check()
     # An answer to an optional scale can be taken back.

@@ -65,6 +65,7 @@ def test_every_answer_is_there_once_with_all_that_was_stored(
 ) -> None:
     trials, sessions = read_tables(engine, study)
     labels = {(s.scenario, s.stimulus): s.label for s in study.stimuli}
+    assert set(trials["look"]) == {"free"}, "the look of all stimuli of this study"
     with engine.connect() as connection:
         query = sa.select(ANSWERS).where(ANSWERS.c.session.in_(list(sessions["session"])))
         stored = {(r.session, r.phase, r.trial): r for r in connection.execute(query)}

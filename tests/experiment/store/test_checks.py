@@ -415,7 +415,7 @@ def test_own_questions_come_in_place_of_demographics(asking_store: Store) -> Non
     again = {**OWN_ANSWERS, "games": "never"}
     assert page(store, token, "questions", **again).stage == "feedback"
     (session,) = rows(store, SESSIONS)
-    assert session.own_answers == OWN_ANSWERS | {"devices": ["phone", "computer"]}
+    assert session.own_answers == OWN_ANSWERS | {"devices": ["phone", "console"]}
     assert session.questions_at is not None and session.demographics_at is None
     assert page(store, token, "feedback").stage == "done"
 
@@ -439,7 +439,7 @@ def test_answers_are_exported_with_their_words(asking_store: Store, tmp_path: Pa
     assert list(table.columns) == ["participant", "session", *columns] and len(table) == 2
     first = table.iloc[0]
     assert restore_cell(first["strategy"]) == OWN_ANSWERS["strategy"] != first["strategy"]
-    assert [first[name] for name in columns[1:]] == ["often", True, False, True, 4]
+    assert [first[name] for name in columns[1:]] == ["often", True, True, False, 4]
     assert set(table["session"]) <= set(pd.read_csv(out / "sessions.csv")["session"])
     described = json.loads((out / "data_dictionary.json").read_text())["questions"]
     assert [column["name"] for column in described] == list(table.columns)

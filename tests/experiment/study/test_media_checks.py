@@ -44,7 +44,7 @@ def test_it_is_not_served(study: Study, capsys: pytest.CaptureFixture[str]) -> N
     [
         ({"frames": 44}, "has 45 frames; stimuli.csv says 44"),
         ({"width": 66}, "64 x 64 at 30"),
-        ({"rate": 25.0}, "64 x 64 at 30"),
+        ({"rate": 29.97}, "64 x 64 at 30"),
     ],
 )
 def test_rows_that_say_otherwise_are_refused(

@@ -110,7 +110,10 @@ options = {a = "A", b = "B"}
 
 def test_valid_answers_are_kept() -> None:
     found = check_answers(OWN_QUESTIONS, OWN_ANSWERS)
-    assert found == OWN_ANSWERS | {"devices": ["phone", "computer"]}
+    assert found == OWN_ANSWERS | {"devices": ["phone", "console"]}
+    for sure in (1, 5):
+        kept = check_answers(OWN_QUESTIONS, OWN_ANSWERS | {"confidence": sure})
+        assert kept["confidence"] == sure
     left_open = {**OWN_ANSWERS, "strategy": "  ", "devices": []}
     found = check_answers(OWN_QUESTIONS, left_open)
     assert found["strategy"] is None and found["devices"] == []

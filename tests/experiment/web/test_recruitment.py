@@ -23,13 +23,14 @@ from physion.experiment.study.recruitment import (
     MTURK_HOSTS,
     RECRUITERS,
     completion,
+    ending_completion,
     links,
     make_pass,
     read_pass,
     session_code,
     start_warnings,
 )
-from physion.experiment.study.settings import Recruitment
+from physion.experiment.study.settings import EarlyEnd, Recruitment
 from physion.experiment.study.study import Study, load_study
 from support.experiment.app_walk import Person, Served, served
 from support.experiment.tiny_study import make_tiny_study
@@ -244,6 +245,14 @@ class TestCompletion:
         assert found.url == "https://app.prolific.com/submissions/complete?cc=C0DE"
         # Ids are not needed for it.
         assert completion(study, secrets, session("prolific")) == found
+
+    def test_who_ends_early_has_the_code_of_the_recruiter(self) -> None:
+        declined = EarlyEnd("NO", "no consent", "https://lab.example/declined")
+        prolific, other = (ending_completion(declined, source) for source in ("prolific", "link"))
+        assert prolific.code == "NO" and prolific.url is not None and prolific.url.endswith("cc=NO")
+        assert (other.code, other.url) == ("no consent", "https://lab.example/declined")
+        nothing = ending_completion(EarlyEnd(code="no consent"), "prolific")
+        assert (nothing.code, nothing.url) == (None, None)
 
     def test_sona_gets_the_survey_code_and_keeps_its_parameters(
         self, study: Study, secrets: Secrets

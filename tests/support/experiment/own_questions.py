@@ -34,7 +34,7 @@ high = "Very"
 OWN_ANSWERS: dict[str, Any] = {
     "strategy": "=I looked; closely",
     "games": "often",
-    "devices": ["computer", "phone"],
+    "devices": ["console", "phone"],
     "confidence": 4,
 }
 

@@ -463,15 +463,17 @@ def test_means_over_the_trials_of_a_configuration() -> None:
          "away": {"x": 4.0}, "frame": 7},
         {"trial_num": 2, "contact": False, "area": 0.4, "room": "tdw", "shift": None,
          "away": None, "frame": 8},
+        {"trial_num": 3, "contact": False, "area": 0.4, "room": "tdw", "shift": [6.0, 4.0],
+         "away": None, "frame": 9},
     ]  # fmt: skip
     assert trial_stats(records) == {
-        "contact/avg_label": 0.333,
-        "area/avg_label": 0.267,
+        "contact/avg_label": 0.25,
+        "area/avg_label": 0.3,
         "room/avg_label": "box-tdw",
-        "shift/avg_label": [1.5, -0.5],
+        "shift/avg_label": [3.0, 1.0],
         "away/avg_label": {"x": 2.5},
-        "frame/avg_label": 7.5,
-        "num_trials": 3,
+        "frame/avg_label": 8.0,
+        "num_trials": 4,
     }
 
 
