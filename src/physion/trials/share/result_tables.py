@@ -45,6 +45,8 @@ OFFICIAL_COLUMNS = tuple(_OURS)
 """Official columns in their order."""
 NEEDED = frozenset({"model", "stimulus", "scenario", "p_contact", "outcome", "readout"})
 """Columns by which a CSV file is recognised as a table of predictions."""
+EXPERIMENTS = {name: names.experiment for name, names in NAMES.items()}
+"""Official name of a scenario."""
 _READOUTS = {"full": "A", "observed+simulated": "B", "observed": "C"}
 """Official letter of a readout."""
 
@@ -97,7 +99,7 @@ def _official_text(path: Path) -> str | None:
     official = pd.DataFrame(
         {name: table.get(ours or "", "") for name, ours in _OURS.items()}, index=table.index
     )
-    scenario = table["scenario"].replace({name: names.experiment for name, names in NAMES.items()})
+    scenario = table["scenario"].replace(EXPERIMENTS)
     protocol = official["Dynamics Training Dataset"]
     official["Readout Train Data"] = official["Readout Test Data"] = scenario
     official["Readout Type"] = official["Readout Type"].replace(_READOUTS)
@@ -107,4 +109,9 @@ def _official_text(path: Path) -> str | None:
     official["Dynamics Training Dataset"] = protocol.mask(
         protocol == "all-but", "no_" + scenario
     ).mask(protocol == "only", scenario)
+    if "dynamics_training_dataset" in table:
+        one = table["dynamics_training_dataset"].replace(EXPERIMENTS)
+        official["Dynamics Training Dataset"] = official["Dynamics Training Dataset"].mask(
+            protocol == "one", one
+        )
     return str(official.to_csv(index=False, lineterminator="\n"))
