@@ -33,7 +33,7 @@ def clips(frames: Any, features: Any = None) -> Batch:
     ).to("cpu")
 
 
-def test_spec_shows_all_observed_frames_that_fit_and_goes_on_to_the_end_of_the_movie() -> None:
+def test_spec_shows_all_observed_frames_that_fit_and_all_up_to_the_end_of_the_movie() -> None:
     assert Spec().context_frames() == (2, 8, 14, 20, 26, 32, 38, 44)
     assert Spec(stride=9).context_frames() == (8, 17, 26, 35, 44)
     assert Spec(stride=1).context == 45 and Spec(stride=100).context_frames() == (44,)

@@ -50,12 +50,17 @@ def _make(folder: Path, scenario: str, split: str, number: int) -> dict[str, Any
     frames = draw(contact, np.random.default_rng(seed))
     paths = TrialPaths(folder, split, scenario, name)
     row: dict[str, Any] = {
-        column: {"string": "none", "boolean": False, "bool": False, "int64": 0, "float64": 0.0}.get(kind)
+        column: {"string": "none", "bool": False, "int64": 0, "float64": 0.0}.get(kind)
         for column, kind in COLUMNS.items()
     }
     row |= {"trial": name, "dataset": "dots", "scenario": scenario, "split": split}
     row |= {"index": number, "contact": contact, "frames": FRAMES, "observed_frames": OBSERVED}
-    row |= {"width": SIZE, "height": SIZE, "playback_seconds": FRAMES / 30}
+    row |= {
+        "observed_contact": False,
+        "width": SIZE,
+        "height": SIZE,
+        "playback_seconds": FRAMES / 30,
+    }
     row |= {"digest": hashlib.sha256(frames.tobytes()).hexdigest()}
     for column, path, shown in (
         ("movie", paths.movie, frames),

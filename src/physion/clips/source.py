@@ -130,7 +130,7 @@ class ObservedSource:
     def context(self, trials: Sequence[str]) -> Batch:
         """Return the context of clips; motions end with the last observed frame.
 
-        ``future`` of the batch is that of the spec, or 0 where it depends on the movies.
+        The batch has the ``future`` of the spec, or 0 where it depends on the movies.
         """
         frames = self._spec.context_frames()
         if max(frames) > LAST_OBSERVED:

@@ -474,7 +474,7 @@ class Rpin(VisionModel):
         """Predict states and boxes from the last h frames of the context.
 
         The prediction is deterministic: all samples are equal, and ``seed`` has no effect.
-        ``shown`` holds the boxes, in the order of those of the context; they are NaN for absent
+        ``shown`` holds the boxes, in the order of the boxes of the context; they are NaN for absent
         objects.
         """
         features = self.encode(context) if context.features is None else context.features

@@ -203,7 +203,7 @@ class StoredFeatures:
             [self._rows[row] for row in chosen],
             repeated=self._repeated,
         )
-        # Equal for all choices, also for that of no trial.
+        # Equal for all choices, also without a trial.
         selected._steps, selected._size = self._steps, self._size
         return selected
 

@@ -40,7 +40,7 @@ _OUTCOME = ("contact", "first_frame", "observed", "min_distance", "robust", "rec
 
 
 def labels_of(trial: Trial) -> Labels:
-    """Return the labels of a trial; those of its motion if it is stored without."""
+    """Return the labels of a trial, from its motion if it is stored without labels."""
     return trial.labels or label_contact(trial.scene, trial.trajectory)
 
 
