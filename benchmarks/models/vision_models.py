@@ -92,6 +92,8 @@ MODELS: tuple[tuple[str, dict[str, Any], int], ...] = (
     *((name, {"size": size, "weights": "random"}, 1) for name in ENCODERS for size in SIZES),
 )
 """Models whose speed is measured: name, options, clips of a batch."""
+FUTURE = 18
+"""Steps that are imagined when speed is measured."""
 TESTED_CLIPS = 20
 """Clips of a batch of testing trials, whose states are ranked together."""
 LATEST_START = 40
@@ -112,6 +114,7 @@ def random_clips(clips: int, frames: int, spec: Spec) -> Batch:
         tuple(f"clip_{row}" for row in range(clips)),
         np.tile(np.arange(frames), (clips, 1)),
         np.ones((clips, frames), np.bool_),
+        future=FUTURE,
         rgb=rng.integers(0, 256, shape, np.uint8),
         boxes=boxes if "boxes" in spec.inputs else None,
     ).to("cpu")
@@ -184,7 +187,7 @@ def learn(folder: Path, names: list[str], steps: int, seeds: int) -> Rows:
             clips = tested_clips(model, source, dataset.trials("testing"))
             features = None
             if name in DYNAMICS:
-                features = store.encoded(model, source, trials, "whole").array()
+                features = store.encoded(model, source, trials, "whole").by_trial()
             before, *_ = metric(name, model, clips)
             start = time.process_time()
             trained = train_model(

@@ -168,20 +168,27 @@ def measure_model(name: str, dataset: Dataset) -> ModelTimes:
         validate_every=model.training_settings.validate_every,
         calibration_trials=getattr(model, "calibration_trials", 0),
         context=model.spec.context,
-        whole=model.spec.total,
+        whole=round(float(np.mean([len(model.spec.all_frames(n)) for n in lengths_of(dataset)]))),
         **evaluated,
         **reading,
         **train_times(model, windows, clips, fabric, clock),
     )
 
 
+def lengths_of(dataset: Dataset) -> list[int]:
+    """Return the frames of the trials."""
+    frames = dict(zip(dataset.index["trial"], dataset.index["frames"], strict=True))
+    return [int(frames[trial]) for trial in dataset.trials("training")]
+
+
 def read_times(model: Any, dataset: Dataset, features: int) -> tuple[Windows, dict[str, float]]:
     """Return the windows of the trials, and the seconds to read one: again, and a new one."""
     trials = tuple(dataset.trials("training"))
     if model.learns_from == "features":
-        shape = (len(trials), model.spec.total, features)
-        values = generator("study times").normal(size=shape).astype(np.float32)
-        rows, lengths = np.arange(len(trials)), [model.spec.all_frames()[-1] + 1] * len(trials)
+        rng, lengths = generator("study times"), lengths_of(dataset)
+        shapes = [(len(model.spec.all_frames(length)), features) for length in lengths]
+        values = [rng.normal(size=shape).astype(np.float32) for shape in shapes]
+        rows = np.arange(len(trials))
         stored = FeatureWindows(model.spec, trials, values, lengths, rows, model.window)
         again = CORE.least(lambda: stored.read(cycled(stored, len(trials), 0))) / len(trials)
         return stored, {"read_window": again, "read_window_new": again}
@@ -233,7 +240,8 @@ def evaluate_times(model: Any, dataset: Dataset, clips: int, clock: Clock) -> di
         read_whole = once(source.whole, trials) / len(trials)
     context, whole = observed.context(trials[:clips]), source.whole(trials[:clips])
     features = np.stack([arrays["features"] for arrays in encode_clips(model, context)])
-    known = dataclasses.replace(context, features=features)
+    future = model.spec.steps_after(max(lengths_of(dataset)))
+    known = dataclasses.replace(context, features=features, future=future)
     return {
         "encode_context": clock.least(lambda: encode_clips(model, context)) / clips,
         "encode_whole": clock.least(lambda: encode_clips(model, whole)) / clips,

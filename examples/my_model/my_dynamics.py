@@ -30,7 +30,7 @@ class MyDynamics(MyEncoder):
     def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
         """Return imagined features (B, samples, future, D); all samples are equal."""
         seen = list(context.features.unbind(1))
-        for _ in range(self.spec.future):
+        for _ in range(context.future):
             seen.append(self.following(*seen[-2:]))
         future = torch.stack(seen[self.spec.context :], dim=1)
         return Rollout(features=future[:, None].repeat(1, samples, 1, 1))

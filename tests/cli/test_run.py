@@ -15,10 +15,19 @@ import pytest
 
 from physion.cli import output
 from physion.cli.main import main
-from physion.cli.run import _once, balanced_trials, plan_sampled
+from physion.cli.run import (
+    OFFICIAL_MODELS,
+    _learns,
+    _once,
+    balanced_trials,
+    plan_official,
+    plan_sampled,
+)
 from physion.core.errors import BadInputError
 from physion.data.official import official
+from physion.models import build_model
 from physion.scenes.tdw.read_logs import TrialSet
+from physion.trials.making.plan import GenerateSettings
 
 SMALL = ["--limit", "2", "--size", "64", "--workers", "2"]
 FEW = ["--option", "steps=10", "noisy-simulation:samples=4"]
@@ -123,6 +132,24 @@ def test_sampled_trials_are_twice_as_many_for_the_readout() -> None:
     counts = Counter((task.scenario, task.split) for task in tasks)
     assert set(counts.values()) == {3, 6} and len(counts) == 6
     assert all(counts[scenario, "readout"] == 6 for scenario, _ in counts)
+
+
+def test_what_learns_is_trained_on_trials_that_show_no_roles() -> None:
+    """As many as fit the readout, of another split, whose movies have the free colours."""
+    tasks = plan_sampled(3, learn=True).tasks
+    counts = Counter((task.scenario, task.split) for task in tasks)
+    assert set(counts.values()) == {3, 6} and len(counts) == 9
+    assert all(counts[s, "training"] == counts[s, "readout"] for s, _ in counts)
+    plans = [plan_official(Path("official"), None, 2, learn=learn).tasks for learn in (False, True)]
+    added = plans[1][: len(plans[0])] and [t for t in plans[1] if t.split == "training"]
+    assert [t for t in plans[1] if t.split != "training"] == plans[0]
+    readout = Counter(task.scenario for task in plans[0] if task.split == "readout")
+    assert Counter(task.scenario for task in added) == readout
+    assert all(task.scene is None and task.presets for task in added)
+    assert GenerateSettings(look="split").looks("training") == ("free",)
+    assert GenerateSettings(look="split").looks("readout") == ("redyellow",)
+    learn = [name for name in OFFICIAL_MODELS if _learns(build_model(name))]
+    assert learn == ["pEffNetLite0-mlp"], "the weights of the others ship, or they have none"
 
 
 def test_two_different_trials_of_one_name_are_refused_with_their_files(tmp_path: Path) -> None:

@@ -18,7 +18,9 @@ import physion
 from physion.core.errors import BadInputError
 from physion.trials.dataset import Dataset
 
-SHORT: dict[str, Any] = {"context": 3, "future": 2, "stride": 4, "size": 16}
+SHORT: dict[str, Any] = {
+    "context": 3, "future": 2, "stride": 4, "size": 16, "context_at": "start"
+}  # fmt: skip
 
 
 def test_a_clip_holds_the_frames_of_the_movie_and_the_outcome(made: Dataset) -> None:
@@ -65,6 +67,10 @@ def test_clips_longer_than_a_trial_repeat_its_last_frame_or_are_left_out(made: D
     with pytest.raises(BadInputError, match="is long enough for a clip"):
         physion.clips(made, **long, padding=False)
     assert len(physion.clips(made, **SHORT, padding=False)) == len(made)
+    usual = physion.clips(made, size=16)
+    assert usual[0]["frames"].tolist() == [2, 8, 14, 20, 26, 32, 38, 44, 49]
+    with pytest.raises(BadInputError, match="need the number of frames that follow"):
+        physion.clips(made, size=16, padding=False)
 
 
 def test_without_a_future_only_the_observed_movies_are_opened(

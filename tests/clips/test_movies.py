@@ -23,7 +23,7 @@ from physion.trials.dataset import Dataset
 from physion.trials.video import encode_movie, read_frames
 from support.official_hand_made import CLOTH, FRAMES, RIGID, SIZE
 
-SPEC = Spec(image_size=16, future=5)
+SPEC = Spec(image_size=16, context=7, future=5, context_at="start")
 
 
 @pytest.fixture
@@ -51,16 +51,20 @@ def test_the_end_anchor_ends_with_the_last_observed_frame(made: Dataset) -> None
     np.testing.assert_array_equal(batch.rgb[0], movie[29:45:5])
 
 
-def test_whole_and_later_show_the_full_movie_and_repeat_its_last_frame(made: Dataset) -> None:
+def test_whole_clips_show_the_full_movie_and_repeat_its_last_frame(made: Dataset) -> None:
     source = whole_source(made, SPEC)
-    whole, later = source.whole([CLOTH]), source.later([CLOTH])
+    whole = source.whole([CLOTH])
     assert source.length(CLOTH) == FRAMES
     assert whole.frames.tolist() == [[0, 6, 12, 18, 24, 30, 36, 42, 48, 49, 49, 49]]
     assert whole.valid.tolist() == [[True] * 9 + [False] * 3]
     movie = read_frames(made.paths(CLOTH).movie, size=(16, 16))
     np.testing.assert_array_equal(whole.rgb[0], movie[whole.frames[0]])
-    np.testing.assert_array_equal(later.rgb, whole.rgb[:, 7:])
-    np.testing.assert_array_equal(later.valid, whole.valid[:, 7:])
+    usual = whole_source(made, Spec(image_size=16))
+    assert usual.whole([CLOTH]).frames.tolist() == [[2, 8, 14, 20, 26, 32, 38, 44, 49]]
+    longer = usual.whole([CLOTH], 60)
+    assert longer.frames.tolist() == [[2, 8, 14, 20, 26, 32, 38, 44, 49, 49, 49]]
+    assert longer.valid.tolist() == [[True] * 8 + [False] * 3]
+    np.testing.assert_array_equal(longer.rgb[0], movie[longer.frames[0]])
 
 
 def test_windows_start_anywhere(made: Dataset) -> None:
@@ -83,8 +87,8 @@ def test_windows_that_make_no_sense_are_refused(made: Dataset) -> None:
         source.window([RIGID], [0], 0)
     with pytest.raises(BadInputError, match="at least one trial"):
         source.context([])
-    with pytest.raises(BadInputError, match="no future"):
-        whole_source(made, replace(SPEC, future=0)).later([RIGID])
+    with pytest.raises(BadInputError, match="at least one trial"):
+        source.whole([])
 
 
 def test_unknown_trials_get_the_closest_ones(made: Dataset) -> None:
@@ -205,6 +209,7 @@ def test_keys_follow_the_movie_and_what_the_spec_reads(made: Dataset, copy: Data
         replace(SPEC, context=6),
         replace(SPEC, stride=5),
         replace(SPEC, context_at="end"),
+        Spec(image_size=16),
         replace(SPEC, inputs=("rgb", "ids")),
     )
     keys = [observed_source(made, spec).key(RIGID, "context") for spec in equal]
@@ -221,10 +226,10 @@ def test_the_context_of_whole_trials_matches_the_observed_source(made: Dataset) 
     observed, whole = observed_source(made, SPEC), whole_source(made, SPEC)
     assert observed.key(RIGID, "context") == whole.key(RIGID, "context")
     np.testing.assert_array_equal(observed.context([RIGID]).rgb, whole.context([RIGID]).rgb)
-    parts = [whole.key(RIGID, part) for part in ("context", "later", "whole")]
-    assert len(set(parts)) == 3
-    longer = whole_source(made, replace(SPEC, future=6))
-    assert longer.key(RIGID, "later") != whole.key(RIGID, "later")
+    assert whole.key(RIGID, "context") != whole.key(RIGID, "whole")
+    for future in (6, None):
+        other = whole_source(made, replace(SPEC, future=future))
+        assert other.key(RIGID, "whole") != whole.key(RIGID, "whole")
 
 
 # Batches read ahead: in order, errors at their place, nothing left running.

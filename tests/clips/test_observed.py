@@ -26,12 +26,13 @@ from support.hand_made import write_trial
 from support.official_hand_made import CLOTH, FRAMES, RIGID, SIZE, make_scene, make_trajectory
 
 EVERYTHING = ("rgb", "ids", "depth", "boxes", "camera", "state")
-SPEC = Spec(inputs=EVERYTHING, image_size=16, stride=4, context=12, future=1)
+SPEC = Spec(inputs=EVERYTHING, image_size=16, stride=4, context=12, future=1, context_at="start")
 SPECS = {
     "rgb": dataclasses.replace(SPEC, inputs=("rgb",)),
     "state": dataclasses.replace(SPEC, inputs=("state",)),
     "all": SPEC,
-    "end": dataclasses.replace(SPEC, context_at="end"),
+    "end": dataclasses.replace(SPEC, context=11, context_at="end"),
+    "default": Spec(inputs=EVERYTHING, image_size=16),
     "every frame": dataclasses.replace(SPEC, stride=1, context=45),
 }
 
@@ -107,16 +108,15 @@ def test_noise_after_the_observed_part_changes_no_byte_of_the_context(
         assert len({source.key(trial, "context") for source in sources}) == 1
 
 
-@pytest.mark.parametrize("part", ["later", "whole"])
-def test_the_noise_shows_in_whole_trials(made: Dataset, noisy: Dataset, part: Any) -> None:
+def test_the_noise_shows_in_whole_trials(made: Dataset, noisy: Dataset) -> None:
     """Else the test above would prove nothing. Frame 48 is the only one after frame 44."""
     for inputs in (("rgb",), ("ids",), ("depth",), ("state",)):
         spec = dataclasses.replace(SPEC, inputs=inputs)
         sources = [whole_source(data, spec) for data in (made, noisy)]
-        clean, changed = (as_bytes(getattr(source, part)([RIGID])) for source in sources)
+        clean, changed = (as_bytes(source.whole([RIGID])) for source in sources)
         assert clean != changed, inputs
         if inputs != ("rgb",):  # the index still has the SHA-256 of the movie
-            assert sources[0].key(RIGID, part) != sources[1].key(RIGID, part)
+            assert sources[0].key(RIGID, "whole") != sources[1].key(RIGID, "whole")
     with pytest.raises(BadInputError, match="was changed"):
         whole_source(Dataset(noisy.folder), SPECS["rgb"]).whole([RIGID])
 
@@ -219,11 +219,10 @@ def test_the_search_finds_later_frames(made: Dataset) -> None:
 @pytest.mark.parametrize("rendered", [False, True])
 def test_an_observed_source_has_no_request_for_later_frames(made: Dataset, rendered: bool) -> None:
     source: Any = observed_source(made, SPECS["rgb"], rendered=rendered)
-    for name in ("window", "whole", "later", "length"):
+    for name in ("window", "whole", "length"):
         assert not hasattr(source, name)
-    for part in ("later", "whole"):
-        with pytest.raises(FutureFrameError, match=f"no part {part!r}"):
-            source.key(RIGID, part)
+    with pytest.raises(FutureFrameError, match="no part 'whole'"):
+        source.key(RIGID, "whole")
 
 
 def test_a_context_with_frame_45_is_refused(made: Dataset) -> None:

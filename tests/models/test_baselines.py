@@ -501,9 +501,9 @@ def test_pixels_are_the_features_of_a_copy() -> None:
 def test_the_last_context_frame_is_imagined(stored: bool) -> None:
     model, rgb = build_model("copy-last-frame"), noise(2, 7, 32, 32, 3)
     features = model.encode(clips(rgb))
-    context = clips(rgb)
+    context = replace(clips(rgb), future=18)
     if stored:
-        context = Batch(context.trials, context.frames, context.valid, features=features)
+        context = replace(context, rgb=None, features=features)
     rollout = model.imagine(context, 2, 0)
     assert rollout.features.shape == (2, 2, 18, 32 * 32 * 3)
     assert (rollout.features == features[:, None, -1:]).all()

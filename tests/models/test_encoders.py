@@ -186,7 +186,7 @@ def test_a_rollout_predicts_from_the_last_features_and_its_own_predictions() -> 
         known.append(known[-1] + 0.5 * known[-3])
     expected = torch.stack(known[3:], 1) * scale + center
     batch = MovingValues(2, spec=model.spec).context(["drop_0000", "roll_0001"])
-    found = model.imagine(dataclasses.replace(batch, features=features), 2, 0).features
+    found = model.imagine(dataclasses.replace(batch, features=features, future=4), 2, 0).features
     assert torch.allclose(found, expected[:, None].expand(-1, 2, -1, -1), atol=1e-4)
 
 
@@ -214,7 +214,7 @@ def train(model: Any, folder: Path) -> Path:
     source = MovingValues(count=8, spec=model.spec)
     result = train_model(
         model, source, source.trials, seed=0, name="all", folder=folder, settings=QUICK,
-        features=lambda trials: model.encode(source.whole(trials).to("cpu")).numpy(),
+        features=lambda trials: list(model.encode(source.whole(trials).to("cpu")).numpy()),
         accelerator="cpu",
     )  # fmt: skip
     assert result.folder is not None
@@ -228,7 +228,9 @@ def features_of(model: EncoderModel) -> tuple[torch.Tensor, torch.Tensor]:
     seen = model.encode(context)
     with torch.no_grad():
         later = model.imagine(
-            type(context)(context.trials, context.frames, context.valid, features=seen), 1, 0
+            type(context)(context.trials, context.frames, context.valid, features=seen, future=2),
+            1,
+            0,
         )
     return seen, later.features
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -32,16 +33,28 @@ def clips(frames: Any, features: Any = None) -> Batch:
     ).to("cpu")
 
 
+def test_spec_shows_all_observed_frames_that_fit_and_all_up_to_the_end_of_the_movie() -> None:
+    assert Spec().context_frames() == (2, 8, 14, 20, 26, 32, 38, 44)
+    assert Spec(stride=9).context_frames() == (8, 17, 26, 35, 44)
+    assert Spec(stride=1).context == 45 and Spec(stride=100).context_frames() == (44,)
+    for length, last in ((45, 44), (46, 50), (51, 50), (52, 56), (602, 602)):
+        assert Spec().all_frames(length) == tuple(range(2, last + 1, 6))
+        assert Spec().steps_after(length) == (last - 44) // 6
+    assert replace(Spec(stride=9), stride=6).context == 5, "a number that was chosen is kept"
+
+
 def test_spec_shows_the_frames_of_the_released_models() -> None:
-    assert Spec().context_frames() == (0, 6, 12, 18, 24, 30, 36)
-    assert Spec().all_frames() == tuple(range(0, 145, 6))
-    assert Spec(stride=9, context=5, future=11).all_frames()[-1] == 135
+    spec = Spec(context=7, future=18, context_at="start")
+    assert spec.context_frames() == (0, 6, 12, 18, 24, 30, 36)
+    for length in (60, 602):
+        assert spec.all_frames(length) == tuple(range(0, 145, 6))
+    spec = Spec(stride=9, context=5, future=11, context_at="start")
+    assert spec.all_frames(602)[-1] == 135
 
 
-def test_spec_with_its_context_at_the_end_shows_the_last_observed_frame() -> None:
-    spec = Spec(context_at="end", stride=5, context=4, future=2)
-    assert spec.context_frames() == (29, 34, 39, 44)
-    assert spec.future_frames() == (49, 54)
+def test_spec_with_few_frames_ends_with_the_last_observed_one() -> None:
+    spec = Spec(stride=5, context=4, future=2)
+    assert spec.all_frames(100) == (29, 34, 39, 44, 49, 54)
 
 
 @pytest.mark.parametrize(
@@ -51,7 +64,7 @@ def test_spec_with_its_context_at_the_end_shows_the_last_observed_frame() -> Non
         {"future": -1},
         {"stride": 0},
         {"image_size": 0},
-        {"context": 0},
+        {"context": -1},
         {"inputs": ("sound",)},
         {"inputs": ()},
         {"context_at": "middle"},
@@ -143,8 +156,8 @@ def test_every_frozen_encoder_encodes_imagines_and_learns(name: str) -> None:
     assert not torch.equal(features[0, 0], features[0, 1])
     context = features[:, : spec.context]
     kept = context.clone()
-    rollout = model.imagine(clips(None, context), 2, 0).features
-    assert rollout.shape == (2, 2, spec.future, model.feature_size)
+    rollout = model.imagine(replace(clips(None, context), future=3), 2, 0).features
+    assert rollout.shape == (2, 2, 3, model.feature_size)
     assert torch.equal(rollout[:, 0], rollout[:, 1]), "the dynamics are deterministic"
     assert torch.equal(context, kept), "a rollout must not change what it started from"
     model.prepare(clips(None, features))

@@ -197,7 +197,8 @@ def test_sizes_and_their_names() -> None:
     )
     assert (paper.slots, paper.deterministic, paper.stochastic) == (8, 64, 64)
     assert released.density == "released"
-    assert replace(released, density="gaussian", size="paper") == paper
+    as_paper = {"context": 0, "future": None, "context_at": "end", "density": "gaussian"}
+    assert replace(released, size="paper", **as_paper) == paper
     assert tiny(density="released").digest() != tiny().digest()
 
 

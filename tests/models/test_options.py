@@ -51,7 +51,7 @@ def test_values_of_another_type_are_one_line(option: str, says: str) -> None:
     ("name", "options", "says"),
     [
         ("frozen-encoder", {"pooling": "other"}, "pooling of model frozen-encoder must be"),
-        ("frozen-encoder", {"fine_tuned": True, "distillation": 0.0}, "must be above 0"),
+        ("frozen-encoder", {"fine_tuned": True, "distillation": -0.1}, "must be at least 0"),
         ("frozen-encoder", {"fine_tuned": True, "standardised": False}, "standardised=true"),
         ("pVGG-mlp", {"size": "released", "fine_tuned": True}, "trains no encoder"),
         ("svg", {"backbone": "resnet"}, "must be 'dcgan' or 'vgg'"),

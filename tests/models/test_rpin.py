@@ -290,5 +290,32 @@ def test_bad_boxes_are_named() -> None:
 def test_history_lies_in_the_context_of_every_size() -> None:
     for size in ("small", "paper", "released"):
         model = model_of(size=size)
-        assert model.settings.history <= model.spec.context
-        assert model.spec.all_frames()[-1] == 135
+        assert model.settings.history <= model.spec.context == 5
+        last = 135 if size == "released" else 152
+        assert model.spec.all_frames(150)[-1] == last
+
+
+def test_the_order_of_objects_is_their_place_and_not_their_role() -> None:
+    """Features of clips whose objects change numbers are equal; shown boxes keep the numbers."""
+    model = model_of()
+    with torch.no_grad():
+        model.dynamics.decode.weight.normal_()
+    clip = squares(4, 8, model.spec, count=4)
+    swapped = with_boxes(clip, clip.boxes[:, :, [1, 0, 3, 2, *range(4, 8)]])
+    found, other = model.encode(clip), model.encode(swapped)
+    assert torch.allclose(found, other, atol=1e-6) and not torch.equal(clip.boxes, swapped.boxes)
+    # Frames 0, 9, ..., 63: number 4 is frame 36, and number 5 comes after the observed part.
+    centers = model._split(found)[1][:, 4, :4, 0]
+    assert (centers.diff(dim=1) >= 0).all()
+    left = to_center(clip.boxes)[:, 4, :4, 0]
+    assert torch.allclose(centers, left.sort(dim=1).values, atol=1e-6)
+    assert not (to_center(clip.boxes)[:, 5, :4, 0].gather(1, left.argsort(1)).diff() > 0).all()
+    context, turned = clip.steps(slice(0, 5)), swapped.steps(slice(0, 5))
+    with torch.no_grad():
+        assert torch.allclose(model.encode(context), found[:, :5], atol=1e-5)
+        rollouts = [model.imagine(batch, 1, 0) for batch in (context, turned)]
+    assert torch.allclose(rollouts[0].features, rollouts[1].features, atol=1e-5)
+    boxes, exchanged = (rollout.shown["boxes"] for rollout in rollouts)
+    assert torch.allclose(boxes[..., [1, 0, 3, 2], :], exchanged[..., :4, :], atol=1e-5)
+    gap = to_center(boxes[:, 0, 0, :4]) - to_center(context.boxes[:, -1, :4])
+    assert gap.abs().max() < 0.2, "each box continues its own"

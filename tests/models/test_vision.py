@@ -71,10 +71,11 @@ def outputs(model: Any, context: Batch) -> tuple[Any, Any]:
 @pytest.mark.parametrize("name", NAMES)
 def test_features_of_context_and_future_have_one_size(name: str) -> None:
     model = model_of(name)
-    features, future = outputs(model, context_of(model))
+    context = context_of(model)
+    features, future = outputs(model, context)
     assert features.dtype == future.dtype == torch.float32
     assert features.shape[:2] == (2, model.spec.context)
-    assert future.shape == (2, 2, model.spec.future, features.shape[-1])
+    assert future.shape == (2, 2, context.future, features.shape[-1])
     assert features.isfinite().all() and future.isfinite().all()
     assert not torch.equal(features[0], features[1]) and not torch.equal(future[0], future[1])
 
@@ -287,11 +288,11 @@ def test_clips_of_another_size_or_length_or_with_missing_frames_are_refused(name
     shorter = context.steps(slice(0, frames - 1))
     with pytest.raises(BadInputError, match=f"from a context of {frames} frames, not {frames - 1}"):
         model.imagine(shorter, 1, 0)
-    with pytest.raises(BadInputError, match=f"clips of {model.window} frames, not {frames - 1}"):
-        model.loss(shorter)
+    with pytest.raises(BadInputError, match=f"clips of {model.window} frames, not 2"):
+        model.loss(context.steps(slice(0, 2)))
     valid = context.valid.clone()
     valid[1, frames - 1] = False
-    with pytest.raises(BadInputError, match=rf"squares_0001.*up to frame {spec.stride * 6}"):
+    with pytest.raises(BadInputError, match=r"squares_0001.*up to frame 44"):
         model.imagine(with_arrays(context, valid=valid), 1, 0)
 
 

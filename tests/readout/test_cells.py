@@ -16,6 +16,7 @@ from physion.core.errors import BadInputError, PhysionError
 from physion.models.checkpoint import read_checkpoint
 from physion.readout.logistic import LogisticSettings
 from physion.readout.settings import EvaluationSettings, TrainSettings, choose_models
+from physion.readout.tables import summarise_accuracy
 from physion.trials.dataset import Dataset
 from support import cell_models
 from support.moving_dots import make_dots
@@ -81,6 +82,48 @@ def test_trainings_are_models_by_protocols_by_sets_by_seeds(dots: Dataset, tmp_p
     assert all(one.loaded for one in again.trained) and stamps(tmp_path / "training") == before
     planned = physion.train(IMAGINING, dots, tmp_path, dry_run=True, **given).planned
     assert all(one.done for one in planned)
+
+
+def test_each_scenario_trains_a_model_that_is_tested_on_all(dots: Dataset, tmp_path: Path) -> None:
+    given: dict[str, Any] = {"protocols": ("only", "one"), "settings": QUICK}
+    table = physion.evaluate(IMAGINING, dots, tmp_path, **given).predictions
+    assert len(list((tmp_path / "training").iterdir())) == 2, "both protocols have the same weights"
+    one = table[table["protocol"] == "one"]
+    pairs = one.groupby(["dynamics_training_dataset", "scenario", "readout"])["stimulus"]
+    sizes = pairs.agg(["size", "nunique"])
+    assert (sizes == 4).all(axis=None) and len(sizes) == 2 * 2 * 3
+    only = table[table["protocol"] == "only"]
+    assert (only["dynamics_training_dataset"] == "").all() and len(only) == len(one) / 2
+    # What was trained on the tested scenario is the same in both.
+    same = one[one["dynamics_training_dataset"] == one["scenario"]]
+    keys = ["readout", "scenario", "stimulus"]
+    both = only.merge(same, on=keys, suffixes=("", "_one"))
+    assert len(both) == len(only) and (both["p_contact"] == both["p_contact_one"]).all()
+    other = one[one["dynamics_training_dataset"] != one["scenario"]].merge(only, on=keys)
+    simulated = other[other["readout"] == "observed+simulated"]
+    assert (simulated["validation_loss_x"] != simulated["validation_loss_y"]).all()
+    for (_, trained, tested), rows in one.groupby(
+        ["readout", "dynamics_training_dataset", "scenario"]
+    ):
+        hits = ((rows["p_contact"] > 0.5) == rows["outcome"]).mean()
+        assert rows["test_accuracy"].to_numpy() == pytest.approx(hits), (trained, tested)
+    scores = summarise_accuracy(one).set_index(["protocol", "readout", "scenario"])["accuracy"]
+    assert set(scores.index.get_level_values(0)) == {"one: collide", "one: drop"}
+    rows = one[(one["readout"] == "full") & (one["dynamics_training_dataset"] == "drop")]
+    rows = rows[rows["scenario"] == "collide"]
+    hits = ((rows["p_contact"] > 0.5) == rows["outcome"]).mean()
+    assert scores["one: drop", "full", "collide"] == hits
+    planned = physion.train(IMAGINING, dots, tmp_path, dry_run=True, protocols="one", settings=CPU)
+    assert [(plan.name, plan.done) for plan in planned.planned] == [
+        ("collide", True),
+        ("drop", True),
+    ]
+    (single,) = physion.train(
+        IMAGINING, dots, tmp_path, dry_run=True, protocols="one", scenario="drop", settings=CPU
+    ).planned
+    assert single.name == "drop"
+    with pytest.raises(BadInputError, match="all-but, only or one"):
+        physion.train(IMAGINING, dots, tmp_path, dry_run=True, scenario="drop", settings=CPU)
 
 
 def test_a_training_that_is_missing_or_was_changed_is_done_again(

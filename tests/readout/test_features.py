@@ -30,8 +30,11 @@ from physion.readout.features import FeatureStore
 from physion.readout.model_calls import OutOfMemoryError
 from physion.scenes.scene import Ending
 
-SPEC = Spec(image_size=2, context=3, future=4)
+SPEC = Spec(image_size=2, context=3, future=4, context_at="start")
 TRIALS = ("roll_1", "roll_2", "drop_1", "drop_2", "link_1")
+
+
+FUTURE = dict.fromkeys(TRIALS, 4)
 
 
 def sha(*parts: Any) -> str:
@@ -45,6 +48,7 @@ class Movies:
     spec: Spec = SPEC
     trials: tuple[str, ...] = TRIALS
     version: int = 0
+    lengths: dict[str, int] = field(default_factory=dict)
     read: list[tuple[str, ...]] = field(default_factory=list)
 
     def _clips(self, trials: Sequence[str], frames: tuple[int, ...]) -> Batch:
@@ -64,14 +68,14 @@ class Movies:
             rgb=np.array(pixels, np.uint8).reshape(*shape, 2, 2, 3),
         )
 
+    def length(self, trial: str) -> int:
+        return self.lengths.get(trial, 50)
+
     def context(self, trials: Sequence[str]) -> Batch:
         return self._clips(trials, self.spec.context_frames())
 
-    def later(self, trials: Sequence[str]) -> Batch:
-        return self._clips(trials, self.spec.future_frames())
-
     def whole(self, trials: Sequence[str]) -> Batch:
-        return self._clips(trials, self.spec.all_frames())
+        return self._clips(trials, self.spec.all_frames(max(map(self.length, trials))))
 
     def key(self, trial: str, part: str) -> str:
         return sha(self.version, trial, part, self.spec)
@@ -139,13 +143,13 @@ def files(folder: Path) -> list[Path]:
 
 
 @pytest.mark.parametrize("kind", [Network, Numpy])
-@pytest.mark.parametrize("part", ["context", "later", "whole"])
+@pytest.mark.parametrize("part", ["context", "whole"])
 def test_features_match_the_model_and_are_computed_once(
     tmp_path: Path, kind: Any, part: Any
 ) -> None:
     model, movies = kind(), Movies()
     at_once = FeatureStore(tmp_path / "all", batch=2).encoded(model, movies, TRIALS, part)
-    frames = {"context": 3, "later": 4, "whole": 7}[part]
+    frames = {"context": 3, "whole": 7}[part]
     assert at_once.shape == (5, frames, 5 if kind is Network else 12)
     batch = getattr(movies, part)(TRIALS)
     if kind is Network:
@@ -183,6 +187,71 @@ def test_features_after_training_are_never_those_from_before(tmp_path: Path) -> 
     assert not movies.read, "the features of the first weights are still there"
 
 
+def test_whole_movies_are_encoded_to_their_own_end_and_repeat_their_last_features(
+    tmp_path: Path,
+) -> None:
+    """Lengths 45, 46, 50, 51 and 100 have 8, 9, 9, 9 and 18 frames: 2, 8, ..., up to the last."""
+    lengths = dict(zip(TRIALS, (45, 46, 50, 51, 100), strict=True))
+    movies = Movies(Spec(image_size=2), lengths=lengths)
+    model: Any = Numpy()
+    model.spec = movies.spec
+    store = FeatureStore(tmp_path, batch=2)
+    found = store.encoded(model, movies, TRIALS, "whole")
+    assert movies.read == [TRIALS[:1], TRIALS[1:3], TRIALS[3:4], TRIALS[4:]]
+    assert found.shape == (5, 18, 12)
+    own = [row[:].reshape(-1, 12) for row in found.by_trial()]
+    assert [len(row) for row in own] == [8, 9, 9, 9, 18]
+    for trial, row in zip(TRIALS, own, strict=True):
+        (expected,) = model.encode(movies.whole([trial]))
+        assert (row == expected).all()
+    padded = np.stack([row[np.minimum(np.arange(18), len(row) - 1)] for row in own])
+    assert (found.array() == padded).all()
+    assert (found.columns(90, 130) == padded.reshape(5, -1)[:, 90:130]).all()
+    assert (found.frame(17) == padded[:, 17]).all()
+    assert (own[4][3:5] == found.by_trial()[4][3:5]).all()
+    short = found.select([0, 2])
+    assert short.shape == (2, 18, 12), "as wide as what it was chosen from"
+    assert (short.array() == padded[[0, 2]]).all()
+    assert store.encoded(model, movies, TRIALS[:2], "whole").shape == (2, 9, 12)
+
+
+def test_long_clips_are_encoded_in_parts_of_equal_numbers(tmp_path: Path) -> None:
+    sizes: list[tuple[int, ...]] = []
+
+    def give(pixels: Any) -> Any:
+        sizes.append(pixels.shape[:2])
+        return flat(pixels)
+
+    lengths = {TRIALS[0]: 602, TRIALS[1]: 602, TRIALS[2]: 150}
+    movies = Movies(Spec(image_size=2), lengths=lengths)
+    model: Any = Numpy(give)
+    model.spec = movies.spec
+    found = FeatureStore(tmp_path, batch=4).encoded(model, movies, TRIALS[:3], "whole").array()
+    assert sizes == [(1, 13)] * 2 + [(1, 20), (1, 20), (1, 20), (1, 20), (1, 21)] * 2
+    assert (found[0] == flat(movies.whole([TRIALS[0]]).rgb)[0]).all()
+
+
+def test_futures_of_other_lengths_are_stored_apart(tmp_path: Path) -> None:
+    model, movies, store = Network(), Movies(), FeatureStore(tmp_path)
+
+    class Steps(Network):
+        def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
+            return Rollout(features=torch.zeros(len(context), samples, context.future, 1))
+
+    model = Steps()
+    options: Any = {"samples": 1, "seed": 0, "arguments": {}}
+    for steps in (3, 5, 3):
+        future = dict.fromkeys(TRIALS, steps)
+        (found,) = store.imagined(model, movies, TRIALS, future=future, **options).values()
+        features = found.features()
+        assert features is not None and features.shape == (5, steps, 1)
+    assert len(files(tmp_path)) == 10
+    future = dict(zip(TRIALS, (3, 5, 3, 5, 3), strict=True))
+    movies.read.clear()
+    store.imagined(model, movies, TRIALS, future=future, **options)
+    assert not movies.read, "all were there"
+
+
 def test_other_clips_are_other_features(tmp_path: Path) -> None:
     store, model = FeatureStore(tmp_path), Numpy()
     first = store.encoded(model, Movies(), TRIALS, "context").array()
@@ -218,7 +287,7 @@ def test_dynamics_change_what_is_imagined_and_not_what_is_encoded(tmp_path: Path
     def imagined(**arguments: float) -> tuple[Any, Any]:
         context = store.encoded(model, movies, TRIALS, "context")
         (found,) = store.imagined(
-            model, movies, TRIALS[1:], samples=3, seed=0, context=context,
+            model, movies, TRIALS[1:], samples=3, seed=0, context=context, future=FUTURE,
             arguments={name: (value,) for name, value in arguments.items()},
         ).values()  # fmt: skip
         return found.features(), found.outcomes()
@@ -400,21 +469,22 @@ class Dreamer(Numpy):
 def test_wrong_rollouts_are_refused(tmp_path: Path, given: Any, message: str) -> None:
     with pytest.raises(BadInputError) as caught:
         FeatureStore(tmp_path, batch=5).imagined(
-            Dreamer(**given), Movies(), TRIALS, samples=2, seed=0, arguments={}
+            Dreamer(**given), Movies(), TRIALS, samples=2, seed=0, arguments={}, future=FUTURE
         )
     assert message in str(caught.value)
 
 
 def test_only_outcomes_are_stored_too(tmp_path: Path) -> None:
     contact = np.array([[True, False]] * 5)
+    options: Any = {"samples": 2, "arguments": {}, "future": FUTURE}
     model, movies, store = Dreamer(contact=contact), Movies(), FeatureStore(tmp_path, batch=5)
     for _ in range(2):
-        found = store.imagined(model, movies, TRIALS, samples=2, seed=0, arguments={})[()]
+        found = store.imagined(model, movies, TRIALS, seed=0, **options)[()]
         outcomes = found.outcomes()
         assert found.features() is None and outcomes.gap is None
         assert outcomes.contact.dtype == bool and (outcomes.contact == contact).all()
     assert len(movies.read) == 1
-    store.imagined(model, movies, TRIALS, samples=2, seed=1, arguments={})
+    store.imagined(model, movies, TRIALS, seed=1, **options)
     assert len(movies.read) == 2
 
 
@@ -436,7 +506,7 @@ def exhausted(what: str, tmp_path: Path, batch: int) -> None:
         movies.context = context
     if what == "imagining":
         model.imagine = lambda context, samples, seed: np.ones(2**50)
-        store.imagined(model, movies, TRIALS, samples=2, seed=0, arguments={})
+        store.imagined(model, movies, TRIALS, samples=2, seed=0, arguments={}, future=FUTURE)
     else:
         model.encode = encode
         store.encoded(model, movies, TRIALS, "context")
@@ -480,9 +550,8 @@ def test_later_frames_need_a_whole_source(tmp_path: Path) -> None:
     observed: Any = ObservedMovies(Movies())
     store = FeatureStore(tmp_path)
     assert store.encoded(Numpy(), observed, TRIALS, "context").shape == (5, 3, 12)
-    for part in ("later", "whole"):
-        with pytest.raises(BadInputError, match=f"no part '{part}'"):
-            store.encoded(Numpy(), observed, TRIALS, part)  # type: ignore[arg-type]
+    with pytest.raises(BadInputError, match="no part 'whole'"):
+        store.encoded(Numpy(), observed, TRIALS, "whole")
 
 
 def test_bad_folders_batches_and_digests_are_refused(tmp_path: Path) -> None:
@@ -508,7 +577,7 @@ def test_progress_counts_what_is_computed(tmp_path: Path) -> None:
 def test_no_trial_has_no_feature(tmp_path: Path) -> None:
     store = FeatureStore(tmp_path)
     assert store.encoded(Numpy(), Movies(), [], "context").array().size == 0
-    found = store.imagined(Dreamer(), Movies(), [], samples=1, seed=0, arguments={})[()]
+    found = store.imagined(Dreamer(), Movies(), [], samples=1, seed=0, arguments={}, future={})[()]
     assert found.trials == () and len(found.outcomes().touches()) == 0
 
 
@@ -569,8 +638,9 @@ def test_trials_that_fail_cost_no_other_trial(tmp_path: Path) -> None:
     store, model = FeatureStore(tmp_path), Counts()
     source: Any = Source(names)
     found = store.imagined(
-        model, source, names, samples=1, seed=0, arguments={"factor": (1.0, 2.0)}, together=3
-    )
+        model, source, names, samples=1, seed=0, arguments={"factor": (1.0, 2.0)}, together=3,
+        future=dict.fromkeys(names, 0),
+    )  # fmt: skip
     for factor in (1, 2):
         imagined = found[(("factor", float(factor)),)]
         assert imagined.trials == ("a", "bb", "ccc", "dddd")
@@ -602,7 +672,14 @@ def test_particle_models_imagine_the_same_in_processes(tmp_path: Path) -> None:
     assert model.trials_together > 1
     found = [
         FeatureStore(tmp_path / type(executor).__name__, executor=executor).imagined(
-            model, source, names, samples=1, seed=0, arguments={}, together=2
+            model,
+            source,
+            names,
+            samples=1,
+            seed=0,
+            arguments={},
+            together=2,
+            future=dict.fromkeys(names, 0),
         )[()]
         for executor in (SerialExecutor(), LocalExecutor(2))
     ]

@@ -111,7 +111,7 @@ def test_motions_continue_like_another_trial(tmp_path: Path) -> None:
         assert row["digest"] == opened.metadata.digest == changed.digest()
         assert row["frames"] == opened.metadata.frames == len(exchanged.frames(trial))
         assert row["playback_seconds"] == pytest.approx(len(partner) / 30)
-    spec = Spec(inputs=("rgb", "boxes"), image_size=32, stride=9, context=5, future=12)
+    spec = Spec(inputs=("rgb", "boxes"), image_size=32, stride=9, future=12)
     batches = [whole_source(dataset, spec).whole(trials) for dataset in (made, exchanged)]
     before, after = (np.nan_to_num(np.asarray(batch.boxes)) for batch in batches)
     assert np.array_equal(before[:, :5], after[:, :5]) and not np.array_equal(before, after)

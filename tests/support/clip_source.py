@@ -21,11 +21,13 @@ class ClipSource:
     def context(self, trials: Sequence[str]) -> Batch:
         return self.clips(trials, [self.spec.context_frames()] * len(trials))
 
-    def later(self, trials: Sequence[str]) -> Batch:
-        return self.clips(trials, [self.spec.future_frames()] * len(trials))
+    def length(self, trial: str) -> int:
+        """Return the frames of a trial."""
+        raise NotImplementedError
 
     def whole(self, trials: Sequence[str]) -> Batch:
-        return self.clips(trials, [self.spec.all_frames()] * len(trials))
+        longest = max(self.length(trial) for trial in trials)
+        return self.clips(trials, [self.spec.all_frames(longest)] * len(trials))
 
     def window(self, trials: Sequence[str], starts: Sequence[int], length: int) -> Batch:
         steps = self.spec.stride * np.arange(length)

@@ -55,7 +55,12 @@ def _make(folder: Path, scenario: str, split: str, number: int) -> dict[str, Any
     }
     row |= {"trial": name, "dataset": "dots", "scenario": scenario, "split": split}
     row |= {"index": number, "contact": contact, "frames": FRAMES, "observed_frames": OBSERVED}
-    row |= {"width": SIZE, "height": SIZE, "playback_seconds": FRAMES / 30}
+    row |= {
+        "observed_contact": False,
+        "width": SIZE,
+        "height": SIZE,
+        "playback_seconds": FRAMES / 30,
+    }
     row |= {"digest": hashlib.sha256(frames.tobytes()).hexdigest()}
     for column, path, shown in (
         ("movie", paths.movie, frames),

@@ -10,6 +10,8 @@ import numpy as np
 from physion.clips.batch import Batch, Spec
 
 COLORS = ((220, 40, 30), (230, 220, 40), (40, 60, 200), (40, 180, 60))
+FUTURE = 11
+"""Steps that a model is asked to imagine, where its spec leaves that open."""
 BACKGROUND = 110
 """Gray of the pictures around the squares."""
 SIDE, MARGIN = 0.2, 0.15
@@ -45,6 +47,7 @@ def squares(
         valid=np.ones((clips, frames), np.bool_),
         rgb=rgb if "rgb" in spec.inputs else None,
         boxes=boxes if "boxes" in spec.inputs else None,
+        future=FUTURE if spec.future is None else spec.future,
     ).to("cpu")
 
 

@@ -16,7 +16,7 @@ FROZEN = [
 ]  # fmt: skip
 VIDEO: dict[str, Any] = {
     "weights": "random", "image_size": 32, "patch": 8, "frames": 4, "width": 24, "depth": 2,
-    "heads": 2, "later": 2,
+    "heads": 2,
 }  # fmt: skip
 UNTRAINED: dict[str, Any] = {"weights": "random"}
 OPTIONS: dict[str, dict[str, Any]] = {

@@ -21,7 +21,7 @@ from physion.models.torch_model import TorchModel
 from support.clip_source import ClipSource
 from support.hand_made import make_scene, make_trajectory
 
-SPEC = Spec(image_size=4, stride=6, context=3, future=5)
+SPEC = Spec(image_size=4, stride=6, context=3, future=5, context_at="start")
 QUICK = TrainingSettings(
     steps=40, batch=8, learning_rate=1e-2, log_every=10, checkpoint_every=10, validate_every=20
 )
@@ -58,11 +58,14 @@ class MovingValues(ClipSource):
     def values(self, trial: str, frames: NDArray[np.int64]) -> NDArray[np.float64]:
         return self._start[trial] + self._speed[trial] * frames
 
-    def features(self, trials: Sequence[str]) -> NDArray[np.float32]:
-        """Return features (n, T, 2) of whole clips: the brightness, and its square."""
-        frames = np.array(self.spec.all_frames())
-        rows = [self.values(t, np.minimum(frames, self.frames[t] - 1)) / 100 for t in trials]
-        return np.stack([np.stack([row, row**2], axis=1) for row in rows]).astype(np.float32)
+    def features(self, trials: Sequence[str]) -> list[NDArray[np.float32]]:
+        """Return features (T, 2) of whole clips: the brightness, and its square."""
+        found = []
+        for trial in trials:
+            frames = np.array(self.spec.all_frames(self.frames[trial]))
+            row = self.values(trial, np.minimum(frames, self.frames[trial] - 1)) / 100
+            found.append(np.stack([row, row**2], axis=1).astype(np.float32))
+        return found
 
     def clips(self, trials: Sequence[str], frames: Sequence[Sequence[int]]) -> Batch:
         clipped = [clip_frames(f, self.frames[t]) for t, f in zip(trials, frames, strict=True)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import struct
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import torch
 from lightning_fabric import Fabric
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import ReduceLROnPlateau
 
@@ -37,8 +36,8 @@ from physion.training.loop import (
     learning_rate,
 )
 from physion.training.train import TrainedModel, train_model
-from physion.training.windows import ClipWindows, step_request
-from support.trained_models import QUICK, MovingValues, NextBrightness, equal_weights
+from physion.training.windows import ClipWindows, FeatureWindows, Request, step_request
+from support.trained_models import QUICK, SPEC, MovingValues, NextBrightness, equal_weights
 
 CPU = make_fabric(Devices("cpu"))
 ALL_AT_ONCE = replace(
@@ -191,13 +190,13 @@ def test_held_out_trials_are_not_trained_on() -> None:
     assert len(held) == 5 and others == set(source.trials) - set(held)
 
 
-def test_models_see_a_sample_of_clips_or_all_features_before_training() -> None:
+def test_models_see_a_sample_of_clips_or_features_before_training() -> None:
     for learns_from, count in (("clips", 64), ("features", 90)):
         model = NextBrightness(learns_from)  # type: ignore[arg-type]
         run(model, source=MovingValues(count=100), settings=replace(QUICK, steps=1))
         (sample,) = model.prepared
         assert len(sample) == count == len(set(sample.trials))
-        assert sample.frames.shape[1] == (4 if learns_from == "clips" else 8)
+        assert sample.frames.shape[1] == 4
 
 
 def test_frames_of_feature_windows_match_the_features() -> None:
@@ -212,6 +211,43 @@ def test_frames_of_feature_windows_match_the_features() -> None:
 
     source = MovingValues(frames=40)  # the last steps of a clip repeat frame 39
     run(Checked("features"), source=source, settings=replace(QUICK, steps=3))
+
+
+def test_windows_of_features_come_from_the_entire_movie() -> None:
+    """Of movies of 60 and 602 frames: 2, 8, ..., 62 (59 is the last one) and 2, ..., 602 (601)."""
+    spec = replace(SPEC, context=0, future=None, context_at="end")
+    source = MovingValues(count=2, spec=spec)
+    source.frames = dict(zip(source.trials, (60, 602), strict=True))
+    features = source.features(source.trials)
+    assert [len(own) for own in features] == [11, 101]
+    windows = FeatureWindows(spec, source.trials, features, [60, 602], np.arange(2), 4)
+    starts = windows.starts([0, 1] * 5000, np.random.default_rng(0))
+    assert set(starts[::2]) == set(range(8)) and set(starts[1::2]) == set(range(98))
+    batch = windows.read(Request((source.trials[1], source.trials[0]), (97, 7)))
+    assert batch.frames.tolist() == [[584, 590, 596, 601], [44, 50, 56, 59]]
+    assert batch.valid.tolist() == [[True, True, True, False]] * 2
+    for trial, frames, own in zip(batch.trials, batch.frames, batch.features, strict=True):
+        assert own[:, 0] == pytest.approx(source.values(trial, frames) / 100, rel=1e-6)
+    long = FeatureWindows(spec, source.trials, features, [60, 602], np.arange(2), 13)
+    assert long.starts([0], np.random.default_rng(0)).tolist() == [0]
+    short = long.read(Request(source.trials[:1], (0,)))
+    assert short.frames.tolist() == [[*range(2, 57, 6), 59, 59, 59]]
+    assert short.valid.tolist() == [[True] * 10 + [False] * 3]
+    assert (short.features[0, -1] == short.features[0, -3]).all()
+    with pytest.raises(BadInputError, match=r"clip of 11 frames of trial 'drop_0000'"):
+        FeatureWindows(spec, source.trials, features[::-1], [60, 602], np.arange(2), 4)
+
+
+def test_nothing_held_out_uses_every_trial_and_validates_nothing() -> None:
+    source = MovingValues(count=10)
+    for held_out, used in ((0.1, 9), (0.0, 10)):
+        source.read.clear()
+        trained = run(
+            NextBrightness(), source=source, settings=replace(QUICK, held_out=held_out, steps=60)
+        )
+        steps = [trials for trials, _ in source.read if len(trials) == QUICK.batch]
+        assert len({trial for trials in steps for trial in trials}) == used
+        assert np.isnan(trained.validation) == (held_out == 0)
 
 
 def test_the_rate_rises_linearly_and_is_constant_afterwards() -> None:
@@ -451,15 +487,6 @@ def test_memory_that_is_used_up_names_the_setting_to_lower(error: Exception) -> 
         run(Large(), settings=replace(QUICK, held_out=0.0))
     with pytest.raises(OutOfMemoryError, match=r"at batch 1; use .*bf16-mixed"):
         run(Large(), settings=replace(QUICK, held_out=0.0, batch=1))
-
-
-def test_features_that_do_not_fit_into_memory_are_not_blamed_on_the_batch() -> None:
-    class Full(MovingValues):
-        def features(self, trials: Sequence[str]) -> NDArray[np.float32]:
-            raise MemoryError
-
-    with pytest.raises(OutOfMemoryError, match=r"features of 20 training trials .* fewer trials"):
-        run(NextBrightness("features"), source=Full())
 
 
 @pytest.mark.parametrize(

@@ -15,14 +15,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 
 import physion
+from physion.clips.clips import clips
 from physion.compute.local import LocalExecutor, SerialExecutor
 from physion.compute.run_tasks import RunReport
 from physion.core.errors import BadInputError, PhysionError, UnknownNameError
 from physion.core.files import folder_lock, write_atomic
 from physion.physics.engine import make_engine
+from physion.readout.evaluate import evaluate
 from physion.trials.dataset import Dataset
 from physion.trials.files import TrialPaths, find_trials
 from physion.trials.index import build_index, index_row
@@ -69,6 +72,43 @@ def test_index_equals_the_files(finished: Path) -> None:
         assert stored["digest"] == trial.trajectory.digest()
         assert stored["agent_fraction"] == 64 / 1024 and stored["patient_fraction"] == 512 / 1024
     assert dataset.index["first_frame"].isna().tolist() == [True, False, True, False]
+
+
+def test_without_labels_training_trials_hold_no_outcome_and_no_roles(tmp_path: Path) -> None:
+    tasks = plan_dataset("plain", ("collide",), {"training": 1, "readout": 2, "testing": 2})
+    made = {}
+    for labels in (True, False):
+        settings = GenerateSettings(width=64, height=64, jitters=0, labels=labels)
+        folder = tmp_path / str(labels)
+        assert not make_trials(folder, tasks, settings, executor=SerialExecutor()).failed
+        assert not verify_dataset(folder, again=5).faults
+        again = make_trials(folder, tasks, settings, executor=SerialExecutor())
+        assert not again.made, "nothing is missing"
+        made[labels] = Dataset(folder)
+    full, plain = made[True], made[False]
+    (training,) = plain.trials("training")
+    rows = plain.index.set_index("trial")
+    hidden = [
+        "contact", "first_frame", "observed_contact", "min_distance", "robust", "agent_fraction",
+        "patient_fraction", "map", "map_sha256", "recorded_contact",
+    ]  # fmt: skip
+    assert rows.loc[training, hidden].isna().all()
+    assert rows.drop(index=training)["contact"].tolist() == (
+        full.index.set_index("trial").drop(index=training)["contact"].tolist()
+    )
+    assert plain.trial(training).labels is None
+    assert not list((plain.folder / "training").rglob("*_map.png"))
+    assert len(list(plain.folder.rglob("*_map.png"))) == 4
+    known, kept = full.index.set_index("trial"), ["digest", "movie_sha256", "observed_movie_sha256"]
+    assert known[kept].equals(rows[kept]), "else they are the same trials"
+    assert known["contact"].dtype == bool and rows["contact"].dtype == "boolean"
+    with pytest.raises(BadInputError, match="stored without labels"):
+        clips(plain, size=16)
+    assert len(clips(plain, size=16, labels=False)) == 5
+    assert len(clips(plain, size=16, split="readout")) == 2
+    found = evaluate("blob-centroids", plain, tmp_path / "out").predictions
+    expected = evaluate("blob-centroids", full, tmp_path / "out").predictions
+    pd.testing.assert_frame_equal(found, expected)
 
 
 def test_observed_frames_need_no_file_with_the_future(finished: Path, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json as json_module
 import os
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -24,6 +24,7 @@ from physion.core.names import canonical_name
 from physion.core.seeds import stable_hash
 from physion.core.settings import split_names
 from physion.data.official import PACKAGED, find_official, humans_folder, read_official_trials
+from physion.models.interface import ask, can
 from physion.readout.evaluate import Evaluation, evaluate
 from physion.readout.settings import EvaluationSettings, choose_models, options_by_model
 from physion.scenes.tdw.read_logs import ImportedTrial, TrialSet
@@ -78,7 +79,8 @@ class Options:
     """Folder for trials, predictions and the report; default: runs/official or runs/sampled."""
     limit: int | None = None
     """Testing trials per scenario, 10 by default, and as many for the readout (twice as many of
-    sampled ones); 0 takes all official ones."""
+    sampled ones); 0 takes all official ones. Models that learn get as many sampled training trials
+    as there are for the readout, which show no agent and patient."""
     size: int = 128
     """Pixels per side of the movies."""
     option: tuple[str, ...] = ()
@@ -102,17 +104,17 @@ def main(options: Options) -> int:
     humans = _humans(options)
     out = options.out or Path("runs") / ("sampled" if options.sampled else "official")
     models = model_options(options)
-    for chosen in choose_models(models):
-        # So that a wrong name or a missing library fails before trials are made.
-        chosen.build(0)
+    # Built now, so that a wrong name or a missing library fails before trials are made.
+    built = [chosen.build(0) for chosen in choose_models(models)]
+    learn = any(_learns(model) for model in built)
     if options.sampled:
-        plan = plan_sampled(options.limit)
+        plan = plan_sampled(options.limit, learn=learn)
     else:
-        plan = plan_official(options.scenes, humans, options.limit)
+        plan = plan_official(options.scenes, humans, options.limit, learn=learn)
     executor = LocalExecutor(workers=options.workers)
     with Stages() as stages:
         settings = GenerateSettings(
-            width=options.size, height=options.size, look="redyellow", jitters=0,
+            width=options.size, height=options.size, look="split", jitters=0,
             engine=options.engine,
         )  # fmt: skip
         trials = make_trials(
@@ -141,6 +143,11 @@ def main(options: Options) -> int:
     minutes, seconds = divmod(round(time.monotonic() - started), 60)
     print_line(f"report, made in {minutes} min {seconds} s: {page}")
     return 1 if failures else 0
+
+
+def _learns(model: Any) -> bool:
+    """Return whether an evaluation trains a built model."""
+    return can(model, "loss") and not ask(model, "trained")
 
 
 def _humans(options: Options) -> Path | None:
@@ -201,7 +208,8 @@ def methods(options: Options, index: pd.DataFrame) -> dict[str, str]:
         "Scenes": f"{source}; trials: {counts}; movies of {options.size} x {options.size} pixels",
         "Readout": "one L2 logistic regression per scenario on standardised features, C from 17 "
         "values in 1e-8 to 1e8 by stratified 5-fold cross-validation on readout trials",
-        "Training": f"models that learn: {TRAINING['steps']} steps on the readout trials, no labels"
+        "Training": f"models that learn: {TRAINING['steps']} steps on the training trials, which "
+        "show no agent and patient, no labels"
         + (f"; options: {' '.join(options.option)}" if options.option else ""),
         "Noise of the simulation": "20 simulations per trial from the true state at the end of the "
         "observed part; the noise scale is fitted on readout trials only",
@@ -226,18 +234,23 @@ class RunPlan:
     failures: list[str]
 
 
-def plan_sampled(limit: int | None) -> RunPlan:
-    """Plan a small set of sampled trials: testing, and twice as many for the readout."""
+def plan_sampled(limit: int | None, *, learn: bool = False) -> RunPlan:
+    """Plan a small set of sampled trials: testing, and twice as many for the readout.
+
+    With ``learn`` there are as many training trials as for the readout.
+    """
     count = LIMIT if limit is None else limit
-    tasks = plan_dataset("sampled", SAMPLED_SCENARIOS, {"readout": 2 * count, "testing": count})
-    return RunPlan(tasks, {}, [])
+    counts = {"readout": 2 * count, "testing": count, **({"training": 2 * count} if learn else {})}
+    return RunPlan(plan_dataset("sampled", SAMPLED_SCENARIOS, counts), {}, [])
 
 
-def plan_official(scenes: Path, humans: Path | None, limit: int | None) -> RunPlan:
+def plan_official(
+    scenes: Path, humans: Path | None, limit: int | None, *, learn: bool = False
+) -> RunPlan:
     """Plan official scenes: those that people saw are tested, others fit models and readouts.
 
     ``limit`` is the number of testing trials of a scenario, balanced by recorded outcome; as many
-    others are fitted. 0 takes all.
+    others are fitted. 0 takes all. With ``learn``, as many training trials are sampled.
     """
     from physion.analysis.tables import read_humans
 
@@ -259,6 +272,9 @@ def plan_official(scenes: Path, humans: Path | None, limit: int | None) -> RunPl
     for split, trials in parts.items():
         chosen = [trial.scene for trial in balanced_trials(trials, limit)]
         tasks += plan_scenes("official", chosen, split, recorded)
+        if learn and split == "readout":
+            for scenario, count in Counter(scene.scenario for scene in chosen).items():
+                tasks += plan_dataset("official", (scenario,), {"training": count})
     if not any(task.split == "testing" for task in tasks):
         raise BadInputError(f"none of the scenes in {scenes} is in {humans}")
     check_names(tasks)

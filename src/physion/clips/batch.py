@@ -39,16 +39,18 @@ class Spec:
     - ``mean``, ``std``: of the red, green and blue channel in 0..1. They belong to the weights; the
       model itself normalises its uint8 pictures with them.
     - ``stride``: frames between two frames of a clip (6 of a movie at 30 frames/s: 5 a second).
-    - ``context``: frames of a clip that are observed. ``future``: those that follow, 0 for a model
-      that neither imagines nor reads later frames.
-    - ``context_at``: where the context lies: ``start`` (0, s, 2 s, ...) or ``end`` (..., 44 - s,
-      44).
+    - ``context``: frames of a clip that are observed; 0: all that fit into the observed part.
+    - ``future``: frames that follow; None: up to the end of the movie. 0 is for a model that
+      neither imagines nor reads later frames.
+    - ``context_at``: where the context lies: ``end`` (..., 44 - s, 44) or ``start`` (0, s, 2 s,
+      ...).
     - ``objects``: rows of ``Batch.boxes``.
     - ``framewise``: whether the features of a frame depend on that frame only, so that a clip can
       be encoded in parts.
 
-    The defaults are as in the released frozen-encoder models: frames 0, 6, ..., 36 of the 45
-    observed ones, and 42, 48, ..., 144 after them.
+    The defaults are as in the paper: every sixth frame up to the last observed one, 2, 8, ..., 44,
+    and from there to the end of the movie. The released frozen-encoder models had ``context=7,
+    context_at="start", future=18``: frames 0, 6, ..., 36, and 42, 48, ..., 144 after them.
     """
 
     inputs: tuple[str, ...] = ("rgb",)
@@ -56,9 +58,9 @@ class Spec:
     mean: tuple[float, float, float] = IMAGENET_MEAN
     std: tuple[float, float, float] = IMAGENET_STD
     stride: int = 6
-    context: int = 7
-    future: int = 18
-    context_at: Literal["start", "end"] = "start"
+    context: int = 0
+    future: int | None = None
+    context_at: Literal["start", "end"] = "end"
     objects: int = 10
     framewise: bool = True
 
@@ -68,12 +70,15 @@ class Spec:
             raise BadInputError(
                 f"spec: inputs must be some of {', '.join(INPUTS)}, not {list(self.inputs)}"
             )
-        if min(self.image_size, self.stride, self.context, self.objects) < 1 or self.future < 0:
+        least = min(self.context, self.future or 0)
+        if min(self.image_size, self.stride, self.objects) < 1 or least < 0:
             raise BadInputError(
-                f"spec: image size {self.image_size}, stride {self.stride}, context {self.context} "
-                f"and objects {self.objects} must be at least 1, and future {self.future} at least "
-                "0"
+                f"spec: image size {self.image_size}, stride {self.stride} and objects "
+                f"{self.objects} must be at least 1, and context {self.context} and future "
+                f"{self.future} at least 0"
             )
+        if not self.context:
+            object.__setattr__(self, "context", LAST_OBSERVED // self.stride + 1)
         if self.context_at not in ("start", "end"):
             raise BadInputError(f"spec: context_at must be start or end, not {self.context_at!r}")
         if (self.context - 1) * self.stride > LAST_OBSERVED:
@@ -89,26 +94,28 @@ class Spec:
         return 0 if self.context_at == "start" else LAST_OBSERVED - (self.context - 1) * self.stride
 
     @property
-    def total(self) -> int:
-        """Number of frames of a whole clip."""
-        return self.context + self.future
-
-    @property
     def sees_pictures(self) -> bool:
         """Whether the model asks for anything that the camera sees."""
         return any(name in PIXELS for name in self.inputs)
 
     def context_frames(self) -> tuple[int, ...]:
         """Return the frames of the context; all are observed."""
-        return self.all_frames()[: self.context]
+        return tuple(self.first + step * self.stride for step in range(self.context))
 
-    def future_frames(self) -> tuple[int, ...]:
-        """Return the frames that follow the context. The first may lie in the observed part."""
-        return self.all_frames()[self.context :]
+    def steps_after(self, length: int) -> int:
+        """Return how many frames follow the context in a clip of a motion of ``length`` frames.
 
-    def all_frames(self) -> tuple[int, ...]:
-        """Return the frames of a whole clip."""
-        return tuple(self.first + step * self.stride for step in range(self.total))
+        Without a ``future`` they are as many as it takes to reach the last frame.
+        """
+        if self.future is not None:
+            return self.future
+        left = length - 1 - self.context_frames()[-1]
+        return max(0, -(-left // self.stride))
+
+    def all_frames(self, length: int) -> tuple[int, ...]:
+        """Return the frames of a whole clip of a motion of ``length`` frames."""
+        steps = self.context + self.steps_after(length)
+        return tuple(self.first + step * self.stride for step in range(steps))
 
 
 @dataclass(frozen=True)
@@ -139,6 +146,7 @@ class Batch:
     - ``camera`` (B, 2, 4, 4) float64: view matrix (world to camera) and projection matrix.
     - ``state``: motions (B); they have all frames from 0 on, not only ``frames``.
     - ``features`` (B, T, D) float32: of a frozen encoder, if ``learns_from`` is features.
+    - ``future``: steps that `Model.imagine` is asked for.
     """
 
     trials: tuple[str, ...]
@@ -151,6 +159,7 @@ class Batch:
     camera: Any = None
     state: tuple[Motion, ...] | None = None
     features: Any = None
+    future: int = 0
 
     def __post_init__(self) -> None:
         clips, steps = len(self.trials), self.frames.shape[-1]
@@ -176,8 +185,9 @@ class Batch:
 
     def arrays(self) -> dict[str, Any]:
         """Return the arrays that are not None, by name."""
-        names = [item.name for item in dataclasses.fields(self)]
-        values = {name: getattr(self, name) for name in names if name not in ("trials", "state")}
+        others = ("trials", "state", "future")
+        names = [item.name for item in dataclasses.fields(self) if item.name not in others]
+        values = {name: getattr(self, name) for name in names}
         return {name: value for name, value in values.items() if value is not None}
 
     def to(self, device: Any) -> Batch:
@@ -256,6 +266,7 @@ def join_batches(parts: Sequence[Batch]) -> Batch:
     """Return one batch with the clips of all ``parts``, numpy arrays of equal shapes."""
     states = [part.state for part in parts]
     return Batch(
+        future=parts[0].future,
         trials=tuple(trial for part in parts for trial in part.trials),
         state=None
         if any(state is None for state in states)

@@ -111,10 +111,10 @@ def clips(
     *,
     split: str | None = None,
     scenario: str | None = None,
-    context: int = 7,
-    future: int = 18,
+    context: int = 0,
+    future: int | None = None,
     stride: int = 6,
-    context_at: Literal["start", "end"] = "start",
+    context_at: Literal["start", "end"] = "end",
     size: int = 224,
     passes: Sequence[str] = ("rgb",),
     look: str | None = None,
@@ -134,13 +134,14 @@ def clips(
     split, scenario
         Which trials; by default all.
     context, future
-        Frames of a clip in the observed part, and after them. With ``future=0`` nothing that
-        follows the observed part is opened.
+        Frames of a clip in the observed part, 0 for all that fit, and after them: by default up to
+        the end of the longest of the trials. With ``future=0`` nothing that follows the observed
+        part is opened.
     stride
         Frames of 0.01 s from one frame of a clip to the next.
     context_at
-        ``start``: frame 0 comes first; ``end``: the last frame of the context is the last
-        observed one.
+        ``end``: the last frame of the context is the last observed one; ``start``: frame 0 comes
+        first.
     size
         Pixels per side.
     passes
@@ -151,7 +152,7 @@ def clips(
         Rows of ``boxes``.
     padding
         Repeat the last frame in clips that are longer than their trial; otherwise such trials
-        are left out.
+        are left out, which needs a ``future``.
     labels
         Give the outcome, too.
     rendered
@@ -195,9 +196,11 @@ def clips(
         dataset = Dataset(dataset)
     trials = dataset.trials(split, scenario)
     if not padding:
+        if future is None:
+            raise BadInputError("clips without padding need the number of frames that follow")
         column = "frames" if future else "observed_frames"
         length = dict(zip(dataset.index["trial"], dataset.index[column], strict=True))
-        trials = [trial for trial in trials if length[trial] > spec.all_frames()[-1]]
+        trials = [t for t in trials if length[t] > spec.all_frames(length[t])[-1]]
     if not trials:
         if padding:
             raise BadInputError(
@@ -229,9 +232,18 @@ class Clips(Sequence[dict[str, Any]]):
         rendered: bool,
     ) -> None:
         self.spec, self.trials = spec, tuple(trials)
-        outcomes = dataset.index.set_index("trial")["contact"].astype(bool)
-        self._labels = outcomes.to_dict() if labels else None
+        self._labels = None
+        if labels:
+            outcomes = dataset.index.set_index("trial")["contact"].loc[list(self.trials)]
+            if outcomes.isna().any():
+                raise BadInputError(
+                    f"trial {outcomes.index[outcomes.isna()][0]!r} is stored without labels; ask "
+                    "for clips without (labels=False)"
+                )
+            self._labels = outcomes.astype(bool).to_dict()
         self._dataset, self._look, self._rendered = dataset, look, rendered
+        frames = dict(zip(dataset.index["trial"], dataset.index["frames"], strict=True))
+        self._longest = max(int(frames[trial]) for trial in self.trials)
         self._source = self._open()
 
     def __len__(self) -> int:
@@ -242,8 +254,9 @@ class Clips(Sequence[dict[str, Any]]):
         if isinstance(index, slice):
             return [self[row] for row in range(*index.indices(len(self)))]
         trial = self.trials[index]
-        read = self._source.whole if self.spec.future else self._source.context
-        item: dict[str, Any] = {name: a[0] for name, a in read([trial]).arrays().items()}
+        whole, longest = self.spec.future != 0, self._longest
+        read = self._source.whole([trial], longest) if whole else self._source.context([trial])
+        item: dict[str, Any] = {name: a[0] for name, a in read.arrays().items()}
         if self._labels is not None:
             item["label"] = np.bool_(self._labels[trial])
         return {**item, "trial": trial}
@@ -260,5 +273,5 @@ class Clips(Sequence[dict[str, Any]]):
         self._source = self._open()
 
     def _open(self) -> Any:
-        open_source = whole_source if self.spec.future else observed_source
+        open_source = whole_source if self.spec.future != 0 else observed_source
         return open_source(self._dataset, self.spec, look=self._look, rendered=self._rendered)

@@ -7,6 +7,7 @@ observed part: it opens the observed movies, and motions that were cut when they
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Protocol
@@ -19,15 +20,15 @@ from physion.clips.states import motion_digest
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import digest_of
 
-Part = Literal["context", "later", "whole"]
-"""Part of a clip: its context, the frames after the context, or both."""
+Part = Literal["context", "whole"]
+"""Part of a clip: its context, or all its frames."""
 
 
 class FutureFrameError(BadInputError):
     """Error for a request of a frame after the observed part from an `ObservedSource`."""
 
 
-_VERSION = 1
+_VERSION = 2
 """To be increased with every change that can alter what a source gives for equal files."""
 
 
@@ -127,14 +128,18 @@ class ObservedSource:
         return self._readers.trials
 
     def context(self, trials: Sequence[str]) -> Batch:
-        """Return the context of clips; motions end with the last observed frame."""
+        """Return the context of clips; motions end with the last observed frame.
+
+        The batch has the ``future`` of the spec, or 0 where it depends on the movies.
+        """
         frames = self._spec.context_frames()
         if max(frames) > LAST_OBSERVED:
             raise FutureFrameError(
                 f"frame {max(frames)} comes after the observed part, whose last frame is "
                 f"{LAST_OBSERVED}"
             )
-        return self._readers.batch(trials, [frames] * len(trials))
+        batch = self._readers.batch(trials, [frames] * len(trials))
+        return dataclasses.replace(batch, future=self._spec.future or 0)
 
     def key(self, trial: str, part: Part) -> str:
         """Return the hexadecimal SHA-256 of all that determines the context of a trial."""
@@ -142,7 +147,7 @@ class ObservedSource:
             raise FutureFrameError(
                 f"trial {trial!r}: a source of the observed part has no part {part!r} of a clip"
             )
-        return clip_key(self._spec, part, self._readers.identity(trial))
+        return clip_key(self._spec, self._spec.context_frames(), self._readers.identity(trial))
 
 
 class WholeSource(ObservedSource):
@@ -164,15 +169,10 @@ class WholeSource(ObservedSource):
         """Return the context of clips; motions end with the last observed frame."""
         return self._observed.context(trials)
 
-    def later(self, trials: Sequence[str]) -> Batch:
-        """Return the frames of clips that follow the context."""
-        if not self.spec.future:
-            raise BadInputError("the spec has no future: there are no frames after the context")
-        return self._read(trials, [self.spec.future_frames()] * len(trials))
-
-    def whole(self, trials: Sequence[str]) -> Batch:
-        """Return whole clips."""
-        return self._read(trials, [self.spec.all_frames()] * len(trials))
+    def whole(self, trials: Sequence[str], length: int = 0) -> Batch:
+        """Return whole clips, of motions of ``length`` frames; 0: of the longest of the trials."""
+        longest = length or max((self.length(trial) for trial in trials), default=0)
+        return self._read(trials, [self.spec.all_frames(longest)] * len(trials))
 
     def window(self, trials: Sequence[str], starts: Sequence[int], length: int) -> Batch:
         """Return ``length`` frames of every trial, ``spec.stride`` apart, from its start frame."""
@@ -200,22 +200,18 @@ class WholeSource(ObservedSource):
         """Return the hexadecimal SHA-256 of all that determines the part of a trial's clip."""
         if part == "context":
             return self._observed.key(trial, part)
-        return clip_key(self.spec, part, self._readers.identity(trial))
+        frames = self.spec.all_frames(self.length(trial))
+        return clip_key(self.spec, frames, self._readers.identity(trial))
 
 
-def clip_key(spec: Spec, part: Part, identity: Sequence[str]) -> str:
-    """Return the hexadecimal SHA-256 of ``identity`` and of what ``spec`` says of a part.
+def clip_key(spec: Spec, frames: Sequence[int], identity: Sequence[str]) -> str:
+    """Return the hexadecimal SHA-256 of ``identity``, ``frames`` and what ``spec`` says of them.
 
     Statistics of the weights (``mean``, ``std``) do not count: a source does not use them.
     """
-    frames = {
-        "context": spec.context_frames,
-        "later": spec.future_frames,
-        "whole": spec.all_frames,
-    }[part]()
     values = {
         "version": _VERSION,
-        "frames": frames,
+        "frames": list(frames),
         "inputs": sorted(set(spec.inputs)),
         "size": spec.image_size if spec.sees_pictures else None,
         "objects": spec.objects if "boxes" in spec.inputs else None,

@@ -28,7 +28,12 @@ from physion.core.errors import BadInputError
 from physion.models.checkpoint import load_named
 from physion.models.interface import Sizes, TrainingSettings
 from physion.models.torch_model import initial_weights
-from physion.models.vision import VisionModel, VisionSettings, normalized_pictures
+from physion.models.vision import (
+    RELEASED_CLIPS,
+    VisionModel,
+    VisionSettings,
+    normalized_pictures,
+)
 
 NAME, VERSION = "cswm", 1
 
@@ -37,7 +42,8 @@ _PAPER: Mapping[str, Any] = {
     "kernels": (9, 5), "strides": (1, 5),
 }  # fmt: skip
 _RELEASED: Mapping[str, Any] = {
-    **_PAPER, "stacked": 7, "memory": 1, "transitions": 1, "negatives": "permuted",
+    **_PAPER, **RELEASED_CLIPS,
+    "stacked": 7, "memory": 1, "transitions": 1, "negatives": "permuted",
 }  # fmt: skip
 
 
@@ -311,6 +317,10 @@ class Cswm(VisionModel):
             image_size=settings.image_size,
             mean=(0.0, 0.0, 0.0),
             std=(1.0, 1.0, 1.0),
+            stride=settings.stride,
+            context=settings.context,
+            future=settings.future,
+            context_at=settings.context_at,
             framewise=settings.stacked == 1,
         )
         super().__init__(VERSION, settings, TRAINING[settings.size], spec)
@@ -355,7 +365,7 @@ class Cswm(VisionModel):
         states = features[:, -self.settings.memory :]
         states = states.view(*states.shape[:2], self.settings.slots, -1)
         imagined = []
-        for _ in range(self.spec.future):
+        for _ in range(context.future):
             states = torch.cat([states[:, 1:], self._predicted(states)], 1)
             imagined.append(states[:, -1].flatten(1))
         future = torch.stack(imagined, 1)[:, None].expand(-1, samples, -1, -1)

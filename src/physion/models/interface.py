@@ -210,7 +210,8 @@ class Model:
         What a model with a `loss` is trained on: ``clips`` (what `Spec` asks for), ``features`` (of
         its own `encode`), or ``states`` (whole motions).
     window
-        Frames of a training clip, at ``spec.stride``, from a random start; 0: as `Spec` asks for.
+        Frames of a training clip, at ``spec.stride``, from a random start; 0: context and future
+        of the `Spec`, or twice the context where the future depends on the movie.
     training_settings
         Optimiser and schedule of its training.
     calibration_trials
@@ -248,7 +249,7 @@ class Model:
         raise NotImplementedError
 
     def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
-        """Return ``samples`` futures of every clip.
+        """Return ``samples`` futures of every clip, of ``context.future`` steps.
 
         ``seed`` and the names of the trials determine all random numbers. ``arguments`` are
         values that a decision fits. If the model encodes, ``context.features`` holds the

@@ -38,6 +38,7 @@ from physion.models.interface import Sizes
 from physion.models.torch_model import initial_weights
 from physion.models.vision import (
     PICTURE_TRAINING,
+    RELEASED_CLIPS,
     PictureModel,
     PictureSettings,
     context_pictures,
@@ -99,7 +100,7 @@ class Op3Settings(PictureSettings):
     sizes: ClassVar[Sizes] = {
         "small": {},
         "paper": _PAPER,
-        "released": {**_PAPER, "density": "released"},
+        "released": {**_PAPER, **RELEASED_CLIPS, "density": "released"},
     }
 
     def __post_init__(self) -> None:
@@ -604,8 +605,8 @@ class Op3(PictureModel):
         """
         _, seen = self._watch(context_pictures(context, self.spec, self.name))
         slots = seen[-1]
-        settings, clips = self.settings, len(context)
-        shape = (samples, settings.future + 1, settings.slots, settings.stochastic)
+        settings, clips, future = self.settings, len(context), context.future
+        shape = (samples, future + 1, settings.slots, settings.stochastic)
         noise = self.imagined_noise(context.trials, seed, shape).to(slots.mean)
         shows = arguments.get("show", 0) > 0
         features, shown, found = [], [], []
@@ -613,12 +614,12 @@ class Op3(PictureModel):
             if shows:
                 found = [self.slots.decoder(beliefs.states) for beliefs in seen]
             state = _repeated(slots, samples, noise[:, 0])
-            for step in range(settings.future):
+            for step in range(future):
                 state = self.slots.predict(state, noise[:, step + 1])
                 features.append(state.features())
                 if shows:
                     shown.append(self.slots.decoder(state.states))
-        values = torch.stack(features, 1).float().view(clips, samples, settings.future, -1)
+        values = torch.stack(features, 1).float().view(clips, samples, future, -1)
         return Rollout(features=values, shown=_shown(shown, found, clips, samples))
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:

@@ -4,8 +4,9 @@ Tensors (B clips, T frames, h = ``settings.history``, K objects, states of C x p
 
 - boxes (B, T, K, 4): centre and size in 0..1, without NaN (`known_boxes`).
 - states (B, T, K, C, p, p): regions of the boxes in the feature maps of the pictures.
-- features (B, T, K (C p p + 4)): state and box of each object, one object after the other. They
-  are zeros for an object that no frame of the clip shows.
+- features (B, T, K (C p p + 4)): state and box of each object, one object after the other, from
+  left to right as they lie at the last observed frame (`from_left`), so that their order does not
+  say which object is the agent. They are zeros for an object that no frame of the clip shows.
 
 The boxes come from the ids, as in the published experiments: the model is supervised by them.
 The published code encodes no boxes apart from the regions; here the box and its last change are
@@ -25,7 +26,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torchvision.ops import roi_align
 
-from physion.clips.batch import Batch, Provenance, Rollout, Spec
+from physion.clips.batch import LAST_OBSERVED, Batch, Provenance, Rollout, Spec
 from physion.core.errors import BadInputError
 from physion.models.checkpoint import load_named
 from physion.models.interface import Sizes, TrainingSettings
@@ -38,7 +39,8 @@ _PAPER: Mapping[str, Any] = {
     "image_size": 256, "objects": 10, "rollout": 11, "width": 256, "groups": 32, "depth": 4,
 }  # fmt: skip
 _RELEASED: Mapping[str, Any] = {
-    **_PAPER, "history": 5, "sampling": 1, "aligned": False, "outputs": "published",
+    **_PAPER, "context_at": "start", "context": 5, "future": 11,
+    "history": 5, "sampling": 1, "aligned": False, "outputs": "published",
 }  # fmt: skip
 
 
@@ -60,6 +62,7 @@ class RpinSettings(VisionSettings):
     """
 
     model: str = NAME
+    stride: int = 9
     objects: int = 8
     history: int = 4
     rollout: int = 8
@@ -148,6 +151,16 @@ def known_boxes(boxes: Tensor) -> Tensor:
 def is_present(known: Tensor) -> Tensor:
     """Return which objects (...) of boxes (..., 4) as `known_boxes` gives them are not absent."""
     return known[..., 2] > 0
+
+
+def from_left(known: Tensor, row: int) -> Tensor:
+    """Return the objects (B, K) from left to right as they lie in frame number ``row`` of a clip.
+
+    Objects that are absent come last. ``known`` (B, T, K, 4) are boxes as `known_boxes` gives them.
+    """
+    now = known[:, row]
+    place = torch.where(is_present(now), now[..., 0], torch.inf)
+    return place.argsort(dim=1, stable=True)
 
 
 def to_center(boxes: Tensor) -> Tensor:
@@ -426,9 +439,10 @@ class Rpin(VisionModel):
             image_size=settings.image_size,
             mean=(0.5, 0.5, 0.5),
             std=(0.25, 0.25, 0.25),
-            stride=9,
-            context=5,
-            future=11,
+            stride=settings.stride,
+            context=settings.context,
+            future=settings.future,
+            context_at=settings.context_at,
             objects=settings.objects,
             framewise=False,
         )
@@ -450,7 +464,9 @@ class Rpin(VisionModel):
 
     def encode(self, batch: Batch) -> Tensor:
         """Return features (B, T, K (C p p + 4)) of the objects of a batch."""
-        boxes = self._boxes(batch)
+        boxes = known_boxes(self._seen(batch))
+        order = self._order(batch, boxes)[:, None, :, None].expand_as(boxes)
+        boxes = boxes.gather(2, order)
         states = self._states(batch, boxes)
         return torch.cat([states.flatten(3), boxes], -1).flatten(2)
 
@@ -458,14 +474,18 @@ class Rpin(VisionModel):
         """Predict states and boxes from the last h frames of the context.
 
         The prediction is deterministic: all samples are equal, and ``seed`` has no effect.
-        ``shown`` holds the boxes; they are NaN for absent objects.
+        ``shown`` holds the boxes, in the order of the boxes of the context; they are NaN for absent
+        objects.
         """
         features = self.encode(context) if context.features is None else context.features
         states, boxes = self._split(features[:, -self.settings.history :])
-        imagined = self._roll_out(states, boxes, self.spec.future)
+        imagined = self._roll_out(states, boxes, context.future)
         joined = torch.cat([imagined.states.flatten(3), imagined.boxes], -1).flatten(2)
         absent = ~is_present(boxes[:, -1])[:, None, :, None]
         shown = to_edges(imagined.boxes).masked_fill(absent, float("nan"))
+        if context.boxes is not None:
+            place = self._order(context, known_boxes(self._seen(context))).argsort(dim=1)
+            shown = shown.gather(2, place[:, None, :, None].expand_as(shown))
         return Rollout(
             features=joined[:, None].expand(-1, samples, -1, -1),
             shown={"boxes": shown[:, None].expand(-1, samples, -1, -1, -1)},
@@ -578,9 +598,10 @@ class Rpin(VisionModel):
         # Where a frame does not show an object, its last box stands in; it does not count.
         return boxes, Targets(known_boxes(all_boxes)[:, history:], counted)
 
-    def _boxes(self, batch: Batch) -> Tensor:
-        """Return the boxes (B, T, K, 4) of all frames, as centre and size."""
-        return known_boxes(self._seen(batch))
+    def _order(self, batch: Batch, known: Tensor) -> Tensor:
+        """Return the objects (B, K) of clips from left to right at the last observed frame."""
+        observed = batch.frames[0] <= LAST_OBSERVED
+        return from_left(known, max(int(observed.sum()) - 1, 0))
 
     def _seen(self, batch: Batch) -> Tensor:
         """Return the boxes of a batch, after a check of their shape."""

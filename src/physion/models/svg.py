@@ -36,6 +36,7 @@ from physion.models.interface import Sizes
 from physion.models.torch_model import initial_weights
 from physion.models.vision import (
     PICTURE_TRAINING,
+    RELEASED_CLIPS,
     PictureModel,
     PictureSettings,
     context_pictures,
@@ -86,7 +87,7 @@ class SvgSettings(PictureSettings):
     sizes: ClassVar[Sizes] = {
         "small": {},
         "paper": _PAPER,
-        "released": {**_PAPER, "skip": "before"},
+        "released": {**_PAPER, **RELEASED_CLIPS, "skip": "before"},
     }
 
     def __post_init__(self) -> None:
@@ -96,7 +97,9 @@ class SvgSettings(PictureSettings):
             raise BadInputError(
                 f"SVG: image_size must be 16, 32, 64, 128 or {LARGEST_IMAGE}, not {size}"
             )
-        self.at_least(2, "past", "context")
+        self.at_least(2, "past")
+        if self.context == 1:
+            raise BadInputError("SVG: context must be at least 2, not 1")
 
 
 SMALL_TRAINING = replace(PICTURE_TRAINING, steps=3000, batch=16, clip=1.0)
@@ -317,7 +320,7 @@ class Svg(PictureModel):
         ``shown`` holds the pictures under ``rgb`` (B, S, future, H, W, 3), uint8.
         """
         pictures = context_pictures(context, self.spec, self.name)
-        steps = self.spec.context - 1 + self.spec.future
+        steps = self.spec.context - 1 + context.future
         shape = (samples, steps, self.settings.latent)
         noise = self.imagined_noise(context.trials, seed, shape).to(pictures)
         imagined = self._roll_out(pictures, noise)

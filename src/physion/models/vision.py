@@ -6,9 +6,9 @@ something moves, and the pictures of a batch as input.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -26,9 +26,22 @@ class VisionSettings(SizedSettings):
     """Settings of a vision model that is trained from pictures.
 
     - ``image_size``: pixels per side.
+    - ``stride``, ``context``, ``future``, ``context_at``: see `physion.clips.batch.Spec`.
     """
 
     image_size: int = 64
+    stride: int = 6
+    context: int = 0
+    future: int | None = None
+    context_at: Literal["start", "end"] = "end"
+
+    any_weights: ClassVar[frozenset[str]] = SizedSettings.any_weights | {
+        "context", "future", "context_at"
+    }  # fmt: skip
+
+
+RELEASED_CLIPS: Mapping[str, Any] = {"context_at": "start", "context": 7, "future": 18}
+"""Frames of clips in the released code: 0, 6, ..., 36 of the 45 observed ones, and 42 to 144."""
 
 
 class VisionModel(TorchModel):
@@ -256,7 +269,6 @@ class PictureSettings(VisionSettings):
     """Settings of a model that predicts pictures.
 
     - ``past``, ``imagined``: frames of a training clip that are seen, and that follow.
-    - ``stride``, ``context``, ``future``: see `physion.clips.batch.Spec`.
     - ``beta``: weight of the divergence in the loss.
     - ``motion``: additional weight of moving pixels in the loss; published 0. Few pixels move, and
       a short training would learn the scenery only.
@@ -265,15 +277,12 @@ class PictureSettings(VisionSettings):
 
     past: int = 7
     imagined: int = 9
-    stride: int = 6
-    context: int = 7
-    future: int = 18
     beta: float = 1e-4
     motion: float = 20.0
     samples: int = 1
 
     def __post_init__(self) -> None:
-        self.at_least(1, "image_size", "past", "imagined", "stride", "context", "samples")
+        self.at_least(1, "image_size", "past", "imagined", "samples")
 
 
 PICTURE_TRAINING = TrainingSettings(
@@ -311,6 +320,7 @@ class PictureModel(VisionModel):
             stride=settings.stride,
             context=settings.context,
             future=settings.future,
+            context_at=settings.context_at,
             framewise=framewise,
         )
         super().__init__(version, settings, training, spec)

@@ -49,7 +49,7 @@ from physion.trials.dataset import Dataset
 
 NOTHING_TO_FIT = "no trial to fit|one answer only"
 """Notes of `physion.readout.logistic.fit_readout` where it predicts the base rate."""
-_VERSION = 6
+_VERSION = 7
 """To be increased with every change that can alter the table of an evaluation."""
 _NOT_HASHED = ("protocols", "seeds", "encoder_batch", "accelerator", "rollout_errors")
 """Settings of where and how an evaluation runs, or of others than this one."""
@@ -242,6 +242,8 @@ class _Evaluate:
             from physion.readout.rollout_error import check_moves_objects, rollout_error
 
             check_moves_objects(model)
+            if cell.protocol is Protocol.ONE:
+                raise BadInputError("rollout errors need another protocol than one: one per trial")
         done = is_whole(path) and (errors_path is None or is_whole(errors_path))
         protocol = cell.protocol.value if cell.protocol is not None else ""
         evaluated = EvaluatedModel(

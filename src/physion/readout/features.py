@@ -106,6 +106,21 @@ FEATURES = "features"
 """Name of the array of features."""
 
 
+class FeatureRow:
+    """Features (T', D) float32 of one trial, in a file of which time steps are read."""
+
+    def __init__(self, file: FeatureFile) -> None:
+        self._file = file
+        self.shape = file.shapes[FEATURES]
+
+    def __getitem__(self, steps: slice) -> Floats:
+        """Return a range of time steps, with a step of 1."""
+        start, stop, _ = steps.indices(self.shape[0])
+        size = self.shape[1]
+        values: Floats = self._file.read(FEATURES, start * size, stop * size).reshape(-1, size)
+        return values
+
+
 class StoredFeatures:
     """Features (n, T', D) float32 of n trials, in files of which pieces are read.
 
@@ -115,24 +130,30 @@ class StoredFeatures:
         Names (n).
     rows
         For every trial the file with its features (T', D).
+    repeated
+        Whether trials may have different numbers of time steps. T' is then the largest, and a trial
+        with fewer repeats its last one, as a movie that has ended keeps showing its last frame.
 
     Raises
     ------
     BadInputError
-        If the shapes of two trials differ.
+        If the shapes of two trials differ otherwise.
     """
 
-    def __init__(self, trials: Sequence[str], rows: Sequence[FeatureFile]) -> None:
-        self.trials = tuple(trials)
+    def __init__(
+        self, trials: Sequence[str], rows: Sequence[FeatureFile], *, repeated: bool = False
+    ) -> None:
+        self.trials, self._repeated = tuple(trials), repeated
         self._rows = tuple(rows)
         shapes = [row.shapes[FEATURES] for row in self._rows]
         for trial, shape in zip(self.trials, shapes, strict=True):
-            if shape != shapes[0]:
+            if shape[repeated:] != shapes[0][repeated:]:
                 raise BadInputError(
                     f"features of trial {trial!r} have shape {shape}, but {self.trials[0]!r} has "
                     f"{shapes[0]}; a model must give equal shapes for all trials"
                 )
-        self._steps, self._size = shapes[0] if shapes else (0, 0)
+        self._steps = max((shape[0] for shape in shapes), default=0)
+        self._size = shapes[0][1] if shapes else 0
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -152,7 +173,14 @@ class StoredFeatures:
         stop = min(stop, self.width)
         out = np.empty((len(self._rows), max(stop - start, 0)), np.float32)
         for values, row in zip(out, self._rows, strict=True):
-            values[:] = row.read(FEATURES, start, stop)
+            known = row.shapes[FEATURES][0] * self._size
+            ends = min(stop, known)
+            if start < ends:
+                values[: ends - start] = row.read(FEATURES, start, ends)
+            if known < stop:
+                last = row.read(FEATURES, known - self._size, known)
+                repeated = np.arange(max(start, known), stop) % self._size
+                values[max(known - start, 0) :] = last[repeated]
         return out
 
     def frame(self, step: int) -> Floats:
@@ -163,13 +191,19 @@ class StoredFeatures:
         """Return all features (n, T', D), in memory."""
         return self.columns(0, self.width).reshape(self.shape)
 
+    def by_trial(self) -> list[FeatureRow]:
+        """Return the features (T', D) of every trial, none repeated, which are read when needed."""
+        return [FeatureRow(row) for row in self._rows]
+
     def select(self, rows: Sequence[int] | NDArray[Any]) -> StoredFeatures:
         """Return the trials with the given row numbers; their features are not read."""
         chosen = [int(row) for row in rows]
         selected = StoredFeatures(
-            [self.trials[row] for row in chosen], [self._rows[row] for row in chosen]
+            [self.trials[row] for row in chosen],
+            [self._rows[row] for row in chosen],
+            repeated=self._repeated,
         )
-        # Without a trial the shape of one is still known.
+        # Equal for all choices, also without a trial.
         selected._steps, selected._size = self._steps, self._size
         return selected
 
@@ -182,17 +216,25 @@ Arrays = Mapping[str, NDArray[Any]]
 
 
 def encode_clips(model: Model, batch: Batch) -> list[Arrays]:
-    """Return the features (T', D) of every clip of a batch."""
+    """Return the features (T', D) of every clip of a batch.
+
+    Of framewise features, at most `_FRAMES` frames of a clip are encoded at a time.
+    """
     clips, steps = batch.frames.shape[:2]
-    value = call_model(model, "encode", batch)
-    expected = steps if model.spec.framewise else None
-    features = to_array(value, model, "encode gave features", (clips, expected, None), ("float32",))
+    framewise, what = model.spec.framewise, "encode gave features"
+    bounds = np.linspace(0, steps, (-(-steps // _FRAMES) if framewise else 1) + 1).astype(int)
+    parts = []
+    for start, stop in itertools.pairwise(bounds.tolist()):
+        value = call_model(model, "encode", batch.steps(slice(start, stop)))
+        shape = (clips, stop - start if framewise else None, None)
+        parts.append(to_array(value, model, what, shape, ("float32",)))
+    features = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
     if features.shape[1] > steps:
         raise BadInputError(
             f"model {model_name(model)!r}: encode gave features of {features.shape[1]} time "
             f"steps for clips of {steps} frames"
         )
-    check_finite(features, model, "encode gave features", batch.trials)
+    check_finite(features, model, what, batch.trials)
     return _split({FEATURES: features}, clips)
 
 
@@ -205,7 +247,7 @@ def imagine_clips(
         raise BadInputError(
             f"model {model_name(model)!r}: imagine gave {type(rollout).__name__}, expected Rollout"
         )
-    clips, future = len(batch), model.spec.future
+    clips, future = len(batch), batch.future
     expected: dict[str, tuple[tuple[int | None, ...], tuple[str, ...]]] = {
         FEATURES: ((clips, samples, future, None), ("float32",)),
         GAP: ((clips, samples), ("float64", "float32")),
@@ -313,9 +355,11 @@ def all_arguments(arguments: Mapping[str, Sequence[float]]) -> list[Arguments]:
     return [tuple(zip(names, chosen, strict=True)) for chosen in itertools.product(*values)]
 
 
-_VERSION = "3"
+_VERSION = "4"
 """To be increased with every change that can alter what is stored of a clip and model."""
 IMAGINED = "imagined"
+_FRAMES = 25
+"""Frames of a clip that an encoder batch is counted by; of longer clips it has fewer."""
 
 
 @dataclass(frozen=True)
@@ -338,7 +382,7 @@ class FeatureStore:
     folder
         Folder of the files.
     batch
-        Clips that a model receives at a time, the *encoder batch*.
+        Clips of `_FRAMES` frames that a model receives at a time, the *encoder batch*.
     executor
         Runs models whose futures are imagined in processes.
     """
@@ -391,8 +435,10 @@ class FeatureStore:
 
         digest = ask(model, "encoder_digest")
         work = _Work("features", digest, compute, model_name(model), part)
-        rows = self._rows(work, source, trials, progress)
-        return StoredFeatures(trials, [rows[trial] for trial in trials])
+        steps = {trial: _clip_steps(source, trial, part) for trial in dict.fromkeys(trials)}
+        rows = self._rows(work, source, steps, progress)
+        whole = part == "whole"
+        return StoredFeatures(trials, [rows[trial] for trial in trials], repeated=whole)
 
     def imagined(
         self,
@@ -403,6 +449,7 @@ class FeatureStore:
         samples: int,
         seed: int,
         arguments: Mapping[str, Sequence[float]],
+        future: Mapping[str, int],
         context: StoredFeatures | None = None,
         together: int = 0,
         progress: Progress | None = None,
@@ -419,6 +466,8 @@ class FeatureStore:
             Names of trials.
         samples, seed, arguments
             Number of futures S, seed and settings for ``model.imagine``.
+        future
+            Steps that are imagined, by trial.
         context
             Features of the context of at least ``trials``, for a model that also encodes.
         together
@@ -440,6 +489,7 @@ class FeatureStore:
 
             def compute(group: tuple[str, ...], value: Arguments = value) -> list[Arrays]:
                 batch = _read_clips(source.context, group)
+                batch = dataclasses.replace(batch, future=future[group[0]])
                 if context is not None:
                     features = context.select([place[trial] for trial in group]).array()
                     batch = dataclasses.replace(batch, features=features)
@@ -449,11 +499,12 @@ class FeatureStore:
             works[value] = _Work(
                 IMAGINED, model.digest, compute, model_name(model), IMAGINED, settings
             )
+        steps = {trial: future[trial] for trial in trials}
         if together:
             request = functools.partial(_Request, LoadedFiles(), model, samples, seed)
-            by_value = self._rows_of_processes(works, request, source, trials, together, progress)
+            by_value = self._rows_of_processes(works, request, source, steps, together, progress)
         else:
-            by_value = {v: self._rows(w, source, trials, progress) for v, w in works.items()}
+            by_value = {v: self._rows(w, source, steps, progress) for v, w in works.items()}
         for value, rows in by_value.items():
             kept = {trial: rows[trial] for trial in trials if trial in rows}
             found[value] = Imagined(model_name(model), kept)
@@ -463,19 +514,28 @@ class FeatureStore:
         self,
         work: _Work,
         source: ObservedSource,
-        trials: Sequence[str],
+        steps: Mapping[str, int],
         progress: Progress | None,
     ) -> dict[str, FeatureFile]:
-        """Return the arrays of every trial, read where they are stored, and computed elsewhere."""
+        """Return the arrays of every trial, read where they are stored, and computed elsewhere.
+
+        ``steps`` are the frames of its clip, or the steps to be imagined, by trial.
+        """
         digest = _ask_digest(work)
         part: Any = "context" if work.part == IMAGINED else work.part
         paths = {
-            trial: self._path(work, digest, source.key(trial, part), trial)
-            for trial in dict.fromkeys(trials)
+            trial: self._path(work, digest, source.key(trial, part), trial, count)
+            for trial, count in steps.items()
         }
         rows = _stored(paths)
-        missing = [trial for trial in paths if trial not in rows]
-        groups = [tuple(missing[i : i + self._batch]) for i in range(0, len(missing), self._batch)]
+        missing = {trial: steps[trial] for trial in paths if trial not in rows}
+        of_clips = part == work.part
+        groups = _groups(
+            missing,
+            lambda count: (
+                max(1, self._batch * _FRAMES // max(count, _FRAMES)) if of_clips else self._batch
+            ),
+        )
         changed = False
         try:
             for group in tracked(groups, work.what, len(groups), progress if groups else None):
@@ -497,29 +557,32 @@ class FeatureStore:
         works: Mapping[Arguments, _Work],
         request: Callable[[Arguments, Batch], _Request],
         source: ObservedSource,
-        trials: Sequence[str],
+        steps: Mapping[str, int],
         together: int,
         progress: Progress | None,
     ) -> dict[Arguments, dict[str, FeatureFile]]:
         """Return the arrays of every trial with all arguments, computed by the executor."""
         digest = _ask_digest(next(iter(works.values())))
         paths: dict[Arguments, dict[str, Path]] = {value: {} for value in works}
-        for trial in dict.fromkeys(trials):
+        for trial, count in steps.items():
             try:
                 key = source.key(trial, "context")
             except BadInputError as error:
                 self.problems[trial] = str(error)
                 continue
             for value, work in works.items():
-                paths[value][trial] = self._path(work, digest, key, trial)
+                paths[value][trial] = self._path(work, digest, key, trial, count)
         found = {value: _stored(of_value) for value, of_value in paths.items()}
         missing = {v: [t for t in paths[v] if t not in found[v]] for v in works}
         requests: dict[str, _Request] = {}
         read: dict[tuple[str, ...], list[Batch]] = {}
         for value, left in missing.items():
-            for group in (tuple(left[i : i + together]) for i in range(0, len(left), together)):
+            for group in _groups({t: steps[t] for t in left}, lambda _: together):
                 if group not in read:
-                    read[group] = list(self._contexts(source, group))
+                    read[group] = [
+                        dataclasses.replace(context, future=steps[group[0]])
+                        for context in self._contexts(source, group)
+                    ]
                 for context in read[group]:
                     arguments = " ".join(f"{name}={level:g}" for name, level in value)
                     name = f"{context.trials[0]} {arguments}".strip()
@@ -551,9 +614,9 @@ class FeatureStore:
                 for trial in trials:
                     yield from self._contexts(source, (trial,))
 
-    def _path(self, work: _Work, digest: str, key: str, trial: str) -> Path:
+    def _path(self, work: _Work, digest: str, key: str, trial: str, steps: int) -> Path:
         """Return the file of a trial, named by all that its arrays depend on."""
-        identity = [_VERSION, digest, key, trial, work.part, work.settings]
+        identity = [_VERSION, digest, key, trial, work.part, work.settings, steps]
         name = digest_of(json.dumps(identity))
         return self._folder / work.part / digest[:16] / name[:2] / f"{name}.safetensors"
 
@@ -595,6 +658,23 @@ def _stored(paths: Mapping[str, Path]) -> dict[str, FeatureFile]:
     """Return what is stored, by trial."""
     opened = ((trial, open_features(path)) for trial, path in paths.items())
     return {trial: file for trial, file in opened if file is not None}
+
+
+def _clip_steps(source: Any, trial: str, part: Part) -> int:
+    """Return the number of frames of a part of a trial's clip."""
+    if part == "context":
+        return int(source.spec.context)
+    return len(source.spec.all_frames(source.length(trial)))
+
+
+def _groups(steps: Mapping[str, int], size: Callable[[int], int]) -> list[tuple[str, ...]]:
+    """Return groups of trials with equal ``steps``, each of at most ``size`` of them."""
+    groups: list[tuple[str, ...]] = []
+    ordered = sorted(steps, key=lambda trial: steps[trial])
+    for count, same in itertools.groupby(ordered, lambda trial: steps[trial]):
+        trials, most = list(same), size(count)
+        groups += [tuple(trials[i : i + most]) for i in range(0, len(trials), most)]
+    return groups
 
 
 def _read_clips(read: Callable[[tuple[str, ...]], Batch], group: tuple[str, ...]) -> Batch:

@@ -1,7 +1,8 @@
 """Folds of an evaluation: which trials train the dynamics, fit a readout, and are predicted.
 
 A protocol says which scenarios train the dynamics that are tested on a scenario: *all*, *all-but*
-the tested one, or *only* the tested one.
+the tested one, or *only* the tested one. With *one*, each scenario trains dynamics that are tested
+on all.
 """
 
 from __future__ import annotations
@@ -21,11 +22,15 @@ _COLUMNS = ["trial", "scenario", "split", "contact", "digest"]
 
 
 class Protocol(Enum):
-    """Training protocol; the value is its name in the study."""
+    """Training protocol; the value is its name in tables.
+
+    The study has the first three; ``one`` is the generalisation between scenarios in its supplement.
+    """
 
     ALL = "all"
     ALL_BUT = "all-but"
     ONLY = "only"
+    ONE = "one"
 
     @classmethod
     def named(cls, name: str) -> Protocol:
@@ -57,6 +62,8 @@ def training_sets(protocol: Protocol, scenarios: Sequence[str]) -> list[Training
         return [TrainingSet("all", names, names)]
     if protocol is Protocol.ONLY:
         return [TrainingSet(name, (name,), (name,)) for name in names]
+    if protocol is Protocol.ONE:
+        return [TrainingSet(name, (name,), names) for name in names]
     if len(names) < 2:
         raise BadInputError(f"all-but needs two scenarios or more; there is only {names[0]!r}")
     return [
@@ -90,6 +97,8 @@ class Fold:
 
 def plan_folds(index: pd.DataFrame, protocol: Protocol, folds: int, seed: int) -> list[Fold]:
     """Return the folds of an evaluation, in which every testing trial is predicted once.
+
+    With the protocol *one* it is predicted once for each scenario that trains.
 
     Readouts are fitted on the readout split; dynamics are trained on the training split, or on
     the readout split where there is none. If a scenario has no readout trial, the testing trials

@@ -125,6 +125,8 @@ def _without_movies(dataset: Dataset, trials: Sequence[str]) -> bool:
 def _imagine_group(model: Model, source: WholeSource, trials: Sequence[str]) -> list[ImaginedTrial]:
     """Return what a model imagines of each trial; the first future is shown."""
     batch = _context(model, source.context(trials))
+    longest = max(source.length(trial) for trial in trials)
+    batch = dataclasses.replace(batch, future=model.spec.steps_after(longest))
     samples, seed = ask(model, "samples"), ask(model, "seed") or 0
     rollout = call_model(model, "imagine", batch, samples, seed, show=1.0)
     if not isinstance(rollout, Rollout):
@@ -133,7 +135,7 @@ def _imagine_group(model: Model, source: WholeSource, trials: Sequence[str]) -> 
         )
     shown, steps = _shown_arrays(model, rollout, len(batch), samples)
     seen = _seen_arrays(model, rollout, batch, shown)
-    true = _true_arrays(model, source, trials, shown, steps)
+    true = _true_arrays(model, source, trials, shown, steps) if steps == batch.future else {}
     probability, gap = _outcomes(model, rollout, len(batch), samples)
     context = model.spec.context_frames()
     frames = context[-1] + model.spec.stride * np.arange(1, steps + 1)
@@ -222,9 +224,9 @@ def _true_arrays(
 ) -> dict[str, Arrays]:
     """Return what was to be imagined (B, F, ...): pictures, and the slots that are found there."""
     spec = model.spec
-    if not spec.sees_pictures or steps != spec.future:
+    if not spec.sees_pictures:
         return {}
-    whole = source.whole(trials)
+    whole = source.window(trials, [spec.first] * len(trials), spec.context + steps)
     true = {} if whole.rgb is None else {"rgb": whole.rgb[:, spec.context :]}
     if "slots" in shown and can(model, "encode"):
         features = _encoded(model, whole)[:, spec.context :]

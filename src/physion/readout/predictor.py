@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from enum import Enum
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +76,7 @@ def ways(model: Model, decision: str = "") -> dict[Readout, Way]:
     found: dict[Readout, Way] = {}
     if can(model, "encode"):
         found[Readout.OBSERVED] = Way.FEATURES
-        if model.spec.future:
+        if model.spec.future != 0:
             found[Readout.FULL] = Way.FEATURES
     if can(model, "imagine"):
         needs = decisions.get(decision_name(model, decision))(LogisticSettings()).input
@@ -161,11 +161,12 @@ class Predictor:
         self.seed, self.progress = seed, progress
         self._protocol = protocol
         index = dataset.index.set_index("trial")
-        known = index["recorded_contact"]
+        self._frames, known = index["frames"], index["recorded_contact"]
         self._labels = pd.DataFrame(
             {
-                "simulated": index["contact"].astype(bool),
-                "recorded": known.fillna(index["contact"]).astype(bool),
+                # Trials without labels train dynamics only.
+                "simulated": index["contact"].fillna(False).astype(bool),
+                "recorded": known.fillna(index["contact"]).fillna(False).astype(bool),
                 "known": known.notna(),
             }
         )
@@ -198,8 +199,7 @@ class Predictor:
             losses = trained.validation, trained.baseline
         if Way.ROLLOUTS in self.ways.values():
             # All at once, so that all processes have work.
-            trials = [t for split in fold.scenarios for t in (*split.fit, *split.test)]
-            self._imagined(list(dict.fromkeys(trials)))
+            self._imagined(fold.scenarios)
         return [
             self._predict_scenario(fold, split, readout, way, losses)
             for split in fold.scenarios
@@ -218,6 +218,15 @@ class Predictor:
     @cached_property
     def _whole(self) -> WholeSource:
         return whole_source(self.dataset, self.model.spec, rendered=self.settings.rendered)
+
+    def _longest(self, split: ScenarioSplit) -> int:
+        """Return the frames of the longest trial that the readout of a scenario sees."""
+        return int(self._frames.loc[[*split.fit, *split.test]].max())
+
+    def _future(self, split: ScenarioSplit) -> dict[str, int]:
+        """Return how many steps are imagined of each trial: equally many, to the longest's end."""
+        steps = self.model.spec.steps_after(self._longest(split))
+        return dict.fromkeys((*split.fit, *split.test), steps)
 
     def _predict_scenario(
         self,
@@ -251,6 +260,7 @@ class Predictor:
             fit_labels=describe_labels([recorded and self._labels["known"][t] for t in fit]),
             decision="" if decision is None else decision_name(self.model, self.settings.decision),
             protocol=self._protocol.value if trained and self._protocol else "",
+            dynamics_training_dataset=fold.training.name if self._protocol is Protocol.ONE else "",
             seed=str(self.seed) if trained or untrained else "",
             validation_loss=losses[0],
             copy_last_loss=losses[1],
@@ -265,7 +275,7 @@ class Predictor:
         self, decision: Decision, split: ScenarioSplit, readout: Readout
     ) -> _Made:
         trials = [*split.fit, *split.test]
-        parts = self._parts(trials, readout)
+        parts = self._parts(trials, readout, self._future(split))
         rows = np.arange(len(trials))
         count = len(split.fit)
         fit = [part.select(rows[:count]) for part in parts]
@@ -273,7 +283,9 @@ class Predictor:
         labels = self._labels_of(split.fit, decision.labels)
         return decision.decide(fit, labels, test), split.fit, split.test
 
-    def _parts(self, trials: Sequence[str], readout: Readout) -> list[StoredFeatures]:
+    def _parts(
+        self, trials: Sequence[str], readout: Readout, future: Mapping[str, int]
+    ) -> list[StoredFeatures]:
         """Return the features that a decision gets under a readout; they are joined in time."""
         if readout.sees_future:
             return [self._store.encoded(self.model, self._whole, trials, "whole", self.progress)]
@@ -289,6 +301,7 @@ class Predictor:
             samples=samples,
             seed=seed,
             arguments=first,
+            future=future,
             context=context,
             progress=self.progress,
         ).values()
@@ -305,25 +318,27 @@ class Predictor:
         samples, seed, arguments = (ask(model, name) for name in ("samples", "seed", "arguments"))
         return samples, self.seed if seed is None else seed, arguments
 
-    def _imagined(self, trials: Sequence[str]) -> dict[Arguments, Imagined]:
-        """Return what could be imagined of the trials, with all arguments."""
+    def _imagined(self, splits: Sequence[ScenarioSplit]) -> dict[Arguments, Imagined]:
+        """Return what could be imagined of the trials of scenarios, with all arguments."""
+        future = {trial: steps for split in splits for trial, steps in self._future(split).items()}
         samples, seed, arguments = self._rollout_settings()
         model = self.model
         shared = ask(model, "trials_together")
         return self._store.imagined(
             model,
             self._observed,
-            trials,
+            list(future),
             samples=samples,
             seed=seed,
             arguments=arguments,
+            future=future,
             # A network stays in this process, unless it says otherwise.
             together=shared if is_network(model) else max(shared, 1),
             progress=self.progress,
         )
 
     def _decide_on_rollouts(self, decision: Decision, split: ScenarioSplit, _: Readout) -> _Made:
-        found = self._imagined([*split.fit, *split.test])
+        found = self._imagined([split])
         fit = tuple(trial for trial in split.fit if trial not in self.problems)
         test = tuple(trial for trial in split.test if trial not in self.problems)
         if split.fit and not fit:
@@ -339,7 +354,9 @@ class Predictor:
     def _answer(self, split: ScenarioSplit, readout: Readout) -> _Made:
         """Ask the model itself, after it was fitted on the fit trials if it can be."""
         source: Any = self._whole if readout.sees_future else self._observed
-        read = source.whole if readout.sees_future else source.context
+        read = source.context
+        if readout.sees_future:
+            read = partial(source.whole, length=self._longest(split))
         asked: Any = self.model
         accuracy = _UNKNOWN
         if can(self.model, "fit"):

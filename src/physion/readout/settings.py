@@ -33,11 +33,11 @@ class HarnessSettings:
     """Settings that evaluations and trainings have in common."""
 
     protocols: Annotated[tuple[str, ...], tyro.conf.arg(aliases=("--protocol",))] = ("all",)
-    """Scenarios that train a model: all, all-but the tested one, or only the tested one; several
-    with commas. Weights that ship saw all: under the others such a model starts from random ones.
-    A model that is not trained is evaluated once."""
+    """Scenarios that train a model: all, all-but the tested one, only the tested one, or each one
+    by itself, tested on all (one); several with commas. Weights that ship saw all: under the others
+    such a model starts from random ones. A model that is not trained is evaluated once."""
     scenario: str = ""
-    """Tested scenario; default: all of them. A training needs it for all-but or only one."""
+    """Tested scenario; default: all of them. A training needs it for all-but, only or one."""
     seeds: int = 1
     """Number of seeds, from --seed on."""
     seed: int = 0

@@ -22,12 +22,13 @@ COLUMNS = (
     "test_accuracy", "cv_accuracy", "fit_labels", "fit_trials", "fold", "readout_c", "noise_scale",
     "gap_threshold", "validation_loss", "copy_last_loss", "encoder_type",
     "encoder_pretraining_task", "encoder_pretraining_dataset", "encoder_pretraining_seed",
-    "encoder_training_task", "dynamics_type", "dynamics_training_task", "note", "versions",
+    "encoder_training_task", "dynamics_type", "dynamics_training_task",
+    "dynamics_training_dataset", "note", "versions",
 )  # fmt: skip
 """Columns of the table, in their order.
 
 - ``readout``: observed, observed+simulated or full. ``protocol``: scenarios that trained the model:
-  all, all-but or only; it and ``seed`` are empty for a model that was not trained.
+  all, all-but, only or one; it and ``seed`` are empty for a model that was not trained.
 - ``init``: initial weights of the model. ``inputs``: what the model was given of a trial: names of
   `clips.batch.INPUTS` with commas, ``outcomes``, ``answers of people``, or ``base rate`` (nothing).
 - ``p_contact``: P(contact). ``outcome``: of the trial as it was shown; ``recorded_outcome``: of the
@@ -39,11 +40,12 @@ COLUMNS = (
 - ``fit_labels``: outcomes that the decision was fitted on (`describe_labels`); ``fit_trials``:
   number of trials in the fit; ``fold``: fold of a cross-validation, or -1.
 - ``copy_last_loss``: loss of the trivial predictor on held-out trials, as ``validation_loss``.
-- ``encoder_*``, ``dynamics_*``: the fields of `clips.batch.Provenance`.
+- ``encoder_*``, ``dynamics_*``: the fields of `clips.batch.Provenance`, but
+  ``dynamics_training_dataset``: the scenario that trained the model under the protocol *one*.
 - ``versions``: of this package and of those that the model used.
 """
 
-ORDER = ("readout", "scenario", "stimulus")
+ORDER = ("readout", "dynamics_training_dataset", "scenario", "stimulus")
 """Columns by which the rows are sorted."""
 
 _NUMBERS = (
@@ -76,6 +78,7 @@ class ScenarioPredictions:
     fold: int
     fit_labels: str
     protocol: str = ""
+    dynamics_training_dataset: str = ""
     seed: str = ""
     decision: str = ""
     validation_loss: float = float("nan")
@@ -109,6 +112,7 @@ def make_table(
         shared = facts | {
             "readout": part.readout,
             "protocol": part.protocol,
+            "dynamics_training_dataset": part.dynamics_training_dataset,
             "seed": part.seed,
             "scenario": part.scenario,
             "decision": part.decision,
@@ -138,7 +142,7 @@ def make_table(
             )
     table = pd.DataFrame(rows, columns=list(COLUMNS))
     hits = ((table["p_contact"] > 0.5) == table["outcome"]).astype(float)
-    cells = [table["readout"], table["scenario"]]
+    cells = [table[name] for name in ORDER[:-1]]
     table["test_accuracy"] = hits.groupby(cells).transform("mean")
     table["train_accuracy"] = table["train_accuracy"].astype(float).groupby(cells).transform("mean")
     return table.sort_values(list(ORDER), ignore_index=True)
@@ -187,12 +191,15 @@ def summarise_accuracy(table: pd.DataFrame) -> pd.DataFrame:
         Columns ``model``, ``init``, ``protocol``, ``readout``, ``scenario``, ``seeds`` and
         ``trials`` (numbers of them), ``accuracy`` (0..1, mean of the seeds), ``spread`` (standard
         deviation of a seed, n - 1; NaN for one seed). Rows with the scenario `MEAN` are of the mean
-        of the scenarios of each seed, where there are several.
+        of the scenarios of each seed, where there are several. Under the protocol *one*,
+        ``protocol`` names the scenario that trained, too: ``one: drop``.
     """
     if table.empty:
         return pd.DataFrame(columns=[*_GROUP, "seeds", "trials", "accuracy", "spread"])
     hits = ((table["p_contact"] > 0.5) == table["outcome"]).astype(float)
-    scored = table[[*_GROUP, "seed"]].assign(accuracy=hits)
+    trained = table["dynamics_training_dataset"]
+    protocol = table["protocol"].where(trained == "", table["protocol"] + ": " + trained)
+    scored = table[[*_GROUP, "seed"]].assign(accuracy=hits, protocol=protocol)
     by_seed = scored.groupby([*_GROUP, "seed"])["accuracy"].agg(["mean", "size"]).reset_index()
     by_seed = by_seed.rename(columns={"mean": "accuracy", "size": "trials"})
     whole = by_seed.groupby([*_MODEL, "seed"]).agg(

@@ -10,15 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from physion.clips.clips import whole_source
 from physion.clips.source import WholeSource
 from physion.compute.tasks import Executor, Progress
 from physion.core.errors import BadInputError, MissingExtraError
 from physion.models.interface import TrainingSettings
-from physion.readout.features import FeatureStore
+from physion.readout.features import FeatureRow, FeatureStore
 from physion.readout.folds import Fold, Protocol, select_scenario, training_folds
 from physion.readout.settings import (
     Cell,
@@ -117,9 +114,9 @@ class Trainer:
         """Give the model its initial weights again."""
         self.model.load_state_dict(self._initial)
 
-    def _features(self, trials: Sequence[str]) -> NDArray[np.float32]:
+    def _features(self, trials: Sequence[str]) -> Sequence[FeatureRow]:
         stored = self.store.encoded(self.model, self.source, trials, "whole", self.progress)
-        return stored.array()
+        return stored.by_trial()
 
 
 def train(
@@ -243,7 +240,9 @@ class _Train:
         """Return the folds whose dynamics are trained."""
         assert cell.protocol is not None, "all models are trained"
         index, settings = self.dataset.index, self.settings
-        folds = training_folds(index, cell.protocol, settings.folds, cell.seed)
         if settings.scenario and cell.protocol is Protocol.ALL:
-            raise BadInputError("a scenario needs the protocol all-but or only")
+            raise BadInputError("a scenario needs the protocol all-but, only or one")
+        # Both train on each scenario.
+        protocol = Protocol.ONLY if cell.protocol is Protocol.ONE else cell.protocol
+        folds = training_folds(index, protocol, settings.folds, cell.seed)
         return select_scenario(folds, settings.scenario)

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import torch
 from lightning_fabric import Fabric
-from numpy.typing import NDArray
 from torch import nn
 
 from physion.clips.source import WholeSource
@@ -43,7 +42,13 @@ from physion.training.loop import (
     call,
     evaluating,
 )
-from physion.training.windows import ClipWindows, FeatureWindows, hold_out
+from physion.training.windows import (
+    ClipWindows,
+    FeatureWindows,
+    TrialFeatures,
+    hold_out,
+    window_length,
+)
 
 # Model card of a trained model: what it is, its data, settings, versions and losses.
 
@@ -116,7 +121,7 @@ def _text(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-Features = Callable[[Sequence[str]], NDArray[np.float32]]
+Features = Callable[[Sequence[str]], Sequence[TrialFeatures]]
 
 _NOT_HASHED = ("log_every", "checkpoint_every")
 """Settings that do not change the weights, only how often something is written."""
@@ -290,7 +295,7 @@ def training_inputs(
         },
         "seed": seed,
         "learns_from": learns_from,
-        "window": ask(model, "window") or model.spec.total,
+        "window": window_length(model),
     }
 
 
@@ -315,7 +320,7 @@ def _windows(
     fabric: Fabric,
 ) -> TrainingData:
     rows, held = hold_out(len(trials), settings.held_out, seed)
-    window = ask(model, "window") or model.spec.total
+    window = window_length(model)
     if ask(model, "learns_from") != "features":
         chosen, rest = (tuple(trials[row] for row in part) for part in (rows, held))
         chooses = model if can(model, "start_probabilities") else None
@@ -325,13 +330,7 @@ def _windows(
     if features is None:
         raise BadInputError(f"model {model.provenance().model!r} is trained on features")
     with fabric.rank_zero_first():  # which stores them for the others
-        try:
-            values = features(trials)
-        except MemoryError as error:
-            raise OutOfMemoryError(
-                f"the features of {len(trials)} training trials do not fit into memory; train on "
-                "fewer trials, or use pooled features or a smaller image_size of the model"
-            ) from error
+        values = features(trials)
     frames = [source.length(trial) for trial in trials]
     first, second = (
         FeatureWindows(model.spec, trials, values, frames, part, window) for part in (rows, held)

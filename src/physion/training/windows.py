@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from physion.clips.batch import Batch, Spec, clip_frames
 from physion.clips.source import WholeSource
 from physion.core.errors import BadInputError
 from physion.core.seeds import generator
-from physion.models.interface import Model
+from physion.models.interface import Model, ask
 
 Floats = NDArray[np.float32]
 
@@ -20,6 +21,19 @@ SAMPLE_CLIPS = 64
 """Clips from which a model sets its statistics, unless it is trained on features."""
 VALIDATION_CLIPS = 256
 """Largest number of clips of a validation."""
+SAMPLE_FEATURES = 2048
+"""Windows of features from which a model sets its statistics."""
+
+
+def window_length(model: Model) -> int:
+    """Return the frames of a training clip of a model.
+
+    Without a ``window`` they are context and future of its spec; or twice the context, where the
+    future depends on the movie.
+    """
+    spec = model.spec
+    usual = spec.context + (spec.context if spec.future is None else spec.future)
+    return int(ask(model, "window") or usual)
 
 
 @dataclass(frozen=True)
@@ -75,8 +89,23 @@ class ClipWindows:
         return self._probabilities[row]
 
 
+class TrialFeatures(Protocol):
+    """Features (T, D) float32 of a trial: an array, or something that reads time steps of one."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of time steps, and of features."""
+        ...
+
+    def __getitem__(self, steps: slice) -> Floats:
+        """Return a range of time steps."""
+        ...
+
+
 class FeatureWindows:
-    """Windows of ``length`` time steps of stored features.
+    """Windows of ``length`` time steps of stored features, from anywhere in a movie.
+
+    A window of a trial that has fewer time steps repeats the last one.
 
     Parameters
     ----------
@@ -85,7 +114,7 @@ class FeatureWindows:
     trials
         Names of n trials.
     features
-        Features (n, T, D) of their whole clips, T = ``spec.total``.
+        Features (T, D) of the whole clip of each; windows are read when they are needed.
     frames
         Number of frames of each trial's motion.
     rows
@@ -98,25 +127,20 @@ class FeatureWindows:
         self,
         spec: Spec,
         trials: Sequence[str],
-        features: Floats,
+        features: Sequence[TrialFeatures],
         frames: Sequence[int],
         rows: NDArray[np.int64],
         length: int,
     ) -> None:
-        if features.ndim != 3 or features.shape[:2] != (len(trials), spec.total):
-            raise BadInputError(
-                f"features of {len(trials)} clips of {spec.total} frames must have the shape "
-                f"({len(trials)}, {spec.total}, size), not {features.shape}"
-            )
-        if length > spec.total:
-            raise BadInputError(
-                f"training needs windows of {length} steps, but the clips have {spec.total}"
-            )
-        self._features, self._chosen, self._length = features, rows, length
+        clipped = [clip_frames(spec.all_frames(count), count) for count in frames]
+        for trial, own, (shown, _) in zip(trials, features, clipped, strict=True):
+            if len(own.shape) != 2 or own.shape[0] != len(shown):
+                raise BadInputError(
+                    f"features of the clip of {len(shown)} frames of trial {trial!r} must have the "
+                    f"shape ({len(shown)}, size), not {tuple(own.shape)}"
+                )
+        self._features, self._clipped, self._length = features, clipped, length
         self._rows = {trials[row]: int(row) for row in rows}
-        clipped = [clip_frames(spec.all_frames(), count) for count in frames]
-        self._frames = np.stack([shown for shown, _ in clipped])
-        self._valid = np.stack([valid for _, valid in clipped])
 
     @property
     def trials(self) -> tuple[str, ...]:
@@ -124,26 +148,31 @@ class FeatureWindows:
         return tuple(self._rows)
 
     def starts(self, trials: Sequence[int], rng: np.random.Generator) -> NDArray[np.int64]:
-        """Return random first time steps."""
-        return rng.integers(self._features.shape[1] - self._length + 1, size=len(trials))
+        """Return random first time steps such that the windows end within their trials."""
+        chosen = list(self._rows.values())
+        steps = np.array([self._features[chosen[row]].shape[0] for row in trials], np.int64)
+        return rng.integers(np.maximum(steps - self._length + 1, 1))
 
     def read(self, request: Request) -> Batch:
         """Return the windows of a request."""
-        rows = np.array([self._rows[trial] for trial in request.trials], np.int64)[:, None]
-        steps = np.array(request.starts, np.int64)[:, None] + np.arange(self._length)
-        return Batch(
-            trials=request.trials,
-            frames=self._frames[rows, steps],
-            valid=self._valid[rows, steps],
-            features=self._features[rows, steps],
-        )
+        pairs = zip(request.trials, request.starts, strict=True)
+        windows = [self._window(self._rows[trial], start) for trial, start in pairs]
+        frames, valid, features = (np.stack(part) for part in zip(*windows, strict=True))
+        return Batch(trials=request.trials, frames=frames, valid=valid, features=features)
 
     def sample(self, seed: int) -> Batch:
-        """Return all clips."""
-        rows = self._chosen
-        return Batch(
-            self.trials, self._frames[rows], self._valid[rows], features=self._features[rows]
-        )
+        """Return a random window of each trial, up to `SAMPLE_FEATURES`."""
+        rng = generator("sample", seed)
+        return self.read(_draw(self, min(SAMPLE_FEATURES, len(self._rows)), rng, distinct=True))
+
+    def _window(self, row: int, start: int) -> tuple[NDArray[np.int64], NDArray[np.bool_], Floats]:
+        """Return frames, whether they exist, and features of a window."""
+        (frames, valid), features = self._clipped[row], self._features[row]
+        steps = np.arange(start, start + self._length)
+        inside = steps < len(frames)
+        last = np.minimum(steps, len(frames) - 1)
+        read = features[start : start + self._length]
+        return frames[last], valid[last] & inside, read[last - start]
 
 
 Windows = ClipWindows | FeatureWindows

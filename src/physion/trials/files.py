@@ -89,26 +89,28 @@ class TrialPaths:
         """Movie of only the observed frames, in free colours (MP4)."""
         return self._named("_free_observed.mp4")
 
-    def all(self, movies: bool = True, free: bool = False) -> dict[str, Path]:
+    def all(self, movies: bool = True, free: bool = False, maps: bool = True) -> dict[str, Path]:
         """Return the paths by column of the index, the trial file last.
 
         ``movies``: include movies and map. ``free``: include also the movies in free colours.
+        Without ``maps`` there is no map, as of trials that are stored without labels.
         """
         files = {}
         if movies:
             files = {
                 "movie": self.movie,
                 "observed_movie": self.observed_movie,
-                "map": self.map,
             }
+        if movies and maps:
+            files["map"] = self.map
         if movies and free:
             files["free_movie"] = self.free_movie
             files["free_observed_movie"] = self.free_observed_movie
         return {**files, "trial_file": self.trial_file}
 
-    def complete(self, movies: bool = True, free: bool = False) -> bool:
+    def complete(self, movies: bool = True, free: bool = False, maps: bool = True) -> bool:
         """Return whether all these files exist."""
-        return all(path.is_file() for path in self.all(movies, free).values())
+        return all(path.is_file() for path in self.all(movies, free, maps).values())
 
     def _named(self, ending: str) -> Path:
         return self.folder / self.split / self.scenario / (self.trial + ending)

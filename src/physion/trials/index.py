@@ -40,9 +40,18 @@ _FACTS: Mapping[str, IndexColumn] = {
         ("seed", "string", "entropy of the random numbers, hexadecimal; missing if imported"),
         ("attempt", "Int64", "sampled scenes rejected before this one; missing if imported"),
         ("scene_digest", "string", "SHA-256 of everything that determines the motion"),
-        ("contact", "bool", "the label: agent and patient touch at some time of the trial"),
+        (
+            "contact",
+            "boolean",
+            "the label: agent and patient touch at some time of the trial; missing if it is not "
+            "stored",
+        ),
         ("first_frame", "Int64", "first frame in which they touch; missing without contact"),
-        ("observed_contact", "bool", "they touch already in the observed part"),
+        (
+            "observed_contact",
+            "boolean",
+            "they touch already in the observed part; missing without labels",
+        ),
         ("min_distance", "Float64", "smallest gap between cloth and object, m; missing without"),
         ("robust", "Float64", "fraction of jittered simulations with the same outcome"),
         ("recorded_contact", "boolean", "outcome recorded with an imported scene, else missing"),
@@ -115,23 +124,26 @@ def index_row(paths: TrialPaths, opened: Trial | None = None) -> dict[str, Any]:
             f"{paths.trial_file} is trial {meta.trial!r} of {meta.split}/{meta.scenario}: "
             "it was moved or renamed"
         )
-    for name, path in paths.all(meta.movies, meta.free_movies).items():
+    for name, path in paths.all(meta.movies, meta.free_movies, labels is not None).items():
         content = read_plain(path, MAX_FILE_BYTES, follow_links=True)
         row[name] = path.relative_to(paths.folder).as_posix()
         row[f"{name}_bytes"] = len(content)
         row[f"{name}_sha256"] = digest_of(content)
     row |= {name: getattr(meta, name) for name in COLUMNS if hasattr(meta, name)}
-    row |= {
-        "contact": labels.contact,
-        "first_frame": labels.first_frame,
-        "observed_contact": labels.observed,
-        "min_distance": labels.min_distance,
-        "robust": labels.robust,
-        **_elements(scene, imported=meta.seed is None),
-        **drawn_values(scene),
-        "agent_fraction": float(trial.pixel_fractions[scene.index(scene.roles.agent)]),
-        "patient_fraction": float(trial.pixel_fractions[scene.index(scene.roles.patient)]),
-    }
+    row |= {**_elements(scene, imported=meta.seed is None), **drawn_values(scene)}
+    if labels is not None:
+        shown = {
+            role: float(trial.pixel_fractions[scene.index(getattr(scene.roles, role))])
+            for role in ("agent", "patient")
+        }
+        row |= {
+            "contact": labels.contact,
+            "first_frame": labels.first_frame,
+            "observed_contact": labels.observed,
+            "min_distance": labels.min_distance,
+            "robust": labels.robust,
+            **{f"{role}_fraction": part for role, part in shown.items()},
+        }
     return row
 
 
@@ -213,8 +225,14 @@ def same_value(one: Any, other: Any) -> bool:
 
 def as_table(rows: list[dict[str, Any]]) -> pd.DataFrame:
     """Return rows as a table with the columns and types of `COLUMNS`, sorted by split and trial."""
-    table = pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS)
+    table = _plain(pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS))
     return table.sort_values(["split", "scenario", "trial"], ignore_index=True)
+
+
+def _plain(table: pd.DataFrame) -> pd.DataFrame:
+    """Return a table whose labels are plain bools, if none of them is missing."""
+    complete = [name for name in ("contact", "observed_contact") if table[name].notna().all()]
+    return table.astype(dict.fromkeys(complete, "bool"))
 
 
 def write_index(folder: Path, table: pd.DataFrame) -> Path:
@@ -271,7 +289,7 @@ def _read_columns(path: Path, content: bytes) -> pd.DataFrame:
         for name, dtype in COLUMNS.items():
             _check_type(path, stored.column(name), name, dtype)
         table: pd.DataFrame = stored.to_pandas()
-        return table.astype(COLUMNS)
+        return _plain(table.astype(COLUMNS))
     except (pa.ArrowException, OSError, ValueError, KeyError, TypeError, OverflowError) as error:
         reason = " ".join(str(error).split())
         raise BadInputError(f"{path} cannot be read: {reason}; {_AGAIN}") from error

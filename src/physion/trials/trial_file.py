@@ -443,7 +443,7 @@ class TrialWriter:
         metadata: Metadata,
         scene: Scene,
         trajectory: Trajectory,
-        labels: Labels,
+        labels: Labels | None,
         ids: NDArray[np.integer[Any]],
         *,
         passes: Sequence[str] = (),
@@ -460,7 +460,7 @@ class TrialWriter:
         self._file.attrs["schema"] = np.int32(SCHEMA)
         self._compatible = compatible
         self._text("scene", scene.to_json())
-        self._text("labels", _to_json(labels))
+        self._text("labels", "null" if labels is None else _to_json(labels))
         self._text("metadata", _to_json(metadata))
         for path, values in _arrays(trajectory, ids, len(scene.names())).items():
             array = np.asarray(values).astype(FIELDS[path].dtype)
@@ -549,9 +549,17 @@ class Trial:
         return metadata
 
     @cached_property
-    def labels(self) -> Labels:
-        """Whether and when agent and patient touch."""
+    def labels(self) -> Labels | None:
+        """Whether and when agent and patient touch; None if the trial is stored without labels."""
+        if self._reader.text("labels") == "null":
+            return None
         return self._read_json(Labels, "labels")
+
+    def known_labels(self) -> Labels:
+        """Return the labels; raise `BadInputError` if the trial is stored without."""
+        if self.labels is None:
+            raise BadInputError(f"{self._where} is stored without labels, which are needed here")
+        return self.labels
 
     @cached_property
     def scene(self) -> Scene:

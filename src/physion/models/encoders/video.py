@@ -3,7 +3,7 @@
 A clip of n = ``frames`` frames becomes tubelets, patches of two frames; the network gives a token
 (D,) of each, which depends on the whole clip. The context is one such clip, and it ends with the
 last observed frame. What follows, which *full* reads, is encoded in further clips of n frames, so
-that no feature of the context depends on a later frame.
+that no feature of the context depends on a later frame. The last one repeats the last frame.
 
 Features are (B, T / 2, D), the means of the tokens at one time; with ``grid`` (B, T / 2, R C D),
 the means in R x C cells (`models.weights.grid`).
@@ -62,7 +62,8 @@ class VideoSettings(ModelSettings):
       state dict.
     - ``image_size``, ``patch``: pixels per side. ``frames``: of a clip, a multiple of 2.
     - ``width``, ``depth``, ``heads``: of the transformer.
-    - ``stride``: frames of the motion between two frames of a clip. ``later``: clips of the future.
+    - ``stride``: frames of the motion between two frames of a clip. ``future``: frames after the
+      context, up to the end of the movie by default.
     - ``pooling``: ``pooled`` or ``grid``. ``seed``: of random weights.
     """
 
@@ -76,7 +77,7 @@ class VideoSettings(ModelSettings):
     depth: int = 12
     heads: int = 6
     stride: int = 2
-    later: int = 3
+    future: int | None = None
     pooling: Pooling = POOLED
     seed: int = 0
 
@@ -257,20 +258,23 @@ class VideoEncoder(TorchModel):
             image_size=settings.image_size,
             stride=settings.stride,
             context=settings.frames,
-            future=settings.later * settings.frames,
-            context_at="end",
+            future=settings.future,
             framewise=False,
         )
         self.network, self.init = create_video_encoder(self.family, settings)
 
     @torch.no_grad()
     def encode(self, batch: Batch) -> Tensor:
-        """Return features (B, T / 2, D) of pictures (B, T, H, W, 3), T a multiple of ``frames``."""
+        """Return features (B, T / 2, D) of pictures (B, T, H, W, 3).
+
+        T is filled up to a multiple of ``frames`` by repeating the last picture.
+        """
         pictures = normalized_pictures(batch, self.spec, self.name())
-        clips, steps = pictures.shape[:2]
         frames, size = self.settings.frames, self.settings.image_size
-        if steps % frames:
-            raise BadInputError(f"{self.name()} encodes clips of {frames} frames, not {steps}")
+        missing = -pictures.shape[1] % frames
+        last = pictures[:, -1:].expand(-1, missing, -1, -1, -1)
+        pictures = torch.cat([pictures, last], dim=1)
+        clips, steps = pictures.shape[:2]
         tokens: Tensor = self.network(pictures.reshape(-1, frames, 3, size, size)).last_hidden_state
         side, width = size // self.settings.patch, tokens.shape[-1]
         maps = tokens.reshape(-1, side, side, width).permute(0, 3, 1, 2)

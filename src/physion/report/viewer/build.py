@@ -253,7 +253,12 @@ def _trial_data(
         detail["paths"] = viewer_facts.paths(trial)
         detail["touches"] = viewer_facts.touches(trial)
         detail["imagined"] = [
-            pack_imagined(one, trial.scene, trial.metadata.frames, observed=trial.labels.observed)
+            pack_imagined(
+                one,
+                trial.scene,
+                trial.metadata.frames,
+                observed=viewer_facts.labels_of(trial).observed,
+            )
             for one in imagined
         ]
     stored = dataset.file(row["trial"], "movie")

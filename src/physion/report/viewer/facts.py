@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from physion.numerics.rotations import rotate_vectors
-from physion.physics.labels import contact_frames
+from physion.physics.labels import Labels, contact_frames, label_contact
 from physion.report.viewer.movies import thing_colors
 from physion.scenes.scene import Scene
 from physion.scenes.shapes.primitives import shape
@@ -40,9 +40,14 @@ _NAMES = {
 _OUTCOME = ("contact", "first_frame", "observed", "min_distance", "robust", "recorded_contact")
 
 
+def labels_of(trial: Trial) -> Labels:
+    """Return the labels of a trial, from its motion if it is stored without labels."""
+    return trial.labels or label_contact(trial.scene, trial.trajectory)
+
+
 def card(trial: Trial, unusable: str = "") -> dict[str, Any]:
     """Return what the grid shows and filters by; ``unusable``: why the trial is, if it is."""
-    meta, labels = trial.metadata, trial.labels
+    meta, labels = trial.metadata, labels_of(trial)
     robust = labels.robust
     return {
         "trial": meta.trial,
@@ -161,7 +166,7 @@ def _table(title: str, header: Sequence[str] | None, rows: Iterable[Sequence[obj
 
 def _trial_table(trial: Trial) -> Table:
     """Return times and labels first, then the other metadata in the order of the file."""
-    meta, labels = trial.metadata, trial.labels
+    meta, labels = trial.metadata, labels_of(trial)
     facts: dict[str, object] = {
         "physics_seconds": meta.physics_seconds,
         "playback_seconds": meta.playback_seconds,

@@ -48,8 +48,9 @@ def make_trial(job: GenerateJob) -> str:
             f"trial {task.trial!r} has {len(trajectory)} frames; nothing is left to predict after "
             f"the {OBSERVED_FRAMES} observed ones"
         )
-    labels = label_contact(scene, trajectory)
-    labels = dataclasses.replace(labels, robust=task.robust)
+    labels = None
+    if job.settings.stores_labels(task.split):
+        labels = dataclasses.replace(label_contact(scene, trajectory), robust=task.robust)
     write_files(job.paths, _files(job, scene, trajectory, labels))
     return task.trial
 
@@ -64,7 +65,7 @@ def scene_of(task: TrialTask) -> Scene:
 
 
 def _files(
-    job: GenerateJob, scene: Scene, trajectory: Trajectory, labels: Labels
+    job: GenerateJob, scene: Scene, trajectory: Trajectory, labels: Labels | None
 ) -> dict[str, bytes]:
     """Return the bytes of the trial's files; each frame is rendered once per look."""
     settings = job.settings
@@ -83,7 +84,8 @@ def _files(
     files = {}
     if settings.movies:
         rate = settings.playback_rate
-        files["map"] = encode_png(role_map(ids, scene))
+        if settings.stores_labels(job.task.split):
+            files["map"] = encode_png(role_map(ids, scene))
         files["movie"], files["observed_movie"] = make_movies(
             renderer, rate, writer if settings.passes else None
         )
@@ -179,7 +181,7 @@ def foreign_movies(paths: TrialPaths, trial: Trial) -> list[str]:
     if not meta.movies or not np.isfinite(trial.trajectory.positions).all():
         return []
     observed = [0, meta.observed_frames - 1]
-    files = paths.all(meta.movies, meta.free_movies)
+    files = paths.all(meta.movies, meta.free_movies, maps=False)
     faults = []
     for look, prefix in ((meta.look, ""), *((("free", "free_"),) if meta.free_movies else ())):
         rendered = _rendered(trial, look, [*observed, meta.frames - 1])

@@ -100,6 +100,9 @@ class GenerateSettings:
     with movies also has a map of agent and patient."""
     movies: bool = True
     """Make movies and maps; otherwise trials have only trial files."""
+    labels: bool = True
+    """Store labels of all trials. With --no-labels trials of the split training have neither labels
+    nor a map of agent and patient."""
     playback: Literal["slow", "real"] = "slow"
     """Slow movies show 0.01 s of physics per frame at 30 frames per second, as the official ones:
     3.33 times slower than real time. Real ones show 100 frames per second."""
@@ -152,7 +155,13 @@ class GenerateSettings:
         """
         values = dataclasses.asdict(self)
         del values["engine"]
+        if self.labels:
+            del values["labels"]  # as in folders that are older than this setting
         return values
+
+    def stores_labels(self, split: str) -> bool:
+        """Return whether trials of a split are stored with labels and maps."""
+        return self.labels or split != "training"
 
     def looks(self, split: str) -> tuple[str, ...]:
         """Return the looks of the movies of a split; the first is the trial's own."""
@@ -188,7 +197,8 @@ class GenerateJob:
 
     def complete(self) -> bool:
         """Return whether all files of the trial exist."""
-        return self.paths.complete(self.settings.movies, free=len(self.looks) > 1)
+        settings, free = self.settings, len(self.looks) > 1
+        return self.paths.complete(settings.movies, free, settings.stores_labels(self.task.split))
 
 
 def plan_dataset(

@@ -139,6 +139,8 @@ def _check_split(row: Mapping[str, Any], settings: Mapping[str, Any]) -> list[st
     if (belongs := split_of(row["scene_digest"])) != row["split"]:
         faults.append(f"{row['trial']}: field 'scene_digest': its physics belongs to {belongs}")
     task = TrialTask(row["dataset"], row["scenario"], row["split"], int(row["index"]))
+    if pd.isna(row["contact"]):
+        return faults
     if wanted_contact(task) not in (None, row["contact"]):
         faults.append(
             f"{row['trial']}: field 'contact': the balance of its split requires the opposite"
@@ -181,7 +183,7 @@ def _check_trial(paths: TrialPaths, trial: Trial) -> list[str]:
     meta, faults = trial.metadata, []
     lengths = {"movie": meta.frames, "observed_movie": meta.observed_frames}
     lengths |= {f"free_{name}": frames for name, frames in lengths.items()}
-    for name, path in paths.all(meta.movies, meta.free_movies).items():
+    for name, path in paths.all(meta.movies, meta.free_movies, trial.labels is not None).items():
         if name in lengths and (found := count_frames(path)) != lengths[name]:
             faults.append(f"{path} has {found} frames, not {lengths[name]}")
     if trial.trajectory.digest() != meta.digest:
@@ -194,8 +196,8 @@ def _check_trial(paths: TrialPaths, trial: Trial) -> list[str]:
         for path, array in trial.geometry.items()
         if not np.array_equal(array, wanted[path])
     ]
-    if meta.imported:
-        return faults  # labels and movies come from another simulator
+    if meta.imported or trial.labels is None:
+        return faults  # labels and movies come from another simulator, or there are no labels
     labels = label_contact(trial.scene, trial.trajectory)
     for name in ("contact", "first_frame", "observed", "min_distance"):
         computed, stored = getattr(labels, name), getattr(trial.labels, name)
@@ -264,11 +266,12 @@ def _render_again(paths: TrialPaths, trial: Trial, notes: list[str]) -> list[str
                 faults.append(f"{paths.trial_file}: field 'passes/{name}': frame {frame} differs")
     if not meta.movies:
         return faults
-    made = {"map": encode_png(role_map(ids, trial.scene))}
+    labelled = trial.labels is not None
+    made = {"map": encode_png(role_map(ids, trial.scene))} if labelled else {}
     for look, prefix in ((meta.look, ""), *((("free", "free_"),) if meta.free_movies else ())):
         both = make_movies(trial.renderer(look=look), meta.playback_rate)
         made |= zip((f"{prefix}movie", f"{prefix}observed_movie"), both, strict=True)
-    files = paths.all(meta.movies, meta.free_movies)
+    files = paths.all(meta.movies, meta.free_movies, labelled)
     for name, content in made.items():
         stored_bytes = files[name].read_bytes()
         if name == "map" and stored_bytes != content and same_picture(stored_bytes, content):
@@ -300,12 +303,13 @@ def _sample_again(paths: TrialPaths, trial: Trial, settings: Mapping[str, Any]) 
     faults = []
     if scene_of(task) != trial.scene:
         faults.append(f"{paths.trial_file}: field 'scene' is not the one that preset and seed give")
-    if trial.labels.robust is not None and settings:
+    labels = trial.labels
+    if labels is not None and labels.robust is not None and settings:
         runs, engine = settings.get("jitters", 0), engine_of(meta.engine)
-        found = robustness(trial.scene, trial.labels.contact, task.seed(), runs, engine)
-        if found != trial.labels.robust:
+        found = robustness(trial.scene, labels.contact, task.seed(), runs, engine)
+        if found != labels.robust:
             faults.append(
-                f"{paths.trial_file}: labels/robust is {trial.labels.robust}, again it is {found}"
+                f"{paths.trial_file}: labels/robust is {labels.robust}, again it is {found}"
             )
     return faults
 

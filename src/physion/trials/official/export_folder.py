@@ -520,7 +520,7 @@ def _record(meta: Metadata, content: Content) -> dict[str, Any]:
 
 
 def _label(trial: Trial) -> dict[str, Any]:
-    labels = trial.labels
+    labels = trial.known_labels()
     first = labels.first_frame if labels.contact else None
     frame = trial.metadata.frames // 2 if first is None else first
     return {"label": labels.contact, "contact_frame_label": frame}

@@ -414,7 +414,7 @@ def official_file(
         last = None if last is None else objects.official_ids(last)
         record = {**trial_record(objects, writer.labels, first, last, static), "split": meta.split}
         texts = {"scene": scene.to_json(), "record": json.dumps(record)}
-        texts |= {"labels": json.dumps(dataclasses.asdict(trial.labels))}
+        texts |= {"labels": json.dumps(dataclasses.asdict(trial.known_labels()))}
         texts |= {"metadata": json.dumps(dataclasses.asdict(meta) | {"look": look or meta.look})}
         for name, text in texts.items():
             put(extra.id, name, np.array(text.encode()))

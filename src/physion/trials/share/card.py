@@ -177,13 +177,13 @@ def _counts(index: pd.DataFrame) -> pd.DataFrame:
     """Return counts and rates of each split and scenario, one row each."""
     rows = []
     for (split, scenario), part in index.groupby(["split", "scenario"], observed=True):
-        robust = part["robust"].dropna()
+        robust, known = part["robust"].dropna(), part["contact"].notna()
         rows.append(
             {
                 "split": split,
                 "scenario": scenario,
                 "trials": len(part),
-                "contact rate": f"{part['contact'].mean():.3f}",
+                "contact rate": f"{part['contact'].mean():.3f}" if known.all() else "no labels",
                 "contact while observed": int(part["observed_contact"].sum()),
                 "frames, median": f"{part['frames'].median():.0f}",
                 "agreement under jitter": f"{robust.mean():.3f}" if len(robust) else "-",

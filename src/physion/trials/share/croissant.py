@@ -85,7 +85,8 @@ class DatasetFacts:
     def biases(self) -> list[str]:
         """Return the known biases, with counts."""
         index = self.index
-        rates = index.groupby("split", observed=True)["contact"].agg(["mean", "size"])
+        labelled = index[index["contact"].notna()]
+        rates = labelled.groupby("split", observed=True)["contact"].agg(["mean", "size"])
         statements = [
             f"Agent and patient touch in {row['mean']:.3f} of the {row['size']:.0f} {split} trials."
             for split, row in rates.iterrows()

@@ -62,8 +62,7 @@ def trial_gltf(trial: Trial, *, look: str | None = None) -> bytes:
         "scenario": meta.scenario,
         "observed_frames": meta.observed_frames,
         "playback_rate": meta.playback_rate,
-        "contact": labels.contact,
-        "first_contact": labels.first_frame,
+        **({"contact": labels.contact, "first_contact": labels.first_frame} if labels else {}),
     }
     return motion_gltf(
         trial.shown(look),

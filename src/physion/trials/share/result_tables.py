@@ -48,6 +48,8 @@ NEEDED = frozenset({"model", "stimulus", "scenario", "p_contact", "outcome", "re
 NO_DATASET = "none"
 """Data set of a model that was not trained on any."""
 _DATASETS = ("Encoder Training Dataset", "Dynamics Training Dataset", "Readout Train Data")
+EXPERIMENTS = {name: names.experiment for name, names in NAMES.items()}
+"""Official name of a scenario."""
 _READOUTS = {"full": "A", "observed+simulated": "B", "observed": "C"}
 """Official letter of a readout."""
 
@@ -100,7 +102,7 @@ def _official_text(path: Path) -> str | None:
     official = pd.DataFrame(
         {name: table.get(ours or "", "") for name, ours in _OURS.items()}, index=table.index
     )
-    scenario = table["scenario"].replace({name: names.experiment for name, names in NAMES.items()})
+    scenario = table["scenario"].replace(EXPERIMENTS)
     protocol = official["Dynamics Training Dataset"]
     official["Readout Train Data"] = official["Readout Test Data"] = scenario
     official["Readout Type"] = official["Readout Type"].replace(_READOUTS)
@@ -110,6 +112,11 @@ def _official_text(path: Path) -> str | None:
     official["Dynamics Training Dataset"] = protocol.mask(
         protocol == "all-but", "no_" + scenario
     ).mask(protocol == "only", scenario)
+    if "dynamics_training_dataset" in table:
+        one = table["dynamics_training_dataset"].replace(EXPERIMENTS)
+        official["Dynamics Training Dataset"] = official["Dynamics Training Dataset"].mask(
+            protocol == "one", one
+        )
     # pandas reads an empty column as numbers, into which the notebooks cannot write their texts.
     official[list(_DATASETS)] = official[list(_DATASETS)].replace("", NO_DATASET)
     return str(official.to_csv(index=False, lineterminator="\n"))
