@@ -107,6 +107,11 @@ def choose_readouts(model: Model, names: tuple[str, ...], decision: str = "") ->
     return {r: way for r, way in possible.items() if not requested or r in requested}
 
 
+def _fit_trials(decision: Decision, split: ScenarioSplit) -> tuple[str, ...]:
+    """Return the fit trials of a scenario; none for a decision on which nothing is fitted."""
+    return tuple(split.fit) if getattr(decision, "fits", True) else ()
+
+
 _UNKNOWN = float("nan")
 _Made = tuple[Decided, tuple[str, ...], tuple[str, ...]]
 """What was decided, and the fit and tested trials of which that could be done."""
@@ -198,7 +203,9 @@ class Predictor:
             losses = trained.validation, trained.baseline
         if Way.ROLLOUTS in self.ways.values():
             # All at once, so that all processes have work.
-            trials = [t for split in fold.scenarios for t in (*split.fit, *split.test)]
+            decision = build_decision(self.model, self.settings.decision, self.settings.logistic)
+            parts = [(*_fit_trials(decision, split), *split.test) for split in fold.scenarios]
+            trials = [trial for part in parts for trial in part]
             self._imagined(list(dict.fromkeys(trials)))
         return [
             self._predict_scenario(fold, split, readout, way, losses)
@@ -323,11 +330,12 @@ class Predictor:
         )
 
     def _decide_on_rollouts(self, decision: Decision, split: ScenarioSplit, _: Readout) -> _Made:
-        found = self._imagined([*split.fit, *split.test])
-        fit = tuple(trial for trial in split.fit if trial not in self.problems)
+        wanted = _fit_trials(decision, split)
+        found = self._imagined([*wanted, *split.test])
+        fit = tuple(trial for trial in wanted if trial not in self.problems)
         test = tuple(trial for trial in split.test if trial not in self.problems)
-        if split.fit and not fit:
-            reason = self.problems[split.fit[0]]
+        if wanted and not fit:
+            reason = self.problems[wanted[0]]
             raise BadInputError(f"no trial of {split.scenario} to fit on was imagined: {reason}")
         if not test:
             return Decided(np.empty(0), _UNKNOWN), fit, test
