@@ -287,13 +287,13 @@ def run_decisions(folder: Path) -> str:
     plan = plan_official(Path(PACKAGED), humans_folder(Path(PACKAGED)), 0)
     settings = GenerateSettings(movies=False, jitters=0, min_visible=0.0, look="redyellow")
     make_trials(folder / "official", plan.tasks, settings)
+    trials, out = folder / "official", folder / "models"
     paths: list[Path] = []
     for decision in DECISIONS:
-        done = evaluate(
-            {name: {"weights": "shipped"} for name in NAMES},
-            folder / "official", folder / "models", decision=decision,
-        )  # fmt: skip
-        paths += done.paths
+        own = {name: {"weights": "shipped"} for name in NAMES}
+        paths += evaluate(own, trials, out, decision=decision).paths
+        free = {"gns": {"weights": "shipped", "rigid": "free"}}
+        paths += evaluate(free, trials, out, decision=decision).paths
     labels = {canonical_name(name): contact for name, contact in plan.recorded.items()}
     result = compare(paths, humans=humans_folder(Path(PACKAGED)), labels=labels)
     return "```\n" + text_table(result.summary) + "\n```\n"

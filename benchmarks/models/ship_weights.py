@@ -11,7 +11,8 @@ TRAINED is the output folder of the trainings. Particle models were trained on t
     physion train gns FOLDER/all --out TRAINED --option steps=7000
 
 GNS-RANSAC has the weights of GNS. Particle models need ``--particles FOLDER`` too: the distances of
-the decision *touch* are fitted on contacts of its training trials, for the rollouts of each. Vision models were trained on movies of 64 px:
+the decision *touch* are fitted on contacts of its training trials, for the rollouts of each. Vision
+models were trained on movies of 64 px:
 
     physion generate MOVIES --split training --count 200 --name small --width 64 --height 64 \
         --jitters 0
@@ -93,9 +94,9 @@ def ship(trained: Path, name: str, particles: Path | None) -> None:
     if isinstance(model, ParticleSimulator):
         touch = ", ".join(f"{value:.3f}" for value in model.touch.tolist())
         card += (
-            f"\n## Contact\nThe default decision has a fixed distance, {model.contact_distance:.3f} m "
-            f"at the end. Distances of the decision touch, bodies and cloth, m: {touch}\nThese are "
-            "fitted on contacts of training trials, on rollouts of this model.\n"
+            "\n## Contact\nThe default decision has a fixed distance at the end, "
+            f"{model.contact_distance:.3f} m.\nDistances of the decision touch, bodies and cloth, "
+            f"m: {touch}\nThey are fitted on contacts of training trials, for this model's rollouts.\n"
         )
     if name != SOURCES[name]:
         card += f"The weights are those of {SOURCES[name]}.\n"

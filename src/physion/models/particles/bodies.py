@@ -224,7 +224,7 @@ class Poses:
     """Motion of the objects of one scene over T frames.
 
     - ``centers`` (T, K, 3): metres, mean of the particles of each object.
-    - ``rotations`` (T, K, 3, 3): of bodies, the best fit where they deform; the identity for cloths.
+    - ``rotations`` (T, K, 3, 3): of bodies, a fit where they deform; the identity for cloths.
     - ``loose`` (T, C, 3): positions of the particles that move on their own.
     """
 

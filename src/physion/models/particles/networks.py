@@ -15,8 +15,8 @@ by
     u = v + (exp(w) - 1) r
 
 A particle of a cloth moves by its last displacement d. So does a particle of a body that deforms,
-but relative to the body's motion, which turns: u = v + exp(w) (d - v). Where the body was rigid this
-is the same as above.
+but relative to the body's motion, which turns: u = v + exp(w) (d - v). Where the body was rigid
+this is the same as above.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from physion.models.particles.bodies import (
-    CLOTH,
     KINEMATIC,
     RIGID,
     Poses,
@@ -102,8 +101,8 @@ class SceneLayout:
 class ObjectState:
     """Where the objects of a `SceneLayout` are; float64, metres.
 
-    - ``centers`` (K, 3): means of the particles. ``rotations`` (K, 3, 3): of bodies; of one that
-      deforms, of the rigid motion that fits its particles best.
+    - ``centers`` (K, 3): means of the particles. ``rotations`` (K, 3, 3): of bodies; where one
+      deforms, the rotation of the rigid motion that fits its particles best.
     - ``loose`` (C, 3): particles that move on their own.
     """
 
@@ -188,7 +187,7 @@ def with_loose(
 ) -> ObjectState:
     """Return a state in which the poses of objects that deform follow from their particles.
 
-    Their centres are means. The rotation of a body is that of the rigid motion that fits best;
+    Their centres are means. The rotation of a body belongs to the rigid motion that fits best;
     fewer than three particles determine none, and it stays as given. The other arguments are as in
     `ObjectState`.
     """

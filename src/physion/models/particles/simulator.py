@@ -4,7 +4,8 @@ Of every object a simulator knows the last two poses, of a cloth the last two po
 particles. If it keeps its motion, a particle at x moves by u (`networks`). The network predicts
 what is added to this motion:
 
-- GNS: a change a of the displacement of every particle, x' = x + u + a. Bodies deform.
+- GNS: a change a of the displacement of every particle, x' = x + u + a. Bodies deform in the size
+  paper. In the size small the rigid motion that fits the x' of a body best keeps it rigid.
 - GNS-RANSAC: the same network and the same training. In a rollout a rigid motion is fitted to the
   x' of those particles of a body that agree with one another, and keeps it rigid in every step.
 - DPI-Net: changes of velocity and spin of every body, and of the displacements of the particles of
@@ -98,13 +99,20 @@ MESSAGES, OBJECTS = "messages", "objects"
 FREE, RANSAC, RELEASED, WHOLE = "free", "ransac", "released", "whole"
 """What keeps bodies rigid: nothing, a rigid motion fitted by RANSAC, one fitted to all particles as
 in the released code of GNS-RANSAC, and a network that moves bodies as wholes (DPI-Net)."""
-_RIGID = {"gns": FREE, "gns-ransac": RANSAC, "dpi": WHOLE}
+_RIGID = {
+    "small": {"gns": RELEASED, "gns-ransac": RANSAC, "dpi": WHOLE},
+    "paper": {"gns": FREE, "gns-ransac": RANSAC, "dpi": WHOLE},
+}
+"""By size and model. The shipped weights of the size small never saw a body that deforms."""
 
 _SMALL: Mapping[str, Mapping[str, Any]] = {
     MESSAGES: {"rounds": 5, "limit": 50, "inner": 6},
     OBJECTS: {"rounds": 3},
 }
-_PAPER: Mapping[str, Mapping[str, Any]] = {MESSAGES: {"rounds": 10}, OBJECTS: {"rounds": 4}}
+_PAPER: Mapping[str, Mapping[str, Any]] = {
+    MESSAGES: {"rounds": 10, "free_training": True},
+    OBJECTS: {"rounds": 4},
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +125,9 @@ class ParticleSettings(SizedSettings):
     - ``stride``: frames of 0.01 s in one step, 3 or 1.
     - ``width``, ``rounds``: of the network.
     - ``rigid``: what keeps bodies rigid in a rollout: ``free`` (nothing), ``ransac``, ``released``
-      (a fit to all particles), or ``whole`` for DPI-Net. GNS and GNS-RANSAC are trained alike.
+      (a fit to all particles), or ``whole`` for DPI-Net.
+    - ``free_training``: whether bodies deform in the training of GNS and GNS-RANSAC, which are
+      trained alike; otherwise a fit to all particles keeps them rigid there.
     - ``spacing``, ``limit``, ``still_limit``, ``cloth_step``, ``inner``, ``within``: how objects
       become particles (`Sampling`).
     - ``radius``: metres within which particles are neighbours, of different objects, and with
@@ -150,7 +160,8 @@ class ParticleSettings(SizedSettings):
     stride: Literal[1, 3] = 3
     width: int = 64
     rounds: int = 3
-    rigid: Literal["free", "ransac", "released", "whole"] = "free"
+    rigid: Literal["free", "ransac", "released", "whole"] = "released"
+    free_training: bool = False
     spacing: float = 0.10
     limit: int = 100
     still_limit: int = 600
@@ -185,7 +196,7 @@ class ParticleSettings(SizedSettings):
         sized = dict(super().defaults(model, options))
         small = options.get("size", "small") == "small"
         sized |= (_SMALL if small else _PAPER)[network_of(model)]
-        sized["rigid"] = _RIGID[model]
+        sized["rigid"] = _RIGID["small" if small else "paper"][model]
         if options.get("stride") == 1:
             # A shorter step: what is counted in metres a step is less. Nothing is shipped for it.
             sized |= {"velocity_noise": cls.velocity_noise / 3, "rest": cls.rest / 3}
@@ -203,8 +214,8 @@ class ParticleSettings(SizedSettings):
 
     @property
     def training_sampling(self) -> Sampling:
-        """How objects become particles in a training: bodies of all GNS are free there."""
-        return self._sampling(free=self.network == MESSAGES)
+        """How objects become particles in a training."""
+        return self._sampling(free=self.free_training)
 
     def _sampling(self, *, free: bool) -> Sampling:
         return Sampling(
@@ -430,9 +441,11 @@ class ParticleSimulator(TorchModel):
         return "end"
 
     def provenance(self) -> Provenance:
-        """Return name, size and origin of the weights."""
+        """Return name, size and origin of the weights; the name has a ``rigid`` of one's own."""
+        settings = self.settings
+        usual = settings.rigid == _RIGID[settings.size][settings.model]
         return Provenance(
-            model=self.name,
+            model=self.name if usual else f"{self.name}-{settings.rigid}",
             init=self.init,
             encoder_type="true state",
             dynamics_type="particles",
@@ -512,8 +525,8 @@ class ParticleSimulator(TorchModel):
     def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
         """Return distances (B, S) of agent and patient in the imagined steps.
 
-        ``gap`` is the smallest, less ``touch``, between steps too (`gaps`); ``end`` is that of
-        points at the end, ``closest`` their smallest, both less `contact_distance`
+        ``gap`` is the smallest, less ``touch``, between steps too (`gaps`); ``end`` is the distance
+        of points at the end, ``closest`` their smallest, both less `contact_distance`
         (`point_gaps`). With the argument ``show`` above 0, ``shown`` holds the imagined particles
         and their objects (`shown_particles`). The frames are 44 + s, 44 + 2 s, ... with the stride
         s.
@@ -552,7 +565,7 @@ class ParticleSimulator(TorchModel):
     def step(self, layout: SceneLayout, before: ObjectState, now: ObjectState) -> ObjectState:
         """Return the state after the next step."""
         drift = drift_of(layout, before, now)
-        _, after = self._predict_next(layout, now, drift)
+        _, after = self._predict_next(layout, now, drift, robust=self.settings.rigid == RANSAC)
         return self._rested(layout, now, after)
 
     def _loss(self, window: Window, later: Sequence[ObjectState]) -> Tensor:
@@ -560,13 +573,14 @@ class ParticleSimulator(TorchModel):
         total = torch.zeros((), device=layout.shape.device)
         for target in later:
             drift = drift_of(layout, before, now)
-            predicted, after = self._predict_next(layout, now, drift)
+            # Without RANSAC: GNS and GNS-RANSAC are trained alike.
+            predicted, after = self._predict_next(layout, now, drift, robust=False)
             total = total + self._error(layout, target, predicted)
             before, now = now, self._rested(layout, now, after.detached())
         return total / len(later)
 
     def _predict_next(
-        self, layout: SceneLayout, now: ObjectState, drift: Drift
+        self, layout: SceneLayout, now: ObjectState, drift: Drift, *, robust: bool
     ) -> tuple[Tensor, ObjectState]:
         """Return the next positions of particles (P, 3), and the next state.
 
@@ -582,7 +596,7 @@ class ParticleSimulator(TorchModel):
             rigid = layout.kinds == RIGID
             centers, rotations = now.centers, rotation_from_vector(drift.spin) @ now.rotations
             if not bool(layout.soft_bodies.any()):
-                fitted, centers = self._fit(layout, goal)
+                fitted, centers = self._fit(layout, goal, robust=robust)
                 # Fewer than three particles determine no rotation: such a body keeps its spin.
                 few = (_counts(layout) < 3)[:, None, None]
                 rotations = torch.where(few, rotations, fitted)
@@ -673,9 +687,9 @@ class ParticleSimulator(TorchModel):
         loose = self._of_particles(graph, changes)[layout.loose]
         return move_loose(layout, state, drift, loose)
 
-    def _fit(self, layout: SceneLayout, goal: Tensor) -> tuple[Tensor, Tensor]:
+    def _fit(self, layout: SceneLayout, goal: Tensor, *, robust: bool) -> tuple[Tensor, Tensor]:
         """Return the rotations and centres of the rigid motions that fit the particles."""
-        if self.settings.rigid != RANSAC:
+        if not robust:
             return fit_rigid(layout.shape, goal, layout.owners, layout.objects)
         draws = torch.rand(_HYPOTHESES, 4, generator=torch.Generator().manual_seed(0))
         tolerance = _INLIER * self.settings.spacing
