@@ -96,7 +96,7 @@ def ship(trained: Path, name: str, particles: Path | None) -> None:
         card += (
             "\n## Contact\nThe default decision has a fixed distance at the end, "
             f"{model.contact_distance:.3f} m.\nDistances of the decision touch, bodies and cloth, "
-            f"m: {touch}\nThey are fitted on contacts of training trials, for this model's rollouts.\n"
+            f"m: {touch}\nThey are fitted on contacts of training trials, for its own rollouts.\n"
         )
     if name != SOURCES[name]:
         card += f"The weights are those of {SOURCES[name]}.\n"
