@@ -5,6 +5,7 @@
     python benchmarks/models/particles.py transfer FOLDER --write  # trained without Collide
     python benchmarks/models/particles.py shipped FOLDER --write  # weights of the package
     python benchmarks/models/particles.py official FOLDER --write  # the same on official scenes
+    python benchmarks/models/particles.py decisions FOLDER --write  # what turns rollouts into yes
     python benchmarks/models/particles.py futures FOLDER --write  # one and several, beside people
     python benchmarks/models/particles.py batched FOLDER --write  # rollouts together, one by one
     python benchmarks/models/particles.py symmetry FOLDER --write  # scenes that are rotated
@@ -14,6 +15,10 @@
 tests on 300 balanced trials without observed contact; the state classifier is fitted on the same
 300. Answers are those of one future, and P(contact) of 8 futures with noise on the velocities from
 which they start.
+
+``shipped`` and ``official`` are of the decision *touch*, whose distance was calibrated on contacts
+of training trials. ``decisions`` compares all four decisions on the 590 official stimuli that
+people saw; only *gap* is fitted, on the other official trials.
 
 ``futures`` compares such answers of the shipped DPI-Net with those of the people who saw the
 official scenes, Drape left out; outcomes are the recorded ones. ``symmetry`` compares the step
@@ -46,11 +51,13 @@ from sklearn.metrics import roc_auc_score
 
 from physion import Dataset, build_model, sample_scene, simulate
 from physion.analysis.tables import read_humans
+from physion.cli.output import text_table
+from physion.cli.run import plan_official
 from physion.clips.batch import LAST_OBSERVED, Batch, Motion, cut_to_observed
 from physion.clips.clips import observed_source, whole_source
 from physion.compute.tasks import processor
 from physion.core.names import SCENARIOS, canonical_name
-from physion.data.official import official
+from physion.data.official import PACKAGED, humans_folder, official
 from physion.models.build import build_untrained
 from physion.models.interface import can
 from physion.models.particles.bodies import poses_of, rotation_from_vector, scene_particles
@@ -65,7 +72,9 @@ from physion.models.particles.networks import (
 )
 from physion.models.particles.simulator import OBJECTS, ParticleSimulator
 from physion.physics.labels import label_contact
+from physion.readout.evaluate import evaluate
 from physion.readout.rollout_error import motion_error
+from physion.report.compare import compare
 from physion.scenes.sampling.build import scenarios
 from physion.training.train import train_model
 from physion.trials.making.generate import make_trials
@@ -81,6 +90,7 @@ FUTURES, SPREAD = 8, 0.1
 COLLIDE_STEPS = 2600
 TRANSFER_STEPS = 5000
 NAMES = ("dpi", "gns", "gns-ransac")
+DECISIONS = ("end", "closest", "gap", "touch")
 RIGID = tuple(name for name in SCENARIOS if name != "drape")
 
 Rows = list[list[str]]
@@ -272,6 +282,23 @@ def run_official(_: Path, name: str) -> str:
     )
 
 
+def run_decisions(folder: Path) -> str:
+    """Return scores beside people of every decision on the same rollouts."""
+    plan = plan_official(Path(PACKAGED), humans_folder(Path(PACKAGED)), 0)
+    settings = GenerateSettings(movies=False, jitters=0, min_visible=0.0, look="redyellow")
+    make_trials(folder / "official", plan.tasks, settings)
+    trials, out = folder / "official", folder / "models"
+    paths: list[Path] = []
+    for decision in DECISIONS:
+        own = {name: {"weights": "shipped"} for name in NAMES}
+        paths += evaluate(own, trials, out, decision=decision).paths
+        free = {"gns": {"weights": "shipped", "rigid": "free"}}
+        paths += evaluate(free, trials, out, decision=decision).paths
+    labels = {canonical_name(name): contact for name, contact in plan.recorded.items()}
+    result = compare(paths, humans=humans_folder(Path(PACKAGED)), labels=labels)
+    return "```\n" + text_table(result.summary) + "\n```\n"
+
+
 def run_futures(_: Path) -> str:
     """Return accuracy, and r with people, of one future and of several."""
     people = read_humans(official().humans).set_index("stimulus")["accuracy"]
@@ -418,8 +445,11 @@ def step_of_drape(name: str, size: str) -> list[str]:
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     layout, *states = last_states(model, motion)
     drift = drift_of(layout, *states)
-    near_only = model.settings.network == OBJECTS
-    graph = make_graph(layout, drift, model.settings.radius, 1.0, swept=True, near_only=near_only)
+    settings = model.settings
+    graph = make_graph(
+        layout, drift, settings.radius, 1.0,
+        swept=settings.swept, within=settings.within, roots=settings.network == OBJECTS,
+    )  # fmt: skip
     counts = [len(layout.owners), len(graph.senders), before // 1024, most // 1024]
     return [f"{count:,}" for count in counts]
 
@@ -450,6 +480,7 @@ def main() -> None:
     """Run one of the benchmarks."""
     runs = {
         "collide": run_collide, "transfer": run_transfer, "futures": run_futures,
+        "decisions": run_decisions,
         "batched": run_batched, "symmetry": run_symmetry, "memory": run_memory,
     }  # fmt: skip
     by_model = {"shipped": run_shipped, "official": run_official}

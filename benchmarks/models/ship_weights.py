@@ -10,8 +10,9 @@ TRAINED is the output folder of the trainings. Particle models were trained on t
     physion train dpi FOLDER/all --out TRAINED --option steps=16000
     physion train gns FOLDER/all --out TRAINED --option steps=7000
 
-GNS-RANSAC has the weights of GNS and thresholds that are fitted on its own rollouts, for which it
-needs ``--particles FOLDER``. Vision models were trained on movies of 64 px:
+GNS-RANSAC has the weights of GNS. Particle models need ``--particles FOLDER`` too: the distances of
+the decision *touch* are fitted on contacts of its training trials, for the rollouts of each. Vision
+models were trained on movies of 64 px:
 
     physion generate MOVIES --split training --count 200 --name small --width 64 --height 64 \
         --jitters 0
@@ -25,6 +26,7 @@ digests of the weights and the tables of ``results/particles.md`` and ``results/
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import re
 from pathlib import Path
 from typing import Any
@@ -81,21 +83,23 @@ def ship(trained: Path, name: str, particles: Path | None) -> None:
     card = (folder / "model_card.md").read_text()
     model: Any = build_untrained(name.removesuffix("-small"))
     load_tensors(folder, tensors, model)
-    if name != SOURCES[name]:
+    if isinstance(model, ParticleSimulator):
         if particles is None:
             raise SystemExit(f"{name} needs --particles FOLDER")
         fit_distances(model, Dataset(particles / "all"), metadata["config"])
+    if name != SOURCES[name]:
         card = card.replace("gns-small", name).replace("| model | gns |", "| model | gns-ransac |")
     use = f"`physion evaluate {name.removesuffix('-small')} TRIALS`"
     card = card.split("## Use")[0] + f"## Use\n{use}\n"
     if isinstance(model, ParticleSimulator):
         touch = ", ".join(f"{value:.3f}" for value in model.touch.tolist())
-        card += f"\n## Contact\nDistance that counts as contact, bodies and cloth, m: {touch}\n"
-    if name != SOURCES[name]:
         card += (
-            f"The weights are those of {SOURCES[name]}; the distances are fitted on the rollouts "
-            "of this model.\n"
+            "\n## Contact\nThe default decision has a fixed distance at the end, "
+            f"{model.contact_distance:.3f} m.\nDistances of the decision touch, bodies and cloth, "
+            f"m: {touch}\nThey are fitted on contacts of training trials, for its own rollouts.\n"
         )
+    if name != SOURCES[name]:
+        card += f"The weights are those of {SOURCES[name]}.\n"
     card += f"\n## Hardware\n{processor()}, one thread\n"
     card += f"\n## Trials\nMade by {TRIALS[model.learns_from]}.\n"
     stored = tensors_of(model)
@@ -109,8 +113,9 @@ def ship(trained: Path, name: str, particles: Path | None) -> None:
     print(name, (SHIPPED / f"{name}.safetensors").stat().st_size, "bytes")
 
 
-def fit_distances(model: Any, dataset: Dataset, training: Any) -> None:
-    """Fit the distances that count as contact, as at the end of a training."""
+def fit_distances(model: ParticleSimulator, dataset: Dataset, training: Any) -> None:
+    """Fit the distances of the decision *touch*, as a training with ``calibrated=true`` does."""
+    model.settings = dataclasses.replace(model.settings, calibrated=True)
     source = whole_source(dataset, model.spec)
     calibrate(model, source, dataset.trials("training"), int(training["seed"]))
 

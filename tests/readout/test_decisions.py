@@ -7,6 +7,8 @@ import pytest
 
 from physion.core.errors import BadInputError
 from physion.readout.decisions import (
+    ClosestDecision,
+    EndDecision,
     GapDecision,
     NoiseDecision,
     TouchDecision,
@@ -111,13 +113,26 @@ def test_only_contacts_have_no_threshold() -> None:
         GapDecision().decide(contacts, np.array([True]), contacts)
 
 
+def test_the_fixed_distance_counts_at_the_end_or_at_any_time() -> None:
+    end, closest = np.array([[0.2, 0.0], [0.1, 0.3]]), np.array([[-0.1, -0.2], [0.1, 0.0]])
+    tested = {NO_ARGUMENTS: Outcomes(None, np.ones((2, 2)), end, closest)}
+    for decision, expected in (
+        (EndDecision(), [1.5 / 3, 0.5 / 3]),
+        (ClosestDecision(), [2.5 / 3, 1.5 / 3]),
+    ):
+        decided = decision.decide({}, np.zeros(0, np.bool_), tested)
+        assert decided.probability == pytest.approx(expected) and not decision.fits
+        with pytest.raises(BadInputError, match="which particle models give"):
+            decision.decide({}, np.zeros(0, np.bool_), gaps([0.1]))
+
+
 def test_touching_needs_no_fit_and_counts_futures() -> None:
     """P = (k + 1/2) / (S + 1) for k of S futures; a gap of 0 touches."""
     decide = TouchDecision().decide
     near = gaps([0.0, -0.1, 0.2], [0.1, 0.2, 0.3], [0.0, 0.0, 0.0])
-    decided = decide(near, np.array([True, True, True]), near)
+    decided = decide({}, np.zeros(0, np.bool_), near)
     assert decided.probability == pytest.approx([2.5 / 4, 0.5 / 4, 3.5 / 4])
-    assert decided.train_accuracy == pytest.approx(2 / 3) and decided.fitted == {}
+    assert np.isnan(decided.train_accuracy) and decided.fitted == {}
     seen = {NO_ARGUMENTS: Outcomes(np.array([[True], [False]]), np.array([[0.3], [-0.3]]))}
     assert decide(seen, np.array([True, False]), seen).probability.tolist() == [1.0, 0.0]
     nothing = {NO_ARGUMENTS: Outcomes(None, np.zeros((0, 3)))}

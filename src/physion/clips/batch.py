@@ -224,6 +224,8 @@ class Rollout:
 
     - ``features`` (B, S, future, D) float32.
     - ``gap`` (B, S): smallest distance of agent and patient in metres; 0 or less is a touch.
+    - ``end``, ``closest`` (B, S): their distance at the end of the future, and the smallest, less a
+      fixed one at which they count as touching, of models that have such a rule.
     - ``contact`` (B, S) bool: whether they touch, of simulators that report contacts.
     - ``shown``: what the model imagined, for ``physion view``: rgb (B, S, future, H, W, 3) uint8,
       boxes (B, S, future, K, 4), masks (B, S, future, K, H, W) in 0..1, slots (B, S, future, K, D),
@@ -236,6 +238,8 @@ class Rollout:
     features: Any = None
     gap: Any = None
     contact: Any = None
+    end: Any = None
+    closest: Any = None
     shown: Mapping[str, Any] = field(default_factory=dict)
 
 

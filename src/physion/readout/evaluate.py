@@ -27,7 +27,7 @@ from physion.models.interface import Model, TrainingSettings, ask, can
 from physion.readout.decisions import Readout, decisions
 from physion.readout.folds import Protocol, plan_folds, select_scenario
 from physion.readout.model_calls import check_identity, is_network
-from physion.readout.predictor import Predictor, Way, choose_readouts
+from physion.readout.predictor import Predictor, Way, choose_readouts, decision_name
 from physion.readout.settings import (
     Cell,
     EvaluationSettings,
@@ -234,6 +234,11 @@ class _Evaluate:
         training = cell.chosen.settings_of(model) if cell.protocol is not None else None
         provenance = check_identity(model)
         ways = choose_readouts(model, settings.readouts, settings.decision)
+        if Way.ROLLOUTS in ways.values():
+            # Another decision on the same rollouts is another row.
+            wanted, own = decision_name(model, settings.decision), decision_name(model)
+            name = provenance.model if wanted == own else f"{provenance.model}-{wanted}"
+            provenance = dataclasses.replace(provenance, model=name)
         if not provenance.inputs:
             provenance = dataclasses.replace(provenance, inputs=", ".join(model.spec.inputs))
         path = self._table(cell, model, training, provenance, ways)

@@ -210,7 +210,7 @@ class StoredFeatures:
 
 # Features and outcomes that a model gives for a batch of clips, checked and split by trial.
 
-GAP, CONTACT = "gap", "contact"
+GAP, CONTACT, END, CLOSEST = "gap", "contact", "end", "closest"
 Arrays = Mapping[str, NDArray[Any]]
 """Arrays of one trial, by name."""
 
@@ -241,7 +241,7 @@ def encode_clips(model: Model, batch: Batch) -> list[Arrays]:
 def imagine_clips(
     model: Model, batch: Batch, samples: int, seed: int, arguments: Mapping[str, float]
 ) -> list[Arrays]:
-    """Return features (S * future, D), gap (S) and contact (S) of every clip, if given."""
+    """Return features (S * future, D), distances (S) and contact (S) of every clip, if given."""
     rollout = call_model(model, "imagine", batch, samples, seed, **arguments)
     if not isinstance(rollout, Rollout):
         raise BadInputError(
@@ -250,7 +250,7 @@ def imagine_clips(
     clips, future = len(batch), batch.future
     expected: dict[str, tuple[tuple[int | None, ...], tuple[str, ...]]] = {
         FEATURES: ((clips, samples, future, None), ("float32",)),
-        GAP: ((clips, samples), ("float64", "float32")),
+        **dict.fromkeys((GAP, END, CLOSEST), ((clips, samples), ("float64", "float32"))),
         CONTACT: ((clips, samples), ("bool",)),
     }
     arrays: dict[str, NDArray[Any]] = {}
@@ -268,8 +268,8 @@ def imagine_clips(
     if FEATURES in arrays:
         features = arrays[FEATURES]
         arrays[FEATURES] = features.reshape(clips, samples * future, features.shape[-1])
-    if GAP in arrays:
-        arrays[GAP] = arrays[GAP].astype(np.float64)
+    for name in {GAP, END, CLOSEST} & set(arrays):
+        arrays[name] = arrays[name].astype(np.float64)
     return _split(arrays, clips)
 
 
@@ -289,11 +289,13 @@ class Outcomes:
     """Imagined outcomes of n trials, S samples each.
 
     ``contact`` (n, S) bool where the model reports contacts, and ``gap`` (n, S) float64 in metres
-    where it reports distances; 0 or less is a touch.
+    where it reports distances; 0 or less is a touch. ``end``, ``closest``: see `Rollout`.
     """
 
     contact: NDArray[np.bool_] | None
     gap: NDArray[np.float64] | None
+    end: NDArray[np.float64] | None = None
+    closest: NDArray[np.float64] | None = None
 
     @property
     def samples(self) -> int:
@@ -339,13 +341,13 @@ class Imagined:
         if not rows:
             return Outcomes(np.zeros((0, 1), np.bool_), np.zeros((0, 1), np.float64))
         names = set.intersection(*(set(row.shapes) for row in rows))
-        gap, contact = (
+        contact, gap, end, closest = (
             np.stack([row.array(name) for row in rows]) if name in names else None
-            for name in (GAP, CONTACT)
+            for name in (CONTACT, GAP, END, CLOSEST)
         )
         if gap is None and contact is None:
             raise BadInputError(f"model {self.model!r}: imagine gave neither gap nor contact")
-        return Outcomes(contact, gap)
+        return Outcomes(contact, gap, end, closest)
 
 
 def all_arguments(arguments: Mapping[str, Sequence[float]]) -> list[Arguments]:

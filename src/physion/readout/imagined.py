@@ -255,13 +255,17 @@ def _array(
 def _outcomes(model: Model, rollout: Rollout, clips: int, samples: int) -> tuple[Arrays, Arrays]:
     """Return P(contact) (B,) over all futures, and the gap (B,) of the first; NaN if unknown."""
     shape, unknown = (clips, samples), np.full(clips, np.nan)
-    gap, contact = (
+    gap, end, contact = (
         None if value is None else to_array(value, model, f"imagine gave {name}", shape, dtypes)
         for name, value, dtypes in (
             ("gap", rollout.gap, ("float64", "float32")),
+            ("end", rollout.end, ("float64", "float32")),
             ("contact", rollout.contact, ("bool",)),
         )
     )
-    known = gap is not None or contact is not None
-    probability = fraction_of_futures(Outcomes(contact, gap).touches()) if known else unknown
+    probability = unknown
+    if end is not None:
+        probability = fraction_of_futures(end <= 0)
+    elif gap is not None or contact is not None:
+        probability = fraction_of_futures(Outcomes(contact, gap).touches())
     return probability, unknown if gap is None else gap[:, 0]

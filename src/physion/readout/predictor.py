@@ -107,6 +107,11 @@ def choose_readouts(model: Model, names: tuple[str, ...], decision: str = "") ->
     return {r: way for r, way in possible.items() if not requested or r in requested}
 
 
+def _fit_trials(decision: Decision, split: ScenarioSplit) -> tuple[str, ...]:
+    """Return the fit trials of a scenario; none for a decision on which nothing is fitted."""
+    return tuple(split.fit) if getattr(decision, "fits", True) else ()
+
+
 _UNKNOWN = float("nan")
 _Made = tuple[Decided, tuple[str, ...], tuple[str, ...]]
 """What was decided, and the fit and tested trials of which that could be done."""
@@ -199,7 +204,8 @@ class Predictor:
             losses = trained.validation, trained.baseline
         if Way.ROLLOUTS in self.ways.values():
             # All at once, so that all processes have work.
-            self._imagined(fold.scenarios)
+            decision = build_decision(self.model, self.settings.decision, self.settings.logistic)
+            self._imagined(fold.scenarios, decision)
         return [
             self._predict_scenario(fold, split, readout, way, losses)
             for split in fold.scenarios
@@ -318,9 +324,15 @@ class Predictor:
         samples, seed, arguments = (ask(model, name) for name in ("samples", "seed", "arguments"))
         return samples, self.seed if seed is None else seed, arguments
 
-    def _imagined(self, splits: Sequence[ScenarioSplit]) -> dict[Arguments, Imagined]:
-        """Return what could be imagined of the trials of scenarios, with all arguments."""
-        future = {trial: steps for split in splits for trial, steps in self._future(split).items()}
+    def _imagined(
+        self, splits: Sequence[ScenarioSplit], decision: Decision
+    ) -> dict[Arguments, Imagined]:
+        """Return what could be imagined of the trials that a decision needs, with all arguments."""
+        future = {}
+        for split in splits:
+            steps = self._future(split)
+            for trial in (*_fit_trials(decision, split), *split.test):
+                future[trial] = steps[trial]
         samples, seed, arguments = self._rollout_settings()
         model = self.model
         shared = ask(model, "trials_together")
@@ -338,11 +350,12 @@ class Predictor:
         )
 
     def _decide_on_rollouts(self, decision: Decision, split: ScenarioSplit, _: Readout) -> _Made:
-        found = self._imagined([split])
-        fit = tuple(trial for trial in split.fit if trial not in self.problems)
+        found = self._imagined([split], decision)
+        wanted = _fit_trials(decision, split)
+        fit = tuple(trial for trial in wanted if trial not in self.problems)
         test = tuple(trial for trial in split.test if trial not in self.problems)
-        if split.fit and not fit:
-            reason = self.problems[split.fit[0]]
+        if wanted and not fit:
+            reason = self.problems[wanted[0]]
             raise BadInputError(f"no trial of {split.scenario} to fit on was imagined: {reason}")
         if not test:
             return Decided(np.empty(0), _UNKNOWN), fit, test

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from physion.models.particles.neighbours import gap_over_time, swept_edges
+from physion.models.particles.neighbours import gap_over_time, near_edges, swept_edges
 
 F64 = NDArray[np.float64]
 
@@ -43,6 +43,17 @@ def test_swept_pairs_are_those_that_come_close(seed: int) -> None:
             if pair and distance <= 0.2:
                 expected.append((i, j))
     assert list(zip(receivers.tolist(), senders.tolist(), strict=True)) == sorted(expected)
+
+
+def test_near_pairs_of_one_object_are_those_within_the_radius() -> None:
+    rng = np.random.default_rng(0)
+    points, starts = rng.normal(size=(300, 3)), np.array([0, 40, 40, 200, 300])
+    owner, moves = np.repeat(np.arange(4), np.diff(starts)), np.array([True, True, True, False])
+    receivers, senders = near_edges(points, starts, moves, 0.7)
+    near = np.linalg.norm(points[:, None] - points, axis=-1) < 0.7
+    near &= (owner[:, None] == owner) & moves[owner] & ~np.eye(300, dtype=bool)
+    assert near.sum() > 100
+    assert np.array_equal(np.stack([receivers, senders]), np.argwhere(near).T)
 
 
 def test_a_fast_body_meets_what_it_passes() -> None:

@@ -149,7 +149,9 @@ class Sampling:
     - ``spacing``: metres between particles. ``limit``: largest number for one body,
       ``still_limit``: for a kinematic one, which may be large.
     - ``inner``: how many of the nearest particles of its own rigid body a particle is linked to.
+    - ``within``: no links; instead particles of one object are neighbours while they are near.
     - ``cloth_step``: every how many vertices of a cloth, along both sides, is a particle.
+    - ``free``: whether the particles of rigid bodies move on their own, so that bodies deform.
     """
 
     spacing: float = 0.10
@@ -157,6 +159,8 @@ class Sampling:
     still_limit: int = 600
     cloth_step: int = 3
     inner: int = 0
+    within: bool = False
+    free: bool = False
 
     def __post_init__(self) -> None:
         counts = min(self.limit, self.still_limit, self.cloth_step)
@@ -184,6 +188,7 @@ class SceneParticles:
       diagonals of the grid of a cloth, and between near particles of a rigid body.
     - ``floor``: height of the floor, metres.
     - ``agent``, ``patient``: rows of objects, -1 for one that is absent.
+    - ``free``: whether the particles of rigid bodies move on their own.
     """
 
     name: str
@@ -198,6 +203,7 @@ class SceneParticles:
     floor: float
     agent: int
     patient: int
+    free: bool = False
 
     @property
     def sizes(self) -> F64:
@@ -208,8 +214,9 @@ class SceneParticles:
 
     @property
     def loose(self) -> NDArray[np.bool_]:
-        """Which particles (P,) move on their own: the particles of cloths."""
-        return np.asarray(self.kinds[self.owners] == CLOTH)
+        """Which particles (P,) move on their own: of cloths, and of bodies that are free."""
+        kinds = self.kinds[self.owners]
+        return np.asarray((kinds == CLOTH) | ((kinds == RIGID) & self.free))
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +224,7 @@ class Poses:
     """Motion of the objects of one scene over T frames.
 
     - ``centers`` (T, K, 3): metres, mean of the particles of each object.
-    - ``rotations`` (T, K, 3, 3): of bodies; the identity for cloths.
+    - ``rotations`` (T, K, 3, 3): of bodies, a fit where they deform; the identity for cloths.
     - ``loose`` (T, C, 3): positions of the particles that move on their own.
     """
 
@@ -293,6 +300,10 @@ def poses_of(particles: SceneParticles, motion: Motion, frames: Sequence[int]) -
     owners = particles.owners[(particles.kinds == CLOTH)[particles.owners]]
     for row in np.flatnonzero(~bodies):
         centers[:, row] = loose[:, owners == row].mean(axis=1)
+    if particles.free:
+        placed = posed_positions(particles, centers, rotations)
+        placed[:, (particles.kinds == CLOTH)[particles.owners]] = loose
+        loose = placed[:, particles.loose]
     return Poses(centers, rotations, loose)
 
 
@@ -322,11 +333,19 @@ def join_poses_in_time(first: Poses, second: Poses) -> Poses:
     )
 
 
+def posed_positions(particles: SceneParticles, centers: F64, rotations: F64) -> F64:
+    """Return where particles (T, P, 3) would be if all objects were rigid, metres.
+
+    The other arguments are as in `Poses`.
+    """
+    rotated = (rotations[:, particles.owners] @ particles.shape[None, :, :, None])[..., 0]
+    positions: F64 = centers[:, particles.owners] + rotated
+    return positions
+
+
 def particle_positions(particles: SceneParticles, poses: Poses) -> F64:
     """Return the positions (T, P, 3) of all particles in every row of a motion, metres."""
-    rotations = poses.rotations[:, particles.owners]
-    rotated = (rotations @ particles.shape[None, :, :, None])[..., 0]
-    positions = poses.centers[:, particles.owners] + rotated
+    positions = posed_positions(particles, poses.centers, poses.rotations)
     positions[:, particles.loose] = poses.loose
     return positions
 
@@ -343,7 +362,7 @@ def _sample(scene: Scene, sampling: Sampling, present: tuple[bool, ...]) -> Scen
         pivot = points.mean(axis=0)
         things.append(index)
         kinds.append(KINEMATIC if body.kinematic else RIGID)
-        if not body.kinematic and sampling.inner:
+        if not body.kinematic and sampling.inner and not sampling.within:
             links.append(_nearest(points, sampling.inner) + sum(len(part) for part in shapes))
         pivots.append(pivot)
         shapes.append(points - pivot)
@@ -353,7 +372,8 @@ def _sample(scene: Scene, sampling: Sampling, present: tuple[bool, ...]) -> Scen
         pivots.append(np.zeros(3))
         rows, grid = _grid(cloth.resolution, sampling.cloth_step)
         before = sum(sheet.resolution**2 for sheet in scene.cloths[:number])
-        links.append(grid + sum(len(points) for points in shapes))
+        if not sampling.within:
+            links.append(grid + sum(len(points) for points in shapes))
         vertices.append(rows + before)
         shapes.append(np.zeros((len(rows), 3)))
         normals.append(np.zeros((len(rows), 3)))
@@ -380,6 +400,7 @@ def _sample(scene: Scene, sampling: Sampling, present: tuple[bool, ...]) -> Scen
         floor=scene.floor,
         agent=row_of.get(agent, -1),
         patient=row_of.get(patient, -1),
+        free=sampling.free,
     )
 
 

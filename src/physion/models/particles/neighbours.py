@@ -60,6 +60,31 @@ def swept_edges(
     return _both_ways(first, second)
 
 
+def near_edges(points: F64, starts: I64, moves: NDArray[np.bool_], radius: float) -> Edges:
+    """Return the pairs of particles of one object that are closer than ``radius``.
+
+    Both directions of a pair are returned, sorted by receiver, then sender.
+
+    Parameters
+    ----------
+    points : (P, 3)
+        Metres.
+    starts : (K + 1,)
+        Rows at which the particles of each object begin, and P.
+    moves : (K,)
+        Whether an object can move; those that cannot have no edges within.
+    radius : float
+        Metres.
+    """
+    first, second = _near_pairs(
+        np.ascontiguousarray(points, np.float64),
+        np.ascontiguousarray(starts, np.int64),
+        np.ascontiguousarray(moves, np.bool_),
+        float(radius),
+    )
+    return _both_ways(first, second)
+
+
 def gap_over_time(a: F64, b: F64) -> float:
     """Return the smallest distance over T frames and between them of particles (T, A or B, 3)."""
     best = np.inf
@@ -119,6 +144,37 @@ def _swept_pairs(
                     first[count] = i
                     second[count] = j
                     count += 1
+    return first[:count], second[:count]
+
+
+@kernel
+def _near_pairs(
+    points: F64, starts: I64, moves: NDArray[np.bool_], radius: float
+) -> tuple[I64, I64]:
+    """Return the pairs (E,), (E,) of `near_edges` in one direction."""
+    first = np.empty(64, np.int64)
+    second = np.empty(64, np.int64)
+    count = 0
+    for k in range(len(starts) - 1):
+        if not moves[k]:
+            continue
+        for i in range(starts[k], starts[k + 1]):
+            for j in range(i + 1, starts[k + 1]):
+                squared = 0.0
+                for c in range(3):
+                    squared += (points[j, c] - points[i, c]) ** 2
+                if squared >= radius * radius:
+                    continue
+                if count == len(first):
+                    more = np.empty(2 * count, np.int64)
+                    more[:count] = first
+                    first = more
+                    more = np.empty(2 * count, np.int64)
+                    more[:count] = second
+                    second = more
+                first[count] = i
+                second[count] = j
+                count += 1
     return first[:count], second[:count]
 
 

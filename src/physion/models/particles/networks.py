@@ -14,7 +14,9 @@ by
 
     u = v + (exp(w) - 1) r
 
-A particle of a cloth moves by its last displacement.
+A particle of a cloth moves by its last displacement d. So does a particle of a body that deforms,
+but relative to the body's motion, which turns: u = v + exp(w) (d - v). Where the body was rigid
+this is the same as above.
 """
 
 from __future__ import annotations
@@ -29,16 +31,16 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from physion.models.particles.bodies import (
-    CLOTH,
     KINEMATIC,
     RIGID,
     Poses,
     SceneParticles,
+    fit_rigid,
     mean_by,
     rotation_from_vector,
     vector_from_rotation,
 )
-from physion.models.particles.neighbours import swept_edges
+from physion.models.particles.neighbours import near_edges, swept_edges
 
 # Particles of several scenes as one set of tensors, and the state of their objects.
 #
@@ -55,7 +57,8 @@ class SceneLayout:
     - ``shape`` (P, 3) float64: offset of a particle from the centre of its object at rest, metres.
     - ``normals`` (P, 3) float64: outward unit normals at rest; 0 where there are none.
     - ``owners`` (P,), ``kinds`` (K,), ``scene`` (K,): see `bodies.SceneParticles`.
-    - ``loose`` (C,): rows of the particles that move on their own.
+    - ``loose`` (C,): rows of the particles that move on their own. ``deforms`` (K,): their objects,
+      which are cloths, and bodies that are free.
     - ``links`` (2, L): edges within objects that never change: receivers and senders.
     - ``floor`` (K,): height of the floor, metres. ``size`` (K,): root mean square of ``shape``.
     - ``starts`` (K + 1,), ``scene_array`` (K,), ``moves`` (K,): for `neighbours`, numpy.
@@ -68,6 +71,7 @@ class SceneLayout:
     kinds: Tensor
     scene: Tensor
     loose: Tensor
+    deforms: Tensor
     links: Tensor
     floor: Tensor
     size: Tensor
@@ -87,12 +91,18 @@ class SceneLayout:
         """Number of scenes B."""
         return len(self.ends) - 1
 
+    @property
+    def soft_bodies(self) -> Tensor:
+        """Which objects (K,) are bodies whose particles move on their own."""
+        return self.deforms & (self.kinds == RIGID)
+
 
 @dataclass(frozen=True, eq=False)
 class ObjectState:
     """Where the objects of a `SceneLayout` are; float64, metres.
 
-    - ``centers`` (K, 3): means of the particles. ``rotations`` (K, 3, 3): of bodies.
+    - ``centers`` (K, 3): means of the particles. ``rotations`` (K, 3, 3): of bodies; where one
+      deforms, the rotation of the rigid motion that fits its particles best.
     - ``loose`` (C, 3): particles that move on their own.
     """
 
@@ -120,6 +130,8 @@ def join_scenes(scenes: Sequence[SceneParticles], device: torch.device) -> Scene
     )
     shape = np.concatenate([scene.shape for scene in scenes])
     kinds = np.concatenate([scene.kinds for scene in scenes])
+    loose = np.flatnonzero(np.concatenate([scene.loose for scene in scenes]))
+    deforms = np.isin(np.arange(len(kinds)), owners[loose])
     links = [scene.links + start for scene, start in zip(scenes, ends[:-1], strict=True)]
     total = len(kinds)
 
@@ -133,7 +145,8 @@ def join_scenes(scenes: Sequence[SceneParticles], device: torch.device) -> Scene
         owners=tensor(owners),
         kinds=tensor(kinds),
         scene=tensor(scene_array),
-        loose=tensor(np.flatnonzero(kinds[owners] == CLOTH)),
+        loose=tensor(loose),
+        deforms=tensor(deforms),
         links=tensor(np.concatenate(links, axis=1)),
         floor=tensor(np.repeat([scene.floor for scene in scenes], objects)),
         size=tensor(np.concatenate([scene.sizes for scene in scenes])),
@@ -172,13 +185,21 @@ def rotate_scenes(state: ObjectState, layout: SceneLayout, rotations: Tensor) ->
 def with_loose(
     layout: SceneLayout, centers: Tensor, rotations: Tensor, loose: Tensor
 ) -> ObjectState:
-    """Return a state in which centres of cloths are the means of their particles.
+    """Return a state in which the poses of objects that deform follow from their particles.
 
-    The other arguments are as in `ObjectState`.
+    Their centres are means. The rotation of a body belongs to the rigid motion that fits best;
+    fewer than three particles determine none, and it stays as given. The other arguments are as in
+    `ObjectState`.
     """
     if len(loose):
-        means = mean_by(loose, layout.owners[layout.loose], layout.objects)
-        centers = torch.where((layout.kinds == CLOTH)[:, None], means, centers)
+        owners = layout.owners[layout.loose]
+        means = mean_by(loose, owners, layout.objects)
+        centers = torch.where(layout.deforms[:, None], means, centers)
+        bodies = layout.soft_bodies
+        if bool(bodies.any()):
+            fitted, _ = fit_rigid(layout.shape[layout.loose], loose, owners, layout.objects)
+            bodies = bodies & (torch.bincount(layout.owners, minlength=layout.objects) > 2)
+            rotations = torch.where(bodies[:, None, None], fitted, rotations)
     return ObjectState(centers, rotations, loose)
 
 
@@ -208,9 +229,9 @@ class Graph:
     """Inputs of a network, float32: N nodes, E edges, K objects.
 
     Nodes are the particles of all objects that can move, and the ones of kinematic bodies that have
-    an edge: the others would change nothing. For DPI-Net, whose bodies move as wholes, they are
-    the particles of cloths, and of bodies only those that have an edge or, if the body can move,
-    come nearer to the floor than the radius in the step.
+    an edge: the others would change nothing. For DPI-Net without edges within bodies, which move as
+    wholes, they are the particles of cloths, and of bodies only those that have an edge or, if the
+    body can move, come nearer to the floor than the radius in the step.
 
     - ``particles``: P. ``rows`` (N,): particle of each node. ``owners`` (N,): its object.
     - ``receivers``, ``senders`` (E,): nodes.
@@ -238,9 +259,17 @@ def drift_of(layout: SceneLayout, before: ObjectState, now: ObjectState) -> Drif
     spin = vector_from_rotation(now.rotations @ before.rotations.transpose(-1, -2))
     positions = now.positions(layout)
     offsets = positions - now.centers[layout.owners]
-    rotated = (rotation_from_vector(spin)[layout.owners] @ offsets[..., None])[..., 0]
+    turn = rotation_from_vector(spin)
+    rotated = (turn[layout.owners] @ offsets[..., None])[..., 0]
     moves = velocity[layout.owners] + rotated - offsets
-    moves = moves.index_copy(0, layout.loose, now.loose - before.loose)
+    last = now.loose - before.loose
+    bodies = layout.soft_bodies
+    if bool(bodies.any()):
+        owners = layout.owners[layout.loose]
+        own = velocity[owners]
+        turned = own + (turn[owners] @ (last - own)[..., None])[..., 0]
+        last = torch.where(bodies[owners][:, None], turned, last)
+    moves = moves.index_copy(0, layout.loose, last)
     moves = moves.masked_fill((layout.kinds == KINEMATIC)[layout.owners][:, None], 0.0)
     normals = (now.rotations[layout.owners] @ layout.normals[..., None])[..., 0]
     return Drift(velocity, spin, positions, normals, moves)
@@ -263,7 +292,7 @@ def move(
 def move_loose(
     layout: SceneLayout, state: ObjectState, drift: Drift, change: Tensor
 ) -> ObjectState:
-    """Return a state whose particles of cloths moved, with changes (C, 3) of displacements."""
+    """Return a state whose loose particles moved, with changes (C, 3) of displacements."""
     loose = state.loose + drift.moves[layout.loose] + change
     return with_loose(layout, state.centers, state.rotations, loose)
 
@@ -275,7 +304,8 @@ def make_graph(
     unit: float,
     *,
     swept: bool,
-    near_only: bool = False,
+    within: bool = False,
+    roots: bool = False,
 ) -> Graph:
     """Return the graph of a state.
 
@@ -289,14 +319,17 @@ def make_graph(
         Unit of displacements, metres a step.
     swept : bool
         Whether particles that come within the radius during the step are neighbours too.
-    near_only : bool
-        Whether the graph is for DPI-Net, and leaves out particles far from everything.
+    within : bool
+        Whether particles of one object that are within the radius now are neighbours, too.
+    roots : bool
+        Whether the graph is for DPI-Net, whose objects have a node.
     """
     moves = drift.moves if swept else torch.zeros_like(drift.moves)
     outer = outer_edges(layout, drift.positions, moves, radius)
-    pairs = torch.cat([outer, layout.links], dim=1)
+    inner = inner_edges(layout, drift.positions, radius) if within else layout.links
+    pairs = torch.cat([outer, inner], dim=1)
     used = (layout.kinds != KINEMATIC)[layout.owners]
-    if near_only:
+    if roots and not within:
         # Fast bodies reach the floor within the step, with plain edges too.
         lowest = drift.positions[:, 2] + drift.moves[:, 2].clamp_max(0)
         used &= lowest - layout.floor[layout.owners] < radius
@@ -316,7 +349,7 @@ def make_graph(
         nodes=_node_inputs(layout, drift, offsets, radius, unit, rows),
         edges=_edge_inputs(drift, pairs, outer.shape[1], radius, unit),
         things=_object_inputs(layout, drift, radius, unit),
-        moments=_moments(layout, offsets) if near_only else drift.positions.new_zeros(0),
+        moments=_moments(layout, offsets) if roots else drift.positions.new_zeros(0),
     )
 
 
@@ -334,6 +367,12 @@ def outer_edges(layout: SceneLayout, positions: Tensor, moves: Tensor, radius: f
         layout.moves,
         radius,
     )
+    return torch.from_numpy(np.stack(edges)).to(positions.device)
+
+
+def inner_edges(layout: SceneLayout, positions: Tensor, radius: float) -> Tensor:
+    """Return the pairs (2, E) of particles of one object that can move, closer than the radius."""
+    edges = near_edges(positions.cpu().numpy(), layout.starts, layout.moves, radius)
     return torch.from_numpy(np.stack(edges)).to(positions.device)
 
 

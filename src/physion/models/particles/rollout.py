@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from physion.clips.batch import Batch
@@ -24,6 +25,7 @@ from physion.models.particles.bodies import (
     Poses,
     Sampling,
     SceneParticles,
+    posed_positions,
     poses_of,
     put_by_events,
     rotation_from_vector,
@@ -83,7 +85,11 @@ def disturbed_start(start: Start, spread: float, rng: np.random.Generator) -> St
         spread * rng.normal(size=(count, 3)) * free / particles.sizes[:, None]
     )
     rotations[-2] = rotation_from_vector(angles).numpy() @ rotations[-2]
-    loose[-2] += spread * rng.normal(size=loose[-2].shape)
+    # Bodies that deform start as rigid ones.
+    cloth = particles.kinds[particles.owners[particles.loose]] == CLOTH
+    placed = posed_positions(particles, centers[-2:-1], rotations[-2:-1])[0, particles.loose]
+    loose[-2, ~cloth] = placed[~cloth]
+    loose[-2, cloth] += spread * rng.normal(size=(int(cloth.sum()), 3))
     return replace(start, poses=Poses(centers, rotations, loose))
 
 
@@ -294,7 +300,7 @@ def disturbed(window: Window, velocity_noise: float, relative_noise: float) -> W
         The window.
     velocity_noise, relative_noise : float
         Standard deviations by axis: metres a step, and a fraction of the speed of the centre and
-        rim of a body or of a particle of a cloth. They are independent.
+        rim of a body or of a particle that moves on its own. They are independent.
     """
     layout, first = window.layout, window.before
     drift = drift_of(layout, first, window.now)
@@ -308,19 +314,36 @@ def disturbed(window: Window, velocity_noise: float, relative_noise: float) -> W
 
     free = (layout.kinds == RIGID).to(speed.dtype)[:, None]
     turn = rotation_from_vector(noise(speed) * free / layout.size[:, None])
-    before = ObjectState(
-        first.centers + noise(speed) * free,
-        turn @ first.rotations,
-        first.loose + noise(loose_speed),
-    )
+    centers, rotations = first.centers + noise(speed) * free, turn @ first.rotations
+    # Particles of a body that deforms follow its noise, and have noise of their own.
+    owners = layout.owners[layout.loose]
+    rotated = (rotations[owners] @ layout.shape[layout.loose][..., None])[..., 0]
+    bodies = layout.soft_bodies[owners][:, None]
+    loose = torch.where(bodies, centers[owners] + rotated, first.loose) + noise(loose_speed)
+    before = ObjectState(centers, rotations, loose)
     return Window(layout, before, window.now, window.later)
 
 
-# Smallest distance of agent and patient over a motion, between its steps too.
+# Distances of agent and patient over a motion, between its steps too.
 #
 # Between two rows of a motion a body goes from one pose to the next with constant velocity and
-# angular velocity. Bodies are compared by their convex pieces; a cloth and a body by the particles
-# of the cloth and points on the surface of the body, which go along straight lines.
+# angular velocity. Rigid bodies are compared by their convex pieces; a cloth and a body by the
+# particles of the cloth and points on the surface of the body, which go along straight lines.
+
+
+def point_distances(
+    scene: Scene, particles: SceneParticles, poses: Poses, spacing: float, limit: int
+) -> tuple[float, float]:
+    """Return the distances of the points of agent and patient, metres: smallest, and at the end.
+
+    They are at most `FAR`, also if one of the objects is absent. The arguments are as in
+    `smallest_distance`.
+    """
+    rows = (particles.agent, particles.patient)
+    if min(rows) < 0 or not len(poses.centers):
+        return FAR, FAR
+    first, second = (_points(scene, particles, poses, row, spacing, limit) for row in rows)
+    return min(gap_over_time(first, second), FAR), min(gap_over_time(first[-1:], second[-1:]), FAR)
 
 
 def smallest_distance(
@@ -330,7 +353,7 @@ def smallest_distance(
 
     Learned bodies can overlap, and the deeper they do, the surer is the contact. The distance is
     at most `FAR`, also if one of them is absent, and at most `TOLERANCE` too large; depths are
-    those at the rows of the motion only.
+    those at the rows of the motion only. Bodies that deform are compared by points, as cloths are.
 
     Parameters
     ----------
@@ -339,16 +362,14 @@ def smallest_distance(
     poses
         Motion over T rows.
     spacing, limit
-        Of the points on the surface of a body that is compared with a cloth. They may be finer
-        than the particles that move, since the pose of a body gives the place of each of its
-        points.
+        Of the points on the surface of a body. They may be finer than the particles that move,
+        since these say where each of the points is.
     """
     rows = (particles.agent, particles.patient)
     if min(rows) < 0 or not len(poses.centers):
         return FAR
-    if CLOTH in particles.kinds[list(rows)]:
-        first, second = (_points(scene, particles, poses, row, spacing, limit) for row in rows)
-        return min(gap_over_time(first, second), FAR)
+    if particles.loose[np.isin(particles.owners, rows)].any():
+        return point_distances(scene, particles, poses, spacing, limit)[0]
     return min(_distance_of_bodies(scene, particles, poses, rows), FAR)
 
 
@@ -391,11 +412,19 @@ def _distance_of_bodies(
 def _points(
     scene: Scene, particles: SceneParticles, poses: Poses, row: int, spacing: float, limit: int
 ) -> F64:
-    """Return the points (T, P, 3) of an object."""
+    """Return the points (T, P, 3) of an object.
+
+    A point on the surface of a body that deforms keeps its place at the nearest particle, and turns
+    with the body.
+    """
+    own = poses.loose[:, particles.owners[particles.loose] == row]
     if particles.kinds[row] == CLOTH:
-        owners = particles.owners[particles.loose]
-        return np.ascontiguousarray(poses.loose[:, owners == row])
+        return np.ascontiguousarray(own)
     body = scene.bodies[int(particles.things[row])]
     points, _ = surface_points(body.shape, body.scale, spacing, limit)
-    rotated = (points - particles.pivots[row])[None] @ poses.rotations[:, row].transpose(0, 2, 1)
-    return np.ascontiguousarray(rotated + poses.centers[:, row, None])
+    offsets, turn = points - particles.pivots[row], poses.rotations[:, row].transpose(0, 2, 1)
+    if not len(own[0]):
+        return np.ascontiguousarray(offsets[None] @ turn + poses.centers[:, row, None])
+    shape = particles.shape[particles.owners == row]
+    nearest = cKDTree(shape).query(offsets)[1]
+    return np.ascontiguousarray((offsets - shape[nearest])[None] @ turn + own[:, nearest])

@@ -4,9 +4,10 @@ Of every object a simulator knows the last two poses, of a cloth the last two po
 particles. If it keeps its motion, a particle at x moves by u (`networks`). The network predicts
 what is added to this motion:
 
-- GNS: a change a of the displacement of every particle, x' = x + u + a. Bodies are kept rigid by
-  the rigid motion that fits the x' of their particles best; GNS-RANSAC fits only those particles
-  that agree with one another.
+- GNS: a change a of the displacement of every particle, x' = x + u + a. Bodies deform in the size
+  paper. In the size small the rigid motion that fits the x' of a body best keeps it rigid.
+- GNS-RANSAC: the same network and the same training. In a rollout a rigid motion is fitted to the
+  x' of those particles of a body that agree with one another, and keeps it rigid in every step.
 - DPI-Net: changes of velocity and spin of every body, and of the displacements of the particles of
   cloths.
 
@@ -81,6 +82,7 @@ from physion.models.particles.rollout import (
     Window,
     disturbed,
     disturbed_start,
+    point_distances,
     read_window,
     roll_out,
     rotated,
@@ -94,12 +96,21 @@ from physion.scenes.scene import FRAME_TIME
 MESSAGES, OBJECTS = "messages", "objects"
 """Networks: messages between particles (GNS), and changes of whole objects (DPI-Net)."""
 
+FREE, RANSAC, RELEASED, WHOLE = "free", "ransac", "released", "whole"
+"""What keeps bodies rigid: nothing, a rigid motion fitted by RANSAC, one fitted to all particles as
+in the released code of GNS-RANSAC, and a network that moves bodies as wholes (DPI-Net)."""
+_RIGID = {
+    "small": {"gns": RELEASED, "gns-ransac": RANSAC, "dpi": WHOLE},
+    "paper": {"gns": FREE, "gns-ransac": RANSAC, "dpi": WHOLE},
+}
+"""By size and model. The shipped weights of the size small never saw a body that deforms."""
+
 _SMALL: Mapping[str, Mapping[str, Any]] = {
     MESSAGES: {"rounds": 5, "limit": 50, "inner": 6},
     OBJECTS: {"rounds": 3},
 }
 _PAPER: Mapping[str, Mapping[str, Any]] = {
-    MESSAGES: {"rounds": 10, "inner": 10},
+    MESSAGES: {"rounds": 10, "free_training": True},
     OBJECTS: {"rounds": 4},
 }
 
@@ -113,9 +124,15 @@ class ParticleSettings(SizedSettings):
       initial velocities, m/s. One future has no noise.
     - ``stride``: frames of 0.01 s in one step, 3 or 1.
     - ``width``, ``rounds``: of the network.
-    - ``spacing``, ``limit``, ``still_limit``, ``cloth_step``, ``inner``: how objects become
-      particles (`Sampling`).
-    - ``radius``: metres within which particles of different objects are neighbours.
+    - ``rigid``: what keeps bodies rigid in a rollout: ``free`` (nothing), ``ransac``, ``released``
+      (a fit to all particles), or ``whole`` for DPI-Net.
+    - ``free_training``: whether bodies deform in the training of GNS and GNS-RANSAC, which are
+      trained alike; otherwise a fit to all particles keeps them rigid there.
+    - ``spacing``, ``limit``, ``still_limit``, ``cloth_step``, ``inner``, ``within``: how objects
+      become particles (`Sampling`).
+    - ``radius``: metres within which particles are neighbours, of different objects, and with
+      ``within`` of the same; the paper's threshold of .08 in the size paper. In the size small
+      particles are .10 m apart, so that .08 would join hardly any.
     - ``velocity_noise``, ``relative_noise``: metres a step, and fraction of the speed; standard
       deviations of the noise in training, drawn for every rigid body and for every particle of a
       cloth. Noise that is large compared with a slow motion teaches that it stops.
@@ -130,7 +147,10 @@ class ParticleSettings(SizedSettings):
       a velocity, tip what stands.
     - ``knee``: errors of an object count squared up to this many units (`CHANGE`), and linearly
       beyond.
-    - ``gap_spacing``, ``gap_limit``: of the particles by which distances are measured.
+    - ``gap_spacing``, ``gap_limit``: of the points by which distances are measured. In the size
+      paper they are the particles; in the size small particles would be too far apart.
+    - ``calibrated``: whether the distance of the decision ``touch`` is fitted after a training, on
+      the contacts of training trials. The paper's models see no such labels.
     """
 
     model: str = "gns"
@@ -140,11 +160,14 @@ class ParticleSettings(SizedSettings):
     stride: Literal[1, 3] = 3
     width: int = 64
     rounds: int = 3
+    rigid: Literal["free", "ransac", "released", "whole"] = "released"
+    free_training: bool = False
     spacing: float = 0.10
     limit: int = 100
     still_limit: int = 600
     cloth_step: int = 3
     inner: int = 0
+    within: bool = False
     radius: float = 0.12
     velocity_noise: float = 3e-4
     relative_noise: float = 0.02
@@ -154,15 +177,18 @@ class ParticleSettings(SizedSettings):
     knee: float = 1.0
     gap_spacing: float = 0.04
     gap_limit: int = 300
+    calibrated: bool = False
 
     sizes: ClassVar[Sizes] = {
         "small": {},
         "paper": {
             "width": 128, "spacing": 0.05, "limit": 1000, "cloth_step": 1, "radius": 0.08,
-            "gap_spacing": 0.03, "gap_limit": 1000,
+            "within": True, "swept": False, "gap_spacing": 0.05, "gap_limit": 1000,
         },
     }  # fmt: skip
-    any_weights: ClassVar[frozenset[str]] = SizedSettings.any_weights | {"spread"}
+    any_weights: ClassVar[frozenset[str]] = SizedSettings.any_weights | {
+        "spread", "rigid", "calibrated",
+    }  # fmt: skip
 
     @classmethod
     def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -170,6 +196,7 @@ class ParticleSettings(SizedSettings):
         sized = dict(super().defaults(model, options))
         small = options.get("size", "small") == "small"
         sized |= (_SMALL if small else _PAPER)[network_of(model)]
+        sized["rigid"] = _RIGID["small" if small else "paper"][model]
         if options.get("stride") == 1:
             # A shorter step: what is counted in metres a step is less. Nothing is shipped for it.
             sized |= {"velocity_noise": cls.velocity_noise / 3, "rest": cls.rest / 3}
@@ -183,9 +210,27 @@ class ParticleSettings(SizedSettings):
     @property
     def sampling(self) -> Sampling:
         """How objects become particles."""
-        return Sampling(self.spacing, self.limit, self.still_limit, self.cloth_step, self.inner)
+        return self._sampling(free=self.rigid == FREE)
+
+    @property
+    def training_sampling(self) -> Sampling:
+        """How objects become particles in a training."""
+        return self._sampling(free=self.free_training)
+
+    def _sampling(self, *, free: bool) -> Sampling:
+        return Sampling(
+            self.spacing, self.limit, self.still_limit, self.cloth_step, self.inner,
+            within=self.within, free=free,
+        )  # fmt: skip
+
+    @property
+    def contact_distance(self) -> float:
+        """Metres at which points of agent and patient count as touching; see `CONTACT_SPACINGS`."""
+        return CONTACT_SPACINGS * self.gap_spacing
 
     def __post_init__(self) -> None:
+        if (self.rigid == WHOLE) != (self.network == OBJECTS):
+            raise BadInputError(f"{self.model}: rigid={self.rigid} is not for this model")
         self.at_least(1, "samples", "width", "rounds", "gap_limit")
         self.at_least(0, "spread", "pushforward", "velocity_noise", "relative_noise", "rest")
         _ = self.sampling  # which checks its numbers
@@ -208,8 +253,16 @@ _SMALL_TRAINING = TrainingSettings(
     checkpoint_every=500,
 )
 _PAPER_TRAINING = replace(
-    _SMALL_TRAINING, steps=500_000, learning_rate=5e-4, warmup=2000, validate_every=5000
+    _SMALL_TRAINING,
+    steps=1_500_000,
+    batch=2,
+    learning_rate=1e-4,
+    schedule="plateau",
+    warmup=0,
+    validate_every=5000,
 )
+"""Adam from 1e-4 for 1.5 million steps, as in the paper; batch and schedule as released. The size
+small has a rate of 2e-3, since it learns for a hundredth of these steps."""
 
 
 def training_of(settings: ParticleSettings) -> TrainingSettings:
@@ -234,9 +287,11 @@ def observed_start(motion: Motion, frames: range, sampling: Sampling) -> Start:
     poses = poses_of(own, motion, frames)
     # What was put somewhere between the last two steps did not move there.
     put = np.isin(own.things, put_by_events(scene, frames[-2], frames[-1]))
-    poses.centers[-2, put], poses.rotations[-2, put] = (
+    loose = put[own.owners[own.loose]]
+    poses.centers[-2, put], poses.rotations[-2, put], poses.loose[-2, loose] = (
         poses.centers[-1, put],
         poses.rotations[-1, put],
+        poses.loose[-1, loose],
     )
     limit = scene.ending.frame_limits()[1] - 1 - LAST_OBSERVED
     return Start(own, poses, limit // frames.step)
@@ -310,11 +365,18 @@ UNIT, CHANGE = 0.06, 0.02
 """Metres a step of 3 frames: units of displacements, and of their changes. A body that falls for
 0.03 s changes its displacement by 0.009 m, one that moves at 1 m/s moves 0.03 m. In steps of s
 frames the units are those times s / 3 and (s / 3)²."""
+_DISTANCES = 1
+"""To be raised with every change of the distances that equal motions have."""
 _AT_ONCE = 32
 """Scenes of one graph when the distances are fitted."""
 _TOGETHER = 4
 """Scenes of one graph on a CPU. The published scores were computed with 4; another number changes
 rounding, and with it the rollouts of a few scenes."""
+CONTACT_SPACINGS = 1.5
+"""Distance in spacings at which points of two objects count as touching. The points of a surface
+are at least a spacing apart, and every place on it has one within a spacing. Where two surfaces
+touch, points of both are thus within two spacings of each other; 1.5 is what the released code
+has, .075 m at .05 m."""
 _HYPOTHESES = 16
 """Random choices of particles in a robust fit."""
 _INLIER = 0.1
@@ -375,13 +437,15 @@ class ParticleSimulator(TorchModel):
 
     @property
     def decision(self) -> str:
-        """Name of the decision: a fitted threshold, or the one that came with the weights."""
-        return "touch" if self.trained else "gap"
+        """Name of the decision, a fixed distance at the end of the rollout."""
+        return "end"
 
     def provenance(self) -> Provenance:
-        """Return name, size and origin of the weights."""
+        """Return name, size and origin of the weights; the name has a ``rigid`` of one's own."""
+        settings = self.settings
+        usual = settings.rigid == _RIGID[settings.size][settings.model]
         return Provenance(
-            model=self.name,
+            model=self.name if usual else f"{self.name}-{settings.rigid}",
             init=self.init,
             encoder_type="true state",
             dynamics_type="particles",
@@ -397,9 +461,9 @@ class ParticleSimulator(TorchModel):
     def digest(self) -> str:
         """Return the SHA-256 of settings and weights; the number of futures is no part."""
         settings = asdict(self.settings)
-        for name in ("weights", "seed", "samples"):
+        for name in ("weights", "seed", "samples", "calibrated"):
             settings.pop(name)
-        parts = [self._weights_version, settings, torch.__version__]
+        parts = [self._weights_version, _DISTANCES, settings, torch.__version__]
         return digest_of(parts, self.state_dict().items())
 
     def built_as(self) -> dict[str, Any]:
@@ -426,7 +490,7 @@ class ParticleSimulator(TorchModel):
         All steps but the first start from what the network predicted, without gradient.
         """
         settings = self.settings
-        window = read_window(batch, self.settings.sampling, self.device)
+        window = read_window(batch, settings.training_sampling, self.device)
         if not self.training:
             # A validation is without noise, as the loss of the trivial predictor is.
             return {"loss": self._loss(window, window.later[:1])}
@@ -443,9 +507,12 @@ class ParticleSimulator(TorchModel):
     def calibrate(self, whole: Batch) -> None:
         """Fit ``touch`` on rollouts of training trials, which start from the observed part.
 
+        It uses the contacts of these trials, and does nothing without the option ``calibrated``.
         Trials with a contact in the observed part do not count.
         """
         self.touch.zero_()
+        if not self.settings.calibrated:
+            return
         motions, labels, cloth = unseen_outcomes(whole.state or ())
         if not motions:
             return
@@ -456,10 +523,11 @@ class ParticleSimulator(TorchModel):
 
     @torch.no_grad()
     def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
-        """Return the smallest gap (B, S) of agent and patient, less the fitted ``touch``.
+        """Return distances (B, S) of agent and patient in the imagined steps.
 
-        It counts steps that are imagined and the time between them; see `gaps` for a contact that
-        was observed. With the argument ``show`` above 0, ``shown`` holds the imagined particles
+        ``gap`` is the smallest, less ``touch``, between steps too (`gaps`); ``end`` is the distance
+        of points at the end, ``closest`` their smallest, both less `contact_distance`
+        (`point_gaps`). With the argument ``show`` above 0, ``shown`` holds the imagined particles
         and their objects (`shown_particles`). The frames are 44 + s, 44 + 2 s, ... with the stride
         s.
         """
@@ -467,7 +535,9 @@ class ParticleSimulator(TorchModel):
             raise BadInputError("a particle model imagines from motions, which the batch lacks")
         futures = self.futures(context.state, samples, seed)
         shown = shown_particles(futures, self.spec.context) if arguments.get("show", 0) > 0 else {}
-        return Rollout(gap=self.gaps(context.state, futures), shown=shown)
+        end, closest = self.point_gaps(context.state, futures)
+        gap = self.gaps(context.state, futures)
+        return Rollout(gap=gap, end=end, closest=closest, shown=shown)
 
     @torch.no_grad()
     def futures(self, motions: Sequence[Motion], samples: int, seed: int) -> list[Futures]:
@@ -495,9 +565,7 @@ class ParticleSimulator(TorchModel):
     def step(self, layout: SceneLayout, before: ObjectState, now: ObjectState) -> ObjectState:
         """Return the state after the next step."""
         drift = drift_of(layout, before, now)
-        _, after = self._predict_next(
-            layout, now, drift, robust=self.settings.model == "gns-ransac"
-        )
+        _, after = self._predict_next(layout, now, drift, robust=self.settings.rigid == RANSAC)
         return self._rested(layout, now, after)
 
     def _loss(self, window: Window, later: Sequence[ObjectState]) -> Tensor:
@@ -505,7 +573,7 @@ class ParticleSimulator(TorchModel):
         total = torch.zeros((), device=layout.shape.device)
         for target in later:
             drift = drift_of(layout, before, now)
-            # The fit to all particles: GNS and GNS-RANSAC are trained alike.
+            # Without RANSAC: GNS and GNS-RANSAC are trained alike.
             predicted, after = self._predict_next(layout, now, drift, robust=False)
             total = total + self._error(layout, target, predicted)
             before, now = now, self._rested(layout, now, after.detached())
@@ -514,9 +582,9 @@ class ParticleSimulator(TorchModel):
     def _predict_next(
         self, layout: SceneLayout, now: ObjectState, drift: Drift, *, robust: bool
     ) -> tuple[Tensor, ObjectState]:
-        """Return the next positions of particles (P, 3), and the state in which bodies are rigid.
+        """Return the next positions of particles (P, 3), and the next state.
 
-        The state of GNS has no gradient.
+        Bodies that are not free in ``layout`` are rigid in it. The state of GNS has no gradient.
         """
         graph = self._graph(layout, drift)
         if not isinstance(self.network, MessageNetwork):
@@ -525,12 +593,13 @@ class ParticleSimulator(TorchModel):
         changes = self._of_particles(graph, cast("Tensor", self.network(graph)))
         goal = drift.positions + drift.moves + changes
         with torch.no_grad():
-            rotations, centers = self._fit(layout, goal, robust=robust)
-            # Fewer than three particles determine no rotation: such a body keeps its spin.
-            few = (_counts(layout) < 3)[:, None, None]
-            spun = rotation_from_vector(drift.spin) @ now.rotations
-            rotations = torch.where(few, spun, rotations)
             rigid = layout.kinds == RIGID
+            centers, rotations = now.centers, rotation_from_vector(drift.spin) @ now.rotations
+            if not bool(layout.soft_bodies.any()):
+                fitted, centers = self._fit(layout, goal, robust=robust)
+                # Fewer than three particles determine no rotation: such a body keeps its spin.
+                few = (_counts(layout) < 3)[:, None, None]
+                rotations = torch.where(few, rotations, fitted)
             state = ObjectState(
                 torch.where(rigid[:, None], centers, now.centers),
                 torch.where(rigid[:, None, None], rotations, now.rotations),
@@ -546,7 +615,7 @@ class ParticleSimulator(TorchModel):
         return ObjectState(
             torch.where(rests, now.centers, after.centers),
             torch.where(rests[:, None], now.rotations, after.rotations),
-            after.loose,
+            torch.where(rests[layout.owners[layout.loose]], now.loose, after.loose),
         )
 
     def gaps(self, motions: Sequence[Motion], futures: Sequence[Futures]) -> F64:
@@ -570,11 +639,35 @@ class ParticleSimulator(TorchModel):
                 gaps[row] = -FAR
         return gaps
 
+    def point_gaps(self, motions: Sequence[Motion], futures: Sequence[Futures]) -> tuple[F64, F64]:
+        """Return the distances (B, S) of points of agent and patient, less `contact_distance`.
+
+        The first is the distance at the end of the imagined motion. The second is the smallest from
+        frame 44 on; after a contact that was observed it is -`FAR`.
+        """
+        settings = self.settings
+        shape = (len(motions), len(futures[0]))
+        end, closest = np.zeros(shape), np.zeros(shape)
+        for row, (motion, own) in enumerate(zip(motions, futures, strict=True)):
+            for column, (particles, poses) in enumerate(own):
+                later = later_poses(poses, self.spec.context - 1)
+                closest[row, column], end[row, column] = point_distances(
+                    motion.scene, particles, later, settings.gap_spacing, settings.gap_limit
+                )
+            if label_contact(motion.scene, motion.trajectory).observed:
+                closest[row] = -FAR
+        return end - settings.contact_distance, closest - settings.contact_distance
+
     def _graph(self, layout: SceneLayout, drift: Drift) -> Graph:
         settings = self.settings
-        near_only = settings.network == OBJECTS
         return make_graph(
-            layout, drift, settings.radius, self._unit, swept=settings.swept, near_only=near_only
+            layout,
+            drift,
+            settings.radius,
+            self._unit,
+            swept=settings.swept,
+            within=settings.within,
+            roots=settings.network == OBJECTS,
         )
 
     def _of_particles(self, graph: Graph, values: Tensor) -> Tensor:
