@@ -24,7 +24,7 @@ _COLUMNS = ["trial", "scenario", "split", "contact", "digest"]
 class Protocol(Enum):
     """Training protocol; the value is its name in tables.
 
-    The study has the first three; ``one`` is the generalisation between scenarios in its supplement.
+    The study has the first three; ``one`` is the generalisation of its supplement.
     """
 
     ALL = "all"
