@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -114,13 +115,14 @@ def test_pictures_come_with_what_was_seen_and_what_is_true(folder: Path) -> None
     imagined = imagine_with(Dataset(folder), ["copy-last-frame"], {})(["drop_0", "drape_0"])
     for (one,) in imagined.values():
         assert one.model == "copy-last-frame" and one.weights == "no weights"
-        assert one.seen_frames.tolist() == list(range(0, 37, 6)) and set(one.seen) == {"rgb"}
-        assert one.frames[:4].tolist() == [42, 48, 54, 60]
+        assert one.seen_frames.tolist() == list(range(2, 45, 6)) and set(one.seen) == {"rgb"}
+        assert one.frames.tolist() == [50, 56, 62]
         seen, true, copied = (
             values["rgb"].mean(axis=(1, 2, 3)) for values in (one.seen, one.true, one.shown)
         )
         assert seen == pytest.approx(40 + 3 * one.seen_frames, abs=3)
-        assert true[:3] == pytest.approx(40 + 3 * one.frames[:3], abs=3)
+        # The last step is after the end of the movie, whose last frame stays.
+        assert true == pytest.approx(40 + 3 * np.minimum(one.frames, 59), abs=3)
         assert copied == pytest.approx(np.full(len(one.frames), seen[-1]))
         assert np.isnan(one.gap) and np.isnan(one.probability)
 
@@ -155,11 +157,14 @@ def test_vision_models_show_what_they_saw_and_imagined(folder: Path, name: str) 
     assert one.weights == f"weights {model.init}"
     spec, parts = model.spec, (one.seen, one.true, one.shown)
     assert tuple(map(set, parts)) == SHOWN[name]
-    assert one.seen_frames.tolist() == [spec.stride * i for i in range(spec.context)]
-    last = one.seen_frames[-1]
-    assert one.frames.tolist() == [last + spec.stride * (i + 1) for i in range(spec.future)]
+    seen = [44 - spec.stride * i for i in range(spec.context)]
+    assert one.seen_frames.tolist() == seen[::-1] and seen[-1] < spec.stride
+    # On to the first step that is not before the last frame.
+    last = len(dataset.trial("drop_0").trajectory) - 1
+    assert one.frames.tolist() == list(range(44 + spec.stride, last + spec.stride, spec.stride))
     # Exactly what the model imagines of the same frames.
     context = whole_source(dataset, spec).context(("drop_0",)).to("cpu")
+    context = replace(context, future=len(one.frames))
     with torch.no_grad():
         imagined = model.eval().imagine(context, 1, 0, show=1.0).shown
     for key, values in one.shown.items():
