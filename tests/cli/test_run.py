@@ -52,7 +52,8 @@ def test_sampled_scenes_to_report(tmp_path: Path, capsys: pytest.CaptureFixture[
     models = {row["base_model"] for row in answer["scores"] if row["kind"] == "model"}
     assert models == {"random-resnet18-mlp", "noisy-simulation"}
     index = pd.read_parquet(tmp_path / "trials" / "index.parquet")
-    assert dict(index.groupby("split").size()) == {"readout": 12, "testing": 6}
+    splits = {"readout": 12, "testing": 6, "training": 12}
+    assert dict(index.groupby("split").size()) == splits
     first = digests(tmp_path)
     assert main(command) == 0
     assert digests(tmp_path) == first, "a second run must change nothing"

@@ -538,7 +538,7 @@ def test_the_next_feature_is_nearer_than_the_last_one(
         model,
         source,
         source.trials,
-        settings=dataclasses.replace(model.training_settings, steps=200),
+        settings=dataclasses.replace(model.training_settings, steps=300),
         seed=0,
         name="all",
         folder=None,

@@ -16,7 +16,7 @@ from physion.readout.imagined import imagine_with
 from physion.report.viewer.build import ViewerOptions, build_viewer
 from physion.trials.dataset import Dataset
 from support.browser import Browser
-from support.viewer_dataset import Plan, make_dataset
+from support.viewer_dataset import FRAMES, Plan, make_dataset
 
 pytestmark = pytest.mark.slow
 
@@ -75,7 +75,9 @@ def test_every_vision_model_is_shown(
     options = ViewerOptions(details=1, card_size=32, pass_size=32, stride=6)
     page = build_viewer(folder, tmp_path / "v.html", options, imagine=imagine).page
     (one,) = found["drop_0"]
-    first, second = (int(frame) for frame in one.frames[:2])
+    # The second imagined step, or the first where the movie ends before the second.
+    step = sum(frame < FRAMES for frame in one.frames[:2]) - 1
+    first, later = int(one.frames[0]), int(one.frames[step])
     assert page.stat().st_size < 1_500_000
     for dark in (False, True) if name == "op3" else (False,):
         browser.open(page, "#trial=drop_0", dark=dark, reduced_motion=True)
@@ -90,11 +92,11 @@ def test_every_vision_model_is_shown(
         # A corner of the picture, which no box covers.
         assert canvas(browser, "true")[-8:, :8, :3].mean() == pytest.approx(40 + 3 * at, abs=5)
         assert "een" in text(browser, "true") and f"frame {at}" in text(browser, "true")
-        seek(browser, second + 1)
-        assert canvas(browser, "true")[-8:, :8, :3].mean() == pytest.approx(40 + 3 * second, abs=5)
-        assert f"frame {second}" in text(browser, "true")
+        seek(browser, later + 1)
+        assert canvas(browser, "true")[-8:, :8, :3].mean() == pytest.approx(40 + 3 * later, abs=5)
+        assert f"frame {later}" in text(browser, "true")
         assert "not seen" in text(browser, "true")
-        check_kind(browser, name, one, first, second)
+        check_kind(browser, name, one, first, step)
     assert browser.complaints() == []
     assert browser.requests() == [page.resolve().as_uri()]
     assert browser.ask("document.images.length") == 0
@@ -113,16 +115,16 @@ def check_masks(drawn: np.ndarray, masks: np.ndarray) -> None:
     assert np.corrcoef(colored, masks.mean(axis=(1, 2)))[0, 1] > 0.9
 
 
-def check_kind(browser: Browser, name: str, one: ImaginedTrial, first: int, second: int) -> None:
-    """Check what sets a model apart; the time line is just after its frame ``second``."""
+def check_kind(browser: Browser, name: str, one: ImaginedTrial, first: int, step: int) -> None:
+    """Check what sets a model apart; the time line is just after the imagined step ``step``."""
     if "imagined" in TILES[name]:
         painted(browser, "imagined")
         shown = canvas(browser, "imagined")
         side = one.shown["rgb"].shape[1]
-        step = len(shown) // side
-        centres = shown[step // 2 :: step, step // 2 :: step, :3]
+        zoom = len(shown) // side
+        centres = shown[zoom // 2 :: zoom, zoom // 2 :: zoom, :3]
         gaps = [np.abs(centres - picture.astype(int)).mean() for picture in one.shown["rgb"]]
-        assert gaps[1] < 25 and gaps[1] <= min(gaps) + 1
+        assert gaps[step] < 25 and gaps[step] <= min(gaps) + 1
         seek(browser, first - 1)
         assert not canvas(browser, "imagined").any()
         assert f"from frame {first} on" in text(browser, "imagined")
@@ -137,7 +139,7 @@ def check_kind(browser: Browser, name: str, one: ImaginedTrial, first: int, seco
         check_masks(canvas(browser, "masks"), one.seen["masks"][1])
         assert not np.array_equal(drawn, canvas(browser, "masks"))
     if name == "rpin":
-        left, top, right, bottom = 256 * one.shown["boxes"][1, 0]
+        left, top, right, bottom = 256 * one.shown["boxes"][step, 0]
         near = np.abs(canvas(browser, "true")[..., :3] - RED).max(axis=2) < 40
         rows, columns = np.nonzero(near)
         edges = (columns.min(), rows.min(), columns.max(), rows.max())
@@ -162,8 +164,8 @@ def test_no_prediction_hides_the_pictures_and_so_do_hidden_labels(
     assert browser.ask(count) == 2
     seek(browser, 59)
     painted(browser, "imagined")
-    # The picture of frame 36, the last one that was seen, stays.
-    assert canvas(browser, "imagined")[..., :3].mean() == pytest.approx(40 + 3 * 36, abs=5)
+    # The picture of frame 44, the last one that was seen, stays.
+    assert canvas(browser, "imagined")[..., :3].mean() == pytest.approx(40 + 3 * 44, abs=5)
     browser.key("i", 73, "i")
     assert browser.ask(count) == 0
     browser.key("n", 78, "n")
