@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+from collections import Counter
+from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -64,6 +68,73 @@ def test_links_and_named_files_exist(page: Path) -> None:
     paths = re.findall(r"`((?:src/physion|tests|benchmarks|examples)/[\w/.*-]+)`", text)
     named = [path for path in paths if "NAME" not in path]
     assert all(list(ROOT.glob(path.rstrip("/"))) for path in named), named
+
+
+PAPER = DOCS / "explanation" / "paper.md"
+STATUSES = ("as written, with", "as written", "otherwise, because", "not possible here")
+
+
+def paper_rows() -> list[list[str]]:
+    """Return the cells of the statements: number, statement, status and places."""
+    rows = re.findall(r"^\| (\d+) \| (.+) \| (.+) \| (.+) \|$", PAPER.read_text(), re.M)
+    return [list(row) for row in rows]
+
+
+def status_of(cell: str) -> str:
+    """Return the one of `STATUSES` that a cell begins with."""
+    endings = (" ", "(;|$)", " ", ": ")
+    pairs = zip(STATUSES, endings, strict=True)
+    return next((status for status, end in pairs if re.match(status + end, cell)), cell)
+
+
+def test_counts_of_the_paper_match_its_rows() -> None:
+    rows = paper_rows()
+    assert [int(row[0]) for row in rows] == list(range(1, len(rows) + 1))
+    counts = Counter(status_of(row[2]) for row in rows)
+    assert set(counts) == set(STATUSES)
+    head = PAPER.read_text().partition("\n## ")[0]
+    printed = {a: int(b) for a, b in re.findall(r"^\| ([\w, ]*?) ?\| .+ \| (\d+) \|$", head, re.M)}
+    assert printed == {**counts, "": len(rows)}, counts
+    listed = re.findall(r"\d+", ", ".join(re.findall(r"^- .+: ([\d, ]+)\.$", head, re.M)))
+    impossible = [row[0] for row in rows if status_of(row[2]) == "not possible here"]
+    assert sorted(listed, key=int) == impossible
+
+
+def test_places_of_the_paper_exist() -> None:
+    for number, _, _, cell in paper_rows():
+        places = re.findall(r"`([^`]+)`", cell)
+        assert ", ".join(f"`{place}`" for place in places) == cell, number
+        for place in places:
+            path, _, name = place.partition(":")
+            assert (ROOT / path).exists(), f"row {number}: {place}"
+            assert has_name(ROOT / path, name), f"row {number}: {place}"
+
+
+def has_name(path: Path, name: str) -> bool:
+    """Return whether a module defines a name, or another file contains a text."""
+    if not name or path.suffix != ".py":
+        return not name or name in path.read_text(encoding="utf-8")
+    return name in names_of(path)
+
+
+@cache
+def names_of(path: Path) -> frozenset[str]:
+    return frozenset(defined_names(ast.parse(path.read_text(encoding="utf-8")).body))
+
+
+def defined_names(body: Iterable[ast.stmt], prefix: str = "") -> list[str]:
+    """Return what statements define: functions, classes, values, and these of classes, dotted."""
+    found: list[str] = []
+    for node in body:
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+            found.append(prefix + node.name)
+        if isinstance(node, ast.ClassDef):
+            found += defined_names(node.body, f"{prefix}{node.name}.")
+        elif isinstance(node, (ast.Assign, ast.AnnAssign)):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            parts = (part for target in targets for part in ast.walk(target))
+            found += [prefix + part.id for part in parts if isinstance(part, ast.Name)]
+    return found
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if commands(p)], ids=name_of)
