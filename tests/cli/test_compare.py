@@ -55,6 +55,7 @@ def test_help_imports_nothing_heavy() -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_two_columns_are_enough_and_the_terminal_shows_the_results(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -146,6 +146,7 @@ def test_commands_are_accepted(page: Path) -> None:
             tyro.cli(module.Options, args=words[taken:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", RUNNING)
 def test_python_runs(page: str, tmp_path: Path) -> None:
     scripts = []

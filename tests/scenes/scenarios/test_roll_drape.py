@@ -120,6 +120,7 @@ def test_roll_is_drawn_as_the_official_scenes(official: Path, preset: Preset) ->
         assert inside(*speeds, slack=0.2) and inside(*headings, slack=0.2)
 
 
+@pytest.mark.slow
 def test_roll_samples_and_records_each_template() -> None:
     params = roll.RollParameters(template=roll.TEMPLATES)
     seen = set()
@@ -269,6 +270,7 @@ def test_drape_is_drawn_as_the_official_scenes(official: Path, preset: Preset) -
     }
 
 
+@pytest.mark.slow
 def test_cloth_is_the_agent_and_nothing_meets_on_the_floor() -> None:
     for preset, index in itertools.product(load_presets("drape").values(), range(10)):
         scene = draw("drape", preset.params, index)
