@@ -7,6 +7,7 @@ import importlib
 import importlib.util
 import inspect
 from collections.abc import Callable, Iterator
+from functools import cache
 from importlib.metadata import EntryPoints, entry_points
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -90,9 +91,13 @@ class Registry(Generic[T]):
         return iter(self.names())
 
 
-def plugin_names(kind: str) -> list[str]:
-    """Return the names that other packages add to the registry of a kind, without loading them."""
-    return sorted(point.name for point in _plugins(kind))
+@cache
+def plugin_names(kind: str) -> tuple[str, ...]:
+    """Return the names that other packages add to the registry of a kind, without loading them.
+
+    What is installed is read once in a process: reading takes longer than sampling a scene.
+    """
+    return tuple(sorted(point.name for point in _plugins(kind)))
 
 
 def _plugins(kind: str) -> EntryPoints:
