@@ -27,6 +27,18 @@ from physion.scenes.tdw.read_logs import read_scenes
 from support.official import official_folder
 
 OFFICIAL = official_folder() or Path("absent")
+MORE = OFFICIAL.parent / "official_more"
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """Return a folder with all files of the study that the package was made from."""
+    if not OFFICIAL.is_dir() or not MORE.is_dir():
+        pytest.skip("the official data is not here")
+    folder = tmp_path / "checkout"
+    for part in (OFFICIAL, MORE):
+        shutil.copytree(part, folder, dirs_exist_ok=True, copy_function=shutil.copyfile)
+    return folder
 
 
 @pytest.fixture
@@ -40,7 +52,7 @@ def copy(tmp_path: Path) -> Path:
 def test_the_package_has_scenes_of_all_scenarios_with_outcomes_and_people() -> None:
     data = official()
     names = [canonical_name(trial.scene.name) for trial in data.trials]
-    assert len(names) == len(set(names)) == 874
+    assert len(names) == len(set(names)) == 1629
     assert {trial.scene.scenario for trial in data.trials} == set(SCENARIOS)
     humans = read_humans(data.humans)
     assert len(humans) == 1144 and humans["accuracy"].mean() == pytest.approx(0.747, abs=0.01)
@@ -48,7 +60,7 @@ def test_the_package_has_scenes_of_all_scenarios_with_outcomes_and_people() -> N
     counts = dict.fromkeys(SCENARIOS, 0)
     for trial in data.trials:
         counts[trial.scene.scenario] += canonical_name(trial.scene.name) in seen
-    assert sum(counts.values()) == 590 and min(counts.values()) == 56
+    assert sum(counts.values()) == 1056 and min(counts.values()) == 94
     known = dict(zip(names, data.trials, strict=True))
     both = set(known) & set(data.labels)
     assert len(both) > 600
@@ -92,10 +104,9 @@ def test_other_folders_are_refused(copy: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not OFFICIAL.is_dir(), reason="the official data is not here")
-def test_the_package_is_what_the_official_files_give(tmp_path: Path) -> None:
-    made = make_official(OFFICIAL, tmp_path / "made")
-    assert made.trials == 874 and made.answered == 1144
+def test_the_package_is_what_the_official_files_give(checkout: Path, tmp_path: Path) -> None:
+    made = make_official(checkout, tmp_path / "made")
+    assert made.trials == 1629 and made.answered == 1144
     assert any("have no scene" in note for note in made.notes)
     packaged = official()
     names = {str(p.relative_to(made.folder)) for p in made.folder.rglob("*") if p.is_file()}
@@ -108,7 +119,7 @@ def test_the_package_is_what_the_official_files_give(tmp_path: Path) -> None:
             assert gzip.decompress(content) == gzip.decompress(packaged.read(name))
         else:
             assert content == packaged.read(name), name
-    read = {trial.scene.name: trial for trial in read_scenes(OFFICIAL / "scenes").trials}
+    read = {trial.scene.name: trial for trial in read_scenes(checkout / "scenes").trials}
     assert all(read[trial.scene.name] == trial for trial in packaged.trials)
 
 
@@ -135,13 +146,12 @@ def test_a_line_of_a_trial_comes_back_whole() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not OFFICIAL.is_dir(), reason="the official data is not here")
 def test_a_checkout_is_converted_and_read_in_place_of_the_package(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli(["import", str(OFFICIAL), str(tmp_path / "made"), "--json"]) == 0
+    assert cli(["import", str(checkout), str(tmp_path / "made"), "--json"]) == 0
     made = json.loads(capsys.readouterr().out)
-    assert made["trials"] == 874 and made["answered"] == 1144
+    assert made["trials"] == 1629 and made["answered"] == 1144
     assert read_official_trials(tmp_path / "made").trials == list(official().trials)
     assert humans_folder(tmp_path / "made") == tmp_path / "made" / "humans"
 
