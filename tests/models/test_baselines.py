@@ -13,7 +13,12 @@ from physion.clips.batch import Batch, Motion
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.models import build_model
 from physion.models.baselines.motion import BLOCK, NAMES, state_features
-from physion.models.baselines.pixels import BlobCentroids, CopyLastFrame, color_masks
+from physion.models.baselines.pixels import (
+    BLOB_FEATURES,
+    BlobCentroids,
+    CopyLastFrame,
+    color_masks,
+)
 from physion.models.gaps import FAR, TOLERANCE, minimise
 from physion.models.interface import Model, can
 from physion.physics.cloth.simulate import ClothSettings
@@ -29,6 +34,7 @@ OTHERS: dict[str, dict[str, Any]] = {
     "already-touched": {"margin": 0.02},
     "constant-motion": {"frames": 20},
     "blob-centroids": {"image_size": 48},
+    "blob-trees": {"image_size": 48},
     "copy-last-frame": {"image_size": 16},
 }
 """Every baseline, with options that are not the default."""
@@ -429,6 +435,59 @@ def test_blobs_that_are_not_seen_are_in_the_middle_without_area() -> None:
     assert build_model("blob-centroids").encode(clips(gray)).tolist() == [
         [[0.5, 0.5, 0, 0.5, 0.5, 0]]
     ]
+
+
+def test_blobs_over_time_are_exact() -> None:
+    """Squares of known pixels, of which the red one moves by 8 pixels between two frames."""
+    frames = np.full((2, 128, 128, 3), 120, np.uint8)
+    for frame, left in enumerate((16, 24)):
+        frames[frame, 32:48, left : left + 8] = RED
+        frames[frame, 64:96, 64:96] = YELLOW
+    values = build_model("blob-trees").encode(clips(frames[None]))[0]
+    named = [dict(zip(BLOB_FEATURES, row.tolist(), strict=True)) for row in values]
+
+    def deviation(pixels: int) -> float:
+        """Return the standard deviation of so many neighbouring pixels, parts of the picture."""
+        return math.sqrt((pixels**2 - 1) / 12) / 128
+
+    expected = {
+        "red area": 128 / 128**2,
+        "red x": 20 / 128,
+        "red y": 40 / 128,
+        "red width": deviation(8),
+        "red height": deviation(16),
+        "red slant": 0,
+        "red left": 16 / 128,
+        "red top": 32 / 128,
+        "red right": 24 / 128,
+        "red bottom": 48 / 128,
+        "yellow area": 32**2 / 128**2,
+        "yellow right": 96 / 128,
+        "red to yellow x": 60 / 128,
+        "red to yellow y": 40 / 128,
+        "red to yellow distance": math.hypot(60, 40) / 128,
+        "red to yellow gap": math.hypot(64 - 24, 64 - 48) / 128,
+    }
+    assert {name: named[0][name] for name in expected} == pytest.approx(expected, abs=1e-6)
+    changes = {name: named[1][f"change of {name}"] for name in expected}
+    moved = {"red x": 8, "red left": 8, "red right": 8, "red to yellow x": -8}
+    moved["red to yellow distance"] = math.hypot(52, 40) - math.hypot(60, 40)
+    moved["red to yellow gap"] = math.hypot(32, 16) - math.hypot(40, 16)
+    assert changes == pytest.approx({n: moved.get(n, 0) / 128 for n in expected}, abs=1e-6)
+    assert not values[0, len(BLOB_FEATURES) // 2 :].any()
+
+
+def test_a_slanted_blob_and_one_that_is_not_seen() -> None:
+    frames = np.full((1, 128, 128, 3), 120, np.uint8)
+    for step in range(10):
+        frames[0, 20 + step, 40 + step] = RED
+    values = dict(
+        zip(BLOB_FEATURES, build_model("blob-trees").encode(clips(frames[None]))[0, 0], strict=True)
+    )
+    # Equal rows and columns: the covariance is the variance of either.
+    assert values["red slant"] == pytest.approx(99 / 12 / 128**2, abs=1e-6)
+    unseen = {"area": 0, "x": 0.5, "width": 0, "slant": 0, "left": 0.5, "bottom": 0.5}
+    assert {name: values[f"yellow {name}"] for name in unseen} == unseen
 
 
 @pytest.mark.parametrize(

@@ -308,6 +308,7 @@ BASELINE_MODELS = frozenset(
         "already-touched",
         "constant-motion",
         "blob-centroids",
+        "blob-trees",
         "copy-last-frame",
         "chance",
     }

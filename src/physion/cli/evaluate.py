@@ -36,6 +36,9 @@ class Options:
     """Folder of a dataset."""
     out: Path = Path("runs/models")
     """Folder for predictions and caches."""
+    fit: Path | None = None
+    """Folder of another dataset, whose trials of the splits training and readout are used in place
+    of the dataset's own; without movies it needs --rendered."""
     option: tuple[str, ...] = ()
     """Settings of the models or of their training as NAME=VALUE, such as encoder=resnet50
     weights=random steps=500; of one of several models as MODEL:NAME=VALUE; of the logistic
@@ -68,6 +71,7 @@ def main(options: Options) -> int:
             Dataset(options.dataset, verify=options.verify),
             options.out,
             options.settings,
+            fit=None if options.fit is None else Dataset(options.fit, verify=options.verify),
             logistic=logistic,
             executor=options.compute.open(),
             progress=stages,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from physion.compute.local import available_cores
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.trials.dataset import Dataset, indexed_file
+from physion.trials.dataset import Dataset
 from physion.trials.files import IndexedFile
 from physion.trials.video import MovieProperties, read_chosen
 
@@ -65,11 +65,13 @@ def movie_files(
     - ``look``: colours: ``redyellow`` or ``free``, by default each trial's own.
     """
     kind = "observed_movie" if observed else "movie"
+    own = dataset.files(kind)
+    # Trials have movies in free colours besides their own, but no others.
+    other = dataset.files(f"free_{kind}") if look == "free" else {}
     files: dict[str, MovieFile | None] = {}
     for row in dataset.index.to_dict("records"):
-        own = look is None or look == row["look"]
-        column = kind if own else f"{look}_{kind}"
-        file = indexed_file(dataset.folder, row, column, verify=dataset.verify)
+        of_look = own if look is None or look == row["look"] else other
+        file = of_look.get(row["trial"])
         known = None if file is None else MovieFile(file, _properties(row, observed))
         files[row["trial"]] = known
     return files

@@ -96,6 +96,7 @@ models: Registry[ModelFactory] = Registry(
         "chance": "physion.models.baselines.motion:BaseRate",
         "constant-motion": "physion.models.baselines.motion:ConstantMotion",
         "blob-centroids": "physion.models.baselines.pixels:BlobCentroids",
+        "blob-trees": "physion.models.baselines.pixels:BlobTrees",
         "copy-last-frame": "physion.models.baselines.pixels:CopyLastFrame",
     },
 )

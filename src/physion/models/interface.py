@@ -322,6 +322,15 @@ class Model:
         """
         return self.digest()
 
+    def readout_digest(self) -> str:
+        """Return the hexadecimal SHA-256 of all that determines features, for readouts that ship.
+
+        Unlike `digest` and `encoder_digest` it has no versions of libraries, under which features
+        differ by rounding only. Imagined features must follow from it too, if readouts of them
+        ship.
+        """
+        return self.digest()
+
     def built_as(self) -> dict[str, Any]:
         """Return JSON values that weights belong to, such as name and version of the model.
 

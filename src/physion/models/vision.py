@@ -78,9 +78,15 @@ class VisionModel(TorchModel):
 
     def digest(self) -> str:
         """Return the SHA-256 of code version, settings and weights."""
+        return digest_of([*self._digested(), torch.__version__], self.state_dict().items())
+
+    def readout_digest(self) -> str:
+        """Return the SHA-256 of code version, settings and weights."""
+        return digest_of(self._digested(), self.state_dict().items())
+
+    def _digested(self) -> list[Any]:
         settings = {k: v for k, v in asdict(self.settings).items() if k not in ("weights", "seed")}
-        parts = [self.name, self.version, settings, repr(self.spec), torch.__version__]
-        return digest_of(parts, self.state_dict().items())
+        return [self.name, self.version, settings, repr(self.spec)]
 
     def origin(self, encoder: str, dynamics: str, task: str) -> Provenance:
         """Return the provenance of a model with these parts, trained together on one task."""

@@ -110,6 +110,7 @@ decisions: Registry[Callable[[LogisticSettings], Decision]] = Registry(
     {
         "logistic": "physion.readout.decisions:LogisticDecision",
         "released": "physion.readout.decisions:released_decision",
+        "trees": "physion.readout.trees:TreesDecision",
         "end": "physion.readout.decisions:EndDecision",
         "closest": "physion.readout.decisions:ClosestDecision",
         "gap": "physion.readout.decisions:GapDecision",

@@ -25,7 +25,16 @@ from physion.core.files import is_whole
 from physion.core.version import __version__
 from physion.models.interface import Model, TrainingSettings, ask, can
 from physion.readout.decisions import Readout, decisions
-from physion.readout.folds import Protocol, plan_folds, select_scenario
+from physion.readout.folds import (
+    TESTING,
+    Protocol,
+    check_pictures,
+    describe_fit,
+    join_for_fit,
+    plan_folds,
+    select_scenario,
+)
+from physion.readout.logistic import LogisticSettings
 from physion.readout.model_calls import check_identity, is_network
 from physion.readout.predictor import Predictor, Way, choose_readouts, decision_name
 from physion.readout.settings import (
@@ -37,6 +46,7 @@ from physion.readout.settings import (
     plan_cells,
     run_cells,
 )
+from physion.readout.shipped import ShippedReadouts, find_readouts
 from physion.readout.tables import (
     ScenarioPredictions,
     file_name,
@@ -45,11 +55,11 @@ from physion.readout.tables import (
     summarise_accuracy,
     write_table,
 )
-from physion.trials.dataset import Dataset
+from physion.trials.dataset import Dataset, JoinedDataset
 
 NOTHING_TO_FIT = "no trial to fit|one answer only"
 """Notes of `physion.readout.logistic.fit_readout` where it predicts the base rate."""
-_VERSION = 7
+_VERSION = 8
 """To be increased with every change that can alter the table of an evaluation."""
 _NOT_HASHED = ("protocols", "seeds", "encoder_batch", "accelerator", "rollout_errors")
 """Settings of where and how an evaluation runs, or of others than this one."""
@@ -134,6 +144,7 @@ def evaluate(
     out: Path | str = "runs/models",
     settings: EvaluationSettings | None = None,
     *,
+    fit: Dataset | Path | str | None = None,
     options: Mapping[str, Any] | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
@@ -155,7 +166,12 @@ def evaluate(
         ``training/``, errors of imagined motion (`rollout_error`) to ``rollout-errors/``. A table
         whose inputs are the same is not made again.
     settings
-        Protocols, seeds, readouts, decision, cross-validation and device.
+        Protocols, seeds, readouts, decision, cross-validation and device. Readouts that ship for a
+        model (`physion.readout.shipped`) are used where they fit, unless ``readout="fit"``.
+    fit
+        Another dataset, whose trials of the splits training and readout take the place of the
+        dataset's own, as in the paper. No motion may be in both, and look, frame rate and size of
+        the movies must agree; a set without movies needs ``rendered``.
     options
         Fields of the settings of the models, or of their training (`TrainingSettings`).
     executor
@@ -193,12 +209,16 @@ def evaluate(
         every_seed=settings.untrained,
     )
     elsewhere = None if isinstance(executor, LocalExecutor | SerialExecutor) else executor
+    trials, fit_on = open_dataset(dataset, None if dry_run else elsewhere), ""
+    if fit is not None:
+        other = open_dataset(fit, None if dry_run else elsewhere)
+        trials, fit_on = join_for_fit(trials, other), describe_fit(other)
     if elsewhere is None or dry_run:
-        work = _Evaluate(open_dataset(dataset, None), Path(out), settings)
+        work = _Evaluate(trials, Path(out), settings, fit_on)
         here = functools.partial(work, executor=executor, progress=progress, dry_run=dry_run)
         return Evaluation(*run_cells(cells, here, Path(out), "evaluations", None, progress))
     # Its processes may have another working directory.
-    there = _Evaluate(open_dataset(dataset, elsewhere), Path(out).absolute(), settings)
+    there = _Evaluate(trials, Path(out).absolute(), settings, fit_on)
     return Evaluation(*run_cells(cells, there, Path(out), "evaluations", elsewhere, progress))
 
 
@@ -220,6 +240,7 @@ class _Evaluate:
     dataset: Dataset
     out: Path
     settings: EvaluationSettings
+    fit_on: str = ""
 
     def __call__(
         self,
@@ -233,6 +254,8 @@ class _Evaluate:
         model, settings, index = cell.take_model(), self.settings, self.dataset.index
         training = cell.chosen.settings_of(model) if cell.protocol is not None else None
         provenance = check_identity(model)
+        if isinstance(self.dataset, JoinedDataset):
+            check_pictures(index, model.spec, rendered=settings.rendered)
         ways = choose_readouts(model, settings.readouts, settings.decision)
         if Way.ROLLOUTS in ways.values():
             # Another decision on the same rollouts is another row.
@@ -241,7 +264,8 @@ class _Evaluate:
             provenance = dataclasses.replace(provenance, model=name)
         if not provenance.inputs:
             provenance = dataclasses.replace(provenance, inputs=", ".join(model.spec.inputs))
-        path = self._table(cell, model, training, provenance, ways)
+        shipped = self._shipped(model)
+        path = self._table(cell, model, training, provenance, ways, shipped)
         errors_path = self.out / "rollout-errors" / path.name if settings.rollout_errors else None
         if errors_path is not None:
             from physion.readout.rollout_error import check_moves_objects, rollout_error
@@ -269,6 +293,8 @@ class _Evaluate:
             protocol=cell.protocol,
             seed=cell.seed,
             folder=self.out,
+            shipped=shipped,
+            fit_on=self.fit_on,
             executor=executor,
             progress=progress,
         )
@@ -300,6 +326,16 @@ class _Evaluate:
             evaluated, path=path, rollout_errors=errors_path, problems=problems
         )
 
+    def _shipped(self, model: Model) -> ShippedReadouts | None:
+        """Return the readouts that ship for a model and may be used; None to fit them."""
+        settings = self.settings
+        anew = settings.readout == "fit" or settings.logistic != LogisticSettings()
+        if anew or self.fit_on or settings.decision not in ("", decision_name(model)):
+            return None
+        index = self.dataset.index
+        looks = set(index["look"][index["split"] == TESTING])
+        return find_readouts(model) if looks == {"redyellow"} else None
+
     def _table(
         self,
         cell: Cell,
@@ -307,6 +343,7 @@ class _Evaluate:
         training: TrainingSettings | None,
         provenance: Provenance,
         ways: Mapping[Readout, Way],
+        shipped: ShippedReadouts | None,
     ) -> Path:
         """Return the table, named by a hash of trials, labels, model, settings and code."""
         settings = dataclasses.asdict(self.settings) | {"readouts": [r.value for r in ways]}
@@ -316,6 +353,7 @@ class _Evaluate:
         of_training = dataclasses.asdict(training) if training is not None else {}
         facts = dataclasses.asdict(provenance)
         inputs = [_VERSION, __version__, kept, facts, options, of_training, model.digest()]
+        inputs.append(shipped.sha256 if shipped is not None else self.fit_on)
         sha = hashlib.sha256(json.dumps(inputs, sort_keys=True, default=str).encode())
         sha.update(self.dataset.index[_HASHED_COLUMNS].to_csv(index=False).encode())
         name = f"{file_name(provenance.model)}-{sha.hexdigest()[:12]}.csv"

@@ -168,6 +168,12 @@ class StoredFeatures:
         """Number of features of a trial, all time steps together."""
         return self._steps * self._size
 
+    def with_steps(self, steps: int) -> StoredFeatures:
+        """Return features of ``steps`` time steps: what is longer is cut, or the last repeated."""
+        changed = StoredFeatures(self.trials, self._rows, repeated=True)
+        changed._steps, changed._size = steps, self._size
+        return changed
+
     def columns(self, start: int, stop: int) -> Floats:
         """Return columns ``start`` to ``stop`` of the features flattened in time, (n, columns)."""
         stop = min(stop, self.width)

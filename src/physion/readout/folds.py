@@ -10,11 +10,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any
 
 import pandas as pd
 
+from physion.clips.batch import Spec
 from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.files import digest_of
 from physion.core.seeds import stable_hash
+from physion.trials.dataset import Dataset, JoinedDataset
 
 TRAINING, READOUT, TESTING = "training", "readout", "testing"
 """Names of the splits in the index."""
@@ -147,6 +151,68 @@ def plan_folds(index: pd.DataFrame, protocol: Protocol, folds: int, seed: int) -
         pool = train if len(train) else rest
         planned += [_make_fold(s, pool, rest, tested[held], number) for s in sets]
     return planned
+
+
+def join_for_fit(tested: Dataset, fit: Dataset) -> Dataset:
+    """Return a dataset with the testing trials of one and the training and readout of another.
+
+    Raises `BadInputError` if a scenario has nothing to fit a readout on, or a motion is in both.
+    """
+    joined = JoinedDataset([(tested, (TESTING,)), (fit, (TRAINING, READOUT))])
+    index = joined.index
+    of_test = index["split"] == TESTING
+    without = set(index["scenario"][of_test]) - set(index["scenario"][index["split"] == READOUT])
+    if without:
+        raise BadInputError(
+            f"{fit.folder} has no trial of {min(without)} in the split {READOUT} to fit on, which "
+            f"{tested.folder} tests; add some, or choose another set"
+        )
+    known = dict(zip(index["digest"][of_test], index["trial"][of_test], strict=True))
+    both = index[~of_test & index["digest"].isin(known.keys())]
+    if len(both):
+        row = both.iloc[0]
+        raise BadInputError(
+            f"{len(both)} trials of {fit.folder} have motions of tested trials, such as "
+            f"{row['trial']!r} of {known[row['digest']]!r}; fit on a set without them"
+        )
+    return joined
+
+
+def check_pictures(index: pd.DataFrame, spec: Spec, *, rendered: bool) -> None:
+    """Raise `BadInputError` unless tested and fitted trials show a model pictures of one kind.
+
+    Looks and frame rates must agree, and so must the sizes of movies, unless pictures are rendered.
+    """
+    if not spec.sees_pictures:
+        return
+    rate = (index["frames"] / index["playback_seconds"]).round(3)
+    facts = index[["split", "look"]].assign(rate=rate, size=index["width"].astype(str))
+    facts["size"] += " x " + index["height"].astype(str)
+    tested, fit = (facts[facts["split"] == split] for split in (TESTING, READOUT))
+    for name, what in (("look", "look"), ("rate", "frame rate"), ("size", "size of the movies")):
+        if name == "size" and rendered:
+            continue
+        if set(tested[name]) != set(fit[name]):
+            raise BadInputError(
+                f"the {what} of tested trials is {_listed(tested[name])}, of those that fit the "
+                f"readout {_listed(fit[name])}; use sets that agree"
+                + (", or render all pictures (--rendered)" if name == "size" else "")
+            )
+
+
+def _listed(values: pd.Series[Any]) -> str:
+    return " and ".join(sorted(str(value) for value in set(values)))
+
+
+def describe_fit(fit: Dataset) -> str:
+    """Return the name of the folder of a set, and the start of the digest of its readout trials.
+
+    The digest is the SHA-256 of scenarios, motions and outcomes, in any order.
+    """
+    index = fit.index[fit.index["split"] == READOUT]
+    rows = zip(index["scenario"], index["digest"], index["contact"], strict=True)
+    digest = digest_of("\n".join(sorted(f"{s} {d} {int(c)}" for s, d, c in rows)))
+    return f"{fit.folder.name} {digest[:12]}"
 
 
 def training_folds(index: pd.DataFrame, protocol: Protocol, folds: int, seed: int) -> list[Fold]:

@@ -175,16 +175,21 @@ def _grams(tables: Sequence[JoinedFeatures], fits: Sequence[Fit]) -> list[tuple[
 def _standardise(block: Array, fit: Fit) -> tuple[Array, Array]:
     """Return the fitted and the other rows, standardised; constant columns become zero."""
     fitted, others = block[fit.fitted], block[fit.others]
-    mean = fitted.mean(axis=0)
-    fitted -= mean
-    deviation = np.sqrt(np.einsum("ij,ij->j", fitted, fitted) / len(fitted))
-    # Rounding leaves a constant column a deviation near, but not at, zero.
-    varies = deviation > 1e-9 * np.maximum(np.abs(mean), 1e-30)
-    scale = np.divide(1.0, deviation, out=np.zeros_like(deviation), where=varies)
+    mean, scale = _center(fitted)
     fitted *= scale
     others -= mean
     others *= scale
     return fitted, others
+
+
+def _center(fitted: Array) -> tuple[Array, Array]:
+    """Take the means off the columns of ``fitted``; return them and 1 / standard deviation."""
+    mean: Array = fitted.mean(axis=0)
+    fitted -= mean
+    deviation = np.sqrt(np.einsum("ij,ij->j", fitted, fitted) / len(fitted))
+    # Rounding leaves a constant column a deviation near, but not at, zero.
+    varies = deviation > 1e-9 * np.maximum(np.abs(mean), 1e-30)
+    return mean, np.divide(1.0, deviation, out=np.zeros_like(deviation), where=varies)
 
 
 def _blocks(tables: Sequence[JoinedFeatures]) -> Iterator[Array]:
@@ -384,11 +389,31 @@ def _objective(design: Array, signs: Array, penalty: Array, x: Array) -> tuple[f
 def _solve_exactly(
     train: JoinedFeatures, labels: Booleans, test: JoinedFeatures, settings: LogisticSettings
 ) -> tuple[float, float, str, Array]:
-    """Return the chosen C, its accuracy, a note, and the decision values (n + m,) of all trials.
+    """Return the chosen C, its accuracy, a note, and the decision values (n + m,) of all trials."""
+    dual = _solve_dual(train, labels, test, settings)
+    return dual.c, dual.cv_accuracy, dual.note, dual.values
+
+
+@dataclass(frozen=True)
+class _Dual:
+    """Weights (n,) of the fit trials, intercept, and decision values (n + m,) of all trials."""
+
+    weights: Array
+    intercept: float
+    values: Array
+    c: float
+    cv_accuracy: float
+    note: str
+
+
+def _solve_dual(
+    train: JoinedFeatures, labels: Booleans, test: JoinedFeatures, settings: LogisticSettings
+) -> _Dual:
+    """Return the solution at the chosen C.
 
     The Gram matrices of all folds and of the final fit are made in one pass over the features.
     """
-    splits, note = _splits(labels, settings)
+    splits, note = stratified_splits(labels, settings)
     count, everything = len(labels), np.arange(len(labels) + test.shape[0])
     final = Fit(everything[:count], everything[count:])
     *of_folds, (within, across) = grams(
@@ -401,8 +426,70 @@ def _solve_exactly(
     c, cv_accuracy = _choose(scores, splits, labels, settings)
     # The solution for one C starts from that for the next smaller one.
     weights, intercepts = solve_path(within, labels, tuple(v for v in settings.grid if v <= c))
-    values: Array = np.concatenate([within, across]) @ weights[:, -1] + intercepts[-1]
-    return c, cv_accuracy, note, values
+    chosen, intercept = weights[:, -1], float(intercepts[-1])
+    values: Array = np.concatenate([within, across]) @ chosen + intercept
+    return _Dual(chosen, intercept, values, c, cv_accuracy, note)
+
+
+@dataclass(frozen=True)
+class LinearReadout:
+    """Readout as weights of features as they come, which needs no trial of its fit any more.
+
+    P(contact) is 1 / (1 + exp(-((x - mean) . weights + intercept))) for features x (d,), flattened
+    in time. ``train_accuracy``, ``cv_accuracy``, ``c``: as of `FittedReadout`.
+    """
+
+    weights: Array
+    mean: Array
+    intercept: float
+    train_accuracy: float
+    cv_accuracy: float
+    c: float
+
+    def probability(self, features: NDArray[Any]) -> Array:
+        """Return P(contact) (m,) from features (m, d)."""
+        values = (features.astype(np.float64) - self.mean) @ self.weights + self.intercept
+        probability: Array = 1 / (1 + np.exp(-np.clip(values, -700, 700)))
+        return probability
+
+
+def fit_weights(
+    train: Parts, labels: Booleans, settings: LogisticSettings | None = None
+) -> LinearReadout:
+    """Return the readout that `fit_readout` applies to tested trials.
+
+    Notes
+    -----
+    With standardised features z_i = (x_i - m) / s of the fit trials and dual weights a, decision
+    values are sum_i a_i z_i . (x - m) / s + b, so that the weights of x - m are (sum_i a_i z_i) /
+    s.
+
+    Raises
+    ------
+    BadInputError
+        As `fit_readout`, and if there are not both outcomes.
+    """
+    settings = settings if settings is not None else LogisticSettings()
+    labels = np.asarray(labels, bool)
+    fit = JoinedFeatures(train)
+    _check(fit, labels, fit)
+    if len(set(labels.tolist())) < 2:
+        raise BadInputError(f"readout: {len(labels)} trials without both outcomes give no weights")
+    dual = _solve_dual(fit, labels, fit.select(np.arange(0)), settings)
+    weights, means = [], []
+    for block in _blocks([fit]):
+        mean, scale = _center(block)
+        weights.append((dual.weights @ block) * scale**2)
+        means.append(mean)
+    accuracy = float(np.mean((dual.values > 0) == labels))
+    return LinearReadout(
+        weights=np.concatenate(weights),
+        mean=np.concatenate(means),
+        intercept=dual.intercept,
+        train_accuracy=accuracy,
+        cv_accuracy=dual.cv_accuracy,
+        c=dual.c,
+    )
 
 
 def _solve_released(
@@ -418,7 +505,7 @@ def _solve_released(
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
 
-    splits, note = _splits(labels, settings)
+    splits, note = stratified_splits(labels, settings)
     features = train.array()
 
     def fit(rows: Rows, c: float) -> Any:
@@ -439,7 +526,9 @@ def _solve_released(
     return c, cv_accuracy, note, values
 
 
-def _splits(labels: Booleans, settings: LogisticSettings) -> tuple[list[tuple[Rows, Rows]], str]:
+def stratified_splits(
+    labels: Booleans, settings: LogisticSettings
+) -> tuple[list[tuple[Rows, Rows]], str]:
     """Return fitted and held-out rows of every fold of the cross-validation, and a note."""
     folds = min(settings.folds, int(labels.sum()), int((~labels).sum()))
     if len(settings.grid) == 1 or folds < 2:

@@ -30,6 +30,7 @@ from physion.readout.model_calls import (
     to_array,
 )
 from physion.readout.settings import EvaluationSettings
+from physion.readout.shipped import ShippedReadout, ShippedReadouts
 from physion.readout.tables import ScenarioPredictions, describe_labels
 from physion.readout.train import Trainer
 from physion.trials.dataset import Dataset
@@ -142,6 +143,10 @@ class Predictor:
         Training protocol, None if the model is not trained, and seed.
     folder
         Output folder.
+    shipped
+        Readouts that ship for the model, which are not fitted here.
+    fit_on
+        Name and digest of the set with the fit trials; empty if they are the dataset's own.
     executor
         Runs simulations; by default they run in this process.
     progress
@@ -159,12 +164,14 @@ class Predictor:
         training: TrainingSettings | None = None,
         protocol: Protocol | None = None,
         seed: int = 0,
+        shipped: ShippedReadouts | None = None,
+        fit_on: str = "",
         executor: Executor | None = None,
         progress: Progress | None = None,
     ) -> None:
         self.dataset, self.model, self.ways, self.settings = dataset, model, ways, settings
         self.seed, self.progress = seed, progress
-        self._protocol = protocol
+        self._protocol, self._shipped, self._fit_on = protocol, shipped, fit_on
         index = dataset.index.set_index("trial")
         self._frames, known = index["frames"], index["recorded_contact"]
         self._labels = pd.DataFrame(
@@ -243,6 +250,11 @@ class Predictor:
         losses: tuple[float, float],
     ) -> ScenarioPredictions:
         decision = None
+        known = None
+        if self._shipped is not None and way is Way.FEATURES:
+            known = self._shipped.find(readout, split.scenario)
+        if known is not None:
+            return self._predict_shipped(known, split, readout)
         if way is Way.ANSWERS:
             decided, fit, test = self._answer(split, readout)
         else:
@@ -264,6 +276,7 @@ class Predictor:
             fit_trials=len(fit),
             fold=fold.number,
             fit_labels=describe_labels([recorded and self._labels["known"][t] for t in fit]),
+            fit_on=self._fit_on if fit else "",
             decision="" if decision is None else decision_name(self.model, self.settings.decision),
             protocol=self._protocol.value if trained and self._protocol else "",
             dynamics_training_dataset=fold.training.name if self._protocol is Protocol.ONE else "",
@@ -271,6 +284,23 @@ class Predictor:
             validation_loss=losses[0],
             copy_last_loss=losses[1],
             note="; ".join(filter(None, ("untrained" if untrained else "", decided.note))),
+        )
+
+    def _predict_shipped(
+        self, known: ShippedReadout, split: ScenarioSplit, readout: Readout
+    ) -> ScenarioPredictions:
+        """Return the predictions of a readout that ships."""
+        future = dict.fromkeys(split.test, known.steps)
+        return ScenarioPredictions(
+            scenario=split.scenario,
+            readout=readout.value,
+            trials=split.test,
+            decided=known.decide(self._parts(split.test, readout, future)),
+            fit_trials=known.fit_trials,
+            fold=-1,
+            fit_labels="simulated",
+            fit_on=known.fit_on,
+            decision=decision_name(self.model),
         )
 
     def _labels_of(self, trials: Sequence[str], kind: str) -> NDArray[np.bool_]:

@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
 
@@ -82,6 +82,9 @@ class EvaluationSettings(HarnessSettings):
     decision: str = ""
     """What turns features or rollouts into P(contact) (physion ls decisions); default: the model's
     own."""
+    readout: Literal["shipped", "fit"] = "shipped"
+    """Readouts that ship are used where they fit the model and the trials are red and yellow; fit:
+    fit all anew, on readout trials."""
     untrained: bool = False
     """Leave the weights of the model as they are; the table says untrained."""
     rollout_errors: Annotated[bool, tyro.conf.arg(aliases=("--rollout-error",))] = False

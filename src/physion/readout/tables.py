@@ -19,8 +19,8 @@ from physion.readout.decisions import Decided
 COLUMNS = (
     "model", "readout", "protocol", "init", "seed", "stimulus", "scenario", "p_contact", "outcome",
     "recorded_outcome", "observed_contact", "inputs", "decision", "train_accuracy",
-    "test_accuracy", "cv_accuracy", "fit_labels", "fit_trials", "fold", "readout_c", "noise_scale",
-    "gap_threshold", "validation_loss", "copy_last_loss", "encoder_type",
+    "test_accuracy", "cv_accuracy", "fit_labels", "fit_trials", "fit_on", "fold", "readout_c",
+    "noise_scale", "gap_threshold", "validation_loss", "copy_last_loss", "encoder_type",
     "encoder_pretraining_task", "encoder_pretraining_dataset", "encoder_pretraining_seed",
     "encoder_training_task", "dynamics_type", "dynamics_training_task",
     "dynamics_training_dataset", "note", "versions",
@@ -38,7 +38,8 @@ COLUMNS = (
   and ``gap_threshold`` (metres): what it fitted.
 - ``train_accuracy``, ``test_accuracy``: means over all folds of a protocol, readout and scenario.
 - ``fit_labels``: outcomes that the decision was fitted on (`describe_labels`); ``fit_trials``:
-  number of trials in the fit; ``fold``: fold of a cross-validation, or -1.
+  number of trials in the fit; ``fit_on``: set that they belong to, name and digest, empty for the
+  dataset's own trials; ``fold``: fold of a cross-validation, or -1.
 - ``copy_last_loss``: loss of the trivial predictor on held-out trials, as ``validation_loss``.
 - ``encoder_*``, ``dynamics_*``: the fields of `clips.batch.Provenance`, but
   ``dynamics_training_dataset``: the scenario that trained the model under the protocol *one*.
@@ -77,6 +78,7 @@ class ScenarioPredictions:
     fit_trials: int
     fold: int
     fit_labels: str
+    fit_on: str = ""
     protocol: str = ""
     dynamics_training_dataset: str = ""
     seed: str = ""
@@ -120,6 +122,7 @@ def make_table(
             "cv_accuracy": decided.cv_accuracy,
             "fit_labels": part.fit_labels,
             "fit_trials": part.fit_trials,
+            "fit_on": part.fit_on,
             "fold": part.fold,
             "readout_c": decided.c,
             "noise_scale": decided.fitted.get("scale", float("nan")),

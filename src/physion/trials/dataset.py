@@ -5,7 +5,7 @@ What reads trial files and movies is imported when it is used: an index is known
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -133,6 +133,57 @@ class Dataset:
     @cached_property
     def _rows(self) -> dict[str, int]:
         return {str(name): row for row, name in enumerate(self.index["trial"])}
+
+
+class JoinedDataset(Dataset):
+    """Trials of several datasets, under names that differ; each keeps its files where they are.
+
+    Parameters
+    ----------
+    parts
+        Datasets, and the splits that are taken from each.
+
+    Raises
+    ------
+    BadInputError
+        If two trials have one name.
+    """
+
+    def __init__(self, parts: Sequence[tuple[Dataset, Collection[str]]]) -> None:
+        tables = [part.index[part.index["split"].isin(list(splits))] for part, splits in parts]
+        self.folder, self.verify = parts[0][0].folder, all(part.verify for part, _ in parts)
+        self.index = pd.concat(tables, ignore_index=True)
+        twice = self.index["trial"][self.index["trial"].duplicated()]
+        if len(twice):
+            folders = " and ".join(str(part.folder) for part, _ in parts)
+            raise BadInputError(f"{folders} both have a trial {twice.iloc[0]!r}")
+        self._parts = {
+            str(trial): part
+            for (part, _), table in zip(parts, tables, strict=True)
+            for trial in table["trial"]
+        }
+
+    def paths(self, trial: str) -> TrialPaths:
+        """Return the paths of the files of a trial."""
+        return self._part(trial).paths(trial)
+
+    def file(self, trial: str, column: str) -> IndexedFile | None:
+        """Return a file of a trial, by its column of the index; None if the trial has no such."""
+        return self._part(trial).file(trial, column)
+
+    def files(self, column: str) -> dict[str, IndexedFile]:
+        """Return the files of one column of the index by trial, without trials that have none."""
+        return {
+            trial: file
+            for part in dict.fromkeys(self._parts.values())
+            for trial, file in part.files(column).items()
+            if self._parts.get(trial) is part
+        }
+
+    def _part(self, trial: str) -> Dataset:
+        if trial not in self._parts:
+            raise UnknownNameError("trial", trial, self._parts)
+        return self._parts[trial]
 
 
 def indexed_file(

@@ -366,6 +366,12 @@ class EncoderModel(TorchModel):
         parts += [self.spec.mean, self.spec.std, f"timm{timm.__version__}", self.settings.pooling]
         return hashlib.sha256(repr(parts).encode()).hexdigest()
 
+    def readout_digest(self) -> str:
+        """Return the SHA-256 of the encoder and its clips; what it imagines is left out."""
+        settings, spec = self.settings, self.spec
+        parts = [settings.encoder, settings.pooling, self._weights.identity(), repr(spec)]
+        return digest_of(parts)
+
     def name(self) -> str:
         """Return the name for tables, such as ``pVGG-mlp-paper``.
 
@@ -491,6 +497,10 @@ class FineTunedEncoder(EncoderModel):
     def encoder_digest(self) -> str:
         """Return the key of stored features, from the initial encoder and the weights now."""
         return digest_of(super().encoder_digest(), self.encoder.state_dict().items())
+
+    def readout_digest(self) -> str:
+        """Return the digest of the model: no readouts ship for what is trained further."""
+        return self.digest()
 
     @torch.no_grad()
     def _initial_features(self, batch: Batch) -> Tensor:
