@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 
 import physion
@@ -124,6 +125,27 @@ def test_each_scenario_trains_a_model_that_is_tested_on_all(dots: Dataset, tmp_p
     assert single.name == "drop"
     with pytest.raises(BadInputError, match="all-but, only or one"):
         physion.train(IMAGINING, dots, tmp_path, dry_run=True, scenario="drop", settings=CPU)
+
+
+def test_trainings_on_one_scenario_fill_the_heat_map(dots: Dataset, tmp_path: Path) -> None:
+    """From trainings to the figure's table: each cell is the accuracy in the predictions."""
+    given: dict[str, Any] = {"protocols": ("all", "one"), "settings": QUICK}
+    done = physion.evaluate(IMAGINING, dots, tmp_path / "models", **given)
+    physion.compare(done.paths).report(tmp_path / "report")
+    assert (tmp_path / "report" / "figures" / "generalization.png").is_file()
+    cells = pd.read_csv(tmp_path / "report" / "figures" / "generalization.csv")
+    assert len(cells) == 3 * 3 * 2, "readouts, trainings with *all*, tested scenarios"
+    rows = done.predictions
+    rows = rows.assign(
+        right=(rows["p_contact"] > 0.5) == rows["outcome"],
+        trained=rows["dynamics_training_dataset"].replace("", "all"),
+    )
+    expected = rows.groupby(["readout", "trained", "scenario"])["right"].mean()
+    for _, cell in cells.iterrows():
+        readout = cell["model"].partition(" · ")[2]
+        right = expected[readout, cell["trained"], cell["tested"]]
+        assert cell["accuracy"] == pytest.approx(right)
+        assert cell["difference"] == pytest.approx(right - 0.5), "without people: to guessing"
 
 
 def test_a_training_that_is_missing_or_was_changed_is_done_again(

@@ -23,10 +23,14 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 @pytest.fixture(scope="session")
 def make_comparison() -> Maker:
-    """Builds a comparison of two models on Collide and Drop; ``model`` names the first one."""
+    """Builds a comparison of two models on Collide and Drop; ``model`` and ``readout`` are of the
+    first one."""
 
     def make(
-        model: str = "simulation", with_people: bool = True, constant: bool = False
+        model: str = "simulation",
+        with_people: bool = True,
+        constant: bool = False,
+        readout: str = "observed",
     ) -> Comparison:
         generator = np.random.default_rng(0)
         stems = {"collide": "pilot_it2_collision_simple_box", "drop": "pilot_it2_drop_simple_box"}
@@ -38,13 +42,13 @@ def make_comparison() -> Maker:
         actual = np.array(list(labels.values()))
         actual[5] = not actual[5]
         tables = []
-        for name, readout in ((model, "observed"), ("encoder", "observed+simulated")):
+        for name, given in ((model, readout), ("encoder", "observed+simulated")):
             p = np.full(24, 0.5) if constant else generator.random(24)
             tables.append(
                 pd.DataFrame(
                     {
                         "Model": name,
-                        "Readout Type": readout,
+                        "Readout Type": given,
                         "Predicted Prob_true": p,
                         "Predicted Outcome": p > 0.5,
                         "Actual Outcome": actual,

@@ -236,6 +236,19 @@ def test_scores_by_scenario_stand_below_their_scenario(inputs: ReportInputs, pag
     assert ceiling[:2] == ["ceiling", f"{people.loc['collide', 'ceiling']:.2f}"]
 
 
+def test_accuracies_over_runs(inputs: ReportInputs, page: str) -> None:
+    """Of the model with two readouts only; its interval draws them."""
+    table = find(page, "Accuracy over runs")
+    assert table.header[1:] == ["runs", "collide", "drop", MEAN]
+    (line,) = table.rows
+    assert line[:2] == ["one", "2"]
+    scores = inputs.comparison.scores.set_index(["base_model", "scenario"])["accuracy"]
+    for scenario, cell in zip(("collide", "drop", MEAN), line[2:], strict=True):
+        two = sorted(scores.loc["one", scenario])
+        # A quarter of the draws has the same run twice: both values lie within 95 %.
+        assert cell == f"{np.mean(two):.2f} {two[0]:.2f} to {two[1]:.2f}"
+
+
 def test_the_first_sentence_names_the_best(inputs: ReportInputs, page: str) -> None:
     """The recorded scores by hand: readout full, which sees the outcome, is left out."""
     scores = inputs.comparison.all_scores
@@ -343,11 +356,11 @@ def test_kappa_of_models_with_each_other(inputs: ReportInputs, page: str) -> Non
     mean = inputs.beside.pairs.groupby(["first", "second"])["kappa"].mean()
     table = find(page, "kappa of models with each other")
     names = [row[0].partition(" ")[2] for row in table.rows]
-    assert len(names) == 3
+    assert len(names) == 2, "readout full is not next to people"
     for (first, second), kappa in mean.items():
         for one, other in ((first, second), (second, first)):
             assert table.rows[names.index(one)][1 + names.index(other)] == fixed(2)(kappa)
-    assert all(table.rows[k][1 + k] == "" for k in range(3))
+    assert all(table.rows[k][1 + k] == "" for k in range(2))
 
 
 # --- people -------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import itertools
 import os
 import subprocess
 import sys
@@ -22,7 +23,7 @@ from PIL import Image
 
 from physion.analysis import Comparison, figure_tables
 from physion.analysis.comparison import ANOTHER
-from physion.analysis.model_tests import fits_of_models
+from physion.analysis.model_tests import fits_of_models, paired_tests, pool_comparison
 from physion.analysis.people.effects import below_chance_level
 from physion.analysis.scores import COMPUTED
 from physion.analysis.tables import MEAN, name_models
@@ -96,6 +97,40 @@ def test_figures_of_single_answers_show_only_models(make_comparison: Maker) -> N
     assert ReportInputs(comparison).scatter_models() == model
 
 
+def test_the_readout_that_sees_the_outcome_is_not_compared_with_people(
+    make_comparison: Maker,
+) -> None:
+    """As in the paper: detection has accuracies only."""
+    plain = make_comparison()
+    comparison = make_comparison(readout="full")
+    detecting, predicting = comparison.names
+    assert detecting.endswith("full")
+    scores = comparison.all_scores.set_index(["model", "scenario"])
+    known = plain.all_scores.set_index(["model", "scenario"])
+    likeness = ["r", "kappa_from_averages", "rmsd", "difference", "r_beyond_outcome"]
+    for scenario in ("collide", "drop", MEAN):
+        own = scores.loc[detecting, scenario]
+        before = known.loc[plain.names[0], scenario]
+        assert own["accuracy"] == before["accuracy"] and own["d_prime"] == before["d_prime"]
+        assert own["human_accuracy"] == before["human_accuracy"]
+        assert own[likeness].isna().all() and before[likeness].notna().all()
+        assert own[[f"{name}_low" for name in likeness]].isna().all()
+        assert "sees the outcome" in own["reason"]
+        other = scores.loc[predicting, scenario]
+        assert other[likeness].tolist() == known.loc[predicting, scenario][likeness].tolist()
+    inputs = ReportInputs(comparison)
+    marks = inputs.tables()["comparison"].set_index(["model", "scenario"])
+    assert (marks.loc[detecting, ["reliably", "people_interval"]] == "").all(axis=None)
+    plots = {plot.name: plot.table for plot in make_plots(inputs)}
+    for name in ("r", "thirds", "scatter", "right_answers", "people_and_models"):
+        assert predicting in set(plots[name]["model"]), name
+        assert detecting not in set(plots[name]["model"]), name
+    assert detecting in set(plots["accuracy"]["model"])
+    tests = paired_tests(pool_comparison(comparison), permutations=20).iloc[0]
+    assert np.isnan(tests["r_difference"]) and np.isfinite(tests["accuracy_difference"])
+    assert paired_tests(pool_comparison(plain), permutations=20)["r_difference"].notna().all()
+
+
 def test_zones_of_participants_and_of_scenarios_look_different(make_comparison: Maker) -> None:
     table = figure_tables.accuracy_table(make_comparison())
     assert set(table.loc[table["zone_low"].notna(), "panel"]) == {"collide"}
@@ -161,10 +196,40 @@ def test_thirds_are_of_the_stimuli_that_bear_their_name(make_comparison: Maker) 
     easy = own[own["human_accuracy"] >= 2 / 3]
     row = table[(table["model"] == comparison.names[1]) & table["panel"].str.startswith("easy")]
     assert row["stimuli"].item() == len(easy)
-    expected = np.corrcoef(easy["p_contact"], easy["p_yes"])[0, 1]
-    assert row["value"].item() == pytest.approx(expected)
-    assert row["low"].item() < expected < row["high"].item()
+    expected = [
+        np.corrcoef(part["p_contact"], part["p_yes"])[0, 1] for _, part in easy.groupby("scenario")
+    ]
+    assert len(expected) == 2
+    assert row["value"].item() == pytest.approx(np.mean(expected))
+    assert row["low"].isna().all(), "two scenarios are too few to draw"
     assert table["people"].isna().all()
+
+
+def test_intervals_of_thirds_draw_scenarios(make_comparison: Maker) -> None:
+    """As in the paper: percentiles of means over scenarios drawn with replacement. A scenario
+    whose answers are constant does not count, and is named."""
+    comparison = make_comparison()
+    rng = np.random.default_rng(3)
+    model = comparison.names[0]
+    part = comparison.stimuli[comparison.stimuli["model"] == model].iloc[:6]
+    rows = []
+    for scenario in ("collide", "drop", "link", "roll", "support"):
+        p_contact = np.full(6, 0.5) if scenario == "roll" else rng.random(6)
+        p_yes = 0.9 + rng.random(6) / 10
+        names = [f"{scenario}{i}" for i in range(6)]
+        rows.append(part.assign(scenario=scenario, stimulus=names, p_contact=p_contact,
+                                p_yes=p_yes, human_accuracy=p_yes, label=True))  # fmt: skip
+    stimuli = pd.concat(rows, ignore_index=True)
+    table = figure_tables.thirds_table(dataclasses.replace(comparison, stimuli=stimuli))
+    row = table[(table["model"] == model) & table["panel"].str.startswith("easy")].iloc[0]
+    known = [rows[k] for k in (0, 1, 2, 4)]
+    r = np.array([np.corrcoef(part["p_contact"], part["p_yes"])[0, 1] for part in known])
+    assert row["value"] == pytest.approx(r.mean())
+    # All 256 draws of four scenarios, instead of random ones.
+    means = [r[list(drawn)].mean() for drawn in itertools.product(range(4), repeat=4)]
+    expected = np.percentile(means, [2.5, 97.5])
+    assert [row["low"], row["high"]] == pytest.approx(expected, abs=0.1 * np.ptp(expected))
+    assert "roll" in row["reason"] and "drop" not in row["reason"]
 
 
 def test_thirds_show_what_halves_of_people_reach(make_comparison: Maker) -> None:
@@ -177,15 +242,20 @@ def test_thirds_show_what_halves_of_people_reach(make_comparison: Maker) -> None
     drawn = np.random.default_rng(0).random(len(rows))
     rows["yes"] = drawn < shown.loc[rows["stimulus"], "p_yes"].to_numpy()
     table = figure_tables.thirds_table(comparison, rows).drop_duplicates("panel").set_index("panel")
-    easy = shown.index[shown["human_accuracy"] >= 2 / 3]
-    yes = rows[rows["stimulus"].isin(easy)].pivot(index="session", columns="stimulus", values="yes")
-    # Written out here: halves of people, their shares of yes, r of the two.
+    easy = shown[shown["human_accuracy"] >= 2 / 3]
+    # Written out here: halves of people, their fractions of yes, r of the two, by scenario.
     order = np.random.default_rng(1).permuted(np.tile(np.arange(20), (500, 1)), axis=1)
-    halves = [(yes.to_numpy()[one[:10]].mean(0), yes.to_numpy()[one[10:]].mean(0)) for one in order]
-    r = [np.corrcoef(*pair)[0, 1] for pair in halves]
+    found = []
+    for scenario in ("collide", "drop"):
+        own = rows[rows["stimulus"].isin(easy.index[easy["scenario"] == scenario])]
+        yes = own.pivot(index="session", columns="stimulus", values="yes").to_numpy()
+        halves = [(yes[one[:10]].mean(0), yes[one[10:]].mean(0)) for one in order]
+        r = [np.corrcoef(*pair)[0, 1] for pair in halves]
+        found.append([np.mean(r), np.percentile(r, 2.5)])
+    mean, low = np.mean(found, axis=0)
     row = table.loc["easy (from 2/3)"]
-    assert row["people"] == pytest.approx(np.mean(r), abs=0.02)
-    assert row["zone_low"] == pytest.approx(np.percentile(r, 2.5), abs=0.08)
+    assert row["people"] == pytest.approx(mean, abs=0.02)
+    assert row["zone_low"] == pytest.approx(low, abs=0.08)
     assert row["zone_low"] < row["people"] < row["zone_high"]
     figure = measure_figure(figure_tables.thirds_table(comparison, rows), measure="r")
     place = list(table["people"].notna()).index(True)
@@ -388,6 +458,19 @@ def test_points_of_a_model_against_people_have_the_model_to_the_right() -> None:
     points = [np.asarray(line.get_xydata())[0].tolist() for line in axis.lines[1:]]
     assert points == [[0.6, 0.7], [0.9, 0.65], [0.75, 0.675]]
     assert "people" in axis.get_ylabel() and "DPI" in axis.get_xlabel()
+
+
+def test_the_key_tells_the_scenarios_apart() -> None:
+    names = [*SCENARIOS, MEAN]
+    table = pd.DataFrame({"model": "DPI", "scenario": names, "accuracy": 0.6, "people": 0.7})
+    figure = model_and_people_figure(table)
+    key = {text.get_text(): (line.get_color(), line.get_marker(), line.get_markerfacecolor())
+           for text, line in zip(figure.legends[0].get_texts(), figure.legends[0].get_lines(),
+                                 strict=True)}  # fmt: skip
+    assert list(key) == [*SCENARIOS, "mean over scenarios"] and len(set(key.values())) == 9
+    drawn = [(line.get_color(), line.get_marker(), line.get_markerfacecolor())
+             for line in figure.axes[0].lines[1:]]  # fmt: skip
+    assert drawn == list(key.values())
 
 
 # --- readout and training -----------------------------------------------------------------------

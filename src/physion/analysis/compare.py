@@ -28,7 +28,7 @@ from physion.analysis.people.measures import HALVES, accuracy_by_stimulus, all_a
 from physion.analysis.people.results import PeopleResults
 from physion.analysis.scores import TWO_PEOPLE, against_people, with_kind
 from physion.analysis.statistics.regression import calibration_table
-from physion.analysis.tables import check_excluded_names, name_models, require_columns
+from physion.analysis.tables import DETECTION, check_excluded_names, name_models, require_columns
 from physion.analysis.with_participants import (
     add_baselines,
     human_zones,
@@ -137,7 +137,7 @@ class ComparisonResults:
     - ``comparison``: from `compare_scores`.
     - ``predictions``: from `read_predictions`, for what needs readout and training.
     - ``people``: results about single participants; None if only their averages are known.
-    - ``beside``: models and single participants, from `compare_everywhere`.
+    - ``beside``: models and single participants, from `compare_everywhere`, without `DETECTION`.
     - ``comparison_all``: the comparison with all complete sessions, including flagged ones.
     - ``paired``: from `paired_tests`, all scenarios pooled; None for one model.
     - ``paired_measures``: from `paired_measures`; None for one model or no people.
@@ -232,7 +232,8 @@ def all_results(
         )
         everybody = accuracy_by_stimulus(people.whole.test, draws)
         whole = compare_scores(predictions, everybody, known, **settings)
-        beside = compare_everywhere(main.stimuli, test, draws)
+        predicting = main.stimuli[main.stimuli["readout"] != DETECTION]
+        beside = compare_everywhere(predicting, test, draws)
         about_people = fits_of_people(people)
     pooled = pool_comparison(main)
     several = len(main.names) > 1

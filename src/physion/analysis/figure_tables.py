@@ -14,12 +14,12 @@ import pandas as pd
 
 from physion.analysis.compare import PeopleComparison
 from physion.analysis.comparison import ANOTHER, Comparison, with_training
-from physion.analysis.intervals import jackknife, mean_of, variance_of_mean
+from physion.analysis.intervals import mean_of, variance_of_mean
 from physion.analysis.people.effects import THIRDS, below_chance_level, difficulty_third, r_by_third
 from physion.analysis.scores import COMPUTED, baseline_stimuli, kind_of
-from physion.analysis.statistics.agreement import correlate_resampled, correlate_rows
+from physion.analysis.statistics.agreement import pearson
 from physion.analysis.statistics.regression import brier, reliability_curve
-from physion.analysis.tables import ALL_BUT, MEAN, ONLY, POOLED, READOUTS, in_order
+from physion.analysis.tables import ALL_BUT, DETECTION, MEAN, ONLY, POOLED, READOUTS, in_order
 from physion.analysis.with_participants import released_zone
 from physion.core.names import SCENARIOS
 
@@ -65,7 +65,8 @@ def r_table(comparison: Comparison, zones: pd.DataFrame | None = None) -> pd.Dat
         halves = zones[(zones["measure"] == "r") & (zones["of"] == "halves")]
         people.loc[MEAN, ["zone_low", "zone_high"]] = halves[["low", "high"]].mean().tolist()
         people.loc[MEAN, "zone"] = HALVES_ZONE
-    return _measure(_scores(comparison, "r"), people, "ceiling")
+    rows = _scores(comparison, "r")
+    return _measure(rows[rows["kind"] != DETECTION], people, "ceiling")
 
 
 def kappa_table(comparison: Comparison, with_people: PeopleComparison) -> pd.DataFrame:
@@ -216,22 +217,22 @@ def calibration_table(comparison: Comparison) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def thirds_table(
-    comparison: Comparison, answers: pd.DataFrame | None = None, level: float = 0.95
-) -> pd.DataFrame:
+def thirds_table(comparison: Comparison, answers: pd.DataFrame | None = None) -> pd.DataFrame:
     """Return r with the average person within the stimuli that are hard, chance and easy for
     people.
 
-    `MEASURE_COLUMNS` and ``stimuli``, their number; a panel a third; all scenarios pooled,
-    intervals about other stimuli of the third. With the ``answers`` of participants (``test`` of
-    `Responses`) the dashed line is the r of halves of them with each other.
+    `MEASURE_COLUMNS` and ``stimuli``, their number; a panel a third. r is computed in each scenario
+    and averaged; intervals draw the scenarios, from three on, as in the paper. With the ``answers``
+    of participants (``test`` of `Responses`) the dashed line is the r of halves of them with each
+    other, likewise averaged, and so are the bounds of its zone.
     """
     people = _halves_by_third(comparison, answers)
     stimuli = pd.concat([comparison.stimuli, baseline_stimuli(comparison.stimuli)])
+    stimuli = stimuli[stimuli["readout"] != DETECTION]
     parts = []
     for name, words in THIRD_WORDS.items():
         rows = [
-            {"model": model, "kind": subset["readout"].iloc[0]} | _third(subset, name, level)
+            {"model": model, "kind": subset["readout"].iloc[0]} | _third(subset, name)
             for model, subset in stimuli.groupby("model", sort=False)
         ]
         parts.append(pd.DataFrame(rows).assign(panel=words, **people[name]))
@@ -244,19 +245,23 @@ def thirds_table(
 THIRD_WORDS = dict(zip(THIRDS, ("hard (up to 1/3)", "chance", "easy (from 2/3)"), strict=True))
 
 
-def _third(subset: pd.DataFrame, name: str, level: float) -> dict[str, float | str]:
-    """Return r of one model within one third, with its interval."""
+def _third(subset: pd.DataFrame, name: str) -> dict[str, float | str]:
+    """Return r of one model within one third, mean over scenarios, with its interval."""
     rows = subset.sort_values("stimulus", kind="stable")
     part = rows[(difficulty_third(rows["human_accuracy"]) == name).to_numpy()]
-    x, y = (part[[key]].to_numpy(np.float64).T for key in ("p_contact", "p_yes"))
-    result: dict[str, float | str] = {"stimuli": len(part), "low": np.nan, "high": np.nan}
-    r = float(correlate_rows(x, y)[0]) if len(part) else np.nan
-    if not np.isfinite(r):
-        return result | {"value": np.nan, "reason": "fewer than 3 stimuli, or constant answers"}
-    without = 1 - np.eye(len(part))
-    variance = jackknife(correlate_resampled(x, np.broadcast_to(y, without.shape), without))
-    result["low"], result["high"] = variance.of(0).interval(r, level, "correlation")
-    return result | {"value": r, "reason": ""}
+    found = {
+        scenario: pearson(own["p_contact"], own["p_yes"])
+        for scenario in in_order(rows["scenario"])
+        if len(own := part[part["scenario"] == scenario])
+    }
+    known = [r for r in found.values() if np.isfinite(r)]
+    undefined = [scenario for scenario, r in found.items() if not np.isfinite(r)]
+    value, low, high = (float(np.mean(known)) if known else np.nan), np.nan, np.nan
+    if len(known) > 2:
+        value, low, high = released_zone(known)
+    reason = f"undefined in {', '.join(undefined)}: " if undefined else ""
+    reason += "fewer than 3 stimuli, or constant answers" if undefined or not known else ""
+    return {"stimuli": len(part), "value": value, "low": low, "high": high, "reason": reason}
 
 
 def _halves_by_third(
@@ -267,15 +272,20 @@ def _halves_by_third(
                                     "zone_high": np.nan, "zone": ""}  # fmt: skip
     if answers is None:
         return dict.fromkeys(THIRDS, none)
-    labels = comparison.stimuli.drop_duplicates("stimulus").set_index("stimulus")["label"]
-    asked = answers[answers["stimulus"].isin(labels.index)]
-    yes = asked.pivot(index="session", columns="stimulus", values="yes").astype("float64")
-    truth = labels.loc[yes.columns].to_numpy(dtype=np.float64)
-    rows = r_by_third(np.full((1, len(truth)), np.nan), yes.to_numpy(), truth)
-    halves = rows[rows["model"] == -1].set_index("third")
+    shown = comparison.stimuli.drop_duplicates("stimulus").set_index("stimulus")
+    asked = answers[answers["stimulus"].isin(shown.index)]
+    tables = []
+    for scenario in in_order(shown["scenario"]):
+        labels = shown.loc[shown["scenario"] == scenario, "label"]
+        own = asked[asked["stimulus"].isin(labels.index)]
+        yes = own.pivot(index="session", columns="stimulus", values="yes").astype("float64")
+        truth = labels.loc[yes.columns].to_numpy(dtype=np.float64)
+        rows = r_by_third(np.full((1, len(truth)), np.nan), yes.to_numpy(), truth)
+        tables.append(rows[rows["model"] == -1])
+    halves = pd.concat(tables).groupby("third")[["r", "low", "high"]].mean()
     return {
         str(name): {"people": row["r"], "people_is": "half of the people with the others",
-                    "zone_low": row["low"], "zone_high": row["high"], "zone": HALVES}
+                    "zone_low": row["low"], "zone_high": row["high"], "zone": HALVES_ZONE}
         for name, row in halves.iterrows()
     }  # fmt: skip
 

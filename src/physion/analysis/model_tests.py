@@ -30,7 +30,7 @@ from physion.analysis.statistics.paired import (
     mcnemar_exact,
     paired_difference,
 )
-from physion.analysis.tables import MEAN, POOLED, in_order
+from physion.analysis.tables import DETECTION, MEAN, POOLED, in_order
 from physion.core.errors import BadInputError, PhysionError
 
 Array = npt.NDArray[np.float64]
@@ -43,7 +43,8 @@ class PooledStimuli:
     - ``names``: of the models;
     - ``p_contact``, ``correct`` (m, s): NaN if a model does not predict the stimulus;
     - ``label``, ``p_yes`` (s,): official outcome, and fraction of people who say yes;
-    - ``scenario``: of each stimulus, length s.
+    - ``scenario``: of each stimulus, length s;
+    - ``detecting``: names of models that are not compared with people, see `DETECTION`.
     """
 
     names: tuple[str, ...]
@@ -52,6 +53,7 @@ class PooledStimuli:
     label: Array
     p_yes: Array
     scenario: tuple[str, ...]
+    detecting: frozenset[str] = frozenset()
 
 
 def permutations_of(pairs: int) -> int:
@@ -81,6 +83,7 @@ def pool_comparison(comparison: Comparison) -> PooledStimuli:
         label=by_stimulus["label"].to_numpy(dtype=np.float64),
         p_yes=by_stimulus["p_yes"].to_numpy(dtype=np.float64),
         scenario=tuple(by_stimulus["scenario"]),
+        detecting=frozenset(rows.loc[rows["readout"] == DETECTION, "model"].astype(str)),
     )
 
 
@@ -200,7 +203,9 @@ def _difference(
     draws: Bootstrap,
     permutations: int,
 ) -> Difference:
-    both, label = list(pair), pooled.label[shared]
+    both = list(pair)
+    shared = shared & (not pooled.detecting & {pooled.names[one] for one in both})
+    label = pooled.label[shared]
     right = pooled.correct[both][:, shared] == 1
     return paired_difference(
         measure,

@@ -17,6 +17,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from physion.analysis.intervals import (
+    Bootstrap,
     Integers,
     Variance,
     delete_one,
@@ -27,7 +28,7 @@ from physion.analysis.intervals import (
 from physion.analysis.metrics import metrics, score_metrics
 from physion.analysis.sample import Sample, pool, sample_of_rows
 from physion.analysis.statistics import agreement
-from physion.analysis.tables import MEAN, POOLED, in_order
+from physion.analysis.tables import DETECTION, MEAN, POOLED, in_order
 
 Array = npt.NDArray[np.float64]
 Compute = Callable[[Sample], dict[str, Array]]
@@ -56,6 +57,7 @@ def score_table(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
     outcome is not the official one; every metric of `score_metrics` with ``_low`` and
     ``_high``; ``ceiling`` of r and ``floor`` of the RMSD; ``reason``: why a score or an interval is
     NaN, or means less than it seems to (for example if all labels are of one class); else empty.
+    The readout `DETECTION` has no metric that compares it with people.
     """
     # Sorted, so that rounding does not depend on the order of the files.
     ordered = stimuli.sort_values("stimulus", kind="stable")
@@ -63,11 +65,26 @@ def score_table(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
         _scenario_rows(rows, level, _of_models, _why_undefined)
         for _, rows in ordered.groupby("model", sort=False)
     ]
-    table = pd.concat(parts, ignore_index=True)
+    table = _without_likeness(pd.concat(parts, ignore_index=True))
     rank = {model: position for position, model in enumerate(stimuli["model"].unique())}
     return table.sort_values("model", key=lambda a: a.map(rank), kind="stable").reset_index(
         drop=True
     )
+
+
+def _without_likeness(table: pd.DataFrame) -> pd.DataFrame:
+    """Return a table without the metrics that compare rows of `DETECTION` with people."""
+    likeness = [m for m in score_metrics() if m.needs == "people" and m.name != "human_accuracy"]
+    names, labels = [m.name for m in likeness], {m.label for m in likeness} | {"ceiling"}
+    why = f"likeness to people: not of {DETECTION}, which sees the outcome"
+    given = (table["readout"] == DETECTION) & table[names].notna().any(axis=1)
+    for row in table.index[given]:
+        known = str(table.loc[row, "reason"]).split("; ")
+        kept = [part for part in known if part and part.partition(":")[0] not in labels]
+        table.loc[row, "reason"] = "; ".join([*kept, why])
+    columns = [f"{name}{end}" for name in names for end in ("", "_low", "_high")]
+    table.loc[given, columns] = np.nan
+    return table
 
 
 def two_people_table(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
@@ -186,28 +203,59 @@ def against_people(scores: pd.DataFrame, people: pd.DataFrame) -> pd.DataFrame:
     Parameters
     ----------
     scores
-        Table with ``scenario``, ``accuracy``, ``difference_low`` and ``difference_high``.
+        Table with ``scenario``, ``readout``, ``accuracy``, ``difference_low`` and
+        ``difference_high``.
     people
         From `people_table`.
 
     Returns
     -------
-    Two columns more, empty where nothing is known. ``reliably``: *better* or *worse* if the
-    interval of the difference to people on the same stimuli excludes 0. ``people_interval``:
-    whether the accuracy is *below*, *inside* or *above* the interval of people's accuracy by
-    drawing participants, as preregistered.
+    Two columns more, empty where nothing is known and for the readout `DETECTION`. ``reliably``:
+    *better* or *worse* if the interval of the difference to people on the same stimuli excludes 0.
+    ``people_interval``: whether the accuracy is *below*, *inside* or *above* the interval of
+    people's accuracy by drawing participants, as preregistered.
     """
     low, high = scores["difference_low"], scores["difference_high"]
     known = people.set_index("scenario")[list(BOOTSTRAP)].reindex(scores["scenario"])
     first, last = known.to_numpy(np.float64).T
     value = scores["accuracy"].to_numpy(np.float64)
     inside = (value >= first) & (value <= last)
+    place = np.select([value < first, inside, value > last], ["below", "inside", "above"], "")
     return scores.assign(
         reliably=np.select([low > 0, high < 0], ["better", "worse"], ""),
-        people_interval=np.select(
-            [value < first, inside, value > last], ["below", "inside", "above"], ""
-        ),
+        people_interval=np.where(scores["readout"] == DETECTION, "", place),
     )
+
+
+def runs_table(scores: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
+    """Return the accuracy of each model over its runs, as the paper's table by scenario has it.
+
+    Parameters
+    ----------
+    scores
+        From `score_table`, with ``kind``. A run is one of its models: a readout, a training and a
+        seed of a base model.
+    bootstrap
+        Draws of the runs, and the level of the intervals.
+
+    Returns
+    -------
+    ``base_model``, ``scenario`` (with `MEAN`), ``runs``, ``accuracy`` with ``_low`` and ``_high``:
+    the mean over runs, and the interval by drawing runs with replacement. Models of a single run
+    are left out.
+    """
+    draws = bootstrap or Bootstrap()
+    rows = scores[(scores["kind"] == "model") & (scores["scenario"] != POOLED)]
+    records = []
+    for model, own in rows.groupby("base_model", sort=False):
+        for scenario in [*in_order(set(own["scenario"]) - {MEAN}), MEAN]:
+            values = own.loc[own["scenario"] == scenario, "accuracy"].to_numpy(np.float64)
+            if len(values) > 1:
+                drawn = draws.weights("runs", len(values)) @ values / len(values)
+                interval = draws.interval(drawn)
+                records.append((model, scenario, len(values), float(values.mean()), *interval))
+    columns = ["base_model", "scenario", "runs", "accuracy", "accuracy_low", "accuracy_high"]
+    return pd.DataFrame(records, columns=columns)
 
 
 def shown_average(scores: pd.DataFrame) -> str:

@@ -312,6 +312,10 @@ def check_excluded_names(exclude: Iterable[str], known: Collection[str]) -> None
 READOUTS = {"A": "full", "B": "observed+simulated", "C": "observed"}
 """The letters of the official files and the readouts that they stand for."""
 
+DETECTION = READOUTS["A"]
+"""The readout that sees the outcome. It detects and people predict, so that its accuracy is given,
+and not its likeness to people."""
+
 ONLY, ALL_BUT = "only", "all-but"
 """Training protocols: only on the tested scenario, or on all but that one."""
 

@@ -12,6 +12,8 @@ import pandas as pd
 from physion.analysis.compare import ComparisonResults, tidy_scores
 from physion.analysis.model_tests import MixedTable
 from physion.analysis.people.results import PeopleResults
+from physion.analysis.scores import runs_table
+from physion.analysis.tables import DETECTION
 
 EXPECTED_METHODS = ("Engine", "Renderer", "Readout", "Encoder weights", "Noise of the simulation")
 """Settings made outside the analysis; those that the caller omits are printed as not stated."""
@@ -58,8 +60,12 @@ class ReportInputs(ComparisonResults):
         return "" if self.people is None else self.people.mark
 
     def scatter_models(self) -> list[str]:
-        """The models of the scatter figure: the first ones, in the order of the predictions."""
-        return self.comparison.models[: self.scatter_limit]
+        """The models of the figures next to people: the first ones, in the order of the
+        predictions; not the readout that sees the outcome, if there is another."""
+        stimuli = self.comparison.stimuli
+        detecting = set(stimuli.loc[stimuli["readout"] == DETECTION, "model"])
+        models = [name for name in self.comparison.models if name not in detecting]
+        return models[: self.scatter_limit]
 
     def tables(self) -> dict[str, pd.DataFrame]:
         """Every table by the name of its file."""
@@ -73,6 +79,7 @@ class ReportInputs(ComparisonResults):
             "stimuli": comparison.stimuli,
             "changed_outcomes": comparison.changed,
             "left_out": comparison.dropped,
+            "accuracy_over_runs": runs if len(runs := runs_table(comparison.scores)) else None,
             "paired_tests": self.paired,
             "paired_measures": self.paired_measures,
             "group_contrasts": self.contrasts,

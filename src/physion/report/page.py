@@ -167,7 +167,8 @@ def _figures(section: str, shown: Mapping[str, Markup], below: Mapping[str, Mark
 def _by_scenario(inputs: ReportInputs, shown: Mapping[str, Markup]) -> Markup:
     comparison = inputs.comparison
     below = {
-        "accuracy": html.details("Accuracy as a table", scores.accuracies(inputs)),
+        "accuracy": html.details("Accuracy as a table", scores.accuracies(inputs))
+        + scores.accuracies_over_runs(comparison),
         "kappa": people_parts.measures(inputs),
     }
     if comparison.has_people:

@@ -12,7 +12,7 @@ from physion.analysis.comparison import SETTING, Comparison
 from physion.analysis.metrics import BEYOND_OUTCOME, Metric, score_metrics
 from physion.analysis.mixed.result import effect_name
 from physion.analysis.model_tests import MixedTable, permutations_of
-from physion.analysis.scores import AVERAGES, TWO_PEOPLE, shown_average
+from physion.analysis.scores import AVERAGES, TWO_PEOPLE, runs_table, shown_average
 from physion.analysis.tables import MEAN, POOLED, in_order
 from physion.core.html import Markup, joined
 from physion.report.html import (
@@ -245,6 +245,13 @@ RELIABLY = (
 """Caption of the table of accuracies by scenario, if people are known."""
 
 
+OVER_RUNS = (
+    "Mean over the runs of a model (readouts, trainings, seeds), with intervals by drawing runs, "
+    "as in the paper's table by scenario."
+)
+"""Caption of the table of accuracies over runs."""
+
+
 def accuracies(inputs: ReportInputs) -> Markup:
     """Return accuracy by model and scenario, with what is reliably better or worse than people."""
     if not inputs.comparison.has_people:
@@ -252,6 +259,21 @@ def accuracies(inputs: ReportInputs) -> Markup:
     rows = tidy_scores(inputs)
     marks = rows.set_index(["model", "scenario"])["reliably"].to_dict()
     return matrix(inputs.comparison, "accuracy", marks, RELIABLY)
+
+
+def accuracies_over_runs(comparison: Comparison) -> Markup:
+    """Return the accuracies of `runs_table`, models by scenarios; nothing if there are none."""
+    rows = runs_table(comparison.scores)
+    if rows.empty:
+        return Markup()
+    columns = [*in_order(comparison.stimuli["scenario"]), MEAN]
+    lines = []
+    for model, own in rows.groupby("base_model", sort=False):
+        cells = own.set_index("scenario")
+        lines.append([str(model), str(cells["runs"].max()),
+                      *(interval(cells.loc[name], "accuracy") if name in cells.index
+                        else undefined("no predictions") for name in columns)])  # fmt: skip
+    return details("Accuracy over runs", table(["", "runs", *columns], lines, OVER_RUNS))
 
 
 def matrix(

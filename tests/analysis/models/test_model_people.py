@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,14 @@ from physion.analysis.people.effects import difficulty_third, r_by_third
 from physion.analysis.people.measures import ScenarioAnswers, answers_of, split_halves
 from physion.analysis.people.results import analyse_people
 from physion.analysis.sample import Resampled
-from physion.analysis.scores import MAJORITY, OUTCOME, TWO_PEOPLE, against_people, shown_average
+from physion.analysis.scores import (
+    MAJORITY,
+    OUTCOME,
+    TWO_PEOPLE,
+    against_people,
+    runs_table,
+    shown_average,
+)
 from physion.analysis.statistics import agreement
 from physion.analysis.statistics.agreement import correctness
 from physion.analysis.tables import MEAN, POOLED
@@ -384,14 +392,34 @@ def test_reliably_better_or_worse_than_people() -> None:
          "bootstrap_high": [0.7, np.nan, np.nan]}
     )  # fmt: skip
     scores = pd.DataFrame(
-        {"scenario": ["drop", "drop", "drop", "roll", "drop"],
-         "accuracy": [0.55, 0.6, 0.8, 0.9, np.nan],
-         "difference_low": [-0.2, -0.1, 0.01, 0.1, np.nan],
-         "difference_high": [-0.01, 0.05, 0.2, 0.3, np.nan]}
+        {"scenario": ["drop", "drop", "drop", "roll", "drop", "drop"],
+         "readout": [*["observed"] * 5, "full"],
+         "accuracy": [0.55, 0.6, 0.8, 0.9, np.nan, 0.8],
+         "difference_low": [-0.2, -0.1, 0.01, 0.1, np.nan, np.nan],
+         "difference_high": [-0.01, 0.05, 0.2, 0.3, np.nan, np.nan]}
     )  # fmt: skip
     found = against_people(scores, people)
-    assert found["reliably"].tolist() == ["worse", "", "better", "better", ""]
-    assert found["people_interval"].tolist() == ["below", "inside", "above", "", ""]
+    assert found["reliably"].tolist() == ["worse", "", "better", "better", "", ""]
+    assert found["people_interval"].tolist() == ["below", "inside", "above", "", "", ""]
+
+
+def test_accuracies_over_runs_draw_the_runs() -> None:
+    accuracies = {"drop": [0.5, 0.6, 0.9], "roll": [0.7, 0.8, 0.6], MEAN: [0.6, 0.7, 0.75]}
+    rows = [(f"svg · {run}", "svg", "model", scenario, values[run])
+            for scenario, values in accuracies.items() for run in range(3)]  # fmt: skip
+    rows += [("one", "one", "model", "drop", 0.4), ("svg · 0", "svg", "model", POOLED, 0.1)]
+    rows += [(name, "chance", "baseline", "drop", 0.5) for name in ("chance", "chance · b")]
+    columns = ["model", "base_model", "kind", "scenario", "accuracy"]
+    table = runs_table(pd.DataFrame(rows, columns=columns), Bootstrap(resamples=20_000))
+    assert table["base_model"].tolist() == ["svg"] * 3, "of a single run nothing can be drawn"
+    assert table["scenario"].tolist() == ["drop", "roll", MEAN] and (table["runs"] == 3).all()
+    for row in table.itertuples():
+        values = np.array(accuracies[str(row.scenario)])
+        assert row.accuracy == pytest.approx(values.mean())
+        # All 27 draws of three runs.
+        means = [values[list(drawn)].mean() for drawn in itertools.product(range(3), repeat=3)]
+        expected = np.percentile(np.sort(means), [2.5, 97.5], method="inverted_cdf")
+        assert [row.accuracy_low, row.accuracy_high] == pytest.approx(expected.tolist())
 
 
 def test_what_is_missing_somewhere_is_counted_and_undefined_there() -> None:

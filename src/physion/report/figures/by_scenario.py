@@ -291,9 +291,6 @@ def draw_rollout_error(table: pd.DataFrame, theme: Theme) -> Figure:
 
 # --- accuracy of models against people, one point per scenario ----------------------------------
 
-NEAR = (0.04, 0.015)
-"""Differences of accuracy below which a name to the right of a point meets the next point."""
-
 
 @register_figure(
     "people_and_models", section=BY_SCENARIO, heading="People against models", order=33
@@ -317,34 +314,34 @@ def model_and_people_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure
     diagonal.
 
     ``table``: ``model``, ``scenario`` (with the mean, which is hollow), ``accuracy``, ``people``.
-    One panel per model.
+    One panel per model. The key names the marks: names next to points would overlap where scenarios
+    are alike.
     """
     models = list(table["model"].unique())
+    names = list(table["scenario"].unique())
+    marks: dict[str, dict[str, Any]] = {
+        name: {"linestyle": "", "markersize": 7, "marker": marker, "color": colour,
+               "markeredgecolor": theme.ink, "markeredgewidth": 0.6}
+        for name, (colour, marker) in zip(names, map(theme.mark, range(len(names))), strict=True)
+    }  # fmt: skip
+    if MEAN in marks:
+        marks[MEAN] |= {"marker": "o", "color": theme.ink, "markerfacecolor": "none"}
     values = table[["accuracy", "people"]]
     low = min(0.5, float(values.min(axis=None)) - 0.02)
     high = min(1.0, float(values.max(axis=None)) + 0.05)
     with matplotlib.rc_context(style(theme)):
         columns = 2 if len(models) == 1 else 3
-        figure, axes = panels(len(models), columns, (11 / columns, 9.2 / columns), above=0)
+        figure, axes = panels(len(models), columns, (11 / columns, 9.2 / columns), above=0.5)
         for axis, model in zip(axes, models, strict=True):
             rows = table[table["model"] == model]
             axis.plot([low, high], [low, high], color=theme.faint, linewidth=1, zorder=0)
             for name, x, y in rows[["scenario", "accuracy", "people"]].itertuples(index=False):
-                mean = name == MEAN
-                axis.plot(x, y, marker="o", markersize=6, color=theme.palette[0],
-                          markerfacecolor="none" if mean else theme.palette[0])  # fmt: skip
-                left = _has_neighbour(rows, x, y)
-                axis.annotate(name, (x, y), (-6 if left else 6, 4), textcoords="offset points",
-                              ha="right" if left else "left", fontsize=8)  # fmt: skip
+                axis.plot(x, y, **marks[name])
             axis.set_xlim(low, high)
             axis.set_ylim(low, high)
             axis.set_aspect("equal")
             axis.set_xlabel(f"accuracy of {label(str(model), 40)}")
             axis.set_ylabel("accuracy of people")
+        words = {name: "mean over scenarios" if name == MEAN else name for name in names}
+        legend(figure, [Line2D([], [], label=words[name], **marks[name]) for name in names], 5)
     return figure
-
-
-def _has_neighbour(table: pd.DataFrame, x: float, y: float) -> bool:
-    """Return whether another point is so close on the right that names would overlap."""
-    ahead = table["accuracy"] - x
-    return bool((ahead.between(1e-9, NEAR[0]) & ((table["people"] - y).abs() < NEAR[1])).any())

@@ -54,7 +54,7 @@ def scatter(inputs: ReportInputs) -> Plot | None:
     )
     if len(comparison.changed):
         caption += " Hollow: the simulated outcome is not the official one."
-    rest = comparison.models[inputs.scatter_limit :]
+    rest = [name for name in comparison.models if name not in shown]
     if rest:
         caption += f" Not drawn, but in tables/stimuli.csv: {', '.join(map(str, rest))}."
     return Plot("scatter", caption, tables.scatter_table(comparison, shown), scatter_figure)
@@ -177,16 +177,17 @@ def thirds(inputs: ReportInputs) -> Plot | None:
         return None
     caption = (
         "Pearson's r with the average person within the stimuli on which people are right up to a "
-        "third of the time (hard), from two thirds on (easy), and between (chance); all scenarios "
-        "pooled, intervals draw stimuli. Within hard and easy stimuli the answers of people nearly "
-        "determine the outcome, so a model that is always right has r below 0 in hard ones."
+        "third of the time (hard), from two thirds on (easy), and between (chance): mean over the "
+        "scenarios in which it is defined, with intervals by drawing scenarios, as in the paper. "
+        "Within hard and easy stimuli the answers of people nearly determine the outcome, so a "
+        "model that is always right has r below 0 in hard ones."
     )
     answers = None if inputs.people is None else inputs.people.kept.test
     if answers is not None:
         caption += (
-            " Dashed: mean r between random halves of the people within the same stimuli; grey: "
-            "the middle 95 % of these r. A half is a noisier average than all people, with whom "
-            "models are correlated."
+            " Dashed: mean r between random halves of the people within the same stimuli; hatched: "
+            "the middle 95 % of these r, its bounds averaged over scenarios. A half is a noisier "
+            "average than all people, with whom models are correlated."
         )
     table = tables.thirds_table(inputs.comparison, answers)
     draw = partial(measure_figure, measure="r")

@@ -142,7 +142,7 @@ def generalization_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
     trained, tested = (list(table[name].unique()) for name in ("trained", "tested"))
     widest = max(float(table["difference"].abs().max()), 0.01)
     with matplotlib.rc_context(style(theme)):
-        size = (0.46 * len(tested) + 1.2, 0.3 * len(trained) + 0.6)
+        size = (max(0.46 * len(tested) + 1.2, 3.7), 0.3 * len(trained) + 0.6)  # titles fit
         columns = max(1, min(int(12 / size[0]), 3, len(models)))
         figure, axes = panels(len(models), columns, size, above=0.8, sharex=True, sharey=True)
         image = None
