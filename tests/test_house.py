@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import itertools
+import re
 import subprocess
 import sys
 import tomllib
@@ -125,6 +127,36 @@ def test_no_module_names_one_of_a_higher_room() -> None:
 def test_modules_have_names_that_say_something() -> None:
     vague = {"utils", "util", "helpers", "helper", "common", "misc"}
     assert not [path for path in SOURCES if {path.stem, path.parent.name} & vague]
+
+
+FILES = ("csv", "parquet", "json", "jsonl.gz", "py")
+ELSEWHERE = {"datasets.load_dataset"}
+"""Names of other libraries that the package does not import."""
+
+
+def test_references_in_texts_name_what_exists() -> None:
+    """Each `module.name` in a docstring or comment: the module exists and has the name."""
+    words: dict[str, set[str]] = {}
+    texts = {path: path.read_text() for path in SOURCES}
+    for path, text in texts.items():
+        parts = _module(path).split(".")
+        words.setdefault(parts[-1], set()).update(re.findall(r"\w+", text))
+        for folder, member in itertools.pairwise(parts):
+            words.setdefault(folder, set()).add(member)
+    wrong = []
+    for path, text in texts.items():
+        for written in re.findall(r"(?<!`)`([a-z_]\w*(?:\.[A-Za-z_]\w*)+)`(?!`)", text):
+            first, second = written.split(".")[:2]
+            foreign = first in sys.stdlib_module_names or f"import {first}" in text
+            known = second in words.get(first, ()) or foreign or written in ELSEWHERE
+            if not known and not written.endswith(FILES):
+                wrong.append(f"{path.relative_to(ROOT)}: {written}")
+            if first == "physion" and any(
+                member not in words.get(folder, ()) and folder.islower()
+                for folder, member in itertools.pairwise(written.split("."))
+            ):
+                wrong.append(f"{path.relative_to(ROOT)}: {written}")
+    assert not wrong
 
 
 SAME_BYTES = [

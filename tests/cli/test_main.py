@@ -88,7 +88,7 @@ def test_doctor_names_the_command_that_installs_playwright(monkeypatch: pytest.M
     )
     (check,) = (check for check in doctor.packages() if check.name == "extra dev")
     assert not check.good and not check.needed
-    assert "playwright" in check.value and "physion-benchmark[dev]" in check.remedy
+    assert "playwright" in check.value and "-e '.[dev]'" in check.remedy
 
 
 def test_doctor_refuses_a_folder_that_is_not_there(

@@ -203,7 +203,7 @@ def test_the_page_on_own_models_leads_to_a_report(first_report: Path, tmp_path: 
     assert [shlex.split(line)[1] for line in lines] == ["run", "evaluate", "compare"]
     # Both tutorials make the same trials: those of the first are found by the second.
     made = first_report / "runs" / "first" / "trials"
-    shutil.copytree(made, tmp_path / "runs" / "official" / "trials")
+    shutil.copytree(made, tmp_path / "runs" / "my-model" / "trials")
     for line in lines:
         run(["bash", "-c", line], tmp_path)
     scripts = [block for block in blocks(page, "python") if not block.startswith("# my_")]

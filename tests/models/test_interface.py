@@ -205,4 +205,4 @@ except MissingExtraError as error:
     print(error)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "physion-benchmark[models]" in done.stdout
+    assert "-e '.[models]'" in done.stdout

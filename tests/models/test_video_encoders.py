@@ -251,4 +251,4 @@ except MissingExtraError as error:
     print(error)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "physion-benchmark[video]" in done.stdout
+    assert "-e '.[video]'" in done.stdout

@@ -433,4 +433,4 @@ def test_the_engine_without_its_package_names_the_extra() -> None:
         "    print(error)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "physion-benchmark[mujoco]" in done.stdout and "\n" not in done.stdout.strip()
+    assert "-e '.[mujoco]'" in done.stdout and "\n" not in done.stdout.strip()

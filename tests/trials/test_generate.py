@@ -369,7 +369,7 @@ def test_two_runs_on_one_folder_are_refused(tmp_path: Path) -> None:
 
 
 def test_other_settings_and_foreign_folders_are_refused(finished: Path, tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="other settings"):
+    with pytest.raises(BadInputError, match=r"settings\.width 256, now 64"):
         run(finished, scenes_named("a"), settings=GenerateSettings(width=64))
     (tmp_path / "thesis.tex").write_text("precious")
     with pytest.raises(BadInputError, match=r"contains 'thesis\.tex'"):

@@ -186,7 +186,7 @@ def right_answers_table(comparison: Comparison, models: Sequence[str]) -> pd.Dat
 
 
 def difficulty_table(comparison: Comparison, by_stimulus: pd.DataFrame | None) -> pd.DataFrame:
-    """Return the stimuli with people's accuracy and its tests; see `difficulty.below_chance_level`.
+    """Return the stimuli with people's accuracy and its tests; see `effects.below_chance_level`.
 
     ``by_stimulus``: all that people answered; without it those that any model predicts.
     """

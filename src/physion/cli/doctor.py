@@ -96,7 +96,7 @@ def packages() -> list[Check]:
     try:
         needed = requirements()
     except importlib.metadata.PackageNotFoundError:
-        remedy = f"pip install {DISTRIBUTION}, or in a clone: pip install -e ."
+        remedy = "in the clone: pip install -e . -c requirements.lock"
         return [Check(DISTRIBUTION, "not installed", False, remedy=remedy)]
     checks = []
     for package in needed.pop(""):
@@ -108,7 +108,9 @@ def packages() -> list[Check]:
         value = ", ".join(f"{name} {_version(name)}" for name in names)
         if missing:
             value = f"without {', '.join(missing)}"
-        remedy = f"pip install '{DISTRIBUTION}[{extra}]'" if missing else ""
+        remedy = (
+            f"in the clone: pip install -e '.[{extra}]' -c requirements.lock" if missing else ""
+        )
         checks.append(Check(f"extra {extra}", value, not missing, needed=False, remedy=remedy))
     return checks
 

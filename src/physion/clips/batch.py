@@ -122,7 +122,7 @@ class Spec:
 class Motion:
     """Scene and motion of one trial.
 
-    Under a predicting protocol ``trajectory`` ends with frame 44 (`models.observed`).
+    Under a predicting protocol ``trajectory`` ends with frame 44 (`source.ObservedSource`).
     """
 
     scene: Scene

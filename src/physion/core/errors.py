@@ -82,8 +82,8 @@ class MissingExtraError(PhysionError):
 
     def __init__(self, what: str, extra: str) -> None:
         super().__init__(
-            f"{what} needs the extra {extra!r}: pip install 'physion-benchmark[{extra}]', "
-            f"or in a clone: pip install -e '.[{extra}]' -c requirements.lock"
+            f"{what} needs the extra {extra!r}: in the clone, "
+            f"pip install -e '.[{extra}]' -c requirements.lock"
         )
         self.extra = extra
 

@@ -7,7 +7,7 @@ times are milliseconds of the browser's monotonic clock.
 ============================  =========================  ==========================================
 request                       body, answer               meaning
 ============================  =========================  ==========================================
-``GET /api/study``            `public_study.PublicStudy`  settings that the page needs before a
+``GET /api/study``            `PublicStudy`              settings that the page needs before a
                                                          session begins
 ``GET /api/texts/{language}`` flat object of texts       texts of the pages
 ``POST /api/enter``           `Enter`, `Entered`         continue a session, or show the consent

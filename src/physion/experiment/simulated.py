@@ -135,7 +135,7 @@ GO_ON = ("out_of_order", "already_answered", "wrong_stage", "not_shown")
 
 
 class RefusedError(PhysionError):
-    """Refusal by the server: a ``code`` of `wire.REFUSALS` and the session's state, if sent."""
+    """Refusal by the server: a ``code`` of `protocol.REFUSALS` and the session's state, if sent."""
 
     def __init__(self, refusal: wire.Refusal) -> None:
         super().__init__(refusal.message)

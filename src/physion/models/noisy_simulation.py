@@ -435,7 +435,7 @@ def cut_trial(scene: Scene, trajectory: Trajectory) -> ObservedTrial:
 
 
 class NoisySimulation(Model):
-    """Model that simulates the rest of a trial several times with noise; see the module.
+    """Simulate the rest of a trial several times with noise, whose levels are given or fitted.
 
     ``engine`` is an engine object for use in this process; by default the settings name one.
     """

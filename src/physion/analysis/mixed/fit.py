@@ -405,7 +405,7 @@ def fit_logistic(formula: str, data: pd.DataFrame, level: float = 0.95) -> Mixed
     """Fit a logistic mixed model such as ``correct ~ scenario + x + (1 + x|participant) +
     (1|stimulus)``.
 
-    The response is a column of True/False or 0/1; `mixed.formula` lists what formulas may contain.
+    The response is a column of True/False or 0/1; `mixed.design` lists what formulas may contain.
     The table has Wald tests: statistic z, df infinite. ``level``: of the intervals.
 
     Rows with a missing value are left out, counted in ``missing`` and named in ``warnings``. Raises

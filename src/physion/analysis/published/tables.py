@@ -705,7 +705,7 @@ NOT_MADE = {
 def figure_s1(tables: PublishedTables) -> pd.DataFrame:
     """Return the accuracy of people by stimulus: the top of figure S1, for all eight scenarios.
 
-    Columns: see `difficulty.below_chance_level`.
+    Columns: see `effects.below_chance_level`.
     """
     return below_chance_level(tables.stimuli)
 

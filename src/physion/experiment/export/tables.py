@@ -56,7 +56,7 @@ def arrow_schema(columns: Sequence[Column]) -> pa.Schema:
 
 
 def as_frame(table: pa.Table, columns: Sequence[Column]) -> pd.DataFrame:
-    """Convert an Arrow table to a data frame with the types of `response_schema.check_table`."""
+    """Convert an Arrow table to a data frame with the types of `tables.check_table`."""
     nullable = {pa.int64(): pd.Int64Dtype(), pa.bool_(): pd.BooleanDtype()}
     frame = table.to_pandas(types_mapper=nullable.get)
     typed = {}
@@ -594,7 +594,7 @@ def read_tables(
     Returns
     -------
     tuple of DataFrame
-        Trials and sessions, with the types of `response_schema.check_table`.
+        Trials and sessions, with the types of `tables.check_table`.
 
     Raises
     ------

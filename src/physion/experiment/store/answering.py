@@ -485,7 +485,7 @@ class FetchedMedia:
         Parameters
         ----------
         tag
-            `media_links.session_tag` of the session.
+            `media.session_tag` of the session.
         started_at
             When the session began.
         phase, trial

@@ -137,7 +137,7 @@ the session, separated by commas; NULL without any.
 ``next_from``: earliest time at which the next trial can have begun. ``fast_answers``,
 ``unfetched``, ``replayed``: number of answers that were too fast, whose media were not fetched, and
 whose movie was shown too often. ``implausible``: reasons, separated by commas, for which the
-session is no person's (`plausibility.REASONS`); NULL without any."""
+session is no person's (`judging.REASONS`); NULL without any."""
 
 PAUSES = Table(
     "pauses",

@@ -108,7 +108,7 @@ class Courses:
         ------
         Refused
             The study no longer has the scenario, which can only happen to previews
-            (`study_record.register`).
+            (`store.register`).
         """
         if not self.has(session):
             raise Refused(

@@ -3,12 +3,12 @@
 ::
 
     STUDY/
-      study.toml            settings: this module
+      study.toml            settings (`settings`)
       texts/en.toml, ...    texts of all pages, one file per language
       stimuli.csv           stimuli and their outcomes; never served
       media/                movies and maps, named by the hash of their content
       secret.json           keys and the experimenter's password hash (mode 600)
-      responses.sqlite      the data, unless another database is given
+      responses.sqlite      the data
 """
 
 from __future__ import annotations

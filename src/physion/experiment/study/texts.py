@@ -8,7 +8,7 @@ Some texts may be absent: ``study.title``, in place of the title of ``study.toml
 ``consent.check_1`` to ``consent.check_9``, boxes that must be ticked to agree; and
 ``scenario.NAME.KEY`` and ``condition.NAME.KEY``, in place of the text ``KEY`` in the sessions of
 one scenario or condition (the condition comes first). The texts of
-a study's own questions (`questions.Question.text_keys`) are needed in each language. A file
+a study's own questions (`settings.Question.text_keys`) are needed in each language. A file
 ``consent-LANGUAGE.pdf`` next to the texts is the consent form as a file; pictures of questions are
 PNG files there.
 """

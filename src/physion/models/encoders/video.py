@@ -6,7 +6,7 @@ last observed frame. What follows, which *full* reads, is encoded in further cli
 that no feature of the context depends on a later frame. The last one repeats the last frame.
 
 Features are (B, T / 2, D), the means of the tokens at one time; with ``grid`` (B, T / 2, R C D),
-the means in R x C cells (`models.weights.grid`).
+the means in R x C cells (`encoder.GRID`).
 """
 
 from __future__ import annotations

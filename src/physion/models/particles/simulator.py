@@ -384,9 +384,9 @@ _INLIER = 0.1
 
 
 class ParticleSimulator(TorchModel):
-    """Graph network that learns how particles move, and imagines by moving them step by step.
+    """GNS, GNS-RANSAC or DPI-Net, by name: a graph network that learns how particles move.
 
-    GNS, GNS-RANSAC or DPI-Net, by the name in the settings.
+    It imagines by moving them step by step.
 
     ``touch`` (2,): metres; agent and patient touch if they come at most this close, two bodies and
     a cloth and a body. It is fitted after training (`calibrate`) and stored with the weights.

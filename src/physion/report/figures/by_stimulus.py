@@ -280,7 +280,7 @@ def difficulty_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
     """Draw the distribution of people's accuracy over stimuli, by scenario, with the tail below
     chance.
 
-    ``table``: from `difficulty.below_chance_level`.
+    ``table``: from `effects.below_chance_level`.
     """
     scenarios = in_order(table["scenario"])
     with matplotlib.rc_context(style(theme)):

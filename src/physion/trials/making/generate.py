@@ -230,12 +230,16 @@ def _fix_settings(
     if path.is_file():
         known = read_json(path, dict[str, Any])
         before = known.pop("presets", {})
-        differs = [name for name in wanted if known.get(name) != wanted[name]]
-        differs += [name for name in presets if before.get(name, presets[name]) != presets[name]]
+        differs = _differences(known, wanted)
+        differs += [
+            f"preset values of {name}"
+            for name in presets
+            if before.get(name, presets[name]) != presets[name]
+        ]
         if differs or known.keys() != wanted.keys():
             raise BadInputError(
-                f"{folder} was made with another dataset name, other settings or other versions "
-                f"({', '.join(differs)}), see {path}; choose another folder"
+                f"{folder} was made with other settings: {', '.join(differs)}; see {path}, and "
+                "choose another folder with --out or the same settings"
             )
         presets = {**before, **presets}
         if presets == before:
@@ -247,6 +251,20 @@ def _fix_settings(
         )
     text = json.dumps({**wanted, "presets": presets}, indent=1, sort_keys=True) + "\n"
     write_atomic(path, text.encode())
+
+
+def _differences(
+    known: Mapping[str, Any], wanted: Mapping[str, Any], prefix: str = ""
+) -> list[str]:
+    """Name each value that differs, with the known value and the wanted one."""
+    found: list[str] = []
+    for name, value in wanted.items():
+        old = known.get(name)
+        if isinstance(value, Mapping) and isinstance(old, Mapping):
+            found += _differences(old, value, f"{prefix}{name}.")
+        elif old != value:
+            found.append(f"{prefix}{name} {old!r}, now {value!r}")
+    return found
 
 
 def _presets_in_use(tasks: Sequence[TrialTask]) -> dict[str, dict[str, str]]:
