@@ -17,8 +17,9 @@ For all but the first, a run without the event counts as density 0 before the mi
 are divided into folds; for each fold the value with the largest sum over the *other* folds is
 chosen, and its gain over the present value is counted on the fold itself. A change is worth keeping
 if this gain is larger than its standard error over configurations. Only trials with a shape that
-the quantity concerns are simulated; a quantity with trials of one configuration only cannot be
-cross-validated. ``--write`` appends a table to benchmarks/results/calibration.md.
+the quantity concerns are simulated. With trials of one or two configurations, single trials take
+the place of configurations, which tells less: they share what is wrong with their configuration.
+``--write`` appends a table to benchmarks/results/calibration.md.
 """
 
 from __future__ import annotations
@@ -311,7 +312,10 @@ def main() -> None:
                 table.append([found[i] for i in indices])
             rows = np.array(table)
             total = rows[:, :, : len(PARTS)].sum(axis=2)
-            gain, error, chosen = cross_validate(total, configurations)
+            groups = configurations
+            if len(set(configurations)) < 3:
+                groups = [_trials[i].scene.name for i in indices]
+            gain, error, chosen = cross_validate(total, groups)
             lines += report(quantity, rows, gain, error, chosen, time.time() - started)
             print("\n".join(lines[-len(quantity.values) - 6 :]), flush=True)
     if options.write:

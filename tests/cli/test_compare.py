@@ -66,9 +66,10 @@ def test_two_columns_are_enough_and_the_terminal_shows_the_results(
         table = pd.DataFrame({columns[0]: names, columns[1]: p})
         table.to_csv(tmp_path / f"{name}.csv", index=False)
     files = [str(tmp_path / f"{name}.csv") for name in ("good", "same")]
-    command = ["compare", *files, "--humans", "official", "--out", str(tmp_path / "out")]
-    assert main(command) == 0
+    command = ["compare", *files, "--out", str(tmp_path / "out")]
+    assert main([*command, "--humans", "official"]) == 0
     out = capsys.readouterr().out
+    assert main(command) == 0 and capsys.readouterr().out == out, "known by the stimuli's names"
     lines = [line for line in out.splitlines() if line.strip()]
     assert lines[1].split() == ["model", "stimuli", "accuracy", "r", "with", "people", "kappa"]
     rows = [re.split(r"\s{2,}", line) for line in lines[2:-1]]
@@ -77,6 +78,40 @@ def test_two_columns_are_enough_and_the_terminal_shows_the_results(
     ]  # fmt: skip
     assert rows[1][2] == "1.000 [1.000, 1.000]" and rows[1][1:] == rows[2][1:]
     assert lines[-1] == f"report: {tmp_path / 'out' / 'report.html'}"
+
+
+def test_the_recorded_outcome_decides_and_differences_are_listed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Movies and a simulation of the same stimuli, of which seven end otherwise in the latter."""
+    labels = physion_official().labels
+    names = sorted(name for name in labels if name.startswith("pilot_it2_drop"))
+    other = set(names[::20][:7])
+    for name, differ in (("movies", set()), ("simulated", other)):
+        rows = [f"{one},{0.9 if labels[one] else 0.2},{labels[one] != (one in differ)}\n"
+                for one in names]  # fmt: skip
+        (tmp_path / f"{name}.csv").write_text("stimulus,probability,outcome\n" + "".join(rows))
+    files = [str(tmp_path / f"{name}.csv") for name in ("movies", "simulated")]
+    assert main(["compare", *files, "--out", str(tmp_path / "out")]) == 0
+    out = capsys.readouterr().out
+    rows = [line.split() for line in out.splitlines() if line.startswith(("movies", "simulated"))]
+    assert [row[2] for row in rows] == ["1.000", "1.000"], "both are right about what was recorded"
+    (note,) = (line for line in out.splitlines() if line.startswith("note: "))
+    assert f"7 of {rows[0][1]} stimuli" in note and "and 2 more" in note
+    assert set(re.findall(r"pilot_it2_drop\w+", note)) < other
+    listed = pd.read_csv(tmp_path / "out" / "tables" / "changed_outcomes.csv")
+    assert set(listed["stimulus"]) == other and set(listed["models"]) == {"simulated"}
+
+
+def test_own_stimuli_need_an_outcome(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "own.csv").write_text("stimulus,p\nmine_1,0.3\nmine_2,0.7\n")
+    assert main(["compare", str(tmp_path / "own.csv"), "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert "no outcome" in error and "'mine_1'" in error and "--labels" in error
+    (tmp_path / "own.csv").write_text("stimulus,p,outcome\nmine_1,0.3,0\nmine_2,0.7,0\n")
+    assert main(["compare", str(tmp_path / "own.csv"), "--out", str(tmp_path / "out")]) == 0
+    (row,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("own"))
+    assert row.split()[1:3] == ["2", "0.500"], "p > 0.5 for one of two that never touch"
 
 
 def test_page_and_terminal_show_the_same_average(capsys: pytest.CaptureFixture[str]) -> None:

@@ -371,6 +371,11 @@ def compare_scores(
     else:
         raise BadInputError("people's answers need the official outcomes: give the labels")
     warnings = check_probabilities(rows) + check_labels_of_people(people, set(rows["stimulus"]))
+    if humans is None and people["label"].isna().all():
+        raise BadInputError(
+            f"no outcome of the predicted stimuli is known, such as {rows['stimulus'].iloc[0]!r}: "
+            "add a column outcome to the predictions, or give the labels (--labels)"
+        )
     people, dropped_people = _drop(people, unwanted, exclude_ledge)
     stimuli = _join(rows, people)
     dropped = [dropped_people, *_unmatched(rows, people, unwanted, exclude_ledge)]

@@ -1,7 +1,7 @@
 """Compare predictions with people: a table on the terminal, and a report with figures.
 
-`physion compare FILES... --humans official`: models next to the people of the original study. A
-file needs two columns, stimulus and p_contact.
+`physion compare FILES...`: models next to the people of the original study. A file needs two
+columns, stimulus and p_contact.
 
 `physion compare FILES... --responses FILE`: models next to single participants.
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from physion.analysis.check import Checked, Reference
     from physion.analysis.published.claims import PublishedResults
+    from physion.report.compare import CompareResult
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Options:
     """Files of predictions; none with --responses: a report about people."""
     humans: Path | None = None
     """Answers of people by stimulus: official (shipped with the package), or a folder with
-    human_accuracy-*.csv."""
+    human_accuracy-*.csv; if not given, official for stimuli of the original study."""
     responses: tuple[Path, ...] = ()
     """Answers of single participants, in place of --humans: our export or the study's raw files."""
     labels: Path | None = None
@@ -136,8 +137,25 @@ def _compare(options: Options) -> int:
         print(json_module.dumps({"report": str(page), "scores": scores, **numbers}))
     else:
         print_scores(result)
+        _print_changed(result)
         _print(f"report: {page}")
     return 0
+
+
+def _print_changed(result: CompareResult) -> None:
+    """Name the stimuli whose simulated outcome is not the recorded one."""
+    from physion.report.inputs import ReportInputs
+
+    if not isinstance(result.inputs, ReportInputs) or result.inputs.comparison.changed.empty:
+        return
+    comparison = result.inputs.comparison
+    names, shown = list(comparison.changed["stimulus"]), 5
+    more = f" and {len(names) - shown} more" if len(names) > shown else ""
+    _print(
+        f"note: {len(names)} of {comparison.stimuli['stimulus'].nunique()} stimuli ended otherwise "
+        f"in a simulation than recorded; the recorded outcome counts: {', '.join(names[:shown])}"
+        f"{more} (tables/changed_outcomes.csv)"
+    )
 
 
 # --- check ---------------------------------------------------------------------------------------

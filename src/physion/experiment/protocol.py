@@ -361,7 +361,7 @@ class PageDone(Message):
     ``block`` {block: optional, index of the current block}; ``instructions`` and ``withdraw`` {}.
     """
 
-    page: Stage | Literal["withdraw"]
+    page: Literal[Stage, "withdraw"]
     data: Annotated[dict[Name, bool | int | float | Text | Names | None],
                     Field(max_length=50)] = {}  # fmt: skip
 

@@ -48,7 +48,7 @@ from physion.analysis.tables import (
     require_columns,
 )
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.data.official import find_official
+from physion.data.official import PACKAGED, find_official, official
 from physion.report.build import build_people_report, build_report
 from physion.report.html import plural
 from physion.report.inputs import PeopleReport, ReportInputs
@@ -188,7 +188,8 @@ def compare(
     humans
         Averages of people: ``official`` for the shipped ones, a folder of
         ``human_accuracy-*.csv``, or a table with ``stimulus``, ``scenario``, ``accuracy`` and
-        ``count``.
+        ``count``. None: ``official`` if the predictions name stimuli of the original study and
+        there are no ``labels``, else nobody.
     responses
         Answers of single participants in place of ``humans``: the file of our export, or the
         study's raw files.
@@ -290,6 +291,9 @@ def compare(
                 "sessions, expected, attributes, accepted rules, chosen values (where) and "
                 "simulated participants are about responses: give those"
             )
+        if humans is None and labels is None:
+            of_study = not official().labels.keys().isdisjoint(rows["stimulus"])
+            humans = PACKAGED if of_study else None
         averages = _averages(rows, humans, labels, zone, dominoes)
         methods = dict(averages.methods)
         results = all_results(

@@ -474,7 +474,9 @@ def test_sessions_with_stimuli_of_their_own_are_not_judged_without_a_list() -> N
     assert (flags["trials"] == 10).all() and (flags["expected"] == 0).all()
     assert not flags["incomplete"].any()
     (warning,) = completeness_warnings(found, None)
-    assert "--expected" in warning and "9 sessions" in warning
+    assert "give the study's list (--expected)" in warning and "9 sessions" in warning
+    (warning,) = completeness_warnings(found, {"drape": DROP})
+    assert "give" not in warning and "names none of its stimuli" in warning, "it was given"
     seen = found.test.groupby("session")["stimulus"].agg(frozenset).to_dict()
     assert completeness_warnings(found, seen) == []
     seen["drop-s004"] |= {"drop_031"}

@@ -245,6 +245,12 @@ class TestTexts:
             assert_refused(answer, 404, "not_found")
 
 
+def test_an_unknown_page_is_named_by_its_field_with_the_known_ones(site: Served) -> None:
+    body = {"page": "nowhere", "data": {}}
+    message = assert_refused(site.client.post("/api/page", json=body))
+    assert message.startswith("page: ") and "'consent'" in message and "?" not in message
+
+
 class TestSignatures:
     def test_signatures_of_another_study_are_refused(self, site: Served, tmp_path: Path) -> None:
         other = make_tiny_study(tmp_path / "other", familiarization=1, test=3, size=64)

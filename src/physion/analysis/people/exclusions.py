@@ -131,9 +131,14 @@ def completeness_warnings(responses: Responses, expected: Expected | None) -> li
         sessions = set(responses.test.loc[responses.test["scenario"] == scenario, "session"])
         rows = others[others["scenario"] == scenario]
         if not any(of_session[session] for session in sessions):
+            advice = (
+                "the study's list (--expected) names none of its stimuli"
+                if expected is not None
+                else "give the study's list (--expected)"
+            )
             found.append(
                 f"{scenario}: no stimulus was answered by half of the {len(sessions)} sessions, so "
-                "no session with answers counts as incomplete; give the study's list (--expected)"
+                f"no session with answers counts as incomplete; {advice}"
             )
         elif len(rows):
             which, consequence = (
