@@ -103,13 +103,18 @@ def test_the_recorded_outcome_decides_and_differences_are_listed(
     assert set(listed["stimulus"]) == other and set(listed["models"]) == {"simulated"}
 
 
-def test_own_stimuli_need_an_outcome(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "own.csv").write_text("stimulus,p\nmine_1,0.3\nmine_2,0.7\n")
-    assert main(["compare", str(tmp_path / "own.csv"), "--out", str(tmp_path / "out")]) == 2
-    error = capsys.readouterr().err
-    assert "no outcome" in error and "'mine_1'" in error and "--labels" in error
-    (tmp_path / "own.csv").write_text("stimulus,p,outcome\nmine_1,0.3,0\nmine_2,0.7,0\n")
-    assert main(["compare", str(tmp_path / "own.csv"), "--out", str(tmp_path / "out")]) == 0
+def test_own_stimuli_need_scenario_and_outcome(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "own.csv"
+    command = ["compare", str(file), "--out", str(tmp_path / "out")]
+    for more, cells, advice in (("", "", "column scenario"), (",scenario", ",drop", "--labels")):
+        file.write_text(f"stimulus,p{more}\nmine_1,0.3{cells}\nmine_2,0.7{cells}\n")
+        assert main(command) == 2
+        error = capsys.readouterr().err
+        assert "'mine_1'" in error and advice in error
+    file.write_text("stimulus,p,scenario,outcome\nmine_1,0.3,drop,0\nmine_2,0.7,drop,0\n")
+    assert main(command) == 0
     (row,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("own"))
     assert row.split()[1:3] == ["2", "0.500"], "p > 0.5 for one of two that never touch"
 

@@ -371,11 +371,8 @@ def compare_scores(
     else:
         raise BadInputError("people's answers need the official outcomes: give the labels")
     warnings = check_probabilities(rows) + check_labels_of_people(people, set(rows["stimulus"]))
-    if humans is None and people["label"].isna().all():
-        raise BadInputError(
-            f"no outcome of the predicted stimuli is known, such as {rows['stimulus'].iloc[0]!r}: "
-            "add a column outcome to the predictions, or give the labels (--labels)"
-        )
+    if humans is None:
+        _refuse_unknown_stimuli(people)
     people, dropped_people = _drop(people, unwanted, exclude_ledge)
     stimuli = _join(rows, people)
     dropped = [dropped_people, *_unmatched(rows, people, unwanted, exclude_ledge)]
@@ -416,6 +413,21 @@ def _refuse_two_outcomes(rows: pd.DataFrame, known: Mapping[str, bool]) -> None:
             f"two models were shown {several[several > 1].index[0]!r} with different outcomes, and "
             "no official outcome is known; give the labels, or compare models on one set of trials"
         )
+
+
+def _refuse_unknown_stimuli(people: pd.DataFrame) -> None:
+    """Raise `BadInputError` if the scenario, or the outcome, of no predicted stimulus is known."""
+    advice = {
+        "scenario": "add a column scenario",
+        "label": "add a column outcome, or give the labels (--labels)",
+    }
+    for column, words in advice.items():
+        if people[column].isna().all():
+            what = "outcome" if column == "label" else column
+            raise BadInputError(
+                f"the {what} of no predicted stimulus is known, such as of "
+                f"{people['stimulus'].iloc[0]!r}; {words}"
+            )
 
 
 def _recorded(rows: pd.DataFrame) -> dict[str, bool]:
