@@ -18,6 +18,7 @@ from physion.rendering.rasterizer import (
     Triangles,
     VisibilityBuffer,
     barycentric,
+    bound_blocks,
     fill_geometry_buffers,
     lit_fraction,
     occluded_fraction,
@@ -193,7 +194,9 @@ def depth_map(depth: NDArray[np.float64] | float, occupied: bool = True) -> Dept
     """Return a map whose texel coordinates and depth are the world's x, y and z."""
     matrix = np.eye(3, 4)
     texels = np.array(np.broadcast_to(depth, (MAP_SIZE, MAP_SIZE)), np.float32)
-    return DepthMap(matrix, texels, np.full((4, 4), occupied), np.zeros((4, 4), bool))
+    bounds = np.zeros((4, 4, 2), np.float32)
+    bound_blocks(texels, np.ones((4, 4), bool), bounds)
+    return DepthMap(matrix, texels, np.full((4, 4), occupied), np.zeros((4, 4), bool), bounds)
 
 
 def half_blocked(column: int, depth: float = 0.0) -> DepthMap:

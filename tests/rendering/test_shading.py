@@ -115,8 +115,12 @@ def plane(
 
 def shaded_points(inputs: ShadingInputs, buffer: VisibilityBuffer) -> NDArray[np.void]:
     """Return the `POINT` of each pixel of a plane that never moves."""
-    known, colors = keep_nothing(SIZE, SIZE), np.zeros((SIZE, SIZE, 3), np.uint8)
-    shade(buffer, 1, inputs, LightMaps(flat_map(np.inf), flat_map(np.inf)), known, colors)
+    maps, colors = (
+        LightMaps(flat_map(np.inf), flat_map(np.inf)),
+        np.zeros((SIZE, SIZE, 3), np.uint8),
+    )
+    known = keep_nothing(SIZE, SIZE, maps)
+    shade(buffer, 1, inputs, maps, known, colors)
     return known.points[:-1]
 
 
@@ -241,7 +245,8 @@ def flat_map(depth: float) -> DepthMap:
     size = 8 * BLOCK
     matrix = np.array([[4.0, 0, 0, size / 2], [0, 4.0, 0, size / 2], [0, 0, -1.0, 0]])
     everywhere, nowhere = np.ones((8, 8), bool), np.zeros((8, 8), bool)
-    return DepthMap(matrix, np.full((size, size), depth, np.float32), everywhere, nowhere)
+    depths, bounds = (np.full(shape, depth, np.float32) for shape in ((size, size), (8, 8, 2)))
+    return DepthMap(matrix, depths, everywhere, nowhere, bounds)
 
 
 @pytest.mark.parametrize("kept", [0, 1])
@@ -255,7 +260,7 @@ def test_shadow_takes_its_fraction_only_of_the_direct_light(kept: int) -> None:
     # nearer than that. Depths of the map are heights with the sign reversed.
     for blocker, direct in ((np.inf, 1.0), (-1.0, 0.25), (0.0, 1.0), (-0.02, 1.0), (-0.04, 0.25)):
         colors, maps = np.zeros((SIZE, SIZE, 3), np.uint8), LightMaps(flat_map(blocker), nothing)
-        known = keep_nothing(SIZE, SIZE)
+        known = keep_nothing(SIZE, SIZE, maps)
         for _ in range(1 + kept):
             shade(buffer, kept, inputs, maps, known, colors)
         assert known.colored.all() == bool(kept)
@@ -269,7 +274,7 @@ def test_occlusion_under_objects_takes_its_fraction_of_all_light() -> None:
     inputs, buffer = plane(0.0, light, material_of())
     colors = np.zeros((SIZE, SIZE, 3), np.uint8)
     maps = LightMaps(flat_map(np.inf), flat_map(0.0))
-    shade(buffer, 0, inputs, maps, keep_nothing(SIZE, SIZE), colors)
+    shade(buffer, 0, inputs, maps, keep_nothing(SIZE, SIZE, maps), colors)
     assert abs(int(colors[MIDDLE, MIDDLE, 0]) - BYTES * 0.4 * 0.5 * 1.8) <= 1
 
 

@@ -12,9 +12,11 @@ from physion.rendering.rasterizer import (
     LIGHT,
     DepthMap,
     Records,
+    bound_blocks,
     mark_neighbours,
     rasterize_depth,
     restore_blocks,
+    transform,
 )
 from physion.rendering.rooms import Room
 from physion.rendering.shading import TONES, WHITEST
@@ -62,29 +64,36 @@ class StaticDepthMap:
         self._depth = self._static.copy()
         self._drawn = np.zeros((size // BLOCK, size // BLOCK), np.bool_)
         self._occupied = np.zeros_like(self._drawn)
+        self._bounds = np.full((*self._drawn.shape, 2), np.inf, np.float32)
+        self._texels = np.zeros((0, 3))
 
     def draw_static(self, vertices: F64, faces: I32, first: int, last: int) -> None:
         """Draw the triangles ``first:last`` of what never moves; vertices (V, 3) in the world."""
         drawn = np.zeros_like(self._drawn)
-        rasterize_depth(self._to_texels(vertices), faces, first, last, self._static, drawn)
+        self._texels = np.empty_like(vertices)
+        transform(self.matrix, vertices, 0, self._texels)
+        rasterize_depth(self._texels, faces, first, last, self._static, drawn)
         mark_neighbours(drawn, self._occupied)
+        bound_blocks(self._static, drawn, self._bounds)
         self._depth[...] = self._static
 
-    def with_moving(self, vertices: F64, faces: I32, first: int) -> DepthMap:
-        """Return the map of one frame, in which the triangles from ``first`` on move.
+    def with_moving(self, vertices: F64, first_vertex: int, faces: I32, first: int) -> DepthMap:
+        """Return the map of one frame; the next call changes its ``depth``.
 
-        The next call changes its ``depth``.
+        Parameters
+        ----------
+        vertices, first_vertex
+            (V, 3) in the world, and the first of them that moves.
+        faces, first
+            (T, 3) vertex indices, and the first triangle that moves.
         """
         restore_blocks(self._static, self._depth, self._drawn)
-        points = self._to_texels(vertices)
-        rasterize_depth(points, faces, first, len(faces), self._depth, self._drawn)
-        moved = np.zeros_like(self._drawn)
+        transform(self.matrix, vertices, first_vertex, self._texels)
+        rasterize_depth(self._texels, faces, first, len(faces), self._depth, self._drawn)
+        moved, bounds = np.zeros_like(self._drawn), self._bounds.copy()
         mark_neighbours(self._drawn, moved)
-        return DepthMap(self.matrix, self._depth, self._occupied | moved, moved)
-
-    def _to_texels(self, vertices: F64) -> F64:
-        """Return texel x, texel y and depth in metres (V, 3) of world points (V, 3)."""
-        return apply(self.matrix[:, :3], vertices) + self.matrix[:, 3]
+        bound_blocks(self._depth, self._drawn, bounds)
+        return DepthMap(self.matrix, self._depth, self._occupied | moved, moved, bounds)
 
 
 def empty_maps(scene: Scene, room: Room) -> tuple[StaticDepthMap, StaticDepthMap]:

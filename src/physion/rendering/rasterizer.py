@@ -108,6 +108,18 @@ class SurfaceMotion(NamedTuple):
 
 
 @kernel
+def transform(matrix: F64, points: F64, first: int, out: F64) -> None:
+    """Write a matrix (3, 4) times the points (V, 3) from index ``first`` on to ``out`` (V, 3).
+
+    The bits are those of `physion.numerics.linear_algebra.apply` and an addition.
+    """
+    for i in range(first, points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        for k in range(3):
+            out[i, k] = matrix[k, 0] * x + matrix[k, 1] * y + matrix[k, 2] * z + matrix[k, 3]
+
+
+@kernel
 def _bounds(points: F64, face: I32, near: float) -> tuple[float, float, float, float]:
     """Return left, right, top and bottom in pixels of the part of a triangle beyond ``near``.
 
@@ -318,6 +330,23 @@ def restore_blocks(static: F32, depth: F32, drawn: Bools) -> None:
 
 
 @kernel
+def bound_blocks(depth: F32, drawn: Bools, bounds: F32) -> None:
+    """Write the smallest and the largest depth of each true block to ``bounds`` (rows, columns, 2).
+
+    ``depth`` and ``drawn`` as in `rasterize_depth`.
+    """
+    for i in range(drawn.shape[0]):
+        for j in range(drawn.shape[1]):
+            if drawn[i, j]:
+                low = high = depth[i * BLOCK, j * BLOCK]
+                for row in range(i * BLOCK, (i + 1) * BLOCK):
+                    for column in range(j * BLOCK, (j + 1) * BLOCK):
+                        low = min(low, depth[row, column])
+                        high = max(high, depth[row, column])
+                bounds[i, j, 0], bounds[i, j, 1] = low, high
+
+
+@kernel
 def mark_neighbours(blocks: Bools, marked: Bools) -> None:
     """Mark the true blocks of a map and their eight neighbours, whatever was marked before."""
     rows, columns = blocks.shape
@@ -450,12 +479,15 @@ class DepthMap(NamedTuple):
       which, there is anything. Elsewhere a lookup is skipped.
     - ``moved``, of the same shape: blocks in which, or in a neighbour of which, something that
       moves is nearest. Elsewhere a lookup gives the same in every frame.
+    - ``bounds`` (H / BLOCK, W / BLOCK, 2) float32: smallest and largest depth of each block, by
+      which most lookups are known without reading the texels.
     """
 
     matrix: F64
     depth: F32
     occupied: Bools
     moved: Bools
+    bounds: F32
 
 
 @kernel
@@ -472,6 +504,25 @@ def block_index(depth_map: DepthMap, px: float, py: float, pz: float, radius: in
     if x < radius or y < radius or x >= width - radius - 1 or y >= height - radius - 1:
         return -1
     return int(int(y) // BLOCK * (width // BLOCK) + int(x) // BLOCK)
+
+
+@kernel
+def _window_bounds(bounds: F32, i: int, j: int, low: int, high: int) -> tuple[float, float]:
+    """Return the smallest and the largest depth of the blocks of the texels that a lookup reads.
+
+    They are in rows i + low to i + high and columns j + low to j + high, at most `BLOCK` each.
+    """
+    top, left, bottom, right = i + low, j + low, i + high, j + high
+    top, left, bottom, right = top // BLOCK, left // BLOCK, bottom // BLOCK, right // BLOCK
+    least = min(
+        min(bounds[top, left, 0], bounds[top, right, 0]),
+        min(bounds[bottom, left, 0], bounds[bottom, right, 0]),
+    )
+    most = max(
+        max(bounds[top, left, 1], bounds[top, right, 1]),
+        max(bounds[bottom, left, 1], bounds[bottom, right, 1]),
+    )
+    return least, most
 
 
 @kernel
@@ -500,6 +551,15 @@ def lit_fraction(shadow: DepthMap, px: float, py: float, pz: float) -> float:
     z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
     ax, ay = x - j, y - i
     total = 0.0
+    least, most = _window_bounds(shadow.bounds, i, j, low, high)
+    if most < z:
+        return 0.0
+    if least >= z:  # the sum below for all texels, in its order, which gives its bits
+        line = high - low - 1.0 + (1.0 - ax) + ax
+        total = line * (1.0 - ay)
+        for _ in range(low + 1, high):
+            total += line
+        return float((total + line * ay) / SHADOW_AREA)
     for row in range(low, high + 1):
         line = 0.0
         for column in range(low + 1, high):
@@ -531,6 +591,9 @@ def occluded_fraction(occlusion: DepthMap, px: float, py: float, pz: float) -> f
         return 0.0
     j, i = int(x), int(y)
     if not occupied[i // BLOCK, j // BLOCK]:
+        return 0.0
+    least, most = _window_bounds(occlusion.bounds, i, j, low, high)
+    if least - pz >= OCCLUSION_REACH or most - pz <= -OCCLUSION_TOLERANCE:
         return 0.0
     ax, ay = x - j, y - i
     total = 0.0

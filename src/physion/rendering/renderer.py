@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.numerics.linear_algebra import apply
 from physion.physics.trajectory import Trajectory
 from physion.rendering.camera import View
 from physion.rendering.light import StaticDepthMap, empty_maps, pack_light, tone_table
@@ -33,6 +32,7 @@ from physion.rendering.rasterizer import (
     fill_geometry_buffers,
     rasterize,
     restore_pixels,
+    transform,
 )
 from physion.rendering.rooms import Room, rooms
 from physion.rendering.shading import KeptPixels, keep_nothing, shade
@@ -200,13 +200,14 @@ class Renderer:
 
     def _to_pixels(self, vertices: F64) -> F64:
         """Return the homogeneous pixels (V, 3) of world points (V, 3)."""
-        return apply(self._projection[:, :3], vertices) + self._projection[:, 3]
+        points = np.empty_like(vertices)
+        transform(self._projection, vertices, 0, points)
+        return points
 
     def _moved_points(self, vertices: F64) -> F64:
         """Return the homogeneous pixels of all vertices, of which only the moving ones moved."""
         points = self._static_points.copy()
-        first = self._assembly.first_vertex
-        points[first:] = self._to_pixels(vertices[first:])
+        transform(self._projection, vertices, self._assembly.first_vertex, points)
         return points
 
     def render(self, frame: int, passes: Sequence[str] = ("color",)) -> Frame:
@@ -258,12 +259,10 @@ class Renderer:
         inputs, assembly = self._inputs, self._assembly
         faces, first = assembly.faces, assembly.first_triangle
         inputs.surfaces["normals"][first:] = normals[first:]
+        moving = vertices, assembly.first_vertex, faces, first
+        maps = LightMaps(self._shadow.with_moving(*moving), self._occlusion.with_moving(*moving))
         if self._kept_pixels is None:
-            self._kept_pixels = keep_nothing(self.height, self.width)
-        maps = LightMaps(
-            self._shadow.with_moving(vertices, faces, first),
-            self._occlusion.with_moving(vertices, faces, first),
-        )
+            self._kept_pixels = keep_nothing(self.height, self.width, maps)
         colors = np.empty((self.height, self.width, 3), np.uint8)
         shade(self._buffer, self._kept_triangles, inputs, maps, self._kept_pixels, colors)
         return colors

@@ -305,7 +305,10 @@ def _shade_point(
     u, v, footprint = texture_footprint(edges, surfaces, t, weights, depth)
     atlas = inputs.atlas
     level = mip_level(footprint, 1 << (atlas.starts.shape[1] - 1))
-    red, green, blue, slope_u, slope_v = sample_texture(atlas, material.texture, u, v, level)
+    scale = material.normal_scale
+    red, green, blue, slope_u, slope_v = sample_texture(
+        atlas, material.texture, u, v, level, scale > 0.0
+    )
     color = material.color
     albedo = (red * color[0], green * color[1], blue * color[2])
 
@@ -316,7 +319,6 @@ def _shade_point(
         point.normal[k] = normal[k]
     levelness = (normal[2] - LEVEL_COSINE) / (1.0 - LEVEL_COSINE)
     point.levelness = min(max(levelness, 0.0), 1.0)
-    scale = material.normal_scale
     if scale > 0.0:
         normal = _mapped_normal(normal, surfaces, t, slope_u * scale, slope_v * scale)
 
@@ -373,50 +375,53 @@ class KeptPixels(NamedTuple):
     - ``points`` (H * W + 1,) of `physion.rendering.rasterizer.POINT`: the surface at the centre of
       pixel i * W + j, in row i and column j. The last one is overwritten.
     - ``shaded`` (H * W,) bool: whether it is there.
-    - ``surfaces`` (H, W) uint8: number of surfaces that the pixel shows; 0 as long as the lookups
-      are not known.
-    - ``shadow_blocks``, ``occlusion_blocks`` (H, W, S) int32: the `block_index` of the lookup of
-      each surface in the two depth maps; -1 for none.
-    - ``colored`` (H, W) bool, ``colors`` (H, W, 3) uint8: the colour while no moving body is near
+    - ``linked`` (H * W,) bool: whether the lookups of the pixel are in the lists below.
+    - ``shadow_first``, ``occlusion_first`` (blocks,) int32, ``shadow_next``, ``occlusion_next``
+      (H * W * S,) int32: for each block of the two depth maps, a linked list of the lookups with
+      this `block_index`. Lookup p * S + k is of pixel p. Lists end with -1.
+    - ``colored`` (H * W,) bool, ``colors`` (H, W, 3) uint8: the colour while no moving body is near
       the blocks, and whether it is there.
+    - ``near`` (H * W,) bool: true only within `shade`, where a moving body is near.
     """
 
     points: Records
     shaded: Bools
-    surfaces: U8
-    shadow_blocks: I32
-    occlusion_blocks: I32
+    linked: Bools
+    shadow_first: I32
+    shadow_next: I32
+    occlusion_first: I32
+    occlusion_next: I32
     colored: Bools
     colors: U8
+    near: Bools
 
 
-def keep_nothing(height: int, width: int) -> KeptPixels:
-    """Return a `KeptPixels` in which nothing is known yet."""
-    blocks = (height, width, len(SAMPLES))
+def keep_nothing(height: int, width: int, maps: LightMaps) -> KeptPixels:
+    """Return a `KeptPixels` in which nothing is known yet, for depth maps of these sizes."""
+    pixels = height * width
     return KeptPixels(
-        points=np.zeros(height * width + 1, POINT),
-        shaded=np.zeros(height * width, np.bool_),
-        surfaces=np.zeros((height, width), np.uint8),
-        shadow_blocks=np.full(blocks, -1, np.int32),
-        occlusion_blocks=np.full(blocks, -1, np.int32),
-        colored=np.zeros((height, width), np.bool_),
+        points=np.zeros(pixels + 1, POINT),
+        shaded=np.zeros(pixels, np.bool_),
+        linked=np.zeros(pixels, np.bool_),
+        shadow_first=np.full(maps.shadow.moved.size, -1, np.int32),
+        shadow_next=np.empty(pixels * len(SAMPLES), np.int32),
+        occlusion_first=np.full(maps.occlusion.moved.size, -1, np.int32),
+        occlusion_next=np.empty(pixels * len(SAMPLES), np.int32),
+        colored=np.zeros(pixels, np.bool_),
         colors=np.zeros((height, width, 3), np.uint8),
+        near=np.zeros(pixels, np.bool_),
     )
 
 
 @kernel
-def _moved_over(
-    kept: KeptPixels, row: int, column: int, shadow_moved: Bools, occlusion_moved: Bools
-) -> bool:
-    """Whether a moving body is near one of the blocks that a pixel's lookups read."""
-    for s in range(kept.surfaces[row, column]):
-        block = kept.shadow_blocks[row, column, s]
-        if block >= 0 and shadow_moved[block]:
-            return True
-        block = kept.occlusion_blocks[row, column, s]
-        if block >= 0 and occlusion_moved[block]:
-            return True
-    return False
+def _mark_near(first: I32, following: I32, moved: Bools, near: Bools) -> None:
+    """Mark the pixels with a lookup in one of the blocks that are true in ``moved`` (blocks,)."""
+    for block in range(len(first)):
+        if moved[block]:
+            lookup = first[block]
+            while lookup >= 0:
+                near[lookup // len(SAMPLES)] = True
+                lookup = following[lookup]
 
 
 @kernel
@@ -451,15 +456,19 @@ def shade(
     shadow, occlusion = maps.shadow, maps.occlusion
     shadow_moved, occlusion_moved = shadow.moved.ravel(), occlusion.moved.ravel()
     points = kept.points
+    if static > 0:
+        _mark_near(kept.shadow_first, kept.shadow_next, shadow_moved, kept.near)
+        _mark_near(kept.occlusion_first, kept.occlusion_next, occlusion_moved, kept.near)
     for row in range(height):
+        colors[row] = kept.colors[row]
         for column in range(width):
+            pixel = row * width + column
             still = static > 0 and not buffer.drawn[row, column]
-            known = still and kept.colored[row, column]
-            if known and not _moved_over(kept, row, column, shadow_moved, occlusion_moved):
-                for k in range(3):
-                    colors[row, column, k] = kept.colors[row, column, k]
+            near = kept.near[pixel]
+            if still and kept.colored[pixel] and not near:
                 continue
-            new = still and kept.surfaces[row, column] == 0
+            kept.near[pixel] = False
+            new = still and not kept.linked[pixel]
             surfaces = 0
             red, green, blue = 0.0, 0.0, 0.0
             todo = (1 << samples) - 1  # bit mask of the samples not yet shaded
@@ -479,7 +488,7 @@ def shade(
                     green += weight * light.background[1]
                     blue += weight * light.background[2]
                     continue
-                p = row * width + column
+                p = pixel
                 if s > 0 or t >= static:
                     p = height * width
                 if p == height * width or not kept.shaded[p]:
@@ -506,19 +515,26 @@ def shade(
                 green += weight * (point.ambient[1] + lit * point.direct[1])
                 blue += weight * (point.ambient[2] + lit * point.direct[2])
                 if new:
+                    lookup = pixel * samples + surfaces
                     if not turned_away:
                         block = block_index(shadow, sx, sy, sz, SHADOW_RADIUS)
-                        kept.shadow_blocks[row, column, surfaces] = block
+                        if block >= 0:
+                            kept.shadow_next[lookup] = kept.shadow_first[block]
+                            kept.shadow_first[block] = lookup
+                            near = near or shadow_moved[block]
                     if levelness > 0.0:
                         block = block_index(occlusion, px, py, pz, OCCLUSION_RADIUS)
-                        kept.occlusion_blocks[row, column, surfaces] = block
+                        if block >= 0:
+                            kept.occlusion_next[lookup] = kept.occlusion_first[block]
+                            kept.occlusion_first[block] = lookup
+                            near = near or occlusion_moved[block]
                     surfaces += 1
             colors[row, column, 0] = _tone(tones, red)
             colors[row, column, 1] = _tone(tones, green)
             colors[row, column, 2] = _tone(tones, blue)
             if new:
-                kept.surfaces[row, column] = surfaces
-            if still and not _moved_over(kept, row, column, shadow_moved, occlusion_moved):
-                kept.colored[row, column] = True
+                kept.linked[pixel] = True
+            if still and not near:
+                kept.colored[pixel] = True
                 for k in range(3):
                     kept.colors[row, column, k] = colors[row, column, k]

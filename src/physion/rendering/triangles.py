@@ -77,18 +77,42 @@ def face_normals(vertices: F64, faces: I32) -> F64:
     return np.asarray(np.divide(cross, length, out=np.zeros_like(cross), where=length > 0))
 
 
-def solid(vertices: F64, faces: I32, scale: F64, crease: float, material: int) -> MeshPart:
+@dataclass(frozen=True)
+class Surface:
+    """Mesh of a shape at unit scale, with what does not depend on the scale.
+
+    - ``vertices`` (V, 3), ``faces`` (T, 3), ``groups`` (T,), ``uv`` (T, 3, 2): as in `MeshPart`.
+    - ``corners`` (3 T,): corners of one number belong to one vertex of one smooth surface.
+    """
+
+    vertices: F64
+    faces: I32
+    groups: I32
+    uv: F32
+    corners: NDArray[np.intp]
+
+
+def surface(vertices: F64, faces: I32, crease: float) -> Surface:
+    """Return the surface of a mesh (V, 3), (T, 3).
+
+    ``crease``: angle in radians below which triangles that meet at an edge form one smooth surface.
+    """
+    unit, faces = _merge(np.asarray(vertices, np.float64), np.asarray(faces, np.int32))
+    groups = _smooth_groups(faces, face_normals(unit, faces), cos(max(crease, FLAT)))
+    key = faces.astype(np.int64) + len(unit) * groups[:, None].astype(np.int64)
+    _, corners = np.unique(key.ravel(), return_inverse=True)
+    return Surface(unit, faces, groups, _box_uv(unit, faces), corners)
+
+
+def solid(surface: Surface, scale: F64, material: int) -> MeshPart:
     """Return the mesh of a body in metres.
 
     Parameters
     ----------
-    vertices, faces
-        (V, 3) at unit scale and (T, 3).
+    surface
+        Of its shape.
     scale
         (3,) factors along the axes of the body.
-    crease
-        Angle in radians, at unit scale, below which triangles that meet at an edge form one smooth
-        surface.
     material
         Index of the material of all triangles.
 
@@ -104,12 +128,9 @@ def solid(vertices: F64, faces: I32, scale: F64, crease: float, material: int) -
     Thurmer, G. and Wuthrich, C. (1998). Computing vertex normals from polygonal facets. Journal of
         Graphics Tools 3(1).
     """
-    unit, faces = _merge(np.asarray(vertices, np.float64), np.asarray(faces, np.int32))
-    scaled = unit * scale
-    groups = _smooth_groups(faces, face_normals(unit, faces), cos(max(crease, FLAT)))
+    faces, corner_index = surface.faces, surface.corners
+    scaled = surface.vertices * scale
     normals = face_normals(scaled, faces)
-    key = faces.astype(np.int64) + len(unit) * groups[:, None].astype(np.int64)
-    _, corner_index = np.unique(key.ravel(), return_inverse=True)
     angles = _corner_angles(scaled, faces).reshape(-1, 1)
     weighted = np.repeat(normals, 3, axis=0) * angles
     total = np.zeros((int(corner_index.max()) + 1, 3))
@@ -123,9 +144,9 @@ def solid(vertices: F64, faces: I32, scale: F64, crease: float, material: int) -
         vertices=scaled,
         faces=faces,
         normals=corner.reshape(count, 3, 3).astype(np.float32),
-        uv=_box_uv(unit, faces),
+        uv=surface.uv,
         tangents=np.zeros((count, 2, 3), np.float32),
-        groups=groups,
+        groups=surface.groups,
         materials=np.full(count, material, np.int32),
     )
 
@@ -358,9 +379,14 @@ def assemble(scene: Scene, room: Room) -> Assembly:
 @lru_cache(maxsize=64)
 def _bare_mesh(name: str, scale: tuple[float, ...]) -> MeshPart:
     """Return the mesh of a shape, of the first material; scenes share it, so it is not changed."""
+    return solid(surface_of(name), np.asarray(scale), 0)
+
+
+@lru_cache(maxsize=256)
+def surface_of(name: str) -> Surface:
+    """Return the surface of a shape, which all its sizes share."""
     mesh = shape(name).mesh
-    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
-    return solid(vertices, faces, np.asarray(scale), mesh.smooth, 0)
+    return surface(mesh.vertices, mesh.faces, mesh.smooth)
 
 
 def _concatenate(

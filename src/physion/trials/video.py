@@ -256,13 +256,24 @@ class MovieEncoder:
         self._stream = stream
         self._reformatter = VideoReformatter()
 
-    def add(self, frame: NDArray[np.uint8]) -> None:
-        """Append one picture: (height, width, 3), sRGB, 0..255."""
+    def add(self, frame: NDArray[np.uint8] | av.VideoFrame) -> av.VideoFrame:
+        """Append one picture: (height, width, 3), sRGB, 0..255.
+
+        Returns it as it is encoded, which another encoder for pictures of this size and rate takes
+        too, without converting it again.
+        """
+        picture = frame if isinstance(frame, av.VideoFrame) else self._converted(frame)
+        picture.pts = self._added
+        self._container.mux(self._stream.encode(picture))
+        self._added += 1
+        return picture
+
+    def _converted(self, frame: NDArray[np.uint8]) -> av.VideoFrame:
         if frame.shape != self._shape or frame.dtype != np.uint8:
             raise BadInputError(
                 f"movie frame {self._added} is {frame.dtype} {frame.shape}, not uint8 {self._shape}"
             )
-        picture = self._reformatter.reformat(
+        return self._reformatter.reformat(
             av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24"),
             format="yuv420p",
             dst_colorspace=Colorspace.ITU709,
@@ -270,9 +281,6 @@ class MovieEncoder:
             dst_color_range=ColorRange.MPEG,
             interpolation=_CONVERSION,
         )
-        picture.pts = self._added
-        self._container.mux(self._stream.encode(picture))
-        self._added += 1
 
     def finish(self) -> bytes:
         """Close the movie and return the bytes of its file."""

@@ -75,9 +75,12 @@ def mip_level(footprint: float, side: int) -> float:
 
 @kernel
 def _bilinear(
-    texels: U8, start: int, side: int, u: float, v: float
+    texels: U8, start: int, side: int, u: float, v: float, slopes: bool
 ) -> tuple[float, float, float, float, float]:
-    """Return the stored values of one level between its four nearest texels; it repeats."""
+    """Return the stored values of one level between its four nearest texels; it repeats.
+
+    Without ``slopes`` the last two are 0.
+    """
     x, y = u * side - 0.5, v * side - 0.5
     fx, fy = np.floor(x), np.floor(y)
     ax, ay = x - fx, y - fy
@@ -90,14 +93,16 @@ def _bilinear(
     r = wi * texels[i, 0] + wj * texels[j, 0] + wk * texels[k, 0] + wm * texels[m, 0]
     g = wi * texels[i, 1] + wj * texels[j, 1] + wk * texels[k, 1] + wm * texels[m, 1]
     b = wi * texels[i, 2] + wj * texels[j, 2] + wk * texels[k, 2] + wm * texels[m, 2]
-    p = wi * texels[i, 3] + wj * texels[j, 3] + wk * texels[k, 3] + wm * texels[m, 3]
-    q = wi * texels[i, 4] + wj * texels[j, 4] + wk * texels[k, 4] + wm * texels[m, 4]
+    p, q = 0.0, 0.0
+    if slopes:
+        p = wi * texels[i, 3] + wj * texels[j, 3] + wk * texels[k, 3] + wm * texels[m, 3]
+        q = wi * texels[i, 4] + wj * texels[j, 4] + wk * texels[k, 4] + wm * texels[m, 4]
     return r, g, b, p, q
 
 
 @kernel
 def sample_texture(
-    atlas: Atlas, texture: int, u: float, v: float, level: float
+    atlas: Atlas, texture: int, u: float, v: float, level: float, slopes: bool
 ) -> tuple[float, float, float, float, float]:
     """Look up a texture with trilinear filtering (Williams 1983).
 
@@ -109,6 +114,8 @@ def sample_texture(
         Texture coordinates; the texture repeats every unit.
     level
         Mip level, 0 or more; between two whole levels their values are mixed linearly.
+    slopes
+        Whether the slopes are looked up; otherwise they have no meaning.
 
     Returns
     -------
@@ -119,10 +126,10 @@ def sample_texture(
     fine = min(int(level), levels - 1)
     weight = level - fine
     side = 1 << (levels - 1)
-    r, g, b, p, q = _bilinear(atlas.texels, atlas.starts[texture, fine], side >> fine, u, v)
+    r, g, b, p, q = _bilinear(atlas.texels, atlas.starts[texture, fine], side >> fine, u, v, slopes)
     if weight > NEGLIGIBLE_WEIGHT and fine + 1 < levels:
         start = atlas.starts[texture, fine + 1]
-        r1, g1, b1, p1, q1 = _bilinear(atlas.texels, start, side >> (fine + 1), u, v)
+        r1, g1, b1, p1, q1 = _bilinear(atlas.texels, start, side >> (fine + 1), u, v, slopes)
         r, g, b = r + weight * (r1 - r), g + weight * (g1 - g), b + weight * (b1 - b)
         p, q = p + weight * (p1 - p), q + weight * (q1 - q)
     unit = 1.0 / (ALBEDO_SCALE * ALBEDO_SCALE)

@@ -111,9 +111,9 @@ def make_movies(
     for index in range(frames):
         frame = renderer.render(index, tuple(dict.fromkeys(("color", *kept))))
         color = _image(frame, "color")
-        movie.add(color)
+        picture = movie.add(color)
         if index < OBSERVED_FRAMES:
-            observed.add(color)
+            observed.add(picture)
         if writer:
             writer.add_frame({name: _image(frame, name) for name in kept})
     return movie.finish(), observed.finish()

@@ -36,9 +36,8 @@ from physion.core.errors import BadInputError
 from physion.core.files import write_atomic
 from physion.core.version import MADE_WITH
 from physion.physics.trajectory import Trajectory
-from physion.rendering.triangles import solid
+from physion.rendering.triangles import solid, surface_of
 from physion.scenes.scene import FRAME_TIME, GRAVITY, Camera, Look, Scene
-from physion.scenes.shapes.primitives import shape
 from physion.trials.dataset import Dataset
 from physion.trials.trial_file import Trial
 
@@ -231,11 +230,7 @@ class _Writer:
     def shape(self, name: str) -> dict[str, Any]:
         """Return a primitive with the mesh of a shape at unit scale, added once."""
         if name not in self.shapes:
-            mesh = shape(name).mesh
-            part = solid(
-                np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32),
-                np.ones(3), mesh.smooth, 0,
-            )  # fmt: skip
+            part = solid(surface_of(name), np.ones(3), 0)
             # A vertex on a crease occurs once for each side.
             normals = part.normals.reshape(-1, 3).astype(np.float32)
             corners = np.column_stack([part.faces.reshape(-1, 1), np.round(normals, 5)])
