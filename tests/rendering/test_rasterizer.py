@@ -196,7 +196,7 @@ def depth_map(depth: NDArray[np.float64] | float, occupied: bool = True) -> Dept
     texels = np.array(np.broadcast_to(depth, (MAP_SIZE, MAP_SIZE)), np.float32)
     bounds = np.zeros((4, 4, 2), np.float32)
     bound_blocks(texels, np.ones((4, 4), bool), bounds)
-    return DepthMap(matrix, texels, np.full((4, 4), occupied), np.zeros((4, 4), bool), bounds)
+    return DepthMap(matrix, texels, np.full((4, 4), occupied), np.zeros(16, bool), bounds)
 
 
 def half_blocked(column: int, depth: float = 0.0) -> DepthMap:

@@ -13,6 +13,7 @@ from physion.rendering.rasterizer import (
     DepthMap,
     Records,
     bound_blocks,
+    mark_lookups,
     mark_neighbours,
     rasterize_depth,
     restore_blocks,
@@ -90,10 +91,12 @@ class StaticDepthMap:
         restore_blocks(self._static, self._depth, self._drawn)
         transform(self.matrix, vertices, first_vertex, self._texels)
         rasterize_depth(self._texels, faces, first, len(faces), self._depth, self._drawn)
-        moved, bounds = np.zeros_like(self._drawn), self._bounds.copy()
-        mark_neighbours(self._drawn, moved)
+        occupied, bounds = self._occupied.copy(), self._bounds.copy()
+        moved = np.zeros_like(self._drawn)
+        mark_neighbours(self._drawn, occupied)
+        mark_lookups(self._drawn, moved)
         bound_blocks(self._depth, self._drawn, bounds)
-        return DepthMap(self.matrix, self._depth, self._occupied | moved, moved, bounds)
+        return DepthMap(self.matrix, self._depth, occupied, moved.reshape(-1), bounds)
 
 
 def empty_maps(scene: Scene, room: Room) -> tuple[StaticDepthMap, StaticDepthMap]:

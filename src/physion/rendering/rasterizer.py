@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.numerics.kernel import kernel
+from physion.numerics.kernel import in_place_kernel
 from physion.rendering.textures.atlas import Atlas
 
 F32 = NDArray[np.float32]
@@ -43,6 +43,8 @@ SHORTEST_NORMAL = 1e-12
 """Length below which an interpolated normal is not scaled up to one."""
 BLOCK = 8
 """Texels along the side of a block of a `DepthMap`."""
+EDGE_ROWS, EDGE_COLUMNS = 2, 1
+"""Last row and column of blocks near the edge of a `DepthMap` in the sense of `mark_lookups`."""
 
 
 class Triangles(NamedTuple):
@@ -107,7 +109,7 @@ class SurfaceMotion(NamedTuple):
     next_points: F64
 
 
-@kernel
+@in_place_kernel
 def transform(matrix: F64, points: F64, first: int, out: F64) -> None:
     """Write a matrix (3, 4) times the points (V, 3) from index ``first`` on to ``out`` (V, 3).
 
@@ -119,7 +121,7 @@ def transform(matrix: F64, points: F64, first: int, out: F64) -> None:
             out[i, k] = matrix[k, 0] * x + matrix[k, 1] * y + matrix[k, 2] * z + matrix[k, 3]
 
 
-@kernel
+@in_place_kernel
 def _bounds(points: F64, face: I32, near: float) -> tuple[float, float, float, float]:
     """Return left, right, top and bottom in pixels of the part of a triangle beyond ``near``.
 
@@ -144,7 +146,7 @@ def _bounds(points: F64, face: I32, near: float) -> tuple[float, float, float, f
     return left, right, top, bottom
 
 
-@kernel
+@in_place_kernel
 def _covered_pixels(low: float, high: float, size: int) -> tuple[int, int]:
     """Return the first and last pixel of ``size`` that may have a sample between two coordinates.
 
@@ -155,7 +157,7 @@ def _covered_pixels(low: float, high: float, size: int) -> tuple[int, int]:
     return first, last
 
 
-@kernel
+@in_place_kernel
 def rasterize(
     points: F64, triangles: Triangles, first: int, depths: DepthRange, buffer: VisibilityBuffer
 ) -> None:
@@ -251,7 +253,7 @@ def rasterize(
                             buffer.drawn[row, column] = True
 
 
-@kernel
+@in_place_kernel
 def restore_pixels(static: VisibilityBuffer, buffer: VisibilityBuffer) -> None:
     """Take back what was drawn over ``static``: ``buffer`` is its copy again."""
     height, width, samples = buffer.triangle_ids.shape
@@ -264,7 +266,7 @@ def restore_pixels(static: VisibilityBuffer, buffer: VisibilityBuffer) -> None:
                     buffer.inverse_depth[row, column, s] = static.inverse_depth[row, column, s]
 
 
-@kernel
+@in_place_kernel
 def rasterize_depth(
     points: F64, faces: I32, first: int, last: int, depth: F32, drawn: Bools
 ) -> None:
@@ -317,7 +319,7 @@ def rasterize_depth(
                     drawn[row // BLOCK, column // BLOCK] = True
 
 
-@kernel
+@in_place_kernel
 def restore_blocks(static: F32, depth: F32, drawn: Bools) -> None:
     """Take back what was drawn over the depth map ``static``: ``depth`` is its copy again."""
     for i in range(drawn.shape[0]):
@@ -329,7 +331,7 @@ def restore_blocks(static: F32, depth: F32, drawn: Bools) -> None:
                         depth[row, column] = static[row, column]
 
 
-@kernel
+@in_place_kernel
 def bound_blocks(depth: F32, drawn: Bools, bounds: F32) -> None:
     """Write the smallest and the largest depth of each true block to ``bounds`` (rows, columns, 2).
 
@@ -346,7 +348,7 @@ def bound_blocks(depth: F32, drawn: Bools, bounds: F32) -> None:
                 bounds[i, j, 0], bounds[i, j, 1] = low, high
 
 
-@kernel
+@in_place_kernel
 def mark_neighbours(blocks: Bools, marked: Bools) -> None:
     """Mark the true blocks of a map and their eight neighbours, whatever was marked before."""
     rows, columns = blocks.shape
@@ -358,7 +360,26 @@ def mark_neighbours(blocks: Bools, marked: Bools) -> None:
                         marked[row, column] = True
 
 
-@kernel
+@in_place_kernel
+def mark_lookups(drawn: Bools, moved: Bools) -> None:
+    """Mark in ``moved`` the blocks from which on a lookup reads a true block of ``drawn``.
+
+    Lookups read two blocks in each direction, see `block_index`. Where nothing is near, they give
+    1 without reading, and elsewhere a sum of weights: `lit_fraction`. That is exactly 1 from texel
+    4 in x and 16 in y on, since fractions of a texel there have so few bits that no step rounds.
+    Nearer to the edge, all lookups that a block may influence are marked.
+    """
+    rows, columns = drawn.shape
+    for i in range(rows):
+        for j in range(columns):
+            if drawn[i, j]:
+                wide = 1 if i <= EDGE_ROWS or j <= EDGE_COLUMNS else 0
+                for row in range(max(i - 1 - wide, 0), min(i + 1 + wide, rows)):
+                    for column in range(max(j - 1 - wide, 0), min(j + 1 + wide, columns)):
+                        moved[row, column] = True
+
+
+@in_place_kernel
 def barycentric(edges: F64, t: int, x: float, y: float) -> tuple[float, float, float, float]:
     """Return depth and barycentric coordinates of the point of triangle ``t`` seen at a pixel.
 
@@ -373,7 +394,7 @@ def barycentric(edges: F64, t: int, x: float, y: float) -> tuple[float, float, f
     return w, e0 * w, e1 * w, e2 * w
 
 
-@kernel
+@in_place_kernel
 def fill_geometry_buffers(
     triangle_ids: I32, triangles: Triangles, motion: SurfaceMotion, first: int, out: GeometryBuffers
 ) -> None:
@@ -432,7 +453,7 @@ def fill_geometry_buffers(
                 out.flow[row, column, 1] = np.nan
 
 
-@kernel
+@in_place_kernel
 def shows_back(edges: F64, t: int) -> bool:
     """Whether the camera sees the back of triangle ``t``; ``edges`` as `rasterize` writes them.
 
@@ -477,8 +498,8 @@ class DepthMap(NamedTuple):
     - ``depth`` (H, W) float32: metres; infinity where there is nothing.
     - ``occupied`` (H / BLOCK, W / BLOCK) bool: blocks of texels in which, or in a neighbour of
       which, there is anything. Elsewhere a lookup is skipped.
-    - ``moved``, of the same shape: blocks in which, or in a neighbour of which, something that
-      moves is nearest. Elsewhere a lookup gives the same in every frame.
+    - ``moved`` (H / BLOCK * W / BLOCK,) bool, row by row: where lookups of this `block_index` may
+      read something that moves. The others give the same in every frame.
     - ``bounds`` (H / BLOCK, W / BLOCK, 2) float32: smallest and largest depth of each block, by
       which most lookups are known without reading the texels.
     """
@@ -490,12 +511,13 @@ class DepthMap(NamedTuple):
     bounds: F32
 
 
-@kernel
+@in_place_kernel
 def block_index(depth_map: DepthMap, px: float, py: float, pz: float, radius: int) -> int:
-    """Return the block, counted row by row, in which a world point is looked up.
+    """Return the block, counted row by row, of the first texel that a lookup of a point reads.
 
-    A lookup that reads ``radius`` texels on each side of the point, at most `BLOCK`, reads only
-    this block and its eight neighbours. -1 if it would leave the map: then it reads nothing.
+    It reads ``radius`` texels on each side of the point and one more, at most `BLOCK` in all: none
+    but those of this block and of the next ones in row and column. -1 if it would leave the map:
+    then it reads nothing.
     """
     m = depth_map.matrix
     x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3] - 0.5
@@ -503,10 +525,10 @@ def block_index(depth_map: DepthMap, px: float, py: float, pz: float, radius: in
     height, width = depth_map.depth.shape
     if x < radius or y < radius or x >= width - radius - 1 or y >= height - radius - 1:
         return -1
-    return int(int(y) // BLOCK * (width // BLOCK) + int(x) // BLOCK)
+    return int((int(y) - radius) // BLOCK * (width // BLOCK) + (int(x) - radius) // BLOCK)
 
 
-@kernel
+@in_place_kernel
 def _window_bounds(bounds: F32, i: int, j: int, low: int, high: int) -> tuple[float, float]:
     """Return the smallest and the largest depth of the blocks of the texels that a lookup reads.
 
@@ -525,7 +547,7 @@ def _window_bounds(bounds: F32, i: int, j: int, low: int, high: int) -> tuple[fl
     return least, most
 
 
-@kernel
+@in_place_kernel
 def lit_fraction(shadow: DepthMap, px: float, py: float, pz: float) -> float:
     """Return the fraction, 0..1, of the directional light that reaches a world point.
 
@@ -561,10 +583,11 @@ def lit_fraction(shadow: DepthMap, px: float, py: float, pz: float) -> float:
             total += line
         return float((total + line * ay) / SHADOW_AREA)
     for row in range(low, high + 1):
-        line = 0.0
+        whole = 0
         for column in range(low + 1, high):
             if depth[i + row, j + column] >= z:
-                line += 1.0
+                whole += 1
+        line = float(whole)
         if depth[i + row, j + low] >= z:
             line += 1.0 - ax
         if depth[i + row, j + high] >= z:
@@ -573,7 +596,7 @@ def lit_fraction(shadow: DepthMap, px: float, py: float, pz: float) -> float:
     return float(total / SHADOW_AREA)
 
 
-@kernel
+@in_place_kernel
 def occluded_fraction(occlusion: DepthMap, px: float, py: float, pz: float) -> float:
     """Return how much of the surroundings of a world point is hidden by things above it, 0..1.
 

@@ -263,7 +263,7 @@ class Renderer:
         maps = LightMaps(self._shadow.with_moving(*moving), self._occlusion.with_moving(*moving))
         if self._kept_pixels is None:
             self._kept_pixels = keep_nothing(self.height, self.width, maps)
-        colors = np.empty((self.height, self.width, 3), np.uint8)
+        colors = self._kept_pixels.colors.copy()
         shade(self._buffer, self._kept_triangles, inputs, maps, self._kept_pixels, colors)
         return colors
 

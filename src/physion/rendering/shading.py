@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.numerics.elementary import coarse_log2_of, exp_of
-from physion.numerics.kernel import kernel
+from physion.numerics.kernel import in_place_kernel
 from physion.rendering.rasterizer import (
     OCCLUSION_RADIUS,
     POINT,
@@ -78,25 +78,25 @@ CORNER_RANGE = 0.6
 """Metres from that edge at which the loss has fallen to 1/e."""
 
 
-@kernel
+@in_place_kernel
 def dot(a: Vector, b: Vector) -> float:
     """Return the scalar product of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@kernel
+@in_place_kernel
 def scaled(a: Vector, factor: float) -> Vector:
     """Return ``factor`` times a vector."""
     return a[0] * factor, a[1] * factor, a[2] * factor
 
 
-@kernel
+@in_place_kernel
 def lambert(normal: Vector, to_light: Vector) -> float:
     """Return Lambert's cosine, max(n . l, 0): what a matte surface receives by its tilt."""
     return max(dot(normal, to_light), 0.0)
 
 
-@kernel
+@in_place_kernel
 def highlight(normal: Vector, to_light: Vector, to_eye: Vector, exponent: float) -> float:
     """Return the specular highlight (n . h)^exponent, h = (l + v) / |l + v| (Blinn 1977).
 
@@ -110,7 +110,7 @@ def highlight(normal: Vector, to_light: Vector, to_eye: Vector, exponent: float)
     return 0.0
 
 
-@kernel
+@in_place_kernel
 def fresnel(reflectance: float, metalness: float, cosine: float) -> float:
     """Return the fraction of the environment that a surface reflects at an angle to its normal.
 
@@ -122,7 +122,7 @@ def fresnel(reflectance: float, metalness: float, cosine: float) -> float:
     return reflectance * (1.0 + (GRAZING_GAIN - GRAZING_GAIN_LOST * metalness) * grazing * grazing)
 
 
-@kernel
+@in_place_kernel
 def mirrored(normal: Vector, to_eye: Vector, cosine: float) -> Vector:
     """Return the mirrored viewing ray r = 2 (n . v) n - v; ``cosine`` is n . v."""
     twice = 2.0 * cosine
@@ -133,7 +133,7 @@ def mirrored(normal: Vector, to_eye: Vector, cosine: float) -> Vector:
     )
 
 
-@kernel
+@in_place_kernel
 def window_fraction(position: Vector, ray: Vector, low: F64, high: F64) -> float:
     """Return how much of the window a rough reflection along ``ray`` shows, 0..1.
 
@@ -152,7 +152,7 @@ def window_fraction(position: Vector, ray: Vector, low: F64, high: F64) -> float
     return float(u * u * (3.0 - 2.0 * u) * v * v * (3.0 - 2.0 * v))
 
 
-@kernel
+@in_place_kernel
 def corner_occlusion(position: Vector, normal: Vector, low: F64, high: F64) -> float:
     """Return the fraction of light left near the edges where walls, floor and ceiling meet.
 
@@ -189,7 +189,7 @@ LEVEL_COSINE = 0.5
 """Vertical component of the normal up to which objects near a surface do not occlude it."""
 
 
-@kernel
+@in_place_kernel
 def _pixel_ray(camera: Any, x: float, y: float) -> Vector:
     """Return the world vector from a camera record to depth 1 at a pixel."""
     rays = camera.rays
@@ -200,7 +200,7 @@ def _pixel_ray(camera: Any, x: float, y: float) -> Vector:
     )
 
 
-@kernel
+@in_place_kernel
 def texture_footprint(
     edges: F64, surfaces: Records, t: int, weights: Vector, depth: float
 ) -> tuple[float, float, float]:
@@ -237,7 +237,7 @@ def texture_footprint(
     return u, v, FOOTPRINT * depth * depth * area
 
 
-@kernel
+@in_place_kernel
 def _smooth_normal(surfaces: Records, t: int, weights: Vector, to_eye: Vector) -> Vector:
     """Return the interpolated unit normal of triangle ``t``, on the side that the camera sees."""
     normals = surfaces[t].normals
@@ -251,7 +251,7 @@ def _smooth_normal(surfaces: Records, t: int, weights: Vector, to_eye: Vector) -
     return nx * scale, ny * scale, nz * scale
 
 
-@kernel
+@in_place_kernel
 def _mapped_normal(
     normal: Vector, surfaces: Records, t: int, slope_u: float, slope_v: float
 ) -> Vector:
@@ -266,7 +266,7 @@ def _mapped_normal(
     return scaled((nx, ny, nz), 1.0 / np.sqrt(nx * nx + ny * ny + nz * nz))
 
 
-@kernel
+@in_place_kernel
 def _shade_point(
     t: int, x: float, y: float, inputs: ShadingInputs, points: Records, row: int
 ) -> None:
@@ -358,13 +358,17 @@ def _shade_point(
         point.direct[k] = room * light.color[k] * (matte * diffuse + tint * specular)
 
 
-@kernel
+@in_place_kernel
 def _tone(tones: U8, light: float) -> int:
     """Return the byte of a linear light; black for NaN (from a normal without length)."""
     index = light * ((TONES - 1) / WHITEST)
     if not index > 0.0:
         return int(tones[0])
     return int(tones[int(min(index, TONES - 1.0))])
+
+
+UNKNOWN, NEAR = 1, 2
+"""Bits of `KeptPixels.state`."""
 
 
 class KeptPixels(NamedTuple):
@@ -379,9 +383,9 @@ class KeptPixels(NamedTuple):
     - ``shadow_first``, ``occlusion_first`` (blocks,) int32, ``shadow_next``, ``occlusion_next``
       (H * W * S,) int32: for each block of the two depth maps, a linked list of the lookups with
       this `block_index`. Lookup p * S + k is of pixel p. Lists end with -1.
-    - ``colored`` (H * W,) bool, ``colors`` (H, W, 3) uint8: the colour while no moving body is near
-      the blocks, and whether it is there.
-    - ``near`` (H * W,) bool: true only within `shade`, where a moving body is near.
+    - ``colors`` (H, W, 3) uint8: the colour while no moving body is near the blocks.
+    - ``state`` (H * W,) uint8: `UNKNOWN` as long as the colour is not there, otherwise 0. Within
+      `shade`, plus `NEAR` where a moving body is near.
     """
 
     points: Records
@@ -391,9 +395,8 @@ class KeptPixels(NamedTuple):
     shadow_next: I32
     occlusion_first: I32
     occlusion_next: I32
-    colored: Bools
     colors: U8
-    near: Bools
+    state: U8
 
 
 def keep_nothing(height: int, width: int, maps: LightMaps) -> KeptPixels:
@@ -407,24 +410,23 @@ def keep_nothing(height: int, width: int, maps: LightMaps) -> KeptPixels:
         shadow_next=np.empty(pixels * len(SAMPLES), np.int32),
         occlusion_first=np.full(maps.occlusion.moved.size, -1, np.int32),
         occlusion_next=np.empty(pixels * len(SAMPLES), np.int32),
-        colored=np.zeros(pixels, np.bool_),
         colors=np.zeros((height, width, 3), np.uint8),
-        near=np.zeros(pixels, np.bool_),
+        state=np.full(pixels, UNKNOWN, np.uint8),
     )
 
 
-@kernel
-def _mark_near(first: I32, following: I32, moved: Bools, near: Bools) -> None:
+@in_place_kernel
+def _mark_near(first: I32, following: I32, moved: Bools, state: U8) -> None:
     """Mark the pixels with a lookup in one of the blocks that are true in ``moved`` (blocks,)."""
     for block in range(len(first)):
         if moved[block]:
             lookup = first[block]
             while lookup >= 0:
-                near[lookup // len(SAMPLES)] = True
+                state[lookup // len(SAMPLES)] |= NEAR
                 lookup = following[lookup]
 
 
-@kernel
+@in_place_kernel
 def shade(
     buffer: VisibilityBuffer,
     static: int,
@@ -448,26 +450,24 @@ def shade(
     kept
         Read and filled in.
     colors
-        (H, W, 3) uint8, written: sRGB.
+        (H, W, 3) uint8, sRGB: a copy of ``kept.colors`` in which all other pixels are written.
     """
     triangle_ids = buffer.triangle_ids
     height, width, samples = triangle_ids.shape
     light, groups, tones = inputs.lights[0], inputs.groups, inputs.tones
     shadow, occlusion = maps.shadow, maps.occlusion
-    shadow_moved, occlusion_moved = shadow.moved.ravel(), occlusion.moved.ravel()
-    points = kept.points
+    points, state, drawn = kept.points, kept.state, buffer.drawn
     if static > 0:
-        _mark_near(kept.shadow_first, kept.shadow_next, shadow_moved, kept.near)
-        _mark_near(kept.occlusion_first, kept.occlusion_next, occlusion_moved, kept.near)
+        _mark_near(kept.shadow_first, kept.shadow_next, shadow.moved, state)
+        _mark_near(kept.occlusion_first, kept.occlusion_next, occlusion.moved, state)
     for row in range(height):
-        colors[row] = kept.colors[row]
         for column in range(width):
             pixel = row * width + column
-            still = static > 0 and not buffer.drawn[row, column]
-            near = kept.near[pixel]
-            if still and kept.colored[pixel] and not near:
+            if state[pixel] == 0 and not drawn[row, column]:
                 continue
-            kept.near[pixel] = False
+            still = static > 0 and not drawn[row, column]
+            moved = state[pixel] & NEAR != 0
+            state[pixel] &= UNKNOWN
             new = still and not kept.linked[pixel]
             surfaces = 0
             red, green, blue = 0.0, 0.0, 0.0
@@ -521,20 +521,20 @@ def shade(
                         if block >= 0:
                             kept.shadow_next[lookup] = kept.shadow_first[block]
                             kept.shadow_first[block] = lookup
-                            near = near or shadow_moved[block]
+                            moved = moved or shadow.moved[block]
                     if levelness > 0.0:
                         block = block_index(occlusion, px, py, pz, OCCLUSION_RADIUS)
                         if block >= 0:
                             kept.occlusion_next[lookup] = kept.occlusion_first[block]
                             kept.occlusion_first[block] = lookup
-                            near = near or occlusion_moved[block]
+                            moved = moved or occlusion.moved[block]
                     surfaces += 1
             colors[row, column, 0] = _tone(tones, red)
             colors[row, column, 1] = _tone(tones, green)
             colors[row, column, 2] = _tone(tones, blue)
             if new:
                 kept.linked[pixel] = True
-            if still and not near:
-                kept.colored[pixel] = True
+            if still and not moved:
+                state[pixel] = 0
                 for k in range(3):
                     kept.colors[row, column, k] = colors[row, column, k]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.numerics.elementary import arccos, cos
-from physion.numerics.kernel import kernel
+from physion.numerics.kernel import in_place_kernel
 from physion.numerics.linear_algebra import cross, dot, norm, unit
 from physion.numerics.rotations import rotation_matrices
 from physion.physics.trajectory import Trajectory
@@ -444,7 +444,7 @@ def _room_part(panels: tuple[Panel, ...], table: _MaterialTable) -> MeshPart:
     )
 
 
-@kernel
+@in_place_kernel
 def _rotate(rotation: F64, points: Any, out: Any) -> None:
     """Write the rotated points (P, 3) to ``out`` (P, 3)."""
     for i in range(len(points)):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from physion.core.errors import UnknownNameError
 from physion.core.seeds import child_generator, named_seed
 from physion.numerics.elementary import coarse_log2_of
-from physion.numerics.kernel import kernel
+from physion.numerics.kernel import in_place_kernel
 from physion.rendering.textures.materials import (
     MATERIAL_PAINTERS,
     ROOM_PAINTERS,
@@ -62,7 +62,7 @@ class Atlas(NamedTuple):
     starts: I64
 
 
-@kernel
+@in_place_kernel
 def mip_level(footprint: float, side: int) -> float:
     """Return the mip level at which a pixel covers one texel; 0 is the finest.
 
@@ -73,7 +73,7 @@ def mip_level(footprint: float, side: int) -> float:
     return 0.5 * coarse_log2_of(max(side * side * footprint, 1.0))
 
 
-@kernel
+@in_place_kernel
 def _bilinear(
     texels: U8, start: int, side: int, u: float, v: float, slopes: bool
 ) -> tuple[float, float, float, float, float]:
@@ -100,7 +100,7 @@ def _bilinear(
     return r, g, b, p, q
 
 
-@kernel
+@in_place_kernel
 def sample_texture(
     atlas: Atlas, texture: int, u: float, v: float, level: float, slopes: bool
 ) -> tuple[float, float, float, float, float]:
