@@ -9,8 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 from physion.rendering.rasterizer import (
     BLOCK,
     NOTHING,
+    OCCLUSION_RADIUS,
     OCCLUSION_REACH,
     SAMPLES,
+    SHADOW_RADIUS,
     DepthMap,
     DepthRange,
     GeometryBuffers,
@@ -18,9 +20,12 @@ from physion.rendering.rasterizer import (
     Triangles,
     VisibilityBuffer,
     barycentric,
+    block_index,
     bound_blocks,
     fill_geometry_buffers,
     lit_fraction,
+    mark_lookups,
+    mark_neighbours,
     occluded_fraction,
     rasterize,
     rasterize_depth,
@@ -245,6 +250,51 @@ def test_occlusion_falls_linearly_with_the_gap(gap: float, expected: float) -> N
 
 def test_next_to_a_wall_half_of_the_surroundings_are_occluded() -> None:
     assert occluded_fraction(half_blocked(16), 16.0, 16.8, 0.0) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_lookups_by_the_bounds_of_blocks_have_the_bits_of_lookups_by_texels(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    blocks = rng.choice([0.0, 0.1, 0.5, np.inf], (4, 4)).repeat(BLOCK, 0).repeat(BLOCK, 1)
+    texels = np.where(rng.random(blocks.shape) < 0.02 * seed, 0.3, blocks)
+    quick = depth_map(texels)
+    slow = quick._replace(bounds=np.full((4, 4, 2), (-np.inf, np.inf), np.float32))
+    decided = 0
+    for x, y, z in rng.uniform((2, 2, -0.2), (MAP_SIZE, MAP_SIZE, 0.7), (3000, 3)):
+        one, other = (
+            (lit_fraction(map_, x, y, z), occluded_fraction(map_, x, y, z))
+            for map_ in (quick, slow)
+        )
+        assert one == other
+        decided += one[0] in (0.0, 1.0)
+    assert 300 < decided < 2900
+
+
+@pytest.mark.parametrize("radius", [SHADOW_RADIUS, OCCLUSION_RADIUS])
+def test_lookups_that_read_a_block_are_marked(radius: int) -> None:
+    """Also that lookups give the same number whether or not a block near them counts as empty."""
+    rng = np.random.default_rng(radius)
+    size = 6
+    empty = np.full((size * BLOCK, size * BLOCK), np.inf, np.float32)
+    bounds = np.full((size, size, 2), np.inf, np.float32)
+    near = DepthMap(np.eye(3, 4), empty, np.ones((size, size), bool), np.zeros(36, bool), bounds)
+    for i, j in np.ndindex(size, size):
+        drawn, moved, beside = (np.zeros((size, size), bool) for _ in range(3))
+        drawn[i, j] = True
+        mark_lookups(drawn, moved)
+        mark_neighbours(drawn, beside)
+        for x, y in rng.uniform(0.5 + radius, size * BLOCK - radius - 1, (400, 2)):
+            block = block_index(near, x, y, 0.0, radius)
+            rows, columns = (
+                {(int(v - 0.5) + k) // BLOCK for k in (-radius, radius + 1)} for v in (y, x)
+            )
+            reads = i in rows and j in columns
+            rounds = (
+                beside[int(y - 0.5) // BLOCK, int(x - 0.5) // BLOCK]
+                and lit_fraction(near, x, y, 0.0) != 1.0
+            )
+            assert moved.reshape(-1)[block] or not (reads or rounds)
+        assert moved.sum() <= 16 and (min(i, j) < 3 or moved.sum() == 4)
 
 
 def test_outside_the_map_and_in_empty_blocks_nothing_is_occluded() -> None:

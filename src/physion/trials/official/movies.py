@@ -146,9 +146,9 @@ def make_movies(pictures: Iterable[NDArray[np.uint8]], frames: int, rate: int) -
             observed = MovieEncoder(*size, OBSERVED_FRAMES, rate=rate)
         if index >= frames:
             raise BadInputError(f"there are more than {frames} pictures")
-        full.add(picture)
+        converted = full.add(picture)
         if index < OBSERVED_FRAMES:
-            observed.add(picture)
+            observed.add(converted)
     if full is None or observed is None:
         raise BadInputError("there is no picture")
     return EncodedMovies(full.finish(), observed.finish(), size, frames, rate)
