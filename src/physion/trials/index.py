@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -161,7 +161,7 @@ def _elements(scene: Scene, imported: bool) -> dict[str, int | None]:
 
 
 def build_index(
-    folder: Path, known: pd.DataFrame | None = None
+    folder: Path, known: Iterable[Mapping[Any, Any]] = ()
 ) -> tuple[pd.DataFrame, dict[str, str]]:
     """Return the index of all readable trials under ``folder``, and the problems of the others.
 
@@ -170,17 +170,16 @@ def build_index(
     folder
         Folder of the dataset.
     known
-        Older index. A row is copied from it if all files of the trial still have the stored
-        sizes, so that adding a trial does not require reading the whole dataset again.
+        Rows of an older index. A row is taken over if all files of the trial still have the
+        stored sizes, so that adding a trial does not require reading the whole dataset again.
 
     Returns
     -------
     table, problems
         The index, and messages by name of the trial.
     """
-    old = {} if known is None else {row["trial"]: row for row in known.to_dict("records")}
-    old = {trial: row for trial, row in old.items() if has_drawn(row)}
-    rows: dict[str, dict[str, Any]] = {}
+    old = {row["trial"]: row for row in known if has_drawn(row)}
+    rows: dict[str, Mapping[Any, Any]] = {}
     problems = {}
     for paths in find_trials(folder):
         try:
@@ -223,7 +222,7 @@ def same_value(one: Any, other: Any) -> bool:
     return bool(one == other)
 
 
-def as_table(rows: list[dict[str, Any]]) -> pd.DataFrame:
+def as_table(rows: Sequence[Mapping[Any, Any]]) -> pd.DataFrame:
     """Return rows as a table with the columns and types of `COLUMNS`, sorted by split and trial."""
     table = _plain(pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS))
     return table.sort_values(["split", "scenario", "trial"], ignore_index=True)

@@ -94,7 +94,7 @@ def choose(job: GenerateJob) -> tuple[TrialTask, Scene]:
                 del params[name]
             continue
         elsewhere[name] = 0
-        if short(digest) in job.taken:
+        if job.taken.get(short(digest), task.index) < task.index:
             refused["another trial has the same physics"] += 1
             continue
         reason, robust = judge(scene, seed, task, job.settings)

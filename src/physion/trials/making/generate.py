@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,7 @@ from physion.trials.index import (
     as_table,
     build_index,
     has_sizes,
+    index_row,
     read_index,
     write_index,
 )
@@ -108,11 +110,11 @@ def make_trials(
         index = _known_index(folder)
         listed = {str(row["trial"]): row for row in index.to_dict("records")}
         missing = [n for n, job in jobs.items() if not _is_made(job, listed.get(n))]
-        todo, made, failed = missing, dict[str, str](), dict[str, str]()
+        todo, made, failed = missing, dict[str, dict[str, Any] | None](), dict[str, str]()
         while True:
             new, refused = run_tasks(
-                make,
-                {name: _without_taken(jobs[name], index) for name in todo},
+                _MakeAndRead(make),
+                _without_taken([jobs[name] for name in todo], index),
                 folder=folder,
                 what="generating",
                 executor=executor,
@@ -120,7 +122,7 @@ def make_trials(
                 on_outcome=lambda outcome: _note_outcome(folder, outcome, jobs[outcome.key]),
             )
             made, failed = {**made, **new}, {**failed, **refused}
-            index, problems = _update_index(folder, set(made))
+            index, problems = _update_index(folder, made)
             todo = _repeated(index, jobs)
             if not todo:
                 break
@@ -139,17 +141,36 @@ def _known_index(folder: Path) -> pd.DataFrame:
         return as_table([])
 
 
-def _without_taken(job: GenerateJob, index: pd.DataFrame) -> GenerateJob:
-    """Return the job of a trial with the physics that its scene must not have.
+@dataclass(frozen=True)
+class _MakeAndRead:
+    """Function that makes a trial and returns its row of the index, where the trial is made.
 
-    Trials of the same split and scenario with lower numbers have it.
+    Returns None for a trial that cannot be read: the index says why.
     """
-    if not job.task.presets:
-        return job
-    task = job.task
-    same = (index["split"] == task.split) & (index["scenario"] == task.scenario)
-    lower = index[same & (index["index"] < task.index)]["scene_digest"]
-    return dataclasses.replace(job, taken=frozenset(short(digest) for digest in lower))
+
+    make: Callable[[GenerateJob], str]
+
+    def __call__(self, job: GenerateJob) -> dict[str, Any] | None:
+        self.make(job)
+        try:
+            return index_row(job.paths)
+        except BadInputError:
+            return None
+
+
+def _without_taken(jobs: Sequence[GenerateJob], index: pd.DataFrame) -> dict[str, GenerateJob]:
+    """Return jobs by trial, with the physics that other trials have; see `GenerateJob`."""
+    taken: dict[tuple[str, str], dict[int, int]] = {}
+    columns = (index[name] for name in ("split", "scenario", "index", "scene_digest"))
+    for split, scenario, number, digest in zip(*columns, strict=True):
+        others = taken.setdefault((split, scenario), {})
+        others[short(digest)] = min(number, others.get(short(digest), number))
+    found = {}
+    for job in jobs:
+        task = job.task
+        others = taken.get((task.split, task.scenario), {})
+        found[task.trial] = dataclasses.replace(job, taken=others) if task.presets else job
+    return found
 
 
 def _repeated(index: pd.DataFrame, jobs: Mapping[str, GenerateJob]) -> list[str]:
@@ -195,11 +216,13 @@ def _note_outcome(folder: Path, outcome: TaskOutcome[Any], job: GenerateJob) -> 
     write_atomic(path, text.encode())
 
 
-def _update_index(folder: Path, made: set[str]) -> tuple[pd.DataFrame, dict[str, str]]:
+def _update_index(
+    folder: Path, made: Mapping[str, dict[str, Any] | None]
+) -> tuple[pd.DataFrame, dict[str, str]]:
     """Write the index unless it is up to date; return it, and problems by name of the trial.
 
     It is up to date if it has a digest file, lists exactly the trials of the folder with what was
-    drawn for each, and none of them is in ``made``.
+    drawn for each, and none of them is in ``made``, which has the rows of new trials.
     """
     there = {(paths.split, paths.trial) for paths in find_trials(folder)}
     index = _known_index(folder)
@@ -207,7 +230,8 @@ def _update_index(folder: Path, made: set[str]) -> tuple[pd.DataFrame, dict[str,
     known = bool(index["drawn_room"].notna().all())
     if not made and has_digest(folder / INDEX) and listed == there and known:
         return index, {}
-    table, problems = build_index(folder, index[~index["trial"].isin(made)])
+    known = index[~index["trial"].isin(made)].to_dict("records")
+    table, problems = build_index(folder, [*known, *(row for row in made.values() if row)])
     write_index(folder, table)
     return table, problems
 

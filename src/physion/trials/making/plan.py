@@ -177,13 +177,15 @@ class GenerateSettings:
 class GenerateJob:
     """A task with folder and settings: everything that a worker needs.
 
-    ``taken`` are `physion.trials.making.choose.short` digests of physics that other trials have.
+    ``taken``: lowest number of a trial of this split and scenario by the digest of its physics, as
+    `physion.trials.making.choose.short` gives it. A scene must not have the physics of a trial with
+    a lower number.
     """
 
     task: TrialTask
     folder: Path
     settings: GenerateSettings
-    taken: frozenset[int] = frozenset()
+    taken: Mapping[int, int] = dataclasses.field(default_factory=dict)
 
     @property
     def paths(self) -> TrialPaths:
