@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -169,6 +171,7 @@ def _empty_map(axes: F64, center: F64, half: float, texel: float) -> StaticDepth
     return StaticDepthMap(matrix, size)
 
 
+@lru_cache(maxsize=16)
 def tone_table(exposure: float) -> U8:
     """Return the sRGB bytes (TONES,) of linear light from 0 to `WHITEST`.
 

@@ -321,9 +321,10 @@ class Assembly:
 
 
 class _MaterialTable:
-    """Surface materials in the order in which they were added, and the textures they use."""
+    """Different surface materials in the order in which they were added, and their textures."""
 
     def __init__(self) -> None:
+        self._rows: dict[tuple[Look, float, bool], int] = {}
         self._colors: list[tuple[float, float, float]] = []
         self._finishes: list[Finish] = []
         self._emission: list[float] = []
@@ -331,7 +332,11 @@ class _MaterialTable:
         self.textures: list[str] = []
 
     def add(self, look: Look, emission: float = 0.0, occluded: bool = False) -> int:
-        """Add the material of a look and return its index."""
+        """Add the material of a look, unless it is there, and return its index."""
+        key = (look, emission, occluded)
+        if key in self._rows:
+            return self._rows[key]
+        self._rows[key] = len(self._rows)
         kind = finish(look.texture)
         if kind.texture not in self.textures:
             self.textures.append(kind.texture)
@@ -339,7 +344,7 @@ class _MaterialTable:
         self._finishes.append(kind)
         self._emission.append(emission)
         self._occluded.append(occluded)
-        return len(self._colors) - 1
+        return self._rows[key]
 
     def materials(self) -> Records:
         """Return all materials (M,) of `physion.rendering.rasterizer.MATERIAL`."""
@@ -424,6 +429,13 @@ def _concatenate(
 
 def _room_part(panels: tuple[Panel, ...], table: _MaterialTable) -> MeshPart:
     """Return the room as one mesh in the world, two triangles for each panel."""
+    materials = [table.add(Look(p.color, p.texture), p.emission, p.occluded) for p in panels]
+    return replace(_bare_room(panels), materials=np.repeat(np.array(materials, np.int32), 2))
+
+
+@lru_cache(maxsize=16)
+def _bare_room(panels: tuple[Panel, ...]) -> MeshPart:
+    """Return the mesh of a room, of the first material; scenes share it, so it is not changed."""
     corner, u, v = (np.array([getattr(p, name) for p in panels]) for name in ("corner", "u", "v"))
     count = len(panels)
     quad = np.stack([corner, corner + u, corner + u + v, corner + v], axis=1)
@@ -432,7 +444,6 @@ def _room_part(panels: tuple[Panel, ...], table: _MaterialTable) -> MeshPart:
     uv = dot(quad[:, :, None], axes[:, None]) / tile[:, None, None]
     index = np.array([0, 1, 2, 0, 2, 3])
     normal = np.cross(axes[:, 0], axes[:, 1]).astype(np.float32)
-    materials = [table.add(Look(p.color, p.texture), p.emission, p.occluded) for p in panels]
     return MeshPart(
         vertices=quad.reshape(-1, 3),
         faces=(4 * np.arange(count)[:, None] + index).reshape(-1, 3).astype(np.int32),
@@ -440,7 +451,7 @@ def _room_part(panels: tuple[Panel, ...], table: _MaterialTable) -> MeshPart:
         uv=uv[:, index].reshape(2 * count, 3, 2).astype(np.float32),
         tangents=np.repeat(axes, 2, axis=0).astype(np.float32),
         groups=np.repeat(np.arange(count, dtype=np.int32), 2),
-        materials=np.repeat(np.array(materials, np.int32), 2),
+        materials=np.zeros(2 * count, np.int32),
     )
 
 
