@@ -58,7 +58,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_rows_of_the_index_from_where_trials_are_made_are_those_of_their_files(
+def test_new_rows_of_the_index_equal_their_files(
     finished: Path,
 ) -> None:
     pd.testing.assert_frame_equal(Dataset(finished).index, build_index(finished)[0])
