@@ -1,6 +1,7 @@
 """Speed of the vision models, and what they have learned of movies that they were not trained on.
 
     OMP_NUM_THREADS=1 python benchmarks/models/vision_models.py speed --write  # seconds a clip
+    OMP_NUM_THREADS=1 python benchmarks/models/vision_models.py longest --write  # memory of *full*
     python benchmarks/models/vision_models.py learn FOLDER --write  # after trainings
     python benchmarks/models/vision_models.py shipped FOLDER --write  # shipped weights
 
@@ -9,6 +10,9 @@ imagined, on random pictures with moving boxes; of frozen encoders, which have r
 it times a training step of the dynamics on stored features. Times are processor time on a CPU, and
 elapsed time on a GPU (``--accelerator cuda``, also with ``--precision bf16-mixed``), where batches
 are 16 times as large.
+
+``longest`` encodes random pictures, as many as *full* reads of the longest movies, 602 frames, each
+model in a process of its own, and prints the memory of that process before and at most.
 
 ``learn`` needs the trials of ``physion generate FOLDER --width 64 --height 64`` with the splits
 training and testing. It trains the small models with three seeds and prints, for one clip of every
@@ -41,9 +45,12 @@ import datetime
 import itertools
 import os
 import re
+import resource
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +65,7 @@ from physion.core.seeds import generator, stable_hash
 from physion.models.build import build_untrained
 from physion.models.cswm import ranking
 from physion.models.vision import empty_scene_error
-from physion.readout.features import FeatureStore
+from physion.readout.features import FeatureStore, encode_clips
 from physion.training.train import train_model
 
 RESULTS = Path(__file__).parents[1] / "results" / "vision_models.md"
@@ -92,6 +99,8 @@ MODELS: tuple[tuple[str, dict[str, Any], int], ...] = (
     *((name, {"size": size, "weights": "random"}, 1) for name in ENCODERS for size in SIZES),
 )
 """Models whose speed is measured: name, options, clips of a batch."""
+LONGEST = 602
+"""Frames of the longest movies, of Support."""
 FUTURE = 18
 """Steps that are imagined when speed is measured."""
 TESTED_CLIPS = 20
@@ -153,6 +162,30 @@ def speed(names: list[str], repeats: int, device: str, precision: str) -> Rows:
         label = model.provenance().model
         cells = [label, f"{weights / 1e6:.2f} M", f"{spec.image_size} px", str(model.window)]
         yield [*cells, *(f"{seconds:.4f}" for seconds in times), *(f"{1 / s:.1f}" for s in times)]
+
+
+def longest(names: list[str]) -> Rows:
+    """Yield name, frames, features of a trial, memory before and at most of each model."""
+    for name, options, _ in MODELS:
+        if name in names and "backbone" not in options:
+            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+                yield pool.submit(encode_longest, name, options).result()
+
+
+@torch.no_grad()
+def encode_longest(name: str, options: dict[str, Any]) -> list[str]:
+    """Encode a movie of `LONGEST` frames; return the cells of its row."""
+    torch.set_num_threads(1)
+    model: Any = build_untrained(name, **options)
+    frames = len(model.spec.all_frames(LONGEST))
+    movie = random_clips(1, frames, model.spec)
+    if name in ENCODERS:
+        model.network()  # its weights count before
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    (arrays,) = encode_clips(model.eval(), movie)
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    counts = [frames, arrays["features"].size, before // 1024, most // 1024]
+    return [model.provenance().model, *(f"{count:,}" for count in counts)]
 
 
 def best_time(function: Callable[[], None], repeats: int, device: str) -> float:
@@ -313,7 +346,7 @@ def write_section(title: str, text: str) -> None:
 def main() -> None:
     """Run one part."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("part", choices=("speed", "learn", "shipped"))
+    parser.add_argument("part", choices=("speed", "longest", "learn", "shipped"))
     parser.add_argument("folder", nargs="?", type=Path)
     parser.add_argument("--models", nargs="+", default=(), choices=sorted({*METRICS, *ENCODERS}))
     parser.add_argument("--steps", type=int, default=0, help="0: those of the model")
@@ -325,7 +358,8 @@ def main() -> None:
     )
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    known = {"speed": (*SHIPPED, *ENCODERS), "learn": tuple(METRICS), "shipped": SHIPPED}
+    both = (*SHIPPED, *ENCODERS)
+    known = {"speed": both, "longest": both, "learn": tuple(METRICS), "shipped": SHIPPED}
     models = list(options.models or known.get(options.part, ()))
     if unknown := set(models).difference(known.get(options.part, ())):
         parser.error(f"{options.part} has no model {', '.join(sorted(unknown))}")
@@ -337,6 +371,10 @@ def main() -> None:
         if device != "cpu":
             title = f"Time of a clip on {torch.cuda.get_device_name()}, {precision}"
         rows = speed(models, options.repeats, device, precision)
+    elif options.part == "longest":
+        head = ["model", "frames", "features", "before, MB", "at most, MB"]
+        title = f"Memory of the features of a movie of {LONGEST} frames"
+        rows = longest(models)
     elif options.folder is None:
         parser.error(f"{options.part} needs the folder of the trials")
     elif options.part == "learn":

@@ -9,9 +9,11 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections import Counter
 from collections.abc import Iterable
 from functools import cache
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 import pytest
@@ -212,3 +214,29 @@ def test_the_page_on_own_models_leads_to_a_report(first_report: Path, tmp_path: 
     assert names >= {"MyEncoder", "my"}
     report = (tmp_path / "runs" / "report" / "report.html").read_text(encoding="utf-8")
     assert "MyEncoder" in report and "my rule" in report
+
+
+def test_the_datasheet_lists_the_licence_of_every_dependency() -> None:
+    """Those of the extra ``dev`` are tools; licences are compared with the installed packages."""
+    page = (DOCS / "reference" / "datasheet.md").read_text()
+    listed = dict(re.findall(r"^\| (?:`\w+` )?\| ([\w-]+) \| (.+?) \|$", page, re.M))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    groups = [project["dependencies"], *(extras[n] for n in extras if n not in ("all", "dev"))]
+    names = [re.split(r"[^\w-]", needed)[0] for group in groups for needed in group]
+    assert set(listed) == set(names)
+    compared = 0
+    for name, licence in listed.items():
+        family = re.match(r"MIT|BSD|Apache|ISC|Python Software", licence)
+        assert family, f"{name}: {licence}"
+        try:
+            found = distribution(name)
+        except PackageNotFoundError:
+            continue
+        fields = ("License-Expression", "License", "Classifier")
+        said = [text for field in fields for text in found.metadata.get_all(field) or []]
+        texts = [path for path in found.files or [] if "LICENSE" in path.name]
+        said += [Path(str(path.locate())).read_text(encoding="utf-8")[:3000] for path in texts]
+        assert any(family[0] in text for text in said), f"{name}: {licence}, not {said}"
+        compared += 1
+    assert compared > 20

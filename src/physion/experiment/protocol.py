@@ -553,6 +553,8 @@ class PublicStudy(Message):
     consent_version: str
     consent_files: list[str]
     """Languages in which the consent form can be read as a file, ``/consent/LANGUAGE.pdf``."""
+    funders: str
+    """Who pays for the study; empty: the consent does not say it."""
     payment: PaidAmount | None
     """None: the consent does not speak of payment."""
     expected_minutes: int

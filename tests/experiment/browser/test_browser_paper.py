@@ -24,6 +24,10 @@ CONSENTS = {
     "en": ("en-US", "you receive $4.00. At 20 minutes this is $12.00 per hour."),
     "de": ("de-DE", "erhalten Sie 4,00\xa0$. Bei 20 Minuten sind das 12,00\xa0$ in der Stunde."),
 }
+FUNDERS = {
+    "en": "This study is paid for by the Abc Foundation.",
+    "de": "Diese Studie wird bezahlt von: the Abc Foundation.",
+}
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +44,7 @@ def paper(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Study, str
     study = make_tiny_study(
         folder, test=3, familiarization=1, plausibility=FAST, more_texts=f"\n{texts['en']}",
         recruitment=Recruitment(link_code="TINY-CODE"),
-        **{**PAPER, "timing": replace(SHORT, break_every=0)},
+        **{**PAPER, "timing": replace(SHORT, break_every=0), "funders": "the Abc Foundation"},
     )  # fmt: skip
     german = folder / TEXTS_FOLDER / "de.toml"
     german.write_text(german.read_text().replace(texts["en"], texts["de"]))
@@ -58,6 +62,7 @@ def test_the_consent_states_payment_and_wage(
         visit.main_button().wait_for()
         said = visit.page.inner_text("main")
         assert words in said
+        assert FUNDERS[language] in said
         assert "20 minutes" in said or "20 Minuten" in said
         visit.picture("consent")
         assert visit.unexpected() == []

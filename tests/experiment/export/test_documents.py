@@ -34,7 +34,7 @@ def test_the_plan_follows_the_template_and_the_settings(tmp_path: Path) -> None:
         tmp_path, test=6, familiarization=4, questions=OWN_QUESTIONS, more_texts=OWN_TEXTS,
         title="Red & yellow", participants=37, exclusions="preregistered-only",
         timing=Timing(fixation_in_familiarization=False, cue_ms=1234, break_every=0),
-        payment=PaymentRule(4.0, "EUR", 20),
+        payment=PaymentRule(4.0, "EUR", 20), funders="the Abc Foundation",
     )  # fmt: skip
     text = preregistration(study)
     assert re.findall("^##+ (.*)$", text, re.MULTILINE) == TEMPLATE
@@ -49,6 +49,7 @@ def test_the_plan_follows_the_template_and_the_settings(tmp_path: Path) -> None:
         f"for {OBSERVED / RATE:g} s at {RATE} frames per second",
         "Will the red object touch the yellow object?",
         "4 EUR",
+        "paid for by the Abc Foundation",
         "12.00 EUR per hour",
         "when 37 participants have finished each scenario",
         "more than 6 equal answers in a row",  # 2 of 64 sequences of 6 tosses have 6 in a row
@@ -63,6 +64,7 @@ def test_the_plan_follows_the_template_and_the_settings(tmp_path: Path) -> None:
     )
     assert "no person can have made it" in other and "age, gender" not in other
     assert "[What do participants receive?]" in other
+    assert "paid for" not in preregistration(replace(study, funders=""))
 
 
 def _pictures(svg: str) -> list[np.ndarray]:

@@ -59,6 +59,7 @@ STUDIES = st.builds(
     languages=st.lists(st.sampled_from(["en", "de", "pt-BR", "zh-Hant"]), min_size=1,
                        unique=True).map(tuple),
     consent_version=LINES,
+    funders=st.just("") | LINES,
     participants=st.integers(1, 10**6),
     seed=st.integers(0, 2**63 - 1),
     orders=st.integers(0, 100_000),

@@ -161,6 +161,21 @@ def test_bodies_deform_where_they_are_free(
         assert np.allclose(own.mean(axis=1), poses.centers[:, row])
 
 
+def test_the_steps_of_a_rollout_can_be_limited(collide: Motion) -> None:
+    """The first steps are the same; a limit beyond the trial's end changes nothing."""
+    whole, few, many = (silent("dpi", future=steps) for steps in (None, 4, 10_000))
+    ((_, full),), ((_, short),), ((_, long),) = (
+        model.futures([collide], 1, 0)[0] for model in (whole, few, many)
+    )
+    observed = whole.spec.context
+    assert len(short.centers) == observed + 4 < len(full.centers) == len(long.centers)
+    assert np.array_equal(short.centers, full.centers[: observed + 4])
+    assert whole.digest() != few.digest()
+    assert model_of("dpi", weights="shipped", future=4).settings.future == 4
+    with pytest.raises(BadInputError, match="future must be at least 1, not 0"):
+        model_of("dpi", future=0)
+
+
 @pytest.mark.parametrize("size", ["small", "paper"])
 def test_gns_and_gns_ransac_are_one_network_with_one_training(size: str, collide: Motion) -> None:
     own, robust = (model_of(name, seed=1, size=size) for name in ("gns", "gns-ransac"))

@@ -32,6 +32,7 @@ export function consentPage(context) {
       el("h1", {}, t("consent.title")),
       ...paragraphs(t("consent.text", values)),
       ...payment(study, texts, lasting),
+      ...(study.funders ? paragraphs(t("consent.funders", { funders: study.funders })) : []),
       ...consentFile(study, texts),
       ...boxes.elements,
       el("p", { class: "small" }, t("consent.version", { version: study.consent_version })),

@@ -186,6 +186,7 @@ export interface PublicStudy {
   languages: string[];
   consent_version: string;
   consent_files: string[];
+  funders: string;
   payment: PaidAmount | null;
   expected_minutes: number;
   scenarios: string[];

@@ -1,7 +1,9 @@
 """Selection of a study's stimuli from a generated dataset.
 
-For each scenario, testing and familiarization trials are drawn, half of them with contact. The
-order of the familiarization trials is fixed here and the same for all participants.
+For each scenario, testing and familiarization trials are drawn, half of them with contact, and of
+all presets about equally many, as far as there are so many: presets differ in the number of
+elements, distractors and occluders, which are so balanced too. The order of the familiarization
+trials is fixed here and the same for all participants.
 """
 
 from __future__ import annotations
@@ -194,7 +196,7 @@ def _sample(
     unusable: Mapping[str, str],
     notes: list[str],
 ) -> pd.DataFrame:
-    """Draw ``half`` rows of a table whose rows all have the same contact label.
+    """Draw ``half`` rows of a table of one contact label, presets alternating.
 
     In place of an unusable one comes the next in the order of the draw of the same preset or, if
     there is none, of any preset, so that the other trials stay. ``notes`` get what was replaced.
@@ -202,6 +204,7 @@ def _sample(
     contact = str(bool(group["contact"].iloc[0]))
     rng = generator("study trials", seed, scenario, phase, contact)
     order = group.iloc[rng.permutation(len(group))]
+    order = order.iloc[alternating(order["preset"].fillna("").astype(str).to_list())]
     bad = order["trial"].isin(unusable).to_numpy()
     presets = order["preset"].fillna("").astype(str).to_list()
     names = order["trial"].to_list()
@@ -218,6 +221,16 @@ def _sample(
             place = new
         places.append(place)
     return order.iloc[places]
+
+
+def alternating(kinds: Sequence[str]) -> list[int]:
+    """Return all positions, ordered so that the kinds alternate: first of each, then second."""
+    seen: Counter[str] = Counter()
+    rounds = []
+    for kind in kinds:
+        rounds.append(seen[kind])
+        seen[kind] += 1
+    return sorted(range(len(kinds)), key=rounds.__getitem__)
 
 
 def _beyond_the_picture(
@@ -445,7 +458,9 @@ def list_scenario(path: Path, rows: Iterable[ListedStimulus]) -> str:
 def _select(
     path: Path, rows: list[ListedStimulus], scenario: str, count: int | None, seed: int
 ) -> list[ListedStimulus]:
-    """Return all rows, or ``count`` random ones, half with contact, in the order of the list."""
+    """Return all rows, or ``count`` random ones, half with contact, configurations alternating, in
+    the order of the list.
+    """
     if count is None or count == len(rows):
         return rows
     check_even(count, "--test")
@@ -456,9 +471,11 @@ def _select(
             f"not {count // 2} of each"
         )
     rng = generator("study list", seed, scenario)
-    kept = {
-        group[index] for group in by_label for index in rng.permutation(len(group))[: count // 2]
-    }
+    kept: set[ListedStimulus] = set()
+    for group in by_label:
+        drawn = [group[index] for index in rng.permutation(len(group))]
+        order = alternating([plain_name(row.stimulus).rpartition("_")[0] for row in drawn])
+        kept |= {drawn[place] for place in order[: count // 2]}
     return [row for row in rows if row in kept]
 
 

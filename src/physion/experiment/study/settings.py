@@ -440,6 +440,9 @@ class StudySettings:
     """Languages, each with a file in texts/; the first is the default."""
     consent_version: Line = "1"
     """Stored with each consent; change it with each change of the consent text."""
+    funders: Annotated[str, StringConstraints(max_length=300), AfterValidator(_one_line)] = ""
+    """Who pays for the study, as in "the NSF (grant 123)"; the consent says it. Empty: it does not
+    speak of this."""
     participants: Annotated[int, Field(ge=1, le=1_000_000)] = 100
     """Complete sessions wanted for each scenario; later ones read that the study is full."""
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0

@@ -96,6 +96,7 @@ def public_study(study: Study, secrets: Secrets) -> PublicStudy:
         languages=list(study.languages),
         consent_version=study.consent_version,
         consent_files=sorted(study.consent_files),
+        funders=study.funders,
         payment=_paid(study.payment),
         expected_minutes=study.payment.minutes,
         scenarios=list(study.scenarios),

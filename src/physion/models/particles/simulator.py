@@ -123,6 +123,7 @@ class ParticleSettings(SizedSettings):
     - ``samples``: futures of a trial, and ``spread``: standard deviation of the noise on their
       initial velocities, m/s. One future has no noise.
     - ``stride``: frames of 0.01 s in one step, 3 or 1.
+    - ``future``: steps of a rollout at most; None: to the end of the trial.
     - ``width``, ``rounds``: of the network.
     - ``rigid``: what keeps bodies rigid in a rollout: ``free`` (nothing), ``ransac``, ``released``
       (a fit to all particles), or ``whole`` for DPI-Net.
@@ -158,6 +159,7 @@ class ParticleSettings(SizedSettings):
     samples: int = 1
     spread: float = 0.05
     stride: Literal[1, 3] = 3
+    future: int | None = None
     width: int = 64
     rounds: int = 3
     rigid: Literal["free", "ransac", "released", "whole"] = "released"
@@ -187,7 +189,7 @@ class ParticleSettings(SizedSettings):
         },
     }  # fmt: skip
     any_weights: ClassVar[frozenset[str]] = SizedSettings.any_weights | {
-        "spread", "rigid", "calibrated",
+        "spread", "rigid", "calibrated", "future",
     }  # fmt: skip
 
     @classmethod
@@ -233,6 +235,8 @@ class ParticleSettings(SizedSettings):
             raise BadInputError(f"{self.model}: rigid={self.rigid} is not for this model")
         self.at_least(1, "samples", "width", "rounds", "gap_limit")
         self.at_least(0, "spread", "pushforward", "velocity_noise", "relative_noise", "rest")
+        if self.future is not None:
+            self.at_least(1, "future")
         _ = self.sampling  # which checks its numbers
 
 
@@ -463,6 +467,8 @@ class ParticleSimulator(TorchModel):
         settings = asdict(self.settings)
         for name in ("weights", "seed", "samples", "calibrated"):
             settings.pop(name)
+        if settings["future"] is None:
+            del settings["future"]  # as before there was this setting
         parts = [self._weights_version, _DISTANCES, settings, torch.__version__]
         return digest_of(parts, self.state_dict().items())
 
@@ -551,6 +557,8 @@ class ParticleSimulator(TorchModel):
         starts: list[Start] = []
         for motion in motions:
             start = observed_start(motion, frames, self.settings.sampling)
+            if self.settings.future is not None:
+                start = replace(start, steps=min(start.steps, self.settings.future))
             observed += [start] * samples
             for sample in range(samples):
                 rng = generator("particle future", seed, motion.scene.name, sample)

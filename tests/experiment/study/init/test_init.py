@@ -83,6 +83,23 @@ def _draw_of_roll(folder: Path, test: int) -> list[str]:
     return [source.stimulus for source in chosen.sources if source.phase == "test"]
 
 
+def test_presets_alternate_in_the_draw(tmp_path: Path) -> None:
+    """Of 24 trials, 12 with contact, 8 of each outcome have preset a, 3 b and 1 c."""
+    make_tiny_dataset(tmp_path, scenarios=("roll",), test=24)
+    table = read_index(tmp_path)
+    preset = {name: "aaaaaaaabbbc"[int(name[-2:]) // 2] for name in table["trial"]}
+    table["preset"] = table["trial"].map(preset)
+    write_index(tmp_path, table)
+    drawn = _draw_of_roll(tmp_path, 12)
+    for outcome in (0, 1):
+        found = Counter(preset[name] for name in drawn if int(name[-2:]) % 2 == outcome)
+        assert found["c"] == 1 and {found["a"], found["b"]} == {2, 3}
+    names = [{s.stimulus for s in choose_trials(tmp_path, test=2, practice=2, seed=seed).sources}
+             for seed in range(8)]  # fmt: skip
+    first = {preset[name] for chosen in names for name in chosen if "testing" in name}
+    assert len(first) > 1, "which preset begins is drawn too"
+
+
 def test_an_unusable_trial_is_replaced_by_the_next_of_its_preset_and_outcome(
     tmp_path: Path,
 ) -> None:
@@ -95,6 +112,8 @@ def test_an_unusable_trial_is_replaced_by_the_next_of_its_preset_and_outcome(
     table = read_index(tmp_path)
     table.loc[table["trial"].isin([bad, wanted]), "preset"] = "other"
     write_index(tmp_path, table)
+    before = _draw_of_roll(tmp_path, 4)
+    assert bad in before and wanted not in before
     mark_unusable(dataset, {bad: "a block flickers"})
     chosen = choose_trials(tmp_path, scenarios=["roll"], test=4, practice=2)
     after = [source.stimulus for source in chosen.sources if source.phase == "test"]
