@@ -10,10 +10,12 @@ from sklearn.ensemble import ExtraTreesClassifier
 from sklearn.linear_model import LogisticRegression
 from sklearn.preprocessing import StandardScaler
 
+import physion.readout.evaluate
 from physion.core.errors import BadInputError
 from physion.core.names import SCENARIOS
 from physion.models.build import build_model
 from physion.readout.decisions import Readout
+from physion.readout.evaluate import evaluate
 from physion.readout.features import StoredFeatures, write_features
 from physion.readout.logistic import LogisticSettings, fit_readout, fit_weights
 from physion.readout.shipped import (
@@ -23,7 +25,10 @@ from physion.readout.shipped import (
     shipped_files,
     write_readouts,
 )
-from physion.readout.trees import FRACTION, Forest, fit_forest
+from physion.readout.trees import FRACTION, LEAF, Forest, fit_forest
+from physion.trials.dataset import Dataset
+from physion.trials.index import write_index
+from support.moving_dots import make_dots
 
 MODELS = {
     "blob-trees": ("blob-trees", {}),
@@ -79,7 +84,7 @@ def test_stored_trees_answer_as_scikit_learn() -> None:
     def rounded(values: np.ndarray) -> np.ndarray:
         return values.reshape(len(values), -1).astype(np.float16).astype(np.float32)
 
-    oracle = ExtraTreesClassifier(20, min_samples_leaf=3, max_features=FRACTION, random_state=0)
+    oracle = ExtraTreesClassifier(20, min_samples_leaf=LEAF, max_features=FRACTION, random_state=0)
     oracle.fit(rounded(features), labels)
     expected = oracle.predict_proba(rounded(tested))[:, 1]
     # Fractions of leaves are rounded to float16.
@@ -163,3 +168,21 @@ def test_files_are_small_and_belong_to_models() -> None:
 def test_other_settings_have_no_readouts() -> None:
     assert find_readouts(build_model("blob-centroids", image_size=32)) is None
     assert find_readouts(build_model("noisy-simulation")) is None
+
+
+@pytest.mark.parametrize(("fit_trials", "fit_on"), [(8, ""), (9, "set 0123")])
+def test_own_trials_are_fitted_where_there_are_as_many(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fit_trials: int, fit_on: str
+) -> None:
+    make_dots(tmp_path / "dots", {"testing": 2, "readout": 8}, ("drop",))
+    index = Dataset(tmp_path / "dots").index
+    index["look"] = "redyellow"
+    write_index(tmp_path / "dots", index)
+    features, labels = problem(20, 8, 6, 7)
+    known = ShippedReadout(fit_weights([features], labels), 8, 6, fit_trials, "")
+    path = tmp_path / "own.safetensors"
+    write_readouts(path, "0" * 64, "set 0123", {(Readout.OBSERVED, "drop"): known})
+    monkeypatch.setattr(physion.readout.evaluate, "find_readouts", lambda _: ShippedReadouts(path))
+    done = evaluate("blob-centroids", tmp_path / "dots", tmp_path / "out", readouts=("observed",))
+    assert set(done.predictions["fit_on"]) == {fit_on}
+    assert set(done.predictions["fit_trials"]) == {fit_trials}

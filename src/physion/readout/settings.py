@@ -83,8 +83,8 @@ class EvaluationSettings(HarnessSettings):
     """What turns features or rollouts into P(contact) (physion ls decisions); default: the model's
     own."""
     readout: Literal["shipped", "fit"] = "shipped"
-    """Readouts that ship are used where they fit the model and the trials are red and yellow; fit:
-    fit all anew, on readout trials."""
+    """Readouts that ship are used where they fit the model, trials are red and yellow, and the
+    split readout has fewer; fit: fit all anew."""
     untrained: bool = False
     """Leave the weights of the model as they are; the table says untrained."""
     rollout_errors: Annotated[bool, tyro.conf.arg(aliases=("--rollout-error",))] = False

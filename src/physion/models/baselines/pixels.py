@@ -227,7 +227,7 @@ class BlobTrees(BlobCentroids):
 def _blob(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return the features called `_OF_BLOB` (T, 10) of the pixels in masks (T, H, W)."""
     _, height, width = mask.shape
-    x, y = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
+    x, y = ((np.arange(side) + 0.5) / side for side in (width, height))
     rows, columns = mask.sum(axis=2), mask.sum(axis=1)
     counts = rows.sum(axis=1)
     most = np.maximum(counts, 1)
