@@ -52,7 +52,6 @@ from sklearn.metrics import roc_auc_score
 
 from physion import Dataset, build_model, sample_scene, simulate
 from physion.analysis.tables import MEAN, POOLED, read_humans, read_predictions
-from physion.cli.run import plan_official
 from physion.clips.batch import LAST_OBSERVED, Batch, Motion, cut_to_observed
 from physion.clips.clips import observed_source, whole_source
 from physion.compute.tasks import processor
@@ -72,6 +71,7 @@ from physion.models.particles.networks import (
 )
 from physion.models.particles.simulator import OBJECTS, ParticleSimulator
 from physion.physics.labels import label_contact
+from physion.pipeline import plan_official
 from physion.readout.evaluate import evaluate
 from physion.readout.rollout_error import motion_error
 from physion.report.compare import compare

@@ -7,7 +7,7 @@ The public names are imported when they are first used, so that ``import physion
 - `generate`: make a dataset of trials. `Dataset`: read it. `clips`: its clips, as torch takes them.
 - `official`: the data of the original study: scenes, recorded outcomes, answers of people.
 - `build_model`: build a model. `train`: train it. `evaluate`: predict the trials of a dataset.
-- `compare`: compare predictions with people.
+- `compare`: compare predictions with people. `run`: all of this in one call.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from physion.models.build import build_model
     from physion.physics.engine import simulate
     from physion.physics.labels import label_contact
+    from physion.pipeline import run
     from physion.readout.evaluate import evaluate
     from physion.readout.train import train
     from physion.rendering.renderer import Renderer
@@ -41,6 +42,7 @@ __all__ = [
     "generate",
     "label_contact",
     "official",
+    "run",
     "sample_scene",
     "simulate",
     "train",
@@ -56,6 +58,7 @@ _MODULES = {
     "generate": "physion.trials.making.generate",
     "label_contact": "physion.physics.labels",
     "official": "physion.data.official",
+    "run": "physion.pipeline",
     "sample_scene": "physion.scenes.sampling.sample",
     "simulate": "physion.physics.engine",
     "train": "physion.readout.train",

@@ -70,13 +70,17 @@ def test_two_columns_are_enough_and_the_terminal_shows_the_results(
     assert main([*command, "--humans", "official"]) == 0
     out = capsys.readouterr().out
     assert main(command) == 0 and capsys.readouterr().out == out, "known by the stimuli's names"
-    lines = [line for line in out.splitlines() if line.strip()]
-    assert lines[1].split() == ["model", "stimuli", "accuracy", "r", "with", "people", "kappa"]
-    rows = [re.split(r"\s{2,}", line) for line in lines[2:-1]]
-    assert [row[0] for row in rows] == [
-        "one person with another", "good", "same", "recorded outcome", "majority of people"
-    ]  # fmt: skip
-    assert rows[1][2] == "1.000 [1.000, 1.000]" and rows[1][1:] == rows[2][1:]
+    lines = out.splitlines()
+    assert len(lines) <= 26, "25 lines, then the path"
+    assert lines[1].split() == ["model", "given", "accuracy", "r", "with", "people", "kappa"]
+    rows = [re.split(r"\s{2,}", line) for line in lines[2:-2]]
+    names = [row[0] for row in rows]
+    assert names[:3] == ["one person with another", "majority of people", "people of the study *"]
+    assert set(names[3:6]) == {"good", "same", "recorded outcome"}
+    own = {row[0]: row[-3:] for row in rows}
+    assert own["good"][0] == "1.000 [1.000, 1.000]" and own["good"] == own["same"]
+    assert {"DPI-Net *", "pDeIT-lstm *"} < set(names[6:]) and "V-JEPA 2 ViT-L *" not in names
+    assert lines[-2].startswith("* published, not run here")
     assert lines[-1] == f"report: {tmp_path / 'out' / 'report.html'}"
 
 

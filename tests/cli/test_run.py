@@ -15,7 +15,10 @@ import pytest
 
 from physion.cli import output
 from physion.cli.main import main
-from physion.cli.run import (
+from physion.core.errors import BadInputError
+from physion.data.official import official
+from physion.models import build_model
+from physion.pipeline import (
     OFFICIAL_MODELS,
     _learns,
     _once,
@@ -23,9 +26,6 @@ from physion.cli.run import (
     plan_official,
     plan_sampled,
 )
-from physion.core.errors import BadInputError
-from physion.data.official import official
-from physion.models import build_model
 from physion.scenes.tdw.read_logs import TrialSet
 from physion.trials.making.plan import GenerateSettings
 
@@ -102,8 +102,10 @@ def test_command_logs_against_people(
     command = ["run", "--scenes", str(official / "scenes"), "--humans", str(official / "humans")]
     command += [*SMALL, "--limit", "1", "--models", "chance", "--out", str(tmp_path)]
     assert main(command) == 0
-    *table, last = capsys.readouterr().out.splitlines()
-    assert re.match(r"report, made in \d+ min \d+ s: ", last)
+    shown = capsys.readouterr()
+    *table, last = shown.out.splitlines()
+    assert re.match(r"report, made in \d+ min \d+ s: ", last) and len(table) <= 25
+    assert "chance · observed: accuracy 0." in shown.err, "rows appear as models finish"
     (header,) = (line for line in table if line.startswith("model "))
     assert "accuracy" in header and "r with people" in header
     assert any(line.startswith("chance") for line in table)

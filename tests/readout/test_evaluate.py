@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -20,7 +22,7 @@ from physion.core.errors import BadInputError, UnknownNameError
 from physion.models import build_model, models
 from physion.models.interface import TrainingSettings
 from physion.readout.decisions import Decided
-from physion.readout.evaluate import Evaluation, evaluate
+from physion.readout.evaluate import EvaluatedModel, Evaluation, evaluate
 from physion.readout.logistic import LogisticSettings
 from physion.readout.settings import EvaluationSettings
 from physion.readout.tables import (
@@ -113,6 +115,26 @@ def test_a_second_run_does_nothing_and_says_the_same(
     evaluate("frozen-encoder", dots, work, options=OPTIONS, settings=QUICK, progress=note)
     assert "features" not in steps and "training all" not in steps
     assert done.paths[0].read_bytes() == content
+
+
+def test_accuracies_are_known_as_soon_as_a_model_has_predicted(dots: Dataset, work: Path) -> None:
+    finished: list[EvaluatedModel] = []
+    models, settings = ["chance", "blob-centroids"], replace(QUICK, readouts=("observed",))
+    both = evaluate(models, dots, work, settings, on_evaluated=finished.append)
+    assert [one.path for one in finished] == both.paths
+    for one in finished:
+        with one.path.open() as stream:
+            rows = list(csv.DictReader(stream))
+        right: dict[str, list[bool]] = {}
+        for row in rows:
+            yes = float(row["p_contact"]) > 0.5
+            right.setdefault(row["scenario"], []).append(yes == (row["outcome"] == "True"))
+        accuracy = fmean(fmean(hits) for hits in right.values())
+        assert list(one.accuracies().values()) == [pytest.approx(accuracy)]
+        table = read_table(one.path)
+        opposite = replace(one, path=work / "opposite.csv")
+        write_table(table.assign(recorded_outcome=~table["outcome"]), opposite.path)
+        assert list(opposite.accuracies().values()) == [pytest.approx(1 - accuracy)]
 
 
 @pytest.mark.parametrize("damage", ["cut", "empty", "no text", "another number"])

@@ -199,7 +199,8 @@ SCORES = {
 
 
 @pytest.mark.parametrize(
-    ("place", "scenario"), [("/ Mean over scenarios", MEAN), ("All stimuli pooled", POOLED)]
+    ("place", "scenario"),
+    [("Scores / Mean over scenarios", MEAN), ("All stimuli pooled", POOLED)],
 )
 def test_scores_of_models(inputs: ReportInputs, page: str, place: str, scenario: str) -> None:
     table = find(page.partition(">Beyond the outcome<")[0], place)

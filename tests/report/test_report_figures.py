@@ -28,8 +28,10 @@ from physion.analysis.people.effects import below_chance_level
 from physion.analysis.scores import COMPUTED
 from physion.analysis.tables import MEAN, name_models
 from physion.core.names import SCENARIOS
+from physion.data.official import official
 from physion.report import html as blocks
 from physion.report import people, scores
+from physion.report.compare import compare
 from physion.report.figures import theme
 from physion.report.figures.by_scenario import measure_figure, model_and_people_figure
 from physion.report.figures.by_stimulus import (
@@ -40,6 +42,7 @@ from physion.report.figures.by_stimulus import (
     response_time_figure,
     scatter_figure,
 )
+from physion.report.figures.overview import overview
 from physion.report.figures.theme import make_plots
 from physion.report.figures.training import generalization_figure, grouped_figure
 from physion.report.html import Picture, number
@@ -500,8 +503,8 @@ def test_one_condition_makes_no_figure(make_comparison: Maker) -> None:
     assert figure_tables.effects_table(comparison, predictions).empty
     assert figure_tables.generalization_table(comparison, predictions).empty
     names = {plot.name for plot in make_plots(ReportInputs(comparison, predictions=predictions))}
-    assert names == {"accuracy", "r", "people_and_models", "scatter", "right_answers", "thirds",
-                     "calibration", "difficulty"}  # fmt: skip
+    assert names == {"overview", "accuracy", "r", "people_and_models", "scatter", "right_answers",
+                     "thirds", "calibration", "difficulty"}  # fmt: skip
 
 
 def test_a_figure_without_a_value_is_left_out(
@@ -664,7 +667,7 @@ def test_a_figure_of_another_package_is_found(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
-    assert done.stdout.split()[:3] == ["accuracy", "own", "r"]
+    assert done.stdout.split()[:4] == ["overview", "accuracy", "own", "r"]
 
 
 # --- looks --------------------------------------------------------------------------------------
@@ -708,3 +711,28 @@ def test_model_names_are_text_and_not_formulas(make_comparison: Maker) -> None:
     figure = measure_figure(table, measure="accuracy")
     assert figure.axes[0].get_yticklabels()[0].get_text().startswith("$x_1$ <b>")
     assert theme.figure_bytes(figure, "png")
+
+
+def test_the_first_picture_has_one_mark_per_model_and_published_ones_hollow() -> None:
+    """A reader sees accuracy to the right and kappa upwards, as the table of results has them."""
+    labels = official().labels
+    p = {name: 0.8 if contact else 0.3 for name, contact in labels.items()}
+    result = compare({"mine": p}, humans="official")
+    assert isinstance(result.inputs, ReportInputs)
+    plot = overview(result.inputs)
+    assert plot is not None
+    table, shown = plot.table.set_index("row"), result.results.set_index("row")
+    assert "V-JEPA 2 ViT-L *" not in table.index, "its likeness to people is not known"
+    assert set(table.index) == set(shown.index) - {"V-JEPA 2 ViT-L *"}
+    figure = plot.draw(plot.table, theme.LIGHT)
+    (axis,) = figure.axes
+    marks = [line for line in axis.lines if line.get_marker() != "None"]
+    for line, (name, row) in zip(marks, table.iterrows(), strict=True):
+        np.testing.assert_allclose(line.get_xydata(), [[row["accuracy"], row["kappa"]]])
+        hollow = line.get_markerfacecolor() == theme.LIGHT.paper
+        assert hollow == str(name).endswith(" *"), name
+    written = {text.get_text() for text in axis.texts}
+    assert written == {name.removesuffix(" *") for name in table.index}
+    (zone,) = axis.patches
+    low = official().results / "human_accuracy_by_scenario.csv"
+    assert zone.get_x() == pytest.approx(pd.read_csv(low)["pct_2.5"].mean())

@@ -136,9 +136,8 @@ def _compare(options: Options) -> int:
         scores = json_module.loads(result.scores.to_json(orient="records", double_precision=15))
         print(json_module.dumps({"report": str(page), "scores": scores, **numbers}))
     else:
-        print_scores(result)
         _print_changed(result)
-        _print(f"report: {page}")
+        print_scores(result, page)
     return 0
 
 

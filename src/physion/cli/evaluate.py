@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from physion.cli.output import Stages, print_line, print_plan, print_warnings, text_table
+from physion.cli.output import Stages, print_line, print_plan, print_scores, print_warnings
 from physion.compute.run_tasks import ExecutorSettings
 from physion.core.errors import BadInputError
 from physion.core.settings import read_pairs, split_names
@@ -76,6 +76,7 @@ def main(options: Options) -> int:
             executor=options.compute.open(),
             progress=stages,
             dry_run=options.dry_run,
+            on_evaluated=stages.note_evaluated,
         )
     _print(done, options)
     return 1 if done.failed or done.problems else 0
@@ -100,29 +101,24 @@ def _print(done: Evaluation, options: Options) -> None:
         print_line(f"failed: {label}: {reason}")
     if done.evaluated:
         print_warnings(done.warnings)
-        print_line(text_table(done.scores.dropna(axis="columns", how="all")))
-        _print_people(done)
+        _print_scores(done)
     for one in done.evaluated:
         print_line(f"predictions: {one.path}{' (done before)' if one.done else ''}")
         if one.rollout_errors is not None:
             print_line(f"errors of imagined motion: {one.rollout_errors}")
 
 
-def _print_people(done: Evaluation) -> None:
-    """Print how similar the predictions are to people's, of official stimuli that people saw."""
+def _print_scores(done: Evaluation) -> None:
+    """Print the table of results, with the people of the study if they saw the stimuli."""
     import physion
     from physion.core.names import canonical_name
     from physion.data.official import official
 
-    if not set(map(canonical_name, done.predictions["stimulus"])) & set(official().labels):
-        return
+    seen = set(map(canonical_name, done.predictions["stimulus"])) & set(official().labels)
     try:
-        result = physion.compare(done.paths, humans="official")
+        print_scores(physion.compare(done.paths, humans="official" if seen else None))
     except BadInputError as error:
-        print_warnings([f"no comparison with people: {error}"])
-        return
-    print_line("With the people of the original study:")
-    print_line(text_table(result.summary))
+        print_warnings([f"no comparison: {error}"])
 
 
 def _values(one: EvaluatedModel) -> dict[str, Any]:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from physion.compute.run_tasks import RunReport
+    from physion.readout.evaluate import EvaluatedModel
     from physion.report.compare import CompareResult
 
 
@@ -82,6 +83,12 @@ class Stages:
     def note(self, text: str) -> None:
         """Show a line above the bars, which stays, on standard error."""
         self._progress.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    def note_evaluated(self, one: EvaluatedModel) -> None:
+        """Show the accuracies of a model that has just predicted, one line per readout."""
+        if not one.done:
+            for name, accuracy in one.accuracies().items():
+                self.note(f"{name}: accuracy {accuracy:.3f}")
 
     def __call__(self, what: str, done: int, total: int) -> None:
         """Show that ``done`` of ``total`` items of a stage are finished."""
@@ -141,12 +148,25 @@ def counted(number: int, singular: str, plural: str = "") -> str:
     return f"{number} {singular if number == 1 else plural or singular + 's'}"
 
 
-def print_scores(result: CompareResult) -> None:
-    """Print the table of results of a comparison: people, models, baselines."""
-    from physion.analysis.scores import AVERAGES
+MOST_ROWS = 20
+"""Rows of the table of results on the terminal, which with all else has at most 25 lines."""
 
-    title = f"People and models, {AVERAGES[result.summary_of]}, with 95 % intervals"
-    console.print(text_table(result.summary, title) + "\n", markup=False, soft_wrap=True)
+
+def print_scores(result: CompareResult, page: Path | None = None, made: str = "") -> None:
+    """Print the table of results, in at most 25 lines, then the path of the report."""
+    from physion.analysis.results import MARKED, fewest_rows
+    from physion.report.compare import as_text
+
+    rows = result.results
+    shown = fewest_rows(rows, MOST_ROWS)
+    print_line(text_table(as_text(shown), f"People and models: {result.heading}"))
+    if (shown["source"] != "").any():
+        print_line(MARKED)
+    if len(rows) > len(shown):
+        where = "" if page is None else f": {page.parent / 'tables' / 'results.csv'}"
+        print_line(f"{len(rows) - len(shown)} more rows{where}")
+    if page is not None:
+        print_line(f"report{made}: {page}")
 
 
 def text_table(table: pd.DataFrame, title: str = "") -> str:

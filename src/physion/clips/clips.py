@@ -43,7 +43,7 @@ def observed_source(
     look
         Colours: ``redyellow`` or ``free``, by default each trial's own.
     rendered
-        Render ``rgb`` from the motion instead of reading movies.
+        Render ``rgb`` from the motion instead of reading movies, as always where no trial has any.
 
     Raises
     ------
@@ -79,6 +79,7 @@ def _readers(
         str(trial): int(frames) for trial, frames in zip(index["trial"], index[column], strict=True)
     }
     readers: list[ClipReader] = []
+    rendered = rendered or bool(index["movie_sha256"].isna().all())
     from_movies = ("rgb",) if "rgb" in spec.inputs and not rendered else ()
     from_motion = [name for name in spec.inputs if name in PIXELS and name not in from_movies]
     if from_movies:

@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -88,6 +88,22 @@ class EvaluatedModel:
     done: bool
     problems: Mapping[str, str]
 
+    def accuracies(self) -> dict[str, float]:
+        """Return the mean accuracy over scenarios by name and readout of the model.
+
+        The outcome is the recorded one, where it is known.
+        """
+        table = read_table(self.path)
+        known = table["recorded_outcome"].astype(str)
+        label = (known.where(known != "", table["outcome"].astype(str))) == "True"
+        right = table.assign(right=(table["p_contact"] > 0.5) == label)
+        keys = ["model", "init", "readout"]
+        means = right.groupby([*keys, "scenario"])["right"].mean().groupby(keys).mean()
+        return {
+            " · ".join(name for name in (model, readout) if name): float(mean)
+            for (model, _, readout), mean in means.items()
+        }
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -149,6 +165,7 @@ def evaluate(
     executor: Executor | None = None,
     progress: Progress | None = None,
     dry_run: bool = False,
+    on_evaluated: Callable[[EvaluatedModel], None] | None = None,
     **changes: Any,
 ) -> Evaluation:
     """Train models and their readouts, and predict every testing trial of a dataset.
@@ -181,6 +198,8 @@ def evaluate(
         Called after every finished item.
     dry_run
         Only say what would be evaluated, and what is done.
+    on_evaluated
+        Called with each evaluation when it is finished.
     **changes
         Fields of `EvaluationSettings` to replace in ``settings``, such as ``seeds=3``.
 
@@ -208,6 +227,7 @@ def evaluate(
         functools.partial(_is_trained, settings=settings),
         every_seed=settings.untrained,
     )
+    finished = None if dry_run else on_evaluated
     elsewhere = None if isinstance(executor, LocalExecutor | SerialExecutor) else executor
     trials, fit_on = open_dataset(dataset, None if dry_run else elsewhere), ""
     if fit is not None:
@@ -216,10 +236,12 @@ def evaluate(
     if elsewhere is None or dry_run:
         work = _Evaluate(trials, Path(out), settings, fit_on)
         here = functools.partial(work, executor=executor, progress=progress, dry_run=dry_run)
-        return Evaluation(*run_cells(cells, here, Path(out), "evaluations", None, progress))
+        done = run_cells(cells, here, Path(out), "evaluations", None, progress, finished)
+        return Evaluation(*done)
     # Its processes may have another working directory.
     there = _Evaluate(trials, Path(out).absolute(), settings, fit_on)
-    return Evaluation(*run_cells(cells, there, Path(out), "evaluations", elsewhere, progress))
+    done = run_cells(cells, there, Path(out), "evaluations", elsewhere, progress, finished)
+    return Evaluation(*done)
 
 
 def _is_trained(model: Any, settings: EvaluationSettings) -> bool:

@@ -303,6 +303,7 @@ def run_cells(
     what: str,
     executor: Executor | None,
     progress: Progress | None,
+    on_done: Callable[[R], None] | None = None,
 ) -> tuple[list[R], dict[str, str]]:
     """Do all cells; one that fails does not stop the others.
 
@@ -316,6 +317,8 @@ def run_cells(
         Does the cells; this process without one.
     progress
         Called after each.
+    on_done
+        Called with each result.
 
     Returns
     -------
@@ -328,7 +331,10 @@ def run_cells(
         If the only cell fails, or nothing more can be written.
     """
     if executor is None and len(cells) == 1:
-        return [function(cells[0])], {}
+        result = function(cells[0])
+        if on_done is not None:
+            on_done(result)
+        return [result], {}
     results, failed = run_tasks(
         function,
         {cell.label: cell for cell in cells},
@@ -336,6 +342,9 @@ def run_cells(
         what=what,
         executor=executor or SerialExecutor(),
         progress=progress,
+        on_outcome=None
+        if on_done is None
+        else lambda outcome: on_done(outcome.value) if outcome.error is None else None,
     )
     if failed and len(cells) == 1:
         raise PhysionError(next(iter(failed.values())))

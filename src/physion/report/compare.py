@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -26,6 +27,8 @@ from physion.analysis.people.results import (
     read_attributes,
     rules_called,
 )
+from physion.analysis.published.tables import PublishedTables, read_published
+from physion.analysis.results import published_rows, results_table, zone_of_people
 from physion.analysis.rollout_errors import read_rollout_errors, rollout_error_table
 from physion.analysis.scores import AVERAGES, shown_average
 from physion.analysis.tables import (
@@ -48,6 +51,7 @@ from physion.analysis.tables import (
     require_columns,
 )
 from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.names import SCENARIOS
 from physion.data.official import PACKAGED, find_official, official
 from physion.report.build import build_people_report, build_report
 from physion.report.html import plural
@@ -93,20 +97,20 @@ class CompareResult:
         return self.inputs.warnings
 
     @property
-    def summary(self) -> pd.DataFrame:
-        """One row per model with accuracy, r and kappa as text with their intervals.
+    def results(self) -> pd.DataFrame:
+        """The table of results: people first, then all others by accuracy (`results_table`).
 
         Over the scenarios with equal weights or, where that has no number because scenarios have
         too few stimuli, over all stimuli together.
         """
-        rows = self.scores[self.scores["scenario"] == self.summary_of]
-        kappa = "kappa" if rows["kappa"].notna().any() else "kappa_from_averages"
-        columns = {"accuracy": "accuracy", "r with people": "r", "kappa": kappa}
-        table = rows[["model", "stimuli"]].copy()
-        for heading, name in columns.items():
-            if rows[name].notna().any():
-                table[heading] = [_with_interval(row, name) for _, row in rows.iterrows()]
-        return table.reset_index(drop=True)
+        if isinstance(self.inputs, PeopleReport):
+            return results_table(self.scores)
+        return self.inputs.results()
+
+    @property
+    def summary(self) -> pd.DataFrame:
+        """The table of results with accuracy, r and kappa as text with their intervals."""
+        return as_text(self.results)
 
     @property
     def summary_of(self) -> str:
@@ -138,14 +142,42 @@ class CompareResult:
         return build_report(replace(self.inputs, methods=methods, **page), Path(folder))
 
     def __repr__(self) -> str:
-        return f"{self._heading()}\n{self.summary.to_string(index=False)}"
+        return f"{self.heading}\n{self._own().to_string(index=False)}"
 
     def _repr_html_(self) -> str:
-        return f"<p>{self._heading()}</p>{self.summary.to_html(index=False)}"
+        return f"<p>{self.heading}</p>{self._own().to_html(index=False)}"
 
-    def _heading(self) -> str:
-        names = [name for name in self.scores["scenario"].unique() if name not in (MEAN, POOLED)]
-        return f"{', '.join(names)}; {AVERAGES[self.summary_of]}; 95 % intervals"
+    def _own(self) -> pd.DataFrame:
+        """Return `summary` without what others published."""
+        results = self.results
+        return as_text(results[results["source"] == ""])
+
+    @property
+    def heading(self) -> str:
+        """What the table of results is about: scenarios, average, stimuli, intervals."""
+        rows = self.scores
+        names = [name for name in rows["scenario"].unique() if name not in (MEAN, POOLED)]
+        of = "8 scenarios" if set(names) == set(SCENARIOS) else ", ".join(names)
+        counts = rows.loc[rows["scenario"] == self.summary_of, "stimuli"]
+        each = f"; {counts.iloc[0]} stimuli" if counts.nunique() == 1 else ""
+        return f"{of}; {AVERAGES[self.summary_of]}{each}; 95 % intervals"
+
+
+def as_text(results: pd.DataFrame) -> pd.DataFrame:
+    """Return a table of results (`results_table`) for a terminal.
+
+    Columns: ``model``, ``given``, ``stimuli`` where their number differs, and ``accuracy``,
+    ``r with people`` and ``kappa`` with their intervals, as far as they are known.
+    """
+    table = results[["row"]].set_axis(["model"], axis=1)
+    if (results["given"] != "").any():
+        table["given"] = results["given"]
+    if results["stimuli"].nunique() > 1:
+        table["stimuli"] = results["stimuli"]
+    for heading, name in (("accuracy", "accuracy"), ("r with people", "r"), ("kappa", "kappa")):
+        if results[name].notna().any():
+            table[heading] = [_with_interval(row, name) for _, row in results.iterrows()]
+    return table.reset_index(drop=True)
 
 
 def _with_interval(row: pd.Series, name: str) -> str:
@@ -301,14 +333,29 @@ def compare(
             zone_origin=averages.zone_origin, groups=grouped, **settings,
         )  # fmt: skip
         results = replace(results, warnings=(*results.warnings, *averages.warnings))
+    tables, scenarios = None, in_order(results.comparison.stimuli["scenario"])
+    if results.comparison.has_people and set(scenarios) <= set(SCENARIOS) and not files:
+        tables = _published_of(results.comparison.stimuli["stimulus"])
     inputs = ReportInputs.of(
         results,
         methods=methods,
+        published=None if tables is None else published_rows(tables, scenarios),
+        zone=None if tables is None else zone_of_people(tables, scenarios),
         model_inputs=_by_model(rows, "inputs"),
         model_weights=_by_model(rows, "init"),
         rollout_errors=None if errors is None else rollout_error_table(errors, draws.level),
     )
     return CompareResult(tidy_scores(results), results.people, inputs)
+
+
+def _published_of(stimuli: pd.Series) -> PublishedTables | None:
+    """Return the released tables of the study if all stimuli are the study's."""
+    return _released() if set(stimuli) <= set(official().labels) else None
+
+
+@cache
+def _released() -> PublishedTables:
+    return read_published(official().results.parent)
 
 
 def _rows(

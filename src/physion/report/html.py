@@ -307,10 +307,11 @@ def movies_of(folder: Path) -> dict[str, Path]:
     trials = dict.fromkeys(dataset.trials("testing"))
     if not trials:
         raise BadInputError(f"{folder} has no testing trial, so no movie that people saw")
-    for trial, file in dataset.files("movie").items():
-        if trial in trials and file.path.is_file():
+    movies = {trial: file for trial, file in dataset.files("movie").items() if trial in trials}
+    for file in movies.values():
+        if file.path.is_file():
             file.check()
-    return {canonical_name(trial): dataset.paths(trial).movie for trial in trials}
+    return {canonical_name(trial): file.path for trial, file in movies.items()}
 
 
 def check_movies(movies: Mapping[str, Path], stimuli: Iterable[str]) -> None:

@@ -12,6 +12,7 @@ import pandas as pd
 from physion.analysis.compare import ComparisonResults, tidy_scores
 from physion.analysis.model_tests import MixedTable
 from physion.analysis.people.results import PeopleResults
+from physion.analysis.results import results_table
 from physion.analysis.scores import runs_table
 from physion.analysis.tables import DETECTION
 
@@ -30,6 +31,7 @@ class ReportInputs(ComparisonResults):
     - ``question``: what people and models were asked, for the movies.
     - ``model_inputs``: what a model was given, by its name: values of the column *Inputs*.
     - ``model_weights``: which weights a model started from, by its name: of the column *Init*.
+    - ``published``: from `published_rows`, or None; ``zone``: from `zone_of_people`, or None.
     - ``rollout_errors``: from `rollout_error_table`, or None.
     - ``movie_count``: largest number of disagreements that are shown as movies.
     - ``page_bytes``: size of the page up to which movies are added; what does not fit is left out.
@@ -43,6 +45,8 @@ class ReportInputs(ComparisonResults):
     question: str = "Will the agent touch the patient?"
     model_inputs: Mapping[str, str] = field(default_factory=dict)
     model_weights: Mapping[str, str] = field(default_factory=dict)
+    published: pd.DataFrame | None = None
+    zone: tuple[tuple[float, float], tuple[float, float]] | None = None
     rollout_errors: pd.DataFrame | None = None
     movie_count: int = 8
     page_bytes: int = 15_000_000
@@ -67,10 +71,15 @@ class ReportInputs(ComparisonResults):
         models = [name for name in self.comparison.models if name not in detecting]
         return models[: self.scatter_limit]
 
+    def results(self) -> pd.DataFrame:
+        """The table of results, see `results_table`."""
+        return results_table(tidy_scores(self), self.model_inputs, self.published)
+
     def tables(self) -> dict[str, pd.DataFrame]:
         """Every table by the name of its file."""
         comparison = self.comparison
         found: dict[str, pd.DataFrame | None] = {
+            "results": self.results(),
             "comparison": self._with_init(self._against_people()),
             "comparison_later": self._with_init(comparison.later)
             if len(comparison.later)

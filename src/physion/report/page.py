@@ -9,13 +9,20 @@ import pandas as pd
 
 from physion.analysis.comparison import Comparison
 from physion.analysis.people.results import PeopleResults
-from physion.analysis.scores import AVERAGES, shown_average
+from physion.analysis.scores import AVERAGES, TWO_PEOPLE, shown_average
 from physion.analysis.tables import MEAN, in_order
 from physion.core.html import Markup, joined
 from physion.report import html, scores
 from physion.report import people as people_parts
-from physion.report.figures.theme import BY_SCENARIO, BY_STIMULUS, TRAINING, all_figures
+from physion.report.figures.theme import (
+    BY_SCENARIO,
+    BY_STIMULUS,
+    FIRST,
+    TRAINING,
+    all_figures,
+)
 from physion.report.html import (
+    MACROS,
     PageMovies,
     Picture,
     Section,
@@ -43,6 +50,7 @@ def render_page(
     shown = {picture.name: figure(picture) for picture in pictures}
     links = _links(inputs, folder)
     sections = [
+        Section("Results", scores.results(inputs)),
         Section("Scores", scores.scores(inputs.comparison)),
         Section(BY_SCENARIO, _by_scenario(inputs, shown)),
         Section(TRAINING, _figures(TRAINING, shown, {})),
@@ -55,7 +63,7 @@ def render_page(
         Section("How this was made", _methods(inputs)),
         Section("What was left out", _left_out(inputs)),
     ]
-    lead = _summary(inputs)
+    lead = _first(inputs, shown)
     # Once without movies, for the size of all else.
     texts = [
         lead,
@@ -88,6 +96,49 @@ def _links(inputs: ReportInputs, folder: Path | None) -> Mapping[str, str]:
         names = inputs.comparison.stimuli["stimulus"].unique()
         return {name: f"{FOLDER}/{page_name(name)}" for name in names}
     return {} if folder is None else html.relative_links(inputs.movies, folder)
+
+
+def _first(inputs: ReportInputs, shown: Mapping[str, Markup]) -> Markup:
+    """Return the first screen: warnings, one sentence, one picture."""
+    warned = html.warnings(inputs.warnings, inputs.mark)
+    picture = _figures(FIRST, shown, {})
+    return joined([warned, Markup(MACROS.first(_sentence(inputs), picture))])
+
+
+def _sentence(inputs: ReportInputs) -> str:
+    """Return who is how accurate, and who is most like people, in one sentence.
+
+    Models that were shown the outcome are left out.
+    """
+    table = inputs.results()
+    comparison = inputs.comparison
+    stimuli = comparison.stimuli["stimulus"].nunique()
+    scenarios = plural(comparison.stimuli["scenario"].nunique(), "scenario")
+    models = table[(table["group"] == "model") & (table["readout"] != "full")]
+    words = []
+    if comparison.has_people:
+        people = table.set_index("row").loc[TWO_PEOPLE]
+        words.append(f"people are right in {html.percent(people['accuracy'])} of their answers")
+    if len(known := models.dropna(subset=["accuracy"])):
+        best = known.loc[known["accuracy"].idxmax()]
+        words.append(
+            f"the most accurate model, {_named(best)}, in {html.percent(best['accuracy'])}"
+        )
+    text = f"On {plural(stimuli, 'stimulus')} of {scenarios}, {', '.join(words)}"
+    if comparison.has_people and len(known := models.dropna(subset=["kappa"])):
+        like = known.loc[known["kappa"].idxmax()]
+        same = len(words) > 1 and like["row"] == best["row"]
+        who = "it is also most like people" if same else f"{_named(like)} is most like people"
+        text += (
+            f"; {who} (kappa {html.number(like['kappa'])}, where two people with each other reach "
+            f"{html.number(people['kappa'])})"
+        )
+    return f"{text}."
+
+
+def _named(row: pd.Series) -> str:
+    name = str(row["row"]).partition(" · ")[0]
+    return f"{name} (given: {row['given']})" if row["given"] else name
 
 
 def _summary(inputs: ReportInputs) -> Markup:
@@ -124,9 +175,8 @@ def _summary(inputs: ReportInputs) -> Markup:
         )
     words.append(_answer(comparison))
     given = f"{inputs_sentence(inputs)} {weights_sentence(inputs)}".strip()
-    more = paragraph(given, "given") if given else Markup()
-    warned = html.warnings(inputs.warnings, inputs.mark)
-    return joined([warned, paragraph(" ".join(words), "lead"), more])
+    more = paragraph(given) if given else Markup()
+    return joined([paragraph(" ".join(words)), more])
 
 
 def _answer(comparison: Comparison) -> str:
@@ -189,7 +239,7 @@ def _methods(inputs: ReportInputs) -> Markup:
     stated = dict.fromkeys(EXPECTED_METHODS, "not stated") | dict(inputs.methods)
     rules = {} if inputs.people is None else people_parts.rules_text(inputs.people)
     choices = {**stated, **inputs.comparison.settings, **rules}
-    return html.definition_list(choices) + scores.definitions(inputs.comparison)
+    return _summary(inputs) + html.definition_list(choices) + scores.definitions(inputs.comparison)
 
 
 def _left_out(inputs: ReportInputs) -> Markup:

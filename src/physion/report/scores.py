@@ -12,6 +12,7 @@ from physion.analysis.comparison import SETTING, Comparison
 from physion.analysis.metrics import BEYOND_OUTCOME, Metric, score_metrics
 from physion.analysis.mixed.result import effect_name
 from physion.analysis.model_tests import MixedTable, permutations_of
+from physion.analysis.results import MARKED
 from physion.analysis.scores import AVERAGES, TWO_PEOPLE, runs_table, shown_average
 from physion.analysis.tables import MEAN, POOLED, in_order
 from physion.core.html import Markup, joined
@@ -83,6 +84,32 @@ def weights_sentence(inputs: ReportInputs) -> str:
 def _describe(given: str) -> str:
     names = [name.strip() for name in given.split(",")]
     return listed([INPUT_WORDS.get(name, name) for name in names])
+
+
+# --- the table of results ------------------------------------------------------------------------
+
+
+def results(inputs: ReportInputs) -> Markup:
+    """Return the table of results: people first, then all others by accuracy."""
+    rows = inputs.results()
+    measures = {"accuracy": "accuracy", "r with people": "r", "kappa": "kappa"}
+    chosen = measures if inputs.comparison.has_people else {"accuracy": "accuracy"}
+    cells = [
+        [str(row["row"]), str(row["given"]), *(_result(row, key) for key in chosen.values())]
+        for _, row in rows.iterrows()
+    ]
+    published = (rows["source"] != "").any()
+    sources = "; ".join(dict.fromkeys(rows.loc[rows["source"] != "", "source"]))
+    caption = AVERAGES[shown_average(inputs.comparison.all_scores)].capitalize()
+    listing = table(["", "given", *chosen], cells, f"{caption}, by accuracy")
+    return listing + (paragraph(f"{MARKED} ({sources}).", "note") if published else Markup())
+
+
+def _result(row: pd.Series, key: str) -> str:
+    """Return a number of the table of results; of published ones the intervals are not known."""
+    if row["source"]:
+        return "" if pd.isna(row[key]) else number(row[key])
+    return interval(row, key)
 
 
 # --- scores, with baselines below the models ----------------------------------------------------

@@ -167,10 +167,11 @@ def style(theme: Theme) -> Any:
 # modules of this folder are imported, and those that other packages name under the entry points
 # ``physion.figures``. ``docs/how-to/add-a-figure.md`` shows how to add one.
 
+FIRST = "First screen"
 BY_SCENARIO = "By scenario"
 TRAINING = "Readout and training"
 BY_STIMULUS = "Stimulus by stimulus"
-"""Sections of the page that contain figures."""
+"""Sections of the page that contain figures; `FIRST` is the space before the first section."""
 
 MakePlot = Callable[[ReportInputs], Plot | None]
 

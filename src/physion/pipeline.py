@@ -1,0 +1,393 @@
+"""The whole pipeline in one call: scenes, physics, rendering, trials, models, readouts, report."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from physion.analysis.tables import read_humans
+from physion.compute.local import LocalExecutor
+from physion.compute.run_tasks import run_tasks
+from physion.compute.tasks import Executor, Progress
+from physion.core.errors import BadInputError
+from physion.core.files import is_whole, write_with_digest
+from physion.core.names import canonical_name
+from physion.core.seeds import stable_hash
+from physion.core.settings import split_names
+from physion.data.official import PACKAGED, find_official, humans_folder, read_official_trials
+from physion.models.interface import ask, can
+from physion.readout.evaluate import EvaluatedModel, Evaluation, evaluate
+from physion.readout.settings import EvaluationSettings, choose_models
+from physion.report.compare import CompareResult, compare
+from physion.report.inputs import ReportInputs
+from physion.report.trials import shown_stimuli
+from physion.scenes.tdw.read_logs import ImportedTrial, TrialSet
+from physion.trials.dataset import Dataset
+from physion.trials.making.generate import make_trials
+from physion.trials.making.plan import (
+    GenerateSettings,
+    TrialTask,
+    check_names,
+    plan_dataset,
+    plan_scenes,
+)
+from physion.trials.trial_file import Trial
+
+OFFICIAL_MODELS = (
+    "state-classifier",
+    "constant-motion",
+    "already-touched",
+    "chance",
+    "noisy-simulation",
+    "dpi",
+    "gns",
+    "gns-ransac",
+    "pEffNetLite0-mlp",
+)
+"""Models of a run on official scenes; those that take no time come first, so that rows appear."""
+SAMPLED_MODELS = ("frozen-encoder", "noisy-simulation")
+SAMPLED_SCENARIOS = ("dominoes", "collide", "drop")
+LIMIT = 10
+"""Testing trials of a scenario, if no number is asked for."""
+SIMULATIONS = ("noisy-simulation", "noisy-simulation-outcomes", "noisy-simulation-people")
+TRAINING = {"steps": 300}
+"""Settings of the training of models that learn; more steps take longer."""
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """Settings of `run`."""
+
+    scenes: Path = Path(PACKAGED)
+    """Official scenes: official (shipped with the package), a folder made by import, or one with
+    command logs."""
+    humans: Path | None = None
+    """Answers of people to these scenes: official, or a folder with human_accuracy-*.csv. Default:
+    official with the scenes of the package, else none."""
+    sampled: bool = False
+    """Sample scenes of Dominoes, Collide and Drop instead; nobody has seen them."""
+    models: str | None = None
+    """Names of models with commas (physion ls models); default: nine for official scenes."""
+    out: Path | None = None
+    """Folder for trials, predictions and the report; default: runs/official or runs/sampled."""
+    limit: int | None = None
+    """Testing trials per scenario, 10 by default, and as many for the readout (twice as many of
+    sampled ones); 0 takes all official ones. Models that learn get as many sampled training trials
+    as there are for the readout, which show no agent and patient."""
+    size: int = 128
+    """Pixels per side of the pictures and movies."""
+    engine: str = "physion"
+    """Engine of the trials and of noisy-simulation (physion ls engines); mujoco has no cloth."""
+    encoder_batch: int = 4
+    """Clips that a network encodes at a time; lower it when memory runs out."""
+    workers: int = os.cpu_count() or 1
+    """Number of processes."""
+    trial_pages: bool = False
+    """Also write a page for each stimulus, to trials/ in the folder of the report."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What `run` did.
+
+    - ``report``: the page. ``result``: the comparison that it shows.
+    - ``evaluation``: predictions of the models.
+    - ``failures``: reasons of scenes, trials and models that failed, one sentence each.
+    """
+
+    report: Path
+    result: CompareResult
+    evaluation: Evaluation
+    failures: Sequence[str]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What may make the results wrong, one sentence each."""
+        return [*self.evaluation.warnings, *self.result.warnings]
+
+
+def run(
+    settings: RunSettings | None = None,
+    *,
+    options: Mapping[str, Mapping[str, Any]] | None = None,
+    progress: Progress | None = None,
+    on_evaluated: Callable[[EvaluatedModel], None] | None = None,
+    **changes: Any,
+) -> Run:
+    """Make trials, let models predict them, compare all with people, and write the report.
+
+    Without settings, a balanced sample of the official scenes that ship with the package is
+    simulated and rendered, and nine models are compared with the people of the original study. A
+    second run resumes, and a larger ``limit`` only adds.
+
+    Parameters
+    ----------
+    settings
+        Scenes, models, folder and sizes.
+    options
+        Options of models, or of their training, by the name of the model.
+    progress
+        Called after every finished item.
+    on_evaluated
+        Called with each model when it has predicted.
+    **changes
+        Fields of `RunSettings` to replace in ``settings``, such as ``limit=2``.
+
+    Returns
+    -------
+    run
+        Page, comparison and predictions, and what failed.
+
+    Raises
+    ------
+    BadInputError
+        Before anything is made, if settings contradict each other or a model cannot be built.
+    """
+    settings = replace(settings or RunSettings(), **changes)
+    humans = _humans(settings)
+    out = settings.out or Path("runs") / ("sampled" if settings.sampled else "official")
+    models = model_options(settings, options or {})
+    # Built now, so that a wrong name or a missing library fails before trials are made.
+    built = [chosen.build(0) for chosen in choose_models(models)]
+    learn = any(_learns(model) for model in built)
+    if settings.sampled:
+        plan = plan_sampled(settings.limit, learn=learn)
+    else:
+        plan = plan_official(settings.scenes, humans, settings.limit, learn=learn)
+    executor = LocalExecutor(workers=settings.workers)
+    making = GenerateSettings(
+        width=settings.size, height=settings.size, look="split", jitters=0, movies=False,
+        engine=settings.engine,
+    )  # fmt: skip
+    trials = make_trials(out / "trials", plan.tasks, making, executor=executor, progress=progress)
+    done = evaluate(
+        models,
+        out / "trials",
+        out / "models",
+        EvaluationSettings(encoder_batch=settings.encoder_batch),
+        executor=executor,
+        progress=progress,
+        on_evaluated=on_evaluated,
+    )
+    reasons = {**trials.failed, **done.problems, **done.failed}
+    failures = [*plan.failures, *(f"{where}: {why}" for where, why in reasons.items())]
+    dataset = Dataset(out / "trials")
+    labels = {canonical_name(name): contact for name, contact in plan.recorded.items()}
+    result = compare(done.paths, humans=humans, labels=labels or None)
+    page = result.report(
+        out / "report",
+        methods=methods(settings, dataset.index, options or {}),
+        movies=page_movies(settings, dataset, result, out / "movies", executor, progress),
+        question="Will the red object touch the yellow one?",
+        trial_pages=settings.trial_pages,
+    )
+    return Run(page, result, done, failures)
+
+
+def _learns(model: Any) -> bool:
+    """Return whether an evaluation trains a built model."""
+    return can(model, "loss") and not ask(model, "trained")
+
+
+def _humans(settings: RunSettings) -> Path | None:
+    """Return the folder of people's answers; raise `BadInputError` if settings disagree."""
+    if settings.sampled and settings.humans is not None:
+        raise BadInputError("--humans does not apply to --sampled: nobody has seen these scenes")
+    least = 1 if settings.sampled else 0
+    if settings.limit is not None and settings.limit < least:
+        raise BadInputError(f"--limit must be at least {least}, not {settings.limit}")
+    humans = settings.humans
+    if not settings.sampled and humans is None and find_official(settings.scenes) is not None:
+        humans = settings.scenes
+    return None if humans is None else humans_folder(humans)
+
+
+def chosen_models(settings: RunSettings) -> list[str]:
+    """Return the names of the models of a run."""
+    if settings.models is not None:
+        return split_names(settings.models, "model")
+    return list(SAMPLED_MODELS if settings.sampled else OFFICIAL_MODELS)
+
+
+def model_options(
+    settings: RunSettings, options: Mapping[str, Mapping[str, Any]]
+) -> dict[str, dict[str, Any]]:
+    """Return the models of a run and the options of each; ``options`` come before our own."""
+    presets: dict[str, dict[str, Any]] = {
+        # Frames of the size of the movies: enlarging them would only take time.
+        "pEffNetLite0-mlp": {"image_size": settings.size},
+        "pEffNetLite0-lstm": {"image_size": settings.size},
+        "frozen-encoder": {"encoder": "resnet18", "weights": "random"},
+        **{name: {"samples": 20, "engine": settings.engine} for name in SIMULATIONS},
+    }
+    return {
+        name: {**TRAINING, **presets.get(name, {}), **options.get(name, {})}
+        for name in chosen_models(settings)
+    }
+
+
+def page_movies(
+    settings: RunSettings,
+    dataset: Dataset,
+    result: CompareResult,
+    folder: Path,
+    executor: Executor,
+    progress: Progress | None,
+) -> dict[str, Path]:
+    """Make the movies that the page shows, or links to because the outcome differs; return them.
+
+    Models see pictures that are rendered when they are read, so that other movies are not needed.
+    """
+    assert isinstance(result.inputs, ReportInputs)
+    names = {canonical_name(trial): trial for trial in dataset.trials("testing")}
+    tested = {stimulus: folder / f"{trial}.mp4" for stimulus, trial in names.items()}
+    inputs = replace(result.inputs, movies=tested, trial_pages=settings.trial_pages)
+    wanted = [*shown_stimuli(inputs), *inputs.comparison.changed["stimulus"]]
+    movies = {stimulus: tested[stimulus] for stimulus in dict.fromkeys(wanted)}
+    tasks = {
+        names[stimulus]: (dataset.paths(names[stimulus]).trial_file, path)
+        for stimulus, path in movies.items()
+        if not is_whole(path)
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    _, failed = run_tasks(
+        _make_movie, tasks, folder=folder, what="movies", executor=executor, progress=progress
+    )
+    return {stimulus: path for stimulus, path in movies.items() if names[stimulus] not in failed}
+
+
+def _make_movie(task: tuple[Path, Path]) -> None:
+    """Render the movie of a trial file."""
+    # Imported late: loading the compiled renderer takes time.
+    from physion.trials.making.make import make_movies
+
+    trial = Trial.open(task[0])
+    movie, _ = make_movies(trial.renderer(), trial.metadata.playback_rate)
+    write_with_digest(task[1], movie)
+
+
+def methods(
+    settings: RunSettings, index: pd.DataFrame, options: Mapping[str, Mapping[str, Any]]
+) -> dict[str, str]:
+    """Return the settings of a run as texts for the report."""
+    splits = index.groupby("split").size()
+    counts = ", ".join(f"{count} {split}" for split, count in splits.items())
+    source = "sampled by this package" if settings.sampled else "official scenes"
+    given = [f"{m}:{n}={v}" for m, own in options.items() for n, v in own.items()]
+    return {
+        "Scenes": f"{source}; trials: {counts}; pictures of {settings.size} x {settings.size} "
+        "pixels, rendered when they are read",
+        "Readout": "one L2 logistic regression per scenario on standardised features, C from 17 "
+        "values in 1e-8 to 1e8 by stratified 5-fold cross-validation on readout trials",
+        "Training": f"models that learn: {TRAINING['steps']} steps on the training trials, which "
+        "show no agent and patient, no labels" + (f"; options: {' '.join(given)}" if given else ""),
+        "Noise of the simulation": "20 simulations per trial from the true state at the end of the "
+        "observed part; the noise scale is fitted on readout trials only",
+        "Engine": ", ".join(sorted(set(index["engine"]))),
+        "Renderer": ", ".join(sorted(set(index["renderer"]))),
+    }
+
+
+# Trials of a run: the official scenes that people saw, or sampled ones.
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """Trials to make, recorded outcomes by stimulus, and failures of the import."""
+
+    tasks: list[TrialTask]
+    recorded: Mapping[str, bool]
+    failures: list[str]
+
+
+def plan_sampled(limit: int | None, *, learn: bool = False) -> RunPlan:
+    """Plan a small set of sampled trials: testing, and twice as many for the readout.
+
+    With ``learn`` there are as many training trials as for the readout.
+    """
+    count = LIMIT if limit is None else limit
+    counts = {"readout": 2 * count, "testing": count, **({"training": 2 * count} if learn else {})}
+    return RunPlan(plan_dataset("sampled", SAMPLED_SCENARIOS, counts), {}, [])
+
+
+def plan_official(
+    scenes: Path, humans: Path | None, limit: int | None, *, learn: bool = False
+) -> RunPlan:
+    """Plan official scenes: those that people saw are tested, others fit models and readouts.
+
+    ``limit`` is the number of testing trials of a scenario, balanced by recorded outcome; as many
+    others are fitted. 0 takes all. With ``learn``, as many training trials are sampled.
+    """
+    limit = LIMIT if limit is None else limit or None
+    seen = set(read_humans(humans)["stimulus"]) if humans is not None else None
+    logs = read_official_trials(scenes)
+    logs.require_trials()
+    recorded = {trial.scene.name: trial.outcome.contact for trial in logs.trials}
+    parts: dict[str, list[ImportedTrial]] = {"testing": [], "readout": []}
+    for trial in _once(logs):
+        # Familiarization trials are neither tested nor fitted.
+        if "familiarization" not in trial.scene.name:
+            tested = seen is None or canonical_name(trial.scene.name) in seen
+            parts["testing" if tested else "readout"].append(trial)
+    # Scenes with the physics of a tested one are not fitted.
+    known = {trial.scene.physics_digest() for trial in parts["testing"]}
+    parts["readout"] = [t for t in parts["readout"] if t.scene.physics_digest() not in known]
+    tasks: list[TrialTask] = []
+    for split, trials in parts.items():
+        chosen = [trial.scene for trial in balanced_trials(trials, limit)]
+        tasks += plan_scenes("official", chosen, split, recorded)
+        if learn and split == "readout":
+            for scenario, count in Counter(scene.scenario for scene in chosen).items():
+                tasks += plan_dataset("official", (scenario,), {"training": count})
+    if not any(task.split == "testing" for task in tasks):
+        raise BadInputError(f"none of the scenes in {scenes} is in {humans}")
+    check_names(tasks)
+    return RunPlan(tasks, recorded, [str(failure) for failure in logs.failures])
+
+
+def _once(logs: TrialSet) -> list[ImportedTrial]:
+    """Return the trials without copies; raise `BadInputError` if two of one name differ."""
+    found: dict[str, ImportedTrial] = {}
+    for trial in logs.trials:
+        name = trial.scene.name
+        first = found.setdefault(name, trial)
+        if first is not trial and trial.scene.physics_digest() != first.scene.physics_digest():
+            files = " and ".join(str(path) for path in logs.logs[name][:2])
+            raise BadInputError(f"two trials are called {name!r}, in {files}; give one folder")
+    return list(found.values())
+
+
+def balanced_trials(trials: Iterable[ImportedTrial], limit: int | None) -> list[ImportedTrial]:
+    """Return at most ``limit`` trials per scenario, with and without contact alternately.
+
+    The choice depends on names and outcomes only; a larger limit includes the trials of a smaller
+    one. Without a limit all trials are returned.
+    """
+    groups: dict[str, list[ImportedTrial]] = defaultdict(list)
+    for trial in sorted(trials, key=lambda trial: stable_hash("limit", trial.scene.name)):
+        groups[trial.scene.scenario].append(trial)
+    # Scenarios begin with either kind, so that one trial of each is balanced, too.
+    ordered = sorted(groups)
+    return [
+        trial
+        for place, scenario in enumerate(ordered)
+        for trial in _alternating(groups[scenario], first=place % 2 == 0)[:limit]
+    ]
+
+
+def _alternating(trials: Sequence[ImportedTrial], *, first: bool) -> list[ImportedTrial]:
+    """Return trials with the outcome ``first`` and with the other, alternately.
+
+    What is left of the more frequent kind comes last.
+    """
+    same = [trial for trial in trials if trial.outcome.contact == first]
+    others = [trial for trial in trials if trial.outcome.contact != first]
+    pairs = zip_longest(same, others)
+    return [trial for pair in pairs for trial in pair if trial is not None]
