@@ -6,6 +6,7 @@ import os
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -22,9 +23,11 @@ from physion.core.names import canonical_name
 from physion.core.seeds import stable_hash
 from physion.core.settings import split_names
 from physion.data.official import PACKAGED, find_official, humans_folder, read_official_trials
+from physion.models.build import build_model
 from physion.models.interface import ask, can
 from physion.readout.evaluate import EvaluatedModel, Evaluation, evaluate
 from physion.readout.settings import EvaluationSettings, choose_models
+from physion.readout.shipped import find_readouts
 from physion.report.compare import CompareResult, compare
 from physion.report.inputs import ReportInputs
 from physion.report.trials import shown_stimuli
@@ -48,10 +51,12 @@ OFFICIAL_MODELS = (
     "noisy-simulation",
     "dpi",
     "gns",
-    "gns-ransac",
+    "blob-trees",
+    "cswm",
     "pEffNetLite0-mlp",
 )
-"""Models of a run on official scenes; those that take no time come first, so that rows appear."""
+"""Models of a run on official scenes; those that take no time come first, so that rows appear. An
+encoder whose readouts ship has a twin with random weights."""
 SAMPLED_MODELS = ("frozen-encoder", "noisy-simulation")
 SAMPLED_SCENARIOS = ("dominoes", "collide", "drop")
 LIMIT = 10
@@ -82,7 +87,7 @@ class RunSettings:
     sampled ones); 0 takes all official ones. Models that learn get as many sampled training trials
     as there are for the readout, which show no agent and patient."""
     size: int = 128
-    """Pixels per side of the pictures and movies."""
+    """Pixels per side of the movies of the page; every model sees pictures of its own size."""
     engine: str = "physion"
     """Engine of the trials and of noisy-simulation (physion ls engines); mujoco has no cloth."""
     encoder_batch: int = 4
@@ -155,8 +160,9 @@ def run(
     out = settings.out or Path("runs") / ("sampled" if settings.sampled else "official")
     models = model_options(settings, options or {})
     # Built now, so that a wrong name or a missing library fails before trials are made.
-    built = [chosen.build(0) for chosen in choose_models(models)]
-    learn = any(_learns(model) for model in built)
+    built = {chosen.name: chosen.build(0) for chosen in choose_models(models)}
+    encoders = [name for name, model in built.items() if _learns(model) and find_readouts(model)]
+    learn = any(_learns(model) for name, model in built.items() if name not in encoders)
     if settings.sampled:
         plan = plan_sampled(settings.limit, learn=learn)
     else:
@@ -167,15 +173,25 @@ def run(
         engine=settings.engine,
     )  # fmt: skip
     trials = make_trials(out / "trials", plan.tasks, making, executor=executor, progress=progress)
-    done = evaluate(
-        models,
-        out / "trials",
-        out / "models",
-        EvaluationSettings(encoder_batch=settings.encoder_batch),
+    do = partial(
+        evaluate,
+        dataset=out / "trials",
+        out=out / "models",
+        settings=EvaluationSettings(encoder_batch=settings.encoder_batch),
         executor=executor,
         progress=progress,
         on_evaluated=on_evaluated,
     )
+    done = Evaluation([], {})
+    if rest := {name: own for name, own in models.items() if name not in encoders}:
+        done = do(rest)
+    if encoders:
+        # Their readouts ship, and what they imagine would have to be trained: it is left out.
+        seen = [built[name] for name in encoders]
+        if settings.models is None:
+            seen += [build_model(name, weights="random") for name in encoders]
+        more = do(seen, readouts=("observed", "full"))
+        done = Evaluation([*done.evaluated, *more.evaluated], {**done.failed, **more.failed})
     reasons = {**trials.failed, **done.problems, **done.failed}
     failures = [*plan.failures, *(f"{where}: {why}" for where, why in reasons.items())]
     dataset = Dataset(out / "trials")
@@ -221,9 +237,6 @@ def model_options(
 ) -> dict[str, dict[str, Any]]:
     """Return the models of a run and the options of each; ``options`` come before our own."""
     presets: dict[str, dict[str, Any]] = {
-        # Frames of the size of the movies: enlarging them would only take time.
-        "pEffNetLite0-mlp": {"image_size": settings.size},
-        "pEffNetLite0-lstm": {"image_size": settings.size},
         "frozen-encoder": {"encoder": "resnet18", "weights": "random"},
         **{name: {"samples": 20, "engine": settings.engine} for name in SIMULATIONS},
     }
@@ -282,9 +295,10 @@ def methods(
     source = "sampled by this package" if settings.sampled else "official scenes"
     given = [f"{m}:{n}={v}" for m, own in options.items() for n, v in own.items()]
     return {
-        "Scenes": f"{source}; trials: {counts}; pictures of {settings.size} x {settings.size} "
-        "pixels, rendered when they are read",
-        "Readout": "one L2 logistic regression per scenario on standardised features, C from 17 "
+        "Scenes": f"{source}; trials: {counts}; every model sees pictures of its own "
+        "size, rendered when they are read",
+        "Readout": "those that ship, fitted on sampled trials, where there are some for the model; "
+        "else one L2 logistic regression per scenario on standardised features, C from 17 "
         "values in 1e-8 to 1e8 by stratified 5-fold cross-validation on readout trials",
         "Training": f"models that learn: {TRAINING['steps']} steps on the training trials, which "
         "show no agent and patient, no labels" + (f"; options: {' '.join(given)}" if given else ""),
