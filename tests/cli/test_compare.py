@@ -98,10 +98,10 @@ def test_the_recorded_outcome_decides_and_differences_are_listed(
     files = [str(tmp_path / f"{name}.csv") for name in ("movies", "simulated")]
     assert main(["compare", *files, "--out", str(tmp_path / "out")]) == 0
     out = capsys.readouterr().out
-    rows = [line.split() for line in out.splitlines() if line.startswith(("movies", "simulated"))]
-    assert [row[2] for row in rows] == ["1.000", "1.000"], "both are right about what was recorded"
+    shown = [line.split() for line in out.splitlines() if line.startswith(("movies", "simulated"))]
+    assert [row[1] for row in shown] == ["1.000", "1.000"], "both are right about what was recorded"
     (note,) = (line for line in out.splitlines() if line.startswith("note: "))
-    assert f"7 of {rows[0][1]} stimuli" in note and "and 2 more" in note
+    assert f"7 of {len(names)} stimuli" in note and "and 2 more" in note
     assert set(re.findall(r"pilot_it2_drop\w+", note)) < other
     listed = pd.read_csv(tmp_path / "out" / "tables" / "changed_outcomes.csv")
     assert set(listed["stimulus"]) == other and set(listed["models"]) == {"simulated"}
