@@ -82,7 +82,7 @@ class MissingExtraError(PhysionError):
 
     def __init__(self, what: str, extra: str) -> None:
         super().__init__(
-            f"{what} needs the extra {extra!r}: in the clone, "
+            f"{what} needs the extra {extra!r}; in the clone: "
             f"pip install -e '.[{extra}]' -c requirements.lock"
         )
         self.extra = extra
