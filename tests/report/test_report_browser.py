@@ -35,6 +35,7 @@ def page(make_comparison: Maker, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 def test_movies_in_view_play_and_nothing_else_is_asked_for(browser: Browser, page: Path) -> None:
     browser.open(page)
+    browser.ask("document.querySelector('#one-trial-of-each-scenario').scrollIntoView()")
     seen = "[...document.querySelectorAll('#one-trial-of-each-scenario video')]"
     browser.until(f"{seen}.length === 2 && {seen}.every(v => v.currentTime > 0.1 && v.muted)")
     far = "[...document.querySelectorAll('#what-people-and-models-disagree-on video')]"
@@ -52,6 +53,7 @@ def test_with_reduced_motion_a_movie_plays_only_on_request(browser: Browser, pag
     movies = "[...document.querySelectorAll('video')]"
     assert browser.ask(f"{movies}.length") == 10
     assert browser.ask(f"{movies}.every(v => v.paused && v.currentTime === 0)")
+    browser.ask(f"{first}.scrollIntoView()")
     browser.ask(f"{first}.querySelector('input').click()")
     browser.until(f"{first}.querySelector('video').currentTime > 0.1")
     assert browser.ask(f"getComputedStyle({first}.querySelector('img')).display") == "none"
