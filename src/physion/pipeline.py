@@ -79,7 +79,7 @@ class RunSettings:
     sampled: bool = False
     """Sample scenes of Dominoes, Collide and Drop instead; nobody has seen them."""
     models: str | None = None
-    """Names of models with commas (physion ls models); default: nine for official scenes."""
+    """Names of models with commas (physion ls models); default: ten for official scenes."""
     out: Path | None = None
     """Folder for trials, predictions and the report; default: runs/official or runs/sampled."""
     limit: int | None = None
@@ -129,7 +129,7 @@ def run(
     """Make trials, let models predict them, compare all with people, and write the report.
 
     Without settings, a balanced sample of the official scenes that ship with the package is
-    simulated and rendered, and nine models are compared with the people of the original study. A
+    simulated, and ten models are compared with the people of the original study. A
     second run resumes, and a larger ``limit`` only adds.
 
     Parameters
@@ -199,7 +199,7 @@ def run(
     result = compare(done.paths, humans=humans, labels=labels or None)
     page = result.report(
         out / "report",
-        methods=methods(settings, dataset.index, options or {}),
+        methods=methods(settings, dataset.index, options or {}, built, models),
         movies=page_movies(settings, dataset, result, out / "movies", executor, progress),
         question="Will the red object touch the yellow one?",
         trial_pages=settings.trial_pages,
@@ -287,26 +287,45 @@ def _make_movie(task: tuple[Path, Path]) -> None:
 
 
 def methods(
-    settings: RunSettings, index: pd.DataFrame, options: Mapping[str, Mapping[str, Any]]
+    settings: RunSettings,
+    index: pd.DataFrame,
+    options: Mapping[str, Mapping[str, Any]],
+    built: Mapping[str, Any],
+    models: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, str]:
-    """Return the settings of a run as texts for the report."""
+    """Return the settings of a run as texts for the report.
+
+    ``options``: what the user gave. ``built``, ``models``: the models, and all their options.
+    """
     splits = index.groupby("split").size()
     counts = ", ".join(f"{count} {split}" for split, count in splits.items())
     source = "sampled by this package" if settings.sampled else "official scenes"
     given = [f"{m}:{n}={v}" for m, own in options.items() for n, v in own.items()]
-    return {
+    steps = [f"{name} {models[name]['steps']} steps" for name in built if _learns(built[name])]
+    samples = [f"{name} {models[name]['samples']}" for name in built if name in SIMULATIONS]
+    texts = {
         "Scenes": f"{source}; trials: {counts}; every model sees pictures of its own "
         "size, rendered when they are read",
         "Readout": "those that ship, fitted on sampled trials, where there are some for the model; "
         "else one L2 logistic regression per scenario on standardised features, C from 17 "
         "values in 1e-8 to 1e8 by stratified 5-fold cross-validation on readout trials",
-        "Training": f"models that learn: {TRAINING['steps']} steps on the training trials, which "
-        "show no agent and patient, no labels" + (f"; options: {' '.join(given)}" if given else ""),
-        "Noise of the simulation": "20 simulations per trial from the true state at the end of the "
-        "observed part; the noise scale is fitted on readout trials only",
         "Engine": ", ".join(sorted(set(index["engine"]))),
         "Renderer": ", ".join(sorted(set(index["renderer"]))),
     }
+    if steps:
+        texts["Training"] = (
+            f"{', '.join(steps)}, on the training trials, which show no agent and patient, "
+            "without labels"
+        )
+    texts["Noise of the simulation"] = "no model of this run simulates with noise"
+    if samples:
+        texts["Noise of the simulation"] = (
+            f"simulations per trial: {', '.join(samples)}, from the true state at the end of the "
+            "observed part; where several noise scales are offered, readout trials choose"
+        )
+    if given:
+        texts["Options"] = " ".join(given)
+    return texts
 
 
 # Trials of a run: the official scenes that people saw, or sampled ones.

@@ -20,9 +20,12 @@ from physion.data.official import official
 from physion.models import build_model
 from physion.pipeline import (
     OFFICIAL_MODELS,
+    RunSettings,
     _learns,
     _once,
     balanced_trials,
+    methods,
+    model_options,
     plan_official,
     plan_sampled,
 )
@@ -181,3 +184,19 @@ def test_an_unknown_model_is_refused_before_anything_is_made(
         assert main(["run", "--models", names, "--out", str(tmp_path / "out")]) == 2
         assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_the_report_states_the_settings_of_the_models_that_ran() -> None:
+    index = pd.DataFrame({"split": ["testing"], "engine": ["e"], "renderer": ["r"]})
+    for names, options, noise in (
+        ("noisy-simulation,chance", {"noisy-simulation": {"samples": 5}}, "noisy-simulation 5,"),
+        ("chance", {}, "no model of this run simulates with noise"),
+    ):
+        settings = RunSettings(models=names)
+        built = {name: build_model(name) for name in names.split(",")}
+        texts = methods(settings, index, options, built, model_options(settings, options))
+        assert noise in texts["Noise of the simulation"] and "Training" not in texts
+    settings, options = RunSettings(models="frozen-encoder"), {"frozen-encoder": {"steps": 7}}
+    built = {"frozen-encoder": build_model("frozen-encoder", weights="random")}
+    texts = methods(settings, index, options, built, model_options(settings, options))
+    assert texts["Training"].startswith("frozen-encoder 7 steps,")

@@ -293,19 +293,31 @@ def fit_readout(
     if settings.balance:
         kept = undersample(labels, settings.seed)
         fit, labels = fit.select(kept), labels[kept]
-    hits, count = int(labels.sum()), len(labels)
-    if hits in (0, count):
-        p = (hits + 1) / (count + 2)
-        note = "no trial to fit" if count == 0 else "one answer only"
-        accuracy = float("nan") if count == 0 else float(np.mean(labels == (p > 0.5)))
+    if constant := one_answer(labels):
+        p, accuracy, note = constant
         return FittedReadout(
             np.full(tested.shape[0], p), accuracy, float("nan"), float("nan"), note
         )
+    count = len(labels)
     solve = _solve_released if settings.released else _solve_exactly
     c, cv_accuracy, note, scores = solve(fit, labels, tested, settings)
     probability = 1 / (1 + np.exp(-np.clip(scores[count:], -700, 700)))
     accuracy = float(np.mean((scores[:count] > 0) == labels))
     return FittedReadout(probability, accuracy, cv_accuracy, c, note)
+
+
+def one_answer(labels: Booleans) -> tuple[float, float, str] | None:
+    """Return P(contact), accuracy on the fit trials and a note if all have one outcome, else None.
+
+    P is (contacts + 1) / (trials + 2); without any trial it is 1/2, and the accuracy NaN.
+    """
+    hits, count = int(labels.sum()), len(labels)
+    if hits not in (0, count):
+        return None
+    p = (hits + 1) / (count + 2)
+    if count == 0:
+        return p, float("nan"), "no trial to fit"
+    return p, float(np.mean(labels == (p > 0.5))), "one answer only"
 
 
 def undersample(labels: Booleans, seed: int) -> NDArray[np.int64]:

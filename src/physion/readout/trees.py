@@ -20,7 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.readout.decisions import Booleans, Decided, Decision
-from physion.readout.logistic import JoinedFeatures, LogisticSettings, stratified_splits
+from physion.readout.logistic import (
+    JoinedFeatures,
+    LogisticSettings,
+    one_answer,
+    stratified_splits,
+)
 
 TREES, LEAF, FRACTION = 64, 4, 0.2
 """Trees, smallest number of fit trials of a leaf, and fraction of features tried for a split.
@@ -122,11 +127,9 @@ class TreesDecision(Decision):
     def decide(self, fit: Sequence[Any], labels: Booleans, test: Sequence[Any]) -> Decided:
         """Fit on the parts ``fit`` and return the probabilities of the parts ``test``."""
         tested = JoinedFeatures(test, "test").array()
-        hits, count = int(labels.sum()), len(labels)
-        if hits in (0, count):
-            p = (hits + 1) / (count + 2)
-            note = "no trial to fit" if count == 0 else "one answer only"
-            return Decided(np.full(len(tested), p), math.nan, note=note)
+        if constant := one_answer(labels):
+            p, train_accuracy, note = constant
+            return Decided(np.full(len(tested), p), train_accuracy, note=note)
         features = JoinedFeatures(fit).array()
         forest = fit_forest(features, labels)
         accuracy = cross_validate(features, labels, self.settings)
