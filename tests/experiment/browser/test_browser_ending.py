@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 import sqlite3
 from collections.abc import Iterator
 from dataclasses import replace
@@ -193,14 +194,16 @@ def test_stopping_sends_what_was_answered_and_is_final(
         visit.page.get_by_text("Stop taking part").click()
         visit.page.get_by_text("Stop for good").click()
         visit.heading("One moment")
+        # What was noted is stored before the session ends, also by a slow network.
+        visit.page.route("**/api/events", lambda route: (time.sleep(0.5), route.continue_())[1])
         visit.context.set_offline(False)
         visit.heading("You have stopped")
+        session, _, events = rows_of(study, "Leaving")
         visit.picture("stopped")
-        assert rows_of(study, "Leaving")[0].reference in visit.page.inner_text("main")
+        assert session.reference in visit.page.inner_text("main")
         visit.page.reload()
         visit.heading("You have stopped")
         assert visit.unexpected() == []
-    session, _, events = rows_of(study, "Leaving")
     assert session.withdrawn_at is not None and session.finished_at is None
     assert [row.response for row in answers_to_test(study, "Leaving")] == ["no"]
     (stopped,) = [event.data for event in events if event.kind == "stop_answered"]

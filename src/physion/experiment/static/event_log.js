@@ -17,7 +17,8 @@ export class EventLog {
   #events = [];
   /** The batch that is sent next. @type {import("./messages.js").Events|null} */
   #batch = null;
-  #sending = false;
+  /** Sending that has begun and not ended. @type {Promise<void>|null} */
+  #sending = null;
   #consented = false;
 
   /** @param {import("./api.js").Api} api */
@@ -76,16 +77,21 @@ export class EventLog {
     this.#batch = null;
   }
 
-  /** Send all events if consent was given; on failure keep them for the next time. */
+  /**
+   * Send all events if consent was given; on failure keep them for the next time.
+   * @returns {Promise<void>} Ends when what was added before is stored, or sending has failed.
+   */
   async send() {
-    if (this.#sending || !this.#consented || !this.api.token) return;
-    this.#sending = true;
+    if (!this.#consented || !this.api.token) return;
+    this.#sending ??= this.#sendAll().finally(() => (this.#sending = null));
+    await this.#sending;
+  }
+
+  async #sendAll() {
     try {
       while (this.#next()) await this.#sendBatch(this.#batch);
     } catch {
       // The same batch is sent the next time.
-    } finally {
-      this.#sending = false;
     }
   }
 
