@@ -122,7 +122,8 @@ def results_table(
     """
     rows = scores[scores["scenario"] == shown_average(scores)]
     kappa = "kappa" if rows["kappa"].notna().any() else "kappa_from_averages"
-    names = [str(name) for name in rows["base_model"].fillna(rows["model"])]
+    base = rows["base_model"]
+    names = [str(name) for name in base.where(base.notna(), rows["model"])]
     given = [_given(name, (inputs or {}).get(name, "")) for name in names]
     whole = [", whole movie" * (readout == "full") for readout in rows["readout"]]
     people = rows["model"].isin([TWO_PEOPLE, MAJORITY]) | (rows["kind"] == "people")
