@@ -63,6 +63,8 @@ COMMAND = (
     "redyellow --jitters 0 --observed-contact --name readout-1000"
 )
 MODELS: Mapping[str, tuple[str, Mapping[str, Any], tuple[Readout, ...]]] = {
+    "state-trees": ("state-trees", {}, (Readout.OBSERVED,)),
+    "mask-trees": ("mask-trees", {}, (Readout.OBSERVED, Readout.FULL)),
     "blob-trees": ("blob-trees", {}, (Readout.OBSERVED, Readout.FULL)),
     "blob-centroids": ("blob-centroids", {}, (Readout.OBSERVED, Readout.FULL)),
     "tf_efficientnet_lite0": ("pEffNetLite0-mlp", {}, (Readout.OBSERVED, Readout.FULL)),

@@ -40,7 +40,7 @@ SIZE = ["--width", "64", "--height", "64", "--jitters", "0"]
 VISION = "svg,op3,cswm,rpin"
 FROZEN = "pEffNetLite0-mlp,pEffNetLite0-lstm"
 BASELINES = (
-    "state-classifier,constant-motion,already-touched,blob-centroids,copy-last-frame,outcome,chance"
+    "state-trees,constant-motion,already-touched,blob-centroids,copy-last-frame,outcome,chance"
 )
 MOVIES, STATES = "movies", "states"
 """Folders of the trials."""

@@ -44,7 +44,7 @@ from physion.trials.making.plan import (
 from physion.trials.trial_file import Trial
 
 OFFICIAL_MODELS = (
-    "state-classifier",
+    "state-trees",
     "constant-motion",
     "already-touched",
     "chance",

@@ -66,19 +66,19 @@ def test_sampled_scenes_to_report(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_the_first_command_compares_models_with_people(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    few = ["--models", "noisy-simulation,state-classifier,chance"]
+    few = ["--models", "noisy-simulation,state-trees,chance"]
     command = ["run", "--out", str(tmp_path), *SMALL, *FEW, *few, "--trial-pages", "--json"]
     assert main(command) == 0
     answer = json.loads(capsys.readouterr().out)
     scores = pd.DataFrame(answer["scores"])
-    assert {"noisy-simulation", "state-classifier", "chance"} <= set(scores["base_model"])
+    assert {"noisy-simulation", "state-trees", "chance"} <= set(scores["base_model"])
     rows = scores[(scores["scenario"] == "pooled") & (scores["base_model"] == "noisy-simulation")]
     assert rows["stimuli"].item() >= 14  # two a scenario; Roll trials with a ledge may be left out
     assert 0.5 < rows["human_accuracy"].item() < 1
     stimuli = pd.read_csv(Path(answer["report"]).parent / "tables" / "stimuli.csv")
     page = Path(answer["report"]).read_text()
     assert page.count("<video") >= 8 and "Will the red object touch the yellow one?" in page
-    assert "noisy-simulation and state-classifier: the true state of the scene" in page
+    assert "noisy-simulation and state-trees: the true state of the scene" in page
     assert "chance: nothing of the trial" in page
     pages = list((tmp_path / "report" / "trials").iterdir())
     assert len(pages) == stimuli["stimulus"].nunique() + 1

@@ -12,13 +12,8 @@ import pytest
 from physion.clips.batch import Batch, Motion
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.models import build_model
-from physion.models.baselines.motion import BLOCK, NAMES, state_features
-from physion.models.baselines.pixels import (
-    BLOB_FEATURES,
-    BlobCentroids,
-    CopyLastFrame,
-    color_masks,
-)
+from physion.models.baselines.pixels import BlobCentroids, CopyLastFrame, color_masks
+from physion.models.baselines.trees import BLOB_FEATURES, NEAREST, STATE_FEATURES
 from physion.models.gaps import FAR, TOLERANCE, minimise
 from physion.models.interface import Model, can
 from physion.physics.cloth.simulate import ClothSettings
@@ -30,7 +25,8 @@ from support.crossing_bodies import batch_of, crossing, replace_future, some_cro
 from support.rendered_scenes import resting
 
 OTHERS: dict[str, dict[str, Any]] = {
-    "state-classifier": {"trees": 7},
+    "state-trees": {"stride": 9},
+    "mask-trees": {"image_size": 48},
     "already-touched": {"margin": 0.02},
     "constant-motion": {"frames": 20},
     "blob-centroids": {"image_size": 48},
@@ -42,7 +38,7 @@ OTHERS: dict[str, dict[str, Any]] = {
 
 def fitted(name: str, fit: Batch, labels: np.ndarray) -> Any:
     """Return the baseline, fitted if it can be."""
-    model = build_model(name, **({"trees": 20} if name == "state-classifier" else {}))
+    model = build_model(name)
     return model.fit(fit, labels, 3) if can(model, "fit") else model
 
 
@@ -77,7 +73,7 @@ def test_baselines_say_what_they_see_and_answer_from_the_observed_part() -> None
     stated = {name: model.provenance().inputs for name, model in models.items()}
     assert {name: words for name, words in stated.items() if words} == {"chance": "base rate"}
     answering = {name: model.answers for name, model in models.items() if model.answers}
-    known = ("state-classifier", "already-touched", "chance")
+    known = ("already-touched", "chance")
     assert answering == dict.fromkeys(known, "observed")
 
 
@@ -101,7 +97,7 @@ def test_an_answer_depends_only_on_its_own_trial(name: str) -> None:
     assert alone.tobytes() == together.tobytes()
 
 
-@pytest.mark.parametrize("name", ["state-classifier", "already-touched", "constant-motion"])
+@pytest.mark.parametrize("name", ["already-touched", "constant-motion"])
 def test_noise_after_the_observed_part_changes_no_answer(name: str) -> None:
     fit, labels = some_crossings(60, 0)
     model, batch = seen_by(name)
@@ -112,7 +108,7 @@ def test_noise_after_the_observed_part_changes_no_answer(name: str) -> None:
     assert answers(refit, batch).tobytes() == answers(model, batch).tobytes()
 
 
-@pytest.mark.parametrize("name", ["state-classifier", "already-touched", "constant-motion"])
+@pytest.mark.parametrize("name", ["already-touched", "constant-motion"])
 def test_trials_without_motion_or_observed_part_are_named(name: str) -> None:
     model, batch = seen_by(name)
     movie = crossing(name="movie_0001", agent=(float("nan"), 0.0, 0.0))
@@ -274,124 +270,130 @@ def test_search_ends_at_a_touch() -> None:
     assert len(times) == 6
 
 
-# Features of the state at frame 44, and trees that are fitted on them.
+# Features of the true state, for trees.
 
 
-def named(motion: Motion) -> dict[str, float]:
-    """Return the features of a motion by name."""
-    return dict(zip(NAMES, state_features(motion).tolist(), strict=True))
+def state_rows(motion: Motion, *frames: int) -> np.ndarray:
+    """Return the features (T, D) of some frames, by default of frame 44 only."""
+    shown = np.array([frames or (44,)])
+    batch = Batch((motion.scene.name,), shown, np.ones_like(shown, bool), state=(motion,))
+    return np.asarray(build_model("state-trees").encode(batch)[0])
 
 
-def block(role: str, values: dict[str, float]) -> list[float]:
-    """Return the features of one role."""
-    return [values[f"{role} {name}"] for name in BLOCK]
+def named(motion: Motion, frame: int = 44) -> dict[str, float]:
+    """Return the features of a frame by name."""
+    return dict(zip(STATE_FEATURES, state_rows(motion, frame)[0].tolist(), strict=True))
 
 
-def test_features_match_frame_44() -> None:
+def of(slot: str, values: dict[str, float]) -> dict[str, float]:
+    """Return the features of one object by name."""
+    start = f"{slot} "
+    return {n.removeprefix(start): v for n, v in values.items() if n.startswith(start)}
+
+
+def test_features_are_seen_from_the_floor_below_the_patient_towards_the_agent() -> None:
     motion = crossing(
-        agent=(1.0, 2.0, 3.0), velocity=(4.0, 0.0, -1.0), spin=(0.1, 0.2, 0.3),
+        agent=(5.0, 6.0, 3.0), velocity=(4.0, 0.0, -1.0), spin=(0.1, 0.2, 0.3),
         patient=(5.0, 2.0, 0.0), scale=(0.5, 1.0, 2.0),
     )  # fmt: skip
     values = named(motion)
-    # Centres lie half a height above the pivots.
-    expected = [1, 0, 1, 2, 4, 1, 0, 0, 0, 4, 0, -1, 0.1, 0.2, 0.3, 0.5, 1, 2]
-    assert block("agent", values) == pytest.approx(expected)
-    assert block("patient", values)[2:5] == pytest.approx([5, 2, 1])
-    assert block("probe", values) == [0] * len(BLOCK), "this scene has no probe"
-    between = [values[f"agent to patient {n}"] for n in ("dx", "dy", "dz", "dvx", "dvy", "dvz")]
-    assert between == pytest.approx([4, 0, -3, -4, 0, 1])
-    assert values["agent to patient distance"] == pytest.approx(5)
+    # Centres lie half a height above the pivots; the agent is four metres along y.
+    expected = {
+        "present": 1, "cloth": 0, "x": 4, "y": 0, "z": 4, "axis x": 0, "axis y": -1, "axis z": 0,
+        "up x": 0, "up y": 0, "up z": 1, "vx": 0, "vy": -4, "vz": -1, "wx": 0.2, "wy": -0.1,
+        "wz": 0.3, "length": 0.5, "width": 1, "height": 2,
+    }  # fmt: skip
+    assert of("agent", values) == pytest.approx(expected, abs=1e-6)
+    assert [of("patient", values)[axis] for axis in "xyz"] == pytest.approx([0, 0, 1])
+    assert not any(of("probe", values).values()), "this scene has no probe"
+    between = {"ahead": 4, "up": 3, "distance": 5, "approach": (4 * 0 + 3 * -1) / 5}
+    assert {name: values[name] for name in between} == pytest.approx(between)
+    # A tenth of a second earlier the agent was elsewhere, in the same frame of reference.
+    earlier = of("agent", named(motion, 34))
+    assert [earlier[axis] for axis in "xyz"] == pytest.approx([4, 0.4, 4.1], abs=1e-5)
 
 
-def test_equal_rotations_have_equal_features_and_move_the_centre() -> None:
-    motion = crossing(agent=(0.0, 0.0, 0.0), scale=(1.0, 1.0, 2.0))
+@pytest.mark.parametrize("angle", [0.7, -2.0, math.pi])
+def test_a_scene_that_is_turned_and_moved_has_the_same_features(angle: float) -> None:
+    bodies = (
+        Body("agent", "cube", (0, 0, 0)), Body("patient", "cube", (2, 0, 0)),
+        Body("ball", "sphere", (0, -3, 0)), Body("far", "cube", (1, 4, 0)),
+    )  # fmt: skip
+    motion = crossing(
+        agent=(0.0, 0.3, 0.5), velocity=(2.0, 1.0, 0.5), bodies=bodies,
+        roles=Roles("agent", "patient", "ball"),
+    )  # fmt: skip
+    c, s = math.cos(angle), math.sin(angle)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    path = motion.trajectory
+    # About z, as a quaternion in front of those of the bodies, which are at rest.
+    about_z = np.array([math.cos(angle / 2), 0, 0, math.sin(angle / 2)], np.float32)
+    turned = replace(
+        path,
+        positions=(path.positions @ turn.T + (3, -1, 0)).astype(np.float32),
+        velocities=(path.velocities @ turn.T).astype(np.float32),
+        rotations=np.broadcast_to(about_z, path.rotations.shape).copy(),
+    )
+    other = state_rows(Motion(motion.scene, turned), 0, 22, 44)
+    assert other == pytest.approx(state_rows(motion, 0, 22, 44), abs=1e-5)
+
+
+def test_other_objects_are_the_nearest_to_the_line_in_the_order_of_their_distance() -> None:
+    bodies = [Body("agent", "cube", (0, 0, 0)), Body("patient", "cube", (10, 0, 0))]
+    # On the line, from the agent to the patient, and one behind the patient that is farther.
+    bodies += [Body(f"on {x}", "cube", (x, 0.1, 0), (x, 1, 1)) for x in (8, 5, 2, 4, 6, 3)]
+    bodies += [Body("behind", "cube", (10.5, 3, 0), (99, 1, 1))]
+    values = named(crossing(bodies=tuple(bodies), agent=(0.0, 0.0, 0.0)))
+    lengths = [of(f"object {number}", values)["length"] for number in range(1, NEAREST + 1)]
+    assert lengths == [8, 6, 5, 4, 3, 2]
+
+
+def test_a_rotation_and_its_negative_have_equal_features_and_move_the_centre() -> None:
+    motion = crossing(agent=(0.0, 0.0, 0.0), patient=(-5.0, 0.0, 0.0), scale=(1.0, 1.0, 2.0))
     rotations = np.array(motion.trajectory.rotations)
     rotations[:, 0] = (np.sqrt(0.5), np.sqrt(0.5), 0, 0)  # about x: up becomes -y
     turned = Motion(motion.scene, replace(motion.trajectory, rotations=rotations))
     other = Motion(motion.scene, replace(motion.trajectory, rotations=-rotations))
-    assert state_features(turned).tolist() == state_features(other).tolist()
-    values = named(turned)
-    assert [values[f"agent {axis}"] for axis in "xyz"] == pytest.approx([0, -1, 0], abs=1e-6)
-    assert values["agent qw"] == pytest.approx(np.sqrt(0.5))
-
-
-def test_probe_is_a_body_of_its_own() -> None:
-    bodies = (Body("agent", "cube", (0, 0, 0)), Body("patient", "cube", (2, 0, 0)))
-    motion = crossing(
-        bodies=(*bodies, Body("ball", "sphere", (0, -3, 0))),
-        roles=Roles("agent", "patient", "ball"),
+    assert state_rows(turned).tolist() == state_rows(other).tolist()
+    values = of("agent", named(turned))
+    # The centre is one metre to the side of the pivot, and the first axis points to it.
+    assert [values[n] for n in "xyz"] == pytest.approx([math.hypot(5, 1), 0, 0], abs=1e-6)
+    assert [values[f"up {axis}"] for axis in "xyz"] == pytest.approx(
+        [1 / math.hypot(5, 1), -5 / math.hypot(5, 1), 0], abs=1e-6
     )
-    values = named(motion)
-    assert block("probe", values)[:5] == pytest.approx([1, 0, 0, -3, 0.5])
-    assert values["probe to patient distance"] == pytest.approx(np.sqrt(13))
 
 
-def test_absent_bodies_give_zeros() -> None:
-    events = (BodyEvent(50, "patient", "appear"),)
-    values = named(crossing(events=events))
-    assert block("patient", values) == [0] * len(BLOCK)
-    assert values["agent to patient distance"] == 0 and values["agent present"] == 1
+def test_absent_objects_give_zeros() -> None:
+    values = named(crossing(events=(BodyEvent(50, "patient", "appear"),)))
+    assert not any(of("patient", values).values())
+    assert values["distance"] == 0 and of("agent", values)["present"] == 1
     vanished = named(crossing(events=(BodyEvent(44, "agent", "vanish"),)))
-    assert vanished["agent present"] == 0 and vanished["patient present"] == 1
+    assert of("agent", vanished)["present"] == 0 and of("patient", vanished)["present"] == 1
     later = named(crossing(events=(BodyEvent(45, "agent", "vanish"),)))
-    assert later["agent present"] == 1
+    assert of("agent", later)["present"] == 1
 
 
 def test_a_cloth_is_the_mean_of_its_vertices() -> None:
     sheets = (Cloth("first", (0, 0, 2), resolution=3), Cloth("sheet", (0, 0, 2), resolution=2))
-    motion = crossing(cloths=sheets, roles=Roles("sheet", "patient"))
+    motion = crossing(cloths=sheets, patient=(0.0, 0.0, 0.0), roles=Roles("sheet", "patient"))
     vertices = np.zeros((60, 13, 3), np.float32)
     vertices[:, 9:, 0] = (0, 1, 2, 5)
     vertices[:, 9:, 2] = 2 - 0.03 * np.arange(60)[:, None]
     vertices[:, :9] = 77
     values = named(Motion(motion.scene, replace(motion.trajectory, cloth_vertices=vertices)))
-    expected = [1, 1, 2, 0, 2 - 0.03 * 44, 1, 0, 0, 0, 0, 0, -3, 0, 0, 0, 2, 2, 0]
-    assert block("agent", values) == pytest.approx(expected, abs=1e-4)
+    expected = {"present": 1, "cloth": 1, "x": 2, "y": 0, "z": 2 - 0.03 * 44, "vz": -3, "length": 2}
+    found = of("agent", values)
+    assert {name: found[name] for name in expected} == pytest.approx(expected, abs=1e-4)
 
 
-def accuracy(fit_labels: np.ndarray, test_labels: np.ndarray) -> float:
-    """Return the accuracy on 200 trials after a fit on 200 others with given labels."""
-    fit, _ = some_crossings(200, 10)
-    test, _ = some_crossings(200, 11)
-    predicted = build_model("state-classifier", trees=50).fit(fit, fit_labels, 0).predict(test)
-    assert ((predicted >= 0) & (predicted <= 1)).all()
-    return float(np.mean((predicted > 0.5) == test_labels))
-
-
-def test_trees_learn_what_the_state_tells_and_nothing_from_permuted_outcomes() -> None:
-    fit_labels, test_labels = some_crossings(200, 10)[1], some_crossings(200, 11)[1]
-    assert accuracy(fit_labels, test_labels) > 0.9
-    # With all outcomes permuted, the right answers of 10 x 200 trials are Binomial(2000, 1/2).
-    rng = np.random.default_rng(5)
-    means = [accuracy(rng.permutation(fit_labels), rng.permutation(test_labels)) for _ in range(10)]
-    assert abs(np.mean(means) - 0.5) < 4 * np.sqrt(0.25 / 2000)
-    assert all(abs(mean - 0.5) < 4 * np.sqrt(0.25 / 200) for mean in means)
-
-
-def test_the_seed_determines_the_trees_and_the_order_of_the_trials_does_not() -> None:
-    fit, labels = some_crossings(50, 12)
-    order = np.random.default_rng(0).permutation(50)
-    model = build_model("state-classifier", trees=10)
-    first, other = (model.fit(fit, labels, seed) for seed in (1, 2))
-    same = model.fit(fit.select(order), labels[order], 1)
-    assert first.digest() == same.digest() != other.digest()
-    assert first.predict(fit).tobytes() == same.predict(fit).tobytes()
-
-
-@pytest.mark.parametrize("only", [False, True])
-def test_a_single_outcome_is_predicted_again(only: bool) -> None:
-    fit, _ = some_crossings(10, 13)
-    model = build_model("state-classifier", trees=3).fit(fit, np.full(10, only), 0)
-    assert model.predict(fit).tolist() == [float(only)] * 10
-    assert model.predict(fit.select([])).shape == (0,)
-
-
-def test_wrong_input_is_refused() -> None:
-    fit, labels = some_crossings(10, 13)
-    with pytest.raises(BadInputError, match="9 labels for 10 trials"):
-        build_model("state-classifier").fit(fit, labels[:9], 0)
-    with pytest.raises(BadInputError, match="0 labels for 0 trials"):
-        build_model("state-classifier").fit(fit.select([]), labels[:0], 0)
+def test_noise_after_the_observed_part_changes_no_feature() -> None:
+    motion = crossing(agent=(0.0, 1.0, 0.0))
+    assert (
+        state_rows(replace_future(motion), 0, 44).tobytes() == state_rows(motion, 0, 44).tobytes()
+    )
+    movie = crossing(name="movie_0001", agent=(float("nan"), 0.0, 0.0))
+    with pytest.raises(BadInputError, match="'movie_0001' was imported without motion"):
+        state_rows(movie)
 
 
 # Baselines that see pictures: coloured blobs, and a copy of the last frame.
@@ -475,6 +477,29 @@ def test_blobs_over_time_are_exact() -> None:
     moved["red to yellow gap"] = math.hypot(32, 16) - math.hypot(40, 16)
     assert changes == pytest.approx({n: moved.get(n, 0) / 128 for n in expected}, abs=1e-6)
     assert not values[0, len(BLOB_FEATURES) // 2 :].any()
+
+
+def test_masks_are_of_agent_patient_and_the_largest_others() -> None:
+    """Object 5 is larger than 3 in the observed frames only; 4 is never seen."""
+    model = build_model("mask-trees")
+    ids = np.zeros((1, model.spec.context + 1, 64, 64), np.uint8)
+    ids[0, :, 8:16, 8:24] = 1
+    ids[0, :, 40:48, 40:48] = 2
+    ids[0, :, 0:2, 0:10] = 3
+    ids[0, :-1, 60:64, 0:8] = 5
+    ids[0, -1, 30:64, 0:8] = 3
+    shown = np.arange(ids.shape[1])[None]
+    batch = Batch(("a",), shown, np.ones_like(shown, bool), ids=ids)
+    first = model.encode(batch)[0, 0]
+    areas = [8 * 16, 8 * 8, 4 * 8, 2 * 10, 0]
+    assert first[:50:10] * 64**2 == pytest.approx(areas)
+    # Agent and patient have the features of blobs of the same pixels.
+    colors = np.full((*ids.shape, 3), 120, np.uint8)
+    colors[ids == 1], colors[ids == 2] = RED, YELLOW
+    blobs = build_model("blob-trees", image_size=64).encode(clips(colors))[0, 0]
+    assert first[:20].tolist() == blobs[:20].tolist()
+    with pytest.raises(BadInputError, match=r"needs the objects of pixels \(input ids\)"):
+        model.encode(clips(colors))
 
 
 def test_a_slanted_blob_and_one_that_is_not_seen() -> None:

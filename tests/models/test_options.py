@@ -66,7 +66,6 @@ def test_values_of_another_type_are_one_line(option: str, says: str) -> None:
         ("dpi", {"weights": "shipped", "size": "paper"}, "no weights are shipped for dpi-paper"),
         ("constant-motion", {"frames": 0}, "frames must be at least 1"),
         ("already-touched", {"margin": 0.5}, "margin must be at least 0 and below 0.5"),
-        ("state-classifier", {"trees": 0}, "trees and leaf"),
     ],
 )
 def test_values_that_make_no_model_are_one_line(

@@ -31,6 +31,7 @@ from support.tiny_models import OPTIONS, TINY
 from support.viewer_dataset import make_dataset
 
 QUICK = EvaluationSettings(accelerator="cpu", logistic=LogisticSettings(grid=(1e-2, 1.0)))
+TREES = {"blob-trees", "mask-trees", "state-trees"}
 PREDICTING = ("observed", "observed+simulated")
 
 
@@ -54,6 +55,14 @@ def poisoned(made: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Dataset
     return with_poisoned_futures(made, tmp_path_factory.mktemp("poisoned") / "data")
 
 
+@pytest.fixture(scope="module")
+def trees(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Dataset]:
+    """Four trials would be one leaf of a tree, whose answer is always the same."""
+    folder = tmp_path_factory.mktemp("trees")
+    made = make(folder / "leaks", readout=16)
+    return made, with_poisoned_futures(made, folder / "poisoned" / "data")
+
+
 def predict(dataset: Dataset, name: str, folder: Path) -> pd.DataFrame:
     options: dict[str, Any] = {**OPTIONS.get(name, {}), "steps": 3}
     table = evaluate(name, dataset, folder, options=options, settings=QUICK).predictions
@@ -61,7 +70,7 @@ def predict(dataset: Dataset, name: str, folder: Path) -> pd.DataFrame:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted({*models.names()} - {"blob-trees"}))
+@pytest.mark.parametrize("name", sorted({*models.names()} - TREES))
 def test_what_follows_the_observed_part_changes_no_prediction(
     name: str, made: Dataset, poisoned: Dataset, tmp_path: Path
 ) -> None:
@@ -69,11 +78,11 @@ def test_what_follows_the_observed_part_changes_no_prediction(
 
 
 @pytest.mark.slow
-def test_what_follows_the_observed_part_changes_no_tree(tmp_path: Path) -> None:
-    """Four trials would be one leaf of a tree, whose answer is always the same."""
-    made = make(tmp_path / "leaks", readout=16)
-    poisoned = with_poisoned_futures(made, tmp_path / "poisoned" / "data")
-    check_predictions("blob-trees", made, poisoned, tmp_path)
+@pytest.mark.parametrize("name", sorted(TREES))
+def test_what_follows_the_observed_part_changes_no_tree(
+    name: str, trees: tuple[Dataset, Dataset], tmp_path: Path
+) -> None:
+    check_predictions(name, *trees, tmp_path)
 
 
 def check_predictions(name: str, made: Dataset, poisoned: Dataset, folder: Path) -> None:

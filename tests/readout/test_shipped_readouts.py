@@ -31,6 +31,8 @@ from physion.trials.index import write_index
 from support.moving_dots import make_dots
 
 MODELS = {
+    "state-trees": ("state-trees", {}),
+    "mask-trees": ("mask-trees", {}),
     "blob-trees": ("blob-trees", {}),
     "blob-centroids": ("blob-centroids", {}),
     "tf_efficientnet_lite0": ("pEffNetLite0-lstm", {}),

@@ -352,11 +352,12 @@ BASELINE_MODELS = frozenset(
     {
         "outcome",
         "majority-of-people",
-        "state-classifier",
+        "state-trees",
         "already-touched",
         "constant-motion",
         "blob-centroids",
         "blob-trees",
+        "mask-trees",
         "copy-last-frame",
         "chance",
     }

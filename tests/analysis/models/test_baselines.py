@@ -226,15 +226,15 @@ def test_of_a_single_outcome_partial_r_is_r() -> None:
 
 
 def test_baselines_that_come_as_predictions_are_marked_and_follow_the_models() -> None:
-    given = pd.concat([predictions("state-classifier", 2), predictions("m"), predictions("z", 3)])
+    given = pd.concat([predictions("state-trees", 2), predictions("m"), predictions("z", 3)])
     found = compared(given)
-    assert found.names[0] == "state-classifier · observed"
+    assert found.names[0] == "state-trees · observed"
     assert found.models == ["m · observed", "z · observed"]
     order = list(dict.fromkeys(found.all_scores["model"]))
-    assert order == [*found.models, "state-classifier · observed", *COMPUTED]
+    assert order == [*found.models, "state-trees · observed", *COMPUTED]
     kinds = found.all_scores.drop_duplicates("model").set_index("model")["kind"]
     assert set(kinds[found.models]) == {"model"}
-    assert set(kinds[["state-classifier · observed", *COMPUTED]]) == {"baseline"}
+    assert set(kinds[["state-trees · observed", *COMPUTED]]) == {"baseline"}
     assert kind_of("my outcome · observed") == "model" and kind_of("outcome · full") == "baseline"
 
 

@@ -1,4 +1,4 @@
-"""Baselines that see the true motion: `already-touched`, `constant-motion`, `state-classifier`.
+"""Baselines that see the true motion: `already-touched` and `constant-motion`.
 
 Also `chance`, which sees nothing, and what all baselines have in common: `Baseline`, and how they
 read the observed part of a motion.
@@ -12,9 +12,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-import sklearn
 from numpy.typing import NDArray
-from sklearn.ensemble import ExtraTreesClassifier
 
 from physion.clips.batch import (
     LAST_OBSERVED,
@@ -31,7 +29,7 @@ from physion.core.version import __version__
 from physion.models.gaps import FAR, gap_of_bodies, minimise
 from physion.models.interface import Model, ModelSettings
 from physion.numerics.linear_algebra import apply, multiply, norm
-from physion.numerics.rotations import axis_angle_matrix, rotate_vectors, rotation_matrices
+from physion.numerics.rotations import axis_angle_matrix, rotation_matrices
 from physion.physics.cloth.contacts import smallest_distance
 from physion.physics.cloth.simulate import ClothSettings
 from physion.physics.cloth.solids import surface_particles
@@ -40,7 +38,6 @@ from physion.physics.labels import label_contact
 from physion.physics.rigid.bodies import body_mass
 from physion.physics.trajectory import State
 from physion.scenes.scene import Body, Scene
-from physion.scenes.shapes.primitives import shape
 
 # What baselines read from a motion: its observed part, and nothing after it.
 
@@ -196,114 +193,6 @@ def _flying(body: Body, state: State, index: int, reach: float) -> FlyingBody:
         velocity=state.velocities[index],
         angular_velocity=state.angular_velocities[index],
     )
-
-
-# State of agent, patient and probe at the last observed frame, as a row of numbers.
-
-ROLES = ("agent", "patient", "probe")
-PAIRS = (("agent", "patient"), ("probe", "agent"), ("probe", "patient"))
-"""Pairs whose relative position and velocity are features."""
-BLOCK: tuple[str, ...] = (
-    "present",
-    "cloth",
-    "x",
-    "y",
-    "z",
-    "qw",
-    "qx",
-    "qy",
-    "qz",
-    "vx",
-    "vy",
-    "vz",
-)
-BLOCK += ("wx", "wy", "wz", "length", "width", "height")
-BETWEEN = ("dx", "dy", "dz", "dvx", "dvy", "dvz", "distance")
-NAMES = tuple(f"{role} {name}" for role in ROLES for name in BLOCK) + tuple(
-    f"{a} to {b} {name}" for a, b in PAIRS for name in BETWEEN
-)
-"""Names of the features; metres, seconds and radians."""
-
-
-@dataclass(frozen=True)
-class Thing:
-    """Body or cloth at one instant: centre (3,), rotation (4,), velocities (3,), extents (3,)."""
-
-    cloth: bool
-    center: F64
-    rotation: F64
-    velocity: F64
-    angular_velocity: F64
-    size: F64
-
-
-def state_features(motion: Motion) -> F64:
-    """Return the features called `NAMES` of the last observed frame of a motion.
-
-    Agent, patient and probe (the body that is pushed) give whether they are there, whether they
-    are cloth, and then the centre of their bounding box, rotation (with w not negative),
-    velocities and size; pairs of them give relative position and velocity, and distance. A cloth
-    counts as a point with the mean of its vertices and no rotation. What is absent gives zeros.
-    """
-    scene, state = motion.scene, motion.trajectory.state(LAST_OBSERVED)
-    things = {role: find_thing(scene, state, getattr(scene.roles, role)) for role in ROLES}
-    rows = [_block(things[role]) for role in ROLES]
-    rows += [_between(things[first], things[second]) for first, second in PAIRS]
-    return np.concatenate(rows)
-
-
-def find_thing(scene: Scene, state: State, name: str | None) -> Thing | None:
-    """Return the body or cloth called ``name``, None if the scene or the instant has none."""
-    if name is None:
-        return None
-    index = scene.index(name)
-    if not scene.present(state.frame)[index]:
-        return None
-    if index >= len(scene.bodies):
-        return _cloth(scene, state, index - len(scene.bodies))
-    body = scene.bodies[index]
-    low, high = shape(body.shape).bounds * np.asarray(body.scale)
-    rotation = state.rotations[index]
-    return Thing(
-        cloth=False,
-        center=state.positions[index] + rotate_vectors(rotation, (low + high) / 2),
-        rotation=-rotation if rotation[0] < 0 else rotation,
-        velocity=state.velocities[index],
-        angular_velocity=state.angular_velocities[index],
-        size=high - low,
-    )
-
-
-def _cloth(scene: Scene, state: State, number: int) -> Thing:
-    """Return cloth ``number`` as the mean of its vertices."""
-    counts = [cloth.resolution**2 for cloth in scene.cloths]
-    rows = slice(sum(counts[:number]), sum(counts[: number + 1]))
-    return Thing(
-        cloth=True,
-        center=state.cloth_vertices[rows].mean(axis=0),
-        rotation=np.array([1.0, 0.0, 0.0, 0.0]),
-        velocity=state.cloth_velocities[rows].mean(axis=0),
-        angular_velocity=np.zeros(3),
-        size=np.asarray(scene.cloths[number].size, np.float64),
-    )
-
-
-def _block(thing: Thing | None) -> F64:
-    """Return the features of one thing, in the order of `BLOCK`."""
-    if thing is None:
-        return np.zeros(len(BLOCK))
-    flags = [1.0, float(thing.cloth)]
-    parts = [thing.center, thing.rotation, thing.velocity, thing.angular_velocity, thing.size]
-    return np.concatenate([flags, *parts])
-
-
-def _between(first: Thing | None, second: Thing | None) -> F64:
-    """Return the features of a pair, in the order of `BETWEEN`."""
-    if first is None or second is None:
-        return np.zeros(len(BETWEEN))
-    apart = second.center - first.center
-    speed = second.velocity - first.velocity
-    return np.concatenate([apart, speed, [float(norm(apart))]])
 
 
 # What all baselines have in common.
@@ -507,103 +396,3 @@ class ConstantMotion(Baseline):
             return 0.0
         state = motion.trajectory.state(LAST_OBSERVED)
         return gap_in_constant_motion(motion.scene, state, self.settings.frames)
-
-
-# Baseline `state-classifier`: a statistical shortcut from the state at the last observed frame.
-
-
-@dataclass(frozen=True, kw_only=True)
-class StateClassifierSettings(ModelSettings):
-    """Settings of `StateClassifier`: number of trees, and smallest number of trials of a leaf."""
-
-    trees: int = 500
-    leaf: int = 2
-
-    def __post_init__(self) -> None:
-        if min(self.trees, self.leaf) < 1:
-            raise BadInputError("state-classifier: trees and leaf must be at least 1")
-
-
-class StateClassifier(Baseline):
-    """Extremely randomised trees on the true state of agent, patient and probe at one instant.
-
-    It sees positions, rotations, velocities and sizes (`state_features`) and knows nothing of
-    dynamics, the other bodies and what happened before. A simulator should predict better.
-
-    References
-    ----------
-    P. Geurts, D. Ernst, L. Wehenkel, Extremely randomized trees, Machine Learning 63, 2006.
-    """
-
-    name = "state-classifier"
-    sees = "true state"
-    answers = "observed"
-    settings: StateClassifierSettings
-
-    def __init__(self, settings: StateClassifierSettings) -> None:
-        super().__init__(settings)
-        self.spec = Spec(inputs=("state",), stride=1, context=1, future=0, context_at="end")
-
-    def fit(self, batch: Batch, labels: NDArray[np.bool_], seed: int) -> FittedTrees:
-        """Return trees fitted on trials and their outcomes (B,); ``seed`` is for the trees.
-
-        The order of the trials does not matter. Raises `BadInputError` without trials.
-        """
-        if len(labels) != len(batch) or len(batch) == 0:
-            raise BadInputError(f"{self.name}: {len(labels)} labels for {len(batch)} trials")
-        order = np.argsort(np.array(batch.trials), kind="stable")
-        trees = ExtraTreesClassifier(
-            self.settings.trees, min_samples_leaf=self.settings.leaf, random_state=seed, n_jobs=1
-        )
-        trees.fit(_features(batch)[order], np.asarray(labels, np.bool_)[order])
-        return FittedTrees(self.settings, trees)
-
-    def provenance(self) -> Provenance:
-        """Return name and versions for the table of predictions."""
-        versions = f"scikit-learn {sklearn.__version__}, physion {__version__}"
-        return dataclasses.replace(super().provenance(), versions=versions)
-
-    def digest(self) -> str:
-        """Return the SHA-256 of code version and settings."""
-        return self.digest_of(_fit_settings(self.settings))
-
-
-class FittedTrees:
-    """`StateClassifier` that was fitted."""
-
-    answers = "observed"
-
-    def __init__(self, settings: StateClassifierSettings, trees: ExtraTreesClassifier) -> None:
-        self.settings = settings
-        self.trees = trees
-
-    def predict(self, batch: Batch) -> NDArray[np.float64]:
-        """Return the mean over trees of the fraction of contacts in a trial's leaf (B,)."""
-        if len(batch) == 0:
-            return np.zeros(0)
-        known = list(self.trees.classes_)
-        if True not in known:
-            return np.zeros(len(batch))
-        fractions = self.trees.predict_proba(_features(batch))[:, known.index(True)]
-        return np.asarray(fractions, np.float64)
-
-    def digest(self) -> str:
-        """Return the SHA-256 of code version, settings and all trees."""
-        arrays = [np.asarray(self.trees.classes_)]
-        for tree in self.trees.estimators_:
-            parts = tree.tree_
-            arrays += [parts.children_left, parts.children_right, parts.feature]
-            arrays += [parts.threshold, parts.value]
-        return StateClassifier.digest_of(_fit_settings(self.settings), arrays)
-
-
-def _fit_settings(settings: StateClassifierSettings) -> list[Any]:
-    """Return what determines the fit, as JSON values."""
-    return [dataclasses.asdict(settings), NAMES, sklearn.__version__]
-
-
-def _features(batch: Batch) -> NDArray[np.float64]:
-    """Return the features (B, D) of all trials."""
-    pairs = zip(motions(batch, StateClassifier.name), batch.trials, strict=True)
-    rows = [state_features(observed_motion(motion, trial)) for motion, trial in pairs]
-    return np.array(rows).reshape(len(batch), len(NAMES))

@@ -1,4 +1,4 @@
-"""Baselines that see pictures: `copy-last-frame`, `blob-centroids` and `blob-trees`."""
+"""Baselines that see pictures: `copy-last-frame` and `blob-centroids`."""
 
 from __future__ import annotations
 
@@ -168,93 +168,6 @@ def color_masks(rgb: NDArray[np.uint8]) -> tuple[NDArray[np.bool_], NDArray[np.b
         for low, high in (ROLE_HUES[RED], ROLE_HUES[YELLOW])
     ]
     return masks[0], masks[1]
-
-
-# Baseline `blob-trees`: what red and yellow pixels tell over time, read by trees.
-
-_OF_BLOB = (
-    "area", "x", "y", "width", "height", "slant", "left", "top", "right", "bottom",
-)  # fmt: skip
-_BETWEEN = ("x", "y", "distance", "gap")
-_OF_FRAME = (
-    *(f"{color} {name}" for color in ("red", "yellow") for name in _OF_BLOB),
-    *(f"red to yellow {name}" for name in _BETWEEN),
-)
-BLOB_FEATURES = (*_OF_FRAME, *(f"change of {name}" for name in _OF_FRAME))
-"""Features of a frame, in the units of `FEATURES`: area, mean, standard deviations and covariance
-of the pixels of each colour, and the box around them, .5 where there is no such pixel; vector and
-distance from the mean of the red to the mean of the yellow pixels, and distance of their boxes; and
-the changes of all these since the frame before, 0 in the first."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class BlobTreesSettings(PixelSettings):
-    """Settings of `BlobTrees`: see `PixelSettings`."""
-
-    image_size: int = 128
-
-
-class BlobTrees(BlobCentroids):
-    """Encoder of what the red and the yellow pixels of a frame tell, for the decision *trees*.
-
-    Like `BlobCentroids` it knows no shape, no depth and no other object, and nothing of physics. It
-    shows how many outcomes follow from where two blobs are and how they move.
-    """
-
-    name = "blob-trees"
-    decision = "trees"
-
-    def __init__(self, settings: BlobTreesSettings) -> None:
-        Baseline.__init__(self, settings)
-        # Changes need the frame before.
-        self.spec = dataclasses.replace(settings.spec(), framewise=False)
-
-    def encode(self, batch: Batch) -> NDArray[np.float32]:
-        """Return the features called `BLOB_FEATURES` (B, T, D) of every frame."""
-        rgb = pictures(batch, self.spec.image_size, self.name)
-        return np.stack([self._encode_clip(frames) for frames in rgb])
-
-    def _encode_clip(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
-        red, yellow = (_blob(mask) for mask in color_masks(frames))
-        apart = yellow[:, 1:3] - red[:, 1:3]
-        # Distance of boxes (left, top, right, bottom) along each axis.
-        beyond = np.maximum(yellow[:, 6:8] - red[:, 8:10], red[:, 6:8] - yellow[:, 8:10])
-        between = [np.hypot(*apart.T), np.hypot(*np.maximum(beyond, 0).T)]
-        values = np.column_stack([red, yellow, apart, *between])
-        return np.column_stack([values, np.diff(values, axis=0, prepend=values[:1])])
-
-
-def _blob(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return the features called `_OF_BLOB` (T, 10) of the pixels in masks (T, H, W)."""
-    _, height, width = mask.shape
-    x, y = ((np.arange(side) + 0.5) / side for side in (width, height))
-    rows, columns = mask.sum(axis=2), mask.sum(axis=1)
-    counts = rows.sum(axis=1)
-    most = np.maximum(counts, 1)
-    center_x, center_y = columns @ x / most, rows @ y / most
-    spread_x = columns @ x**2 / most - center_x**2
-    spread_y = rows @ y**2 / most - center_y**2
-    slant = (mask @ x) @ y / most - center_x * center_y
-    has_row, has_column = rows > 0, columns > 0
-    left, top = has_column.argmax(axis=1) / width, has_row.argmax(axis=1) / height
-    right = 1 - has_column[:, ::-1].argmax(axis=1) / width
-    bottom = 1 - has_row[:, ::-1].argmax(axis=1) / height
-    deviations = [np.sqrt(np.maximum(spread, 0)) for spread in (spread_x, spread_y)]
-    values = np.column_stack(
-        [
-            counts / (height * width),
-            center_x,
-            center_y,
-            *deviations,
-            slant,
-            left,
-            top,
-            right,
-            bottom,
-        ]
-    )
-    values[counts == 0] = [0, 0.5, 0.5, 0, 0, 0, 0.5, 0.5, 0.5, 0.5]
-    return values.astype(np.float32)
 
 
 def _centroid(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
