@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 
 import physion
 from physion import Dataset
+from physion.analysis.tables import POOLED
 from physion.clips.batch import Spec
 from physion.clips.rendered import MotionRenderer
 from physion.clips.source import ObservedSource, TrialReaders, WholeSource
@@ -51,6 +52,7 @@ from physion.readout.folds import describe_fit
 from physion.readout.logistic import JoinedFeatures, LogisticSettings, fit_weights
 from physion.readout.shipped import ShippedReadout, write_readouts
 from physion.readout.trees import Forest, cross_validate, fit_forest
+from physion.report.compare import compare
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, plan_scenes
 
@@ -324,9 +326,10 @@ def ship(features: Features, dataset: Dataset, name: str) -> None:
 
 
 def score(folder: Path, dataset: Dataset, names: Sequence[str]) -> str:
-    """Return the table of accuracies on the official stimuli, with their recorded outcomes.
+    """Return the table of accuracies on the official stimuli, and of likeness to people.
 
-    Intervals are of the mean of scenarios: 1.96 times sqrt(sum of p (1 - p) / n) / scenarios.
+    Intervals of accuracy are of the mean of scenarios: 1.96 times sqrt(sum of p (1 - p) / n) /
+    scenarios. r is pooled over stimuli, with the jackknife intervals of `physion.compare`.
     """
     rows = []
     for name in names:
@@ -338,6 +341,9 @@ def score(folder: Path, dataset: Dataset, names: Sequence[str]) -> str:
         table = done.predictions
         truth = table["recorded_outcome"].where(table["recorded_outcome"] != "", table["outcome"])
         table["hit"] = (table["p_contact"] > 0.5) == (truth.astype(str) == "True")
+        scores = compare(table, humans="official").scores
+        of_model = scores["readout"] != ""
+        pooled = scores[of_model & (scores["scenario"] == POOLED)].set_index("readout")
         for readout in readouts:
             own = table[table["readout"] == readout.value]
             hits = own.groupby("scenario")["hit"].agg(["mean", "size"])
@@ -345,15 +351,23 @@ def score(folder: Path, dataset: Dataset, names: Sequence[str]) -> str:
             mean, half = hits["mean"].mean(), 1.96 * np.sqrt(variance.sum()) / len(hits)
             rigid = hits["mean"].drop("drape", errors="ignore").mean()
             fit, trials = own["cv_accuracy"].groupby(own["scenario"]).first(), own["fit_trials"]
+            like = [
+                "-" if readout is Readout.FULL else
+                f"{pooled.loc[readout.value, r]:.2f} ({pooled.loc[readout.value, f'{r}_low']:.2f} "
+                f"to {pooled.loc[readout.value, f'{r}_high']:.2f})"
+                for r in ("r", "r_beyond_outcome")
+            ]  # fmt: skip
             rows.append(
                 f"| {name} | *{readout.value}* | {trials.min()} to {trials.max()} | "
                 f"{fit.mean():.3f} | {mean:.3f} ({mean - half:.3f} to {mean + half:.3f}) | "
-                f"{rigid:.3f} | {' | '.join(f'{value:.2f}' for value in hits['mean'])} |"
+                f"{rigid:.3f} | {' | '.join(like)} | "
+                f"{' | '.join(f'{value:.2f}' for value in hits['mean'])} |"
             )
             scenarios = [*hits.index]
             print(rows[-1], flush=True)
     stimuli = int((dataset.index["split"] == "testing").sum())
-    columns = ["model", "readout", "trials fitted", "own trials", "official", "rigid", *scenarios]
+    columns = ["model", "readout", "trials fitted", "own trials", "official", "rigid"]
+    columns += ["r with people", "r beyond the outcome", *scenarios]
     head = f"| {' | '.join(columns)} |"
     return "\n".join(
         [
@@ -363,8 +377,9 @@ def score(folder: Path, dataset: Dataset, names: Sequence[str]) -> str:
             "",
             f"Accuracy, mean of eight scenarios: by cross-validation on the own trials that fitted "
             f"the readout, and on {stimuli} official stimuli that people saw, by the recorded "
-            "outcome, with 95 % intervals over stimuli; then the mean of the seven rigid scenarios "
-            "and each scenario.",
+            "outcome, with 95 % intervals over stimuli; mean of the seven rigid scenarios; r with "
+            "people's answers, and the same given the outcome, pooled, with 95 % jackknife "
+            "intervals; accuracy of each scenario.",
             "",
             head,
             "|---" * (head.count("|") - 1) + "|",
