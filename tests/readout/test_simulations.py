@@ -208,6 +208,8 @@ def test_a_trial_that_fails_is_named_and_the_others_go_on(tmp_path: Path) -> Non
     whole = NoisySimulation(CONFIG, Flight())
     again = evaluate(whole, shelf, tmp_path)
     assert len(again.predictions) == 3 and not again.problems
+    left = sorted(path.name for path in (tmp_path / "predictions").iterdir())
+    assert left == [again.paths[0].name, f"{again.paths[0].name}.sha256"], "the complete table only"
 
 
 def test_without_readout_trials_the_tested_ones_are_cross_fitted(tmp_path: Path) -> None:

@@ -378,8 +378,15 @@ def read_predictions(paths: Sequence[Path]) -> pd.DataFrame:
     """Read and check the rows of several CSV files of predictions; see `check_predictions`."""
     if not paths:
         raise BadInputError("no file of predictions was given")
-    tables = [check_predictions(read_csv(path), str(path), path.stem) for path in paths]
-    return name_models(pd.concat(tables, ignore_index=True))
+    return join_predictions(
+        [(str(path), check_predictions(read_csv(path), str(path), path.stem)) for path in paths]
+    )
+
+
+def join_predictions(tables: Sequence[tuple[str, pd.DataFrame]]) -> pd.DataFrame:
+    """Return tables of `check_predictions`, each with its file, as one table of `name_models`."""
+    rows = pd.concat([table for _, table in tables], ignore_index=True)
+    return name_models(rows, [where for where, table in tables for _ in range(len(table))])
 
 
 def check_predictions(
@@ -433,14 +440,14 @@ _WORDS = {"protocol": "", "dynamics_training_dataset": "trained on "}
 """Words before the value of a column in the name of a model, where they are not its name."""
 
 
-def name_models(predictions: pd.DataFrame) -> pd.DataFrame:
+def name_models(predictions: pd.DataFrame, files: Sequence[str] = ()) -> pd.DataFrame:
     """Return ``predictions`` with a unique ``model`` for each row of results, and ``base_model``.
 
     The unique name is model and readout and, if several models share these, also what
     distinguishes them (protocol, seed, ...). A table that is not of `check_predictions` is checked
     first; one with ``base_model`` is returned as it is. Raises `BadInputError` if one model
     predicts a stimulus twice, or if two models were shown trials of one name but of different
-    scenarios.
+    scenarios. ``files``: where each row was read, for messages.
     """
     if "base_model" in predictions:
         return predictions
@@ -459,10 +466,12 @@ def name_models(predictions: pd.DataFrame) -> pd.DataFrame:
             added = added.where(values != "", "")
         model = model.where(several < 2, model + added)
     named = predictions.assign(base_model=base, model=model)
-    twice = named[named.duplicated(["model", "stimulus"])]
+    twice = np.flatnonzero(named.duplicated(["model", "stimulus"]))
     if len(twice):
-        row = twice.iloc[0]
-        raise BadInputError(f"{row['model']!r} predicts {row['stimulus']!r} twice; keep one row")
+        of = named[["model", "stimulus"]].iloc[twice[0]]
+        both = np.flatnonzero((named[["model", "stimulus"]] == of).all(axis=1))[:2]
+        places = _places(*(files[row] for row in both)) if len(files) else "; keep one row"
+        raise BadInputError(f"{of['model']!r} predicts {of['stimulus']!r} twice{places}")
     scenarios = named.groupby("stimulus")["scenario"].unique()
     several_scenarios = scenarios[scenarios.map(len) > 1]
     if len(several_scenarios):
@@ -472,6 +481,15 @@ def name_models(predictions: pd.DataFrame) -> pd.DataFrame:
             "on one set of trials"
         )
     return named
+
+
+def _places(one: str, other: str) -> str:
+    """Return where a stimulus is predicted twice, and what to do."""
+    if one == other:
+        return f" in {one}; keep one row"
+    made = [Path(name) for name in (one, other) if Path(name).is_file()]
+    older = f" ({min(made, key=lambda path: path.stat().st_mtime)} is older)" if made[1:] else ""
+    return f", in {one} and in {other}; leave out one{older}, or rename its model"
 
 
 def _without_decimals(values: pd.Series) -> pd.Series:

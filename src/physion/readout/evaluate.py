@@ -21,7 +21,7 @@ from physion.clips.batch import Provenance
 from physion.compute.local import LocalExecutor, SerialExecutor
 from physion.compute.tasks import Executor, Progress, tracked
 from physion.core.errors import BadInputError
-from physion.core.files import is_whole
+from physion.core.files import digest_path, is_whole
 from physion.core.version import __version__
 from physion.models.interface import Model, TrainingSettings, ask, can
 from physion.readout.decisions import Readout, decisions
@@ -336,13 +336,18 @@ class _Evaluate:
         if table.empty:
             reason = next(iter(predictor.problems.values()), "there is no trial to predict")
             raise BadInputError(f"{provenance.model} predicts no trial: {reason}")
+        # Another name than a complete table has, so that the next run retries these trials.
+        partial = path.with_suffix(".partial.csv")
         if predictor.problems:
-            # Another name than a complete table has, so that the next run retries these trials.
-            path = path.with_suffix(".partial.csv")
+            path = partial
         write_table(table, path)
         if errors_path is not None:
             errors_path = errors_path.with_name(path.name)
             write_table(pd.concat(errors, ignore_index=True).round(6), errors_path)
+        if not predictor.problems:
+            for old in (partial, self.out / "rollout-errors" / partial.name):
+                old.unlink(missing_ok=True)
+                digest_path(old).unlink(missing_ok=True)
         problems = dict(predictor.problems)
         return dataclasses.replace(
             evaluated, path=path, rollout_errors=errors_path, problems=problems

@@ -40,7 +40,7 @@ from physion.analysis.tables import (
     check_predictions,
     find_next_to,
     in_order,
-    name_models,
+    join_predictions,
     read_csv,
     read_human_zone,
     read_humans,
@@ -376,17 +376,17 @@ def _rows(
             for model, values in one.items():
                 columns = {"stimulus": list(values), "p_contact": list(values.values())}
                 raw.append(pd.DataFrame(columns))
-                tables.append(check_predictions(raw[-1], model, model))
+                tables.append((model, check_predictions(raw[-1], model, model)))
         elif isinstance(one, pd.DataFrame):
             raw.append(one)
-            tables.append(check_predictions(one))
+            tables.append(("a table", check_predictions(one)))
         else:
             path = Path(one)
             raw.append(read_csv(path))
-            tables.append(check_predictions(raw[-1], str(path), path.stem))
+            tables.append((str(path), check_predictions(raw[-1], str(path), path.stem)))
     if not tables:
         return None, []
-    return _with_groups(name_models(pd.concat(tables, ignore_index=True)), raw, groups)
+    return _with_groups(join_predictions(tables), raw, groups)
 
 
 def _with_groups(

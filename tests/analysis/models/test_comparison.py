@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from physion.analysis.tables import (
     read_labels,
 )
 from physion.core.errors import BadInputError
+from physion.report.compare import compare
 
 QUICK = Bootstrap(resamples=200)
 SCENARIOS = {"collide": "pilot_it2_collision_simple_box", "drop": "pilot_it2_drop_simple_box"}
@@ -469,11 +471,28 @@ def test_contradictions_are_refused() -> None:
     given = predictions(people)
     with pytest.raises(BadInputError, match="twice"):
         compare_scores(pd.concat([given, given]), people, labels(people))
+    with pytest.raises(BadInputError, match=r"twice, in m and in a table; leave out one, or"):
+        compare(
+            [{"m": {"a": 0.1}}, pd.DataFrame({"stimulus": ["a"], "p_contact": 0.2, "model": "m"})]
+        )
     other = predictions(people, "other", changed=(people["stimulus"].iloc[0],))
     with pytest.raises(BadInputError, match="different outcomes, and no official outcome"):
         compare_scores(pd.concat([given, other]), None)
     with pytest.raises(BadInputError, match=r"lacks the column\(s\) p_contact or Predicted Prob"):
         compare_scores(given.drop(columns="Predicted Prob_true"), people, labels(people))
+
+
+def test_two_tables_of_one_model_are_named_and_the_older_one(tmp_path: Path) -> None:
+    paths = [tmp_path / "m-1.csv", tmp_path / "m-2.csv"]
+    for path in paths:
+        predictions(humans()).to_csv(path, index=False)
+    os.utime(paths[1], (0, 0))
+    expected = f"twice, in {paths[0]} and in {paths[1]}; leave out one ({paths[1]} is older)"
+    with pytest.raises(BadInputError, match=re.escape(expected)):
+        compare(paths)
+    pd.concat([predictions(humans())] * 2).to_csv(paths[0], index=False)
+    with pytest.raises(BadInputError, match=re.escape(f"twice in {paths[0]}; keep one row")):
+        read_predictions(paths[:1])
 
 
 def test_the_official_outcome_decides_where_simulated_ones_differ() -> None:
