@@ -44,6 +44,7 @@ from physion.experiment.store.lab import forget_raw_ids, forget_session, set_pau
 from physion.experiment.store.sessions import ACTIVE_WITHIN
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.orders import instructed_response, stimuli_by_session
+from physion.experiment.study.stimuli import is_right
 from physion.experiment.study.study import Study
 from physion.experiment.web.files import read_page_files
 
@@ -254,7 +255,7 @@ class _Pages:
             asked = instructed_response(row.stimulus)
             outcome = labels.get((line.row.scenario, row.stimulus))
             wanted = outcome if asked is None else asked == "yes"
-            right = None if wanted is None else (row.response == "yes") == wanted
+            right = None if wanted is None else is_right(row.response, wanted)
             answers.append((row, wanted, right))
         return self._render(
             "session.html", here="sessions", line=line, row=line.row, answers=answers

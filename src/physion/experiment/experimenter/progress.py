@@ -26,6 +26,7 @@ from physion.experiment.store.sessions import (
     SESSION_COLUMNS,
     Courses,
     Session,
+    end_of,
     stage_of,
     stages_of,
 )
@@ -255,15 +256,7 @@ class StudyProgress:
 
 def session_state(row: Any, now: float) -> str:
     """Return the state (one of `STATES`) of the row of a session at the Unix time ``now``."""
-    if row.voided_at is not None:
-        return "void"
-    if row.finished_at is not None:
-        return "finished"
-    if row.withdrawn_at is not None:
-        return "withdrawn"
-    if row.screened_out_at is not None:
-        return "screened_out"
-    return "going" if now - row.last_seen <= ACTIVE_WITHIN else "left"
+    return end_of(row) or ("going" if now - row.last_seen <= ACTIVE_WITHIN else "left")
 
 
 def _row(name: str, wanted: int, part: Sequence[SessionLine]) -> ProgressRow:

@@ -27,6 +27,7 @@ from physion.analysis.tables import Column
 from physion.core.errors import PhysionError, UnknownNameError
 from physion.core.names import canonical_name
 from physion.experiment.store.database import ANSWERS, EVENTS, PRACTICE_REPEATS, SESSIONS, STUDIES
+from physion.experiment.store.sessions import end_of
 from physion.experiment.study.orders import (
     block_scenarios,
     instructed_response,
@@ -34,7 +35,7 @@ from physion.experiment.study.orders import (
     trial_order,
 )
 from physion.experiment.study.settings import ALL_SCENARIOS, Question, columns_of
-from physion.experiment.study.stimuli import ATTENTION, PHASES, Stimulus
+from physion.experiment.study.stimuli import ATTENTION, PHASES, Stimulus, is_right
 from physion.experiment.study.stimuli import COLUMNS as ALL_STIMULI_COLUMNS
 from physion.experiment.study.study import Study, under
 
@@ -265,13 +266,14 @@ def _why_not(row: _Row, wanted: SessionSelection, study: Study) -> str | None:
         return OTHER_KIND.format(kind=row.kind)
     if wanted.scenario not in (None, row.scenario):
         return OTHER_SCENARIO
-    if row.voided_at is not None:
+    end = end_of(row)
+    if end == "void":
         return VOID
-    if row.withdrawn_at is not None:
+    if end == "withdrawn":
         return WITHDRAWN
     if row.scenario not in study.offered:
         return GONE_SCENARIO.format(scenario=row.scenario)
-    if wanted.finished_only and row.finished_at is None:
+    if wanted.finished_only and end != "finished":
         return UNFINISHED
     return None
 
@@ -359,7 +361,7 @@ def read_trials(connection: Connection, study: Study, sessions: pa.Table) -> Ite
                 "scenario": scenario,
                 "block": block if len(blocks) > 1 else None,
                 "label": stimulus.label,
-                "correct": (row["response"] == "yes") == stimulus.label,
+                "correct": is_right(row["response"], stimulus.label),
                 "look": stimulus.look,
             }
             place = ranks[row["session"]], block, PHASES.index(row["phase"]), row["trial"]
@@ -510,7 +512,7 @@ def _table(
         cells = row._asdict() | {
             "participant": person,
             "label": label,
-            "correct": (row.response == "yes") == label,
+            "correct": is_right(row.response, label),
             "instructed": asked is not None,
         }
         kept.append(((at, repeat, row.trial), cells))

@@ -59,7 +59,7 @@ from physion.experiment.study.identity import Secrets
 from physion.experiment.study.media import MediaKind, session_tag, sign_media
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.settings import check_answers, check_attempt
-from physion.experiment.study.stimuli import ATTENTION, PHASES, Stimulus
+from physion.experiment.study.stimuli import ATTENTION, PHASES, Stimulus, is_right
 from physion.experiment.study.study import Study
 
 MAX_DETAILS = 16 * 1024
@@ -196,7 +196,7 @@ def _store_new(
 
 def _judge_attention(step: Step, answer: Answer, check: Stimulus) -> None:
     """Count a failed attention check, unless its movie was interrupted."""
-    if (answer.response == "yes") == check.label or answer.void is not None:
+    if is_right(answer.response, check.label) or answer.void is not None:
         return
     failed = step.session.attention_failed + 1
     too_many = failed > step.study.attention.max_failed
@@ -232,7 +232,7 @@ def _build_feedback(
     """Return the feedback on a familiarization answer."""
     return Feedback(
         contact=stimulus.label,
-        correct=(response == "yes") == stimulus.label,
+        correct=is_right(response, stimulus.label),
         movie=sign_media(
             study,
             secrets,

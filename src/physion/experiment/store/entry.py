@@ -37,6 +37,7 @@ from physion.experiment.store.sessions import (
     Courses,
     Session,
     Step,
+    end_of,
     insert_or_skip,
     new_session_of,
     session_from_row,
@@ -339,11 +340,7 @@ def _find_unfinished(sessions: list[Session], scenario: str | None) -> Session |
     unfinished = [
         session
         for session in sessions
-        if session.finished_at is None
-        and session.withdrawn_at is None
-        and session.voided_at is None
-        and session.screened_out_at is None
-        and scenario in (None, session.scenario)
+        if end_of(session) is None and scenario in (None, session.scenario)
     ]
     return max(unfinished, key=lambda session: session.started_at, default=None)
 

@@ -25,7 +25,7 @@ from physion.experiment.protocol import Answer
 from physion.experiment.store.database import ANSWERS, PRACTICE_REPEATS, SESSIONS, SHOWINGS, STUDIES
 from physion.experiment.store.sessions import Session, Step, block_of, with_check
 from physion.experiment.study.orders import fixation, stimuli_by_session, trial_order
-from physion.experiment.study.stimuli import PHASES, Stimulus
+from physion.experiment.study.stimuli import PHASES, Stimulus, is_right
 from physion.experiment.study.study import Study
 
 REASONS = ("fast answers", "no media", "short")
@@ -169,7 +169,7 @@ def _count_right(step: Step, trials: range) -> int:
     rows = step.connection.execute(
         select(ANSWERS.c.trial, ANSWERS.c.response).where(*_of(ANSWERS, session, trials))
     )
-    return sum((response == "yes") == order[trial].label for trial, response in rows)
+    return sum(is_right(response, order[trial].label) for trial, response in rows)
 
 
 def _repeat(connection: Connection, session: Session, trials: range) -> dict[str, Any]:
@@ -251,7 +251,7 @@ class Scores:
         """Count the correct answers of these sessions and cache the counts."""
         correct: dict[str, int] = defaultdict(int)
         for session, stimulus, response in connection.execute(_TEST, {"sessions": sessions}):
-            correct[session] += (response == "yes") == self._labels[scenario, stimulus]
+            correct[session] += is_right(response, self._labels[scenario, stimulus])
         self._correct.update({session: correct[session] for session in sessions})
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 from sqlalchemy import Connection, Table, bindparam, select, update
 from sqlalchemy.dialects.sqlite import insert
@@ -155,19 +155,32 @@ def read_session(connection: Connection, study: Study, token_hash: str) -> Sessi
     return session_from_row(study, row)
 
 
+def end_of(session: Any) -> Literal["void", "finished", "withdrawn", "screened_out"] | None:
+    """Return how a session, or its row, ended; None while it can continue.
+
+    The lab can void a session that has ended, too.
+    """
+    if session.voided_at is not None:
+        return "void"
+    if session.finished_at is not None:
+        return "finished"
+    if session.withdrawn_at is not None:
+        return "withdrawn"
+    return "screened_out" if session.screened_out_at is not None else None
+
+
 def stage_of(session: Session, course: Course) -> Stage:
     """Return the current stage of a session: the first one that is not complete.
 
     A block without familiarization has no page between practice and test.
     """
-    if session.withdrawn_at is not None:
-        return "declined" if session.consented_at is None else "withdrawn"
-    if session.finished_at is not None:
+    end = end_of(session)
+    if session.finished_at is not None:  # also of a void session
         return "done"
-    if session.voided_at is not None:
-        return "withdrawn"
-    if session.screened_out_at is not None:
-        return "screened_out"
+    if end == "screened_out":
+        return end
+    if end is not None:
+        return "declined" if session.consented_at is None else "withdrawn"
     block = block_of(session, course)
     for stage in course.stages:
         if stage in PHASES:

@@ -99,6 +99,11 @@ COLUMNS: tuple[Column, ...] = (
 """Columns of ``stimuli.csv``."""
 
 
+def is_right(response: str, label: bool) -> bool:
+    """Return whether a response, yes or no, is the outcome ``label``."""
+    return (response == "yes") == label
+
+
 def is_name(name: str) -> bool:
     """Return whether ``name`` is a valid name of a stimulus or scenario."""
     return re.fullmatch(NAME, name) is not None
