@@ -212,6 +212,18 @@ def test_a_trial_that_fails_is_named_and_the_others_go_on(tmp_path: Path) -> Non
     assert left == [again.paths[0].name, f"{again.paths[0].name}.sha256"], "the complete table only"
 
 
+@pytest.mark.parametrize("split", ["readout", "testing"])
+def test_a_missing_label_is_no_label(split: str, tmp_path: Path) -> None:
+    shelf: Any = Shelf(4, 3)
+    shelf.index["contact"] = shelf.index["contact"].astype("boolean")
+    shelf.index.loc[shelf.index["trial"] == f"collide_{split}_1", "contact"] = pd.NA
+    model = NoisySimulation(CONFIG, Flight())
+    with pytest.raises(BadInputError, match=f"1 trials .* without labels.*collide_{split}_1"):
+        evaluate(model, shelf, tmp_path)
+    shelf.index.loc[shelf.index["contact"].isna(), "split"] = "training"
+    assert len(evaluate(model, shelf, tmp_path).predictions) == 3 - (split == "testing")
+
+
 def test_without_readout_trials_the_tested_ones_are_cross_fitted(tmp_path: Path) -> None:
     shelf: Any = Shelf(0, 10)
     model = NoisySimulation(CONFIG, Flight())

@@ -28,6 +28,7 @@ from physion.readout.decisions import Readout, decisions
 from physion.readout.folds import (
     TESTING,
     Protocol,
+    check_labels,
     check_pictures,
     describe_fit,
     join_for_fit,
@@ -232,7 +233,10 @@ def evaluate(
     trials, fit_on = open_dataset(dataset, None if dry_run else elsewhere), ""
     if fit is not None:
         other = open_dataset(fit, None if dry_run else elsewhere)
-        trials, fit_on = join_for_fit(trials, other), describe_fit(other)
+        trials = join_for_fit(trials, other)
+    check_labels(trials.index)
+    if fit is not None:
+        fit_on = describe_fit(other)
     if elsewhere is None or dry_run:
         work = _Evaluate(trials, Path(out), settings, fit_on)
         here = functools.partial(work, executor=executor, progress=progress, dry_run=dry_run)

@@ -178,6 +178,17 @@ def join_for_fit(tested: Dataset, fit: Dataset) -> Dataset:
     return joined
 
 
+def check_labels(index: pd.DataFrame) -> None:
+    """Raise `BadInputError` if a trial that is tested, or fits a readout, has no outcome."""
+    without = index[index["split"].isin((TESTING, READOUT)) & index["contact"].isna()]
+    if len(without):
+        raise BadInputError(
+            f"{len(without)} trials to predict or to fit on are stored without labels, such as "
+            f"{without['trial'].iloc[0]!r}; evaluate trials with labels, or put these into the "
+            f"split {TRAINING}"
+        )
+
+
 def check_pictures(index: pd.DataFrame, spec: Spec, *, rendered: bool) -> None:
     """Raise `BadInputError` unless tested and fitted trials show a model pictures of one kind.
 

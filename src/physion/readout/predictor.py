@@ -176,9 +176,9 @@ class Predictor:
         self._frames, known = index["frames"], index["recorded_contact"]
         self._labels = pd.DataFrame(
             {
-                # Trials without labels train dynamics only.
-                "simulated": index["contact"].fillna(False).astype(bool),
-                "recorded": known.fillna(index["contact"]).fillna(False).astype(bool),
+                # Missing ones are of trials that only train dynamics (`folds.check_labels`).
+                "simulated": index["contact"],
+                "recorded": known.where(known.notna(), index["contact"]),
                 "known": known.notna(),
             }
         )
