@@ -48,37 +48,41 @@ def test_all_combinations_of_arguments_are_tried_in_the_order_of_their_names() -
     ]
 
 
+def futures(*contacts: int) -> np.ndarray:
+    """Return 20 futures of each trial, the first of which end in a contact."""
+    return np.arange(20) < np.array(contacts, np.int64)[:, None]
+
+
 def test_the_scale_is_the_one_under_which_outcomes_are_likeliest() -> None:
     outcomes = np.array([True, True, False, True])
-    fractions = {
-        arguments(0.5): np.array([1.0, 0, 1, 0]),
-        arguments(1.0): np.array([0.9, 0.8, 0.3, 0.9]),
-        arguments(2.0): np.full(4, 0.5),
+    touches = {
+        arguments(0.5): futures(20, 0, 20, 0),
+        arguments(1.0): futures(18, 16, 6, 18),
+        arguments(2.0): futures(10, 10, 10, 10),
     }
-    samples = dict.fromkeys(fractions, 20)
-    assert fit_arguments(fractions, samples, outcomes) == arguments(1.0)
-    only = {arguments(2.0): fractions[arguments(2.0)]}
-    assert fit_arguments(only, samples, outcomes) == arguments(2.0)
-    nothing = {k: v[:0] for k, v in fractions.items()}
-    assert fit_arguments(nothing, samples, outcomes[:0]) == arguments(1.0), "the middle one"
-    equal = {arguments(s): np.full(4, 0.5) for s in (2.0, 0.5, 1.0)}
-    assert fit_arguments(equal, samples, outcomes) == arguments(0.5), "the smallest of equal ones"
+    assert fit_arguments(touches, outcomes) == arguments(1.0)
+    only = {arguments(2.0): touches[arguments(2.0)]}
+    assert fit_arguments(only, outcomes) == arguments(2.0)
+    nothing = {k: v[:0] for k, v in touches.items()}
+    assert fit_arguments(nothing, outcomes[:0]) == arguments(1.0), "the middle one"
+    equal = {arguments(s): futures(10, 10, 10, 10) for s in (2.0, 0.5, 1.0)}
+    assert fit_arguments(equal, outcomes) == arguments(0.5), "the smallest of equal ones"
 
 
 def test_the_likelihood_of_certain_answers_is_finite() -> None:
-    assert np.isnan(log_likelihood(np.zeros(0), 20, np.zeros(0)))
-    assert log_likelihood(np.array([1.0]), 1, np.array([True])) == pytest.approx(np.log(0.75))
-    assert np.isfinite(log_likelihood(np.array([1.0]), 20, np.array([False])))
+    assert np.isnan(log_likelihood(futures(), np.zeros(0)))
+    assert log_likelihood(np.array([[True]]), np.array([True])) == pytest.approx(np.log(0.75))
+    assert log_likelihood(futures(20), np.array([False])) == pytest.approx(np.log(0.5 / 21))
 
 
-def test_noise_gives_the_fractions_of_the_chosen_level() -> None:
+def test_noise_decides_by_the_futures_of_the_chosen_level() -> None:
     sure = Outcomes(np.array([[True, True], [False, False]]), None)
     wrong = Outcomes(np.array([[False, False], [True, True]]), None)
-    tested = Outcomes(np.array([[True, False]]), None)
+    tested = Outcomes(np.array([[True, False], [True, True]]), None)
     fit = {arguments(1.0): sure, arguments(2.0): wrong}
     test = {arguments(1.0): tested, arguments(2.0): wrong}
     decided = NoiseDecision().decide(fit, np.array([True, False]), test)
-    assert decided.probability.tolist() == [0.5] and decided.train_accuracy == 1.0
+    assert decided.probability.tolist() == [0.5, 2.5 / 3] and decided.train_accuracy == 1.0
     assert decided.fitted == {"scale": 1.0}
 
 

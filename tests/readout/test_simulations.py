@@ -162,14 +162,14 @@ def test_the_table_names_the_outcomes_that_were_fitted(
     assert set(table["fit_labels"]) == {expected}
 
 
-def test_predictions_are_fractions_and_state_their_scale(tmp_path: Path) -> None:
+def test_predictions_count_futures_and_state_their_scale(tmp_path: Path) -> None:
     shelf: Any = Shelf()
     model = NoisySimulation(replace(CONFIG, scales=(1.0,)), Flight())
     evaluation = evaluate(model, shelf, tmp_path)
     table = evaluation.predictions
     assert len(table) == 10 and evaluation.problems == {}
-    shares = table["p_contact"].to_numpy() * 20
-    assert np.allclose(shares, shares.round()) and (shares % 20 != 0).sum() > 0
+    counts = table["p_contact"].to_numpy() * 21 - 0.5
+    assert np.allclose(counts, counts.round()) and (counts.round() % 20 != 0).sum() > 0
     assert (table["noise_scale"] == 1.0).all() and set(table["readout"]) == {"observed+simulated"}
     assert table["test_accuracy"].iloc[0] > 0.7
     assert set(table["recorded_outcome"]) == {"True", "False"}

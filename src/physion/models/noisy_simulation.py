@@ -1,8 +1,8 @@
 """Noisy simulation: the physics engine, started from the true state with noise added.
 
 At the last observed frame, normal noise is added to the state (`add_noise`), and the engine
-simulates the rest of the trial. P(contact) is the fraction of such simulations in which agent and
-patient touch, a multiple of 1 / samples; 1 if the contact was already observed. The model has no
+simulates the rest of the trial. P(contact) comes from the number of such simulations in which agent
+and patient touch, which is all of them if the contact was already observed. The model has no
 weights and needs no torch.
 
 All noise levels use the same normal random numbers, multiplied by the level and by one scale.

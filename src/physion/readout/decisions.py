@@ -77,9 +77,13 @@ def fraction_of_futures(touches: Booleans) -> NDArray[np.float64]:
 
     With k contacts it is (k + 1/2) / (S + 1), so that it is never 0 or 1; for one future it is k.
     """
-    samples = touches.shape[1]
-    count: NDArray[np.float64] = touches.sum(axis=1).astype(np.float64)
-    return count if samples == 1 else (count + 0.5) / (samples + 1)
+    return touches[:, 0].astype(np.float64) if touches.shape[1] == 1 else _never_certain(touches)
+
+
+def _never_certain(touches: Booleans) -> NDArray[np.float64]:
+    """Return (k + 1/2) / (S + 1) (m,) for k contacts in S futures, also for one."""
+    probability: NDArray[np.float64] = (touches.sum(axis=1) + 0.5) / (touches.shape[1] + 1)
+    return probability
 
 
 @dataclass(frozen=True)
@@ -213,7 +217,7 @@ class TouchDecision(Decision):
 
 
 class NoiseDecision(Decision):
-    """Fraction of simulations with a contact, at the arguments with the highest likelihood.
+    """`fraction_of_futures` with a contact, at the arguments with the highest likelihood.
 
     It is fitted on recorded outcomes where there are any: compared with the outcomes of its own
     engine, a simulation would always fit best without noise.
@@ -222,48 +226,38 @@ class NoiseDecision(Decision):
     labels: ClassVar[str] = "recorded"
 
     def decide(self, fit: Futures, labels: Booleans, test: Futures) -> Decided:
-        """Choose the arguments on the fit trials and return the fractions of the others."""
-        fractions = {arguments: outcomes.fractions() for arguments, outcomes in fit.items()}
-        samples = {arguments: outcomes.samples for arguments, outcomes in test.items()}
-        chosen = fit_arguments(fractions, samples, labels)
-        accuracy = _accuracy(fractions[chosen], labels)
-        return Decided(test[chosen].fractions(), accuracy, fitted=dict(chosen))
+        """Choose the arguments on the fit trials and decide on the others."""
+        touches = {arguments: outcomes.touches() for arguments, outcomes in fit.items()}
+        chosen = fit_arguments(touches, labels)
+        accuracy = _accuracy(fraction_of_futures(touches[chosen]), labels)
+        probability = fraction_of_futures(test[chosen].touches())
+        return Decided(probability, accuracy, fitted=dict(chosen))
 
 
-def log_likelihood(fractions: NDArray[Any], samples: int, outcomes: NDArray[Any]) -> float:
-    """Return the mean log-likelihood of ``outcomes`` (n,); NaN for n = 0.
-
-    The probability of a contact is (k + 0.5) / (samples + 1), where k = fraction * samples is the
-    number of simulations with a contact, so that it is never 0 or 1.
-    """
-    if len(fractions) == 0:
+def log_likelihood(touches: Booleans, outcomes: NDArray[Any]) -> float:
+    """Return the mean log-likelihood of ``outcomes`` (n,) given (n, S) contacts; NaN for n = 0."""
+    if len(touches) == 0:
         return float("nan")
-    p = (np.asarray(fractions, float) * samples + 0.5) / (samples + 1)
+    p = _never_certain(touches)
     # The exact sum: numpy's depends on the processor, and the fit compares sums.
     return math.fsum(log(np.where(np.asarray(outcomes, bool), p, 1.0 - p))) / len(p)
 
 
-def fit_arguments(
-    fractions: Mapping[Arguments, NDArray[Any]],
-    samples: Mapping[Arguments, int],
-    outcomes: NDArray[np.bool_],
-) -> Arguments:
+def fit_arguments(touches: Mapping[Arguments, Booleans], outcomes: NDArray[np.bool_]) -> Arguments:
     """Return the arguments with the highest likelihood of ``outcomes``; among equals the smallest.
 
     Parameters
     ----------
-    fractions
-        For each set of arguments the fractions (n,) of simulations with a contact.
-    samples
-        Simulations per trial, for each value.
+    touches
+        For each set of arguments whether there is a contact in (n, S) simulations.
     outcomes
         Contact or not (n,), of fit trials only. Without any, the middle value is returned.
     """
-    values = sorted(fractions)
+    values = sorted(touches)
     if len(outcomes) == 0:
         return values[len(values) // 2]
     # `max` keeps the first, which is the smallest, of equal ones.
-    return max(values, key=lambda k: log_likelihood(fractions[k], samples[k], outcomes))
+    return max(values, key=lambda k: log_likelihood(touches[k], outcomes))
 
 
 # Decision on features: L2 logistic regression, exact or as released.

@@ -303,21 +303,12 @@ class Outcomes:
     end: NDArray[np.float64] | None = None
     closest: NDArray[np.float64] | None = None
 
-    @property
-    def samples(self) -> int:
-        """Number of samples S."""
-        return int(self.touches().shape[1])
-
     def touches(self) -> NDArray[np.bool_]:
         """Return for every trial and sample (n, S) whether agent and patient touch."""
         if self.contact is not None:
             return self.contact
         assert self.gap is not None, "one of them is given"
         return self.gap <= 0
-
-    def fractions(self) -> NDArray[np.float64]:
-        """Return the fractions (n,) of samples with a contact."""
-        return np.array([float(np.mean(row)) for row in self.touches()], np.float64)
 
 
 @dataclass(frozen=True, eq=False)
