@@ -16,7 +16,7 @@ import pandas as pd
 from physion.analysis.tables import read_humans
 from physion.compute.local import LocalExecutor
 from physion.compute.run_tasks import run_tasks
-from physion.compute.tasks import Executor, Progress
+from physion.compute.tasks import Executor, Progress, tracked
 from physion.core.errors import BadInputError
 from physion.core.files import is_whole, write_with_digest
 from physion.core.names import canonical_name
@@ -25,6 +25,7 @@ from physion.core.settings import split_names
 from physion.data.official import PACKAGED, find_official, humans_folder, read_official_trials
 from physion.models.build import build_model
 from physion.models.interface import ask, can
+from physion.readout.decisions import decisions
 from physion.readout.evaluate import EvaluatedModel, Evaluation, evaluate
 from physion.readout.settings import EvaluationSettings, choose_models
 from physion.readout.shipped import find_readouts
@@ -88,6 +89,9 @@ class RunSettings:
     as there are for the readout, which show no agent and patient."""
     size: int = 128
     """Pixels per side of the movies of the page; every model sees pictures of its own size."""
+    decision: str = ""
+    """What turns features or rollouts into P(contact) (physion ls decisions); default: the model's
+    own."""
     engine: str = "physion"
     """Engine of the trials and of noisy-simulation (physion ls engines); mujoco has no cloth."""
     encoder_batch: int = 4
@@ -156,17 +160,22 @@ def run(
         Before anything is made, if settings contradict each other or a model cannot be built.
     """
     settings = replace(settings or RunSettings(), **changes)
+    if settings.decision:
+        decisions.get(settings.decision)
     humans = _humans(settings)
     out = settings.out or Path("runs") / ("sampled" if settings.sampled else "official")
     models = model_options(settings, options or {})
     # Built now, so that a wrong name or a missing library fails before trials are made.
-    built = {chosen.name: chosen.build(0) for chosen in choose_models(models)}
+    chosen = choose_models(models)
+    building = tracked(chosen, "building models", len(chosen), progress)
+    built = {one.name: one.build(0) for one in building}
     encoders = [name for name, model in built.items() if _learns(model) and find_readouts(model)]
     learn = any(_learns(model) for name, model in built.items() if name not in encoders)
-    if settings.sampled:
-        plan = plan_sampled(settings.limit, learn=learn)
-    else:
-        plan = plan_official(settings.scenes, humans, settings.limit, learn=learn)
+    for _ in tracked((None,), "reading scenes", 1, progress):
+        if settings.sampled:
+            plan = plan_sampled(settings.limit, learn=learn)
+        else:
+            plan = plan_official(settings.scenes, humans, settings.limit, learn=learn)
     executor = LocalExecutor(workers=settings.workers)
     making = GenerateSettings(
         width=settings.size, height=settings.size, look="split", jitters=0, movies=False,
@@ -177,7 +186,9 @@ def run(
         evaluate,
         dataset=out / "trials",
         out=out / "models",
-        settings=EvaluationSettings(encoder_batch=settings.encoder_batch),
+        settings=EvaluationSettings(
+            encoder_batch=settings.encoder_batch, decision=settings.decision
+        ),
         executor=executor,
         progress=progress,
         on_evaluated=on_evaluated,
@@ -196,7 +207,8 @@ def run(
     failures = [*plan.failures, *(f"{where}: {why}" for where, why in reasons.items())]
     dataset = Dataset(out / "trials")
     labels = {canonical_name(name): contact for name, contact in plan.recorded.items()}
-    result = compare(done.paths, humans=humans, labels=labels or None)
+    for _ in tracked((None,), "comparing", 1, progress):
+        result = compare(done.paths, humans=humans, labels=labels or None)
     page = result.report(
         out / "report",
         methods=methods(settings, dataset.index, options or {}, built, models),
@@ -323,6 +335,8 @@ def methods(
             f"simulations per trial: {', '.join(samples)}, from the true state at the end of the "
             "observed part; where several noise scales are offered, readout trials choose"
         )
+    if settings.decision:
+        texts["Decision"] = f"{settings.decision}, of every model, in place of its own"
     if given:
         texts["Options"] = " ".join(given)
     return texts

@@ -40,6 +40,20 @@ def test_long_work_is_reported_in_lines(
     assert capsys.readouterr().err.splitlines() == lines
 
 
+def test_stages_are_named_when_they_begin(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first at once, others unless they follow each other quickly."""
+    now = 100.0
+    monkeypatch.setattr(output.time, "monotonic", lambda: now)
+    with output.Stages(at_once=True) as stages:
+        for what, seconds in (("models", 1), ("scenes", 3), ("trials", 1), ("movies", 9)):
+            stages(what, 0, 5)
+            now += seconds
+            stages(what, 5, 5)
+    assert capsys.readouterr().err.splitlines() == ["models: 0 of 5", "trials: 0 of 5"]
+
+
 def test_a_table_has_three_decimals_and_keeps_its_columns() -> None:
     table = pd.DataFrame(
         {"model": ["a", "longer"], "r": [0.12345, -0.5], "trials": [7, 12], "known": [np.nan, 2.0],

@@ -88,10 +88,12 @@ def test_the_first_command_compares_models_with_people(
     tested = index[index["split"] == "testing"]
     assert (tested.groupby("scenario")["recorded_contact"].sum() == 1).all(), "balanced"
     first = digests(tmp_path)
-    monkeypatch.setattr(output, "_LINE_EVERY", math.inf)  # progress, on a slow machine
+    # No progress on a slow machine but the first line.
+    monkeypatch.setattr(output, "_LINE_EVERY", math.inf)
+    monkeypatch.setattr(output, "_NAMED_AFTER", math.inf)
     assert main(command) == 0
     again = capsys.readouterr()
-    assert json.loads(again.out) == answer and again.err == ""
+    assert json.loads(again.out) == answer and again.err == "building models: 0 of 3\n"
     assert digests(tmp_path) == first
     (tmp_path / "report" / "report.html").write_text("changed")
     assert main(command) == 0
@@ -103,19 +105,25 @@ def test_command_logs_against_people(
     official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = ["run", "--scenes", str(official / "scenes"), "--humans", str(official / "humans")]
-    command += [*SMALL, "--limit", "1", "--models", "chance", "--out", str(tmp_path)]
+    command += [*SMALL, "--limit", "1", "--models", "chance,noisy-simulation-people"]
+    command += ["--option", "noisy-simulation-people:samples=4", "--decision", "touch"]
+    command += ["--out", str(tmp_path)]
     assert main(command) == 0
     shown = capsys.readouterr()
     *table, last = shown.out.splitlines()
     assert re.match(r"report, made in \d+ min \d+ s: ", last) and len(table) <= 25
     shown_early = re.search(r"^chance · observed: accuracy [01]\.\d{3}$", shown.err, re.MULTILINE)
     assert shown_early, "rows appear as models finish"
+    assert shown.err.startswith("building models: 0 of 2\n"), "something is said at once"
     (header,) = (line for line in table if line.startswith("model "))
     assert "accuracy" in header and "r with people" in header
     assert any(line.startswith("chance") for line in table)
     assert main([*command, "--json"]) == 0
     scores = pd.DataFrame(json.loads(capsys.readouterr().out)["scores"])
     assert scores["human_accuracy"].notna().any()
+    assert "noisy-simulation-people-touch" in set(scores["base_model"])
+    methods = json.loads((tmp_path / "report" / "report.json").read_text())["methods"]
+    assert methods["Decision"] == "touch, of every model, in place of its own"
 
 
 def test_a_larger_limit_adds_to_the_trials_of_a_smaller_one() -> None:
@@ -177,11 +185,15 @@ def test_nobody_has_seen_sampled_scenes(tmp_path: Path, capsys: pytest.CaptureFi
     assert not (tmp_path / "out").exists()
 
 
-def test_an_unknown_model_is_refused_before_anything_is_made(
+def test_an_unknown_name_is_refused_before_anything_is_made(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for names, message in (("chanse", "chance"), ("", "names no model")):
-        assert main(["run", "--models", names, "--out", str(tmp_path / "out")]) == 2
+    for option, name, message in (
+        ("--models", "chanse", "chance"),
+        ("--models", "", "names no model"),
+        ("--decision", "tuch", "touch"),
+    ):
+        assert main(["run", option, name, "--out", str(tmp_path / "out")]) == 2
         assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 

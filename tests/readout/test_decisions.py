@@ -8,6 +8,7 @@ import pytest
 from physion.core.errors import BadInputError
 from physion.readout.decisions import (
     ClosestDecision,
+    Decision,
     EndDecision,
     GapDecision,
     NoiseDecision,
@@ -109,6 +110,14 @@ def test_gaps_of_several_samples_give_probabilities() -> None:
     assert GapDecision().decide(three, np.array([True, False]), three).fitted == {
         "gap": pytest.approx(0.2)
     }
+
+
+@pytest.mark.parametrize("decision", [EndDecision, ClosestDecision, GapDecision, TouchDecision])
+def test_only_noise_chooses_among_arguments(decision: type[Decision]) -> None:
+    outcomes = Outcomes(None, np.zeros((1, 2)), np.zeros((1, 2)), np.zeros((1, 2)))
+    several = {arguments(0.5): outcomes, arguments(1.0): outcomes}
+    with pytest.raises(BadInputError, match=r"offers scale=0.5; scale=1: .* 'noise'"):
+        decision().decide(several, np.array([True]), several)
 
 
 def test_only_contacts_have_no_threshold() -> None:

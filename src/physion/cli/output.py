@@ -59,6 +59,8 @@ def _columns() -> tuple[ProgressColumn, ...]:
 
 _LINE_EVERY = 30.0
 """Seconds between lines of progress where there is no terminal."""
+_NAMED_AFTER = 2.0
+"""Seconds after a line from which on a stage that begins is named at once."""
 _KNOWN_AFTER = 5
 """Items after which such a line says how long the rest takes."""
 
@@ -66,8 +68,12 @@ _KNOWN_AFTER = 5
 class Stages:
     """Progress bars, one per stage, of work that reports to a `physion.compute.tasks.Progress`.
 
-    If standard error is not a terminal, print progress lines instead of bars.
+    If standard error is not a terminal, print progress lines instead of bars; with ``at_once`` also
+    when a stage begins.
     """
+
+    def __init__(self, *, at_once: bool = False) -> None:
+        self._at_once = at_once
 
     def __enter__(self) -> Stages:
         self._begun: dict[str, tuple[float, int]] = {}
@@ -104,8 +110,11 @@ class Stages:
     def _print_line(self, what: str, done: int, total: int) -> None:
         """Print how far a stage is, and how long the rest takes at the speed so far."""
         now = time.monotonic()
+        # Of stages that follow each other quickly, only the first is named.
+        new = self._at_once and what not in self._begun
+        named = new and (not self._begun or now - self._printed >= _NAMED_AFTER)
         since, first = self._begun.setdefault(what, (now, done))
-        if now - self._printed < _LINE_EVERY:
+        if now - self._printed < _LINE_EVERY and not named:
             return
         self._printed = now
         made = done - first

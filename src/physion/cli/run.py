@@ -36,7 +36,7 @@ def main(options: Options) -> int:
     """Run the whole pipeline, or what is missing of it; return 1 if something failed."""
     started = time.monotonic()
     given = options_by_model(chosen_models(options.settings), options.option)
-    with Stages() as stages:
+    with Stages(at_once=True) as stages:
         done = run(
             options.settings, options=given, progress=stages, on_evaluated=stages.note_evaluated
         )

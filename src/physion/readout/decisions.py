@@ -148,7 +148,7 @@ class EndDecision(Decision):
 
     def decide(self, fit: Futures, labels: Booleans, test: Futures) -> Decided:
         """Decide on the futures of the tested trials."""
-        (arguments,) = test
+        arguments = _only(test, "end")
         touches = _within_fixed(test[arguments].end, "end")
         return Decided(fraction_of_futures(touches), math.nan, fitted=dict(arguments))
 
@@ -164,9 +164,20 @@ class ClosestDecision(Decision):
 
     def decide(self, fit: Futures, labels: Booleans, test: Futures) -> Decided:
         """Decide on the futures of the tested trials."""
-        (arguments,) = test
+        arguments = _only(test, "closest")
         touches = _within_fixed(test[arguments].closest, "closest")
         return Decided(fraction_of_futures(touches), math.nan, fitted=dict(arguments))
+
+
+def _only(futures: Futures, name: str) -> Arguments:
+    """Return the one set of arguments of the futures."""
+    if len(futures) > 1:
+        offered = "; ".join(" ".join(f"{k}={v:g}" for k, v in each) for each in futures)
+        raise BadInputError(
+            f"the decision {name!r} needs one value of each argument, but the model offers "
+            f"{offered}: give the model one, or use the decision 'noise', which chooses"
+        )
+    return next(iter(futures))
 
 
 def _within_fixed(distance: NDArray[np.float64] | None, name: str) -> Booleans:
@@ -187,7 +198,7 @@ class GapDecision(Decision):
 
     def decide(self, fit: Futures, labels: Booleans, test: Futures) -> Decided:
         """Fit the threshold on the gaps (n, S) of the fit trials and apply it to the others."""
-        (arguments,) = fit
+        arguments = _only(fit, "gap")
         near, tested = fit[arguments].gap, test[arguments].gap
         if near is None or tested is None:
             raise BadInputError(
@@ -211,7 +222,7 @@ class TouchDecision(Decision):
 
     def decide(self, fit: Futures, labels: Booleans, test: Futures) -> Decided:
         """Decide on the futures of the tested trials."""
-        (arguments,) = test
+        arguments = _only(test, "touch")
         probability = fraction_of_futures(test[arguments].touches())
         return Decided(probability, math.nan, fitted=dict(arguments))
 
