@@ -53,6 +53,10 @@ class FullDisk:
         yield from (TaskOutcome(key, error="No space left on device", errno=28) for key in tasks)
 
 
+class FullDiskHere(FullDisk, LocalExecutor):
+    """The same, of this machine."""
+
+
 def files(folder: Path, pattern: str) -> dict[str, bytes]:
     return {
         path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob(pattern)
@@ -303,3 +307,9 @@ def test_a_full_disk_ends_all(dots: Dataset, tmp_path: Path) -> None:
     for function, settings in ((physion.train, CPU), (physion.evaluate, QUICK)):
         with pytest.raises(PhysionError, match="No space left"):
             function(IMAGINING, dots, tmp_path, seeds=2, settings=settings, executor=FullDisk())
+
+
+def test_an_executor_of_this_machine_has_no_cells_as_tasks(dots: Dataset, tmp_path: Path) -> None:
+    given: dict[str, Any] = {"executor": FullDiskHere(1), "seeds": 2}
+    assert len(physion.train(IMAGINING, dots, tmp_path, settings=CPU, **given).trained) == 2
+    assert len(physion.evaluate(IMAGINING, dots, tmp_path, settings=QUICK, **given).evaluated) == 2

@@ -61,7 +61,7 @@ def main(options: Options) -> int:
             Dataset(options.dataset, verify=options.verify),
             options.out,
             options.settings,
-            executor=None if options.compute.executor == "local" else options.compute.open(),
+            executor=options.compute.open(),
             progress=stages,
             dry_run=options.dry_run,
         )

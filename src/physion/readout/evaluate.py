@@ -18,7 +18,6 @@ from typing import Any
 import pandas as pd
 
 from physion.clips.batch import Provenance
-from physion.compute.local import LocalExecutor, SerialExecutor
 from physion.compute.tasks import Executor, Progress, tracked
 from physion.core.errors import BadInputError
 from physion.core.files import digest_path, is_whole
@@ -46,6 +45,7 @@ from physion.readout.settings import (
     open_dataset,
     plan_cells,
     run_cells,
+    runner_of_cells,
 )
 from physion.readout.shipped import ShippedReadouts, find_readouts
 from physion.readout.tables import (
@@ -193,8 +193,8 @@ def evaluate(
     options
         Fields of the settings of the models, or of their training (`TrainingSettings`).
     executor
-        A `LocalExecutor` runs the simulations of one evaluation after the other; any other runs the
-        evaluations, each a task. By default all run in this process.
+        Runs the evaluations, each a task, but a `LocalExecutor` the simulations of one evaluation
+        after the other (`runner_of_cells`). By default all run in this process.
     progress
         Called after every finished item.
     dry_run
@@ -229,15 +229,15 @@ def evaluate(
         every_seed=settings.untrained,
     )
     finished = None if dry_run else on_evaluated
-    elsewhere = None if isinstance(executor, LocalExecutor | SerialExecutor) else executor
-    trials, fit_on = open_dataset(dataset, None if dry_run else elsewhere), ""
+    elsewhere = None if dry_run else runner_of_cells(executor)
+    trials, fit_on = open_dataset(dataset, elsewhere), ""
     if fit is not None:
-        other = open_dataset(fit, None if dry_run else elsewhere)
+        other = open_dataset(fit, elsewhere)
         trials = join_for_fit(trials, other)
     check_labels(trials.index)
     if fit is not None:
         fit_on = describe_fit(other)
-    if elsewhere is None or dry_run:
+    if elsewhere is None:
         work = _Evaluate(trials, Path(out), settings, fit_on)
         here = functools.partial(work, executor=executor, progress=progress, dry_run=dry_run)
         done = run_cells(cells, here, Path(out), "evaluations", None, progress, finished)

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
 
-from physion.compute.local import SerialExecutor
+from physion.compute.local import LocalExecutor, SerialExecutor
 from physion.compute.run_tasks import run_tasks
 from physion.compute.tasks import Executor, Progress
 from physion.core.errors import BadInputError, PhysionError
@@ -211,6 +211,14 @@ def open_dataset(dataset: Dataset | Path | str, executor: Executor | None) -> Da
     if executor is None:
         return opened
     return Dataset(opened.folder.absolute(), verify=opened.verify)
+
+
+def runner_of_cells(executor: Executor | None) -> Executor | None:
+    """Return the executor whose tasks are cells, or None if cells run one by one in this process.
+
+    An executor of this machine is for the simulations within a cell, which share its processes.
+    """
+    return None if isinstance(executor, LocalExecutor | SerialExecutor) else executor
 
 
 @dataclass(eq=False)

@@ -25,6 +25,7 @@ from physion.readout.settings import (
     open_dataset,
     plan_cells,
     run_cells,
+    runner_of_cells,
 )
 from physion.trials.dataset import Dataset
 
@@ -149,7 +150,8 @@ def train(
     options
         Fields of the settings of the models, or of their training (`TrainingSettings`).
     executor
-        Runs the cells of models, protocols and seeds; by default this process, one by one.
+        Runs the trainings, each a task, but on this machine one runs after the other in this
+        process, as by default (`runner_of_cells`).
     progress
         Called after every step.
     dry_run
@@ -178,6 +180,7 @@ def train(
         return True
 
     settings = dataclasses.replace(settings or TrainSettings(), **changes)
+    executor = runner_of_cells(executor)
     cells = plan_cells(choose_models(models, options), settings, trains, untrained=True)
     out = Path(out) if executor is None else Path(out).absolute()
     work = _Train(open_dataset(dataset, executor), out, settings)
