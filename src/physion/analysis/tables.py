@@ -469,8 +469,8 @@ def name_models(predictions: pd.DataFrame, files: Sequence[str] = ()) -> pd.Data
     twice = np.flatnonzero(named.duplicated(["model", "stimulus"]))
     if len(twice):
         of = named[["model", "stimulus"]].iloc[twice[0]]
-        both = np.flatnonzero((named[["model", "stimulus"]] == of).all(axis=1))[:2]
-        places = _places(*(files[row] for row in both)) if len(files) else "; keep one row"
+        rows = np.flatnonzero((named[["model", "stimulus"]] == of).all(axis=1))[:2]
+        places = _places(*(files[row] for row in rows)) if len(files) else "; keep one row"
         raise BadInputError(f"{of['model']!r} predicts {of['stimulus']!r} twice{places}")
     scenarios = named.groupby("stimulus")["scenario"].unique()
     several_scenarios = scenarios[scenarios.map(len) > 1]

@@ -17,7 +17,7 @@ from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError
 from physion.models.build import OutOfMemoryError, build_model
 from physion.models.interface import Model, ask, can
-from physion.readout.decisions import EndDecision, TouchDecision
+from physion.readout.decisions import EndDecision, Futures, TouchDecision
 from physion.readout.features import Outcomes
 from physion.readout.model_calls import call_model, check_identity, is_network, model_name, to_array
 from physion.trials.dataset import Dataset
@@ -266,6 +266,6 @@ def _outcomes(model: Model, rollout: Rollout, clips: int, samples: int) -> tuple
     probability = unknown
     if end is not None or gap is not None or contact is not None:
         decide = (TouchDecision() if end is None else EndDecision()).decide
-        futures = {(): Outcomes(contact, gap, end)}
+        futures: Futures = {(): Outcomes(contact, gap, end)}
         probability = decide({}, np.empty(0, np.bool_), futures).probability
     return probability, unknown if gap is None else gap[:, 0]
