@@ -407,6 +407,7 @@ class _WithoutDistillation(FineTunedEncoder):
         return {"loss": functional.mse_loss(self.step(windows), target), "variance": variance}
 
 
+@pytest.mark.slow
 def test_features_of_different_pictures_stay_different() -> None:
     """Where the loss of the next feature alone makes them equal."""
     kept, lost = (fine_tuned(encoder="test_efficientnet") for _ in range(2))
@@ -474,6 +475,7 @@ def test_statistics_of_batch_normalisation_stay_as_they_are() -> None:
     assert kept and all(torch.equal(value, now[name]) for name, value in kept.items())
 
 
+@pytest.mark.slow
 def test_evaluation_trains_the_encoder_of_each_fold_and_reads_its_features(tmp_path: Path) -> None:
     counts = {"training": 4, "readout": 8, "testing": 4}
     dots = make_dots(tmp_path / "dots", counts, ("collide", "drop"))

@@ -121,6 +121,7 @@ def _run_step(folder: Path, number: int, killed_after: int | None = None) -> str
     return done.stdout.strip()
 
 
+@pytest.mark.slow
 def test_code_of_equal_sources_is_read_in_another_folder(tmp_path: Path) -> None:
     (tmp_path / "first").mkdir()
     assert _run_step(tmp_path / "first", 1) == "2 0"
@@ -158,6 +159,7 @@ def test_an_older_worker_that_ends_later_leaves_no_older_code(tmp_path: Path) ->
     assert _run_step(tmp_path, 1) == "2 1"
 
 
+@pytest.mark.slow
 def test_files_of_older_sources_are_deleted(tmp_path: Path) -> None:
     _run_step(tmp_path, 1)
     folder = tmp_path / "__pycache__"

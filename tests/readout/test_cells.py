@@ -131,6 +131,7 @@ def test_each_scenario_trains_a_model_that_is_tested_on_all(dots: Dataset, tmp_p
         physion.train(IMAGINING, dots, tmp_path, dry_run=True, scenario="drop", settings=CPU)
 
 
+@pytest.mark.slow
 def test_trainings_on_one_scenario_fill_the_heat_map(dots: Dataset, tmp_path: Path) -> None:
     """From trainings to the figure's table: each cell is the accuracy in the predictions."""
     given: dict[str, Any] = {"protocols": ("all", "one"), "settings": QUICK}

@@ -181,6 +181,7 @@ def test_a_failing_trial_is_reported_and_the_others_continue(tmp_path: Path) -> 
     assert Dataset(tmp_path / "s").trials() == ["a", "c"]
 
 
+@pytest.mark.slow
 def test_a_poison_trial_is_put_aside(tmp_path: Path) -> None:
     report = run(tmp_path / "s", scenes_named("a", "die", "c"), executor=LocalExecutor(1))
     assert report.made == ["a", "c"] and "SIGKILL" in report.failed["die"]
@@ -229,7 +230,11 @@ def check_only_whole_files(folder: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "code"),
-    [("write", errno.ENOSPC), ("replace", errno.EIO), ("fsync", errno.EIO)],
+    [
+        ("write", errno.ENOSPC),
+        ("replace", errno.EIO),
+        pytest.param("fsync", errno.EIO, marks=pytest.mark.slow),
+    ],
 )
 def test_a_fault_at_every_step_leaves_only_whole_files(
     name: str, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -83,6 +83,7 @@ def _draw_of_roll(folder: Path, test: int) -> list[str]:
     return [source.stimulus for source in chosen.sources if source.phase == "test"]
 
 
+@pytest.mark.slow
 def test_presets_alternate_in_the_draw(tmp_path: Path) -> None:
     """Of 24 trials, 12 with contact, 8 of each outcome have preset a, 3 b and 1 c."""
     make_tiny_dataset(tmp_path, scenarios=("roll",), test=24)
