@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from physion.core.errors import BadInputError, BadSceneError
-from physion.core.settings import MAX_DEPTH, parse_json, read_settings, shown
+from physion.core.settings import MAX_DEPTH, parse_json, read_json, read_settings, shown
 from physion.scenes.scene import Body, Camera, Roles, Scene
 
 
@@ -93,6 +95,14 @@ def test_json_without_end_is_refused(depth: int, brackets: str) -> None:
         parse_json(inside, "here")
     with pytest.raises(BadSceneError, match="scene is nested deeper"):
         Scene.from_json(text)
+
+
+def test_a_file_is_named_in_errors(tmp_path: Path) -> None:
+    path = tmp_path / "settings.json"
+    for text, problem in (("[1]", "must be an object"), ("{", "is not JSON")):
+        path.write_text(text)
+        with pytest.raises(BadInputError, match=f"^{re.escape(str(path))} {problem}"):
+            read_json(path, dict[str, Any])
 
 
 def test_json_of_the_greatest_depth_is_read() -> None:

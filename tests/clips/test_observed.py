@@ -13,7 +13,6 @@ import pytest
 
 from physion.clips.batch import Batch, Motion, Spec, cut_to_observed
 from physion.clips.clips import observed_source, whole_source
-from physion.clips.rendered import RenderedSource
 from physion.clips.source import FutureFrameError, ObservedSource, WholeSource
 from physion.clips.states import cut_motion
 from physion.core.errors import BadInputError
@@ -119,21 +118,6 @@ def test_the_noise_shows_in_whole_trials(made: Dataset, noisy: Dataset) -> None:
             assert sources[0].key(RIGID, "whole") != sources[1].key(RIGID, "whole")
     with pytest.raises(BadInputError, match="was changed"):
         whole_source(Dataset(noisy.folder), SPECS["rgb"]).whole([RIGID])
-
-
-def test_motions_in_memory_are_cut_too(made: Dataset, noisy: Dataset) -> None:
-    files = [[data.trial(name) for name in (RIGID, CLOTH)] for data in (made, noisy)]
-    motions = [
-        {trial.metadata.trial: Motion(trial.scene, trial.trajectory) for trial in trials}
-        for trials in files
-    ]
-    for observed in (True, False):
-        batches = [
-            RenderedSource(group, SPEC, observed=observed).context([RIGID, CLOTH])
-            for group in motions
-        ]
-        assert as_bytes(batches[0]) == as_bytes(batches[1])
-        assert all(len(motion.trajectory) == OBSERVED_FRAMES for motion in batches[0].state or ())
 
 
 def test_the_cut_keeps_frames_and_contacts_up_to_number_44() -> None:

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from physion.clips import rendered
-from physion.clips.batch import Motion, Spec
+from physion.clips.batch import PIXELS, Motion, Spec
 from physion.clips.clips import observed_source, whole_source
 from physion.clips.movies import background
-from physion.clips.rendered import MotionRenderer, RenderedSource, boxes, object_ids
-from physion.clips.source import FutureFrameError
+from physion.clips.rendered import MotionRenderer, boxes, object_ids
+from physion.clips.source import ObservedSource, TrialReaders
+from physion.clips.states import cut_motion
 from physion.core.errors import BadInputError
 from physion.rendering.camera import View
 from physion.rendering.renderer import Frame, Renderer
@@ -38,26 +39,35 @@ def motions() -> dict[str, Motion]:
     return {name: Motion(scene, make_trajectory(scene)) for name, scene in scenes.items()}
 
 
+def in_memory(
+    motions: dict[str, Motion], spec: Spec = SPEC, look: str = "redyellow"
+) -> ObservedSource:
+    """Return a source of motions that are cut."""
+    cut = {name: cut_motion(motion) for name, motion in motions.items()}
+    inputs = [name for name in spec.inputs if name in PIXELS]
+    looks = dict.fromkeys(cut, look)
+    reader = MotionRenderer(cut, inputs, spec.image_size, spec.objects, looks)
+    lengths = {name: len(motion.trajectory) for name, motion in cut.items()}
+    state = cut if "state" in spec.inputs else None
+    return ObservedSource(spec, TrialReaders(lengths, [reader] if inputs else [], state))
+
+
 @pytest.mark.parametrize("look", ["redyellow", "free"])
 @pytest.mark.parametrize("trial", [RIGID, CLOTH])
 def test_rendered_pictures_are_those_that_the_movies_were_encoded_from(
-    made: Dataset, motions: dict[str, Motion], trial: str, look: str
+    made: Dataset, trial: str, look: str
 ) -> None:
     spec = Spec(image_size=SIZE, stride=1, context=45, future=FRAMES - 45)
     paths = made.paths(trial)
     movie = paths.movie if look == "redyellow" else paths.free_movie
     observed = paths.observed_movie if look == "redyellow" else paths.free_observed_movie
-    for source in (
-        whole_source(made, spec, look=look, rendered=True),
-        RenderedSource(motions, spec, look=look, observed=False),
-    ):
-        assert encode_movie(source.whole([trial]).rgb[0]) == movie.read_bytes()
-        assert encode_movie(source.context([trial]).rgb[0]) == observed.read_bytes()
+    source = whole_source(made, spec, look=look, rendered=True)
+    assert encode_movie(source.whole([trial]).rgb[0]) == movie.read_bytes()
+    assert encode_movie(source.context([trial]).rgb[0]) == observed.read_bytes()
 
 
-def test_inputs_match_the_renderer(motions: dict[str, Motion]) -> None:
-    source = RenderedSource(motions, SPEC, observed=False)
-    batch = source.whole([RIGID, CLOTH])
+def test_inputs_match_the_renderer(made: Dataset, motions: dict[str, Motion]) -> None:
+    batch = whole_source(made, SPEC, rendered=True).whole([RIGID, CLOTH])
     assert batch.frames.tolist() == [[0, 7, 14, 21, 28, 35, 42]] * 2
     for row, trial in enumerate(batch.trials):
         motion = motions[trial]
@@ -98,7 +108,7 @@ def test_ids_that_do_not_fit_are_refused() -> None:
 def test_depth_is_infinite_where_nothing_is(motions: dict[str, Motion]) -> None:
     motion = motions[RIGID]
     alone = Motion(replace(motion.scene, room="empty"), motion.trajectory)
-    source = RenderedSource({RIGID: alone}, replace(SPEC, inputs=("depth",)), observed=True)
+    source = in_memory({RIGID: alone}, replace(SPEC, inputs=("depth",)))
     depth = source.context([RIGID]).depth
     assert np.isposinf(depth).any() and (depth[np.isfinite(depth)] > 0.1).all()
 
@@ -121,7 +131,7 @@ def test_boxes_are_the_edges_of_visible_pixels() -> None:
 
 
 def test_boxes_of_a_batch_enclose_its_ids(motions: dict[str, Motion]) -> None:
-    batch = RenderedSource(motions, SPEC, observed=True).context([RIGID, CLOTH])
+    batch = in_memory(motions).context([RIGID, CLOTH])
     assert batch.boxes.shape == (2, 4, 4, 4)
     for row, step, number in np.ndindex(2, 4, 4):
         rows, columns = np.nonzero(batch.ids[row, step] == number + 1)
@@ -136,7 +146,7 @@ def test_boxes_of_a_batch_enclose_its_ids(motions: dict[str, Motion]) -> None:
 def test_the_camera_projects_onto_the_pixels_of_the_ids(motions: dict[str, Motion]) -> None:
     """The agent's middle, through both matrices, lies on a pixel of the agent."""
     spec = replace(SPEC, image_size=64)
-    batch = RenderedSource(motions, spec, observed=True).context([RIGID])
+    batch = in_memory(motions, spec).context([RIGID])
     scene, trajectory = motions[RIGID].scene, motions[RIGID].trajectory
     view, projection = batch.camera[0]
     agent = scene.index(scene.roles.agent)
@@ -150,11 +160,11 @@ def test_the_camera_projects_onto_the_pixels_of_the_ids(motions: dict[str, Motio
 
 def test_a_dataset_gives_the_same_as_its_motions(made: Dataset, motions: dict[str, Motion]) -> None:
     from_files = observed_source(made, SPEC, rendered=True)
-    in_memory = RenderedSource(motions, SPEC, observed=True)
-    both = [source.context([CLOTH, RIGID]) for source in (from_files, in_memory)]
+    from_motions = in_memory(motions)
+    both = [source.context([CLOTH, RIGID]) for source in (from_files, from_motions)]
     for name, values in both[0].arrays().items():
         np.testing.assert_array_equal(values, both[1].arrays()[name], name)
-    assert from_files.key(RIGID, "context") == in_memory.key(RIGID, "context")
+    assert from_files.key(RIGID, "context") == from_motions.key(RIGID, "context")
 
 
 def test_movies_and_rendered_inputs_go_together_if_square(made: Dataset) -> None:
@@ -178,15 +188,14 @@ def test_a_trial_without_motion_cannot_be_rendered(motions: dict[str, Motion]) -
         positions=np.full_like(motion.trajectory.positions, np.nan),
         engine="imported movie",
     )
-    source = RenderedSource({RIGID: Motion(motion.scene, empty)}, SPEC, observed=True)
+    source = in_memory({RIGID: Motion(motion.scene, empty)})
     with pytest.raises(BadInputError, match=rf"{RIGID}.*without motion \(imported movie\)"):
         source.context([RIGID])
 
 
 def test_keys_follow_motion_look_and_size(motions: dict[str, Motion]) -> None:
     def key(motion: Motion, spec: Spec = SPEC, look: str = "redyellow") -> str:
-        source = RenderedSource({RIGID: motion}, spec, look=look, observed=True)
-        return source.key(RIGID, "context")
+        return in_memory({RIGID: motion}, spec, look).key(RIGID, "context")
 
     motion = motions[RIGID]
     moved = replace(motion.trajectory, positions=motion.trajectory.positions + np.float32(0.01))
@@ -203,19 +212,6 @@ def test_keys_follow_motion_look_and_size(motions: dict[str, Motion]) -> None:
     assert len(keys) == 7
     plain = replace(SPEC, inputs=("rgb",))
     assert key(motion, plain) == key(motion, replace(plain, objects=5))
-
-
-def test_a_source_of_observed_motions_has_observed_windows_only(
-    motions: dict[str, Motion],
-) -> None:
-    observed = RenderedSource(motions, SPEC, observed=True)
-    assert observed.length(RIGID) == 45
-    assert observed.window([RIGID], [30], 3).frames.tolist() == [[30, 37, 44]]
-    with pytest.raises(FutureFrameError, match="frame 45 comes after the observed part"):
-        observed.window([RIGID], [31], 3)
-    longer = RenderedSource(motions, replace(SPEC, future=4), observed=True)
-    with pytest.raises(FutureFrameError, match="frame 49 comes after"):
-        longer.whole([RIGID])
 
 
 # Boxes that were read before are not rendered again.

@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import nn
 
-from physion.clips.batch import clip_frames, join_batches
+from physion.clips.batch import clip_frames
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.models import Batch, Spec, build_model, models
 from physion.models.interface import Model, can
@@ -92,25 +92,20 @@ def test_batch_refuses_arrays_of_another_shape_or_type() -> None:
         Batch(("a", "b"), frames, valid, state=())
 
 
-def test_batches_are_joined_selected_and_cut() -> None:
+def test_batches_are_selected_and_cut() -> None:
     rng = np.random.default_rng(0)
-    parts = [
-        Batch(
-            (name,),
-            np.arange(4, dtype=np.int64)[None],
-            np.ones((1, 4), np.bool_),
-            rgb=rng.integers(0, 256, (1, 4, 2, 2, 3), dtype=np.uint8),
-            camera=np.zeros((1, 2, 4, 4)),
-        )
-        for name in "abc"
-    ]
-    joined = join_batches(parts)
-    assert joined.trials == ("a", "b", "c")
-    chosen = joined.select([2, 0])
-    assert chosen.trials == ("c", "a") and np.array_equal(chosen.rgb[1], parts[0].rgb[0])
-    cut = joined.steps(slice(1, 3))
+    batch = Batch(
+        ("a", "b", "c"),
+        np.tile(np.arange(4, dtype=np.int64), (3, 1)),
+        np.ones((3, 4), np.bool_),
+        rgb=rng.integers(0, 256, (3, 4, 2, 2, 3), dtype=np.uint8),
+        camera=np.zeros((3, 2, 4, 4)),
+    )
+    chosen = batch.select([2, 0])
+    assert chosen.trials == ("c", "a") and np.array_equal(chosen.rgb[1], batch.rgb[0])
+    cut = batch.steps(slice(1, 3))
     assert cut.frames.tolist() == [[1, 2]] * 3 and cut.camera.shape == (3, 2, 4, 4)
-    moved = joined.to("cpu")
+    moved = batch.to("cpu")
     assert isinstance(moved.rgb, torch.Tensor) and moved.rgb.dtype == torch.uint8
 
 

@@ -21,7 +21,6 @@ from physion.rendering.renderer import (
     Frame,
     Renderer,
     RenderSettings,
-    render_frames,
     role_map,
 )
 from physion.rendering.rooms import rooms
@@ -70,9 +69,7 @@ def test_a_frame_does_not_depend_on_the_frames_rendered_before_it() -> None:
     one = Renderer(scene, trajectory, 128, 128)
     assert [digest(one.render(i, ALL)) for i in (2, 0, 1, 0)] == [fresh[i] for i in (2, 0, 1, 0)]
     assert len(set(fresh)) == 3
-    assert [
-        digest(f) for f in render_frames(scene, trajectory, width=128, height=128, passes=ALL)
-    ] == fresh
+    assert [digest(f) for f in one.frames(ALL)] == fresh
 
 
 def test_a_frame_does_not_depend_on_the_frames_after_the_next() -> None:

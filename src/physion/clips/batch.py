@@ -266,22 +266,6 @@ class Provenance:
     inputs: str = ""
 
 
-def join_batches(parts: Sequence[Batch]) -> Batch:
-    """Return one batch with the clips of all ``parts``, numpy arrays of equal shapes."""
-    states = [part.state for part in parts]
-    return Batch(
-        future=parts[0].future,
-        trials=tuple(trial for part in parts for trial in part.trials),
-        state=None
-        if any(state is None for state in states)
-        else tuple(motion for state in states for motion in state or ()),
-        **{
-            name: np.concatenate([part.arrays()[name] for part in parts])
-            for name in parts[0].arrays()
-        },
-    )
-
-
 def clip_frames(frames: Sequence[int], length: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return which frames of a motion of ``length`` frames a clip shows, and which exist.
 

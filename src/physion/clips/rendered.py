@@ -17,16 +17,11 @@ from numpy.typing import NDArray
 from physion.clips.batch import (
     AGENT_ID,
     FIRST_OTHER_ID,
-    LAST_OBSERVED,
     PATIENT_ID,
-    PIXELS,
     SCENERY_ID,
-    Batch,
     Motion,
-    Spec,
 )
-from physion.clips.source import FutureFrameError, ObservedSource, TrialReaders, WholeSource
-from physion.clips.states import CutMotions, cut_motion, motion_digest
+from physion.clips.states import motion_digest
 from physion.core.errors import BadInputError
 from physion.core.version import version_digest
 from physion.rendering.camera import projection_matrix, view_matrix
@@ -134,50 +129,6 @@ class MotionRenderer:
             self._digests[trial] = motion_digest(self._motions[trial])
         version = f"{VERSION}.{version_digest(*PASSES)}"
         return f"rendered {self._looks[trial]} {version} {self._digests[trial]}"
-
-
-class RenderedSource(WholeSource):
-    """Source over motions in memory.
-
-    - ``motions``: scene, in its free colours, and motion by trial.
-    - ``spec``: what the batches hold.
-    - ``look``: colours: ``redyellow`` or ``free``.
-    - ``observed``: cut all motions at the last observed frame. Then `later`, `whole` and `window`
-      raise `FutureFrameError` unless all their frames are observed.
-    """
-
-    def __init__(
-        self,
-        motions: Mapping[str, Motion],
-        spec: Spec,
-        *,
-        look: str = "redyellow",
-        observed: bool,
-    ) -> None:
-        kept = {name: cut_motion(motion) for name, motion in motions.items()} if observed else None
-        context = ObservedSource(spec, _readers(kept or CutMotions(motions), spec, look))
-        super().__init__(context, _readers(kept or motions, spec, look))
-        self._last = LAST_OBSERVED if observed else None
-
-    def _read(self, trials: Sequence[str], frames: Sequence[Sequence[int]]) -> Batch:
-        for trial, wanted in zip(trials, frames, strict=True):
-            if self._last is not None and max(wanted) > self._last:
-                raise FutureFrameError(
-                    f"trial {trial!r}: frame {max(wanted)} comes after the observed part, whose "
-                    f"last frame is {self._last}"
-                )
-        return super()._read(trials, frames)
-
-
-def _readers(motions: Mapping[str, Motion], spec: Spec, look: str) -> TrialReaders:
-    """Return readers of all that ``spec`` asks for."""
-    inputs = [name for name in spec.inputs if name in PIXELS]
-    lengths = {name: len(motion.trajectory) for name, motion in motions.items()}
-    looks = dict.fromkeys(motions, look)
-    reader = MotionRenderer(motions, inputs, spec.image_size, spec.objects, looks)
-    return TrialReaders(
-        lengths, [reader] if inputs else [], motions if "state" in spec.inputs else None
-    )
 
 
 def object_ids(scene: Scene) -> NDArray[np.uint8]:

@@ -32,22 +32,6 @@ def cut_motion(motion: Motion) -> Motion:
     return Motion(motion.scene, dataclasses.replace(cut, **(_copies(cut) | {"contacts": contacts})))
 
 
-class CutMotions(Mapping[str, Motion]):
-    """Observed parts of motions by name, cut when they are asked for."""
-
-    def __init__(self, motions: Mapping[str, Motion]) -> None:
-        self._motions = motions
-
-    def __getitem__(self, name: str) -> Motion:
-        return cut_motion(self._motions[name])
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._motions)
-
-    def __len__(self) -> int:
-        return len(self._motions)
-
-
 def motion_digest(motion: Motion) -> str:
     """Return the hexadecimal SHA-256 of a scene, including its appearance, and its trajectory."""
     trajectory = motion.trajectory

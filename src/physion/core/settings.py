@@ -61,11 +61,9 @@ _EXPECTED = {
 """What a value must be, by the first word of pydantic's name for the error."""
 
 
-def read_json(
-    path: Path, kind: type[T], where: str = "", error: type[BadInputError] = BadInputError
-) -> T:
-    """Read a JSON file as ``kind`` (see `read_settings`); ``where`` names it in errors."""
-    return read_settings(kind, parse_json(_text(path), where or str(path), error), where, error)
+def read_json(path: Path, kind: type[T]) -> T:
+    """Read a JSON file as ``kind`` (see `read_settings`)."""
+    return read_settings(kind, parse_json(_text(path), str(path)), str(path))
 
 
 def parse_json(text: str, where: str, error: type[BadInputError] = BadInputError) -> Any:
@@ -182,17 +180,12 @@ def parse_pairs(pairs: Iterable[str], where: str) -> dict[str, Any]:
     return values
 
 
-def check_keys(
-    data: Iterable[str],
-    known: Iterable[str],
-    where: str,
-    error: type[BadInputError] = BadInputError,
-) -> None:
-    """Raise ``error`` for the first key that is not ``known``, with the closest one that is."""
+def check_keys(data: Iterable[str], known: Iterable[str], where: str) -> None:
+    """Raise `BadInputError` for the first key that is not ``known``, with the closest one."""
     names = list(known)
     for key in data:
         if key not in names:
-            raise error(f"{where}: {_unknown(key, names)}")
+            raise BadInputError(f"{where}: {_unknown(key, names)}")
 
 
 def field_types(kind: Any) -> Mapping[str, Any]:

@@ -53,11 +53,6 @@ class ServerProcess:
         assert self._process is not None, "the server was not started"
         return self._process.pid
 
-    @property
-    def is_running(self) -> bool:
-        """Whether the process is alive."""
-        return self._process is not None and self._process.poll() is None
-
     def start(self, patience_s: float = 60.0) -> float:
         """Start the server, wait until it answers, and return the seconds that this took.
 

@@ -186,23 +186,18 @@ def _choose(model: Any, options: Mapping[str, Any]) -> ChosenModel:
     return ChosenModel(model, rest, training)
 
 
-def options_by_model(
-    models: Sequence[str],
-    pairs: Sequence[str],
-    presets: Mapping[str, Mapping[str, Any]] | None = None,
-) -> dict[str, dict[str, Any]]:
+def options_by_model(models: Sequence[str], pairs: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Return the options of every model from pairs of the command line.
 
-    A pair is ``NAME=VALUE`` for all models, or ``MODEL:NAME=VALUE`` for one; ``presets`` are used
-    where ``pairs`` set nothing. Raises `BadInputError` for what is no pair, or given twice.
+    A pair is ``NAME=VALUE`` for all models, or ``MODEL:NAME=VALUE`` for one. Raises `BadInputError`
+    for what is no pair, or given twice.
     """
     own: dict[str, list[str]] = {name: [] for name in models}
     for pair in pairs:
         named = [name for name in models if pair.startswith(f"{name}:")]
         for name in named or models:
             own[name].append(pair.removeprefix(f"{name}:"))
-    known = presets or {}
-    return {name: {**known.get(name, {}), **parse_pairs(own[name], "--option")} for name in models}
+    return {name: parse_pairs(own[name], "--option") for name in models}
 
 
 def open_dataset(dataset: Dataset | Path | str, executor: Executor | None) -> Dataset:

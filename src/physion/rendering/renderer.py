@@ -333,18 +333,6 @@ def _empty_geometry(height: int, width: int) -> GeometryBuffers:
     )
 
 
-def render_frames(
-    scene: Scene,
-    trajectory: Trajectory,
-    *,
-    width: int = 256,
-    height: int = 256,
-    passes: Sequence[str] = ("color",),
-) -> Iterator[Frame]:
-    """Render the passes named of all frames of a trial, one at a time."""
-    return Renderer(scene, trajectory, width, height).frames(passes)
-
-
 def role_map(ids: NDArray[np.integer], scene: Scene) -> NDArray[np.uint8]:
     """Return a picture (H, W, 4) uint8 with the agent in red and the patient in yellow.
 

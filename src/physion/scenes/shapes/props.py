@@ -610,7 +610,6 @@ def _slab() -> Iterable[PropPart]:
 
 COFFEE = Look((0.16, 0.09, 0.06), "plastic_glossy")
 BLACK = Look((0.06, 0.06, 0.065), "plastic_matte")
-DARK_INSIDE = Look((0.12, 0.11, 0.1), "plain")
 
 
 @prop("vase", (0.326, 0.326, 0.5))

@@ -25,7 +25,6 @@ RUNS = 2
 """Number of jittered simulations of the robustness."""
 SIZE = 96
 """Width and height of the rendered frame in pixels."""
-MOTION_PARTS = ("scene", "motion", "label", "robust", "particles")
 
 
 def trial_digests(scenario: str) -> dict[str, str]:
