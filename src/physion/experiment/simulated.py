@@ -130,6 +130,8 @@ def _logistic(log_odds: float) -> float:
 
 # HTTP client of a simulated participant, with the same retries as the browser pages.
 
+AT_ONCE = 50
+"""Largest number of simulated participants at the same time."""
 GO_ON = ("out_of_order", "already_answered", "wrong_stage", "not_shown")
 """Refusals that carry the session's state, with which the participant continues."""
 
@@ -272,8 +274,6 @@ class SimulationPlan:
         Seed of all random draws.
     scenario
         The scenario of everybody; all scenarios in rotation if None.
-    at_once
-        Number of participants at the same time.
     pace
         Further seconds before each answer.
     dropouts
@@ -292,7 +292,6 @@ class SimulationPlan:
     pace: float = 0.0
     seed: int = 0
     dropouts: float = 0.1
-    at_once: int = 50
     waits_s: tuple[float, float] = (0.1, 2.0)
     patience_s: float = 60.0
     media: bool = True
@@ -547,8 +546,8 @@ async def simulate(
         raise UnknownNameError("scenario", plan.scenario, study.offered)
     scenarios = study.offered if plan.scenario is None else (plan.scenario,)
     visits = [SimulatedVisit(n, scenarios[n % len(scenarios)]) for n in range(plan.participants)]
-    slots = asyncio.Semaphore(plan.at_once)
-    limits = httpx2.Limits(max_connections=plan.at_once, max_keepalive_connections=plan.at_once)
+    slots = asyncio.Semaphore(AT_ONCE)
+    limits = httpx2.Limits(max_connections=AT_ONCE, max_keepalive_connections=AT_ONCE)
     async with httpx2.AsyncClient(
         base_url=plan.url, timeout=30.0, limits=limits, trust_env=False
     ) as client:

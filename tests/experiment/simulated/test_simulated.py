@@ -255,9 +255,8 @@ def test_another_study_s_server_refuses_the_pilot_link(
 
 @pytest.mark.parametrize(
     ("words", "option"),
-    [(["--participants", "0"], "--participants"), (["--dropouts", "1.5"], "--dropouts"),
-     (["--pace", "-1"], "--pace")],
-)  # fmt: skip
+    [(["--participants", "0"], "--participants"), (["--dropouts", "1.5"], "--dropouts")],
+)
 def test_bad_options_are_refused(
     study: Study, words: list[str], option: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -38,14 +38,10 @@ class Options:
     """Only this scenario. Default: all scenarios of the study."""
     url: str | None = None
     """URL of a running server, such as http://127.0.0.1:8000. Default: start one and stop it."""
-    pace: float = 0.0
-    """Further seconds before each answer."""
     seed: int = 0
     """Seed of the participants."""
     dropouts: float = 0.1
     """Fraction of participants who close the page before a random test trial."""
-    at_once: int = 50
-    """Maximum number of simultaneous participants."""
     json: bool = False
     """Print one JSON object."""
 
@@ -68,10 +64,8 @@ def main(options: Options) -> int:
             url=url,
             participants=options.participants,
             scenario=options.scenario,
-            pace=options.pace,
             seed=options.seed,
             dropouts=options.dropouts,
-            at_once=options.at_once,
         )
         visits = asyncio.run(simulate(study, secrets, plan, visited))
     _print(summary(study, plan, visits), options.json)
@@ -112,12 +106,10 @@ def _check(options: Options) -> None:
     """Check that the options are valid and consistent."""
     from physion.core.errors import BadInputError
 
-    if options.participants < 1 or options.at_once < 1:
-        raise BadInputError("--participants and --at-once must be 1 or more")
+    if options.participants < 1:
+        raise BadInputError("--participants must be 1 or more")
     if not 0 <= options.dropouts <= 1:
         raise BadInputError(f"--dropouts must be from 0 to 1, not {options.dropouts:g}")
-    if not 0 <= options.pace <= 3600:
-        raise BadInputError(f"--pace must be from 0 to 3600 seconds, not {options.pace:g}")
 
 
 @contextmanager
