@@ -23,7 +23,6 @@ from physion.core.names import canonical_name
 from physion.core.seeds import stable_hash
 from physion.core.settings import split_names
 from physion.data.official import PACKAGED, find_official, humans_folder, read_official_trials
-from physion.models.build import build_model
 from physion.models.interface import ask, can
 from physion.readout.decisions import decisions
 from physion.readout.evaluate import EvaluatedModel, Evaluation, evaluate
@@ -198,10 +197,8 @@ def run(
         done = do(rest)
     if encoders:
         # Their readouts ship, and what they imagine would have to be trained: it is left out.
-        seen = [built[name] for name in encoders]
-        if settings.models is None:
-            seen += [build_model(name, weights="random") for name in encoders]
-        more = do(seen, readouts=("observed", "full"))
+        seen = {name: models[name] for name in encoders}
+        more = do(seen, readouts=("observed", "full"), twin=settings.models is None)
         done = Evaluation([*done.evaluated, *more.evaluated], {**done.failed, **more.failed})
     reasons = {**trials.failed, **done.problems, **done.failed}
     failures = [*plan.failures, *(f"{where}: {why}" for where, why in reasons.items())]

@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import timm
 import torch
+from safetensors.torch import save_file
 from sklearn.linear_model import LogisticRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
@@ -406,3 +408,33 @@ def test_scores_are_means_and_deviations_over_seeds() -> None:
     assert set(both["init"]) == {"random", "imagenet"}, "whose rows are not averaged"
     assert both["seeds"].tolist() == [1] * len(both) and both["spread"].isna().all()
     assert len(summarise_accuracy(first.iloc[:0])) == 0
+
+
+def test_a_twin_has_random_weights_and_is_the_row_of_the_model_with_random_weights(
+    dots: Dataset, tmp_path: Path
+) -> None:
+    path = tmp_path / "weights.safetensors"
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(5)
+        network = timm.create_model("test_vit", img_size=64, num_classes=0)
+    save_file(network.state_dict(), path)
+    settings = replace(QUICK, readouts=("observed",))
+    trained = {**OPTIONS, "weights": str(path)}
+    both = evaluate("frozen-encoder", dots, tmp_path, settings, options=trained, twin=True)
+    assert set(both.predictions["model"]) == {"test_vit-mlp", "random-test_vit-mlp"}
+    alone = evaluate("frozen-encoder", dots, tmp_path / "alone", settings, options=OPTIONS)
+    twin = both.predictions[both.predictions["init"] == "random"]
+    assert twin["p_contact"].tolist() == alone.predictions["p_contact"].tolist()
+    assert alone.paths[0].name in {one.name for one in both.paths}, "so that nothing is done twice"
+    none = evaluate("frozen-encoder", dots, tmp_path, settings, options=OPTIONS, twin=True)
+    assert len(none.evaluated) == 1, "a model with random weights is its own twin"
+
+
+def test_the_twin_of_a_trained_model_is_not_trained(dots: Dataset, tmp_path: Path) -> None:
+    """Where training makes the features, random weights must stay random."""
+    settings = replace(QUICK, readouts=("observed",))
+    table = evaluate("cswm", dots, tmp_path, settings, twin=True).predictions
+    assert {init.partition(":")[0] for init in table["init"]} == {"shipped", "random"}
+    twin = table[table["init"] == "random"]
+    assert (twin["note"] == "untrained").all() and (twin["protocol"] == "").all()
+    assert not list((tmp_path / "training").glob("**/*.safetensors"))

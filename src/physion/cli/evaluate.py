@@ -31,9 +31,13 @@ class Options:
     """Options of ``physion evaluate``."""
 
     models: Annotated[str, tyro.conf.Positional]
-    """Names of models with commas (physion ls models lists them), or FILE.py:Class."""
-    dataset: Annotated[Path, tyro.conf.Positional]
+    """Names of models with commas (physion ls models lists them), FILE.py:Class, or files of
+    features; may be left out with --features."""
+    dataset: Annotated[Path | None, tyro.conf.Positional] = None
     """Folder of a dataset."""
+    features: Path | None = None
+    """File of features that were computed elsewhere (physion export --layout features-request), a
+    row like that of a model."""
     out: Path = Path("runs/models")
     """Folder for predictions and caches."""
     fit: Path | None = None
@@ -65,10 +69,17 @@ def main(options: Options) -> int:
     of_models = tuple(pair for pair in options.option if not pair.startswith(LOGISTIC))
     fitted = [pair.removeprefix(LOGISTIC) for pair in options.option if pair not in of_models]
     logistic = read_pairs(LogisticSettings, fitted, "--option logistic")
+    models, dataset = split_names(options.models, "model"), options.dataset
+    if dataset is None:  # the only word is the dataset
+        if options.features is None:
+            raise BadInputError(f"no dataset: write physion evaluate {options.models} FOLDER")
+        models, dataset = [], Path(options.models)
+    if options.features is not None:
+        models = [*models, str(options.features)]
     with Stages() as stages:
         done = evaluate(
-            options_by_model(split_names(options.models, "model"), of_models),
-            Dataset(options.dataset, verify=options.verify),
+            options_by_model(models, of_models),
+            Dataset(dataset, verify=options.verify),
             options.out,
             options.settings,
             fit=None if options.fit is None else Dataset(options.fit, verify=options.verify),

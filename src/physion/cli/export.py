@@ -1,4 +1,5 @@
-"""Export a dataset to layouts that published code reads, to tar shards, or to a dataset card."""
+"""Export a dataset to layouts that published code reads, to tar shards, or to a dataset card, or
+as movies that a network elsewhere is to encode."""
 
 from __future__ import annotations
 
@@ -33,6 +34,7 @@ class Options:
         "hdf5s",
         "webdataset",
         "gltf",
+        "features-request",
         "card",
         "result-tables",
     ] = "official"
@@ -42,6 +44,8 @@ class Options:
     would download others); mp4s, hdf5s: the study's downloads of movies (SlotFormer) and of HDF5
     files; webdataset: tar shards;
     gltf: one GLB file for each trial, with its motion, for Blender and other 3D programs;
+    features-request: movies to be encoded elsewhere, their names, and a script that needs only
+    torch; physion evaluate --features takes its result;
     card: README with Croissant metadata and a table for each split; result-tables: predictions with
     the names of scenarios that the notebooks of the study use."""
     split: Literal["training", "readout", "testing", "familiarization"] | None = None
@@ -54,6 +58,8 @@ class Options:
     """Compare files with their SHA-256 in the index before they are used."""
     parts: Literal["all", "seen"] = "all"
     """For webdataset: all parts of a sample, or only those that do not reveal the outcome."""
+    readout: Literal["observed", "full"] = "observed"
+    """For a features-request: movies that end with the observed part, or whole ones."""
     license: str | None = None
     """For a card: SPDX identifier of the licence, such as CC-BY-4.0; default: MIT."""
     creator: str | None = None
@@ -106,6 +112,10 @@ def _check(options: Options) -> None:
         raise BadInputError(f"--{terms[0]} applies only to a card: use it with --layout card")
     if options.parts != "all" and layout != "webdataset":
         raise BadInputError("--parts applies only to shards: use it with --layout webdataset")
+    if options.readout != "observed" and layout != "features-request":
+        raise BadInputError(
+            "--readout applies only to a request: use it with --layout features-request"
+        )
     if not options.images and layout not in HDF5_LAYOUTS:
         raise BadInputError(
             f"--no-images applies to HDF5 files: use it with --layout {', '.join(HDF5_LAYOUTS)}"
@@ -126,6 +136,14 @@ def _trials(options: Options, out: Path, stages: Stages) -> int:
 
         made = export_gltf(options.folder, out, verify=options.verify, progress=stages, **chosen)
         return _print_paths(made, options.json)
+    if options.layout == "features-request":
+        from physion.trials.share.features_request import export_features_request
+
+        paths = export_features_request(
+            options.folder, out, readout=options.readout, verify=options.verify, progress=stages,
+            **chosen,
+        )  # fmt: skip
+        return _print_paths(paths, options.json)
     chosen |= {"executor": LocalExecutor(workers=options.workers), "progress": stages}
     if options.layout == "webdataset":
         from physion.trials.share.shards import MANIFEST, PARTS, SEEN_PARTS, export_shards

@@ -34,7 +34,7 @@ SCENERY_ID, AGENT_ID, PATIENT_ID, FIRST_OTHER_ID = 0, 1, 2, 3
 class Spec:
     """What a model asks for. Frames are frames of the motion, 0.01 s apart, one per movie frame.
 
-    - ``inputs``: any of `INPUTS`.
+    - ``inputs``: any of `INPUTS`; none for a model that needs only the names of trials.
     - ``image_size``: pixels per side; pictures are scaled to it.
     - ``mean``, ``std``: of the red, green and blue channel in 0..1. They belong to the weights; the
       model itself normalises its uint8 pictures with them.
@@ -66,7 +66,7 @@ class Spec:
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.inputs if name not in INPUTS]
-        if unknown or not self.inputs:
+        if unknown:
             raise BadInputError(
                 f"spec: inputs must be some of {', '.join(INPUTS)}, not {list(self.inputs)}"
             )

@@ -8,6 +8,7 @@ checked against the declared type.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import inspect
 import os
 import sys
@@ -59,6 +60,9 @@ _EXTRAS = {
     "transformers": "video",
 }
 """Extra that installs a library, by name of the library."""
+
+FEATURE_FILES = (".npz", ".hdf5", ".h5")
+"""Endings of files of features, which are models by their path."""
 
 S = TypeVar("S")
 
@@ -112,8 +116,9 @@ def build_model(name: str, **options: Any) -> Model:
     Parameters
     ----------
     name
-        Name of a model (``physion ls models``), or ``FILE.py:Class`` for a class or function in a
-        Python file. A class with ``transform`` and ``extract_features``, as the evaluator of
+        Name of a model (``physion ls models``), the path of a file of features that were computed
+        elsewhere (`physion.models.feature_table`), or ``FILE.py:Class`` for a class or function in
+        a Python file. A class with ``transform`` and ``extract_features``, as the evaluator of
         Physion 1.5 takes it, becomes a model by `physion.models.extractor.ExtractorModel`.
     **options
         Fields of the model's settings, or named arguments of the class.
@@ -211,6 +216,10 @@ def make_settings(kind: type[S], model: str, options: Mapping[str, Any]) -> S:
 
 
 def _factory(name: str) -> Any:
+    if name.lower().endswith(FEATURE_FILES):
+        from physion.models.feature_table import FeatureTable
+
+        return functools.partial(FeatureTable, name)
     return load_from_file(name) if is_file_name(name) else _registered(name)
 
 

@@ -15,7 +15,7 @@ without it.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -203,7 +203,8 @@ class Model:
         level of noise.
     answers
         Protocol under which `predict` or `fit` answers: ``observed``, ``observed+simulated``, or
-        ``full`` for a model that is shown the outcome.
+        ``full`` for a model that is shown the outcome. A model that encodes whole movies only has
+        ``full``, too.
     trained
         Whether the weights are pretrained, so that training is skipped.
     learns_from
@@ -330,6 +331,13 @@ class Model:
         ship.
         """
         return self.digest()
+
+    def check_trials(self, needed: Collection[str], known: Collection[str]) -> None:
+        """Raise `BadInputError` if a model knows trials by name, and does not know these.
+
+        ``needed``: names of the trials that are tested or fit a readout; ``known``: of all trials
+        of the dataset.
+        """
 
     def built_as(self) -> dict[str, Any]:
         """Return JSON values that weights belong to, such as name and version of the model.

@@ -62,7 +62,7 @@ NOTHING_TO_FIT = "no trial to fit|one answer only"
 """Notes of `physion.readout.logistic.fit_readout` where it predicts the base rate."""
 _VERSION = 9
 """To be increased with every change that can alter the table of an evaluation."""
-_NOT_HASHED = ("protocols", "seeds", "encoder_batch", "accelerator", "rollout_errors")
+_NOT_HASHED = ("protocols", "seeds", "encoder_batch", "accelerator", "rollout_errors", "twin")
 """Settings of where and how an evaluation runs, or of others than this one."""
 _HASHED_COLUMNS = [
     "trial", "scenario", "split", "contact", "digest", "movie_sha256", "observed_movie_sha256",
@@ -174,8 +174,9 @@ def evaluate(
     Parameters
     ----------
     models
-        Name of a model (``physion ls models``), ``FILE.py:Class``, or a model; or several of them,
-        or names with options of their own. Models with trained weights are not trained again.
+        Name of a model (``physion ls models``), ``FILE.py:Class``, a file of features that were
+        computed elsewhere, or a model; or several of them, or names with options of their own.
+        Models with trained weights are not trained again.
     dataset
         Trials of the splits testing, readout and training, or the path of their folder. Without
         readout trials the testing trials are cross-validated.
@@ -222,8 +223,12 @@ def evaluate(
         Readout.named(name)
     if settings.decision:
         decisions.get(settings.decision)
+    chosen = choose_models(models, options)
+    if settings.twin:
+        twins = [(one, one.random_twin()) for one in chosen]
+        chosen = [one for pair in twins for one in pair if one is not None]
     cells = plan_cells(
-        choose_models(models, options),
+        chosen,
         settings,
         functools.partial(_is_trained, settings=settings),
         every_seed=settings.untrained,
@@ -278,6 +283,8 @@ class _Evaluate:
     ) -> EvaluatedModel:
         """Predict every testing trial, unless that is done."""
         model, settings, index = cell.take_model(), self.settings, self.dataset.index
+        if cell.chosen.stays_random(model):
+            settings = dataclasses.replace(settings, untrained=True)
         training = cell.chosen.settings_of(model) if cell.protocol is not None else None
         provenance = check_identity(model)
         if isinstance(self.dataset, JoinedDataset):
@@ -310,6 +317,9 @@ class _Evaluate:
         folds = select_scenario(
             plan_folds(index, protocol_of_folds, settings.folds, cell.seed), settings.scenario
         )
+        splits = [split for fold in folds for split in fold.scenarios]
+        needed = {trial for split in splits for trial in (*split.fit, *split.test)}
+        ask(model, "check_trials")(needed, set(index["trial"]))
         predictor = Predictor(
             self.dataset,
             model,

@@ -76,7 +76,8 @@ def ways(model: Model, decision: str = "") -> dict[Readout, Way]:
     """
     found: dict[Readout, Way] = {}
     if can(model, "encode"):
-        found[Readout.OBSERVED] = Way.FEATURES
+        if ask(model, "answers") != Readout.FULL.value:
+            found[Readout.OBSERVED] = Way.FEATURES
         if model.spec.future != 0:
             found[Readout.FULL] = Way.FEATURES
     if can(model, "imagine"):

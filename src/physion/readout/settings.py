@@ -20,7 +20,7 @@ from physion.compute.tasks import Executor, Progress
 from physion.core.errors import BadInputError, PhysionError
 from physion.core.settings import field_types, parse_pairs, read_settings, split_names
 from physion.models.build import build_model, build_untrained, option_names
-from physion.models.interface import Model, TrainingSettings, ask, can
+from physion.models.interface import RANDOM, Model, TrainingSettings, ask, can
 from physion.models.user_files import is_file_name
 from physion.readout.folds import Protocol
 from physion.readout.logistic import LogisticSettings
@@ -87,6 +87,9 @@ class EvaluationSettings(HarnessSettings):
     split readout has fewer; fit: fit all anew."""
     untrained: bool = False
     """Leave the weights of the model as they are; the table says untrained."""
+    twin: bool = False
+    """Also evaluate the random twin of each model with weights: the same with weights=random, only
+    the dynamics of an encoder being trained."""
     rollout_errors: Annotated[bool, tyro.conf.arg(aliases=("--rollout-error",))] = False
     """Also write how far imagined motion is from the true one over time, for particle models."""
     logistic: Annotated[LogisticSettings, tyro.conf.Suppress] = field(
@@ -98,8 +101,8 @@ class EvaluationSettings(HarnessSettings):
 R = TypeVar("R")
 
 Models = str | Model | Sequence[str | Model] | Mapping[str, Mapping[str, Any]]
-"""Models by name, ``FILE.py:Class``, or built: one or several; or names with options of their own.
-"""
+"""Models by name, ``FILE.py:Class``, file of features, or built: one or several; or names with
+options of their own."""
 SEED, WEIGHTS = "seed", "weights"
 """Options of models: seed of the initial weights, and trained weights."""
 
@@ -110,16 +113,31 @@ class ChosenModel:
 
     - ``model``: its name, or the model itself. ``options``: fields of its settings.
     - ``training``: fields of `TrainingSettings` that replace the model's.
+    - ``twin``: whether it is the random twin of another model.
     """
 
     model: str | Model
     options: Mapping[str, Any]
     training: Mapping[str, Any]
+    twin: bool = False
 
     @property
     def name(self) -> str:
         """Name in messages."""
-        return self.model if isinstance(self.model, str) else self.model.provenance().model
+        name = self.model if isinstance(self.model, str) else self.model.provenance().model
+        return f"random twin of {name}" if self.twin else name
+
+    def random_twin(self) -> ChosenModel | None:
+        """Return the model with random weights; None for one without weights, or random ones."""
+        if not isinstance(self.model, str) or WEIGHTS not in option_names(self.model):
+            return None
+        if self.options.get(WEIGHTS) == RANDOM:
+            return None
+        return dataclasses.replace(self, options={**self.options, WEIGHTS: RANDOM}, twin=True)
+
+    def stays_random(self, model: Any) -> bool:
+        """Return whether a built model is a twin that is not trained, as dynamics would be."""
+        return self.twin and ask(model, "learns_from") != "features"
 
     def build(self, seed: int, *, untrained: bool = False) -> Any:
         """Return the model; ``seed``: of its initial weights if it has one.
@@ -281,7 +299,7 @@ def plan_cells(
     for seed in range(first, first + settings.seeds):
         for model, example in zip(models, built, strict=True):
             ready = example if seed == first else None
-            if trains(example):
+            if trains(example) and not model.stays_random(example):
                 cells += [Cell(model, p, seed, untrained) for p in protocols]
                 cells[-len(protocols)].built = ready
                 continue

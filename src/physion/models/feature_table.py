@@ -1,0 +1,213 @@
+"""Features that were computed elsewhere, as a model: for networks that cannot run here.
+
+A table is an ``.npz`` or HDF5 file with these arrays:
+
+- ``names`` (n): names of trials, in any order.
+- ``frames`` (T): for each time step the last frame of the movie that it depends on, from 0 on.
+- ``features`` (n, T, D): floating-point numbers.
+- ``model``: name of the row; optional, by default that of the file.
+- ``readout``: ``observed`` or ``full``; optional, by default ``observed``, which excludes all
+  frames after 44. Features of whole movies are ``full``.
+
+``train_features.hdf5`` and ``test_features.hdf5`` of neuroailab/physion_evaluator are read too,
+each together with the other one if it is there. They do not say which frames were seen. By its
+rules (``dataloader_mp4s.py``) the last one is frame 45, one after the observed part, and in the
+folder ``ocd`` a frame after the contact, so that these features are ``full``.
+
+Nothing in a file is executed: pickled arrays are refused.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import zipfile
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from physion.clips.batch import LAST_OBSERVED, Batch, Provenance, Spec
+from physion.core.errors import BadInputError
+from physion.core.files import digest_of, file_sha256
+from physion.core.names import NAMES, canonical_name
+from physion.models.interface import Model
+
+EVALUATOR = ("train_features.hdf5", "test_features.hdf5")
+_NEEDED = ("names", "frames", "features")
+_OBSERVED, _FULL = "observed", "full"
+_VERSION = 1
+"""To be raised with every change that alters features."""
+
+
+class FeatureTable(Model):
+    """Model whose features of a trial are found by its name.
+
+    Parameters
+    ----------
+    path
+        File of the table.
+
+    Raises
+    ------
+    BadInputError
+        If there is no such file, an array is missing or does not fit the others, a name occurs
+        twice, a frame comes after the observed part, or a feature is not finite.
+    """
+
+    decision = "logistic"
+
+    def __init__(self, path: Path | str) -> None:
+        self.path, self._of_evaluator = Path(path), Path(path).name in EVALUATOR
+        paths = [self.path]
+        if self._of_evaluator:
+            pair = [self.path.with_name(name) for name in EVALUATOR]
+            paths = [one for one in pair if one == self.path or one.is_file()]
+        tables = [self._read(one) for one in paths]
+        names = [self._key(str(name)) for table in tables for name in table["names"]]
+        self.rows = {name: row for row, name in enumerate(names)}
+        if len(self.rows) < len(names):
+            twice = next(name for row, name in enumerate(names) if self.rows[name] != row)
+            raise self._error(f"the name {twice!r} occurs twice")
+        frames, shape = tables[0]["frames"], tables[0]["features"].shape[1:]
+        if any(table["features"].shape[1:] != shape for table in tables):
+            raise self._error(f"{' and '.join(EVALUATOR)} have features of different shapes")
+        self.features = np.concatenate([table["features"] for table in tables])
+        readout = str(tables[0].get("readout", _OBSERVED))
+        if readout not in (_OBSERVED, _FULL):
+            raise self._error(f"readout must be {_OBSERVED} or {_FULL}, not {readout!r}")
+        if self._of_evaluator and self.path.absolute().parent.name == "ocd":
+            readout = _FULL
+        self._check_frames(frames, readout)
+        unfit = np.argwhere(~np.isfinite(self.features))
+        if len(unfit):
+            row, step = unfit[0][:2]
+            raise self._error(
+                f"the features of trial {names[row]!r}, time step {step}, are not finite numbers"
+            )
+        self.answers = _FULL if readout == _FULL else ""
+        self.spec = Spec(
+            inputs=(),
+            stride=1,
+            context=LAST_OBSERVED + 1,
+            future=None if readout == _FULL else 0,
+            framewise=False,
+        )
+        folder = self.path.absolute().parent
+        named = folder.parent if folder.name in ("ocp", "ocd") else folder
+        self._model = named.name if self._of_evaluator else self.path.stem
+        self._model = str(tables[0].get("model", self._model))
+        self._seen = f"features of frames {frames[0]} to {frames[-1]}"
+        self._sha256 = digest_of(" ".join(file_sha256(one) for one in paths))
+
+    def _read(self, path: Path) -> dict[str, Any]:
+        """Return the arrays of a file, checked against each other."""
+        if not path.is_file():
+            raise BadInputError(f"there is no file of features {str(path)!r}")
+        with self._opened(path) as file:
+            if self._of_evaluator and "filenames" in file and "features" in file:
+                names = [Path(_text(name)).name for name in file["filenames"][()]]
+                values = np.asarray(file["features"][()])
+                values = values.reshape(len(values), 1, -1) if len(values) else values
+                table: dict[str, Any] = {"names": names, "frames": np.zeros(1, np.int64)}
+            else:
+                missing = [name for name in _NEEDED if name not in file]
+                if missing:
+                    raise self._error(f"no array {missing[0]!r}; needed: {', '.join(_NEEDED)}")
+                table = {"names": [_text(name) for name in np.atleast_1d(file["names"][()])]}
+                table["frames"], values = (np.asarray(file[name][()]) for name in _NEEDED[1:])
+                table |= {n: _text(file[n][()]) for n in ("model", "readout") if n in file}
+        rows, steps = len(table["names"]), table["frames"].size
+        if table["frames"].ndim != 1 or table["frames"].dtype.kind not in "iu":
+            raise self._error("frames must be integers, one for each time step")
+        if values.ndim != 3 or values.shape[:2] != (rows, steps) or not values.size:
+            raise self._error(
+                f"features are {values.shape} for {rows} names and {steps} frames, expected "
+                f"({rows}, {steps}, features of a time step)"
+            )
+        if values.dtype.kind != "f":
+            raise self._error(f"features are {values.dtype}, expected floating-point numbers")
+        with np.errstate(over="ignore"):
+            table["features"] = values.astype(np.float32)
+        return table
+
+    @contextlib.contextmanager
+    def _opened(self, path: Path) -> Iterator[Any]:
+        """Open a file whose arrays are read by name."""
+        try:
+            if path.suffix.lower() == ".npz":
+                with np.load(path, allow_pickle=False) as arrays:
+                    yield arrays
+            else:
+                with h5py.File(path, "r") as file:
+                    yield file
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+            what = " ".join(str(error).split())
+            if "pickle" in what:
+                what = "pickled objects are refused; save names as an array of text (dtype str)"
+            raise BadInputError(f"features {path} cannot be read: {what}") from error
+
+    def _check_frames(self, frames: NDArray[Any], readout: str) -> None:
+        if (frames < 0).any() or (np.diff(frames.astype(np.int64)) < 0).any():
+            raise self._error("frames must be 0 or more and must not decrease")
+        if readout == _OBSERVED and frames[-1] > LAST_OBSERVED:
+            raise self._error(
+                f"frame {frames[-1]} comes after the observed part, whose last frame is "
+                f"{LAST_OBSERVED}; leave it out, or add readout={_FULL!r} to the file"
+            )
+        if readout == _OBSERVED and len(frames) > LAST_OBSERVED + 1:
+            raise self._error(
+                f"{len(frames)} time steps are more than the {LAST_OBSERVED + 1} observed frames; "
+                "put tokens of one time into one row of features"
+            )
+
+    def _key(self, name: str) -> str:
+        """Return the name of a trial under which its features are found."""
+        if not self._of_evaluator:
+            return name
+        # As `physion.trials.official.export_folder.evaluator_name` writes names.
+        name = canonical_name(name).replace(".", "_")
+        for scenario, names in NAMES.items():
+            if name.startswith(f"{scenario}_"):
+                return f"{names.experiment}_{name.removeprefix(scenario).lstrip('_')}"
+        return name
+
+    def _error(self, what: str) -> BadInputError:
+        return BadInputError(f"features {self.path}: {what}")
+
+    def check_trials(self, needed: Collection[str], known: Collection[str]) -> None:
+        """Raise `BadInputError` for trials without features, and for features of no trial."""
+        missing = sorted(trial for trial in needed if self._key(trial) not in self.rows)
+        if missing:
+            raise self._error(
+                f"{len(missing)} of {len(needed)} trials that are tested or fit the readout are "
+                f"missing, such as {missing[0]!r}; encode them too"
+            )
+        unknown = sorted(set(self.rows) - {self._key(trial) for trial in known})
+        if unknown:
+            raise self._error(
+                f"{len(unknown)} of {len(self.rows)} names are unknown to the dataset, such as "
+                f"{unknown[0]!r}; leave them out, or choose the dataset that was encoded"
+            )
+
+    def encode(self, batch: Batch) -> NDArray[np.float32]:
+        """Return the features (B, T, D) of the trials of a batch."""
+        self.check_trials(batch.trials, self.rows)
+        return self.features[[self.rows[self._key(trial)] for trial in batch.trials]]
+
+    def provenance(self) -> Provenance:
+        """Return the name of the row, and the hash of the file in place of that of weights."""
+        inputs = "features of unstated frames" if self._of_evaluator else self._seen
+        return Provenance(self._model, f"local:{self._sha256[:12]}", inputs=inputs)
+
+    def digest(self) -> str:
+        """Return the SHA-256 of the content of the files."""
+        return digest_of(f"features {_VERSION} {self._sha256} {self.answers}")
+
+
+def _text(value: Any) -> str:
+    """Return a name of a file as text, which HDF5 holds as bytes."""
+    value = value.item() if isinstance(value, np.ndarray | np.generic) else value
+    return value.decode() if isinstance(value, bytes) else str(value)
