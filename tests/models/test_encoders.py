@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from physion.clips.batch import Batch
-from physion.core.errors import BadInputError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.models.build import build_model
 from physion.models.checkpoint import WEIGHTS, load_weights, tensors_of, write_checkpoint
 from physion.models.encoders.encoder import (
@@ -552,3 +552,54 @@ def test_the_next_feature_is_nearer_than_the_last_one(
     print(f"{model.name()}: {error / last:.3f} of the error of the last feature")
     assert error < 0.95 * last
     assert trained.validation < trained.baseline
+
+
+def test_a_name_of_timm_is_built_as_it_was_published() -> None:
+    model: Any = build_model("timm:test_vit", weights="random", hidden=2)
+    assert model.spec.image_size == 160 == timm.get_pretrained_cfg("test_vit").input_size[-1]
+    assert model.provenance().model == "random-test_vit-mlp"
+    for name, tag in (
+        ("timm:vit_small_patch14_dinov2", "lvd142m"),
+        ("timm:vit_small_patch16_dinov3", "lvd1689m"),
+        ("timm:vit_base_patch16_224.augreg_in21k", "augreg_in21k"),
+    ):
+        encoder = name.removeprefix("timm:").partition(".")[0]
+        known = timm.get_pretrained_cfg(f"{encoder}.{tag}")
+        model = build_model(name, hidden=2)
+        assert model.provenance().init == f"timm:{tag}"
+        assert model.spec.image_size == known.input_size[-1]
+        assert (model.spec.mean, model.spec.std) == (known.mean, known.std)
+    with pytest.raises(UnknownNameError, match="unknown timm encoder 'nonet'"):
+        build_model("timm:nonet")
+    with pytest.raises(BadInputError, match="timm has no weights 'timm:x' of 'test_vit'"):
+        build_model("timm:test_vit.x")
+
+
+def test_features_of_a_layer_are_the_output_of_that_block() -> None:
+    """Compared with what a hook on the block sees; the class token is no position."""
+    random = EncoderWeights("random", 3)
+    whole: Any = create_encoder("test_vit", 64, random)
+    seen: list[Tensor] = []
+    whole.blocks[3].register_forward_hook(lambda block, given, output: seen.append(output))
+    pictures = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    last = whole(pictures)
+    patches = seen[0][:, whole.num_prefix_tokens :]
+    chosen = create_encoder("test_vit", 64, random, layer=4)
+    assert torch.allclose(chosen(pictures), patches.mean(1), atol=1e-6)
+    cells = create_encoder("test_vit", 64, random, "grid", 4)(pictures)
+    assert torch.allclose(cells, patches.flatten(1), atol=1e-6), "4 x 4 patches of 16 pixels"
+    tokens = whole.forward_features(pictures)[:, whole.num_prefix_tokens :]
+    mean = create_encoder("test_vit", 64, random, "mean")(pictures)
+    assert torch.allclose(mean, tokens.mean(1), atol=1e-6) and not torch.allclose(mean, last)
+    for layer, message in ((7, "no layer 7; choose 1 to 6"), (0, "no layer 0")):
+        with pytest.raises(BadInputError, match=message):
+            build_model("frozen-encoder", **TINY, layer=layer)
+
+
+def test_a_layer_is_another_model_and_none_leaves_everything_as_it_was() -> None:
+    plain: Any = build_model("frozen-encoder", **TINY)
+    chosen: Any = build_model("frozen-encoder", **TINY, layer=2)
+    assert chosen.name() == "random-test_vit-layer2-mlp"
+    for method in ("digest", "encoder_digest", "readout_digest"):
+        assert getattr(plain, method)() != getattr(chosen, method)()
+    assert "layer" not in plain.built_as()["settings"], "as trainings before there was a choice"

@@ -37,7 +37,7 @@ class Options:
     """Folder of a dataset."""
     features: Path | None = None
     """File of features that were computed elsewhere (physion export --layout features-request), a
-    row like that of a model."""
+    row like one of a model."""
     out: Path = Path("runs/models")
     """Folder for predictions and caches."""
     fit: Path | None = None

@@ -5,7 +5,7 @@ A table is an ``.npz`` or HDF5 file with these arrays:
 - ``names`` (n): names of trials, in any order.
 - ``frames`` (T): for each time step the last frame of the movie that it depends on, from 0 on.
 - ``features`` (n, T, D): floating-point numbers.
-- ``model``: name of the row; optional, by default that of the file.
+- ``model``: name of the row; optional, by default the file's name.
 - ``readout``: ``observed`` or ``full``; optional, by default ``observed``, which excludes all
   frames after 44. Features of whole movies are ``full``.
 
@@ -198,7 +198,7 @@ class FeatureTable(Model):
         return self.features[[self.rows[self._key(trial)] for trial in batch.trials]]
 
     def provenance(self) -> Provenance:
-        """Return the name of the row, and the hash of the file in place of that of weights."""
+        """Return the name of the row, and the hash of the file in place of the weights'."""
         inputs = "features of unstated frames" if self._of_evaluator else self._seen
         return Provenance(self._model, f"local:{self._sha256[:12]}", inputs=inputs)
 

@@ -5,7 +5,7 @@ NAME is a repository of huggingface.co, or a folder with its files: ``config.jso
 which statistics, image size and number of frames are taken. No code of a repository is run.
 
 Features are (B, T, D) of an image encoder, and (B, T / n, D) of a video encoder whose patches have
-n frames, where its tokens can be told apart by time; otherwise each clip has one time step.
+n frames, where its tokens are ordered by time; otherwise each clip has one time step.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ class HubEncoder(TorchModel):
         return tokens
 
     def _pool(self, tokens: Tensor, times: int) -> Tensor:
-        """Return features (N, times, D), or (N, 1, D) if times cannot be told apart."""
+        """Return features (N, times, D), or (N, 1, D) if times are not separable."""
         pooling, count = self.settings.pooling, len(tokens)
         if tokens.ndim == 4:
             maps = tokens[:, None]
@@ -220,7 +220,7 @@ class HubEncoder(TorchModel):
         return digest_of(parts, self.state_dict().items())
 
     def name(self) -> str:
-        """Return the name for tables: the last part of that of the repository or folder."""
+        """Return the name for tables: the last part of the name of repository or folder."""
         settings = self.settings
         pooling = settings.pooling if settings.pooling != POOLED else ""
         layer = "" if settings.layer is None else f"layer{settings.layer}"

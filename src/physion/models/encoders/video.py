@@ -6,7 +6,7 @@ last observed frame. What follows, which *full* reads, is encoded in further cli
 that no feature of the context depends on a later frame. The last one repeats the last frame.
 
 Features are (B, T / 2, D), the means of the tokens at one time; with ``grid`` (B, T / 2, R C D),
-the means in R x C cells (`encoder.GRID`).
+the means in R x C cells (`weights.GRID`).
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ class RotaryAttention(VJEPA2RopeAttention):  # type: ignore[misc]
 
 
 class ModalityEmbeddings(nn.Module):
-    """Patch embeddings of V-JEPA 2.1: those of 2, plus one vector for videos."""
+    """Patch embeddings of V-JEPA 2.1: as in 2, plus one vector for videos."""
 
     def __init__(self, embeddings: nn.Module, width: int) -> None:
         super().__init__()

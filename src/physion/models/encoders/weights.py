@@ -33,7 +33,7 @@ from physion.core.files import file_sha256
 from physion.models.checkpoint import compare_tensors
 from physion.models.torch_model import initial_weights
 
-# Features of a map of an encoder, the last one or that of a chosen layer, averaged in a small grid,
+# Features of a map of an encoder, the last one or that a chosen layer gives, averaged in a grid,
 # which keeps positions, or over all positions.
 
 POOLED: Final = "pooled"

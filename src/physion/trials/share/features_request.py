@@ -25,11 +25,11 @@ _README = """\
 1. `trials.csv` lists trials, their movies and numbers of frames. {shown}
 2. A frame of a movie is 0.01 s of physics; the movies play {rate:g} of them a second.
 3. Put your network into `network` of `encode.py`, choose `FRAMES` there, and run
-   `python encode.py` (needs torch, numpy and av). It writes `features.npz`.
+   `python encode.py` (needs torch, numpy and av). It writes features.npz.
 4. The file holds `names` (n), `frames` (T), `features` (n, T, D), `model` and `readout`; rows may
    have any order. HDF5 with arrays of these names is read, too.
-5. `frames` says for each time step the last frame that it depends on: for a network that joins
-   frames that of the last one, not of the first.
+5. `frames` says for each time step the last frame that it depends on: a network that
+   joins frames depends on the last of them.
 6. `physion evaluate --features features.npz {dataset}` fits the readouts and prints the table.
 """
 _SEEN = "Movies end with the last frame that may be seen, {last}."

@@ -1,0 +1,168 @@
+"""Encoders of transformers by name: small networks, in folders as the library writes them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from physion.core.errors import BadInputError
+from physion.models import Batch, build_model
+from physion.readout.evaluate import evaluate
+from physion.readout.logistic import LogisticSettings
+from physion.readout.settings import EvaluationSettings
+from support.moving_dots import make_dots
+from support.programs import absent
+
+try:
+    import transformers
+except ModuleNotFoundError:
+    absent("transformers is not installed: it comes with the extra video")
+
+SIZE, PATCH, WIDTH = 32, 8, 24
+MEAN, STD = [0.1, 0.2, 0.3], [0.5, 0.6, 0.7]
+SMALL: dict[str, Any] = {
+    "image_size": SIZE, "patch_size": PATCH, "hidden_size": WIDTH, "num_hidden_layers": 3,
+    "num_attention_heads": 2, "intermediate_size": 48,
+}  # fmt: skip
+
+
+def network(kind: str) -> Any:
+    """A small network with random weights, as it would be published."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(1)
+        if kind == "dinov3":
+            config = transformers.DINOv3ViTConfig(**SMALL, num_register_tokens=2)
+            return transformers.DINOv3ViTModel(config)
+        if kind == "videomae":
+            return transformers.VideoMAEForVideoClassification(
+                transformers.VideoMAEConfig(**SMALL, num_frames=16, use_mean_pooling=False)
+            )
+        config = transformers.VJEPA2Config(
+            crop_size=SIZE, patch_size=PATCH, frames_per_clip=64, hidden_size=WIDTH,
+            num_hidden_layers=3, num_attention_heads=2, pred_num_hidden_layers=1,
+            pred_hidden_size=WIDTH, pred_num_attention_heads=2,
+        )  # fmt: skip
+        return transformers.VJEPA2Model(config)
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folders = {}
+    for kind in ("dinov3", "videomae", "vjepa2"):
+        folder = folders[kind] = tmp_path_factory.mktemp("hub") / f"{kind}-tiny"
+        network(kind).save_pretrained(folder)
+        size = {"height": SIZE, "width": SIZE}
+        processor = {"image_mean": MEAN, "image_std": STD, "crop_size": size}
+        name = f"{'video_' * (kind == 'vjepa2')}preprocessor_config.json"
+        (folder / name).write_text(json.dumps(processor))
+    return folders
+
+
+def clips(frames: int) -> Batch:
+    random = np.random.default_rng(0)
+    rgb = random.integers(0, 256, (2, frames, SIZE, SIZE, 3), np.uint8)
+    shape = rgb.shape[:2]
+    return Batch(("a", "b"), np.zeros(shape, np.int64), np.ones(shape, np.bool_), rgb=rgb).to("cpu")
+
+
+def given(batch: Batch) -> Tensor:
+    pictures = batch.rgb.float() / 255
+    return ((pictures - torch.tensor(MEAN)) / torch.tensor(STD)).permute(0, 1, 4, 2, 3)
+
+
+def test_an_image_encoder_gives_what_its_own_library_computes(published: dict[str, Path]) -> None:
+    name = f"hf:{published['dinov3']}"
+    model: Any = build_model(name)
+    assert model.spec.context_frames() == tuple(range(2, 45, 6)) and model.spec.framewise
+    assert (model.spec.image_size, model.spec.mean) == (SIZE, tuple(MEAN))
+    batch = clips(3)
+    alone = transformers.DINOv3ViTModel.from_pretrained(published["dinov3"]).eval()
+    with torch.no_grad():
+        output = alone(given(batch).flatten(0, 1), output_hidden_states=True)
+    tokens = output.last_hidden_state.view(2, 3, 3 + 16, WIDTH)
+    close = {"rtol": 1e-4, "atol": 1e-5}
+    torch.testing.assert_close(model.encode(batch), tokens[:, :, 0], **close)
+    mean = build_model(name, pooling="mean")
+    torch.testing.assert_close(mean.encode(batch), tokens[:, :, 3:].mean(2), **close)
+    grid: Any = build_model(name, pooling="grid")
+    torch.testing.assert_close(grid.encode(batch), tokens[:, :, 3:].flatten(2), **close)
+    second = output.hidden_states[2].view(2, 3, 19, WIDTH)
+    layer: Any = build_model(name, layer=2, pooling="mean")
+    torch.testing.assert_close(layer.encode(batch), second[:, :, 3:].mean(2), **close)
+    assert layer.name() == "dinov3-tiny-mean-layer2" and layer.init.startswith("local:")
+    assert len({m.digest() for m in (model, mean, grid, layer)}) == 4
+
+
+@pytest.mark.parametrize("kind", ["videomae", "vjepa2"])
+def test_clips_of_a_video_encoder_end_with_the_last_observed_frame(
+    kind: str, published: dict[str, Path]
+) -> None:
+    model: Any = build_model(f"hf:{published[kind]}")
+    assert model.spec.context_frames() == tuple(range(14, 45, 2)) and not model.spec.framewise
+    batch = clips(16)
+    alone: Any = network(kind)
+    alone = (alone.videomae if kind == "videomae" else alone.encoder).eval()
+    with torch.no_grad():
+        tokens = alone(given(batch)).last_hidden_state.view(2, 8, 16, WIDTH)
+    torch.testing.assert_close(model.encode(batch), tokens.mean(2), rtol=1e-4, atol=1e-5)
+    longer = clips(19)
+    repeated = longer.steps(slice(0, 16))
+    torch.testing.assert_close(model.encode(longer)[:, :8], model.encode(repeated))
+    assert model.encode(longer).shape == (2, 16, WIDTH)
+
+
+def test_random_weights_follow_the_seed(published: dict[str, Path]) -> None:
+    name = f"hf:{published['dinov3']}"
+    torch.manual_seed(1)
+    one: Any = build_model(name, weights="random")
+    torch.manual_seed(2)
+    assert build_model(name, weights="random").digest() == one.digest()
+    assert build_model(name, weights="random", seed=1).digest() != one.digest()
+    assert one.name() == "random-dinov3-tiny" and one.provenance().init == "random"
+
+
+def test_it_is_evaluated_with_its_twin(published: dict[str, Path], tmp_path: Path) -> None:
+    dots = make_dots(tmp_path / "dots", {"readout": 8, "testing": 4}, ("collide",))
+    quick = EvaluationSettings(accelerator="cpu", logistic=LogisticSettings(grid=(1e-2,)))
+    table = evaluate(f"hf:{published['dinov3']}", dots, tmp_path, quick, twin=True).predictions
+    assert set(table["model"]) == {"dinov3-tiny", "random-dinov3-tiny"}
+    assert set(table["readout"]) == {"observed", "full"}
+
+
+def test_what_cannot_be_loaded_is_one_line(published: dict[str, Path], tmp_path: Path) -> None:
+    for name, options, message in (
+        (f"hf:{published['dinov3']}", {"layer": 4}, "has the layers 1 to 3, not 4"),
+        (f"hf:{published['dinov3']}", {"weights": "a.pt"}, "published or random"),
+        (f"hf:{tmp_path}", {}, "could not be loaded"),
+        ("hf:", {}, "is called hf:NAME"),
+    ):
+        with pytest.raises(BadInputError, match=message) as caught:
+            build_model(name, **options)
+        assert "\n" not in str(caught.value)
+
+
+def test_weights_that_lack_a_tensor_and_code_of_others_are_refused(
+    published: dict[str, Path], tmp_path: Path
+) -> None:
+    """The library would draw the tensor at random, and ask whether to run the code."""
+    folder = tmp_path / "cut"
+    network("dinov3").save_pretrained(folder)
+    state = load_file(folder / "model.safetensors")
+    gone = next(name for name in state if "layer.1" in name and name.endswith("weight"))
+    save_file({n: v for n, v in state.items() if n != gone}, folder / "model.safetensors")
+    with pytest.raises(BadInputError, match=r"lack .*layer\.1"):
+        build_model(f"hf:{folder}")
+    config = json.loads((folder / "config.json").read_text())
+    config |= {"model_type": "own", "auto_map": {"AutoConfig": "own.Config", "AutoModel": "own.M"}}
+    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "own.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w').write('x')")
+    with pytest.raises(BadInputError, match="could not be loaded"):
+        build_model(f"hf:{folder}")
+    assert not (tmp_path / "ran").exists()
