@@ -116,7 +116,7 @@ def test_a_request_is_encoded_without_this_package_and_gives_the_row_of_the_mode
     (path,) = (out / "predictions").glob("*.csv")
     table = pd.read_csv(path).set_index("stimulus")
     assert set(table["readout"]) == {"observed"} and set(table["model"]) == {"my network"}
-    assert set(table["inputs"]) == {"features of frames 2 to 44"}
+    assert set(table["inputs"]) == {"features up to frame 44"}
     own = Encoder(request / "features.npz")
     expected = predicted(own, dots, tmp_path / "own").loc["observed"]["p_contact"]
     np.testing.assert_allclose(table["p_contact"].loc[expected.index], expected, atol=1e-9)

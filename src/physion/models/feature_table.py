@@ -99,7 +99,7 @@ class FeatureTable(Model):
         named = folder.parent if folder.name in ("ocp", "ocd") else folder
         self._model = named.name if self._of_evaluator else self.path.stem
         self._model = str(tables[0].get("model", self._model))
-        self._seen = f"features of frames {frames[0]} to {frames[-1]}"
+        self._seen = f"features up to frame {frames[-1]}"
         self._sha256 = digest_of(" ".join(file_sha256(one) for one in paths))
 
     def _read(self, path: Path) -> dict[str, Any]:

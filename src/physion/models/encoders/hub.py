@@ -151,10 +151,10 @@ class HubEncoder(TorchModel):
                     f"the weights of {self.settings.model} lack {missing[0]}"
                     + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
                 )
-            local = Path(self.source) / "model.safetensors"
-            self.init = f"hub:{self.source}"
-            if local.is_file():
-                self.init = f"local:{weights_sha256(local)[:12]}"
+            local = sorted(Path(self.source).glob("*.safetensors"))
+            digests = [weights_sha256(path) for path in local]
+            found = digests[0] if len(digests) == 1 else digest_of(digests)
+            self.init = f"local:{found[:12]}" if local else f"hub:{self.source}"
         network = getattr(network, "vision_model", network)
         if config.model_type == "vjepa2":  # without its predictor
             network = network.encoder
