@@ -7,6 +7,7 @@ The public names are imported when they are first used, so that ``import physion
 - `generate`: make a dataset of trials. `Dataset`: read it. `clips`: its clips, as torch takes them.
 - `official`: the data of the original study: scenes, recorded outcomes, answers of people.
 - `build_model`: build a model. `train`: train it. `evaluate`: predict the trials of a dataset.
+- `check`: test whether predictions depend on what they must not depend on.
 - `compare`: compare predictions with people. `run`: all of this in one call.
 """
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from physion.physics.engine import simulate
     from physion.physics.labels import label_contact
     from physion.pipeline import run
+    from physion.readout.check import check
     from physion.readout.evaluate import evaluate
     from physion.readout.train import train
     from physion.rendering.renderer import Renderer
@@ -36,6 +38,7 @@ __all__ = [
     "Renderer",
     "__version__",
     "build_model",
+    "check",
     "clips",
     "compare",
     "evaluate",
@@ -52,6 +55,7 @@ _MODULES = {
     "Dataset": "physion.trials.dataset",
     "Renderer": "physion.rendering.renderer",
     "build_model": "physion.models.build",
+    "check": "physion.readout.check",
     "clips": "physion.clips.clips",
     "compare": "physion.report.compare",
     "evaluate": "physion.readout.evaluate",

@@ -15,6 +15,7 @@ VERBS = {
     "replay": "simulate official command logs and compare with the recorded outcomes",
     "train": "train models on trials, without labels",
     "evaluate": "train models and readouts on trials and write their predictions",
+    "check": "test whether predictions depend on what follows, names, order or outcomes",
     "compare": "compare predictions with people",
     "experiment": "run the experiment with people: init, serve, export",
     "view": "write a page that shows a dataset: movies, passes, motion in 3D",
@@ -52,6 +53,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "evaluate": (
         "physion evaluate gns,constant-motion trials --out runs/models",
         "physion evaluate my_model.py:MyEncoder trials",
+    ),
+    "check": (
+        "physion check my_model.py:MyEncoder",
+        "physion check gns trials --trials 40 --changes future,names",
     ),
     "compare": (
         "physion compare runs/models/predictions/*.csv --humans official",

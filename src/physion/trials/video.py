@@ -299,6 +299,19 @@ def encode_movie(frames: NDArray[np.uint8], *, rate: int = PLAYBACK_RATE, crf: i
     return encoder.finish()
 
 
+def repack_movie(path: Path) -> bytes:
+    """Return the bytes of an MP4 file with the same pictures, and nothing else of the first one."""
+    buffer = io.BytesIO()
+    with av.open(str(path)) as source, av.open(buffer, "w", format="mp4") as target:
+        known = source.streams.video[0]
+        stream = target.add_stream_from_template(known)
+        for packet in source.demux(known):
+            if packet.dts is not None:  # the last one is empty
+                packet.stream = stream
+                target.mux(packet)
+    return buffer.getvalue()
+
+
 def read_frames(
     path: Path,
     *,

@@ -1,0 +1,96 @@
+"""Test whether predictions of a model depend on what they must not depend on.
+
+The model predicts some trials, and copies of them in which one thing is changed: what follows the
+observed part becomes noise, outcomes are inverted, names and order change. Such changes must not
+move a prediction; of others it is shown how much they do. Exit code 1: a prediction moved.
+"""
+
+from __future__ import annotations
+
+import json as json_module
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from physion.cli.output import Stages, print_line, print_warnings, text_table, write_text
+from physion.compute.local import LocalExecutor
+from physion.compute.run_tasks import ExecutorSettings
+from physion.core.settings import split_names
+from physion.readout.check import CheckedModel, check
+from physion.readout.settings import EvaluationSettings, options_by_model
+from physion.readout.tables import file_name
+from physion.report.check import check_page, described
+from physion.trials.dataset import Dataset
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of ``physion check``."""
+
+    model: Annotated[str, tyro.conf.Positional]
+    """Name of a model (physion ls models lists them), or FILE.py:Class."""
+    dataset: Annotated[Path | None, tyro.conf.Positional] = None
+    """Folder of a dataset; default: trials of Collide and Drop, made in the output folder."""
+    out: Path = Path("runs/check")
+    """Folder for the page, and for the trials if none are given."""
+    trials: int = 80
+    """About how many trials are taken; half of them fit the readout, half are tested."""
+    changes: tuple[str, ...] = ()
+    """Names of the changes to make; default: all, and evaluations of two other models."""
+    option: tuple[str, ...] = ()
+    """Settings of the model as NAME=VALUE, such as weights=random."""
+    readouts: tuple[str, ...] = EvaluationSettings.readouts
+    """Readouts: observed, observed+simulated, full. Default: all but full, which is checked if the
+    model has no other."""
+    decision: str = EvaluationSettings.decision
+    """What turns features or rollouts into P(contact); default: the model's own."""
+    encoder_batch: int = EvaluationSettings.encoder_batch
+    """Clips that a network encodes at a time; lower it when memory runs out."""
+    rendered: bool = EvaluationSettings.rendered
+    """Render the pictures from the stored motions instead of reading the movies."""
+    accelerator: str = EvaluationSettings.accelerator
+    """Device of the networks, by Lightning's name: auto, cpu, cuda, ..."""
+    workers: int = ExecutorSettings.workers
+    """Number of processes."""
+    json: bool = False
+    """Print one JSON object."""
+
+
+def main(options: Options) -> int:
+    """Print the table of changes and write the page; return 1 if the model is refused."""
+    with Stages() as stages:
+        done = check(
+            options.model,
+            None if options.dataset is None else Dataset(options.dataset),
+            options.out,
+            options=options_by_model([options.model], options.option)[options.model],
+            trials=options.trials,
+            changes=split_names(options.changes, "change") if options.changes else (),
+            executor=LocalExecutor(options.workers),
+            progress=stages,
+            readouts=options.readouts,
+            decision=options.decision,
+            encoder_batch=options.encoder_batch,
+            rendered=options.rendered,
+            accelerator=options.accelerator,
+        )
+    page = options.out / f"{file_name(done.model)}.html"
+    write_text(page, check_page(done.model, done.verdict, done.table))
+    print_warnings(done.warnings)
+    _print(done, page, options)
+    return 0 if done.passed else 1
+
+
+def _print(done: CheckedModel, page: Path, options: Options) -> None:
+    if options.json:
+        rows = json_module.loads(done.table.to_json(orient="records"))
+        values = {"model": done.model, "passed": done.passed, "refused": done.refused}
+        print(json_module.dumps(values | {"changes": rows, "page": str(page)}))
+        return
+    print_line(text_table(described(done.table)))
+    for row in done.table[done.table["note"] != ""].itertuples():
+        print_line(f"{row.change}, {row.readout}: {row.note}")
+    print_line(done.verdict)
+    print_line(f"page: {page}")

@@ -1,0 +1,340 @@
+"""Black-box test of a model: does any prediction depend on what it must not depend on?
+
+A model is evaluated on a few trials, and again on copies of them in which one thing is changed
+(`physion.readout.changes`). What follows the observed part, outcomes, names, order, and everything
+about files but their pictures and motions must not move a prediction. How much other changes move
+predictions is shown, and how accurate a twin with random weights and one that knows only blobs are.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.stats import wilcoxon
+
+from physion.compute.tasks import Executor, Progress, tracked
+from physion.core.errors import BadInputError, PhysionError, UnknownNameError
+from physion.core.seeds import generator
+from physion.models.build import build_model, option_names
+from physion.models.interface import RANDOM, Model, can
+from physion.readout.changes import CHANGES, Change, ChangedTrials, take_trials
+from physion.readout.decisions import Readout
+from physion.readout.evaluate import Evaluation, evaluate
+from physion.readout.model_calls import check_identity
+from physion.readout.predictor import ways
+from physion.readout.settings import WEIGHTS, ChosenModel, EvaluationSettings, choose_models
+from physion.trials.dataset import Dataset
+from physion.trials.making.generate import generate
+from physion.trials.making.plan import GenerateSettings
+
+PASSED, REFUSED, SHOWN = "passed", "refused", "shown"
+"""Verdicts; ``shown``: the change may move predictions."""
+ROUNDING = 1e-3
+"""Largest change of P(contact), of the range of all predictions, where trials are in other batches,
+in which sums are rounded differently."""
+CHANCE = 1e-3
+"""Level of the test whether random numbers that follow the names explain what moved."""
+SCENARIOS, SIZE = ("collide", "drop"), 64
+"""Scenarios of the trials that are made if no dataset is given, and pixels per side."""
+BLOBS, TWIN = "blob-centroids", "random twin"
+_OTHERS = {
+    TWIN: "The same architecture with random weights",
+    BLOBS: "Centroids and areas of red and yellow pixels, in place of the model",
+}
+
+COLUMNS = (
+    "change", "what", "readout", "trials", "moved", "largest", "mean", "accuracy",
+    "accuracy_changed", "verdict", "note",
+)  # fmt: skip
+"""Columns of `CheckedModel.table`.
+
+- ``change``: name in `physion.readout.changes.CHANGES`, or of another model; ``what`` it is.
+  ``readout``: observed, observed+simulated or full.
+- ``trials``: tested ones. ``moved``: those whose P(contact) is another one. ``largest``, ``mean``:
+  absolute change of P(contact).
+- ``accuracy``, ``accuracy_changed``: fraction of right predictions before and after the change.
+- ``verdict``: passed, refused, or shown, where the change may move predictions. ``note``: why.
+"""
+
+
+@dataclass(frozen=True)
+class CheckedModel:
+    """What `check` found.
+
+    - ``model``: its name. ``table``: a row for every change and readout, with `COLUMNS`.
+    - ``warnings``: why the check could say less than it should, in sentences.
+    """
+
+    model: str
+    table: pd.DataFrame
+    warnings: Sequence[str]
+
+    @property
+    def refused(self) -> list[str]:
+        """Names of the changes that moved predictions which must not move."""
+        rows = self.table[self.table["verdict"] == REFUSED]
+        return list(dict.fromkeys(rows["change"]))
+
+    @property
+    def passed(self) -> bool:
+        """Whether no prediction moved that must not."""
+        return not self.refused
+
+    @property
+    def verdict(self) -> str:
+        """The result in one line."""
+        if self.refused:
+            return f"{self.model} refused: predictions depend on {', '.join(self.refused)}"
+        held = self.table["change"][self.table["verdict"] == PASSED].nunique()
+        return f"{self.model} passed: none of {held} changes moved a prediction that must stay"
+
+    def __str__(self) -> str:
+        return f"{self.table.drop(columns=['what', 'note']).to_string(index=False)}\n{self.verdict}"
+
+
+def check(
+    model: str | Model,
+    dataset: Dataset | Path | str | None = None,
+    out: Path | str = "runs/check",
+    settings: EvaluationSettings | None = None,
+    *,
+    options: dict[str, Any] | None = None,
+    trials: int = 80,
+    changes: Sequence[str] = (),
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+    **fields: Any,
+) -> CheckedModel:
+    """Test whether predictions of a model depend on what they must not depend on.
+
+    The model is evaluated on some trials and on changed copies of them; it is not trained.
+
+    Parameters
+    ----------
+    model
+        Name of a model (``physion ls models``), ``FILE.py:Class``, or a model.
+    dataset
+        Labelled trials, or the path of their folder. Without it, trials of Collide and Drop are
+        made in ``out/trials``.
+    out
+        Folder for these trials and for the copies, which are deleted.
+    settings
+        Settings of the evaluations, as of `physion.evaluate`. Without readouts, all that the model
+        supports are checked but *full*, which is checked if there is no other.
+    options
+        Options of the model.
+    trials
+        About how many trials are taken, half of them to fit the readout.
+    changes
+        Names of the changes to make (`physion.readout.changes.CHANGES`); by default all, and
+        evaluations of two other models.
+    executor, progress
+        As of `physion.evaluate`.
+    **fields
+        Fields of `EvaluationSettings` to replace in ``settings``.
+
+    Returns
+    -------
+    CheckedModel
+        A table with a verdict for every change, and whether the model passed.
+
+    Raises
+    ------
+    UnknownNameError
+        For an unknown model, option or change.
+    BadInputError
+        If the model cannot be built or evaluated, or there are too few trials.
+    """
+    for name in changes:
+        if name not in CHANGES:
+            raise UnknownNameError("change", name, CHANGES)
+    settings = dataclasses.replace(settings or EvaluationSettings(), **fields)
+    settings = dataclasses.replace(settings, untrained=True, seeds=1)
+    chosen = choose_models([model] if isinstance(model, str) else model, options)
+    if len(chosen) != 1:
+        raise BadInputError("one model is checked at a time")
+    built = chosen[0].build(settings.seed)
+    name = check_identity(built).model
+    if not settings.readouts:
+        possible = [readout.value for readout in ways(built, settings.decision)]
+        predicting = tuple(readout for readout in possible if readout != Readout.FULL.value)
+        settings = dataclasses.replace(settings, readouts=predicting)
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    if dataset is None:
+        opened: Dataset = _made(out / "trials", trials, executor, progress)
+    else:
+        opened = Dataset(dataset) if isinstance(dataset, str | Path) else dataset
+    wanted = [CHANGES[name] for name in changes or CHANGES]
+    with tempfile.TemporaryDirectory(dir=out, prefix="copies-") as folder:
+        first = take_trials(opened, Path(folder) / "first", trials)
+        work = _Check(
+            built, first, functools.partial(evaluate, settings=settings, executor=executor)
+        )
+        rows = []
+        for change in tracked(wanted, "changes", len(wanted), progress):
+            rows += work.rows(change)
+        if not changes:
+            rows += work.rows_of_others(_twin(chosen[0], settings.seed))
+        table = pd.DataFrame(rows, columns=list(COLUMNS))
+        return CheckedModel(name, table, work.warnings())
+
+
+def _made(
+    folder: Path, count: int, executor: Executor | None, progress: Progress | None
+) -> Dataset:
+    """Make the trials on which a model is checked if no dataset is given."""
+    half = max(2, count // (2 * len(SCENARIOS)))
+    return generate(
+        folder,
+        SCENARIOS,
+        {"readout": half, "testing": half},
+        name="check",
+        settings=GenerateSettings(width=SIZE, height=SIZE, look="redyellow", jitters=0),
+        executor=executor,
+        progress=progress,
+    )
+
+
+def _twin(chosen: ChosenModel, seed: int) -> Model | None:
+    """Return the model with random weights; None for one that was built, or has none."""
+    if not isinstance(chosen.model, str) or WEIGHTS not in option_names(chosen.model):
+        return None
+    options = {**chosen.options, WEIGHTS: RANDOM}
+    twin: Model = dataclasses.replace(chosen, options=options).build(seed)
+    return twin
+
+
+class _Check:
+    """The evaluations of one check: on the first trials, and on changed copies of these."""
+
+    def __init__(self, model: Model, first: Dataset, evaluate: Callable[..., Evaluation]) -> None:
+        self._model, self._first, self._evaluate = model, first, evaluate
+        self._before = self._predict(model, first)
+        self._readouts = list(dict.fromkeys(self._before["readout"]))
+
+    def rows(self, change: Change) -> list[dict[str, Any]]:
+        """Return the rows of `COLUMNS` of one change, one for every readout."""
+        if change.pictures and self._first.index["observed_movie_sha256"].isna().any():
+            return []
+        folder = self._first.folder.parent / "changed"
+        trials = ChangedTrials(self._first, folder, generator("check", change.name))
+        try:
+            change.apply(trials)
+            after, why = self._predict(self._model, trials.finish()), ""
+        except PhysionError as error:
+            if not change.must_hold:
+                raise
+            after, why = self._before[:0], " ".join(str(error).split())
+        finally:
+            shutil.rmtree(folder)
+        rows = []
+        for readout, before in self._before.groupby("readout"):
+            if readout == Readout.FULL.value and not change.must_hold:
+                continue  # it sees the whole movies, in which nothing was changed
+            names = before["stimulus"].map(trials.names)
+            found = after[after["readout"] == readout].set_index("stimulus")["p_contact"]
+            compared = _compared(before, found.reindex(names).to_numpy())
+            rows.append({"change": change.name, "what": change.what, "readout": readout})
+            rows[-1] |= compared
+            rows[-1] |= self._judged(change, str(readout), before, found.reindex(names).to_numpy())
+            if why:
+                rows[-1]["note"] = why
+        return rows
+
+    def _judged(
+        self, change: Change, readout: str, before: pd.DataFrame, after: NDArray[np.float64]
+    ) -> dict[str, str]:
+        """Return verdict and note of a change."""
+        if not change.must_hold or (change.later and readout == Readout.FULL.value):
+            return {"verdict": SHOWN, "note": ""}
+        missing = int(np.isnan(after).sum())
+        if missing:
+            return {"verdict": REFUSED, "note": f"{missing} trials have no prediction"}
+        moved = np.abs(after - before["p_contact"].to_numpy()).max()
+        if moved <= (ROUNDING * np.ptp(before["p_contact"]) if change.renames else 0):
+            return {"verdict": PASSED, "note": "rounding" if moved else ""}
+        if not (change.renames and self._imagines(readout)):
+            return {"verdict": REFUSED, "note": ""}
+        # The names determine the random numbers of an imagined future. Others may make it another
+        # one, but not worse.
+        worse = _scores(before, before["p_contact"].to_numpy()) - _scores(before, after)
+        if 0.5 ** np.count_nonzero(worse) > CHANCE:
+            few = "random numbers follow the names; too few trials moved to tell that from a leak"
+            return {"verdict": SHOWN, "note": few}
+        p = float(wilcoxon(worse, alternative="greater").pvalue)
+        return {
+            "verdict": REFUSED if p < CHANCE else PASSED,
+            "note": f"random numbers follow the names; names tell the outcome: p = {p:.2g}",
+        }
+
+    def _imagines(self, readout: str) -> bool:
+        return readout == Readout.OBSERVED_SIMULATED.value and can(self._model, "imagine")
+
+    def rows_of_others(self, twin: Model | None) -> list[dict[str, Any]]:
+        """Return rows that compare the model with its random twin, and with blobs."""
+        others = {TWIN: twin, BLOBS: build_model(BLOBS) if self._has_pictures() else None}
+        rows = []
+        for name, other in others.items():
+            able = [] if other is None else [readout.value for readout in ways(other)]
+            asked = tuple(readout for readout in self._readouts if readout in able)
+            if other is None or not asked:
+                continue
+            found = self._predict(other, self._first, readouts=asked, decision="")
+            for readout, before in self._before.groupby("readout"):
+                if readout in asked:
+                    same = found[found["readout"] == readout].set_index("stimulus")["p_contact"]
+                    after = same.reindex(before["stimulus"]).to_numpy()
+                    rows.append({"change": name, "what": _OTHERS[name], "readout": readout})
+                    rows[-1] |= {**_compared(before, after), "verdict": SHOWN, "note": ""}
+        return rows
+
+    def _has_pictures(self) -> bool:
+        return set(self._first.index["look"]) == {"redyellow"}
+
+    def _predict(self, model: Model, dataset: Dataset, **changes: Any) -> pd.DataFrame:
+        """Return the table of predictions of the tested trials of a dataset."""
+        with tempfile.TemporaryDirectory(dir=self._first.folder.parent) as folder:
+            return self._evaluate(model, dataset, folder, **changes).predictions
+
+    def warnings(self) -> list[str]:
+        """Return why the check could say less than it should."""
+        found = []
+        for readout, rows in self._before.groupby("readout"):
+            if (rows.groupby("scenario")["p_contact"].nunique() == 1).all():
+                found.append(
+                    f"readout {readout}: all predictions of a scenario are the same number, which "
+                    "hides what they depend on; take more trials"
+                )
+        return found
+
+
+def _scores(before: pd.DataFrame, p: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the probability that predictions gave to what happened."""
+    return np.where(before["outcome"].to_numpy(), p, 1 - p)
+
+
+def _compared(before: pd.DataFrame, after: NDArray[np.float64]) -> dict[str, Any]:
+    """Return how much predictions of one readout moved, and the accuracies."""
+    first, outcome = before["p_contact"].to_numpy(), before["outcome"].to_numpy()
+    known = ~np.isnan(after)
+    apart = np.abs(after - first)[known]
+    right = (after > 0.5) == outcome
+    return {
+        "trials": len(first),
+        "moved": int((apart > 0).sum()),
+        "largest": float(apart.max()) if len(apart) else float("nan"),
+        "mean": float(apart.mean()) if len(apart) else float("nan"),
+        "accuracy": float(((first > 0.5) == outcome).mean()),
+        "accuracy_changed": float(right[known].mean()) if len(apart) else float("nan"),
+    }

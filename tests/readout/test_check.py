@@ -1,0 +1,337 @@
+"""The check of models: each planted leak is refused by its change; every shipped model passes."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import av
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+
+from physion.cli.main import main
+from physion.core.errors import BadInputError
+from physion.models import models
+from physion.readout.changes import CHANGES, ChangedTrials, take_trials
+from physion.readout.check import REFUSED, SHOWN, CheckedModel, check
+from physion.trials.dataset import Dataset
+from physion.trials.index import build_index, write_index
+from physion.trials.trial_file import seal
+from support import leaking_models as leaks
+from support.late_motions import OBSERVED, make_late_motions
+from support.moving_dots import make_dots
+from support.tiny_models import OPTIONS
+
+TESTED = 8
+HELD = [name for name, change in CHANGES.items() if change.must_hold]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """Trials whose files tell the outcome in many ways: the even ones have a contact."""
+    folder = tmp_path_factory.mktemp("check") / "trials"
+    dataset = make_late_motions(folder, {"readout": 4, "testing": TESTED}, more=1)
+    told = {}
+    for number, trial in enumerate(dataset.trials("testing")):
+        paths, contact = dataset.paths(trial), number % 2 == 0
+        told[trial] = float(contact)
+        paths.trial_file.with_suffix(".txt").write_text(str(float(contact)))
+        picture = np.array(Image.open(paths.map))
+        picture[-1, -1] = (255, 0, 0, 255) if contact else (0, 0, 0, 0)
+        Image.fromarray(picture).save(paths.map)
+        add_title(paths.observed_movie, "contact" if contact else "none")
+        add_attribute(paths.trial_file, "note", float(contact))
+    table, problems = build_index(folder)
+    assert problems == {}
+    rng = np.random.default_rng(0)
+    table["seed"] = [f"{n:x}" for n in rng.permutation(len(table))]
+    write_index(folder, table)
+    (folder / "labels.json").write_text(json.dumps(told))
+    for number, trial in enumerate(dataset.trials("testing")):
+        for path in folder.glob(f"testing/*/{trial}*"):
+            os.utime(path, (10**9 + number, 10**9 + number))
+    return Dataset(folder)
+
+
+def add_title(path: Path, title: str) -> None:
+    """Write a title into a movie."""
+    aside = path.with_suffix(".aside.mp4")
+    with av.open(str(path)) as source, av.open(str(aside), "w") as target:
+        target.metadata["title"] = title
+        stream = target.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(source.streams.video[0]):
+            if packet.dts is not None:
+                packet.stream = stream
+                target.mux(packet)
+    aside.rename(path)
+
+
+def add_attribute(path: Path, name: str, value: float) -> None:
+    """Write an attribute into a trial file, under a seal of its own."""
+    with h5py.File(path, "r+") as file:
+        file.attrs[name] = value
+        file["first_frame/ids"][0, 0] = int(value)
+    path.write_bytes(seal(path.read_bytes()))
+
+
+def run(dataset: Dataset, model: Any, folder: Path, *changes: str, **options: Any) -> CheckedModel:
+    return check(model, dataset, folder, changes=changes, trials=2 * TESTED, **options)
+
+
+def test_a_model_that_sees_what_was_observed_passes_exactly(made: Dataset, tmp_path: Path) -> None:
+    done = run(made, leaks.Honest(), tmp_path, *CHANGES)
+    held = done.table[done.table["change"].isin(HELD)]
+    assert done.passed and set(held["verdict"]) == {"passed"} and len(held) == len(HELD)
+    assert (held["largest"] == 0).all() and (held["moved"] == 0).all()
+    assert set(done.table["trials"]) == {TESTED}
+    shown = done.table[done.table["verdict"] == SHOWN].set_index("change")
+    assert set(shown.index) == set(CHANGES) - set(HELD)
+    # The mean over frames is the same in any order, but for the encoder.
+    assert shown["largest"]["colours"] > 0.01 > shown["largest"]["reversed"]
+    assert not any(tmp_path.iterdir()), "the copies are deleted"
+    assert "passed: none of 8 changes" in done.verdict and done.verdict in str(done)
+
+
+PLANTED: dict[str, tuple[leaks.Tells, str]] = {
+    "a number in the name": (leaks.number_in_the_name, "names"),
+    "the hash of the name": (leaks.hash_of_the_name, "names"),
+    "the name of the scene in the trial file": (leaks.scene_name_in_the_file, "names"),
+    "a text file next to the trial": (leaks.file_beside, "names"),
+    "a table of labels in the folder": (leaks.table_of_labels, "names"),
+    "the time of change of a file": (leaks.time_of_the_file, "files"),
+    "the size of the observed movie": (leaks.size_of_the_observed_movie, "files"),
+    "the title of the observed movie": (leaks.title_of_the_movie, "files"),
+    "the seed in the index": (leaks.seed_in_the_index, "files"),
+    "an attribute of the HDF5 file": (leaks.attribute_in_the_file, "files"),
+    "the id map in the trial file": (leaks.ids_in_the_file, "files"),
+    "the map of agent and patient": (leaks.map_of_agent_and_patient, "files"),
+    "the size of the movie": (leaks.size_of_the_movie, "future"),
+    "the last picture": (leaks.last_picture, "future"),
+    "the first picture after the observed part": (leaks.first_picture_after, "future"),
+    "the digest of the motion": (leaks.digest_in_the_index, "future"),
+    "the motion in the trial file": (leaks.motion_in_the_file, "future"),
+    "contacts in the trial file": (leaks.contacts_in_the_file, "future"),
+    "the length of the movie": (leaks.length_of_the_movie, "length"),
+    "the length in the index": (leaks.length_in_the_index, "length"),
+    "the label in the index": (leaks.label_in_the_index, "labels"),
+    "the frame of the contact in the index": (leaks.first_frame_in_the_index, "labels"),
+    "the label in the trial file": (leaks.label_in_the_file, "labels"),
+    "the mean of the labels": (leaks.mean_of_the_labels, "labels"),
+    "the row of the index": (leaks.row_of_the_index, "order"),
+    "the number in the index": (leaks.number_in_the_index, "order"),
+}
+"""What a model reads of the evaluated dataset, and the change that must find it."""
+
+
+@pytest.mark.parametrize("leak", PLANTED)
+def test_a_planted_leak_is_refused(leak: str, made: Dataset, tmp_path: Path) -> None:
+    tells, change = PLANTED[leak]
+    done = run(made, leaks.Cheater(tells), tmp_path, change)
+    assert done.refused == [change] and not done.passed
+    (row,) = done.table.to_dict("records")
+    assert row["verdict"] == REFUSED and row["moved"] > 0 and row["largest"] > 0
+
+
+MODELS: dict[str, tuple[Callable[[], Any], str]] = {
+    "the place in the batch": (leaks.PlaceInBatch, "order"),
+    "the other trials of the batch": (leaks.OthersInTheBatch, "order"),
+    "the number of calls": (leaks.CallCounter, "again"),
+    "a readout fitted on tested trials": (leaks.FitOnTested, "labels"),
+    "a memory of answers by name": (leaks.MemoryOfNames, "everything"),
+}
+"""Models that leak in their own way, and the change that must find it."""
+
+
+@pytest.mark.parametrize("leak", MODELS)
+def test_a_model_with_a_planted_leak_is_refused(leak: str, made: Dataset, tmp_path: Path) -> None:
+    model, change = MODELS[leak]
+    assert run(made, model(), tmp_path, change).refused == [change]
+
+
+def test_answers_in_a_cache_on_disk_are_refused(made: Dataset, tmp_path: Path) -> None:
+    answers = {t: 0.9 * (n % 2) for n, t in enumerate(made.trials("testing"))}
+    done = run(made, leaks.CacheOnDisk(tmp_path / "cache.json", answers), tmp_path, "names")
+    assert done.refused == ["names"]
+
+
+def test_random_numbers_may_follow_the_names(made: Dataset, tmp_path: Path) -> None:
+    """But not the outcome: names of the dots are even with a contact."""
+    dots = make_dots(tmp_path / "dots", {"readout": 4, "testing": 32}, ("drop",))
+    honest: Any = leaks.Imagining()
+    done = check(honest, dots, tmp_path, trials=64, changes=["names", "future"])
+    rows = done.table.set_index("change")
+    assert rows["verdict"].tolist() == ["passed", "passed"]
+    assert rows["moved"]["names"] > 0 and "random numbers" in rows["note"]["names"]
+    assert rows["moved"]["future"] == 0
+    reads: Any = leaks.ImaginesTheName()
+    leaking = check(reads, dots, tmp_path, trials=64, changes=["names"])
+    assert leaking.refused == ["names"]
+    few = run(made, leaks.Imagining(), tmp_path, "names").table
+    assert few["verdict"].tolist() == [SHOWN] and "too few trials" in few["note"][0]
+
+
+def changed(dataset: Dataset, change: str, folder: Path) -> tuple[ChangedTrials, Dataset]:
+    first = folder / "first"
+    if not first.is_dir():
+        take_trials(dataset, first, 2 * TESTED)
+    trials = ChangedTrials(Dataset(first), folder / change, np.random.default_rng(1))
+    CHANGES[change].apply(trials)
+    return trials, trials.finish()
+
+
+@pytest.mark.parametrize("change", HELD)
+def test_no_observed_byte_changes_that_must_not(change: str, made: Dataset, tmp_path: Path) -> None:
+    """Otherwise an honest model could be refused. The fitting trials are the same files."""
+    trials, copy = changed(made, change, tmp_path)
+    assert set(trials.names) == set(made.trials("testing"))
+    for first, name in trials.names.items():
+        assert np.array_equal(made.observed_frames(first), copy.observed_frames(name))
+        before, after = made.trial(first).trajectory, copy.trial(name).trajectory
+        assert before.positions[:OBSERVED].tobytes() == after.positions[:OBSERVED].tobytes()
+        early = [
+            motion.contacts.frame[motion.contacts.frame < OBSERVED] for motion in (before, after)
+        ]
+        assert early[0].tolist() == early[1].tolist() == [10]
+    for trial in made.trials("readout"):
+        assert made.paths(trial).movie.read_bytes() == copy.paths(trial).movie.read_bytes()
+    before_index = Dataset(tmp_path / "first").index
+    for column in ("frames", "contact"):
+        longest = before_index["frames"].max() == copy.index["frames"].max()
+        assert longest, f"{column}: how far models imagine stays"
+
+
+def test_what_is_changed(made: Dataset, tmp_path: Path) -> None:
+    """The copies say what they should, by values that are read independently."""
+    tested = made.trials("testing")
+    _, future = changed(made, "future", tmp_path)
+    for trial in tested:
+        apart = np.abs(made.frames(trial)[OBSERVED:].astype(int) - future.frames(trial)[OBSERVED:])
+        assert apart.mean() > 20
+        assert len(made.frames(trial)) == len(future.frames(trial))
+    _, length = changed(made, "length", tmp_path)
+    counts = {t: (len(made.frames(t)), len(length.frames(t))) for t in tested}
+    assert sum(before > after > OBSERVED for before, after in counts.values()) == TESTED - 1
+    assert (
+        dict(zip(length.index["trial"], length.index["frames"], strict=True)).items()
+        >= {trial: after for trial, (_, after) in counts.items()}.items()
+    )
+    _, labels = changed(made, "labels", tmp_path)
+    both = [data.index.set_index("trial").loc[tested]["contact"] for data in (made, labels)]
+    assert (both[0] != both[1]).sum() == 0.75 * TESTED
+    assert [labels.trial(t).known_labels().contact for t in tested] == both[1].tolist()
+    renamed, names = changed(made, "names", tmp_path)
+    assert not set(names.trials("testing")) & set(tested)
+    assert sorted(renamed.names.values()) == [renamed.names[t] for t in sorted(tested)]
+    exchanged, order = changed(made, "order", tmp_path)
+    assert order.trials("testing") == tested
+    assert all(order.trial(t).metadata.trial == order.trial(t).scene.name == t for t in tested)
+    first = made.index.set_index("trial")["digest"]
+    last = order.index.set_index("trial")["digest"]
+    assert {old: first[old] for old in tested} == {
+        old: last[n] for old, n in exchanged.names.items()
+    }
+    _, files = changed(made, "files", tmp_path)
+    sizes = [(d.paths(t).observed_movie.stat().st_size) for d in (made, files) for t in tested]
+    assert not set(sizes[:TESTED]) & set(sizes[TESTED:])
+
+
+def test_the_order_of_frames_and_the_colours(made: Dataset, tmp_path: Path) -> None:
+    _, backwards = changed(made, "reversed", tmp_path)
+    _, shuffled = changed(made, "shuffled", tmp_path)
+    _, colours = changed(made, "colours", tmp_path)
+    for trial in made.trials("testing"):
+        own = made.trial(trial).trajectory
+        last = backwards.trial(trial).trajectory
+        assert np.array_equal(last.positions[:OBSERVED], own.positions[:OBSERVED][::-1])
+        assert np.array_equal(last.velocities[:OBSERVED], -own.velocities[:OBSERVED][::-1])
+        assert np.array_equal(last.positions[OBSERVED:], own.positions[OBSERVED:])
+        assert last.contacts.frame[0] == OBSERVED - 1 - 10
+        seen, turned = made.observed_frames(trial), backwards.observed_frames(trial)
+        assert np.abs(seen.astype(int) - turned[::-1]).mean() < 3
+        mixed = shuffled.trial(trial).trajectory.positions[:OBSERVED]
+        assert not np.array_equal(mixed, own.positions[:OBSERVED])
+        assert np.array_equal(np.sort(mixed, axis=0), np.sort(own.positions[:OBSERVED], axis=0))
+        # The lower left corner shows the room.
+        corner = [d.observed_frames(trial)[0, -4:, :4].mean((0, 1)) for d in (made, colours)]
+        assert corner[1] == pytest.approx(0.8 * corner[0][::-1], abs=6)
+
+
+def test_half_of_the_tested_trials_fit_where_there_are_no_others(tmp_path: Path) -> None:
+    dots = make_dots(tmp_path / "dots", {"testing": 12}, ("drop", "collide"))
+    taken = take_trials(dots, tmp_path / "taken", 16)
+    counts = taken.index.groupby(["scenario", "split"])["contact"].agg(["size", "sum"])
+    assert counts["size"].tolist() == [4] * 4 and counts["sum"].tolist() == [2] * 4
+    assert set(taken.index["trial"]) <= set(dots.index["trial"])
+    with pytest.raises(BadInputError, match="no labelled trial in the split 'testing'"):
+        take_trials(make_dots(tmp_path / "none", {"readout": 2}, ("drop",)), tmp_path / "x", 8)
+
+
+def test_the_verb(
+    made: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
+) -> None:
+    out = tmp_path / "out"
+    few = ["--out", str(out), "--trials", "16", "--workers", "1"]
+    only = ["--changes", "future,reversed"]
+    assert main(["check", "blob-centroids", str(made.folder), *few, *only]) == 0
+    text = capsys.readouterr().out
+    assert "blob-centroids passed: none of 1 changes moved a prediction" in text
+    page = (out / "blob-centroids.html").read_text()
+    assert CHANGES["future"].what in page and "must not move a prediction" in page
+    file = tmp_path / "cheater.py"
+    file.write_text(
+        "from support import leaking_models as leaks\n"
+        "class Cheat(leaks.Cheater):\n"
+        "    def __init__(self): super().__init__(leaks.number_in_the_name)\n"
+    )
+    code = main(["check", f"{file}:Cheat", str(made.folder), *few, "--changes", "names", "--json"])
+    answer = json.loads(capsys.readouterr().out)
+    assert code == 1 and answer["refused"] == ["names"] and not answer["passed"]
+    assert answer["changes"][0]["verdict"] == "refused" and Path(answer["page"]).is_file()
+    assert main(["check", "blob-centroids", str(made.folder), "--changes", "futur"]) == 2
+    assert "futur" in capsys.readouterr().err
+
+
+def test_a_trial_that_cannot_be_predicted_after_a_change_is_refused(
+    made: Dataset, tmp_path: Path
+) -> None:
+    known = set(made.trials())
+
+    def fails(_: Dataset, trial: str) -> float:
+        return dict.fromkeys(known, 0.5)[trial]
+
+    done = run(made, leaks.Cheater(fails), tmp_path, "names")
+    assert done.refused == ["names"]
+    assert "KeyError" in done.table["note"][0]
+
+
+def test_twins_are_shown(made: Dataset, tmp_path: Path) -> None:
+    """The random twin of a model with shipped weights, and blobs, on the same trials."""
+    done = check("cswm", made, tmp_path, trials=8, accelerator="cpu")
+    rows = done.table.set_index(["change", "readout"])
+    assert done.passed, done.table.to_string()
+    assert rows["verdict"]["random twin"].tolist() == [SHOWN, SHOWN]
+    assert rows["moved"]["random twin"]["observed"] > 0
+    assert set(rows.loc["blob-centroids"].index) == {"observed"}
+    assert set(rows["accuracy_changed"].dropna() * 4 % 1) == {0.0}, "of four tested trials"
+
+
+@pytest.fixture(scope="module")
+def few(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return make_late_motions(tmp_path_factory.mktemp("few") / "few", {"readout": 8, "testing": 8})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(models.names()))
+def test_every_shipped_model_passes(name: str, few: Dataset, tmp_path: Path) -> None:
+    options = OPTIONS.get(name, {})
+    done = check(
+        name, few, tmp_path, options=options, trials=16, changes=HELD, accelerator="cpu",
+    )  # fmt: skip
+    assert done.passed, done.table.to_string()
+    exact = done.table[~done.table["change"].isin(["names", "order", "everything"])]
+    assert (exact["largest"] == 0).all()
