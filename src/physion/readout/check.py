@@ -25,14 +25,15 @@ from scipy.stats import wilcoxon
 from physion.compute.tasks import Executor, Progress, tracked
 from physion.core.errors import BadInputError, PhysionError, UnknownNameError
 from physion.core.seeds import generator
-from physion.models.build import build_model, option_names
-from physion.models.interface import RANDOM, Model, can
+from physion.models.build import build_model
+from physion.models.feature_table import FeatureTable
+from physion.models.interface import Model, can
 from physion.readout.changes import CHANGES, Change, ChangedTrials, take_trials
 from physion.readout.decisions import Readout
 from physion.readout.evaluate import Evaluation, evaluate
 from physion.readout.model_calls import check_identity
 from physion.readout.predictor import ways
-from physion.readout.settings import WEIGHTS, ChosenModel, EvaluationSettings, choose_models
+from physion.readout.settings import EvaluationSettings, choose_models
 from physion.trials.dataset import Dataset
 from physion.trials.making.generate import generate
 from physion.trials.making.plan import GenerateSettings
@@ -165,6 +166,11 @@ def check(
         raise BadInputError("one model is checked at a time")
     built = chosen[0].build(settings.seed)
     name = check_identity(built).model
+    if isinstance(built, FeatureTable):
+        raise BadInputError(
+            f"{name} is a table of features, which knows trials by their names only; its frames "
+            "and names are checked when it is evaluated. Check the network that made it, as a model"
+        )
     if not settings.readouts:
         possible = [readout.value for readout in ways(built, settings.decision)]
         predicting = tuple(readout for readout in possible if readout != Readout.FULL.value)
@@ -185,7 +191,8 @@ def check(
         for change in tracked(wanted, "changes", len(wanted), progress):
             rows += work.rows(change)
         if not changes:
-            rows += work.rows_of_others(_twin(chosen[0], settings.seed))
+            twin = chosen[0].random_twin()
+            rows += work.rows_of_others(None if twin is None else twin.build(settings.seed))
         table = pd.DataFrame(rows, columns=list(COLUMNS))
         return CheckedModel(name, table, work.warnings())
 
@@ -204,15 +211,6 @@ def _made(
         executor=executor,
         progress=progress,
     )
-
-
-def _twin(chosen: ChosenModel, seed: int) -> Model | None:
-    """Return the model with random weights; None for one that was built, or has none."""
-    if not isinstance(chosen.model, str) or WEIGHTS not in option_names(chosen.model):
-        return None
-    options = {**chosen.options, WEIGHTS: RANDOM}
-    twin: Model = dataclasses.replace(chosen, options=options).build(seed)
-    return twin
 
 
 class _Check:
