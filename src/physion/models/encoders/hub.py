@@ -153,8 +153,8 @@ class HubEncoder(TorchModel):
                 )
             local = sorted(Path(self.source).glob("*.safetensors"))
             digests = [weights_sha256(path) for path in local]
-            found = digests[0] if len(digests) == 1 else digest_of(digests)
-            self.init = f"local:{found[:12]}" if local else f"hub:{self.source}"
+            sha256 = digests[0] if len(digests) == 1 else digest_of(digests)
+            self.init = f"local:{sha256[:12]}" if local else f"hub:{self.source}"
         network = getattr(network, "vision_model", network)
         if config.model_type == "vjepa2":  # without its predictor
             network = network.encoder
