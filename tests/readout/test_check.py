@@ -322,7 +322,7 @@ def test_twins_are_shown(made: Dataset, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def few(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return make_late_motions(tmp_path_factory.mktemp("few") / "few", {"readout": 8, "testing": 8})
+    return make_late_motions(tmp_path_factory.mktemp("few") / "few", {"readout": 4, "testing": 4})
 
 
 @pytest.mark.slow
@@ -331,7 +331,7 @@ def test_every_shipped_model_passes(name: str, few: Dataset, tmp_path: Path) -> 
     options = OPTIONS.get(name, {})
     kept = ["future", "labels", "files", "order", "everything"]
     done = check(
-        name, few, tmp_path, options=options, trials=16, changes=kept, accelerator="cpu",
+        name, few, tmp_path, options=options, trials=8, changes=kept, accelerator="cpu",
     )  # fmt: skip
     assert done.passed, done.table.to_string()
     exact = done.table[~done.table["change"].isin(["order", "everything"])]
