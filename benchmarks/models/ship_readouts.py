@@ -175,11 +175,14 @@ class Features:
         for name, model in self.models.items():
             spec, readers = model.spec, {}
             for observed in (True, False):
+                kind = "observed_frames" if observed else "frames"
+                if not spec.sees_pictures:
+                    readers[observed] = TrialReaders(lengths[kind], [], motions[observed])
+                    continue
                 key = observed, spec.image_size
                 shown = pictures.setdefault(
                     key, Pictures(motions[observed], spec.image_size, looks)
                 )
-                kind = "observed_frames" if observed else "frames"
                 readers[observed] = TrialReaders(lengths[kind], [shown.reader(spec)])
             self.sources[name] = WholeSource(ObservedSource(spec, readers[True]), readers[False])
 
