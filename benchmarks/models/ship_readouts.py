@@ -284,7 +284,14 @@ def ship(features: Features, dataset: Dataset, name: str) -> None:
     if not fitted:
         return
     model = features.models[name]
-    trials = sorted({one.fit_trials for one in fitted.values()})
+    trials = {
+        readout: sorted({one.fit_trials for (r, _), one in fitted.items() if r is readout})
+        for readout in readouts
+    }
+    counts = ", ".join(
+        f"*{r.value}* {' to '.join(map(str, dict.fromkeys((n[0], n[-1]))))}"
+        for r, n in trials.items() if n
+    )  # fmt: skip
     fit_on = f"{SET} {describe_fit(dataset).split()[-1]}"
     path = SHIPPED / f"{name}.safetensors"
     write_readouts(path, model.readout_digest(), fit_on, fitted)
@@ -307,7 +314,7 @@ def ship(features: Features, dataset: Dataset, name: str) -> None:
         "|---|---|",
         f"| digest of the model for readouts | {model.readout_digest()} |",
         f"| set, with the start of its digest | {fit_on} |",
-        f"| trials that were fitted, a scenario | {trials[0]} to {trials[-1]} |",
+        f"| trials that were fitted, a scenario | {counts} |",
         f"| date, processor | {datetime.date.today()}, {processor()}, one thread |",
         f"| bytes | {path.stat().st_size} |",
         "",
@@ -361,7 +368,7 @@ def score(folder: Path, dataset: Dataset, names: Sequence[str]) -> str:
                 for r in ("r", "r_beyond_outcome")
             ]  # fmt: skip
             rows.append(
-                f"| {name} | *{readout.value}* | {trials.min()} to {trials.max()} | "
+                f"| {name} | *{readout.value}* | {trials.max()} | "
                 f"{fit.mean():.3f} | {mean:.3f} ({mean - half:.3f} to {mean + half:.3f}) | "
                 f"{rigid:.3f} | {' | '.join(like)} | "
                 f"{' | '.join(f'{value:.2f}' for value in hits['mean'])} |"
