@@ -17,15 +17,16 @@ from physion.analysis.tables import read_humans
 from physion.compute.local import LocalExecutor
 from physion.compute.run_tasks import run_tasks
 from physion.compute.tasks import Executor, Progress, tracked
-from physion.core.errors import BadInputError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import is_whole, write_with_digest
 from physion.core.names import canonical_name
 from physion.core.seeds import stable_hash
 from physion.core.settings import split_names
 from physion.data.official import PACKAGED, find_official, humans_folder, read_official_trials
-from physion.models.interface import ask, can
-from physion.readout.decisions import decisions
+from physion.models.interface import Model, ask, can
 from physion.readout.evaluate import EvaluatedModel, Evaluation, evaluate
+from physion.readout.logistic import LogisticSettings
+from physion.readout.predictor import build_decision
 from physion.readout.settings import EvaluationSettings, choose_models
 from physion.readout.shipped import find_readouts
 from physion.report.compare import CompareResult, compare
@@ -89,8 +90,8 @@ class RunSettings:
     size: int = 128
     """Pixels per side of the movies of the page; every model sees pictures of its own size."""
     decision: str = ""
-    """What turns features or rollouts into P(contact) (physion ls decisions); default: the model's
-    own."""
+    """What turns features or rollouts into P(contact) (physion ls decisions), of the models that it
+    fits; default: the model's own."""
     engine: str = "physion"
     """Engine of the trials and of noisy-simulation (physion ls engines); mujoco has no cloth."""
     encoder_batch: int = 4
@@ -159,8 +160,6 @@ def run(
         Before anything is made, if settings contradict each other or a model cannot be built.
     """
     settings = replace(settings or RunSettings(), **changes)
-    if settings.decision:
-        decisions.get(settings.decision)
     humans = _humans(settings)
     out = settings.out or Path("runs") / ("sampled" if settings.sampled else "official")
     models = model_options(settings, options or {})
@@ -168,7 +167,11 @@ def run(
     chosen = choose_models(models)
     building = tracked(chosen, "building models", len(chosen), progress)
     built = {one.name: one.build(0) for one in building}
-    encoders = [name for name, model in built.items() if _learns(model) and find_readouts(model)]
+    decided = decided_models(built, settings.decision)
+    encoders = [
+        name for name, model in built.items()
+        if name not in decided and _learns(model) and find_readouts(model)
+    ]  # fmt: skip
     learn = any(_learns(model) for name, model in built.items() if name not in encoders)
     for _ in tracked((None,), "reading scenes", 1, progress):
         if settings.sampled:
@@ -185,21 +188,22 @@ def run(
         evaluate,
         dataset=out / "trials",
         out=out / "models",
-        settings=EvaluationSettings(
-            encoder_batch=settings.encoder_batch, decision=settings.decision
-        ),
+        settings=EvaluationSettings(encoder_batch=settings.encoder_batch),
         executor=executor,
         progress=progress,
         on_evaluated=on_evaluated,
     )
+    # Readouts of encoders ship, and what these imagine would have to be trained: it is left out.
+    groups: list[tuple[Sequence[str], dict[str, Any]]] = [
+        (decided, {"decision": settings.decision}),
+        ([name for name in models if name not in (*decided, *encoders)], {}),
+        (encoders, {"readouts": ("observed", "full"), "twin": settings.models is None}),
+    ]
     done = Evaluation([], {})
-    if rest := {name: own for name, own in models.items() if name not in encoders}:
-        done = do(rest)
-    if encoders:
-        # Their readouts ship, and what they imagine would have to be trained: it is left out.
-        seen = {name: models[name] for name in encoders}
-        more = do(seen, readouts=("observed", "full"), twin=settings.models is None)
-        done = Evaluation([*done.evaluated, *more.evaluated], {**done.failed, **more.failed})
+    for names, special in groups:
+        if names:
+            more = do({name: models[name] for name in names}, **special)
+            done = Evaluation([*done.evaluated, *more.evaluated], {**done.failed, **more.failed})
     reasons = {**trials.failed, **done.problems, **done.failed}
     failures = [*plan.failures, *(f"{where}: {why}" for where, why in reasons.items())]
     dataset = Dataset(out / "trials")
@@ -208,7 +212,7 @@ def run(
         result = compare(done.paths, humans=humans, labels=labels or None)
     page = result.report(
         out / "report",
-        methods=methods(settings, dataset.index, options or {}, built, models),
+        methods=methods(settings, dataset.index, options or {}, built, models, decided),
         movies=page_movies(settings, dataset, result, out / "movies", executor, progress),
         question="Will the red object touch the yellow one?",
         trial_pages=settings.trial_pages,
@@ -219,6 +223,27 @@ def run(
 def _learns(model: Any) -> bool:
     """Return whether an evaluation trains a built model."""
     return can(model, "loss") and not ask(model, "trained")
+
+
+def decided_models(built: Mapping[str, Model], decision: str) -> list[str]:
+    """Return the names of the models that a decision fits; none without a decision.
+
+    Raises `BadInputError` if it fits none.
+    """
+    if not decision:
+        return []
+    found, reasons = [], []
+    for name, model in built.items():
+        try:
+            build_decision(model, decision, LogisticSettings())
+            found.append(name)
+        except UnknownNameError:
+            raise
+        except BadInputError as error:
+            reasons.append(str(error))
+    if not found:
+        raise BadInputError(reasons[0])
+    return found
 
 
 def _humans(settings: RunSettings) -> Path | None:
@@ -301,10 +326,12 @@ def methods(
     options: Mapping[str, Mapping[str, Any]],
     built: Mapping[str, Any],
     models: Mapping[str, Mapping[str, Any]],
+    decided: Sequence[str],
 ) -> dict[str, str]:
     """Return the settings of a run as texts for the report.
 
     ``options``: what the user gave. ``built``, ``models``: the models, and all their options.
+    ``decided``: models with the decision that was asked for.
     """
     splits = index.groupby("split").size()
     counts = ", ".join(f"{count} {split}" for split, count in splits.items())
@@ -333,7 +360,7 @@ def methods(
             "observed part; where several noise scales are offered, readout trials choose"
         )
     if settings.decision:
-        texts["Decision"] = f"{settings.decision}, of every model, in place of its own"
+        texts["Decision"] = f"{settings.decision} in place of the own one: {', '.join(decided)}"
     if given:
         texts["Options"] = " ".join(given)
     return texts

@@ -24,6 +24,7 @@ from physion.pipeline import (
     _learns,
     _once,
     balanced_trials,
+    decided_models,
     methods,
     model_options,
     plan_official,
@@ -198,6 +199,14 @@ def test_an_unknown_name_is_refused_before_anything_is_made(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_decision_is_of_the_models_that_it_fits() -> None:
+    built = {name: build_model(name) for name in ("state-trees", "constant-motion", "chance")}
+    expected = {"": [], "touch": ["constant-motion"], "trees": ["state-trees"]}
+    assert {name: decided_models(built, name) for name in expected} == expected
+    with pytest.raises(BadInputError, match="has no method imagine"):
+        decided_models({"chance": built["chance"]}, "touch")
+
+
 def test_the_report_states_the_settings_of_the_models_that_ran() -> None:
     index = pd.DataFrame({"split": ["testing"], "engine": ["e"], "renderer": ["r"]})
     for names, options, noise in (
@@ -206,9 +215,9 @@ def test_the_report_states_the_settings_of_the_models_that_ran() -> None:
     ):
         settings = RunSettings(models=names)
         built = {name: build_model(name) for name in names.split(",")}
-        texts = methods(settings, index, options, built, model_options(settings, options))
+        texts = methods(settings, index, options, built, model_options(settings, options), [])
         assert noise in texts["Noise of the simulation"] and "Training" not in texts
     settings, options = RunSettings(models="frozen-encoder"), {"frozen-encoder": {"steps": 7}}
     built = {"frozen-encoder": build_model("frozen-encoder", weights="random")}
-    texts = methods(settings, index, options, built, model_options(settings, options))
+    texts = methods(settings, index, options, built, model_options(settings, options), [])
     assert texts["Training"].startswith("frozen-encoder 7 steps,")
