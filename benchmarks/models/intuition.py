@@ -5,7 +5,7 @@
 FOLDER is one in which ``ship_readouts.py FOLDER --trials N --official`` has computed the features
 of `state-trees`, `mask-trees` and `blob-trees`. Forests are fitted on own trials, one per scenario,
 and tested on the official stimuli that people saw, without those that show a contact in the
-observed part. Three tables:
+observed part, and without those of Roll with a ledge, as in the study. Three tables:
 
 1. Accuracy by number of own trials per scenario.
 2. Accuracy, r with people and r beyond the outcome: with all trials; without trials of the tested
@@ -71,8 +71,12 @@ class Trials:
         ]
         self.own = index.assign(configuration=names)[["scenario", "configuration", "contact"]]
         index = stimuli.index.set_index("trial")
-        seen = index[(index["split"] == "testing") & ~index["observed_contact"].astype(bool)]
-        names = [trial.rpartition("_")[0] for trial in seen.index]
+        people = set(read_humans(official().humans)["stimulus"])
+        asked = np.array([canonical_name(trial) in people for trial in index.index])
+        tested = asked & (index["split"] == "testing").to_numpy()
+        seen = index[tested & ~index["observed_contact"].astype(bool).to_numpy()]
+        # A name with _2 at its end is a second name of the same configuration.
+        names = [trial.rpartition("_")[0].removesuffix("_2") for trial in seen.index]
         self.tested = seen.assign(configuration=names, contact=seen["recorded_contact"])[
             ["scenario", "configuration", "contact"]
         ]
@@ -200,7 +204,7 @@ def likeness_rows(
         ]
         rows.append(
             f"| {name} | {rigid_accuracy(trials, p):.3f} | {mean['accuracy']:.3f} | "
-            f"{mean['r']:.3f} | {' | '.join(span)} |"
+            f"{'-' if np.isnan(mean['r']) else format(mean['r'], '.3f')} | {' | '.join(span)} |"
         )
         print(rows[-1], flush=True)
     return rows
