@@ -31,6 +31,7 @@ from physion.models.encoders.weights import (
     IMAGENET,
     EncoderWeights,
     create_encoder,
+    feature_size,
     input_statistics,
 )
 from physion.models.interface import TrainingSettings
@@ -594,6 +595,14 @@ def test_features_of_a_layer_are_the_output_of_that_block() -> None:
     for layer, message in ((7, "no layer 7; choose 1 to 6"), (0, "no layer 0")):
         with pytest.raises(BadInputError, match=message):
             build_model("frozen-encoder", **TINY, layer=layer)
+
+
+def test_the_stem_of_a_network_is_its_first_layer() -> None:
+    """As the reference says of resnet18, whose stages have 64, 128, 256 and 512 channels."""
+    sizes = [feature_size("resnet18", 64, "mean", layer) for layer in range(1, 6)]
+    assert sizes == [64, 64, 128, 256, 512]
+    with pytest.raises(BadInputError, match="choose 1 to 5"):
+        feature_size("resnet18", 64, "mean", 6)
 
 
 def test_a_layer_is_another_model_and_none_leaves_everything_as_it_was() -> None:

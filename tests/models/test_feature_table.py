@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from physion.cli.main import main
 from physion.clips.batch import Batch, Provenance, Spec
+from physion.core.errors import BadInputError
 from physion.models import build_model
 from physion.models.interface import Model
 from physion.readout.evaluate import evaluate
@@ -233,6 +234,8 @@ def with_nan(given: dict[str, Any]) -> dict[str, Any]:
         (lambda a: {"names": a["names"], "features": a["features"]}, "no array 'frames'"),
         (lambda a: a | {"readout": "later"}, "readout must be observed or full, not 'later'"),
         (lambda a: a | {"names": a["names"].astype(object)}, "pickled objects are refused"),
+        (lambda a: a | {"names": a["names"][:, None]}, r"names have the shape \(24, 1\)"),
+        (lambda a: a | {"model": "my\x1b[31m net"}, "model must be a name of printable characters"),
     ],
 )
 def test_a_table_that_does_not_fit_is_refused_in_one_line(
@@ -262,6 +265,33 @@ def test_a_damaged_file_is_refused_in_one_line(
     path.unlink()
     assert main(["evaluate", str(path), str(dots.folder), "--out", str(tmp_path)]) == 2
     assert "there is no file of features" in capsys.readouterr().err
+
+
+def test_text_with_the_ending_npz_is_not_called_pickled(tmp_path: Path) -> None:
+    path = tmp_path / "net.npz"
+    path.write_text("names, frames, features")
+    with pytest.raises(BadInputError, match=r"cannot be read: it is no npz file"):
+        build_model(str(path))
+
+
+def test_a_blank_name_is_the_name_of_the_file(dots: Dataset, tmp_path: Path) -> None:
+    path = tmp_path / "net.npz"
+    np.savez(path, **arrays(dots), model=" ")
+    assert build_model(str(path)).provenance().model == "net"
+
+
+def test_other_endings_are_refused(dots: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "--features", "a.txt", str(dots.folder)]) == 2
+    assert "ends with .npz, .hdf5, .h5, not a.txt" in capsys.readouterr().err
+
+
+def test_a_request_names_the_dataset_of_the_working_folder(
+    dots: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(dots.folder)
+    export_features_request(Path(), tmp_path / "request", split="testing")
+    text = (tmp_path / "request/README.md").read_text()
+    assert f"--features features.npz {dots.folder.name}` fits" in text
 
 
 def test_another_file_has_another_digest(dots: Dataset, tmp_path: Path) -> None:

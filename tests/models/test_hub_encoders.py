@@ -148,6 +148,100 @@ def test_what_cannot_be_loaded_is_one_line(published: dict[str, Path], tmp_path:
         assert "\n" not in str(caught.value)
 
 
+def saved(
+    folder: Path, kind: str, *, processor: dict[str, Any] | None = None, **config: Any
+) -> str:
+    """Write a network with random weights, and return its name."""
+    own = getattr(transformers, f"{kind}Model")
+    own(own.config_class(**config)).save_pretrained(folder)
+    (folder / "preprocessor_config.json").write_text(json.dumps(processor or {}))
+    return f"hf:{folder}"
+
+
+def test_an_encoder_that_leaves_out_patches_at_random_is_refused(tmp_path: Path) -> None:
+    for ratio in (0.75, 0.0):
+        name = saved(tmp_path / str(ratio), "ViTMAE", **SMALL, mask_ratio=ratio)
+        with pytest.raises(BadInputError, match=r"patches at random.*timm:vit_base_patch16_224"):
+            build_model(name)
+
+
+@pytest.mark.parametrize("depths", [[1, 1, 5, 1], [1, 1, 1, 1]])
+def test_stages_are_no_layers(tmp_path: Path, depths: list[int]) -> None:
+    widths = [8, 16, 24, 32]
+    name = saved(tmp_path / "net", "ConvNext", depths=depths, hidden_sizes=widths, image_size=SIZE)
+    with pytest.raises(BadInputError, match="divided into stages; leave out layer"):
+        build_model(name, layer=1)
+    assert build_model(name, image_size=SIZE).encode(clips(2)).shape == (2, 2, 32)
+
+
+def test_sizes_of_patches_may_be_tuples(tmp_path: Path) -> None:
+    video = {n: value for n, value in SMALL.items() if n != "patch_size"}
+    name = saved(tmp_path / "vivit", "Vivit", **video, num_frames=16, tubelet_size=[4, 8, 8])
+    model: Any = build_model(name, image_size=SIZE)
+    assert (model.tubelet, model.patch) == (4, 8)
+    assert model.encode(clips(16)).shape == (2, 1, WIDTH), "a class token stands before the others"
+    square = SMALL | {"patch_size": [PATCH, PATCH]}
+    image: Any = build_model(saved(tmp_path / "dinov2", "Dinov2", **square), pooling="grid")
+    assert image.encode(clips(2)).shape == (2, 2, 16 * WIDTH)
+
+
+@pytest.mark.parametrize(
+    ("processor", "mean", "std"),
+    [
+        ({"do_normalize": False, "image_mean": MEAN, "image_std": STD}, (0, 0, 0), (1, 1, 1)),
+        ({"image_mean": 0.5, "image_std": 0.25}, (0.5, 0.5, 0.5), (0.25, 0.25, 0.25)),
+        ({"image_mean": MEAN, "image_std": STD, "rescale_factor": 0.00392156862745098}, MEAN, STD),
+    ],
+)
+def test_pictures_are_normalised_as_published(
+    tmp_path: Path, processor: dict[str, Any], mean: Any, std: Any
+) -> None:
+    name = saved(tmp_path / "net", "Dinov2", processor=processor, **SMALL)
+    model, batch = build_model(name), clips(2)
+    pictures = (batch.rgb.float() / 255 - torch.tensor(mean)) / torch.tensor(std)
+    alone = transformers.Dinov2Model.from_pretrained(tmp_path / "net").eval()
+    with torch.no_grad():
+        tokens = alone(pictures.flatten(0, 1).permute(0, 3, 1, 2)).last_hidden_state
+    expected = tokens[:, 0].view(2, 2, WIDTH)
+    torch.testing.assert_close(model.encode(batch), expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("processor", "what"),
+    [
+        ({"rescale_factor": 1 / 127.5}, "rescale_factor 0.0078"),
+        ({"do_rescale": False}, "rescale_factor 1,"),
+        ({"rescale_offset": True}, "rescale_offset True"),
+        ({"offset": True}, "offset True"),
+        ({"do_flip_channel_order": True}, "do_flip_channel_order True"),
+    ],
+)
+def test_other_preprocessing_is_refused(
+    tmp_path: Path, processor: dict[str, Any], what: str
+) -> None:
+    name = saved(tmp_path / "net", "Dinov2", processor=processor, **SMALL)
+    with pytest.raises(BadInputError, match=f"needs pictures with {what}"):
+        build_model(name)
+
+
+@pytest.mark.parametrize(
+    ("kind", "frames", "message"),
+    [
+        ("dinov3", 8, "is a network of images; leave out frames"),
+        ("vjepa2", 46, "must be 1 to 45, which are observed, not 46"),
+        ("vjepa2", 0, "must be 1 to 45, which are observed, not 0"),
+        ("vjepa2", 7, "joins 2 frames; choose frames that are a multiple of it, not 7"),
+        ("videomae", 8, "takes no clips of 8 frames with 32 pixels per side; choose frames"),
+    ],
+)
+def test_frames_that_a_network_does_not_take_are_one_line(
+    published: dict[str, Path], kind: str, frames: int, message: str
+) -> None:
+    with pytest.raises(BadInputError, match=message) as caught:
+        build_model(f"hf:{published[kind]}", frames=frames)
+    assert "\n" not in str(caught.value)
+
+
 def test_weights_that_lack_a_tensor_and_code_of_others_are_refused(
     published: dict[str, Path], tmp_path: Path
 ) -> None:

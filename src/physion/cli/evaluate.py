@@ -17,6 +17,7 @@ from physion.cli.output import Stages, print_line, print_plan, print_scores, pri
 from physion.compute.run_tasks import ExecutorSettings
 from physion.core.errors import BadInputError
 from physion.core.settings import read_pairs, split_names
+from physion.models.build import FEATURE_FILES
 from physion.readout.evaluate import EvaluatedModel, Evaluation, evaluate
 from physion.readout.logistic import LogisticSettings
 from physion.readout.settings import EvaluationSettings, options_by_model
@@ -37,7 +38,7 @@ class Options:
     """Folder of a dataset."""
     features: Path | None = None
     """File of features that were computed elsewhere (physion export --layout features-request), a
-    row like one of a model."""
+    row like one of a model: .npz, .hdf5 or .h5."""
     out: Path = Path("runs/models")
     """Folder for predictions and caches."""
     fit: Path | None = None
@@ -75,6 +76,10 @@ def main(options: Options) -> int:
             raise BadInputError(f"no dataset: write physion evaluate {options.models} FOLDER")
         models, dataset = [], Path(options.models)
     if options.features is not None:
+        if options.features.suffix.lower() not in FEATURE_FILES:
+            raise BadInputError(
+                f"a file of features ends with {', '.join(FEATURE_FILES)}, not {options.features}"
+            )
         models = [*models, str(options.features)]
     with Stages() as stages:
         done = evaluate(

@@ -5,7 +5,7 @@ A table is an ``.npz`` or HDF5 file with these arrays:
 - ``names`` (n): names of trials, in any order.
 - ``frames`` (T): for each time step the last frame of the movie that it depends on, from 0 on.
 - ``features`` (n, T, D): floating-point numbers.
-- ``model``: name of the row; optional, by default the file's name.
+- ``model``: name of the row; optional, by default, or if blank, the file's name.
 - ``readout``: ``observed`` or ``full``; optional, by default ``observed``, which excludes all
   frames after 44. Features of whole movies are ``full``.
 
@@ -98,7 +98,9 @@ class FeatureTable(Model):
         folder = self.path.absolute().parent
         named = folder.parent if folder.name in ("ocp", "ocd") else folder
         self._model = named.name if self._of_evaluator else self.path.stem
-        self._model = str(tables[0].get("model", self._model))
+        self._model = tables[0].get("model", "").strip() or self._model
+        if not self._model.isprintable():
+            raise self._error(f"model must be a name of printable characters, not {self._model!r}")
         self._seen = f"features up to frame {frames[-1]}"
         self._sha256 = digest_of(" ".join(file_sha256(one) for one in paths))
 
@@ -116,7 +118,10 @@ class FeatureTable(Model):
                 missing = [name for name in _NEEDED if name not in file]
                 if missing:
                     raise self._error(f"no array {missing[0]!r}; needed: {', '.join(_NEEDED)}")
-                table = {"names": [_text(name) for name in np.atleast_1d(file["names"][()])]}
+                named = np.asarray(file["names"][()])
+                if named.ndim != 1:
+                    raise self._error(f"names have the shape {named.shape}, expected one row")
+                table = {"names": [_text(name) for name in named]}
                 table["frames"], values = (np.asarray(file[name][()]) for name in _NEEDED[1:])
                 table |= {n: _text(file[n][()]) for n in ("model", "readout") if n in file}
         rows, steps = len(table["names"]), table["frames"].size
@@ -138,6 +143,8 @@ class FeatureTable(Model):
         """Open a file whose arrays are read by name."""
         try:
             if path.suffix.lower() == ".npz":
+                if not zipfile.is_zipfile(path):  # numpy would speak of pickled data
+                    raise ValueError("it is no npz file, or damaged; write it with numpy.savez")
                 with np.load(path, allow_pickle=False) as arrays:
                     yield arrays
             else:

@@ -202,9 +202,9 @@ class Model:
         Values among which the decision chooses, by the name of an argument of `imagine`, such as a
         level of noise.
     answers
-        Protocol under which `predict` or `fit` answers: ``observed``, ``observed+simulated``, or
-        ``full`` for a model that is shown the outcome. A model that encodes whole movies only has
-        ``full``, too.
+        The readout whose row the model makes by `predict` or `fit`: ``observed``,
+        ``observed+simulated``, or ``full`` if it is shown the outcome. A model with `encode` sets
+        ``full`` if its features always include the outcome, so that they are no other row.
     trained
         Whether the weights are pretrained, so that training is skipped.
     learns_from

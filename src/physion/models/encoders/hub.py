@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +23,15 @@ import transformers
 from torch import Tensor, nn
 from transformers.utils.hub import cached_file
 
-from physion.clips.batch import IMAGENET_MEAN, IMAGENET_STD, LAST_OBSERVED, Batch, Provenance, Spec
+from physion.clips.batch import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    LAST_OBSERVED,
+    OBSERVED_FRAMES,
+    Batch,
+    Provenance,
+    Spec,
+)
 from physion.core.errors import BadInputError
 from physion.core.settings import read_json
 from physion.models.encoders.weights import (
@@ -57,7 +66,7 @@ class HubSettings(ModelSettings):
     - ``stride``: frames of the motion between two frames; None: 6, or of a video encoder as many as
       let a clip fill the observed part. ``future``: see `Spec`.
     - ``layer``: block of a transformer, counted from 1, whose output the features are; None is the
-      last, after its norm.
+      last, after its norm. Networks whose blocks are divided into stages have no such option.
     - ``pooling``: ``pooled`` (the class token of an image encoder that has one, else the mean),
       ``mean`` of the tokens of patches, or ``grid``, means in cells.
     """
@@ -101,25 +110,41 @@ class HubEncoder(TorchModel):
                 f"{first_line(error)}); name a repository of huggingface.co or a folder with "
                 "config.json and model.safetensors"
             ) from error
-        self.patch = int(getattr(config, "patch_size", 0) or 0)
-        self.tubelet = int(getattr(config, "tubelet_size", 1) or 1)
+        if config.model_type == "vit_mae":  # which would also shuffle them at a ratio of 0
+            raise BadInputError(
+                f"{settings.model} leaves out patches at random, so that its features are random; "
+                "use such weights of timm, as in timm:vit_base_patch16_224.mae"
+            )
+        tubelet = getattr(config, "tubelet_size", None) or 1
+        patch = getattr(config, "patch_size", None) or (tubelet if _several(tubelet) else 0)
+        self.patch = int(patch[-1] if _several(patch) else patch)
+        self.tubelet = int(tubelet[0] if _several(tubelet) else tubelet)
         known = getattr(config, "num_frames", None) or getattr(config, "frames_per_clip", None)
         fits = known is not None and known <= LAST_OBSERVED + 1
         self.frames = (settings.frames or (known if fits else FRAMES)) if known else 1
+        self._check_frames(known)
         stride = settings.stride or (6 if not known else LAST_OBSERVED // max(self.frames - 1, 1))
+        mean, std = _statistics(settings.model, processor)
         self.spec = Spec(
             image_size=settings.image_size or _image_size(config, processor),
-            mean=tuple(processor.get("image_mean") or IMAGENET_MEAN),
-            std=tuple(processor.get("image_std") or IMAGENET_STD),
+            mean=mean,
+            std=std,
             stride=stride,
             context=self.frames if known else 0,
             future=settings.future,
             framewise=not known,
         )
         self._chosen: list[Tensor] = []
+        if known:
+            self._check_takes_clips()
         if settings.layer is not None:
             lists = [part for part in self.network.modules() if isinstance(part, nn.ModuleList)]
             blocks = max(lists, key=len, default=nn.ModuleList())
+            inner = [part for one in lists for part in one.modules() if part is not one]
+            if any(isinstance(part, nn.ModuleList) for part in inner):
+                raise BadInputError(
+                    f"the blocks of {settings.model} are divided into stages; leave out layer"
+                )
             if not 1 <= settings.layer <= len(blocks):
                 raise BadInputError(
                     f"{settings.model} has the layers 1 to {len(blocks)}, not {settings.layer}"
@@ -163,6 +188,36 @@ class HubEncoder(TorchModel):
             getattr(config, "vision_config", config),
             processor,
         )
+
+    def _check_frames(self, known: int | None) -> None:
+        """Raise `BadInputError` for an option ``frames`` that does not fit the network."""
+        model, given = self.settings.model, self.settings.frames
+        if given is not None and not known:
+            raise BadInputError(f"{model} is a network of images; leave out frames")
+        if given is not None and not 1 <= given <= OBSERVED_FRAMES:
+            raise BadInputError(
+                f"frames of {model} must be 1 to {OBSERVED_FRAMES}, which are observed, not {given}"
+            )
+        if known and self.frames % self.tubelet:
+            raise BadInputError(
+                f"{model} joins {self.tubelet} frames; choose frames that are a multiple of it, "
+                f"not {self.frames}"
+            )
+
+    @torch.no_grad()
+    def _check_takes_clips(self) -> None:
+        """Raise `BadInputError` unless the network takes clips; only shapes are computed."""
+        tensors = (*self.network.named_parameters(), *self.network.named_buffers())
+        shapes = {name: torch.empty_like(value, device="meta") for name, value in tensors}
+        side = self.spec.image_size
+        clip = torch.empty(1, self.frames, 3, side, side, device="meta")
+        try:
+            torch.func.functional_call(self.network, shapes, (clip,))
+        except (RuntimeError, ValueError) as error:
+            raise BadInputError(
+                f"{self.settings.model} takes no clips of {self.frames} frames with {side} pixels "
+                f"per side; choose frames and image_size as published ({first_line(error)})"
+            ) from error
 
     def _keep(self, block: nn.Module, given: Any, output: Any) -> None:
         self._chosen.append(output[0] if isinstance(output, tuple) else output)
@@ -245,6 +300,36 @@ def _file(source: str, name: str) -> Path | None:
     except OSError:
         return None
     return None if path is None else Path(path)
+
+
+def _several(value: Any) -> bool:
+    return isinstance(value, list | tuple)
+
+
+def _statistics(
+    model: str, processor: Mapping[str, Any]
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Return mean and standard deviation of channels in 0..1; refuse other preprocessing."""
+    factor = processor.get("rescale_factor") or 1 / 255
+    factor = factor if processor.get("do_rescale", True) else 1
+    unlike = [
+        f"{name} {processor[name]}"
+        for name in ("rescale_offset", "offset", "do_flip_channel_order")
+        if processor.get(name)
+    ]
+    if not math.isclose(factor, 1 / 255, rel_tol=1e-6):
+        unlike.append(f"rescale_factor {factor}")
+    if unlike:
+        raise BadInputError(
+            f"{model} needs pictures with {unlike[0]}, which are not made here; encode them "
+            "elsewhere (physion export --layout features-request)"
+        )
+    if not processor.get("do_normalize", True):
+        return (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+    mean: Any = processor.get("image_mean") or IMAGENET_MEAN
+    std: Any = processor.get("image_std") or IMAGENET_STD
+    (m0, m1, m2), (s0, s1, s2) = (v if _several(v) else (v, v, v) for v in (mean, std))
+    return (m0, m1, m2), (s0, s1, s2)
 
 
 def _image_size(config: Any, processor: Mapping[str, Any]) -> int:

@@ -73,7 +73,8 @@ class GridFeatures(nn.Module):
         With another one than ``grid``, the map is averaged over all positions.
     layer
         Block of a transformer, or stage of a convolutional network, counted from 1, whose output is
-        the map, before any norm; by default the last map, after the norm.
+        the map, before any norm; by default the last map, after the norm. Where timm counts the
+        stem, it is 1: of resnet18, 1 is the stem, and 2 to 5 are the four stages.
     """
 
     def __init__(

@@ -124,9 +124,10 @@ def export_features_request(
     stop = OBSERVED_FRAMES if readout == "observed" else int(frames.max())
     rate = float((index["frames"] / index["playback_seconds"]).iloc[0])
     shown = _SEEN.format(last=OBSERVED_FRAMES - 1) if readout == "observed" else _WHOLE
+    name = folder.resolve().name
     rows = [f"{t},movies/{t}.mp4,{n}" for t, n in zip(index["trial"], frames, strict=True)]
     texts = {
-        "README.md": _README.format(count=len(index), shown=shown, rate=rate, dataset=folder.name),
+        "README.md": _README.format(count=len(index), shown=shown, rate=rate, dataset=name),
         "trials.csv": "\n".join(["trial,movie,frames", *rows, ""]),
         "encode.py": _SCRIPT.format(stop=stop, readout=readout),
     }
