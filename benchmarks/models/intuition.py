@@ -188,6 +188,11 @@ def last_frame(values: NDArray[Any], size: int) -> NDArray[Any]:
     return values[:, -size:]
 
 
+def shown(value: float) -> str:
+    """Return three digits of a number, - for NaN."""
+    return "-" if np.isnan(value) else f"{value:.3f}"
+
+
 def likeness_rows(
     trials: Trials, answers: dict[str, pd.Series], result: CompareResult
 ) -> list[str]:
@@ -204,7 +209,7 @@ def likeness_rows(
         ]
         rows.append(
             f"| {name} | {rigid_accuracy(trials, p):.3f} | {mean['accuracy']:.3f} | "
-            f"{'-' if np.isnan(mean['r']) else format(mean['r'], '.3f')} | {' | '.join(span)} |"
+            f"{' | '.join(span)} | {shown(mean['r'])} | {shown(mean['r_beyond_outcome'])} |"
         )
         print(rows[-1], flush=True)
     return rows
@@ -289,9 +294,9 @@ def main() -> None:
             "With all own trials; r is with people's answers, intervals are of the jackknife over "
             f"stimuli; {options.samples} simulations of a stimulus from the true state:",
             "",
-            "| answers | accuracy, rigid | accuracy, mean of eight | r, mean of eight | r, pooled "
-            "| r beyond the outcome, pooled |",
-            "|---|---|---|---|---|---|",
+            "| answers | accuracy, rigid | accuracy, mean of eight | r, pooled "
+            "| r beyond the outcome, pooled | r, mean of eight | r beyond, mean of eight |",
+            "|---|---|---|---|---|---|---|",
             *rows,
             "",
             "Difference of r beyond the outcome, pooled, with 95 % intervals over stimuli:",
