@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -88,3 +90,42 @@ def test_two_trials_of_one_name_are_refused(folder: Path) -> None:
     write_index(folder / "names", index)
     with pytest.raises(BadInputError, match="both have a trial 'collide_testing_0000'"):
         evaluate("blob-centroids", folder / "tested", folder / "c", fit=folder / "names")
+
+
+def test_a_file_of_features_may_have_all_trials_of_both_sets(folder: Path) -> None:
+    sets = [Dataset(folder / "tested").index, Dataset(folder / "fit").index]
+    chosen = pd.concat(sets).drop_duplicates("trial")
+    features = np.random.default_rng(0).normal(size=(len(chosen), 1, 3))
+    arrays = {"names": chosen["trial"].to_numpy(str), "frames": [44], "features": features}
+    np.savez(folder / "all.npz", **arrays)
+    # Readout trials of the tested set, under names that the other set does not have.
+    index = sets[0].copy()
+    own = index["split"] == "readout"
+    index.loc[own, "trial"] = "own_" + index["trial"][own]
+    (folder / "named").mkdir()
+    write_index(folder / "named", index)
+    arrays["names"] = np.append(arrays["names"], index["trial"][own].to_numpy(str))
+    arrays["features"] = np.pad(features, ((0, own.sum()), (0, 0), (0, 0)))
+    np.savez(folder / "own.npz", **arrays)
+    tables = [
+        evaluate(str(path), tested, folder / "d", fit=folder / "fit").predictions
+        for path, tested in (
+            (folder / "all.npz", folder / "tested"),
+            (folder / "own.npz", folder / "named"),
+        )
+    ]
+    assert (tables[0]["p_contact"] == tables[1]["p_contact"]).all() and len(tables[0]) == 12
+
+
+def test_labels_of_other_scenarios_are_not_needed(folder: Path) -> None:
+    index = Dataset(folder / "fit").index.copy()
+    index["contact"] = index["contact"].astype("boolean")
+    index.loc[index["scenario"] == "drop", "contact"] = pd.NA
+    shutil.copytree(folder / "fit", folder / "unlabelled")
+    write_index(folder / "unlabelled", index)
+    model, tested, fit = "blob-centroids", folder / "tested", folder / "unlabelled"
+    done = evaluate(model, tested, folder / "e", fit=fit, scenario="collide").predictions
+    assert set(done["scenario"]) == {"collide"} and done["stimulus"].nunique() == 6
+    for scenario in ("", "drop"):
+        with pytest.raises(BadInputError, match=r"12 trials .* are stored without labels"):
+            evaluate(model, tested, folder / "e", fit=fit, scenario=scenario)

@@ -239,7 +239,8 @@ def evaluate(
     if fit is not None:
         other = open_dataset(fit, elsewhere)
         trials = join_for_fit(trials, other)
-    check_labels(trials.index)
+    index, scenario = trials.index, settings.scenario
+    check_labels(index[index["scenario"] == scenario] if scenario else index)
     if fit is not None:
         fit_on = describe_fit(other)
     if elsewhere is None:
@@ -319,7 +320,7 @@ class _Evaluate:
         )
         splits = [split for fold in folds for split in fold.scenarios]
         needed = {trial for split in splits for trial in (*split.fit, *split.test)}
-        ask(model, "check_trials")(needed, set(index["trial"]))
+        ask(model, "check_trials")(needed, self.dataset.known_trials())
         predictor = Predictor(
             self.dataset,
             model,

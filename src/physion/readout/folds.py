@@ -218,9 +218,10 @@ def _listed(values: pd.Series[Any]) -> str:
 def describe_fit(fit: Dataset) -> str:
     """Return the name of the folder of a set, and the start of the digest of its readout trials.
 
-    The digest is the SHA-256 of scenarios, motions and outcomes, in any order.
+    The digest is the SHA-256 of scenarios, motions and outcomes, in any order. Trials without an
+    outcome fit nothing and do not count.
     """
-    index = fit.index[fit.index["split"] == READOUT]
+    index = fit.index[(fit.index["split"] == READOUT) & fit.index["contact"].notna()]
     rows = zip(index["scenario"], index["digest"], index["contact"], strict=True)
     digest = digest_of("\n".join(sorted(f"{s} {d} {int(c)}" for s, d, c in rows)))
     return f"{fit.folder.name} {digest[:12]}"

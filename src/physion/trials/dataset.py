@@ -64,6 +64,10 @@ class Dataset:
             table = table[table["scenario"] == scenario]
         return [str(name) for name in table["trial"]]
 
+    def known_trials(self) -> set[str]:
+        """Return the names of all trials."""
+        return set(self.index["trial"])
+
     def paths(self, trial: str) -> TrialPaths:
         """Return the paths of the files of a trial."""
         if trial not in self._rows:
@@ -153,6 +157,7 @@ class JoinedDataset(Dataset):
         tables = [part.index[part.index["split"].isin(list(splits))] for part, splits in parts]
         self.folder, self.verify = parts[0][0].folder, all(part.verify for part, _ in parts)
         self.index = pd.concat(tables, ignore_index=True)
+        self._known = {str(name) for part, _ in parts for name in part.index["trial"]}
         twice = self.index["trial"][self.index["trial"].duplicated()]
         if len(twice):
             folders = " and ".join(str(part.folder) for part, _ in parts)
@@ -162,6 +167,10 @@ class JoinedDataset(Dataset):
             for (part, _), table in zip(parts, tables, strict=True)
             for trial in table["trial"]
         }
+
+    def known_trials(self) -> set[str]:
+        """Return the names of all trials of the parts, of the other splits too."""
+        return self._known
 
     def paths(self, trial: str) -> TrialPaths:
         """Return the paths of the files of a trial."""

@@ -27,7 +27,6 @@ from physion.clips.batch import (
     IMAGENET_MEAN,
     IMAGENET_STD,
     LAST_OBSERVED,
-    OBSERVED_FRAMES,
     Batch,
     Provenance,
     Spec,
@@ -48,6 +47,7 @@ from physion.models.encoders.weights import (
 from physion.models.interface import ModelSettings
 from physion.models.torch_model import TorchModel, digest_of, initial_weights
 from physion.models.vision import normalized_pictures
+from physion.scenes.scene import OBSERVED_FRAMES
 
 HF, PUBLISHED = "hf:", "published"
 FRAMES = 16
@@ -115,8 +115,8 @@ class HubEncoder(TorchModel):
                 f"{settings.model} leaves out patches at random, so that its features are random; "
                 "use such weights of timm, as in timm:vit_base_patch16_224.mae"
             )
-        tubelet = getattr(config, "tubelet_size", None) or 1
-        patch = getattr(config, "patch_size", None) or (tubelet if _several(tubelet) else 0)
+        tubelet: Any = getattr(config, "tubelet_size", None) or 1
+        patch: Any = getattr(config, "patch_size", None) or (tubelet if _several(tubelet) else 0)
         self.patch = int(patch[-1] if _several(patch) else patch)
         self.tubelet = int(tubelet[0] if _several(tubelet) else tubelet)
         known = getattr(config, "num_frames", None) or getattr(config, "frames_per_clip", None)
