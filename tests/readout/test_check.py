@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +17,14 @@ import pytest
 from PIL import Image
 
 from physion.cli.main import main
-from physion.core.errors import BadInputError
+from physion.clips.batch import Batch
+from physion.core.errors import BadInputError, PhysionError
 from physion.models import models
+from physion.models.build import OutOfMemoryError
 from physion.readout.changes import CHANGES, ChangedTrials, take_trials
-from physion.readout.check import REFUSED, SHOWN, CheckedModel, check
+from physion.readout.check import REFUSED, SHOWN, CheckedModel, _is_of_the_machine, check
+from physion.readout.evaluate import Evaluation, evaluate
+from physion.readout.settings import choose_models
 from physion.trials.dataset import Dataset
 from physion.trials.index import build_index, write_index
 from physion.trials.trial_file import seal
@@ -318,6 +324,114 @@ def test_twins_are_shown(made: Dataset, tmp_path: Path) -> None:
     assert rows["moved"]["random twin"]["observed"] > 0
     assert set(rows.loc["blob-centroids"].index) == {"observed"}
     assert set(rows["accuracy_changed"].dropna() * 4 % 1) == {0.0}, "of four tested trials"
+
+
+class Failing(leaks.Honest):
+    """Model that raises ``error`` after some evaluations, each of which is one call."""
+
+    def __init__(self, error: Exception, after: int = 1) -> None:
+        self.error, self.left = error, after
+
+    def predict(self, batch: Batch) -> Any:
+        self.left -= 1
+        if self.left < 0:
+            raise self.error
+        return super().predict(batch)
+
+
+def test_a_path_is_a_model_and_numbers_of_trials_are_positive(
+    made: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = tmp_path / "own.py"
+    assert [one.model for one in choose_models(own)] == [str(own)]
+    assert [one.model for one in choose_models([own, "gns"])] == [str(own), "gns"]
+    with pytest.raises(BadInputError, match=r"features\.npz"):
+        check(tmp_path / "features.npz", made, tmp_path)
+    assert main(["check", "blob-centroids", "--trials", "0", "--out", str(tmp_path / "o")]) == 2
+    assert "trials must be at least 1 (--trials), not 0" in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+
+
+def test_files_are_copied_where_they_cannot_be_linked(
+    made: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: Any, **__: Any) -> None:
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    take_trials(made, tmp_path / "first", 4)
+    monkeypatch.setattr(os, "link", refused)
+    trials = ChangedTrials(Dataset(tmp_path / "first"), tmp_path / "x", np.random.default_rng(1))
+    for trial in trials.tested:
+        before, after = (
+            f / trials.paths(trial).movie.relative_to(tmp_path / "x")
+            for f in (tmp_path / "first", tmp_path / "x")
+        )
+        assert before.read_bytes() == after.read_bytes()
+        assert before.stat().st_mtime_ns == after.stat().st_mtime_ns
+
+
+def test_a_failure_that_no_change_made_ends_the_check(made: Dataset, tmp_path: Path) -> None:
+    for error, message in (
+        (OutOfMemoryError("too few bytes"), "too few bytes"),
+        (MemoryError(), "out of memory"),
+        (ValueError("broken"), "broken"),  # without any change, too
+    ):
+        with pytest.raises(PhysionError, match=message):
+            run(made, Failing(error), tmp_path, "labels")
+    assert _is_of_the_machine(_caused_by(OSError(errno.ENOSPC, "full")))
+    assert not _is_of_the_machine(_caused_by(FileNotFoundError(errno.ENOENT, "none")))
+
+
+def _caused_by(error: OSError) -> BadInputError:
+    told = BadInputError("cannot be stored")
+    told.__cause__ = error
+    return told
+
+
+def test_what_is_only_shown_may_fail(made: Dataset, tmp_path: Path) -> None:
+    done = run(made, Failing(ValueError("broken"), 2), tmp_path, "labels", "reversed")
+    assert done.passed and set(done.table["change"]) == {"labels"}
+    (warning,) = done.warnings
+    assert "reversed is not shown" in warning and "broken" in warning
+
+
+def test_others_may_fail_and_a_twin_decides_as_the_model(
+    made: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("physion.readout.check.CHANGES", {"labels": CHANGES["labels"]})
+    asked: dict[str, str] = {}
+
+    def noted(model: Any, *arguments: Any, **options: Any) -> Evaluation:
+        settings = replace(arguments[2], **{k: v for k, v in options.items() if k == "decision"})
+        asked[model.provenance().init] = settings.decision
+        if model.provenance().model == "blob-centroids":
+            raise BadInputError("no blobs")
+        return evaluate(model, *arguments, **options)
+
+    monkeypatch.setattr("physion.readout.check.evaluate", noted)
+    done = check("cswm", made, tmp_path, trials=8, accelerator="cpu", decision="trees")
+    assert asked["random"] == "trees"
+    assert "random twin" in set(done.table["change"]) and done.passed
+    assert [w for w in done.warnings if "blob-centroids is not shown: no blobs" in w]
+
+
+def test_changes_of_movies_are_skipped_where_pictures_are_rendered(
+    made: Dataset, tmp_path: Path
+) -> None:
+    done = run(made, leaks.Honest(), tmp_path, "encoded", "colours", rendered=True)
+    assert done.table.empty and [w.split()[0] for w in done.warnings] == ["encoded", "colours"]
+    assert not done.passed and not done.refused and "not decided: no change" in done.verdict
+
+
+def test_nothing_judged_is_not_passed(
+    made: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few = ["--out", str(tmp_path), "--trials", "16", "--workers", "1", "--changes", "reversed"]
+    assert main(["check", "blob-centroids", str(made.folder), *few]) == 1
+    text = capsys.readouterr().out
+    assert "blob-centroids not decided: no change was made that must not move" in text
+    undecided = run(made, leaks.Imagining(), tmp_path, "names")
+    assert not undecided.passed and "not decided: random numbers" in undecided.verdict
 
 
 @pytest.fixture(scope="module")

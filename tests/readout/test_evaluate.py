@@ -26,7 +26,7 @@ from physion.models.interface import TrainingSettings
 from physion.readout.decisions import Decided
 from physion.readout.evaluate import EvaluatedModel, Evaluation, evaluate
 from physion.readout.logistic import LogisticSettings
-from physion.readout.settings import EvaluationSettings
+from physion.readout.settings import ChosenModel, EvaluationSettings, choose_models, plan_cells
 from physion.readout.tables import (
     COLUMNS,
     MEAN,
@@ -428,6 +428,39 @@ def test_a_twin_has_random_weights_and_is_the_row_of_the_model_with_random_weigh
     assert alone.paths[0].name in {one.name for one in both.paths}, "so that nothing is done twice"
     none = evaluate("frozen-encoder", dots, tmp_path, settings, options=OPTIONS, twin=True)
     assert len(none.evaluated) == 1, "a model with random weights is its own twin"
+
+
+def test_models_have_one_twin_for_each_name_and_none_if_they_are_random_themselves(
+    dots: Dataset, tmp_path: Path
+) -> None:
+    """V-JEPA2 is random unless weights are given; and tables of one name cannot be compared."""
+    settings = replace(QUICK, readouts=("observed",), twin=True)
+
+    def planned(*chosen: ChosenModel) -> list[tuple[str, str]]:
+        cells = plan_cells(chosen, settings, lambda _: False, twins=True)
+        return [(cell.chosen.name, cell.built.provenance().model) for cell in cells]
+
+    random = planned(*choose_models({"V-JEPA2": {"width": 32, "depth": 2, "heads": 2}}))
+    assert [name for name, _ in random] == ["V-JEPA2"]
+    twins = []
+    for seed in (5, 6):
+        path = tmp_path / f"{seed}.safetensors"
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            network = timm.create_model("test_vit", img_size=64, num_classes=0)
+        save_file(network.state_dict(), path)
+        twins.append({**OPTIONS, "weights": str(path)})
+    two = choose_models({"frozen-encoder": twins[0], "timm:test_vit": twins[1]})
+    names = [name for name, _ in planned(*two)]
+    assert names == ["frozen-encoder", "random twin of frozen-encoder", "timm:test_vit"]
+    own = tmp_path / "own.py"
+    own.write_text(
+        "from support import leaking_models as leaks\n"
+        "class Own(leaks.Honest):\n"
+        "    def __init__(self, weights: str = 'w.pt'):\n"
+        "        assert weights == 'w.pt'\n"
+    )
+    assert len(planned(*choose_models(f"{own}:Own"))) == 1, "its weights may mean anything"
 
 
 def test_the_twin_of_a_trained_model_is_not_trained(dots: Dataset, tmp_path: Path) -> None:

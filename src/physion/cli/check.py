@@ -2,7 +2,8 @@
 
 The model predicts some trials, and copies of them in which one thing is changed: what follows the
 observed part becomes noise, outcomes are inverted, names and order change. Such changes must not
-move a prediction; of others it is shown how much they do. Exit code 1: a prediction moved.
+move a prediction; of others it is shown how much they do. Exit code 1: a prediction moved, or
+nothing was judged.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ class Options:
     out: Path = Path("runs/check")
     """Folder for the page, and for the trials if none are given."""
     trials: int = 80
-    """About how many trials are taken; half of them fit the readout, half are tested."""
+    """About how many trials are taken; half of them fit the readout, half are tested (rounded
+    down for each scenario, at least 2 of either half)."""
     changes: tuple[str, ...] = ()
     """Names of the changes to make; default: all, and evaluations of two other models."""
     option: tuple[str, ...] = ()
@@ -51,7 +53,8 @@ class Options:
     rendered: bool = EvaluationSettings.rendered
     """Render the pictures from the stored motions instead of reading the movies."""
     accelerator: str = EvaluationSettings.accelerator
-    """Device of the networks, by Lightning's name: auto, cpu, cuda, ..."""
+    """Device of the networks, by Lightning's name: auto, cpu, cuda, ... Use cpu for an exact check:
+    sums on a GPU may differ from call to call."""
     workers: int = ExecutorSettings.workers
     """Number of processes."""
     json: bool = False
@@ -59,7 +62,7 @@ class Options:
 
 
 def main(options: Options) -> int:
-    """Print the table of changes and write the page; return 1 if the model is refused."""
+    """Print the table of changes and write the page; return 1 unless the model passed."""
     with Stages() as stages:
         done = check(
             options.model,
@@ -87,6 +90,7 @@ def _print(done: CheckedModel, page: Path, options: Options) -> None:
     if options.json:
         rows = json_module.loads(done.table.to_json(orient="records"))
         values = {"model": done.model, "passed": done.passed, "refused": done.refused}
+        values["verdict"] = done.verdict
         print(json_module.dumps(values | {"changes": rows, "page": str(page)}))
         return
     print_line(text_table(described(done.table)))

@@ -103,6 +103,14 @@ def _balanced(rows: pd.DataFrame, count: int) -> pd.DataFrame:
     return rows.loc[place.sort_values(kind="stable").index[:count]].sort_index()
 
 
+def _link(source: str, target: str) -> None:
+    """Link a file, or copy it where the file system has no hard links."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
+
+
 class ChangedTrials:
     """Copy of trials that `take_trials` made, in which the tested ones are changed.
 
@@ -111,7 +119,7 @@ class ChangedTrials:
     """
 
     def __init__(self, source: Dataset, folder: Path, rng: np.random.Generator) -> None:
-        shutil.copytree(source.folder, folder, copy_function=os.link)
+        shutil.copytree(source.folder, folder, copy_function=_link)
         self.folder, self.rng = folder, rng
         rows = source.index.to_dict("records")
         self._fit = [row for row in rows if row["split"] != TESTING]

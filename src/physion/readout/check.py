@@ -22,18 +22,19 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.stats import wilcoxon
 
+from physion.compute.run_tasks import FATAL_ERRNOS
 from physion.compute.tasks import Executor, Progress, tracked
-from physion.core.errors import BadInputError, PhysionError, UnknownNameError
+from physion.core.errors import BadInputError, PhysionError, UnknownNameError, one_line
 from physion.core.seeds import generator
-from physion.models.build import build_model
+from physion.models.build import OutOfMemoryError, build_model
 from physion.models.feature_table import FeatureTable
 from physion.models.interface import Model, can
 from physion.readout.changes import CHANGES, Change, ChangedTrials, take_trials
 from physion.readout.decisions import Readout
-from physion.readout.evaluate import Evaluation, evaluate
+from physion.readout.evaluate import evaluate
 from physion.readout.model_calls import check_identity
 from physion.readout.predictor import ways
-from physion.readout.settings import EvaluationSettings, choose_models
+from physion.readout.settings import ChosenModel, EvaluationSettings, choose_models
 from physion.trials.dataset import Dataset
 from physion.trials.making.generate import generate
 from physion.trials.making.plan import GenerateSettings
@@ -88,23 +89,35 @@ class CheckedModel:
 
     @property
     def passed(self) -> bool:
-        """Whether no prediction moved that must not."""
-        return not self.refused
+        """Whether a change was judged, and no prediction moved that must not."""
+        return not self.refused and bool((self.table["verdict"] == PASSED).any())
 
     @property
     def verdict(self) -> str:
         """The result in one line."""
         if self.refused:
             return f"{self.model} refused: predictions depend on {', '.join(self.refused)}"
+        if not self.passed:
+            return f"{self.model} not decided: {self._undecided()}"
         held = self.table["change"][self.table["verdict"] == PASSED].nunique()
         return f"{self.model} passed: none of {held} changes moved a prediction that must stay"
+
+    def _undecided(self) -> str:
+        """Return why no change was judged."""
+        rows = self.table[
+            self.table["change"].isin([c.name for c in CHANGES.values() if c.must_hold])
+        ]
+        if rows.empty:
+            return "no change was made that must not move a prediction"
+        notes = [note for note in rows["note"] if note]
+        return notes[0] if notes else "the readout full may see all that was changed"
 
     def __str__(self) -> str:
         return f"{self.table.drop(columns=['what', 'note']).to_string(index=False)}\n{self.verdict}"
 
 
 def check(
-    model: str | Model,
+    model: str | Path | Model,
     dataset: Dataset | Path | str | None = None,
     out: Path | str = "runs/check",
     settings: EvaluationSettings | None = None,
@@ -135,7 +148,8 @@ def check(
     options
         Options of the model.
     trials
-        About how many trials are taken, half of them to fit the readout.
+        About how many trials are taken, half of them to fit the readout: rounded down for each
+        scenario, but at least 2 of either half.
     changes
         Names of the changes to make (`physion.readout.changes.CHANGES`); by default all, and
         evaluations of two other models.
@@ -159,9 +173,11 @@ def check(
     for name in changes:
         if name not in CHANGES:
             raise UnknownNameError("change", name, CHANGES)
+    if trials < 1:
+        raise BadInputError(f"trials must be at least 1 (--trials), not {trials}")
     settings = dataclasses.replace(settings or EvaluationSettings(), **fields)
     settings = dataclasses.replace(settings, untrained=True, seeds=1)
-    chosen = choose_models([model] if isinstance(model, str) else model, options)
+    chosen = choose_models(model, options)
     if len(chosen) != 1:
         raise BadInputError("one model is checked at a time")
     built = chosen[0].build(settings.seed)
@@ -184,15 +200,12 @@ def check(
     wanted = [CHANGES[name] for name in changes or CHANGES]
     with tempfile.TemporaryDirectory(dir=out, prefix="copies-") as folder:
         first = take_trials(opened, Path(folder) / "first", trials)
-        work = _Check(
-            built, first, functools.partial(evaluate, settings=settings, executor=executor)
-        )
+        work = _Check(built, first, settings, executor)
         rows = []
         for change in tracked(wanted, "changes", len(wanted), progress):
             rows += work.rows(change)
         if not changes:
-            twin = chosen[0].random_twin()
-            rows += work.rows_of_others(None if twin is None else twin.build(settings.seed))
+            rows += work.rows_of_others(chosen[0].random_twin(built))
         table = pd.DataFrame(rows, columns=list(COLUMNS))
         return CheckedModel(name, table, work.warnings())
 
@@ -216,26 +229,42 @@ def _made(
 class _Check:
     """The evaluations of one check: on the first trials, and on changed copies of these."""
 
-    def __init__(self, model: Model, first: Dataset, evaluate: Callable[..., Evaluation]) -> None:
-        self._model, self._first, self._evaluate = model, first, evaluate
+    def __init__(
+        self, model: Model, first: Dataset, settings: EvaluationSettings, executor: Executor | None
+    ) -> None:
+        self._model, self._first, self._settings = model, first, settings
+        self._executor = executor
+        self._repeats = False  # whether `again` could be predicted
+        self._left_out: list[str] = []
         self._before = self._predict(model, first)
         self._readouts = list(dict.fromkeys(self._before["readout"]))
 
     def rows(self, change: Change) -> list[dict[str, Any]]:
         """Return the rows of `COLUMNS` of one change, one for every readout."""
-        if change.pictures and self._first.index["observed_movie_sha256"].isna().any():
-            return []
+        if change.pictures:
+            reason = "pictures are rendered" if self._settings.rendered else ""
+            if self._first.index["observed_movie_sha256"].isna().any():
+                reason = "trials have none"
+            if reason:
+                self._left_out.append(f"{change.name} is skipped: it changes movies, and {reason}")
+                return []
         folder = self._first.folder.parent / "changed"
         trials = ChangedTrials(self._first, folder, generator("check", change.name))
         try:
             change.apply(trials)
             after, why = self._predict(self._model, trials.finish()), ""
+            self._repeats |= change.name == "again"
         except PhysionError as error:
             if not change.must_hold:
+                self._left_out.append(f"{change.name} is not shown: {one_line(error)}")
+                return []
+            if _is_of_the_machine(error) or change.name == "again":
                 raise
-            after, why = self._before[:0], " ".join(str(error).split())
+            after, why = self._before[:0], one_line(error)
         finally:
             shutil.rmtree(folder)
+        if why and not self._repeats:
+            self.rows(CHANGES["again"])  # raises if the change is not the reason
         rows = []
         for readout, before in self._before.groupby("readout"):
             if readout == Readout.FULL.value and not change.must_hold:
@@ -279,22 +308,36 @@ class _Check:
     def _imagines(self, readout: str) -> bool:
         return readout == Readout.OBSERVED_SIMULATED.value and can(self._model, "imagine")
 
-    def rows_of_others(self, twin: Model | None) -> list[dict[str, Any]]:
+    def rows_of_others(self, twin: ChosenModel | None) -> list[dict[str, Any]]:
         """Return rows that compare the model with its random twin, and with blobs."""
-        others = {TWIN: twin, BLOBS: build_model(BLOBS) if self._has_pictures() else None}
+        others: dict[str, Callable[[], Model]] = {}
+        if twin is not None:
+            others[TWIN] = functools.partial(twin.build, self._settings.seed)
+        if self._has_pictures():
+            others[BLOBS] = functools.partial(build_model, BLOBS)
+        rows: list[dict[str, Any]] = []
+        for name, build in others.items():
+            try:
+                rows += self._rows_of_other(name, build())
+            except PhysionError as error:
+                self._left_out.append(f"{name} is not shown: {one_line(error)}")
+        return rows
+
+    def _rows_of_other(self, name: str, other: Model) -> list[dict[str, Any]]:
+        # A twin decides as the model does.
+        decision = self._settings.decision if name == TWIN else ""
+        able = [readout.value for readout in ways(other, decision)]
+        asked = tuple(readout for readout in self._readouts if readout in able)
+        if not asked:
+            return []
+        found = self._predict(other, self._first, readouts=asked, decision=decision)
         rows = []
-        for name, other in others.items():
-            able = [] if other is None else [readout.value for readout in ways(other)]
-            asked = tuple(readout for readout in self._readouts if readout in able)
-            if other is None or not asked:
-                continue
-            found = self._predict(other, self._first, readouts=asked, decision="")
-            for readout, before in self._before.groupby("readout"):
-                if readout in asked:
-                    same = found[found["readout"] == readout].set_index("stimulus")["p_contact"]
-                    after = same.reindex(before["stimulus"]).to_numpy()
-                    rows.append({"change": name, "what": _OTHERS[name], "readout": readout})
-                    rows[-1] |= {**_compared(before, after), "verdict": SHOWN, "note": ""}
+        for readout, before in self._before.groupby("readout"):
+            if readout in asked:
+                same = found[found["readout"] == readout].set_index("stimulus")["p_contact"]
+                after = same.reindex(before["stimulus"]).to_numpy()
+                rows.append({"change": name, "what": _OTHERS[name], "readout": readout})
+                rows[-1] |= {**_compared(before, after), "verdict": SHOWN, "note": ""}
         return rows
 
     def _has_pictures(self) -> bool:
@@ -303,11 +346,13 @@ class _Check:
     def _predict(self, model: Model, dataset: Dataset, **changes: Any) -> pd.DataFrame:
         """Return the table of predictions of the tested trials of a dataset."""
         with tempfile.TemporaryDirectory(dir=self._first.folder.parent) as folder:
-            return self._evaluate(model, dataset, folder, **changes).predictions
+            return evaluate(
+                model, dataset, folder, self._settings, executor=self._executor, **changes
+            ).predictions
 
     def warnings(self) -> list[str]:
         """Return why the check could say less than it should."""
-        found = []
+        found = list(self._left_out)
         for readout, rows in self._before.groupby("readout"):
             if (rows.groupby("scenario")["p_contact"].nunique() == 1).all():
                 found.append(
@@ -315,6 +360,17 @@ class _Check:
                     "hides what they depend on; take more trials"
                 )
         return found
+
+
+def _is_of_the_machine(error: BaseException | None) -> bool:
+    """Return whether an error is about memory or the disk, whatever the model reads."""
+    while error is not None:
+        if isinstance(error, OutOfMemoryError):
+            return True
+        if isinstance(error, OSError) and error.errno in FATAL_ERRNOS:
+            return True
+        error = error.__cause__
+    return False
 
 
 def _scores(before: pd.DataFrame, p: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -224,14 +224,12 @@ def evaluate(
     if settings.decision:
         decisions.get(settings.decision)
     chosen = choose_models(models, options)
-    if settings.twin:
-        twins = [(one, one.random_twin()) for one in chosen]
-        chosen = [one for pair in twins for one in pair if one is not None]
     cells = plan_cells(
         chosen,
         settings,
         functools.partial(_is_trained, settings=settings),
         every_seed=settings.untrained,
+        twins=settings.twin,
     )
     finished = None if dry_run else on_evaluated
     elsewhere = None if dry_run else runner_of_cells(executor)

@@ -7,8 +7,10 @@ are options of the model: ``options={"steps": 500}``.
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -100,7 +102,10 @@ class EvaluationSettings(HarnessSettings):
 
 R = TypeVar("R")
 
-Models = str | Model | Sequence[str | Model] | Mapping[str, Mapping[str, Any]]
+Models = (
+    str | PathLike[str] | Model | Sequence[str | PathLike[str] | Model]
+    | Mapping[str, Mapping[str, Any]]
+)  # fmt: skip
 """Models by name, ``FILE.py:Class``, file of features, or built: one or several; or names with
 options of their own."""
 SEED, WEIGHTS = "seed", "weights"
@@ -127,11 +132,15 @@ class ChosenModel:
         name = self.model if isinstance(self.model, str) else self.model.provenance().model
         return f"random twin of {name}" if self.twin else name
 
-    def random_twin(self) -> ChosenModel | None:
-        """Return the model with random weights; None for one without weights, or random ones."""
-        if not isinstance(self.model, str) or WEIGHTS not in option_names(self.model):
+    def random_twin(self, built: Any) -> ChosenModel | None:
+        """Return the model with random weights.
+
+        None if ``built``, as it is built, has random ones already, or no weights, or if it comes
+        from a user's file, where the option may mean anything.
+        """
+        if not isinstance(self.model, str) or is_file_name(self.model):
             return None
-        if self.options.get(WEIGHTS) == RANDOM:
+        if WEIGHTS not in option_names(self.model) or built.provenance().init == RANDOM:
             return None
         return dataclasses.replace(self, options={**self.options, WEIGHTS: RANDOM}, twin=True)
 
@@ -181,7 +190,8 @@ def choose_models(models: Models, options: Mapping[str, Any] | None = None) -> l
         do not belong to a training.
     """
     own: Mapping[Any, Mapping[str, Any]] = models if isinstance(models, Mapping) else {}
-    listed = [models] if isinstance(models, str) or hasattr(models, "provenance") else list(models)
+    one = isinstance(models, str | PathLike) or hasattr(models, "provenance")
+    listed: list[Any] = [models] if one else list(models)
     if not listed:
         raise BadInputError("no model is named")
     given = {**(options or {})}
@@ -189,6 +199,7 @@ def choose_models(models: Models, options: Mapping[str, Any] | None = None) -> l
 
 
 def _choose(model: Any, options: Mapping[str, Any]) -> ChosenModel:
+    model = os.fspath(model) if isinstance(model, PathLike) else model
     kinds = field_types(TrainingSettings)
     # An argument of a user's class may have the name of a setting of the training.
     own = option_names(model) if isinstance(model, str) and is_file_name(model) else ()
@@ -270,6 +281,7 @@ def plan_cells(
     *,
     every_seed: bool = False,
     untrained: bool = False,
+    twins: bool = False,
 ) -> list[Cell]:
     """Return the cells of all models, protocols and seeds.
 
@@ -285,6 +297,8 @@ def plan_cells(
         Whether also a model that is not trained has a cell for each seed.
     untrained
         Whether models whose weights ship start from random ones.
+    twins
+        Whether the random twin of each model is added, once for each name.
 
     Raises
     ------
@@ -294,10 +308,12 @@ def plan_cells(
         If a model cannot be built, or two cells have the same name.
     """
     protocols, first = settings.chosen_protocols(), settings.seed
-    built = [model.build(first, untrained=untrained) for model in models]
+    built = [(model, model.build(first, untrained=untrained)) for model in models]
+    if twins:
+        built = _with_twins(built, first)
     cells: list[Cell] = []
     for seed in range(first, first + settings.seeds):
-        for model, example in zip(models, built, strict=True):
+        for model, example in built:
             ready = example if seed == first else None
             if trains(example) and not model.stays_random(example):
                 cells += [Cell(model, p, seed, untrained) for p in protocols]
@@ -315,6 +331,23 @@ def plan_cells(
     if twice:
         raise BadInputError(f"{twice[0]} is asked for twice; models need names of their own")
     return cells
+
+
+def _with_twins(
+    built: Sequence[tuple[ChosenModel, Any]], seed: int
+) -> list[tuple[ChosenModel, Any]]:
+    """Return built models, each with its random twin, unless another model's has the same name."""
+    found: list[tuple[ChosenModel, Any]] = []
+    names: set[str] = set()
+    for model, example in built:
+        found.append((model, example))
+        twin = model.random_twin(example)
+        if twin is not None:
+            made = twin.build(seed)
+            if (name := made.provenance().model) not in names:
+                names.add(name)
+                found.append((twin, made))
+    return found
 
 
 def run_cells(
