@@ -340,25 +340,26 @@ class Failing(leaks.Honest):
 
 
 def test_a_path_is_a_model_and_numbers_of_trials_are_positive(
-    made: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    own = tmp_path / "own.py"
+    own = tmp_path / "features.npz"
     assert [one.model for one in choose_models(own)] == [str(own)]
     assert [one.model for one in choose_models([own, "gns"])] == [str(own), "gns"]
     with pytest.raises(BadInputError, match=r"features\.npz"):
-        check(tmp_path / "features.npz", made, tmp_path)
+        check(own, out=tmp_path)
     assert main(["check", "blob-centroids", "--trials", "0", "--out", str(tmp_path / "o")]) == 2
     assert "trials must be at least 1 (--trials), not 0" in capsys.readouterr().err
     assert not (tmp_path / "o").exists()
 
 
 def test_files_are_copied_where_they_cannot_be_linked(
-    made: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refused(*_: Any, **__: Any) -> None:
         raise OSError(errno.EPERM, "Operation not permitted")
 
-    take_trials(made, tmp_path / "first", 4)
+    dots = make_dots(tmp_path / "dots", {"testing": 4}, ("drop",))
+    take_trials(dots, tmp_path / "first", 4)
     monkeypatch.setattr(os, "link", refused)
     trials = ChangedTrials(Dataset(tmp_path / "first"), tmp_path / "x", np.random.default_rng(1))
     for trial in trials.tested:
@@ -396,23 +397,24 @@ def test_what_is_only_shown_may_fail(made: Dataset, tmp_path: Path) -> None:
 
 
 def test_others_may_fail_and_a_twin_decides_as_the_model(
-    made: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("physion.readout.check.CHANGES", {"labels": CHANGES["labels"]})
+    dots = make_dots(tmp_path / "dots", {"readout": 4, "testing": 4}, ("drop",))
     asked: dict[str, str] = {}
 
     def noted(model: Any, *arguments: Any, **options: Any) -> Evaluation:
         settings = replace(arguments[2], **{k: v for k, v in options.items() if k == "decision"})
         asked[model.provenance().init] = settings.decision
-        if model.provenance().model == "blob-centroids":
-            raise BadInputError("no blobs")
+        if model.provenance().init == "random":
+            raise BadInputError("no twin")
         return evaluate(model, *arguments, **options)
 
     monkeypatch.setattr("physion.readout.check.evaluate", noted)
-    done = check("cswm", made, tmp_path, trials=8, accelerator="cpu", decision="trees")
+    done = check("cswm", dots, tmp_path, trials=8, accelerator="cpu", decision="trees")
     assert asked["random"] == "trees"
-    assert "random twin" in set(done.table["change"]) and done.passed
-    assert [w for w in done.warnings if "blob-centroids is not shown: no blobs" in w]
+    assert set(done.table["change"]) == {"labels"} and done.passed
+    assert "random twin is not shown: no twin" in done.warnings
 
 
 def test_changes_of_movies_are_skipped_where_pictures_are_rendered(
