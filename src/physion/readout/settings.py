@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, cast
 
 import tyro
 
@@ -191,7 +191,7 @@ def choose_models(models: Models, options: Mapping[str, Any] | None = None) -> l
     """
     own: Mapping[Any, Mapping[str, Any]] = models if isinstance(models, Mapping) else {}
     one = isinstance(models, str | PathLike) or hasattr(models, "provenance")
-    listed: list[Any] = [models] if one else list(models)
+    listed: list[Any] = [models] if one else [*cast("Iterable[Any]", models)]
     if not listed:
         raise BadInputError("no model is named")
     given = {**(options or {})}
