@@ -102,6 +102,9 @@ class Shelf:
 
         SHELVED.update({name.encode(): trial for name, trial in self.trials.items()})
 
+    def known_trials(self) -> set[str]:
+        return set(self.trials)
+
     def files(self, column: str) -> dict[str, Any]:
         assert column == "trial_file"
         return {name: SimpleNamespace(read=lambda name=name: name.encode(), path=Path(name))
