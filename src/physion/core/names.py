@@ -100,6 +100,17 @@ def scenario_of(stimulus: str) -> str | None:
     return "drape" if _DRAPE.match(stimulus) else None
 
 
+def evaluator_name(stimulus: str, scenario: str) -> str:
+    """Return a name in which physion_evaluator finds the scenario of a stimulus, and no dot.
+
+    Official names stay; ``collide_testing_0003`` becomes ``collision_testing_0003``.
+    """
+    name = canonical_name(stimulus).replace(".", "_")
+    if scenario_of(name) == scenario or scenario not in NAMES:
+        return name
+    return f"{NAMES[scenario].experiment}_{name.removeprefix(scenario).lstrip('_')}"
+
+
 def is_ledge(stimulus: str) -> bool:
     """Return whether this is a Roll stimulus with a ledge; the study excludes these."""
     return stimulus.startswith(f"{NAMES['roll'].prefix}simple_ledge_")

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from physion.clips.batch import LAST_OBSERVED, Batch, Provenance, Spec
 from physion.core.errors import BadInputError
 from physion.core.files import digest_of, file_sha256
-from physion.core.names import NAMES, canonical_name
+from physion.core.names import NAMES, evaluator_name
 from physion.models.interface import Model
 
 EVALUATOR = ("train_features.hdf5", "test_features.hdf5")
@@ -174,12 +174,8 @@ class FeatureTable(Model):
         """Return the name of a trial under which its features are found."""
         if not self._of_evaluator:
             return name
-        # As `physion.trials.official.export_folder.evaluator_name` writes names.
-        name = canonical_name(name).replace(".", "_")
-        for scenario, names in NAMES.items():
-            if name.startswith(f"{scenario}_"):
-                return f"{names.experiment}_{name.removeprefix(scenario).lstrip('_')}"
-        return name
+        scenario = next((known for known in NAMES if name.startswith(f"{known}_")), "")
+        return evaluator_name(name, scenario)
 
     def _error(self, what: str) -> BadInputError:
         return BadInputError(f"features {self.path}: {what}")

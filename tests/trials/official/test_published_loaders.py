@@ -36,10 +36,12 @@ from PIL import Image
 from physion.cli import export as export_verb
 from physion.compute.local import SerialExecutor
 from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.names import evaluator_name
 from physion.trials.dataset import Dataset
 from physion.trials.files import TrialPaths, write_files
 from physion.trials.index import build_index, write_index
-from physion.trials.official.export_folder import LAYOUTS, evaluator_name, export_official
+from physion.trials.official.export_folder import LAYOUTS, export_official
+from physion.trials.official.names import split_name
 from physion.trials.trial_file import TrialWriter
 from physion.trials.video import count_frames, read_frames
 from support.official_hand_made import CLOTH, FRAMES, RIGID, TOUCH
@@ -377,7 +379,7 @@ def test_hdf5_files_of_the_downloads(dataset: Path, tmp_path: Path) -> None:
     ],
 )
 def test_physion_evaluator_finds_scenarios(scenario: str, trial: str, key: str) -> None:
-    name = evaluator_name(TrialPaths(Path(), "testing", scenario, trial))
+    name = evaluator_name("_".join(split_name(trial)), scenario)
     assert evaluator_scenario(f"/data/physion_mp4s/test/{name}.mp4") == [key]
     assert "." not in name and "redyellow" not in name
 

@@ -1,9 +1,8 @@
-"""Baselines that have seen many outcomes and know no physics: `blob-trees`, `mask-trees`,
-`state-trees`.
+"""Baselines that have seen outcomes and know no physics: trees on blobs, masks and states.
 
-Each turns the observed part of a trial into numbers, from which trees tell P(contact)
-(`physion.readout.trees`): from the red and yellow pixels, from the masks of five objects, or from
-the true state.
+`blob-trees`, `mask-trees` and `state-trees` each turn the observed part of a trial into numbers,
+from which trees predict P(contact) (`physion.readout.trees`): from the red and yellow pixels, from
+the masks of five objects, or from the true state.
 """
 
 from __future__ import annotations

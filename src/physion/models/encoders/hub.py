@@ -40,6 +40,7 @@ from physion.models.encoders.weights import (
     Pooling,
     average_cells,
     check_pooling,
+    clips_of,
     first_line,
     offline_without_network,
     weights_sha256,
@@ -231,10 +232,7 @@ class HubEncoder(TorchModel):
             return (
                 self._pool(self._tokens(pictures.flatten(0, 1)), 1).float().view(clips, steps, -1)
             )
-        missing = -steps % self.frames
-        last = pictures[:, -1:].expand(-1, missing, -1, -1, -1)
-        pictures = torch.cat([pictures, last], 1)
-        parts = pictures.reshape(-1, self.frames, *pictures.shape[2:])
+        parts = clips_of(pictures, self.frames)
         features = self._pool(self._tokens(parts), self.frames // self.tubelet)
         return features.float().reshape(clips, -1, features.shape[-1])
 

@@ -33,6 +33,7 @@ from physion.models.encoders.weights import (
     Pooling,
     average_cells,
     check_pooling,
+    clips_of,
     first_line,
     load_fitting,
     offline_without_network,
@@ -403,15 +404,12 @@ class VideoEncoder(TorchModel):
         """
         pictures = normalized_pictures(batch, self.spec, self.name())
         frames, size = self.settings.frames, self.settings.image_size
-        missing = -pictures.shape[1] % frames
-        last = pictures[:, -1:].expand(-1, missing, -1, -1, -1)
-        pictures = torch.cat([pictures, last], dim=1)
-        clips, steps = pictures.shape[:2]
-        tokens: Tensor = self.network(pictures.reshape(-1, frames, 3, size, size)).last_hidden_state
+        tokens: Tensor = self.network(clips_of(pictures, frames)).last_hidden_state
         side, width = size // self.settings.patch, tokens.shape[-1]
         maps = tokens.reshape(-1, side, side, width).permute(0, 3, 1, 2)
         features = average_cells(maps) if self.settings.pooling == GRID else maps.mean((2, 3))
-        return features.float().reshape(clips, steps // TUBELET, -1)
+        times = -(-pictures.shape[1] // frames) * frames // TUBELET
+        return features.float().reshape(len(pictures), times, -1)
 
     def digest(self) -> str:
         """Return the SHA-256 of settings, versions and weights."""

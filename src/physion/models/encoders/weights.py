@@ -50,6 +50,16 @@ def check_pooling(pooling: str) -> None:
         raise BadInputError(f"pooling must be {POOLED}, {GRID} or {MEAN}, not {pooling!r}")
 
 
+def clips_of(pictures: Tensor, frames: int) -> Tensor:
+    """Return pictures (B, T, 3, H, W) in clips (B n, frames, 3, H, W), one after the other.
+
+    T is filled up to n ``frames`` by repeating the last picture.
+    """
+    missing = -pictures.shape[1] % frames
+    last = pictures[:, -1:].expand(-1, missing, -1, -1, -1)
+    return torch.cat([pictures, last], 1).reshape(-1, frames, *pictures.shape[2:])
+
+
 def average_cells(feature_map: Tensor) -> Tensor:
     """Return maps (N, channels, rows, columns) averaged in cells, as `GridFeatures` orders them."""
     rows, columns = (min(CELLS, side) for side in feature_map.shape[2:])

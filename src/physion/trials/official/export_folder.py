@@ -75,7 +75,7 @@ from physion.compute.run_tasks import RunReport, run_tasks
 from physion.compute.tasks import Executor, Progress
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import folder_for_writing, remove_leftovers, write_atomic
-from physion.core.names import FOLDERS, NAMES, canonical_name, scenario_of
+from physion.core.names import FOLDERS, evaluator_name
 from physion.core.seeds import stable_hash
 from physion.trials.dataset import Dataset
 from physion.trials.files import IndexedFile, Metadata, TrialPaths, encode_png
@@ -305,7 +305,7 @@ def _physion_evaluator(paths: TrialPaths, _first: bool) -> Files:
     phase = {"readout": "train", "testing": "test"}.get(paths.split)
     if phase is None or paths.scenario == "drape":
         return {}
-    name, folder = evaluator_name(paths), f"physion_mp4s/{phase}"
+    name, folder = evaluator_name(_stimulus(paths), paths.scenario), f"physion_mp4s/{phase}"
     return {
         f"{folder}/{name}.mp4": Content("movie", "redyellow"),
         f"{folder}/records/{name}.json": Content("record", "redyellow"),
@@ -328,18 +328,6 @@ def _hdf5s(paths: TrialPaths, _first: bool) -> Files:
     folder = _folder(paths)
     place = f"{folder}/hdf5s" if paths.split == CORE_SPLIT else f"{folder}_{paths.split}_HDF5s"
     return {f"{place}/{_stimulus(paths)}.hdf5": Content("state", _plain_look(paths.split))}
-
-
-def evaluator_name(paths: TrialPaths) -> str:
-    """Return a name of the trial in which physion_evaluator finds its scenario, and no dot.
-
-    Official names stay; ``collide_testing_0003`` becomes ``collision_testing_0003``.
-    """
-    stimulus = canonical_name(_stimulus(paths)).replace(".", "_")
-    if scenario_of(stimulus) == paths.scenario or paths.scenario not in NAMES:
-        return stimulus
-    rest = stimulus.removeprefix(paths.scenario).lstrip("_")
-    return f"{NAMES[paths.scenario].experiment}_{rest}"
 
 
 def _no_lists(out: Path) -> tuple[Path, dict[str, str]]:
