@@ -66,7 +66,6 @@ def test_spec_with_few_frames_ends_with_the_last_observed_one() -> None:
         {"image_size": 0},
         {"context": -1},
         {"inputs": ("sound",)},
-        {"inputs": ()},
         {"context_at": "middle"},
         {"objects": 0},
     ],
