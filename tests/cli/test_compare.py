@@ -97,7 +97,7 @@ def test_the_recorded_outcome_decides_and_differences_are_listed(
                 for one in names]  # fmt: skip
         (tmp_path / f"{name}.csv").write_text("stimulus,probability,outcome\n" + "".join(rows))
     files = [str(tmp_path / f"{name}.csv") for name in ("movies", "simulated")]
-    assert main(["compare", *files, "--out", str(tmp_path / "out")]) == 0
+    assert main(["compare", *files, "--population", "--out", str(tmp_path / "out")]) == 0
     out = capsys.readouterr().out
     shown = [line.split() for line in out.splitlines() if line.startswith(("movies", "simulated"))]
     assert [row[1] for row in shown] == ["1.000", "1.000"], "both are right about what was recorded"
@@ -106,6 +106,14 @@ def test_the_recorded_outcome_decides_and_differences_are_listed(
     assert set(re.findall(r"pilot_it2_drop\w+", note)) < other
     listed = pd.read_csv(tmp_path / "out" / "tables" / "changed_outcomes.csv")
     assert set(listed["stimulus"]) == other and set(listed["models"]) == {"simulated"}
+    # Both as one population, which agrees.
+    (row,) = (line.split() for line in out.splitlines() if re.match(r"models +2 ", line))
+    assert row[4] == "1.000"
+    assert {"kappa of majorities", "Accuracy less people's"} <= set(re.split(r"\s{2,}|\n", out))
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Populations" in page and "kappa of members" in page
+    written = pd.read_csv(tmp_path / "out" / "tables" / "population_consensus.csv")
+    assert set(written["population"]) == {"people", "models"}
 
 
 def test_own_stimuli_need_scenario_and_outcome(

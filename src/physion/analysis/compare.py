@@ -26,6 +26,7 @@ from physion.analysis.model_tests import (
 )
 from physion.analysis.people.measures import HALVES, accuracy_by_stimulus, all_answers, split_halves
 from physion.analysis.people.results import PeopleResults
+from physion.analysis.population import PopulationResults, compare_populations
 from physion.analysis.scores import TWO_PEOPLE, against_people, with_kind
 from physion.analysis.statistics.regression import calibration_table
 from physion.analysis.tables import DETECTION, check_excluded_names, name_models, require_columns
@@ -144,6 +145,7 @@ class ComparisonResults:
     - ``calibration``: from `calibration_table`.
     - ``mixed``: from `fits_of_people` and `fits_of_models`.
     - ``contrasts``: from `group_contrasts`; None if no grouping was given.
+    - ``population``: from `compare_populations`; None if not asked for.
     - ``warnings``: what may make the results wrong, one sentence each.
     """
 
@@ -157,6 +159,7 @@ class ComparisonResults:
     calibration: pd.DataFrame | None = None
     mixed: tuple[MixedTable, ...] = ()
     contrasts: pd.DataFrame | None = None
+    population: PopulationResults | None = None
     warnings: tuple[str, ...] = ()
 
 
@@ -169,6 +172,7 @@ def all_results(
     zone: pd.DataFrame | None = None,
     zone_origin: str = "",
     groups: Sequence[str] = (),
+    population: bool = False,
     exclude: Iterable[str] = (),
     exclude_ledge: bool = True,
     bootstrap: Bootstrap | None = None,
@@ -185,6 +189,8 @@ def all_results(
         From `people.results.analyse_people`, in place of ``humans``, ``labels`` and ``zone``.
     groups
         Columns of ``predictions`` by which models are compared in groups.
+    population
+        Whether models of several seeds are compared as populations (`compare_populations`).
     exclude, exclude_ledge, bootstrap
         As in `compare_scores`.
 
@@ -248,6 +254,7 @@ def all_results(
         calibration=calibration_table(list(pooled.names), pooled.p_contact, pooled.label),
         mixed=(*about_people, *fits_of_models(main, predictions)),
         contrasts=group_contrasts(main, predictions, groups) if groups else None,
+        population=compare_populations(main, predictions, draws.level) if population else None,
         warnings=(*(people.warnings if people else ()), *main.warnings),
     )
 

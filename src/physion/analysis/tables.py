@@ -453,18 +453,7 @@ def name_models(predictions: pd.DataFrame, files: Sequence[str] = ()) -> pd.Data
         return predictions
     if set(predictions.columns) != {column.name for column in PREDICTIONS}:
         predictions = check_predictions(predictions)
-    base, readout = predictions["model"], predictions["readout"]
-    model = base.where(readout == "", base + " · " + readout)
-    for column in DISTINGUISHING:
-        if column not in predictions:
-            continue
-        values = predictions[column].astype(str)
-        several = values.groupby([base, readout]).transform("nunique")
-        words = _WORDS.get(column, column.replace("_", " ") + " ")
-        added = f" · {words}" + values.where(values != "", "not stated")
-        if column == "dynamics_training_dataset":  # only models of protocol one have it
-            added = added.where(values != "", "")
-        model = model.where(several < 2, model + added)
+    base, model = predictions["model"], _unique_names(predictions)
     named = predictions.assign(base_model=base, model=model)
     twice = np.flatnonzero(named.duplicated(["model", "stimulus"]))
     if len(twice):
@@ -481,6 +470,43 @@ def name_models(predictions: pd.DataFrame, files: Sequence[str] = ()) -> pd.Data
             "on one set of trials"
         )
     return named
+
+
+def _unique_names(predictions: pd.DataFrame) -> pd.Series:
+    """Return model and readout of each row and, where models share these, what distinguishes them.
+
+    ``predictions``: with the name of the model, as it was given, in ``model``.
+    """
+    base, readout = predictions["model"], predictions["readout"]
+    model = base.where(readout == "", base + " · " + readout)
+    for column in DISTINGUISHING:
+        if column not in predictions:
+            continue
+        values = predictions[column].astype(str)
+        several = values.groupby([base, readout]).transform("nunique")
+        words = _WORDS.get(column, column.replace("_", " ") + " ")
+        added = f" · {words}" + values.where(values != "", "not stated")
+        if column == "dynamics_training_dataset":  # only models of protocol one have it
+            added = added.where(values != "", "")
+        model = model.where(several < 2, model + added)
+    return model
+
+
+SEEDS = ("seed", "encoder_pretraining_seed", "encoder_training_seed")
+"""Columns in which the members of a population of models differ."""
+
+
+def population_names(predictions: pd.DataFrame) -> dict[str, str]:
+    """Return the population of each model: all that differs is its seed, or file of weights.
+
+    ``predictions``: from `name_models`. Weights from local files are checkpoints of one model.
+    """
+    alike = predictions.assign(model=predictions["base_model"], **dict.fromkeys(SEEDS, ""))
+    if "init" in alike:
+        local = alike["init"].str.startswith("local:")
+        alike["init"] = alike["init"].mask(local, "local")
+    pairs = zip(predictions["model"], _unique_names(alike), strict=True)
+    return {str(model): str(name) for model, name in pairs}
 
 
 def _places(one: str, other: str) -> str:

@@ -5,6 +5,9 @@ columns, stimulus and p_contact.
 
 `physion compare FILES... --responses FILE`: models next to single participants.
 
+`physion compare FILES... --population`: seeds or checkpoints of a model as one population, people
+as the other: consensus, disagreement, kappa of majorities and of single members.
+
 `physion compare --responses FILE`: the people only.
 
 `physion compare --check FILES...`: check the files and name every bad row; exit code 1 if one has
@@ -27,6 +30,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from physion.analysis.check import Checked, Reference
+    from physion.analysis.population import PopulationResults
     from physion.analysis.published.claims import PublishedResults
     from physion.report.compare import CompareResult
 
@@ -72,6 +76,9 @@ class Options:
     groups: tuple[str, ...] = ()
     """Compare groups of models by these columns of the predictions, such as encoder_type, or by the
     columns of a CSV file with model and any others."""
+    population: bool = False
+    """Compare seeds or checkpoints of a model with people as one population: rows that differ in
+    seed or file of weights only; if there are none, all models together."""
     exclude: Path | None = None
     """File of stimuli to exclude, one per line."""
     fitted: Path | None = None
@@ -122,6 +129,7 @@ def _compare(options: Options) -> int:
         where=options.where,
         attributes=options.attributes,
         groups=options.groups,
+        population=options.population,
         exclude=options.exclude or (),
         rollout_errors=options.rollout_errors,
         resamples=options.resamples,
@@ -138,7 +146,45 @@ def _compare(options: Options) -> int:
     else:
         _print_changed(result)
         print_scores(result, page)
+        if result.population is not None:
+            _print_population(result.population)
     return 0
+
+
+def _print_population(results: PopulationResults) -> None:
+    """Print consensus and agreement in the mean over scenarios, and differences by scenario."""
+    from physion.analysis.tables import MEAN
+
+    consensus, agreement = (
+        t[t["scenario"] == MEAN] for t in (results.consensus, results.agreement)
+    )
+    _print("")
+    first = consensus[["population", "members", "ties", "stimuli"]].assign(
+        **_texts(consensus, {"accuracy of the consensus": "consensus", "of a member": "member"}),
+        **{"SD of members": consensus["member_sd"]},
+    )
+    _show("Populations: mean over scenarios; 95 % intervals over stimuli", first)
+    kappas = {"kappa of members": "kappa_members", "kappa of majorities": "kappa_majorities"}
+    apart = {"members disagree": "disagreement_members",
+             "majorities disagree": "disagreement_majorities"}  # fmt: skip
+    second = agreement[["first", "second"]].assign(**_texts(agreement, kappas | apart))
+    _show("Two members, and two majorities (of one population: of its halves)", second)
+    if len(results.differences):
+        names = {"of the consensus": "consensus", "of a member": "member"}
+        third = results.differences[["population", "scenario", "stimuli"]].assign(
+            **_texts(results.differences, names)
+        )
+        _show("Accuracy less people's", third)
+
+
+def _texts(table: pd.DataFrame, columns: Mapping[str, str]) -> dict[str, list[str]]:
+    """Return columns of a table with their intervals as texts, by heading."""
+    from physion.report.compare import with_interval
+
+    return {
+        heading: [with_interval(row, name) for _, row in table.iterrows()]
+        for heading, name in columns.items()
+    }
 
 
 def _print_changed(result: CompareResult) -> None:

@@ -27,6 +27,7 @@ from physion.analysis.people.results import (
     read_attributes,
     rules_called,
 )
+from physion.analysis.population import PopulationResults
 from physion.analysis.published.tables import PublishedTables, read_published
 from physion.analysis.results import published_rows, results_table, zone_of_people
 from physion.analysis.rollout_errors import read_rollout_errors, rollout_error_table
@@ -95,6 +96,11 @@ class CompareResult:
         if isinstance(self.inputs, PeopleReport):
             return self.inputs.people.warnings
         return self.inputs.warnings
+
+    @property
+    def population(self) -> PopulationResults | None:
+        """Consensus, agreement and differences of populations; None if not asked for."""
+        return None if isinstance(self.inputs, PeopleReport) else self.inputs.population
 
     @property
     def results(self) -> pd.DataFrame:
@@ -176,11 +182,12 @@ def as_text(results: pd.DataFrame) -> pd.DataFrame:
         table["stimuli"] = results["stimuli"]
     for heading, name in (("accuracy", "accuracy"), ("r with people", "r"), ("kappa", "kappa")):
         if results[name].notna().any():
-            table[heading] = [_with_interval(row, name) for _, row in results.iterrows()]
+            table[heading] = [with_interval(row, name) for _, row in results.iterrows()]
     return table.reset_index(drop=True)
 
 
-def _with_interval(row: pd.Series, name: str) -> str:
+def with_interval(row: pd.Series, name: str) -> str:
+    """Return a number with its interval as text; empty if it is undefined."""
     value, low, high = row[name], row.get(f"{name}_low"), row.get(f"{name}_high")
     if pd.isna(value):
         return ""
@@ -201,6 +208,7 @@ def compare(
     where: Sequence[str] = (),
     attributes: Path | pd.DataFrame | None = None,
     groups: Sequence[str | Path | pd.DataFrame] = (),
+    population: bool = False,
     exclude: Path | Iterable[str] = (),
     ledge: bool = False,
     dominoes: DominoesLook = "plain",
@@ -250,6 +258,9 @@ def compare(
     groups
         What groups of models are compared by: columns of the predictions, and tables (or their CSV
         files) with ``model`` and any further columns, all of which count.
+    population
+        Whether seeds or checkpoints of a model are compared with people as one population
+        (`CompareResult.population`).
     exclude
         Stimuli to exclude, or a file with one per line.
     ledge
@@ -291,8 +302,8 @@ def compare(
         raise BadInputError(
             "no predictions: give some, or responses for an analysis of people (--responses)"
         )
-    if rows is None and (rollout_errors or groups):
-        what = "rollout errors" if rollout_errors else "groups of models"
+    if rows is None and (rollout_errors or groups or population):
+        what = "rollout errors" if rollout_errors else "groups and populations of models"
         raise BadInputError(f"{what} are about predictions: give some")
     errors = read_rollout_errors(rollout_errors) if rollout_errors else None
     excluded = read_stimulus_list(exclude) if isinstance(exclude, Path) else list(exclude)
@@ -301,6 +312,7 @@ def compare(
         "exclude_ledge": not ledge,
         "bootstrap": draws,
     }
+    asked: dict[str, Any] = {"groups": grouped, "population": population}
     if files:
         if humans is not None:
             raise BadInputError("give averages of people (humans) or their responses, not both")
@@ -314,7 +326,7 @@ def compare(
             fits = tuple(fits_of_people(people))
             page = PeopleReport(people, fits, methods)
             return CompareResult(_scores_of_people(people), people, page)
-        results = all_results(rows, people=people, groups=grouped, **settings)
+        results = all_results(rows, people=people, **asked, **settings)
     else:
         assert rows is not None
         about = (sessions, expected, attributes)
@@ -330,7 +342,7 @@ def compare(
         methods = dict(averages.methods)
         results = all_results(
             rows, averages.people, averages.labels, zone=averages.zone,
-            zone_origin=averages.zone_origin, groups=grouped, **settings,
+            zone_origin=averages.zone_origin, **asked, **settings,
         )  # fmt: skip
         results = replace(results, warnings=(*results.warnings, *averages.warnings))
     tables, scenarios = None, in_order(results.comparison.stimuli["scenario"])

@@ -104,6 +104,9 @@ class ReportInputs(ComparisonResults):
                 "model_pairs": self.beside.pairs,
                 "left_out_beside_people": self.beside.dropped,
             }
+        if self.population is not None:
+            found |= {f"population_{one.name}": getattr(self.population, one.name)
+                      for one in fields(self.population)}  # fmt: skip
         found |= _mixed_tables(self.mixed)
         if self.people is not None:
             found |= _people_tables(self.people)

@@ -58,6 +58,7 @@ def render_page(
         Section(DISAGREE, Markup()),
         Section("People", people_parts.people(inputs)),
         Section("Sessions left out", people_parts.sessions(inputs)),
+        Section("Populations", scores.populations(inputs)),
         Section("Tests", scores.tests(inputs)),
         Section("Trials whose simulated outcome differs", scores.changed(inputs.comparison, links)),
         Section("How this was made", _methods(inputs)),

@@ -367,6 +367,48 @@ def definitions(comparison: Comparison) -> Markup:
     return joined([heading("What the numbers mean"), definition_list(meaning)])
 
 
+# --- populations of models and people -----------------------------------------------------------
+
+_POPULATIONS = (
+    "Seeds or checkpoints of a model as one population, people as the other. The consensus is the "
+    "answer of the majority; where members are divided equally it is half right. Two members are "
+    "different ones, drawn anew for each stimulus. Two majorities are of the two populations or, "
+    "of one population with itself, of two random halves of it. Intervals are about other stimuli."
+)
+
+
+def populations(inputs: ReportInputs) -> Markup:
+    """Return consensus, agreement and differences to people of populations; nothing without."""
+    if inputs.population is None:
+        return Markup()
+    found = inputs.population
+    consensus = [
+        PageColumn("population", "population", "text"),
+        PageColumn("members", "members", "count"),
+        PageColumn("ties", "ties", "count"),
+        PageColumn("accuracy of the consensus", "consensus", "interval"),
+        PageColumn("of a member", "member", "interval"),
+        PageColumn("SD of members", "member_sd", digits=3),
+    ]
+    agreement = [
+        PageColumn("", "first", "text"),
+        PageColumn("with", "second", "text"),
+        PageColumn("members disagree", "disagreement_members", "interval"),
+        PageColumn("majorities disagree", "disagreement_majorities", "interval"),
+        PageColumn("kappa of members", "kappa_members", "interval"),
+        PageColumn("kappa of majorities", "kappa_majorities", "interval"),
+    ]
+    scenario = PageColumn("scenario", "scenario", "text")
+    differences = [consensus[0], scenario, *consensus[3:5]]
+    parts = [paragraph(_POPULATIONS)]
+    for rows, columns in ((found.consensus, consensus), (found.agreement, agreement)):
+        several = rows["scenario"] != MEAN
+        parts.append(rows_table(rows[~several], columns, AVERAGES[MEAN].capitalize()))
+        parts.append(details("By scenario", rows_table(rows[several], [scenario, *columns])))
+    caption = "Accuracy less people's, by the difference of the consensus"
+    return joined([*parts, rows_table(found.differences, differences, caption)])
+
+
 # --- tests: models against each other, mixed models, calibration --------------------------------
 
 
