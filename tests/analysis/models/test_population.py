@@ -102,7 +102,7 @@ def test_halves_of_a_population_against_all_ways_to_halve_it() -> None:
 
     def majority(votes: np.ndarray) -> np.ndarray:
         more = 2 * votes.sum(axis=0) - len(votes)
-        return (1 + np.sign(more)) / 2
+        return np.asarray((1 + np.sign(more)) / 2)
 
     ways = list(combinations(range(5), 2))
     for half in ways:
