@@ -14,7 +14,7 @@ The raters are, for the fraction p of n members who say yes, or q of another pop
 - two *majorities*: m is 1 where p > 1/2, 0 where p < 1/2, and 1/2 where members are divided
   equally, as if a fair coin decided. Of two populations: a = m(p), b = m(q), c = m(p) m(q). Of one
   population with itself: of two random halves. Of k = n p answers yes, x are in the half of
-  h = n // 2 members with the hypergeometric probability C(k, x) C(n - k, h - x) / C(n, h), so that ::
+  h = n // 2 members with the hypergeometric probability C(k, x) C(n - k, h - x) / C(n, h)::
 
     a = E m(x / h),   b = E m((k - x) / (n - h)),   c = E m(x / h) m((k - x) / (n - h))
 
