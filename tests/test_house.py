@@ -14,6 +14,8 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
+from support.sources import parsed
+
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
 
@@ -55,7 +57,7 @@ def _module(path: Path) -> str:
 def _imports(path: Path, modules: set[str]) -> set[str]:
     """Modules of the package that a module imports, inside functions and by `import_module` too."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
             found |= {name.name for name in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -99,7 +101,7 @@ def test_no_import_ring() -> None:
 def test_every_import_by_name_is_known() -> None:
     found = set()
     for path in SOURCES:
-        for name, call in _calls(ast.parse(path.read_text())):
+        for name, call in _calls(parsed(path)):
             written = call.args and isinstance(call.args[0], ast.Constant)
             if name.endswith(("import_module", "__import__")) and not written:
                 found.add(_module(path))
@@ -112,7 +114,7 @@ def test_no_module_names_one_of_a_higher_room() -> None:
     upward = []
     for path in SOURCES:
         level = levels.get(".".join(_module(path).split(".")[:2]), -1)
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(parsed(path)):
             if not (isinstance(node, ast.Constant) and isinstance(node.value, str)):
                 continue
             named = node.value.partition(":")[0]
@@ -187,7 +189,7 @@ PLAIN_IMPORTS = {("numpy", "np"), ("math", None)}
 def test_nothing_between_seed_and_bytes_depends_on_the_processor(path: Path) -> None:
     """BLAS, the C library and numpy's SIMD loops choose their algorithms by processor."""
     found = []
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.BinOp | ast.AugAssign):
             if isinstance(node.op, ast.MatMult):
                 found.append(f"line {node.lineno}: @")
@@ -247,7 +249,7 @@ def test_random_numbers_come_from_seeds() -> None:
     found = [
         f"{path.relative_to(ROOT)}: line {call.lineno}"
         for path in SOURCES
-        for name, call in _calls(ast.parse(path.read_text()))
+        for name, call in _calls(parsed(path))
         if name.endswith(makers) and path.name != "seeds.py"
     ]
     assert not found

@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 import physion
+from support.sources import parsed
 
 ROOT = Path(__file__).parents[1]
 
@@ -81,7 +82,7 @@ def test_unknown_names_are_attribute_errors() -> None:
 def test_every_exported_name_is_in_one_list() -> None:
     lists = {}
     for path in (ROOT / "src").rglob("*.py"):
-        for node in ast.parse(path.read_text()).body:
+        for node in parsed(path).body:
             if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
                 lists[path] = ast.literal_eval(node.value)
     assert len(lists) > 3

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from support.sources import parsed
+
 ROOT = Path(__file__).parents[1]
 PROGRAMS = sorted(
     path
@@ -65,7 +67,7 @@ def find_unsafe(tree: ast.AST) -> list[str]:
 
 @pytest.mark.parametrize("path", PROGRAMS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_files_stay_data(path: Path) -> None:
-    assert not find_unsafe(ast.parse(path.read_text(encoding="utf-8")))
+    assert not find_unsafe(parsed(path))
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from support.sources import parsed
+
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "physion"
 SOURCES = sorted(PACKAGE.rglob("*.py"))
@@ -88,7 +90,7 @@ def test_names_and_first_lines_hold_no_banned_word(folder: str) -> None:
         f"{path.relative_to(PACKAGE)}, {hit}"
         for path in SOURCES
         if path.relative_to(PACKAGE).parts[0] == folder
-        for hit in find_banned(ast.parse(path.read_text()))
+        for hit in find_banned(parsed(path))
     ]
     assert not hits, "see docs/glossary.md\n" + "\n".join(hits)
 
@@ -208,7 +210,7 @@ def test_a_class_name_exists_once() -> None:
     names = Counter(
         node.name
         for path in SOURCES
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in ast.walk(parsed(path))
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
     )
     assert {name for name, count in names.items() if count > 1} <= {"Options"}

@@ -177,6 +177,7 @@ def test_trials_without_movies_are_rendered(tmp_path: Path) -> None:
     assert one.seen["rgb"].std() > 10 and one.true["rgb"].std() > 10
 
 
+@pytest.mark.slow
 def test_the_weights_of_particle_models_are_named(folder: Path) -> None:
     imagined = imagine_with(Dataset(folder), ["dpi"], {"weights": "random"})(["drop_0", "drape_0"])
     for trial, name, agent in (("drop_0", "ball", 0), ("drape_0", "sheet", 2)):

@@ -22,6 +22,7 @@ import tyro
 from physion.cli.help import find_module
 from physion.scenes.sampling.sample import parse_presets
 from support.paths import ROOT
+from support.sources import parsed
 
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
@@ -121,7 +122,7 @@ def has_name(path: Path, name: str) -> bool:
 
 @cache
 def names_of(path: Path) -> frozenset[str]:
-    return frozenset(defined_names(ast.parse(path.read_text(encoding="utf-8")).body))
+    return frozenset(defined_names(parsed(path).body))
 
 
 def defined_names(body: Iterable[ast.stmt], prefix: str = "") -> list[str]:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from physion.experiment.export.tables import iso_times
+from support.sources import parsed
 
 ROOT = Path(__file__).parents[2]
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
@@ -26,7 +27,7 @@ def test_no_archive_is_unpacked() -> None:
     for path in SOURCES:
         if "vendor" in path.parts:  # rebuilds the library of the pages, not part of the program
             continue
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(parsed(path)):
             if not isinstance(node, ast.Call):
                 continue
             name = ast.unparse(node.func)

@@ -42,6 +42,7 @@ from physion.models.encoders.weights import (
     weights_packages,
 )
 from support.programs import absent
+from support.sources import parsed
 
 NAME, SIZE = "test_resnet", 64
 
@@ -240,7 +241,7 @@ def test_no_module_reads_anything_that_could_run_code() -> None:
     """Of all modules of the package, seen as syntax trees."""
     found = []
     for path in Path(physion.__file__).parent.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(parsed(path)):
             if not isinstance(node, ast.Call):
                 continue
             name = ast.unparse(node.func)

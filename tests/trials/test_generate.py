@@ -164,6 +164,7 @@ def test_more_trials_later_change_none_of_the_first(finished: Path, tmp_path: Pa
     assert tree_digest(tmp_path / "s") == tree_digest(finished)
 
 
+@pytest.mark.slow
 def test_workers_and_order_do_not_matter(finished: Path, tmp_path: Path) -> None:
     # Scenes keep the index that they have in their set, whatever the order of work.
     tasks = scenes_named("a", "b", "c", "d")

@@ -156,7 +156,7 @@ def from_start(noise: Path) -> dict[tuple[int, int] | None, NDArray[np.uint8]]:
 
 
 @settings(
-    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(data=st.data(), size=st.sampled_from(SIZES))
 def test_seeking_gives_the_bytes_of_decoding_from_the_start(

@@ -231,7 +231,7 @@ def as_table(rows: Sequence[Mapping[Any, Any]]) -> pd.DataFrame:
 def _plain(table: pd.DataFrame) -> pd.DataFrame:
     """Return a table whose labels are plain bools, if none of them is missing."""
     complete = [name for name in ("contact", "observed_contact") if table[name].notna().all()]
-    return table.astype(dict.fromkeys(complete, "bool"))
+    return table.astype({name: "bool" for name in complete if table[name].dtype != bool})
 
 
 def write_index(folder: Path, table: pd.DataFrame) -> Path:
@@ -288,7 +288,9 @@ def _read_columns(path: Path, content: bytes) -> pd.DataFrame:
         for name, dtype in COLUMNS.items():
             _check_type(path, stored.column(name), name, dtype)
         table: pd.DataFrame = stored.to_pandas()
-        return _plain(table.astype(COLUMNS))
+        # To convert all columns takes longer than to read them.
+        other = {name: d for name, d in COLUMNS.items() if str(table[name].dtype) != d}
+        return _plain(table.astype(other))
     except (pa.ArrowException, OSError, ValueError, KeyError, TypeError, OverflowError) as error:
         reason = " ".join(str(error).split())
         raise BadInputError(f"{path} cannot be read: {reason}; {_AGAIN}") from error

@@ -8,8 +8,6 @@ frames.
 from __future__ import annotations
 
 import io
-import os
-import threading
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -280,6 +278,7 @@ class MovieEncoder:
             src_color_range=ColorRange.JPEG,
             dst_color_range=ColorRange.MPEG,
             interpolation=_CONVERSION,
+            threads=1,
         )
 
     def finish(self) -> bytes:
@@ -415,38 +414,17 @@ def count_frames(path: Path) -> int:
         return decoder.frames
 
 
-class _Reformatters(threading.local):
-    """One reformatter for each thread: it keeps tables between pictures of one size."""
-
-    def __init__(self) -> None:
-        self.rgb = VideoReformatter()
-
-
-_reformatters = _Reformatters()
-_of_parents: list[_Reformatters] = []
-
-
-def _renew_reformatters() -> None:
-    """Replace the reformatters in a forked process, which has none of the threads they wait for."""
-    global _reformatters
-    # To free them would wait for the threads, too.
-    _of_parents.append(_reformatters)
-    _reformatters = _Reformatters()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_renew_reformatters)
-
-
 def _convert_all(
     decoder: MovieDecoder, frames: Sequence[int], size: tuple[int, int] | None
 ) -> NDArray[np.uint8]:
     """Return the pictures of ``frames`` as (len(frames), height, width, 3) in sRGB."""
     out = np.empty((0, 0, 0, 3), np.uint8)
-    # Conversion takes as long as decoding, so only the needed frames are converted.
+    # Conversion takes as long as decoding, so only the needed frames are converted. Further threads
+    # would take longer to wake up than pictures of these sizes take.
+    reformatter = VideoReformatter()
     for row, picture in enumerate(decoder.pictures(frames)):
         height, width = size or (picture.height, picture.width)
-        rgb: Any = _reformatters.rgb.reformat(
+        rgb: Any = reformatter.reformat(
             picture,
             width=width,
             height=height,
@@ -455,6 +433,7 @@ def _convert_all(
             src_color_range=ColorRange.MPEG,
             dst_color_range=ColorRange.JPEG,
             interpolation=_CONVERSION,
+            threads=1,
         )
         if row == 0:
             out = np.empty((len(frames), height, width, 3), np.uint8)

@@ -140,6 +140,7 @@ def test_every_measure_is_what_it_says(models: Models, answers: ScenarioAnswers)
     assert undefined["reason"].str.contains("P\\(contact\\) is constant").all()
 
 
+@pytest.mark.slow
 def test_intervals_match_leaving_out_people_or_stimuli(
     models: Models, answers: ScenarioAnswers
 ) -> None:

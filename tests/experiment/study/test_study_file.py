@@ -123,7 +123,7 @@ STUDIES = st.builds(
 
 
 @given(STUDIES)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_what_is_written_is_read_back(study: Study) -> None:
     text = format_settings(study, Path())
     read = parse_settings(tomllib.loads(text), study.folder / "study.toml")

@@ -272,6 +272,7 @@ def limits(axes: object, axis: int) -> Range:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["support", "contain", "link"])
 def test_official_trials_could_have_been_drawn(scenario: str, official: Path) -> None:
     """Every number of the official command logs lies in the range of its preset."""
@@ -319,6 +320,7 @@ def test_official_trials_could_have_been_drawn(scenario: str, official: Path) ->
             assert len(scene.joints) == params.stand.attached + params.stand.capped
 
 
+@pytest.mark.slow
 def test_stacks_start_at_the_official_height(official: Path) -> None:
     """Height of the lowest body above the top of the stand: equal medians within 3 cm."""
     for scenario, module in (("contain", contain), ("link", link)):

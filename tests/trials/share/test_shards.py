@@ -235,6 +235,7 @@ def test_a_bad_file_does_not_stop_the_other_shards(tmp_path: Path) -> None:
     assert len(export_shards(folder, out, shard_bytes=1)) == 3
 
 
+@pytest.mark.slow
 def test_several_processes_write_the_same_shards(dataset: Path, tmp_path: Path) -> None:
     steps: list[tuple[str, int, int]] = []
     serial = export_shards(dataset, tmp_path / "serial", shard_bytes=1)

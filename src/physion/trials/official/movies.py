@@ -81,6 +81,7 @@ class SourceMovie:
                         format="rgb24",
                         src_colorspace=self._matrix,
                         dst_color_range=ColorRange.JPEG,
+                        threads=1,
                     )
                     yield rgb.to_ndarray()  # type: ignore[misc]
             except av.FFmpegError as error:

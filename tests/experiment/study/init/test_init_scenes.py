@@ -52,6 +52,7 @@ def test_a_larger_study_adds_trials_to_a_smaller_one(seen: set[str]) -> None:
     assert {task.trial for task in few.tasks} < {task.trial for task in many.tasks}
 
 
+@pytest.mark.slow
 def test_scenes_whose_simulation_ends_otherwise_are_left_out_and_counted(seen: set[str]) -> None:
     trials = collide()
     chosen = choose(trials, seen, test=100)
