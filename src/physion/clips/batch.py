@@ -98,9 +98,16 @@ class Spec:
         """Whether the model asks for anything that the camera sees."""
         return any(name in PIXELS for name in self.inputs)
 
-    def context_frames(self) -> tuple[int, ...]:
-        """Return the frames of the context; all are observed."""
-        return tuple(self.first + step * self.stride for step in range(self.context))
+    def context_frames(self, last: int = LAST_OBSERVED) -> tuple[int, ...]:
+        """Return the frames of the context, none after ``last``; all are observed.
+
+        If fewer than ``context`` frames fit, the first one is repeated in front.
+        """
+        if self.context_at == "start":
+            shown = tuple(range(0, last + 1, self.stride))[: self.context]
+        else:
+            shown = tuple(range(last, -1, -self.stride))[: self.context][::-1]
+        return (shown[0],) * (self.context - len(shown)) + shown
 
     def steps_after(self, length: int) -> int:
         """Return how many frames follow the context in a clip of a motion of ``length`` frames.

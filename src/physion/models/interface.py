@@ -205,6 +205,8 @@ class Model:
         The readout whose row the model makes by `predict` or `fit`: ``observed``,
         ``observed+simulated``, or ``full`` if it is shown the outcome. A model with `encode` sets
         ``full`` if its features always include the outcome, so that they are no other row.
+    benchmark
+        Rules by which its features were made (`physion.readout.benchmark`); empty: any.
     trained
         Whether the weights are pretrained, so that training is skipped.
     learns_from
@@ -225,6 +227,7 @@ class Model:
     seed: int | None = None
     arguments: Mapping[str, tuple[float, ...]] = MappingProxyType({})
     answers: str = ""
+    benchmark: str = ""
     trained: bool = False
     learns_from: LearnsFrom = "clips"
     window: int = 0

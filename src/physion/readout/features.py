@@ -434,7 +434,7 @@ class FeatureStore:
 
         digest = ask(model, "encoder_digest")
         work = _Work("features", digest, compute, model_name(model), part)
-        steps = {trial: _clip_steps(source, trial, part) for trial in dict.fromkeys(trials)}
+        steps = {trial: source.steps(trial, part) for trial in dict.fromkeys(trials)}
         rows = self._rows(work, source, steps, progress)
         whole = part == "whole"
         return StoredFeatures(trials, [rows[trial] for trial in trials], repeated=whole)
@@ -657,13 +657,6 @@ def _stored(paths: Mapping[str, Path]) -> dict[str, FeatureFile]:
     """Return what is stored, by trial."""
     opened = ((trial, open_features(path)) for trial, path in paths.items())
     return {trial: file for trial, file in opened if file is not None}
-
-
-def _clip_steps(source: Any, trial: str, part: Part) -> int:
-    """Return the number of frames of a part of a trial's clip."""
-    if part == "context":
-        return int(source.spec.context)
-    return len(source.spec.all_frames(source.length(trial)))
 
 
 def _groups(steps: Mapping[str, int], size: Callable[[int], int]) -> list[tuple[str, ...]]:

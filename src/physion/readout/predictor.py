@@ -18,6 +18,7 @@ from physion.clips.source import ObservedSource, WholeSource
 from physion.compute.tasks import Executor, Progress
 from physion.core.errors import BadInputError
 from physion.models.interface import Model, TrainingSettings, ask, can
+from physion.readout.benchmark import V1, Benchmark
 from physion.readout.decisions import Decided, Decision, Readout, decisions
 from physion.readout.features import Arguments, FeatureStore, Imagined, StoredFeatures
 from physion.readout.folds import Fold, Protocol, ScenarioSplit
@@ -69,8 +70,8 @@ def build_decision(model: Model, wanted: str, settings: LogisticSettings) -> Dec
     return decision
 
 
-def ways(model: Model, decision: str = "") -> dict[Readout, Way]:
-    """Return the readouts that a model supports, and the way of each.
+def ways(model: Model, decision: str = "", rules: Benchmark = V1) -> dict[Readout, Way]:
+    """Return the readouts that a model supports under some rules, and the way of each.
 
     Raises `BadInputError` for a model without any.
     """
@@ -78,7 +79,8 @@ def ways(model: Model, decision: str = "") -> dict[Readout, Way]:
     if can(model, "encode"):
         if ask(model, "answers") != Readout.FULL.value:
             found[Readout.OBSERVED] = Way.FEATURES
-        if model.spec.future != 0:
+        # A window for detection needs no more frames than a model asks for.
+        if model.spec.future != 0 or (rules.window is not None and model.spec.inputs):
             found[Readout.FULL] = Way.FEATURES
     if can(model, "imagine"):
         needs = decisions.get(decision_name(model, decision))(LogisticSettings()).input
@@ -90,15 +92,24 @@ def ways(model: Model, decision: str = "") -> dict[Readout, Way]:
             f"{model_name(model)} has none of the methods encode, imagine, predict and fit, so "
             "that it cannot be evaluated"
         )
-    return {readout: found[readout] for readout in Readout if readout in found}
+    possible = [readout for readout in Readout if readout in found]
+    kept = [readout for readout in possible if readout.value in rules.readouts]
+    if not kept:
+        raise BadInputError(
+            f"{model_name(model)} has the readouts {', '.join(r.value for r in possible)}, but "
+            f"{rules.name} needs one of {', '.join(rules.readouts)}; leave out --benchmark"
+        )
+    return {readout: found[readout] for readout in kept}
 
 
-def choose_readouts(model: Model, names: tuple[str, ...], decision: str = "") -> dict[Readout, Way]:
+def choose_readouts(
+    model: Model, names: tuple[str, ...], decision: str = "", rules: Benchmark = V1
+) -> dict[Readout, Way]:
     """Return the requested readouts, by default all that the model supports.
 
     Raises `BadInputError` for a readout that the model does not support.
     """
-    possible = ways(model, decision)
+    possible = ways(model, decision, rules)
     requested = [Readout.named(name) for name in names]
     impossible = [readout.value for readout in requested if readout not in possible]
     if impossible:
@@ -148,6 +159,8 @@ class Predictor:
         Readouts that ship for the model, which are not fitted here.
     fit_on
         Name and digest of the set with the fit trials; empty if they are the dataset's own.
+    rules
+        Which frames are shown.
     executor
         Runs simulations; by default they run in this process.
     progress
@@ -167,10 +180,12 @@ class Predictor:
         seed: int = 0,
         shipped: ShippedReadouts | None = None,
         fit_on: str = "",
+        rules: Benchmark = V1,
         executor: Executor | None = None,
         progress: Progress | None = None,
     ) -> None:
         self.dataset, self.model, self.ways, self.settings = dataset, model, ways, settings
+        self.rules = rules
         self.seed, self.progress = seed, progress
         self._protocol, self._shipped, self._fit_on = protocol, shipped, fit_on
         index = dataset.index.set_index("trial")
@@ -227,11 +242,24 @@ class Predictor:
 
     @cached_property
     def _observed(self) -> ObservedSource:
-        return observed_source(self.dataset, self.model.spec, rendered=self.settings.rendered)
+        return observed_source(
+            self.dataset,
+            self.model.spec,
+            rendered=self.settings.rendered,
+            last=self.rules.last_frames(self.dataset.index),
+        )
 
     @cached_property
     def _whole(self) -> WholeSource:
-        return whole_source(self.dataset, self.model.spec, rendered=self.settings.rendered)
+        index = self.dataset.index
+        return whole_source(
+            self.dataset,
+            self.model.spec,
+            rendered=self.settings.rendered,
+            last=self.rules.last_frames(index),
+            # A table of features needs no frames.
+            windows=self.rules.windows(self.rules.select(index)) if self.model.spec.inputs else {},
+        )
 
     def _longest(self, split: ScenarioSplit) -> int:
         """Return the frames of the longest trial that the readout of a scenario sees."""

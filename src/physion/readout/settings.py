@@ -79,6 +79,10 @@ class TrainSettings(HarnessSettings):
 class EvaluationSettings(HarnessSettings):
     """Settings of evaluations."""
 
+    benchmark: str = ""
+    """Rules: v1, of the paper, or v1.5, of physion_evaluator (seven scenarios, Collide cut at frame
+    15, one readout of all scenarios, detection around the contact). Default: v1, but v1.5 for files
+    of features that physion_evaluator wrote."""
     readouts: tuple[str, ...] = ()
     """Readouts: observed, observed+simulated, full. Default: all that the model supports."""
     decision: str = ""

@@ -29,7 +29,12 @@ from physion.analysis.people.results import (
 )
 from physion.analysis.population import PopulationResults
 from physion.analysis.published.tables import PublishedTables, read_published
-from physion.analysis.results import published_rows, results_table, zone_of_people
+from physion.analysis.results import (
+    frames_with_benchmark,
+    published_rows,
+    results_table,
+    zone_of_people,
+)
 from physion.analysis.rollout_errors import read_rollout_errors, rollout_error_table
 from physion.analysis.scores import AVERAGES, shown_average
 from physion.analysis.tables import (
@@ -172,12 +177,15 @@ class CompareResult:
 def as_text(results: pd.DataFrame) -> pd.DataFrame:
     """Return a table of results (`results_table`) for a terminal.
 
-    Columns: ``model``, ``given``, ``stimuli`` where their number differs, and ``accuracy``,
-    ``r with people`` and ``kappa`` with their intervals, as far as they are known.
+    Columns: ``model``, ``given``, ``frames`` with the benchmark, ``stimuli`` where their number
+    differs, and ``accuracy``, ``r with people`` and ``kappa`` with their intervals, as far as they
+    are known.
     """
     table = results[["row"]].set_axis(["model"], axis=1)
     if (results["given"] != "").any():
         table["given"] = results["given"]
+    if (results["frames"] != "").any():
+        table["frames"] = frames_with_benchmark(results)
     if results["stimuli"].nunique() > 1:
         table["stimuli"] = results["stimuli"]
     for heading, name in (("accuracy", "accuracy"), ("r with people", "r"), ("kappa", "kappa")):
@@ -354,6 +362,7 @@ def compare(
         published=None if tables is None else published_rows(tables, scenarios),
         zone=None if tables is None else zone_of_people(tables, scenarios),
         model_inputs=_by_model(rows, "inputs"),
+        model_seen=_seen(rows),
         model_weights=_by_model(rows, "init"),
         rollout_errors=None if errors is None else rollout_error_table(errors, draws.level),
     )
@@ -437,6 +446,13 @@ def _by_model(rows: pd.DataFrame, column: str) -> dict[str, str]:
     return {
         str(model): " or ".join(values) for model, values in pairs.groupby("base_model")[column]
     }
+
+
+def _seen(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return frames and benchmark by model; frames of several scenarios are joined by ``or``."""
+    return rows.groupby("model", sort=False)[["frames", "benchmark"]].agg(
+        lambda values: " or ".join(filter(None, dict.fromkeys(values)))
+    )
 
 
 @dataclass(frozen=True)
