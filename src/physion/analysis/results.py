@@ -21,7 +21,7 @@ MARKED = (
     "stimuli"
 )
 RESULTS = (
-    "row", "group", "readout", "given", "frames", "benchmark", "stimuli", "accuracy",
+    "row", "group", "readout", "given", "frames", "benchmark", "check", "stimuli", "accuracy",
     "accuracy_low", "accuracy_high", "r", "r_low", "r_high", "kappa", "kappa_low", "kappa_high",
     "source",
 )  # fmt: skip
@@ -29,8 +29,11 @@ RESULTS = (
 
 - ``group``: people, model, baseline or published. ``given``: what a row was given of a trial.
 - ``frames``: first and last frame that it saw, and how many a second, if its predictions say so.
-- ``benchmark``: rules of the evaluation, v1 or v1.5, likewise.
+- ``benchmark``: rules of the evaluation, v1 or v1.5, and ``check``: verdict of a check, likewise.
 """
+
+SEEN = ("frames", "benchmark", "check")
+"""Columns that predictions may have, too."""
 
 GIVEN = {
     "rgb": "pixels",
@@ -75,7 +78,7 @@ def published_rows(tables: PublishedTables, scenarios: Collection[str]) -> pd.Da
         records.append(_published(name, given, runs[runs["model"] == model]))
     if set(scenarios) == set(SCENARIOS):
         records += [
-            {"row": name + MARK, "group": "published", "given": given, "frames": "",
+            {"row": name + MARK, "group": "published", "given": given, "frames": "", "check": "",
              "benchmark": "v1", "accuracy": accuracy, "source": source}
             for name, given, accuracy, source in OTHER_STUDIES
         ]  # fmt: skip
@@ -88,7 +91,7 @@ def _published(
     """Return a row with the means over scenarios of the means of the seeds."""
     means = rows.groupby("scenario")[["accuracy", "kappa"]].mean().mean()
     about = {"row": name + MARK, "group": group, "given": given, "frames": "", "benchmark": "v1"}
-    about |= {"source": STUDY}
+    about |= {"check": "", "source": STUDY}
     return {**about, "accuracy": means["accuracy"], "kappa": means["kappa"]}
 
 
@@ -123,7 +126,7 @@ def results_table(
     published
         From `published_rows`.
     seen
-        ``frames`` and ``benchmark`` by model (index), which may be empty.
+        Columns `SEEN` by model (index), whose values may be empty.
 
     Returns
     -------
@@ -145,7 +148,7 @@ def results_table(
         "stimuli": rows["stimuli"],
         "source": "",
     }
-    for column in ("frames", "benchmark"):
+    for column in SEEN:
         known = {} if seen is None else seen[column].to_dict()
         values[column] = [known.get(name, "") for name in rows["model"]]
     for name, column in (("accuracy", "accuracy"), ("r", "r"), ("kappa", kappa)):

@@ -342,6 +342,7 @@ PREDICTIONS: tuple[Column, ...] = (
     Column("inputs", "text", "What the model was given of a trial", also=("Inputs",)),
     Column("frames", "text", "Frames that the model saw of a trial, and how many a second"),
     Column("benchmark", "text", "Rules of the evaluation: v1 or v1.5"),
+    Column("check", "text", "Verdict of physion check: passed, refused, ..."),
     Column("init", "text", "Weights that the model started from", also=("Init",)),
     Column("protocol", "text", "Scenarios of the training: all, all-but, only, one",
            also=("Dynamics Training Dataset",)),

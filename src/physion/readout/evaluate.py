@@ -10,7 +10,7 @@ import functools
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -164,6 +164,8 @@ def evaluate(
     settings: EvaluationSettings | None = None,
     *,
     fit: Dataset | Path | str | None = None,
+    verdicts: Mapping[str, str] | None = None,
+    stored: Mapping[str, Path] | None = None,
     options: Mapping[str, Any] | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
@@ -193,6 +195,12 @@ def evaluate(
         Another dataset, whose trials of the splits training and readout take the place of the
         dataset's own, as in the paper. No motion may be in both, and look, frame rate and size of
         the movies must agree; a set without movies needs ``rendered``.
+    verdicts
+        By name of a model, as in ``models``, the verdict of its check, for the column ``check``
+        (`physion.readout.check.check_models`).
+    stored
+        By trial the folder of what models compute of it, for trials that several evaluations with
+        different ``out`` share.
     options
         Fields of the settings of the models, or of their training (`TrainingSettings`).
     executor
@@ -244,12 +252,12 @@ def evaluate(
     if fit is not None:
         fit_on = describe_fit(other)
     if elsewhere is None:
-        work = _Evaluate(trials, Path(out), settings, fit_on)
+        work = _Evaluate(trials, Path(out), settings, fit_on, verdicts or {}, stored or {})
         here = functools.partial(work, executor=executor, progress=progress, dry_run=dry_run)
         done = run_cells(cells, here, Path(out), "evaluations", None, progress, finished)
         return Evaluation(*done)
     # Its processes may have another working directory.
-    there = _Evaluate(trials, Path(out).absolute(), settings, fit_on)
+    there = _Evaluate(trials, Path(out).absolute(), settings, fit_on, verdicts or {}, stored or {})
     done = run_cells(cells, there, Path(out), "evaluations", elsewhere, progress, finished)
     return Evaluation(*done)
 
@@ -274,6 +282,8 @@ class _Evaluate:
     out: Path
     settings: EvaluationSettings
     fit_on: str = ""
+    verdicts: Mapping[str, str] = field(default_factory=dict)
+    stored: Mapping[str, Path] = field(default_factory=dict)
 
     def __call__(
         self,
@@ -336,6 +346,7 @@ class _Evaluate:
             shipped=shipped,
             fit_on=self.fit_on,
             rules=rules,
+            stored=self.stored,
             executor=executor,
             progress=progress,
         )
@@ -354,7 +365,8 @@ class _Evaluate:
         row = index.iloc[0]
         rate = round(float(row["frames"] / row["playback_seconds"]), 3)
         frames = functools.partial(rules.describe_frames, model.spec, rate=rate)
-        table = make_table(predictions, provenance, index, rules.name, frames)
+        verdict = self.verdicts.get(cell.chosen.name, "")
+        table = make_table(predictions, provenance, index, rules.name, frames, verdict)
         if table.empty:
             reason = next(iter(predictor.problems.values()), "there is no trial to predict")
             raise BadInputError(f"{provenance.model} predicts no trial: {reason}")
@@ -405,6 +417,7 @@ class _Evaluate:
         facts = dataclasses.asdict(provenance)
         inputs = [_VERSION, __version__, kept, facts, options, of_training, model.digest()]
         inputs.append(shipped.sha256 if shipped is not None else self.fit_on)
+        inputs += filter(None, [self.verdicts.get(cell.chosen.name)])
         sha = hashlib.sha256(json.dumps(inputs, sort_keys=True, default=str).encode())
         sha.update(self.dataset.index[_HASHED_COLUMNS].to_csv(index=False).encode())
         name = f"{file_name(provenance.model)}-{sha.hexdigest()[:12]}.csv"

@@ -15,6 +15,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -384,12 +385,21 @@ class FeatureStore:
         Clips of `_FRAMES` frames that a model receives at a time, the *encoder batch*.
     executor
         Runs models whose futures are imagined in processes.
+    elsewhere
+        By trial another folder, for trials whose files are shared by several stores.
     """
 
-    def __init__(self, folder: Path, *, batch: int = 4, executor: Executor | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        batch: int = 4,
+        executor: Executor | None = None,
+        elsewhere: Mapping[str, Path] = MappingProxyType({}),
+    ) -> None:
         if batch < 1:
             raise BadInputError(f"the encoder batch must be at least 1, not {batch}")
-        self._folder, self._batch = folder, batch
+        self._folder, self._batch, self._elsewhere = folder, batch, elsewhere
         self._executor: Executor = executor if executor is not None else SerialExecutor()
         self.problems: dict[str, str] = {}
         """Reasons of trials that could not be imagined in processes, by name."""
@@ -617,7 +627,8 @@ class FeatureStore:
         """Return the file of a trial, named by all that its arrays depend on."""
         identity = [_VERSION, digest, key, trial, work.part, work.settings, steps]
         name = digest_of(json.dumps(identity))
-        return self._folder / work.part / digest[:16] / name[:2] / f"{name}.safetensors"
+        folder = self._elsewhere.get(trial, self._folder)
+        return folder / work.part / digest[:16] / name[:2] / f"{name}.safetensors"
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from enum import Enum
 from functools import cached_property, partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -161,6 +162,8 @@ class Predictor:
         Name and digest of the set with the fit trials; empty if they are the dataset's own.
     rules
         Which frames are shown.
+    stored
+        By trial the folder of its features, where it is not in ``folder``.
     executor
         Runs simulations; by default they run in this process.
     progress
@@ -181,6 +184,7 @@ class Predictor:
         shipped: ShippedReadouts | None = None,
         fit_on: str = "",
         rules: Benchmark = V1,
+        stored: Mapping[str, Path] = MappingProxyType({}),
         executor: Executor | None = None,
         progress: Progress | None = None,
     ) -> None:
@@ -199,7 +203,10 @@ class Predictor:
             }
         )
         self._store = FeatureStore(
-            folder / "features", batch=settings.encoder_batch, executor=executor
+            folder / "features",
+            batch=settings.encoder_batch,
+            executor=executor,
+            elsewhere=stored,
         )
         self.problems: dict[str, str] = self._store.problems
         """Reasons of trials that could not be predicted, by name."""
@@ -339,8 +346,10 @@ class Predictor:
     def _decide_on_features(
         self, decision: Decision, split: ScenarioSplit, readout: Readout
     ) -> _Made:
-        trials = [*split.fit, *split.test]
-        parts = self._parts(trials, readout, self._future(split))
+        trials, future = [*split.fit, *split.test], self._future(split)
+        if split.fit:  # so that no batch holds trials of both kinds
+            self._parts(split.fit, readout, future)
+        parts = self._parts(trials, readout, future)
         rows = np.arange(len(trials))
         count = len(split.fit)
         fit = [part.select(rows[:count]) for part in parts]
@@ -387,26 +396,31 @@ class Predictor:
         self, splits: Sequence[ScenarioSplit], decision: Decision
     ) -> dict[Arguments, Imagined]:
         """Return what could be imagined of the trials that a decision needs, with all arguments."""
-        future = {}
+        fit: dict[str, int] = {}
+        test: dict[str, int] = {}
         for split in splits:
             steps = self._future(split)
-            for trial in (*_fit_trials(decision, split), *split.test):
-                future[trial] = steps[trial]
+            fit |= {trial: steps[trial] for trial in _fit_trials(decision, split)}
+            test |= {trial: steps[trial] for trial in split.test}
         samples, seed, arguments = self._rollout_settings()
         model = self.model
         shared = ask(model, "trials_together")
-        return self._store.imagined(
-            model,
-            self._observed,
-            list(future),
-            samples=samples,
-            seed=seed,
-            arguments=arguments,
-            future=future,
-            # A network stays in this process, unless it says otherwise.
-            together=shared if is_network(model) else max(shared, 1),
-            progress=self.progress,
-        )
+        imagined: dict[Arguments, Imagined] = {}
+        # The trials to fit on first, so that no group holds trials of both kinds.
+        for future in ([fit] if fit else []) + [fit | test]:
+            imagined = self._store.imagined(
+                model,
+                self._observed,
+                list(future),
+                samples=samples,
+                seed=seed,
+                arguments=arguments,
+                future=future,
+                # A network stays in this process, unless it says otherwise.
+                together=shared if is_network(model) else max(shared, 1),
+                progress=self.progress,
+            )
+        return imagined
 
     def _decide_on_rollouts(self, decision: Decision, split: ScenarioSplit, _: Readout) -> _Made:
         found = self._imagined([split], decision)

@@ -18,7 +18,7 @@ from physion.readout.decisions import Decided
 
 COLUMNS = (
     "model", "readout", "protocol", "init", "seed", "stimulus", "scenario", "p_contact", "outcome",
-    "recorded_outcome", "observed_contact", "inputs", "frames", "benchmark", "decision",
+    "recorded_outcome", "observed_contact", "inputs", "frames", "benchmark", "check", "decision",
     "train_accuracy", "test_accuracy", "cv_accuracy", "fit_labels", "fit_trials", "fit_on", "fold",
     "readout_c", "noise_scale", "gap_threshold", "validation_loss", "copy_last_loss",
     "encoder_type", "encoder_pretraining_task", "encoder_pretraining_dataset",
@@ -33,6 +33,7 @@ COLUMNS = (
   `clips.batch.INPUTS` with commas, ``outcomes``, ``answers of people``, or ``base rate`` (nothing).
 - ``frames``: first and last frame that it sees, and how many a second of the movie, such as
   ``2 to 44, 5/s``; empty where it sees none here. ``benchmark``: rules (`readout.benchmark`).
+- ``check``: verdict of `physion.check`, such as ``passed``; empty if it was not asked for.
 - ``p_contact``: P(contact). ``outcome``: of the trial as it was shown; ``recorded_outcome``: of the
   official recording, empty where there is none; ``observed_contact``: whether agent and patient
   touched in the observed part already.
@@ -108,6 +109,7 @@ def make_table(
     index: pd.DataFrame,
     benchmark: str = "",
     frames: Callable[[str, str], str] = lambda readout, scenario: "",
+    verdict: str = "",
 ) -> pd.DataFrame:
     """Return the sorted table of predictions; ``frames``: as text, by readout and scenario."""
     truth = index.set_index("trial")
@@ -123,6 +125,7 @@ def make_table(
             "dynamics_training_dataset": part.dynamics_training_dataset,
             "seed": part.seed,
             "benchmark": benchmark,
+            "check": verdict,
             "decision": part.decision,
             "train_accuracy": decided.train_accuracy,
             "cv_accuracy": decided.cv_accuracy,

@@ -30,6 +30,7 @@ from physion.analysis.people.results import (
 from physion.analysis.population import PopulationResults
 from physion.analysis.published.tables import PublishedTables, read_published
 from physion.analysis.results import (
+    SEEN,
     frames_with_benchmark,
     published_rows,
     results_table,
@@ -177,15 +178,17 @@ class CompareResult:
 def as_text(results: pd.DataFrame) -> pd.DataFrame:
     """Return a table of results (`results_table`) for a terminal.
 
-    Columns: ``model``, ``given``, ``frames`` with the benchmark, ``stimuli`` where their number
-    differs, and ``accuracy``, ``r with people`` and ``kappa`` with their intervals, as far as they
-    are known.
+    Columns: ``model``, ``given``, ``frames`` with the benchmark, ``check``, ``stimuli`` where their
+    number differs, and ``accuracy``, ``r with people`` and ``kappa`` with their intervals, as far
+    as they are known.
     """
     table = results[["row"]].set_axis(["model"], axis=1)
     if (results["given"] != "").any():
         table["given"] = results["given"]
     if (results["frames"] != "").any():
         table["frames"] = frames_with_benchmark(results)
+    if (results["check"] != "").any():
+        table["check"] = results["check"]
     if results["stimuli"].nunique() > 1:
         table["stimuli"] = results["stimuli"]
     for heading, name in (("accuracy", "accuracy"), ("r with people", "r"), ("kappa", "kappa")):
@@ -449,8 +452,8 @@ def _by_model(rows: pd.DataFrame, column: str) -> dict[str, str]:
 
 
 def _seen(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return frames and benchmark by model; frames of several scenarios are joined by ``or``."""
-    return rows.groupby("model", sort=False)[["frames", "benchmark"]].agg(
+    """Return columns `SEEN` by model; frames of several scenarios are joined by ``or``."""
+    return rows.groupby("model", sort=False)[list(SEEN)].agg(
         lambda values: " or ".join(filter(None, dict.fromkeys(values)))
     )
 

@@ -31,7 +31,7 @@ class ReportInputs(ComparisonResults):
     - ``question``: what people and models were asked, for the movies.
     - ``model_inputs``: what a model was given, by its name: values of the column *Inputs*.
     - ``model_weights``: which weights a model started from, by its name: of the column *Init*.
-    - ``model_seen``: ``frames`` and ``benchmark`` of the predictions, by model (index), or None.
+    - ``model_seen``: columns `results.SEEN` of the predictions, by model (index), or None.
     - ``published``: from `published_rows`, or None; ``zone``: from `zone_of_people`, or None.
     - ``rollout_errors``: from `rollout_error_table`, or None.
     - ``movie_count``: largest number of disagreements that are shown as movies.

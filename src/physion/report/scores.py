@@ -94,17 +94,17 @@ def results(inputs: ReportInputs) -> Markup:
     rows = inputs.results()
     measures = {"accuracy": "accuracy", "r with people": "r", "kappa": "kappa"}
     chosen = measures if inputs.comparison.has_people else {"accuracy": "accuracy"}
-    known = (rows["frames"] != "").any()
-    frames = frames_with_benchmark(rows)
+    shown = {"frames": frames_with_benchmark(rows), "check": list(rows["check"])}
+    known = {name: of for name, of in shown.items() if (rows[name] != "").any()}
     cells = [
-        [str(row["row"]), str(row["given"]), *([seen] if known else []),
+        [str(row["row"]), str(row["given"]), *(of[k] for of in known.values()),
          *(_result(row, key) for key in chosen.values())]
-        for (_, row), seen in zip(rows.iterrows(), frames, strict=True)
+        for k, (_, row) in enumerate(rows.iterrows())
     ]  # fmt: skip
     published = (rows["source"] != "").any()
     sources = "; ".join(dict.fromkeys(rows.loc[rows["source"] != "", "source"]))
     caption = AVERAGES[shown_average(inputs.comparison.all_scores)].capitalize()
-    columns = ["", "given", *(["frames"] if known else []), *chosen]
+    columns = ["", "given", *known, *chosen]
     listing = table(columns, cells, f"{caption}, by accuracy")
     return listing + (paragraph(f"{MARKED} ({sources}).", "note") if published else Markup())
 
