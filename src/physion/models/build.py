@@ -79,6 +79,8 @@ models: Registry[ModelFactory] = Registry(
         "pDeIT-lstm": "physion.models.encoders.encoder:pdeit",
         "pEffNetLite0-mlp": "physion.models.encoders.encoder:peffnet",
         "pEffNetLite0-lstm": "physion.models.encoders.encoder:peffnet",
+        "pHEDVGG16-mlp": "physion.models.encoders.encoder:phedvgg16",
+        "pHEDVGG16-lstm": "physion.models.encoders.encoder:phedvgg16",
         "cswm": "physion.models.cswm:Cswm",
         "svg": "physion.models.svg:Svg",
         "op3": "physion.models.op3:Op3",
