@@ -64,12 +64,13 @@ from physion.report.build import build_people_report, build_report
 from physion.report.html import plural
 from physion.report.inputs import PeopleReport, ReportInputs
 from physion.report.people import describe_attributes
+from physion.tasks.logs import is_log, read_answers
 
 ZONE_FILE = "human_accuracy_by_scenario.csv"
 
 Predictions: TypeAlias = Mapping[str, Mapping[str, float]] | pd.DataFrame | Path | str
-"""P(contact) by model and stimulus; a table of `physion.analysis.tables.PREDICTIONS`; or its CSV
-file."""
+"""P(contact) by model and stimulus; a table of `physion.analysis.tables.PREDICTIONS`; its CSV file;
+or a log of answers of a language model (`physion.tasks.logs`)."""
 
 _LOOKS = {
     "plain": "those who saw free colours with flashing overlays, as in the paper",
@@ -233,9 +234,10 @@ def compare(
     Parameters
     ----------
     predictions
-        P(contact) by model and stimulus, tables, CSV files, or several of these. A table needs the
-        columns ``stimulus`` and ``p_contact`` only; `physion.analysis.tables.PREDICTIONS` has the
-        others. None: an analysis of the people in ``responses``.
+        P(contact) by model and stimulus, tables, CSV files, logs of answers of language models
+        (``.eval`` of Inspect, samples of lmms-eval), or several of these. A table needs the columns
+        ``stimulus`` and ``p_contact`` only; `physion.analysis.tables.PREDICTIONS` has the others.
+        None: an analysis of the people in ``responses``.
     humans
         Averages of people: ``official`` for the shipped ones, a folder of
         ``human_accuracy-*.csv``, or a table with ``stimulus``, ``scenario``, ``accuracy`` and
@@ -307,7 +309,7 @@ def compare(
         draws = Bootstrap(resamples, seed=seed)
     except ValueError as error:
         raise BadInputError(f"resamples {resamples}: {error}") from error
-    rows, grouped = _rows(predictions, groups)
+    rows, grouped, missing = _rows(predictions, groups)
     files = [Path(responses)] if isinstance(responses, str | Path) else [*map(Path, responses)]
     if rows is None and not files:
         raise BadInputError(
@@ -356,6 +358,7 @@ def compare(
             zone_origin=averages.zone_origin, **asked, **settings,
         )  # fmt: skip
         results = replace(results, warnings=(*results.warnings, *averages.warnings))
+    results = replace(results, warnings=(*results.warnings, *missing))
     tables, scenarios = None, in_order(results.comparison.stimuli["scenario"])
     if results.comparison.has_people and set(scenarios) <= set(SCENARIOS) and not files:
         tables = _published_of(results.comparison.stimuli["stimulus"])
@@ -385,16 +388,16 @@ def _released() -> PublishedTables:
 def _rows(
     predictions: Predictions | Sequence[Predictions],
     groups: Sequence[str | Path | pd.DataFrame],
-) -> tuple[pd.DataFrame | None, list[str]]:
-    """Return all predictions as one table with unique names of models, and the columns of groups.
+) -> tuple[pd.DataFrame | None, list[str], list[str]]:
+    """Return all predictions as one table, the columns of groups, and warnings of logs.
 
-    The table is None if there is none.
+    Names of models are unique. The table is None if there is none.
     """
     if isinstance(predictions, Mapping | pd.DataFrame | Path | str):
         given: Sequence[Predictions] = [predictions]
     else:
         given = predictions
-    tables, raw = [], []
+    tables, raw, warnings = [], [], list[str]()
     for one in given:
         if isinstance(one, Mapping):
             for model, values in one.items():
@@ -406,11 +409,16 @@ def _rows(
             tables.append(("a table", check_predictions(one)))
         else:
             path = Path(one)
-            raw.append(read_csv(path))
+            if is_log(path):
+                log = read_answers(path)
+                raw.append(log.predictions)
+                warnings += log.warnings
+            else:
+                raw.append(read_csv(path))
             tables.append((str(path), check_predictions(raw[-1], str(path), path.stem)))
     if not tables:
-        return None, []
-    return _with_groups(join_predictions(tables), raw, groups)
+        return None, [], []
+    return *_with_groups(join_predictions(tables), raw, groups), warnings
 
 
 def _with_groups(
