@@ -18,7 +18,14 @@ from physion.core.errors import BadInputError, MissingExtraError, UnknownNameErr
 from physion.tasks.logs import read_answers
 from physion.trials.dataset import Dataset
 from physion.trials.share.items import Item, frames_of, items_of, movie_of
-from physion.trials.share.questions import Answer, judged, measures, options_of, prompt, read_answer
+from physion.trials.share.questions import (
+    JudgedAnswer,
+    judged,
+    measures,
+    options_of,
+    prompt,
+    read_answer,
+)
 from physion.trials.video import read_frames
 from support.red_and_yellow import OBSERVED, make_dataset
 
@@ -55,7 +62,7 @@ def test_answers_are_read_by_rule(text: str, answer: str) -> None:
         assert read_answer(text, ("no", "yes")) == swapped[answer], "letters go with the order"
 
 
-def test_measures_equal_those_of_the_analysis() -> None:
+def test_measures_are_as_in_the_analysis() -> None:
     rng = np.random.default_rng(3)
     contact, said = rng.random(40) < 0.4, rng.random(40) < 0.6
     words = np.array(["no", "yes"])
@@ -89,6 +96,7 @@ def test_items_ask_in_both_orders(dataset: Dataset) -> None:
     first, second = (prompt("contact", order).splitlines() for order in (0, 1))
     assert first[2:4] == ["A) yes", "B) no"] and second[2:4] == ["A) no", "B) yes"]
     assert first[:2] == second[:2]
+    assert first[-1] == "Answer with the letter of one option only."
     assert len({prompt("contact", 0, wording) for wording in (1, 2, 3)}) == 3
 
 
@@ -236,4 +244,4 @@ def test_a_log_of_inspect_says_what_it_needs(tmp_path: Path) -> None:
 
 def test_the_first_option_of_a_control_is_named() -> None:
     assert options_of("left", 1) == ("yellow", "red")
-    assert judged("a", "left", "yellow", "red") == Answer("a", "yellow", 1, 1, 0)
+    assert judged("a", "left", "yellow", "red") == JudgedAnswer("a", "yellow", 1, 1, 0)

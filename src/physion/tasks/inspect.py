@@ -3,7 +3,7 @@
 ``inspect eval physion/contact --model PROVIDER/MODEL -T dataset=FOLDER`` asks whether red will
 touch yellow; ``physion/perception`` asks about what is shown, as a control. Each question is asked
 twice, with its options in both orders. ``physion compare LOG.eval`` compares the answers with
-people. Questions, reading of answers and measures are those of `physion.trials.share.questions`.
+people. Questions, reading of answers and measures come from `physion.trials.share.questions`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from physion.trials.share.items import Item, Shown, frames_of, items_of, movie_o
 from physion.trials.share.questions import (
     VERSION,
     WORDINGS,
-    Answer,
+    JudgedAnswer,
     judged,
     measures,
     prompt,
@@ -207,10 +207,10 @@ def _measured(name: str) -> Callable[[list[SampleScore]], float]:
     return value
 
 
-def _answer(score: SampleScore) -> Answer:
+def _answer(score: SampleScore) -> JudgedAnswer:
     about, value = score.sample_metadata or {}, score.score.as_dict()
     numbers = (float(value[name]) for name in ("first", "readable", "right"))
-    return Answer(
+    return JudgedAnswer(
         f"{about['trial']} {about['question']}",
         str((score.score.metadata or {})["truth"]),
         *numbers,

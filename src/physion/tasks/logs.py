@@ -168,13 +168,13 @@ def _check_version(given: object, path: Path) -> None:
         )
 
 
-def _predictions(path: Path, found: _Collected) -> AnswerLog:
+def _predictions(path: Path, log: _Collected) -> AnswerLog:
     """Return one row per stimulus, and warnings of what is missing or cannot be read."""
     by_trial: dict[str, list[tuple[Asked, str]]] = defaultdict(list)
     missing, unreadable = [], 0
-    for name, asked in sorted(found.asked.items()):
+    for name, asked in sorted(log.asked.items()):
         options = options_of(asked.question, asked.order)
-        texts = found.answers.get(name, [])
+        texts = log.answers.get(name, [])
         missing += [] if texts else [name]
         answers = [read_answer(text, options) for text in texts] or [""]
         unreadable += sum(not answer for answer in answers) - (not texts)
@@ -182,15 +182,15 @@ def _predictions(path: Path, found: _Collected) -> AnswerLog:
     warnings = []
     if missing:
         names = ", ".join(missing[:_NAMED]) + (", ..." if len(missing) > _NAMED else "")
-        again = f"; {found.again}" if found.again else ""
+        again = f"; {log.again}" if log.again else ""
         warnings.append(
-            f"{path}: {len(missing)} of {len(found.asked)} answers are missing and count as wrong "
+            f"{path}: {len(missing)} of {len(log.asked)} answers are missing and count as wrong "
             f"({names}){again}"
         )
     if unreadable:
         warnings.append(f"{path}: {unreadable} answers name no option and count as wrong")
     rows = [_row(trial, answers) for trial, answers in sorted(by_trial.items())]
-    table = pd.DataFrame(rows).assign(model=found.model, inputs=found.inputs)
+    table = pd.DataFrame(rows).assign(model=log.model, inputs=log.inputs)
     return AnswerLog(table, tuple(warnings))
 
 

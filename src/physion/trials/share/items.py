@@ -65,7 +65,7 @@ def items_of(
     dataset
         Dataset of the trials.
     split, scenario
-        Trials; by default those of all scenarios of the split testing.
+        Trials; by default all of the split testing.
     control
         Ask what is seen (`physion.trials.share.questions.PERCEPTION`), not what will happen.
 

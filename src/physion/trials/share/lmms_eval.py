@@ -103,7 +103,7 @@ def _results(item, texts, names):
 
 
 def _measure(name):
-    return lambda rows: measures(Answer(*row) for row in rows)[name]
+    return lambda rows: measures(JudgedAnswer(*row) for row in rows)[name]
 
 
 asked = len

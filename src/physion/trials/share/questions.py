@@ -95,7 +95,7 @@ def _named(line: str, options: Sequence[str]) -> set[str]:
     return {by_letter[letter] for letter in letters} | (words if starts else set())
 
 
-class Answer(NamedTuple):
+class JudgedAnswer(NamedTuple):
     """Answer to a question, or the mean of several answers to it; each value lies in 0..1.
 
     - ``stimulus``, ``truth``: what was asked about, and the right option;
@@ -110,13 +110,13 @@ class Answer(NamedTuple):
     right: float
 
 
-def judged(stimulus: str, question: str, truth: str, answer: str) -> Answer:
+def judged(stimulus: str, question: str, truth: str, answer: str) -> JudgedAnswer:
     """Return an answer, an option or an empty text, with what is right about it."""
     first = float(answer == options_of(question, 0)[0])
-    return Answer(stimulus, truth, first, float(bool(answer)), float(answer == truth))
+    return JudgedAnswer(stimulus, truth, first, float(bool(answer)), float(answer == truth))
 
 
-def measures(answers: Iterable[Answer]) -> dict[str, float]:
+def measures(answers: Iterable[JudgedAnswer]) -> dict[str, float]:
     """Return accuracy, d_prime, yes_bias, flips, and the number of unreadable answers.
 
     NaN where there is nothing to measure.
@@ -139,7 +139,7 @@ def measures(answers: Iterable[Answer]) -> dict[str, float]:
     }
 
 
-def _z_of_yes(rows: Sequence[Answer], truth: str) -> float:
+def _z_of_yes(rows: Sequence[JudgedAnswer], truth: str) -> float:
     """Return z of the rate of yes at stimuli of one outcome; wrong is what cannot be read."""
     right = sum(row.right for row in rows)
     yes = right if truth == YES_NO[0] else len(rows) - right
