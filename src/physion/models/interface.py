@@ -207,6 +207,9 @@ class Model:
         ``full`` if its features always include the outcome, so that they are no other row.
     benchmark
         Rules by which its features were made (`physion.readout.benchmark`); empty: any.
+    tokens
+        Tokens in the features of a time step, D / tokens numbers each, one after the other, for the
+        decision *attentive*.
     trained
         Whether the weights are pretrained, so that training is skipped.
     learns_from
@@ -228,6 +231,7 @@ class Model:
     arguments: Mapping[str, tuple[float, ...]] = MappingProxyType({})
     answers: str = ""
     benchmark: str = ""
+    tokens: int = 1
     trained: bool = False
     learns_from: LearnsFrom = "clips"
     window: int = 0

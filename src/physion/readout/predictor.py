@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from enum import Enum
 from functools import cached_property, partial
 from pathlib import Path
@@ -59,6 +60,8 @@ def build_decision(model: Model, wanted: str, settings: LogisticSettings) -> Dec
     """Return the decision of a model; raise `BadInputError` if it does not fit the model."""
     name = decision_name(model, wanted)
     decision = decisions.get(name)(settings)
+    if isinstance(decision, Decision):
+        decision = replace(decision, tokens=ask(model, "tokens"))
     method, others = {
         "features": ("encode", "decision gap or noise"),
         "rollouts": ("imagine", "decision logistic"),

@@ -35,7 +35,9 @@ from physion.models.encoders.weights import (
     TIMM,
     EncoderWeights,
     Pooling,
+    count_cells,
     create_encoder,
+    decision_of,
     feature_size,
     input_statistics,
     published,
@@ -154,8 +156,9 @@ class EncoderSettings(ModelSettings):
     - ``weights``: ``imagenet``, ``timm:<tag>`` of other weights of timm, ``random``,
       ``package:<name>`` of an installed Python package, the path of a state dict, or of the
       ``model.safetensors`` of a training of this model, or of its folder.
-    - ``pooling``: ``pooled`` features, ``grid``, which keeps positions, or ``mean``, over all of
-      them (`GridFeatures`). ``layer``: of whose output, counted from 1; None is the last.
+    - ``pooling``: ``pooled`` features, ``grid``, which keeps positions, ``mean``, over all of them
+      (`GridFeatures`), or ``attentive``, a grid that the decision of this name reads. ``layer``: of
+      whose output, counted from 1; None is the last.
     - ``dynamics``: ``mlp`` (all context features at once) or ``lstm`` (one after the other).
     - ``hidden``: units of the hidden layer.
     - ``residual``: predict the change from the last feature, initially zero, instead of the
@@ -291,6 +294,10 @@ class EncoderModel(TorchModel):
         self.feature_size = feature_size(
             settings.encoder, settings.image_size, settings.pooling, settings.layer
         )
+        self.tokens = count_cells(
+            settings.encoder, settings.image_size, settings.pooling, settings.layer
+        )
+        self.decision = decision_of(settings.pooling)
         self.dynamics = make_dynamics(
             settings.dynamics,
             self.feature_size,

@@ -18,7 +18,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 from urllib.parse import urlsplit
 
 import h5py
@@ -42,15 +42,23 @@ from physion.models.torch_model import initial_weights
 POOLED: Final = "pooled"
 GRID: Final = "grid"
 MEAN: Final = "mean"
-Pooling = Literal["pooled", "grid", "mean"]
+ATTENTIVE: Final = "attentive"
+Pooling = Literal["pooled", "grid", "mean", "attentive"]
+CELLWISE = (GRID, ATTENTIVE)
+"""Poolings with features of cells; with `ATTENTIVE` the decision of that name reads them."""
 CELLS = 4
 """Rows and columns of the grid."""
 
 
 def check_pooling(pooling: str) -> None:
-    """Raise `BadInputError` unless ``pooling`` is ``pooled``, ``grid`` or ``mean``."""
-    if pooling not in (POOLED, GRID, MEAN):
-        raise BadInputError(f"pooling must be {POOLED}, {GRID} or {MEAN}, not {pooling!r}")
+    """Raise `BadInputError` unless ``pooling`` is one of `Pooling`."""
+    if pooling not in get_args(Pooling):
+        raise BadInputError(f"pooling must be one of {', '.join(get_args(Pooling))}, not {pooling}")
+
+
+def decision_of(pooling: str) -> str:
+    """Return the decision that reads features."""
+    return ATTENTIVE if pooling == ATTENTIVE else "logistic"
 
 
 def clips_of(pictures: Tensor, frames: int) -> Tensor:
@@ -83,7 +91,7 @@ class GridFeatures(nn.Module):
     encoder, name
         Network of timm and its name.
     pooling
-        With another one than ``grid``, the map is averaged over all positions.
+        With another one than ``grid`` or ``attentive``, the map is averaged over all positions.
     layer
         Block of a transformer, or stage of a convolutional network, counted from 1, whose output is
         the map, before any norm; by default the last map, after the norm. Where timm counts the
@@ -99,7 +107,7 @@ class GridFeatures(nn.Module):
     def forward(self, pictures: Tensor) -> Tensor:
         """Return features of standardised pictures (B, 3, H, W)."""
         feature_map = self._feature_map(pictures)
-        return average_cells(feature_map) if self.pooling == GRID else feature_map.mean((2, 3))
+        return average_cells(feature_map) if self.pooling in CELLWISE else feature_map.mean((2, 3))
 
     def _of_layer(self, pictures: Tensor, layer: int) -> Tensor:
         """Return the map of a layer; raise `BadInputError` if there is no such layer."""
@@ -540,8 +548,8 @@ def create_encoder(
     It maps (batch, 3, image_size, image_size) float32 to (batch, features). With ``pooled`` these
     are the input of timm's classifier: the class token of a transformer, the pooled map of a
     convolutional network, and for VGG the second fully connected layer before its ReLU, as in the
-    released code. With ``grid`` they keep positions, with ``mean`` they are the mean over all, and
-    with a ``layer`` they come from it: see `GridFeatures`.
+    released code. With ``grid`` or ``attentive`` they keep positions, with ``mean`` they are the
+    mean over all, and with a ``layer`` they come from it: see `GridFeatures`.
     """
     check_encoder_name(name)
     check_pooling(pooling)
@@ -616,6 +624,16 @@ def feature_size(
     if features.ndim != 2:
         raise BadInputError(f"encoder {name!r} gives {tuple(features.shape)}, not a row per frame")
     return int(features.shape[1])
+
+
+def count_cells(
+    name: str, image_size: int, pooling: Pooling = POOLED, layer: int | None = None
+) -> int:
+    """Return the number of cells whose features make up the features of one frame."""
+    if pooling not in CELLWISE:
+        return 1
+    whole = feature_size(name, image_size, MEAN, layer)
+    return feature_size(name, image_size, pooling, layer) // whole
 
 
 def input_statistics(
