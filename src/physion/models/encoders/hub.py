@@ -39,12 +39,12 @@ from physion.models.encoders.weights import (
     POOLED,
     RANDOM,
     Pooling,
-    average_cells,
     check_pooling,
     clips_of,
     decision_of,
     first_line,
     offline_without_network,
+    pool_maps,
     weights_sha256,
 )
 from physion.models.interface import ModelSettings
@@ -274,9 +274,7 @@ class HubEncoder(TorchModel):
                 raise BadInputError(f"{self.settings.model} has no map; use pooling=pooled")
             else:
                 return tokens.mean(1, keepdim=True)
-        flat = maps.flatten(0, 1)
-        pooled = average_cells(flat) if pooling in CELLWISE else flat.mean((2, 3))
-        return pooled.reshape(count, maps.shape[1], -1)
+        return pool_maps(maps, pooling)
 
     def digest(self) -> str:
         """Return the SHA-256 of settings, versions and weights."""

@@ -32,13 +32,13 @@ from physion.models.encoders.weights import (
     POOLED,
     RANDOM,
     Pooling,
-    average_cells,
     check_pooling,
     clips_of,
     decision_of,
     first_line,
     load_fitting,
     offline_without_network,
+    pool_maps,
     read_state_dict,
     weights_sha256,
 )
@@ -411,10 +411,9 @@ class VideoEncoder(TorchModel):
         frames, size = self.settings.frames, self.settings.image_size
         tokens: Tensor = self.network(clips_of(pictures, frames)).last_hidden_state
         side, width = size // self.settings.patch, tokens.shape[-1]
-        maps = tokens.reshape(-1, side, side, width).permute(0, 3, 1, 2)
-        features = average_cells(maps) if self.settings.pooling in CELLWISE else maps.mean((2, 3))
-        times = -(-pictures.shape[1] // frames) * frames // TUBELET
-        return features.float().reshape(len(pictures), times, -1)
+        # Clips follow each other in time, so that all tokens of a trial do.
+        maps = tokens.reshape(len(pictures), -1, side, side, width).permute(0, 1, 4, 2, 3)
+        return pool_maps(maps, self.settings.pooling).float()
 
     def digest(self) -> str:
         """Return the SHA-256 of settings, versions and weights."""

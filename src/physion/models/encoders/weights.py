@@ -78,6 +78,13 @@ def average_cells(feature_map: Tensor) -> Tensor:
     return cells.permute(0, 2, 3, 1).flatten(1)
 
 
+def pool_maps(maps: Tensor, pooling: str) -> Tensor:
+    """Return maps (N, times, channels, rows, columns) as features (N, times, D)."""
+    flat = maps.flatten(0, 1)
+    pooled = average_cells(flat) if pooling in CELLWISE else flat.mean((2, 3))
+    return pooled.reshape(*maps.shape[:2], -1)
+
+
 class GridFeatures(nn.Module):
     """Encoder whose features are a map of it, averaged in a grid of `CELLS` x `CELLS` cells.
 
@@ -106,8 +113,7 @@ class GridFeatures(nn.Module):
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Return features of standardised pictures (B, 3, H, W)."""
-        feature_map = self._feature_map(pictures)
-        return average_cells(feature_map) if self.pooling in CELLWISE else feature_map.mean((2, 3))
+        return pool_maps(self._feature_map(pictures)[:, None], self.pooling)[:, 0]
 
     def _of_layer(self, pictures: Tensor, layer: int) -> Tensor:
         """Return the map of a layer; raise `BadInputError` if there is no such layer."""
