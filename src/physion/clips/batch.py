@@ -153,6 +153,7 @@ class Batch:
     - ``camera`` (B, 2, 4, 4) float64: view matrix (world to camera) and projection matrix.
     - ``state``: motions (B); they have all frames from 0 on, not only ``frames``.
     - ``features`` (B, T, D) float32: of a frozen encoder, if ``learns_from`` is features.
+    - ``contact`` (B,) bool: outcomes, only in the training of a model that ``learns_outcomes``.
     - ``future``: steps that `Model.imagine` is asked for.
     """
 
@@ -166,6 +167,7 @@ class Batch:
     camera: Any = None
     state: tuple[Motion, ...] | None = None
     features: Any = None
+    contact: Any = None
     future: int = 0
 
     def __post_init__(self) -> None:
@@ -179,6 +181,7 @@ class Batch:
             "boxes": ((clips, steps, None, 4), "float32"),
             "camera": ((clips, 2, 4, 4), "float64"),
             "features": ((clips, steps, None), "float32"),
+            "contact": ((clips,), "bool"),
         }
         for name, (shape, dtype) in expected.items():
             value = getattr(self, name)
@@ -220,8 +223,11 @@ class Batch:
         )
 
     def steps(self, chosen: slice) -> Batch:
-        """Return a range of the frames of every clip; motions and cameras stay whole."""
-        kept = {name: value[:, chosen] for name, value in self.arrays().items() if name != "camera"}
+        """Return a range of the frames of every clip; what is no sequence of frames stays whole."""
+        whole = ("camera", "contact")
+        kept = {
+            name: value[:, chosen] for name, value in self.arrays().items() if name not in whole
+        }
         return dataclasses.replace(self, **kept)
 
 

@@ -271,7 +271,7 @@ def _is_trained(model: Any, settings: EvaluationSettings) -> bool:
         return False
     # What is trained on features predicts features, which the other readouts do not need.
     needed = Readout.OBSERVED_SIMULATED.value in (settings.readouts or rules.readouts)
-    return ask(model, "learns_from") != "features" or needed
+    return ask(model, "learns_from") != "features" or ask(model, "learns_outcomes") or needed
 
 
 @dataclass(frozen=True)

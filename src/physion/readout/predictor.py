@@ -35,7 +35,7 @@ from physion.readout.model_calls import (
 from physion.readout.settings import EvaluationSettings
 from physion.readout.shipped import ShippedReadout, ShippedReadouts
 from physion.readout.tables import ScenarioPredictions, describe_labels
-from physion.readout.train import Trainer
+from physion.readout.train import Trainer, training_spec
 from physion.trials.dataset import Dataset
 
 # Which readouts a model supports, and how its predictions are made under each.
@@ -221,8 +221,9 @@ class Predictor:
             if training is not None:
                 self._trainer = Trainer(
                     model,
-                    self._whole,
+                    self._training,
                     self._store,
+                    dataset.index,
                     training,
                     folder / "training",
                     make_fabric(Devices(settings.accelerator), training.precision),
@@ -270,6 +271,14 @@ class Predictor:
             # A table of features needs no frames.
             windows=self.rules.windows(self.rules.select(index)) if self.model.spec.inputs else {},
         )
+
+    @property
+    def _training(self) -> WholeSource:
+        """Source of what a training reads."""
+        spec = training_spec(self.model)
+        if spec == self.model.spec:
+            return self._whole
+        return whole_source(self.dataset, spec, rendered=self.settings.rendered)
 
     def _longest(self, split: ScenarioSplit) -> int:
         """Return the frames of the longest trial that the readout of a scenario sees."""
@@ -455,23 +464,34 @@ class Predictor:
             if len(labels):
                 accuracy = float(np.mean((self._probability(asked, fit_batch) > 0.5) == labels))
         predicted: dict[str, float] = {}
+        notes: dict[str, None] = {}
         for start in range(0, len(split.test), _ANSWER_TRIALS):
             group = split.test[start : start + _ANSWER_TRIALS]
-            predicted |= self._ask(asked, read, group)
+            predicted |= self._ask(asked, read, group, notes)
             if self.progress is not None:
                 self.progress("trials", start + len(group), len(split.test))
         probability = np.array(list(predicted.values()), np.float64)
-        return Decided(probability, accuracy), split.fit, tuple(predicted)
+        decided = Decided(probability, accuracy, note="; ".join(notes))
+        return decided, split.fit, tuple(predicted)
 
-    def _ask(self, asked: Any, read: Any, group: Sequence[str]) -> dict[str, float]:
-        """Return the answers by trial; if a trial fails, the others are asked for one by one."""
+    def _ask(
+        self, asked: Any, read: Any, group: Sequence[str], notes: dict[str, None]
+    ) -> dict[str, float]:
+        """Return the answers by trial; if a trial fails, the others are asked for one by one.
+
+        What the model notes of them is added to ``notes``.
+        """
         try:
-            answers = self._probability(asked, read(group))
+            batch = read(group)
+            answers = self._probability(asked, batch)
         except BadInputError as error:
             if len(group) > 1:
-                return {t: p for one in group for t, p in self._ask(asked, read, [one]).items()}
+                singles = [self._ask(asked, read, [one], notes) for one in group]
+                return {t: p for single in singles for t, p in single.items()}
             self.problems[group[0]] = str(error)
             return {}
+        if can(asked, "note") and (note := call_model(asked, "note", batch)):
+            notes[note] = None
         return dict(zip(group, answers.tolist(), strict=True))
 
     def _probability(self, asked: Any, batch: Batch) -> NDArray[np.float64]:

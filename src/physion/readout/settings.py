@@ -150,7 +150,8 @@ class ChosenModel:
 
     def stays_random(self, model: Any) -> bool:
         """Return whether a built model is a twin that is not trained, as dynamics would be."""
-        return self.twin and ask(model, "learns_from") != "features"
+        dynamics = ask(model, "learns_from") == "features" and not ask(model, "learns_outcomes")
+        return self.twin and not dynamics
 
     def build(self, seed: int, *, untrained: bool = False) -> Any:
         """Return the model; ``seed``: of its initial weights if it has one.
