@@ -12,7 +12,7 @@ TINY: dict[str, Any] = {
 FROZEN = [
     "frozen-encoder", "pVGG-mlp", "pVGG-lstm", "pDeIT-mlp", "pDeIT-lstm", "pEffNetLite0-mlp",
     "pDINO-mlp", "pDINO-lstm", "pDINOv2-mlp", "pDINOv2-lstm", "pDINOv3-mlp", "pDINOv3-lstm",
-    "pEffNetLite0-lstm", "pHEDVGG16-mlp", "pHEDVGG16-lstm",
+    "pEffNetLite0-lstm",
 ]  # fmt: skip
 VIDEO: dict[str, Any] = {
     "weights": "random", "image_size": 32, "patch": 8, "frames": 4, "width": 24, "depth": 2,
@@ -24,6 +24,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     **dict.fromkeys(("VideoMAE", "VideoMAEv2", "V-JEPA2", "V-JEPA2.1"), VIDEO),
     **dict.fromkeys(("svg", "op3", "cswm", "rpin", "gns", "gns-ransac", "dpi"), UNTRAINED),
     "noisy-simulation": {"samples": 3},
+    "seeing-simulation": {"samples": 3, "image_size": 96},
     "noisy-simulation-outcomes": {"samples": 3},
     "noisy-simulation-people": {"samples": 3},
 }

@@ -115,23 +115,16 @@ class ChangedTrials:
     """Copy of trials that `take_trials` made, in which the tested ones are changed.
 
     Files that stay as they are are links to the first ones. ``names`` has the name in the copy by
-    the original name of every tested trial. Randomness comes from ``rng``. ``splits``: whose trials
-    are changed, where it is not only the tested ones.
+    the original name of every tested trial. Randomness comes from ``rng``.
     """
 
-    def __init__(
-        self,
-        source: Dataset,
-        folder: Path,
-        rng: np.random.Generator,
-        splits: Sequence[str] = (TESTING,),
-    ) -> None:
+    def __init__(self, source: Dataset, folder: Path, rng: np.random.Generator) -> None:
         shutil.copytree(source.folder, folder, copy_function=_link)
         self.folder, self.rng = folder, rng
         rows = source.index.to_dict("records")
-        self._fit = [row for row in rows if row["split"] not in splits]
+        self._fit = [row for row in rows if row["split"] != TESTING]
         self._rows: dict[str, dict[Any, Any]] = {
-            str(row["trial"]): row for row in rows if row["split"] in splits
+            str(row["trial"]): row for row in rows if row["split"] == TESTING
         }
         self.names = {trial: trial for trial in self._rows}
 
@@ -165,8 +158,7 @@ class ChangedTrials:
 
     def paths(self, trial: str) -> TrialPaths:
         """Return the paths of a tested trial."""
-        row = self.row(trial)
-        return TrialPaths(self.folder, row["split"], row["scenario"], trial)
+        return TrialPaths(self.folder, TESTING, self.row(trial)["scenario"], trial)
 
     def by_scenario(self) -> dict[str, list[str]]:
         """Return the tested trials of every scenario, sorted by name."""

@@ -61,7 +61,8 @@ class Decided:
     - ``probability`` (m,): P(contact), 0..1. ``train_accuracy``: on the fit trials.
     - ``c``, ``cv_accuracy``: inverse penalty of a regression, and its accuracy over folds; NaN
       where they do not apply.
-    - ``fitted``: values of other fitted quantities by name. ``note``: what was unusual.
+    - ``fitted``: values of other fitted quantities by name. ``note``: what was unusual;
+      ``notes``: of the model on some trials, by name.
     """
 
     probability: NDArray[np.float64]
@@ -70,6 +71,7 @@ class Decided:
     cv_accuracy: float = float("nan")
     fitted: Mapping[str, float] = field(default_factory=dict)
     note: str = ""
+    notes: Mapping[str, str] = field(default_factory=dict)
 
 
 def fraction_of_futures(touches: Booleans) -> NDArray[np.float64]:
@@ -97,11 +99,9 @@ class Decision:
     - ``labels``: outcomes that it is fitted on: ``simulated``, of the trials as they were made, or
       ``recorded``, which prefers the outcomes of the official recording.
     - ``fits``: whether it is fitted; one that is not receives no fit trials.
-    - ``tokens``: in the features of a time step, as the model says (`Model.tokens`).
     """
 
     settings: LogisticSettings = field(default_factory=LogisticSettings)
-    tokens: int = 1
     fits: ClassVar[bool] = True
     input: ClassVar[str] = "rollouts"
     labels: ClassVar[str] = "simulated"
@@ -117,7 +117,6 @@ decisions: Registry[Callable[[LogisticSettings], Decision]] = Registry(
         "logistic": "physion.readout.decisions:LogisticDecision",
         "released": "physion.readout.decisions:released_decision",
         "trees": "physion.readout.trees:TreesDecision",
-        "attentive": "physion.readout.attentive:AttentiveDecision",
         "end": "physion.readout.decisions:EndDecision",
         "closest": "physion.readout.decisions:ClosestDecision",
         "gap": "physion.readout.decisions:GapDecision",

@@ -15,7 +15,6 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -217,7 +216,7 @@ class StoredFeatures:
 
 # Features and outcomes that a model gives for a batch of clips, checked and split by trial.
 
-GAP, CONTACT, END, CLOSEST = "gap", "contact", "end", "closest"
+GAP, CONTACT, END, CLOSEST, NOTE = "gap", "contact", "end", "closest", "note"
 Arrays = Mapping[str, NDArray[Any]]
 """Arrays of one trial, by name."""
 
@@ -248,7 +247,10 @@ def encode_clips(model: Model, batch: Batch) -> list[Arrays]:
 def imagine_clips(
     model: Model, batch: Batch, samples: int, seed: int, arguments: Mapping[str, float]
 ) -> list[Arrays]:
-    """Return features (S * future, D), distances (S) and contact (S) of every clip, if given."""
+    """Return features (S * future, D), distances (S) and contact (S) of every clip, if given.
+
+    Also a note, the bytes of a text, of clips that have one.
+    """
     rollout = call_model(model, "imagine", batch, samples, seed, **arguments)
     if not isinstance(rollout, Rollout):
         raise BadInputError(
@@ -277,7 +279,16 @@ def imagine_clips(
         arrays[FEATURES] = features.reshape(clips, samples * future, features.shape[-1])
     for name in {GAP, END, CLOSEST} & set(arrays):
         arrays[name] = arrays[name].astype(np.float64)
-    return _split(arrays, clips)
+    if len(rollout.notes) not in (0, clips):
+        raise BadInputError(
+            f"model {model_name(model)!r}: imagine gave {len(rollout.notes)} notes for {clips}"
+        )
+    rows = _split(arrays, clips)
+    notes = rollout.notes or [""] * clips
+    return [
+        {**row, NOTE: np.frombuffer(note.encode(), np.uint8)} if note else row
+        for row, note in zip(rows, notes, strict=True)
+    ]
 
 
 def _split(arrays: Mapping[str, NDArray[Any]], clips: int) -> list[Arrays]:
@@ -329,6 +340,11 @@ class Imagined:
         if any(FEATURES not in row.shapes for row in self.rows.values()):
             return None
         return StoredFeatures(self.trials, list(self.rows.values()))
+
+    def note(self, trial: str) -> str:
+        """Return the note of the model on a trial; empty for none."""
+        row = self.rows[trial]
+        return row.array(NOTE).tobytes().decode() if NOTE in row.shapes else ""
 
     def outcomes(self, trials: Sequence[str] | None = None) -> Outcomes:
         """Return gaps and contacts of ``trials``, in order, or of all.
@@ -385,21 +401,12 @@ class FeatureStore:
         Clips of `_FRAMES` frames that a model receives at a time, the *encoder batch*.
     executor
         Runs models whose futures are imagined in processes.
-    elsewhere
-        By trial another folder, for trials whose files are shared by several stores.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        *,
-        batch: int = 4,
-        executor: Executor | None = None,
-        elsewhere: Mapping[str, Path] = MappingProxyType({}),
-    ) -> None:
+    def __init__(self, folder: Path, *, batch: int = 4, executor: Executor | None = None) -> None:
         if batch < 1:
             raise BadInputError(f"the encoder batch must be at least 1, not {batch}")
-        self._folder, self._batch, self._elsewhere = folder, batch, elsewhere
+        self._folder, self._batch = folder, batch
         self._executor: Executor = executor if executor is not None else SerialExecutor()
         self.problems: dict[str, str] = {}
         """Reasons of trials that could not be imagined in processes, by name."""
@@ -444,7 +451,7 @@ class FeatureStore:
 
         digest = ask(model, "encoder_digest")
         work = _Work("features", digest, compute, model_name(model), part)
-        steps = {trial: source.steps(trial, part) for trial in dict.fromkeys(trials)}
+        steps = {trial: _clip_steps(source, trial, part) for trial in dict.fromkeys(trials)}
         rows = self._rows(work, source, steps, progress)
         whole = part == "whole"
         return StoredFeatures(trials, [rows[trial] for trial in trials], repeated=whole)
@@ -627,8 +634,7 @@ class FeatureStore:
         """Return the file of a trial, named by all that its arrays depend on."""
         identity = [_VERSION, digest, key, trial, work.part, work.settings, steps]
         name = digest_of(json.dumps(identity))
-        folder = self._elsewhere.get(trial, self._folder)
-        return folder / work.part / digest[:16] / name[:2] / f"{name}.safetensors"
+        return self._folder / work.part / digest[:16] / name[:2] / f"{name}.safetensors"
 
 
 @dataclass(frozen=True, eq=False)
@@ -668,6 +674,13 @@ def _stored(paths: Mapping[str, Path]) -> dict[str, FeatureFile]:
     """Return what is stored, by trial."""
     opened = ((trial, open_features(path)) for trial, path in paths.items())
     return {trial: file for trial, file in opened if file is not None}
+
+
+def _clip_steps(source: Any, trial: str, part: Part) -> int:
+    """Return the number of frames of a part of a trial's clip."""
+    if part == "context":
+        return int(source.spec.context)
+    return len(source.spec.all_frames(source.length(trial)))
 
 
 def _groups(steps: Mapping[str, int], size: Callable[[int], int]) -> list[tuple[str, ...]]:

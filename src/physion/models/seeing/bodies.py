@@ -1,0 +1,279 @@
+"""Shape, scale and pose of one object from rays of a frame, and its poses in later frames.
+
+`find` starts every shape of the library upright, from the box around the points that are seen, with
+some rotations about the vertical. A side of the box along which almost nothing is seen gets a
+fraction of the median side, away from the camera. If no upright shape fits, other rotations follow.
+The best ones are fitted again with all rays: with free scales, with equal scales along x and y, and
+with three equal ones. Among those that fit nearly as well, the simplest is taken.
+
+`follow` moves what was found to where it fits in a later frame. What fits where it was has not
+moved.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physion.core.seeds import generator
+from physion.models.seeing.pixels import Rays
+from physion.models.seeing.solids import (
+    EQUAL,
+    FREE,
+    POSE,
+    ROUND,
+    TURNS,
+    Placed,
+    Prior,
+    Solid,
+    cost_of,
+    fit,
+    library,
+)
+from physion.numerics.rotations import axis_angle_matrix, rotation_matrices
+
+F64 = NDArray[np.float64]
+
+FEW, SOME = 140, 280
+"""Rays of the first and the second search; the last one takes all."""
+YAWS, FLAT_YAWS = 3, 9
+"""Rotations about the vertical from which a shape that is not round starts, and of flat ones."""
+FLAT = 0.06
+"""Height of what is flat, as a fraction of its largest extent. Too large a plate meets free rays in
+no more than its thickness, so that nothing draws its edges back: the start must be a good one."""
+HIDDEN, HIDDEN_PART = 0.3, 0.8
+"""Side of the seen box, as a fraction of the median one, below which it counts as hidden, and its
+size then."""
+ENOUGH, ROUGH, GOOD = 0.0004, 0.01, 0.0005
+"""Cost that ends the search, the same of a ball, whose drawn mesh has corners, and difference of
+costs below which the simpler solution is taken; a tenth of the cost is added to it."""
+FITS = {"bowl": 0.05, "pipe": 0.04, "sphere": 0.03, "torus": 0.04}
+"""Cost up to which an upright shape is accepted; 0.02 for the others. The collision pieces of
+hollow shapes and their drawn meshes differ by a millimetre."""
+NEAR_FLOOR = 0.04
+"""Height in metres of the lowest seen point up to which an object is taken to reach the floor."""
+ROTATIONS = 16
+KEPT = 5
+PER_SHAPE = 2
+"""Random rotations, and solutions that are fitted with all rays, at most so many of one shape."""
+SAME, STILL = 1.3, 0.008
+"""Factor and summand of the cost up to which an object counts as not moved."""
+LOST = 0.015
+"""Cost above which an object that is followed may have turned further."""
+ANGLES = (math.pi / 6, math.pi / 3, math.pi / 2)
+"""Angles by which it may have turned."""
+
+
+def find(rays: Rays, prior: Prior, solids: Sequence[Solid] | None = None) -> Placed:
+    """Return the shape of the library, with scale and pose, that fits rays best.
+
+    Parameters
+    ----------
+    rays
+        Of an object that is seen.
+    prior
+        What is expected of its pose.
+    solids
+        Shapes to choose from, simple ones first; by default all.
+    """
+    choice = library() if solids is None else solids
+    few, some = rays.first(FEW), rays.first(SOME)
+    low, high = _box(np.eye(3), rays)
+    flat = bool(high[2] - low[2] < FLAT * (high - low).max() and low[2] < prior.floor + NEAR_FLOOR)
+    found: list[Placed] = []
+    for each in choice:
+        starts = [
+            fit(start, few, FREE, prior, widths=(0.02 if flat else 0.05, 0.01), steps=7)
+            for start in _upright(each, rays, prior.floor, flat)
+        ]
+        starts.sort(key=lambda placed: cost_of(placed, few, 0.01))
+        polished = [
+            fit(start, some, FREE, prior, widths=(0.02, 0.004), steps=8)
+            for start in starts[: 4 if flat else 1]
+        ]
+        found.append(min(polished, key=lambda placed: placed.cost))
+        if found[-1].cost < (ROUGH if found[-1].solid.ball else ENOUGH):
+            break
+    best = min(found, key=lambda placed: placed.cost)
+    if best.cost > FITS.get(best.solid.name, 0.02):
+        starts = [
+            fit(start, few, FREE, prior, widths=(0.05, 0.015), steps=5)
+            for each in choice
+            for start in _any_rotation(each, rays)
+        ]
+        starts.sort(key=lambda placed: cost_of(placed, few, 0.015))
+        for start in _several(starts, 8):
+            found.append(fit(start, some, FREE, prior, widths=(0.02, 0.004), steps=10))
+            if found[-1].cost < (ROUGH if found[-1].solid.ball else ENOUGH):
+                break
+    found.sort(key=lambda placed: placed.cost)
+    return refine(_several(found, KEPT), rays, prior)
+
+
+def refine(starts: Sequence[Placed], rays: Rays, prior: Prior) -> Placed:
+    """Return the simplest of the solutions near some starts that fit nearly as well as the best."""
+    order = list(TURNS)
+    tried: list[tuple[float, Placed]] = []
+    for start in starts:
+        rank = 0.0003 * order.index(start.solid.name)
+        whole = fit(start, rays, FREE, prior, widths=(0.01, 0.004), steps=10)
+        allowed = GOOD + 0.1 * whole.cost
+        tried.append((whole.cost + rank + 2 * allowed, whole))
+        for tied in _squares(whole):
+            tied = fit(tied, rays, ROUND, prior, widths=(0.02, 0.004), steps=10)
+            tried.append((tied.cost + rank + allowed, tied))
+        scale = np.full(3, np.exp(np.mean(np.log(whole.scale))))
+        if np.abs(np.log(scale / whole.scale)).max() < 0.3:
+            tied = _centred(replace(whole, scale=scale), whole.middle())
+            tied = fit(tied, rays, EQUAL, prior, widths=(0.02, 0.004), steps=10)
+            tried.append((tied.cost + rank, tied))
+    return min(tried, key=lambda pair: pair[0])[1]
+
+
+def _squares(placed: Placed) -> Iterator[Placed]:
+    """Yield solids with equal scales along x and y; the shorter side may be partly hidden.
+
+    It is made as long as the other one towards both sides, and towards either.
+    """
+    scale = placed.scale.copy()
+    short = int(np.argmin(scale[:2]))
+    scale[:2] = scale[:2].max()
+    hidden = (scale - placed.scale)[short] * (placed.solid.high - placed.solid.low)[short] / 2
+    known = hidden < 0.05 * placed.size()[short]
+    for side in (0.0,) if known else (0.0, 1.0, -1.0):
+        shift = side * hidden * placed.rotation[:, short]
+        yield _centred(replace(placed, scale=scale), placed.middle() + shift)
+
+
+def follow(
+    before: Placed, rays: Rays, prior: Prior, guesses: Sequence[Placed] = ()
+) -> tuple[Placed, bool]:
+    """Return the pose in a later frame, and whether it is another one.
+
+    Parameters
+    ----------
+    before
+        The last known pose.
+    rays
+        Of the later frame.
+    prior
+        What is expected of its pose.
+    guesses
+        Other poses from which the search starts.
+    """
+    some = rays.first(SOME)
+    if cost_of(before, some) <= SAME * before.cost + STILL:
+        return before, False
+    starts = [before, *guesses]
+    found = [fit(s, some, POSE, prior, widths=(0.03, 0.004), steps=10) for s in starts]
+    best = min(found, key=lambda placed: placed.cost)
+    if best.cost > LOST + before.cost:
+        turns = [turn @ best.rotation for angle in ANGLES for turn in _axis_turns(angle)]
+        turned = [replace(best, rotation=rotation) for rotation in (*turns, *_rotations())]
+        few = rays.first(FEW)
+        wide = [
+            fit(_centred(placed, best.middle()), few, POSE, prior, widths=(0.03, 0.01), steps=6)
+            for placed in turned
+        ]
+        wide.sort(key=lambda placed: cost_of(placed, few, 0.01))
+        found = [fit(s, some, POSE, prior, widths=(0.02, 0.004), steps=10) for s in wide[:3]]
+        best = min([best, *found], key=lambda placed: placed.cost)
+    best = fit(best, rays, POSE, prior, widths=(0.006, 0.004), steps=6)
+    return replace(best, cost=max(best.cost, before.cost / 2)), True
+
+
+def moved_with(placed: Placed, shift: F64) -> Placed:
+    """Return a placed solid moved by ``shift`` (3,), metres."""
+    return replace(placed, position=placed.position + shift)
+
+
+def _several(placed: Sequence[Placed], count: int) -> list[Placed]:
+    """Return the first ones, at most `PER_SHAPE` of a shape."""
+    kept: list[Placed] = []
+    for each in placed:
+        if sum(k.solid is each.solid for k in kept) < PER_SHAPE and len(kept) < count:
+            kept.append(each)
+    return kept
+
+
+def _upright(each: Solid, rays: Rays, floor: float, flat: bool) -> Iterator[Placed]:
+    """Yield starts of an upright shape; what is seen near the floor stands on it."""
+    turns = FLAT_YAWS if flat else YAWS + (each.turn > math.pi)
+    turns = 1 if each.turn == 0.0 else turns
+    for number in range(turns):
+        yaw = each.turn * number / turns
+        rotation = axis_angle_matrix(np.array([0.0, 0.0, 1.0]), yaw)
+        low, high = _box(rotation, rays)
+        if low[2] < floor + NEAR_FLOOR:
+            low[2] = min(floor, high[2] - 1e-3)
+            yield _filling(each, rotation, *_extended(low, high, rotation, rays, (0, 1)))
+            if flat:
+                low, high = _box(rotation, rays, 0.0)
+                low[2] = min(floor, high[2] - 1e-3)
+                yield _filling(each, rotation, low, high)
+        else:
+            yield _filling(each, rotation, *_extended(low, high, rotation, rays, (0, 1, 2)))
+
+
+def _any_rotation(each: Solid, rays: Rays) -> Iterator[Placed]:
+    """Yield starts of a shape in all rotations; one is enough of a ball."""
+    if not each.ball:
+        for rotation in _rotations():
+            box = _box(rotation, rays)
+            yield _filling(each, rotation, *_extended(*box, rotation, rays, (0, 1, 2)))
+
+
+def _box(rotation: F64, rays: Rays, outside: float = 0.01) -> tuple[F64, F64]:
+    """Return lowest and highest coordinates (3,) of the seen points along axes with a rotation.
+
+    A fraction ``outside`` of the points lies beyond each side.
+    """
+    low, high = np.quantile(rays.points() @ rotation, (outside, 1 - outside), axis=0)
+    return low, np.maximum(high, low + 1e-3)
+
+
+def _extended(
+    low: F64, high: F64, rotation: F64, rays: Rays, axes: Sequence[int]
+) -> tuple[F64, F64]:
+    """Return a box that is larger, away from the camera, along axes where little is seen of it."""
+    low, high = low.copy(), high.copy()
+    usual = float(np.median(high - low))
+    away = (low + high) / 2 - rays.origin @ rotation
+    for axis in axes:
+        if high[axis] - low[axis] < HIDDEN * usual:
+            if away[axis] >= 0:
+                high[axis] = low[axis] + HIDDEN_PART * usual
+            else:
+                low[axis] = high[axis] - HIDDEN_PART * usual
+    return low, high
+
+
+def _filling(each: Solid, rotation: F64, low: F64, high: F64) -> Placed:
+    """Return a shape that fills a box along axes with a rotation."""
+    scale = (high - low) / (each.high - each.low)
+    middle = (low + high) / 2 - scale * (each.low + each.high) / 2
+    return Placed(each, rotation @ middle, rotation, scale)
+
+
+def _centred(placed: Placed, middle: F64) -> Placed:
+    """Return a placed solid whose middle is at a point (3,)."""
+    return moved_with(placed, middle - placed.middle())
+
+
+@cache
+def _rotations() -> tuple[F64, ...]:
+    """Return rotation matrices, uniform in the space of rotations."""
+    values = generator("seeing", "rotations of a shape").standard_normal((ROTATIONS, 4))
+    values /= np.linalg.norm(values, axis=1, keepdims=True)
+    return tuple(rotation_matrices(values))
+
+
+def _axis_turns(angle: float) -> list[F64]:
+    """Return rotations by an angle about the six directions of the axes."""
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    return [axis_angle_matrix(axis, angle) for axis in axes]

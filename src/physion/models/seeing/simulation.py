@@ -1,0 +1,165 @@
+"""Model `seeing-simulation`: from masks and depth to a scene, then noisy simulation.
+
+The observed frames are seen as masks of the objects, depth and the camera, which are an oracle of
+perception: which pixel belongs to which object, and which object is agent and patient, is known.
+`scenes.see_trial` fits shapes of the library to them; from the scene and the state at the last
+observed frame the engine simulates with noise, as in `physion.models.noisy_simulation`. Nothing is
+fitted to outcomes, and nothing but these inputs is known of a trial: no mass, friction, joint,
+scenario, or body that does not move.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from physion.clips.batch import LAST_OBSERVED, Batch, Provenance, Rollout, Spec
+from physion.core.errors import BadInputError
+from physion.core.files import digest_of, json_digest
+from physion.core.version import __version__
+from physion.models.interface import Model, ModelSettings
+from physion.models.noisy_simulation import (
+    NOISE_VERSION,
+    NoiseLevels,
+    ObservedTrial,
+    simulate_contacts,
+)
+from physion.models.seeing.scenes import SeenTrial, see_trial
+from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine, simulate
+from physion.rendering.renderer import Renderer
+
+VERSION = 2
+"""To be raised with every change of the code that can alter a prediction."""
+KEPT = 16
+"""Trials whose scenes are kept in memory."""
+SHOWN_SIZE = 128
+"""Pixels per side of the pictures for the viewer."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeeingSettings(NoiseLevels, ModelSettings):
+    """Settings of `SeeingSimulation`: the levels of the noise (`NoiseLevels`), and others.
+
+    - ``samples``: simulations per trial. ``engine``: name of the engine. ``seed``: of the noise.
+    - ``image_size``: pixels per side of the pictures that it sees.
+    """
+
+    samples: int = 20
+    engine: str = DEFAULT_ENGINE
+    seed: int = 0
+    image_size: int = 256
+
+    def __post_init__(self) -> None:
+        self.check(self.model)
+        if self.samples < 1 or self.image_size < 64:
+            raise BadInputError(
+                f"{self.model} needs at least one sample, and pictures of at least 64 pixels"
+            )
+
+
+class SeeingSimulation(Model):
+    """Fit bodies to masks and depth, then simulate the rest of the trial several times with noise.
+
+    P(contact) is the fraction of simulations in which agent and patient touch. If one of them was
+    never seen, every second simulation counts as a contact.
+    """
+
+    decision = "touch"
+    settings: SeeingSettings
+
+    def __init__(self, settings: SeeingSettings) -> None:
+        self.settings = settings
+        self.spec = Spec(
+            inputs=("ids", "depth", "camera"),
+            image_size=settings.image_size,
+            stride=2,
+            context=LAST_OBSERVED // 2 + 1,
+        )
+        self.samples, self.seed = settings.samples, settings.seed
+        self._engine: Engine | None = None
+        self._seen: OrderedDict[str, SeenTrial] = OrderedDict()
+
+    def see(self, context: Batch) -> list[SeenTrial]:
+        """Return scene and state of every trial, and what could not be seen."""
+        if context.ids is None or context.depth is None or context.camera is None:
+            raise BadInputError(
+                f"{self.settings.model} needs masks, depth and camera of every trial (inputs ids, "
+                "depth, camera)"
+            )
+        return [self._see(context, row) for row in range(len(context))]
+
+    def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
+        """Simulate every trial ``samples`` times; ``contact`` says whether agent and patient touch.
+
+        With the argument ``show`` pictures of the first trial without noise are drawn, too.
+        """
+        seen = self.see(context)
+        contact = np.zeros((len(seen), samples), np.bool_)
+        for row, one in enumerate(seen):
+            if one.trial is None:
+                contact[row, ::2] = True
+                continue
+            contact[row] = simulate_contacts(
+                one.trial, self.settings, 1.0, samples, seed, self.engine
+            )
+        shown: dict[str, Any] = {}
+        if arguments.get("show"):
+            pictures = np.stack([self._pictures(one.trial, context.future) for one in seen])
+            shown["rgb"] = np.repeat(pictures[:, None], samples, axis=1)
+        return Rollout(contact=contact, shown=shown, notes=tuple(one.note for one in seen))
+
+    @property
+    def engine(self) -> Engine:
+        """The engine that simulates."""
+        if self._engine is None:
+            self._engine = make_engine(self.settings.engine)
+        return self._engine
+
+    def digest(self) -> str:
+        """Return the SHA-256 of code version, engine, noise and size of pictures."""
+        settings = dataclasses.asdict(self.settings)
+        levels = {field.name: settings[field.name] for field in dataclasses.fields(NoiseLevels)}
+        return json_digest(
+            [VERSION, NOISE_VERSION, self.engine.name, levels, self.settings.image_size]
+        )
+
+    def provenance(self) -> Provenance:
+        """Return name and versions for the table of predictions."""
+        return Provenance(
+            model=self.settings.model,
+            init="none",
+            encoder_type="bodies fitted to true masks and depth",
+            dynamics_type="physics engine",
+            versions=f"{self.engine.name}, physion {__version__}",
+        )
+
+    def _see(self, context: Batch, row: int) -> SeenTrial:
+        """Return what is seen of a trial; the last ones are remembered."""
+        arrays = (context.ids[row], context.depth[row], context.camera[row])
+        pixels = digest_of(b"".join(array.tobytes() for array in arrays))
+        key = f"{context.trials[row]} {pixels}"
+        if key not in self._seen:
+            name, frames = context.trials[row], context.frames[row]
+            self._seen[key] = see_trial(name, frames, *arrays)
+            while len(self._seen) > KEPT:
+                self._seen.popitem(last=False)
+        return self._seen[key]
+
+    def _pictures(self, trial: ObservedTrial | None, steps: int) -> Any:
+        """Return pictures (steps, H, W, 3) of the simulation without noise; grey if unknown."""
+        if trial is None:
+            return np.full((steps, SHOWN_SIZE, SHOWN_SIZE, 3), 128, np.uint8)
+        frames = 1 + self.spec.stride * steps
+        path = simulate(trial.scene, engine=self.engine, start=trial.state, frames=frames)
+        renderer = Renderer(trial.scene, path, SHOWN_SIZE, SHOWN_SIZE)
+        chosen = range(self.spec.stride, frames, self.spec.stride)
+        drawn = (renderer.render(frame, ("color",)).color for frame in chosen)
+        return np.stack([color for color in drawn if color is not None])
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the engine and what was seen behind; another process makes its own."""
+        return {**self.__dict__, "_engine": None, "_seen": OrderedDict()}

@@ -1,1 +1,0 @@
-"""Tasks for harnesses that ask language models."""

@@ -1,0 +1,277 @@
+"""Seeing by simulation: rays, fits, tracks, scenes, and what the model answers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.typing import NDArray
+
+from physion import sample_scene
+from physion.clips.batch import Batch, Motion, Provenance, Rollout, Spec
+from physion.clips.rendered import MotionRenderer, object_ids
+from physion.core.errors import BadInputError
+from physion.models.build import build_model
+from physion.models.interface import Model
+from physion.models.seeing.bodies import find, follow
+from physion.models.seeing.pixels import Rays, SeenFrame, floor_height, picture_of
+from physion.models.seeing.scenes import Track, see_trial, velocities
+from physion.models.seeing.simulation import SeeingSimulation
+from physion.models.seeing.solids import Placed, Prior, cost_of, residuals, solid
+from physion.numerics.rotations import rotation_matrices
+from physion.physics.engine import simulate
+from physion.readout.decisions import Decided
+from physion.readout.features import Imagined, imagine_clips, write_features
+from physion.readout.tables import ScenarioPredictions, make_table
+from physion.scenes.scene import Body, Camera, Push, Roles, Scene
+
+TURNED = (math.cos(0.3), 0.0, 0.0, math.sin(0.3))
+"""Rotation by 0.6 about the vertical."""
+
+
+def scene(offset: float = 0.0, name: str = "roll") -> Scene:
+    """Return a ball that is pushed towards a box, which it misses with a large ``offset``."""
+    bodies = (
+        Body("ball", "sphere", (-1.0, offset, 0.0), (0.3, 0.3, 0.3)),
+        Body("box", "cube", (0.3, 0.0, 0.0), (0.4, 0.6, 0.5), TURNED, mass=8.0),
+        Body("cylinder", "cylinder", (-0.4, -0.9, 0.0), (0.3, 0.3, 0.2), mass=2.0),
+    )
+    push = Push("ball", (2.0, 0.0, 0.0), frame=1)
+    camera = Camera((0.2, -3.0, 1.6), (-0.3, 0.0, 0.1))
+    return Scene(name, "collide", bodies, Roles("ball", "box"), camera, pushes=(push,))
+
+
+def batch_of(made: Scene, size: int = 128, **changed: Any) -> Batch:
+    """Return what the model gets of a scene."""
+    model = build_model("seeing-simulation", image_size=size)
+    frames = np.array(model.spec.context_frames(), np.int64)
+    motion = Motion(made, simulate(made, frames=45))
+    reader = MotionRenderer(
+        {made.name: motion}, model.spec.inputs, size, 10, {made.name: "redyellow"}
+    )
+    arrays = {key: value[None] for key, value in reader.read(made.name, frames).items()}
+    valid = np.ones((1, len(frames)), np.bool_)
+    return Batch((made.name,), frames[None], valid, **{**arrays, **changed})
+
+
+@pytest.fixture(scope="module")
+def rolling() -> Batch:
+    return batch_of(scene())
+
+
+@pytest.fixture(scope="module")
+def first(rolling: Batch) -> SeenFrame:
+    return picture_of(rolling.ids[0, 0], rolling.depth[0, 0], rolling.camera[0])
+
+
+def test_points_of_a_mask_lie_on_the_true_surfaces(first: SeenFrame) -> None:
+    box = scene().bodies[1]
+    points = first.points(first.ids == 2) - box.position
+    cosine, sine = math.cos(0.6), math.sin(0.6)
+    x, y = cosine * points[:, 0] + sine * points[:, 1], cosine * points[:, 1] - sine * points[:, 0]
+    outside = np.max([abs(x) - 0.2, abs(y) - 0.3, abs(points[:, 2] - 0.25) - 0.25], axis=0)
+    assert len(points) > 300 and np.abs(outside).max() < 1e-4
+    ball = first.points(first.ids == 1) - (-1.0, 0.0, 0.15)
+    assert np.abs(np.linalg.norm(ball, axis=1) - 0.15).max() < 0.003  # the mesh has 32 sides
+    assert floor_height(first) == pytest.approx(0.0, abs=1e-4)
+
+
+def ray(y: float, depth: float, on: bool) -> Rays:
+    """Return a ray along x from (-2, y, 0.5)."""
+    return Rays(
+        np.array([-2.0, y, 0.5]), np.array([[1.0, 0.0, 0.0]]), np.array([depth]), np.array([on])
+    )
+
+
+@pytest.mark.parametrize(
+    ("shape", "y", "depth", "on", "expected"),
+    [
+        ("cube", 0.1, 1.4, True, 0.1),  # 0.1 m before the face at x = -0.5
+        ("cube", 0.1, 1.7, True, -0.2),  # behind it
+        ("cube", 0.7, 2.0, True, 0.2),  # past the solid
+        ("cube", 0.1, 9.0, False, 0.4),  # through the middle, 0.4 m from the nearest face
+        ("cube", 0.1, 1.2, False, 0.0),  # seen before the solid
+        ("cube", 0.7, 9.0, False, 0.0),
+        ("sphere", 0.0, 1.4, True, 0.1),
+        ("sphere", 0.0, 1.6, True, -0.1),
+        ("sphere", 0.7, 2.0, True, 0.2),
+        ("sphere", 0.3, 9.0, False, 0.2),
+        ("sphere", 0.6, 9.0, False, 0.0),
+    ],
+)
+def test_residuals_are_distances_in_metres(
+    shape: str, y: float, depth: float, on: bool, expected: float
+) -> None:
+    placed = Placed(solid(shape), np.zeros(3), np.eye(3), np.ones(3))
+    assert residuals(placed, ray(y, depth, on))[0] == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_hole_is_free() -> None:
+    down = np.array([[0.0, 0.0, -1.0]])
+    rays = Rays(np.array([0.0, 0.0, 3.0]), down, np.array([3.0]), np.array([False]))
+    placed = [Placed(solid(n), np.zeros(3), np.eye(3), np.ones(3)) for n in ("torus", "cube")]
+    assert [float(residuals(each, rays)[0]) for each in placed] == [0.0, 0.5]
+
+
+def test_shapes_scales_and_poses_are_found(first: SeenFrame) -> None:
+    for number, body in zip(object_ids(scene())[1:].tolist(), scene().bodies, strict=True):
+        rays = first.rays(number)
+        assert rays is not None
+        found = find(rays, Prior())
+        true = Placed(
+            solid(body.shape),
+            np.array(body.position),
+            rotation_matrices(body.rotation),
+            np.array(body.scale),
+        )
+        assert found.solid.name == body.shape
+        assert np.linalg.norm(found.middle() - true.middle()) < 0.003
+        assert sorted(found.scale) == pytest.approx(sorted(body.scale), abs=0.006)
+        assert found.cost <= cost_of(true, rays) + 0.005
+
+
+def test_what_has_turned_and_moved_is_followed(first: SeenFrame, rolling: Batch) -> None:
+    rays = first.rays(2)
+    assert rays is not None
+    box = scene().bodies[1]
+    true = Placed(
+        solid("cube"), np.array(box.position), rotation_matrices(TURNED), np.array(box.scale), 0.0
+    )
+    assert follow(true, rays, Prior()) == (true, False)
+    away = replace(true, position=true.position + 0.05, rotation=np.eye(3))
+    found, moved = follow(away, rays, Prior())
+    assert moved and np.linalg.norm(found.position - true.position) < 0.002
+
+
+def track(places: NDArray[np.float64], shape: str = "sphere") -> Track:
+    """Return an object that was seen at places (3, 3) in frames 40, 42, 44."""
+    scale = np.full(3, 0.2)
+    placed = tuple(Placed(solid(shape), place, np.eye(3), scale) for place in places)
+    return Track(3, (40, 42, 44), placed)
+
+
+def test_velocities_of_falling_rolling_and_still_objects() -> None:
+    times = np.array([0.4, 0.42, 0.44])
+    falling = np.outer(times, (1.0, 0.5, 0.0)) - np.outer(times**2, (0, 0, 9.81 / 2))
+    velocity, spin, flies = velocities(track(falling))
+    assert flies and velocity == pytest.approx((1.0, 0.5, -9.81 * 0.435), abs=1e-6)
+    assert spin == pytest.approx(0)
+    # With v of 1 m/s, then 0.8 m/s, a is -10 m/s2; friction turns a ball by 2.5 (v0 - v) / r.
+    slowed = np.array([[0.0, 0, 0], [0.02, 0, 0], [0.036, 0, 0]])
+    velocity, spin, flies = velocities(track(slowed))
+    assert not flies and velocity == pytest.approx((0.75, 0.0, 0.0))
+    assert spin == pytest.approx((0.0, 2.5 * 0.25 / 0.1, 0.0))
+    velocity, spin, _ = velocities(track(np.zeros((3, 3)), "cube"))
+    assert not velocity.any() and not spin.any()
+
+
+def test_the_scene_at_the_last_frame_is_near_the_true_one(rolling: Batch) -> None:
+    seen = see_trial("a", rolling.frames[0], rolling.ids[0], rolling.depth[0], rolling.camera[0])
+    assert seen.trial is not None and seen.note == ""
+    true = simulate(scene(), frames=45)
+    found = seen.trial.scene
+    assert [body.shape for body in found.bodies] == ["sphere", "cube", "cylinder"]
+    assert (found.roles.agent, found.roles.patient) == ("1", "2")
+    for index in range(2):
+        assert seen.trial.state.velocities[index] == pytest.approx(
+            true.velocities[44, index].astype(float), abs=0.06
+        )
+    assert not seen.trial.observed_contact and found.floor == 0.0
+    assert not any(body.kinematic for body in found.bodies)
+
+
+def test_what_is_predicted_follows_from_what_is_seen(rolling: Batch) -> None:
+    model: SeeingSimulation = build_model("seeing-simulation", samples=4, image_size=128)  # type: ignore[assignment]
+    hit = model.imagine(rolling, 4, 0)
+    missed = model.imagine(batch_of(scene(-0.8)), 4, 0)
+    assert hit.contact.tolist() == [[True] * 4] and missed.contact.tolist() == [[False] * 4]
+    shown = model.imagine(replace(rolling, future=2), 4, 0, show=1.0).shown["rgb"]
+    assert shown.shape == (1, 4, 2, 128, 128, 3)
+    red = (shown[0, 0, 0, :, :, 0] > 90) & (shown[0, 0, 0, :, :, 1] < 60)
+    assert red.sum() > 20
+
+
+def test_an_agent_that_is_never_seen_leaves_the_answer_open(rolling: Batch) -> None:
+    hidden = np.where(rolling.ids == 1, 0, rolling.ids).astype(np.uint8)
+    model = build_model("seeing-simulation", samples=4, image_size=128)
+    rollout = model.imagine(replace(rolling, ids=hidden), 4, 0)
+    assert rollout.contact.sum() == 2 and rollout.notes == ("the agent is never seen",)
+
+
+def test_bad_input_says_what_is_wrong(rolling: Batch) -> None:
+    model = build_model("seeing-simulation", samples=1, image_size=128)
+    with pytest.raises(BadInputError, match="needs masks, depth and camera"):
+        model.imagine(replace(rolling, depth=None), 1, 0)
+    flat = rolling.camera.copy()
+    flat[0, 1, 3] = (0, 0, 0, 1)
+    with pytest.raises(BadInputError, match="needs a pinhole camera"):
+        model.imagine(replace(rolling, camera=flat), 1, 0)
+    many = rolling.ids.copy()
+    many[0, 0, 0, :16] = np.arange(1, 17)
+    with pytest.raises(BadInputError, match=r"trial 'roll' shows 16 objects; .* at most 15"):
+        model.imagine(replace(rolling, ids=many), 1, 0)
+    with pytest.raises(BadInputError, match="at least one sample"):
+        build_model("seeing-simulation", samples=0)
+
+
+class Noted(Model):
+    """Model that says something about the second of two trials."""
+
+    spec = Spec(inputs=(), future=0)
+
+    def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
+        return Rollout(contact=np.ones((2, samples), np.bool_), notes=("", "é unseen"))
+
+    def provenance(self) -> Provenance:
+        return Provenance("noted", "none")
+
+    def digest(self) -> str:
+        return "0" * 64
+
+
+def test_notes_of_a_model_reach_the_table(tmp_path: Any) -> None:
+    batch = Batch(("a", "b"), np.zeros((2, 1), np.int64), np.ones((2, 1), np.bool_))
+    rows = imagine_clips(Noted(), batch, 3, 0, {})
+    files = {
+        trial: write_features(tmp_path / trial, row)
+        for trial, row in zip(batch.trials, rows, strict=True)
+    }
+    imagined = Imagined("noted", files)
+    assert (imagined.note("a"), imagined.note("b")) == ("", "é unseen")
+    decided = Decided(np.array([0.5, 0.5]), 0.5, note="fit", notes={"b": imagined.note("b")})
+    part = ScenarioPredictions("drop", "full", ("a", "b"), decided, 0, -1, "", note="fit")
+    index = pd.DataFrame(
+        {"trial": ["a", "b"], "contact": True, "recorded_contact": None, "observed_contact": False}
+    )
+    table = make_table([part], Noted().provenance(), index)
+    assert table["note"].tolist() == ["fit", "fit; é unseen"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "scenario", ["collide", "contain", "dominoes", "drop", "link", "roll", "support"]
+)
+def test_scenes_of_every_scenario_are_recovered(scenario: str) -> None:
+    """Half of the movable objects are within 5 mm of where they are, and have the right shape."""
+    errors, right = [], []
+    for seed in (1, 2):
+        made = sample_scene(scenario, seed)
+        batch = batch_of(made, 256)
+        seen = see_trial("a", batch.frames[0], batch.ids[0], batch.depth[0], batch.camera[0])
+        tracks = {track.number: track.placed[0] for track in seen.tracks}
+        for number, body in zip(object_ids(made)[1:].tolist(), made.bodies, strict=True):
+            if body.scenery or body.kinematic or number not in tracks:
+                continue
+            true = Placed(
+                solid(body.shape),
+                np.array(body.position),
+                rotation_matrices(body.rotation),
+                np.array(body.scale),
+            )
+            errors.append(np.linalg.norm(tracks[number].middle() - true.middle()))
+            right.append(tracks[number].solid.name == body.shape)
+    assert np.median(errors) < 0.005 and np.mean(right) >= 0.75
