@@ -11,7 +11,7 @@ import pytest
 
 from support.paths import ROOT
 
-OPTIONAL = {"gpboost", "pymer4", "bambi", "mixedlm", "interlace", "lme"}
+OPTIONAL = {"gpboost", "pymer4", "bambi", "mixedlm", "interlace", "lme", "inspect_ai"}
 """Packages that only some comparisons need."""
 SCRIPTS = sorted((ROOT / "benchmarks").glob("*/*.py"))
 

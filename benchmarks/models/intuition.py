@@ -1,17 +1,20 @@
-"""Measure what trees that never simulate predict, and how like people they are.
+"""Measure what models that never simulate predict, and how like people they are.
 
     OMP_NUM_THREADS=1 python benchmarks/models/intuition.py FOLDER [--samples 8] [--write]
 
 FOLDER is one in which ``ship_readouts.py FOLDER --trials N --official`` has computed the features
 of `state-trees`, `mask-trees` and `blob-trees`. Forests are fitted on own trials, one per scenario,
 and tested on the official stimuli that people saw, without those that show a contact in the
-observed part, and without those of Roll with a ledge, as in the study. Three tables:
+observed part, and without those of Roll with a ledge, as in the study. Five tables:
 
-1. Accuracy by number of own trials per scenario.
+1. Accuracy by number of own trials per scenario, and how much a doubling adds.
 2. Accuracy, r with people and r beyond the outcome: with all trials; without trials of the tested
-   configuration; with the last observed frame only; the base rate of the configuration; noisy
-   simulation from the true state; and means of both kinds.
-3. Differences of likeness beyond the outcome between learned and simulated answers, paired over
+   configuration, or of the tested scenario; with the controls of `intuition_controls`; noisy
+   simulation from the true state; mixtures of both, with weights fitted on own trials or, where the
+   name says so, on half of people's answers; predictions of other models (--predictions FILE).
+3. Answers brought to the same spread, and levels of noise fitted to half of people's answers.
+4. What the best model could reach, from halves of the people.
+5. Differences of likeness beyond the outcome between learned and simulated answers, paired over
    stimuli.
 
 With --write they are written to ``results/intuition.md``.
@@ -21,14 +24,29 @@ from __future__ import annotations
 
 import argparse
 import datetime
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.special import expit
 
+from intuition_controls import (
+    CONTROLS,
+    Columns,
+    best_level,
+    ceiling,
+    every,
+    fitted_to_people,
+    log_odds,
+    logistic_weights,
+    partial,
+    slope,
+    weighted_levels,
+    with_spread,
+)
 from physion import Dataset
 from physion.analysis.tables import MEAN, POOLED, read_humans
 from physion.compute.tasks import processor
@@ -36,10 +54,10 @@ from physion.core.names import canonical_name
 from physion.data.official import official
 from physion.readout.decisions import Readout
 from physion.readout.evaluate import evaluate
-from physion.readout.logistic import JoinedFeatures
 from physion.readout.trees import fit_forest
 from physion.report.compare import CompareResult, compare
 from physion.scenes.sampling.sample import load_presets
+from physion.trials.dataset import JoinedDataset
 from ship_readouts import SET, Features, known, make_official
 
 RESULTS = Path(__file__).parents[1] / "results" / "intuition.md"
@@ -47,6 +65,15 @@ MODELS = ("state-trees", "mask-trees", "blob-trees")
 GIVEN = {"state-trees": "states", "mask-trees": "masks", "blob-trees": "blobs"}
 SCALES = (1.0, 2.0, 4.0)
 """Scales of the noise of simulations; the first is the default."""
+COUNTS = (125, 250, 500, 1000)
+"""Own trials of a scenario in the learning curves."""
+ELSEWHERE = 250
+"""Own trials of each other scenario, for forests that have not seen the tested one."""
+COMPARED = (
+    "simulation, noise x 1", "simulation, mean of the levels",
+    "simulation, levels weighted on half of people",
+)  # fmt: skip
+"""Simulations with which learned answers are compared."""
 EDGES = (0.025, 0.975)
 
 
@@ -83,7 +110,6 @@ class Trials:
         self.stimuli = stimuli
         of_own, of_tested = Features(folder, readout, MODELS), Features(folder, stimuli, MODELS)
         self.arrays: dict[tuple[str, str], tuple[list[str], NDArray[Any], NDArray[Any]]] = {}
-        self.sizes: dict[str, int] = {}
         for name in MODELS:
             for scenario, rows in self.own.groupby("scenario"):
                 trials = known(of_own, name, Readout.OBSERVED, list(rows.index))
@@ -92,10 +118,7 @@ class Trials:
                     features.parts(name, Readout.OBSERVED, wanted)
                     for features, wanted in ((of_own, trials), (of_tested, there))
                 )
-                self.sizes[name] = fit[0].shape[2]
-                self.arrays[name, str(scenario)] = (
-                    trials, JoinedFeatures(fit).array(), JoinedFeatures(test).array(),
-                )  # fmt: skip
+                self.arrays[name, str(scenario)] = trials, fit[0].array(), test[0].array()
 
     def predict(
         self,
@@ -103,7 +126,8 @@ class Trials:
         most: int | None = None,
         *,
         unseen: bool = False,
-        columns: Callable[[NDArray[Any], int], NDArray[Any]] = lambda values, _: values,
+        fit: Columns = every,
+        test: Columns = every,
     ) -> pd.Series:
         """Return P(contact) by stimulus.
 
@@ -115,22 +139,52 @@ class Trials:
             Own trials of a scenario that forests are fitted on; None: all.
         unseen
             Whether a stimulus is answered by a forest without the trials of its configuration.
-        columns
-            Which features are used, from all (n, D) and the number in a frame.
+        fit, test
+            Which features are used for the fit, and in the test.
         """
         answers = pd.Series(np.nan, self.tested.index)
+        states = name == "state-trees"
         for scenario, rows in self.tested.groupby("scenario"):
-            trials, fit, test = self.arrays[name, str(scenario)]
+            trials, own_values, test_values = self.arrays[name, str(scenario)]
             own = self.own.loc[trials[:most]]
-            fit, test = (columns(values, self.sizes[name]) for values in (fit[:most], test))
+            of_fit, of_test = fit(own_values[:most], states), test(test_values, states)
             labels = own["contact"].to_numpy(bool)
             groups = rows["configuration"].to_numpy() if unseen else np.full(len(rows), "")
             for group in np.unique(groups):
                 kept = (
                     own["configuration"].to_numpy() != group if unseen else np.full(len(own), True)
                 )
-                forest = fit_forest(fit[kept], labels[kept])
-                answers[rows.index[groups == group]] = forest.probability(test[groups == group])
+                forest = fit_forest(of_fit[kept], labels[kept])
+                answers[rows.index[groups == group]] = forest.probability(of_test[groups == group])
+        return answers
+
+    def predict_elsewhere(self, name: str) -> pd.Series:
+        """Return P(contact) by stimulus, of a forest fitted on all other scenarios."""
+        answers, states = pd.Series(np.nan, self.tested.index), name == "state-trees"
+        for scenario, rows in self.tested.groupby("scenario"):
+            others = [s for (n, s) in self.arrays if n == name and s != scenario]
+            fit, labels = [], []
+            for other in others:
+                trials, values, _ = self.arrays[name, other]
+                fit.append(every(values[:ELSEWHERE], states))
+                labels.append(self.own.loc[trials[:ELSEWHERE], "contact"].to_numpy(bool))
+            forest = fit_forest(np.concatenate(fit), np.concatenate(labels))
+            _, _, values = self.arrays[name, str(scenario)]
+            answers[rows.index] = forest.probability(every(values, states))
+        return answers
+
+    def predict_own(self, name: str, chosen: Sequence[str]) -> pd.Series:
+        """Return P(contact) of own trials, each from a forest without all of them."""
+        answers, states = pd.Series(np.nan, list(chosen)), name == "state-trees"
+        for scenario, rows in self.own.loc[list(chosen)].groupby("scenario"):
+            trials, values, _ = self.arrays[name, str(scenario)]
+            tested = np.isin(trials, rows.index)
+            labels = self.own.loc[trials, "contact"].to_numpy(bool)
+            columns = every(values, states)
+            forest = fit_forest(columns[~tested], labels[~tested])
+            of_trials = dict(zip(trials, range(len(trials)), strict=True))
+            places = [of_trials[trial] for trial in rows.index]
+            answers[rows.index] = forest.probability(columns[places])
         return answers
 
     def base_rates(self) -> pd.Series:
@@ -144,14 +198,34 @@ class Trials:
 
     def simulated(self, folder: Path, scale: float, samples: int) -> pd.Series:
         """Return the fraction of noisy simulations from the true state with a contact."""
-        done = evaluate(
-            {"noisy-simulation": {"scales": [scale], "samples": samples}}, self.stimuli,
-            folder / "simulations", decision="touch",
-        )  # fmt: skip
-        table = done.predictions.set_index("stimulus")["p_contact"].astype(float)
+        table = simulated(self.stimuli, folder / "simulations", scale, samples)
         return table[[canonical_name(trial) for trial in self.tested.index]].set_axis(
             self.tested.index
         )
+
+
+def simulated(dataset: Any, folder: Path, scale: float, samples: int) -> pd.Series:
+    """Return the fraction of noisy simulations with a contact, of all testing trials by name."""
+    options = {"scales": [scale], "samples": samples}
+    done = evaluate({"noisy-simulation": options}, dataset, folder, decision="touch")
+    return done.predictions.set_index("stimulus")["p_contact"].astype(float)
+
+
+def as_tested(dataset: Dataset, chosen: Sequence[str]) -> Dataset:
+    """Return some readout trials of a dataset as its testing trials."""
+    own = JoinedDataset([(dataset, ("readout",))])
+    own.index = own.index[own.index["trial"].isin(chosen)].assign(split="testing")
+    return own
+
+
+def answers_of_people(trials: Trials) -> pd.DataFrame:
+    """Return how many people say ``yes`` to each stimulus, of how many (``count``)."""
+    table = read_humans(official().humans).set_index("stimulus")
+    rows = table.loc[[canonical_name(trial) for trial in trials.tested.index]]
+    count = rows["count"].to_numpy(np.int64)
+    right = np.rint(rows["accuracy"].to_numpy(float) * count).astype(np.int64)
+    yes = np.where(trials.tested["contact"].to_numpy(bool), right, count - right)
+    return pd.DataFrame({"yes": yes, "count": count}, index=trials.tested.index)
 
 
 def scored(answers: dict[str, pd.Series]) -> CompareResult:
@@ -172,20 +246,20 @@ def rigid_accuracy(trials: Trials, answers: pd.Series) -> float:
 
 
 def learning(trials: Trials) -> list[str]:
-    """Return the rows of the table of accuracies by number of trials."""
+    """Return the rows of the table of accuracies by number of trials, and by how much they rise."""
     largest = min(len(one[0]) for one in trials.arrays.values())
-    counts = [n for n in (100, 200, 400, 800) if n < largest] + [largest]
-    rows = []
+    counts = [n for n in COUNTS if n < largest * 0.9] + [largest]
+    table = []
     for count in counts:
-        values = [rigid_accuracy(trials, trials.predict(name, count)) for name in MODELS]
-        rows.append(f"| {count} | " + " | ".join(f"{value:.3f}" for value in values) + " |")
-        print(rows[-1], flush=True)
-    return rows
-
-
-def last_frame(values: NDArray[Any], size: int) -> NDArray[Any]:
-    """Return the features of the last observed frame."""
-    return values[:, -size:]
+        table.append([rigid_accuracy(trials, trials.predict(name, count)) for name in MODELS])
+        print(count, table[-1], flush=True)
+    heads = [*map(str, counts), "each doubling adds"]
+    columns = np.array(table)
+    values = [*columns, [slope(counts, column) for column in columns.T]]
+    return [
+        f"| {head} | " + " | ".join(f"{value:.3f}" for value in row) + " |"
+        for head, row in zip(heads, values, strict=True)
+    ]
 
 
 def shown(value: float) -> str:
@@ -215,38 +289,76 @@ def likeness_rows(
     return rows
 
 
-def beyond_outcome(p: NDArray[Any], people: NDArray[Any], outcome: NDArray[Any]) -> float:
-    """Return the partial r of answers (n,) with P(yes) (n,) given the outcome (n,)."""
-    left = []
-    for values in (p, people):
-        means = np.where(outcome, values[outcome].mean(), values[~outcome].mean())
-        left.append(values - means)
-    return float(np.corrcoef(*left)[0, 1])
-
-
 def difference_rows(trials: Trials, answers: dict[str, pd.Series]) -> list[str]:
     """Return rows of the difference of r beyond the outcome, learned less simulated.
 
     Intervals are of 2000 samples of the stimuli with replacement, the same for both.
     """
-    people = read_humans(official().humans).set_index("stimulus")
-    names = [canonical_name(trial) for trial in trials.tested.index]
+    people = answers_of_people(trials)
     outcome = trials.tested["contact"].to_numpy(bool)
-    right = people.loc[names, "accuracy"].to_numpy(float)
-    yes = np.where(outcome, right, 1 - right)
-    draws = np.random.default_rng(0).integers(len(names), size=(2000, len(names)))
-    everything, rows = np.arange(len(names)), []
-    for learned in (name for name in answers if name.startswith(tuple(GIVEN.values()))):
-        for simulated in (name for name in answers if name.startswith("simulation")):
-            pair = [answers[name].to_numpy(float) for name in (learned, simulated)]
+    yes = (people["yes"] / people["count"]).to_numpy()
+    draws = np.random.default_rng(0).integers(len(yes), size=(2000, len(yes)))
+    everything, rows = np.arange(len(yes)), []
+    learned_names = [n for n in answers if n.startswith((*GIVEN.values(), "intuition"))]
+    for learned in (n for n in learned_names if "spread" not in n and "exchanged" not in n):
+        for other in (name for name in answers if name in COMPARED):
+            pair = [answers[name].to_numpy(float) for name in (learned, other)]
             first, second = (
-                np.array([beyond_outcome(p[r], yes[r], outcome[r]) for r in (everything, *draws)])
+                np.array([partial(p[r], yes[r], outcome[r]) for r in (everything, *draws)])
                 for p in pair
             )
             whole, (low, high) = (first - second)[0], np.quantile((first - second)[1:], EDGES)
-            rows.append(f"| {learned} | {simulated} | {whole:.3f} ({low:.3f} to {high:.3f}) |")
+            rows.append(f"| {learned} | {other} | {whole:.3f} ({low:.3f} to {high:.3f}) |")
             print(rows[-1], flush=True)
     return rows
+
+
+def mixed_on_own(
+    trials: Trials, folder: Path, answers: dict[str, pd.Series], own: int, samples: int
+) -> tuple[dict[str, pd.Series], list[str]]:
+    """Return mixtures whose weights are fitted on own trials, ``own`` of each scenario, and these.
+
+    Forests answer trials that they have not seen.
+    """
+    mixed, rows = {}, []
+    chosen = [
+        trial
+        for scenario, table in trials.own.groupby("scenario")
+        for trial in trials.arrays[MODELS[0], str(scenario)][0][-own:]
+        if trial in table.index
+    ]
+    tested = as_tested(Dataset(folder / SET), chosen)
+    simulation = simulated(tested, folder / "simulations", SCALES[0], samples)
+    simulation = simulation.set_axis([str(trial) for trial in simulation.index])
+    outcome = trials.own.loc[chosen, "contact"].to_numpy(float)
+    for name, given in GIVEN.items():
+        fit = pd.DataFrame(
+            {given: trials.predict_own(name, chosen), "simulation": simulation[chosen]}
+        )
+        weights = logistic_weights(fit, outcome, np.ones(len(outcome)))
+        test = pd.DataFrame(
+            {given: answers[given], "simulation": answers[f"simulation, noise x {SCALES[0]:g}"]}
+        )
+        mixed[f"mixed of {given} and simulation, weights of own trials"] = pd.Series(
+            expit(log_odds(test) @ weights), test.index
+        )
+        rows.append(f"| {given}, own trials | {weights[0]:.2f} | {weights[1]:.2f} |")
+    return mixed, rows
+
+
+def predicted(path: Path, trials: Trials) -> dict[str, pd.Series]:
+    """Return the answers of a table of predictions, by model."""
+    table = pd.read_csv(path)
+    table = table[table["readout"] == "observed"].assign(
+        stimulus=[
+            canonical_name(str(name)) for name in table["stimulus"][table["readout"] == "observed"]
+        ]
+    )
+    names = [canonical_name(trial) for trial in trials.tested.index]
+    return {
+        str(model): rows.set_index("stimulus")["p_contact"][names].set_axis(trials.tested.index)
+        for model, rows in table.groupby("model")
+    }
 
 
 def main() -> None:
@@ -256,28 +368,60 @@ def main() -> None:
     )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--samples", type=int, default=8, help="simulations of a stimulus")
+    parser.add_argument("--own", type=int, default=50, help="own trials that fit weights")
+    parser.add_argument("--predictions", type=Path, nargs="*", default=[], help="of other models")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     trials = Trials(options.folder)
     print(f"{len(trials.own)} own trials, {len(trials.tested)} official stimuli", flush=True)
     curve = learning(trials)
+    people, scenario = answers_of_people(trials), trials.tested["scenario"].astype(str)
+    outcome = trials.tested["contact"].to_numpy(bool)
     answers: dict[str, pd.Series] = {}
     for name, given in GIVEN.items():
         answers[given] = trials.predict(name)
         answers[f"{given}, configuration unseen"] = trials.predict(name, unseen=True)
-        answers[f"{given}, last frame"] = trials.predict(name, columns=last_frame)
+        answers[f"{given}, scenario unseen"] = trials.predict_elsewhere(name)
+        for control in CONTROLS:
+            answers[f"{given}, {control.name}"] = trials.predict(
+                name, fit=control.fit, test=control.test
+            )
+    for path in options.predictions:
+        answers |= predicted(path, trials)
     answers["base rate of the configuration"] = trials.base_rates()
-    for scale in SCALES:
-        answers[f"simulation, noise x {scale:g}"] = trials.simulated(
-            options.folder, scale, options.samples
-        )
-    of_simulations = [p for name, p in answers.items() if name.startswith("simulation")]
-    answers["simulation, mean of the levels"] = sum(of_simulations) / len(of_simulations)
+    levels = pd.DataFrame(
+        {
+            f"simulation, noise x {scale:g}": trials.simulated(
+                options.folder, scale, options.samples
+            )
+            for scale in SCALES
+        }
+    )
+    answers |= {str(name): levels[name] for name in levels}
+    answers["simulation, mean of the levels"] = levels.mean(axis=1)
+    answers["simulation, level fitted to half of people"] = best_level(levels, people, scenario)
+    answers["simulation, levels weighted on half of people"] = weighted_levels(
+        levels, people, scenario
+    )
+    default, weights = answers[str(levels.columns[0])], []
+    for given in GIVEN.values():
+        answers[f"{given}, spread of simulation"] = with_spread(answers[given], default, scenario)
+        answers[f"simulation, spread of {given}"] = with_spread(default, answers[given], scenario)
     for given in GIVEN.values():
         both = (answers[given] + answers["simulation, mean of the levels"]) / 2
         answers[f"mean of {given} and simulation"] = both
+        pair = pd.DataFrame({given: answers[given], **levels})
+        mixed, found = fitted_to_people(pair, people, scenario)
+        answers[f"mixed of {given} and simulation, weights of half of people"] = mixed
+        weights.append(
+            f"| {given}, people | {found[:, 0].mean():.2f} | {found[:, 1:-1].sum(1).mean():.2f} |"
+        )
+    mixed_own, of_own = mixed_on_own(trials, options.folder, answers, options.own, options.samples)
+    answers |= mixed_own
     rows = likeness_rows(trials, answers, scored(answers))
     differences = difference_rows(trials, answers)
+    reliability, most = ceiling(people, outcome)
+    print(f"reliability {reliability:.3f}, ceiling {most:.3f}", flush=True)
     text = "\n".join(
         [
             "# Learned intuition and simulation",
@@ -292,12 +436,25 @@ def main() -> None:
             *curve,
             "",
             "With all own trials; r is with people's answers, intervals are of the jackknife over "
-            f"stimuli; {options.samples} simulations of a stimulus from the true state:",
+            f"stimuli; {options.samples} simulations of a stimulus from the true state. Without "
+            f"the tested scenario, forests saw {ELSEWHERE} trials of each other one:",
             "",
             "| answers | accuracy, rigid | accuracy, mean of eight | r, pooled "
             "| r beyond the outcome, pooled | r, mean of eight | r beyond, mean of eight |",
             "|---|---|---|---|---|---|---|",
             *rows,
+            "",
+            f"People's answers beyond the outcome have the reliability {reliability:.3f} (halves "
+            "of the people of each stimulus, Spearman-Brown, pooled), so that no model has a "
+            f"higher r beyond the outcome than {most:.3f}.",
+            "",
+            "Weights of log odds in the mixtures, fitted on own trials or to people (mean of two "
+            "halves; the weights of all levels of simulation are added):",
+            "",
+            "| learned, fitted on | weight of learned | weight of simulation |",
+            "|---|---|---|",
+            *of_own,
+            *weights,
             "",
             "Difference of r beyond the outcome, pooled, with 95 % intervals over stimuli:",
             "",

@@ -18,7 +18,7 @@ which they start.
 
 ``shipped`` and ``official`` are of the decision *touch*, whose distance was calibrated on contacts
 of training trials. ``decisions`` compares all four decisions on all official stimuli that
-people saw; only *gap* is fitted, on the other official trials.
+people saw, or --limit of each scenario; only *gap* is fitted, on the other official trials.
 
 ``futures`` compares such answers of the shipped DPI-Net with those of the people who saw the
 official scenes, Drape left out; outcomes are the recorded ones. ``symmetry`` compares the step
@@ -285,11 +285,11 @@ def run_official(_: Path, name: str) -> str:
     )
 
 
-def run_decisions(folder: Path, name: str) -> str:
+def run_decisions(folder: Path, name: str, limit: int) -> str:
     """Return scores beside people of every decision on the same rollouts of a model; GNS also with
     bodies that deform.
     """
-    plan = plan_official(Path(PACKAGED), humans_folder(Path(PACKAGED)), 0)
+    plan = plan_official(Path(PACKAGED), humans_folder(Path(PACKAGED)), limit)
     settings = GenerateSettings(movies=False, jitters=0, min_visible=0.0, look="redyellow")
     make_trials(folder / "official", plan.tasks, settings)
     trials, out = folder / "official", folder / "models"
@@ -528,14 +528,17 @@ def main() -> None:
         "collide": run_collide, "transfer": run_transfer, "futures": run_futures,
         "batched": run_batched, "symmetry": run_symmetry, "memory": run_memory,
     }  # fmt: skip
-    by_model = {"shipped": run_shipped, "official": run_official, "decisions": run_decisions}
+    by_model = {"shipped": run_shipped, "official": run_official}
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", choices=["data", *runs, *by_model])
+    parser.add_argument("what", choices=["data", *runs, *by_model, "decisions"])
     parser.add_argument("folder", type=Path)
     parser.add_argument(
         "--models", nargs="+", choices=NAMES, default=NAMES, help="of shipped, official, decisions"
+    )
+    parser.add_argument(
+        "--limit", type=int, default=0, help="stimuli of each scenario, of decisions; 0: all"
     )
     parser.add_argument("--write", action="store_true")
     chosen = parser.parse_args()
@@ -548,8 +551,13 @@ def main() -> None:
         report(what, f"{what} FOLDER", runs[what](chosen.folder), chosen.write)
         return
     for name in chosen.models:
-        text = by_model[what](chosen.folder, name)
-        report(f"{what}, {name}", f"{what} FOLDER --models {name}", text, chosen.write)
+        command = f"{what} FOLDER --models {name}"
+        if what == "decisions":
+            text = run_decisions(chosen.folder, name, chosen.limit)
+            command += f" --limit {chosen.limit}" if chosen.limit else ""
+        else:
+            text = by_model[what](chosen.folder, name)
+        report(f"{what}, {name}", command, text, chosen.write)
 
 
 if __name__ == "__main__":

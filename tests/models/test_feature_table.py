@@ -185,12 +185,13 @@ def test_files_of_the_evaluator_give_the_predictions_of_the_same_features(
     dots: Dataset, tmp_path: Path
 ) -> None:
     given = arrays(dots)
-    write(tmp_path / "net.npz", given)
+    write(tmp_path / "net.npz", given | {"benchmark": "v1.5"})
     path = evaluator_files(tmp_path / "mynet" / "ocp", dots, given)
     own = predicted(str(tmp_path / "net.npz"), dots, tmp_path / "own")
     theirs = predicted(str(path), dots, tmp_path / "theirs")
     assert set(theirs["model"]) == {"mynet"}
     assert set(theirs["inputs"]) == {"features of unstated frames"}
+    assert set(theirs["benchmark"]) == {"v1.5"} and theirs["readout_c"].nunique() == 1
     np.testing.assert_allclose(theirs["p_contact"], own["p_contact"], atol=1e-9)
     detection = evaluator_files(tmp_path / "mynet" / "ocd", dots, given)
     table = predicted(str(detection), dots, tmp_path / "ocd")
@@ -232,6 +233,7 @@ def with_nan(given: dict[str, Any]) -> dict[str, Any]:
         (lambda a: a | {"names": np.full(24, "a")}, "the name 'a' occurs twice"),
         (lambda a: a | {"features": a["features"].astype(int)}, "features are int64"),
         (lambda a: {"names": a["names"], "features": a["features"]}, "no array 'frames'"),
+        (lambda a: a | {"benchmark": "2"}, "benchmark must be v1 or v1.5, not '2'"),
         (lambda a: a | {"readout": "later"}, "readout must be observed or full, not 'later'"),
         (lambda a: a | {"names": a["names"].astype(object)}, "pickled objects are refused"),
         (lambda a: a | {"names": a["names"][:, None]}, r"names have the shape \(24, 1\)"),

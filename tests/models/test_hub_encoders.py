@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +94,9 @@ def test_an_image_encoder_gives_what_its_own_library_computes(published: dict[st
     torch.testing.assert_close(mean.encode(batch), tokens[:, :, 3:].mean(2), **close)
     grid: Any = build_model(name, pooling="grid")
     torch.testing.assert_close(grid.encode(batch), tokens[:, :, 3:].flatten(2), **close)
+    attentive: Any = build_model(name, pooling="attentive")
+    assert torch.equal(attentive.encode(batch), grid.encode(batch))
+    assert (attentive.tokens, attentive.decision) == (grid.tokens, "attentive") == (16, "attentive")
     second = output.hidden_states[2].view(2, 3, 19, WIDTH)
     layer: Any = build_model(name, layer=2, pooling="mean")
     torch.testing.assert_close(layer.encode(batch), second[:, :, 3:].mean(2), **close)
@@ -116,6 +120,21 @@ def test_clips_of_a_video_encoder_end_with_the_last_observed_frame(
     repeated = longer.steps(slice(0, 16))
     torch.testing.assert_close(model.encode(longer)[:, :8], model.encode(repeated))
     assert model.encode(longer).shape == (2, 16, WIDTH)
+
+
+@pytest.mark.parametrize("kind", ["videomae", "vjepa2"])
+def test_registered_names_and_hf_agree(kind: str, published: dict[str, Path]) -> None:
+    """On one file of weights and equal statistics; hf: reads the sizes, the others are given."""
+    hub: Any = build_model(f"hf:{published[kind]}", pooling="grid")
+    name = {"videomae": "VideoMAE", "vjepa2": "V-JEPA2"}[kind]
+    own: Any = build_model(
+        name, weights=str(published[kind] / "model.safetensors"), image_size=SIZE, patch=PATCH,
+        width=WIDTH, depth=3, heads=2, mlp=2.0 if kind == "videomae" else 4.0, pooling="grid",
+    )  # fmt: skip
+    own.spec = replace(own.spec, mean=hub.spec.mean, std=hub.spec.std)
+    assert own.spec == hub.spec and own.init == hub.init
+    batch = clips(19)
+    torch.testing.assert_close(own.encode(batch), hub.encode(batch), rtol=1e-4, atol=1e-5)
 
 
 def test_random_weights_follow_the_seed(published: dict[str, Path]) -> None:

@@ -108,7 +108,10 @@ def test_tokens_are_averaged_at_one_time_and_in_cells(name: str) -> None:
     tokens = grid.network(model_input(grid, large)).last_hidden_state
     cells = tokens.view(2, 2, 4, 2, 4, 2, 24).mean((3, 5)).reshape(2, 2, -1)
     assert torch.allclose(grid.encode(large), cells, atol=1e-6)
-    assert grid.name() == f"random-{name}-grid-small"
+    assert grid.name() == f"random-{name}-grid-small" and (grid.tokens, model.tokens) == (16, 1)
+    attentive = make(name, pooling="attentive", image_size=64)
+    assert torch.equal(attentive.encode(large), grid.encode(large))
+    assert (attentive.tokens, attentive.decision) == (16, "attentive")
 
 
 def model_input(model: VideoEncoder, clips: Batch) -> Tensor:

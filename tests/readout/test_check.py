@@ -25,6 +25,7 @@ from physion.readout.changes import CHANGES, ChangedTrials, take_trials
 from physion.readout.check import REFUSED, SHOWN, CheckedModel, _is_of_the_machine, check
 from physion.readout.evaluate import Evaluation, evaluate
 from physion.readout.settings import choose_models
+from physion.readout.tables import read_table
 from physion.trials.dataset import Dataset
 from physion.trials.index import build_index, write_index
 from physion.trials.trial_file import seal
@@ -324,6 +325,59 @@ def test_twins_are_shown(made: Dataset, tmp_path: Path) -> None:
     assert rows["moved"]["random twin"]["observed"] > 0
     assert set(rows.loc["blob-centroids"].index) == {"observed"}
     assert set(rows["accuracy_changed"].dropna() * 4 % 1) == {0.0}, "of four tested trials"
+
+
+class Encoding(leaks.Honest):
+    """Model with features, which notes the names of each batch."""
+
+    decision = "logistic"
+    answers = ""
+    predict: Any = None
+
+    def __init__(self) -> None:
+        self.batches: list[tuple[str, ...]] = []
+
+    def encode(self, batch: Batch) -> Any:
+        self.batches.append(batch.trials)
+        return batch.rgb.astype(np.float32).mean((2, 3))
+
+
+def test_trials_that_fit_the_readout_are_encoded_once(made: Dataset, tmp_path: Path) -> None:
+    """And never in a batch with tested ones, whose sums would be rounded differently then."""
+    model: Any = Encoding()
+    assert run(made, model, tmp_path, "again", "labels").passed
+    fit, tested = set(made.trials("readout")), set(made.trials("testing"))
+    seen = [name for batch in model.batches for name in batch]
+    assert sorted(name for name in seen if name in fit) == sorted(fit)
+    assert sorted(name for name in seen if name in tested) == sorted(3 * list(tested))
+    assert all(set(batch) <= fit or set(batch) <= tested for batch in model.batches)
+
+
+def test_evaluate_writes_the_verdict_into_the_table(
+    made: Dataset,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("physion.readout.check.CHANGES", {"names": CHANGES["names"]})
+    file = tmp_path / "own.py"
+    file.write_text(
+        "from support import leaking_models as leaks\n"
+        "class Cheat(leaks.Cheater):\n"
+        "    def __init__(self): super().__init__(leaks.number_in_the_name)\n"
+        "class Good(leaks.Honest): pass\n"
+    )
+    models = f"{file}:Cheat,{file}:Good"
+    command = ["evaluate", models, str(made.folder), "--out", str(tmp_path / "out")]
+    assert main([*command, "--check", "--workers", "1"]) == 0
+    out = capsys.readouterr().out
+    tables = [read_table(path) for path in (tmp_path / "out" / "predictions").glob("*.csv")]
+    verdicts = {table["model"][0]: set(table["check"]) for table in tables}
+    assert verdicts == {"Cheat": {"refused: names"}, "Good": {"passed"}}
+    (row,) = (line for line in out.splitlines() if line.startswith("Good"))
+    assert "passed" in row
+    assert main([*command, "--dry-run"]) == 0, "without the check it is another table"
+    assert "2 of 2 evaluations to do" in capsys.readouterr().out
 
 
 class Failing(leaks.Honest):

@@ -386,6 +386,7 @@ def rows_of(hits: dict[str, list[bool]], seed: int = 0, **changes: str) -> pd.Da
     """Return predictions that are right or not as ``hits`` says, by scenario."""
     rows = [
         {"model": "m", "init": "random", "protocol": "all", "readout": "full", "seed": str(seed),
+         "benchmark": "v1",
          "dynamics_training_dataset": "",
          "scenario": scenario, "outcome": True, "p_contact": float(hit), **changes}
         for scenario, values in hits.items()

@@ -71,6 +71,11 @@ class Movies:
     def length(self, trial: str) -> int:
         return self.lengths.get(trial, 50)
 
+    def steps(self, trial: str, part: str) -> int:
+        if part == "context":
+            return self.spec.context
+        return len(self.spec.all_frames(self.length(trial)))
+
     def context(self, trials: Sequence[str]) -> Batch:
         return self._clips(trials, self.spec.context_frames())
 
@@ -86,7 +91,7 @@ class ObservedMovies:
 
     def __init__(self, movies: Movies) -> None:
         self.spec, self.trials = movies.spec, movies.trials
-        self.context, self.key = movies.context, movies.key
+        self.context, self.key, self.steps = movies.context, movies.key, movies.steps
 
 
 class Network(nn.Module):

@@ -1,7 +1,8 @@
 """Changed copies of a dataset that show whether predictions use what they must not.
 
-- With poisoned futures, everything after the observed part is noise. Predictions under *observed*
-  and *observed+simulated* must stay the same to the byte.
+- With poisoned futures, everything after the observed part is noise, by the change ``future`` of
+  `physion.check`. Predictions under *observed* and *observed+simulated* must stay the same to the
+  byte.
 - With exchanged futures, every movie ends like that of another trial; with ``motions=True`` the
   motions do, too. Predictions under *full* must fall to what the observed part tells.
 - With permuted labels, nothing that is fitted can be better than chance.
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 from physion.core.errors import BadInputError
 from physion.core.seeds import generator
 from physion.physics.trajectory import Contacts, Trajectory
+from physion.readout.changes import CHANGES, ChangedTrials
 from physion.scenes.scene import OBSERVED_FRAMES
 from physion.trials.dataset import Dataset
 from physion.trials.index import write_index
@@ -58,18 +60,11 @@ def with_poisoned_futures(
         If the folder exists.
     """
 
-    def poison(trial: str, frames: Pictures) -> Pictures:
-        changed = frames.copy()
-        later = changed[OBSERVED_FRAMES:]
-        later[:] = generator("poison", seed, trial).integers(0, 256, later.shape, np.uint8)
-        return changed
-
-    copy = _copy(dataset, folder)
-    for trial in _trials(copy, splits):
-        _change_movie(copy, trial, poison)
-        if copy.paths(trial).trial_file.is_file():
-            _poison_motion(copy, trial, generator("poison motion", seed, trial))
-    return _written(copy)
+    if folder.exists():
+        raise BadInputError(f"{folder} exists; name a new folder for the changed copy")
+    copy = ChangedTrials(dataset, folder, generator("poison", seed), splits)
+    CHANGES["future"].apply(copy)
+    return copy.finish()
 
 
 def with_exchanged_futures(
@@ -198,22 +193,6 @@ def _exchange_motion(dataset: Dataset, name: str, other: Trajectory) -> None:
         for field in dataclasses.fields(Contacts)
     }
     _change_motion(dataset, name, arrays, Contacts(**contacts), other.completed)
-
-
-def _poison_motion(dataset: Dataset, name: str, rng: np.random.Generator) -> None:
-    """Replace the motion after the observed part by noise, and remove its contacts."""
-    trajectory = Trial.open(dataset.paths(name).trial_file).trajectory
-    changed: dict[str, Any] = {}
-    for what in _MOTION:
-        array = getattr(trajectory, what).copy()
-        array[OBSERVED_FRAMES:] = rng.normal(size=array[OBSERVED_FRAMES:].shape)
-        changed[what] = array
-    observed = trajectory.contacts.frame < OBSERVED_FRAMES
-    contacts = {
-        field.name: getattr(trajectory.contacts, field.name)[observed]
-        for field in dataclasses.fields(Contacts)
-    }
-    _change_motion(dataset, name, changed, Contacts(**contacts), not trajectory.completed)
 
 
 def _change_motion(

@@ -12,7 +12,7 @@ TINY: dict[str, Any] = {
 FROZEN = [
     "frozen-encoder", "pVGG-mlp", "pVGG-lstm", "pDeIT-mlp", "pDeIT-lstm", "pEffNetLite0-mlp",
     "pDINO-mlp", "pDINO-lstm", "pDINOv2-mlp", "pDINOv2-lstm", "pDINOv3-mlp", "pDINOv3-lstm",
-    "pEffNetLite0-lstm",
+    "pEffNetLite0-lstm", "pHEDVGG16-mlp", "pHEDVGG16-lstm",
 ]  # fmt: skip
 VIDEO: dict[str, Any] = {
     "weights": "random", "image_size": 32, "patch": 8, "frames": 4, "width": 24, "depth": 2,

@@ -21,10 +21,19 @@ MARKED = (
     "stimuli"
 )
 RESULTS = (
-    "row", "group", "readout", "given", "stimuli", "accuracy", "accuracy_low", "accuracy_high", "r",
-    "r_low", "r_high", "kappa", "kappa_low", "kappa_high", "source",
+    "row", "group", "readout", "given", "frames", "benchmark", "check", "stimuli", "accuracy",
+    "accuracy_low", "accuracy_high", "r", "r_low", "r_high", "kappa", "kappa_low", "kappa_high",
+    "source",
 )  # fmt: skip
-"""Columns of the table of results. ``group``: people, model, baseline or published."""
+"""Columns of the table of results.
+
+- ``group``: people, model, baseline or published. ``given``: what a row was given of a trial.
+- ``frames``: first and last frame that it saw, and how many a second, if its predictions say so.
+- ``benchmark``: rules of the evaluation, v1 or v1.5, and ``check``: verdict of a check, likewise.
+"""
+
+SEEN = ("frames", "benchmark", "check")
+"""Columns that predictions may have, too."""
 
 GIVEN = {
     "rgb": "pixels",
@@ -69,8 +78,8 @@ def published_rows(tables: PublishedTables, scenarios: Collection[str]) -> pd.Da
         records.append(_published(name, given, runs[runs["model"] == model]))
     if set(scenarios) == set(SCENARIOS):
         records += [
-            {"row": name + MARK, "group": "published", "given": given, "accuracy": accuracy,
-             "source": source}
+            {"row": name + MARK, "group": "published", "given": given, "frames": "", "check": "",
+             "benchmark": "v1", "accuracy": accuracy, "source": source}
             for name, given, accuracy, source in OTHER_STUDIES
         ]  # fmt: skip
     return pd.DataFrame(records).reindex(columns=list(RESULTS))
@@ -81,7 +90,8 @@ def _published(
 ) -> dict[str, object]:
     """Return a row with the means over scenarios of the means of the seeds."""
     means = rows.groupby("scenario")[["accuracy", "kappa"]].mean().mean()
-    about = {"row": name + MARK, "group": group, "given": given, "source": STUDY}
+    about = {"row": name + MARK, "group": group, "given": given, "frames": "", "benchmark": "v1"}
+    about |= {"check": "", "source": STUDY}
     return {**about, "accuracy": means["accuracy"], "kappa": means["kappa"]}
 
 
@@ -102,6 +112,7 @@ def results_table(
     scores: pd.DataFrame,
     inputs: Mapping[str, str] | None = None,
     published: pd.DataFrame | None = None,
+    seen: pd.DataFrame | None = None,
 ) -> pd.DataFrame:
     """Return one row per row of the results: people first, then all others by accuracy.
 
@@ -114,6 +125,8 @@ def results_table(
         What each model was given, by its name: values of the column *Inputs*.
     published
         From `published_rows`.
+    seen
+        Columns `SEEN` by model (index), whose values may be empty.
 
     Returns
     -------
@@ -135,6 +148,9 @@ def results_table(
         "stimuli": rows["stimuli"],
         "source": "",
     }
+    for column in SEEN:
+        known = {} if seen is None else seen[column].to_dict()
+        values[column] = [known.get(name, "") for name in rows["model"]]
     for name, column in (("accuracy", "accuracy"), ("r", "r"), ("kappa", kappa)):
         for end in ("", "_low", "_high"):
             values[f"{name}{end}"] = rows.get(f"{column}{end}", np.nan)
@@ -143,6 +159,12 @@ def results_table(
     table = pd.concat([part.astype(object) for part in parts], ignore_index=True).infer_objects()
     order = np.where(table["group"] == "people", np.inf, table["accuracy"].astype(float))
     return table.iloc[np.argsort(-order, kind="stable")].reset_index(drop=True)
+
+
+def frames_with_benchmark(results: pd.DataFrame) -> list[str]:
+    """Return benchmark and frames of the rows of a table of results, such as v1: 2 to 44, 5/s."""
+    pairs = zip(results["benchmark"], results["frames"], strict=True)
+    return [": ".join(filter(None, pair)) for pair in pairs]
 
 
 def _given(name: str, inputs: str) -> str:

@@ -340,6 +340,9 @@ PREDICTIONS: tuple[Column, ...] = (
            also=("Recorded Outcome",)),
     Column("observed_contact", "flag", "Contact in the observed part", also=("Observed Contact",)),
     Column("inputs", "text", "What the model was given of a trial", also=("Inputs",)),
+    Column("frames", "text", "Frames that the model saw of a trial, and how many a second"),
+    Column("benchmark", "text", "Rules of the evaluation: v1 or v1.5"),
+    Column("check", "text", "Verdict of physion check: passed, refused, ..."),
     Column("init", "text", "Weights that the model started from", also=("Init",)),
     Column("protocol", "text", "Scenarios of the training: all, all-but, only, one",
            also=("Dynamics Training Dataset",)),
@@ -366,7 +369,8 @@ DATASETS = ("encoder_pretraining_dataset", "encoder_training_dataset", "protocol
 in relation to the tested scenario."""
 
 DISTINGUISHING = (
-    *("protocol", "dynamics_training_dataset", "seed", "init", "encoder_type", "dynamics_type"),
+    *("benchmark", "protocol", "dynamics_training_dataset", "seed", "init"),
+    *("encoder_type", "dynamics_type"),
     *("encoder_pretraining_task", "encoder_pretraining_dataset", "encoder_pretraining_seed"),
     *("encoder_training_task", "encoder_training_dataset", "encoder_training_seed"),
     *("dynamics_training_task", "readout_training_dataset"),

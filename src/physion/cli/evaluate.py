@@ -7,7 +7,7 @@ done again, and one evaluation that fails does not stop the others.
 from __future__ import annotations
 
 import json as json_module
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,6 +18,7 @@ from physion.compute.run_tasks import ExecutorSettings
 from physion.core.errors import BadInputError
 from physion.core.settings import read_pairs, split_names
 from physion.models.build import FEATURE_FILES
+from physion.readout.check import check_models
 from physion.readout.evaluate import EvaluatedModel, Evaluation, evaluate
 from physion.readout.logistic import LogisticSettings
 from physion.readout.settings import EvaluationSettings, options_by_model
@@ -57,6 +58,9 @@ class Options:
     )
     """Where tasks run: on Slurm and Ray, one model, protocol and seed is a task; on this machine a
     simulation."""
+    check: bool = False
+    """First check on about 80 trials that no prediction depends on the future, names, order, labels
+    or files (physion check), and write the verdict into the table."""
     verify: bool = True
     """Compare files with their SHA-256 in the index before they are used."""
     dry_run: bool = False
@@ -81,13 +85,26 @@ def main(options: Options) -> int:
                 f"a file of features ends with {', '.join(FEATURE_FILES)}, not {options.features}"
             )
         models = [*models, str(options.features)]
+    chosen = options_by_model(models, of_models)
+    trials = Dataset(dataset, verify=options.verify)
     with Stages() as stages:
+        verdicts = {}
+        if options.check and not options.dry_run:
+            verdicts = check_models(
+                chosen,
+                trials,
+                options.out / "check",
+                replace(options.settings, logistic=logistic),
+                executor=options.compute.open(),
+                progress=stages,
+            )
         done = evaluate(
-            options_by_model(models, of_models),
-            Dataset(dataset, verify=options.verify),
+            chosen,
+            trials,
             options.out,
             options.settings,
             fit=None if options.fit is None else Dataset(options.fit, verify=options.verify),
+            verdicts=verdicts,
             logistic=logistic,
             executor=options.compute.open(),
             progress=stages,

@@ -1,5 +1,5 @@
-"""Export a dataset to layouts that published code reads, to tar shards, or to a dataset card, or
-as movies that a network elsewhere is to encode."""
+"""Export a dataset to layouts that published code reads, to tar shards, or to a dataset card, as
+movies that a network elsewhere is to encode, or as questions for language models."""
 
 from __future__ import annotations
 
@@ -35,6 +35,7 @@ class Options:
         "webdataset",
         "gltf",
         "features-request",
+        "lmms-eval",
         "card",
         "result-tables",
     ] = "official"
@@ -46,6 +47,7 @@ class Options:
     gltf: one GLB file for each trial, with its motion, for Blender and other 3D programs;
     features-request: movies to be encoded elsewhere, their names, and a script that needs only
     torch; physion evaluate --features takes its result;
+    lmms-eval: questions for language models with movies, as tasks of this harness;
     card: README with Croissant metadata and a table for each split; result-tables: predictions with
     the names of scenarios that the notebooks of the study use."""
     split: Literal["training", "readout", "testing", "familiarization"] | None = None
@@ -143,6 +145,13 @@ def _trials(options: Options, out: Path, stages: Stages) -> int:
             options.folder, out, readout=options.readout, verify=options.verify, progress=stages,
             **chosen,
         )  # fmt: skip
+        return _print_paths(paths, options.json)
+    if options.layout == "lmms-eval":
+        from physion.trials.share.lmms_eval import export_lmms_eval
+
+        paths = export_lmms_eval(
+            options.folder, out, verify=options.verify, progress=stages, **chosen
+        )
         return _print_paths(paths, options.json)
     chosen |= {"executor": LocalExecutor(workers=options.workers), "progress": stages}
     if options.layout == "webdataset":

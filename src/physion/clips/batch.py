@@ -98,9 +98,16 @@ class Spec:
         """Whether the model asks for anything that the camera sees."""
         return any(name in PIXELS for name in self.inputs)
 
-    def context_frames(self) -> tuple[int, ...]:
-        """Return the frames of the context; all are observed."""
-        return tuple(self.first + step * self.stride for step in range(self.context))
+    def context_frames(self, last: int = LAST_OBSERVED) -> tuple[int, ...]:
+        """Return the frames of the context, none after ``last``; all are observed.
+
+        If fewer than ``context`` frames fit, the first one is repeated in front.
+        """
+        if self.context_at == "start":
+            shown = tuple(range(0, last + 1, self.stride))[: self.context]
+        else:
+            shown = tuple(range(last, -1, -self.stride))[: self.context][::-1]
+        return (shown[0],) * (self.context - len(shown)) + shown
 
     def steps_after(self, length: int) -> int:
         """Return how many frames follow the context in a clip of a motion of ``length`` frames.
@@ -146,6 +153,7 @@ class Batch:
     - ``camera`` (B, 2, 4, 4) float64: view matrix (world to camera) and projection matrix.
     - ``state``: motions (B); they have all frames from 0 on, not only ``frames``.
     - ``features`` (B, T, D) float32: of a frozen encoder, if ``learns_from`` is features.
+    - ``contact`` (B,) bool: outcomes, only in the training of a model that ``learns_outcomes``.
     - ``future``: steps that `Model.imagine` is asked for.
     """
 
@@ -159,6 +167,7 @@ class Batch:
     camera: Any = None
     state: tuple[Motion, ...] | None = None
     features: Any = None
+    contact: Any = None
     future: int = 0
 
     def __post_init__(self) -> None:
@@ -172,6 +181,7 @@ class Batch:
             "boxes": ((clips, steps, None, 4), "float32"),
             "camera": ((clips, 2, 4, 4), "float64"),
             "features": ((clips, steps, None), "float32"),
+            "contact": ((clips,), "bool"),
         }
         for name, (shape, dtype) in expected.items():
             value = getattr(self, name)
@@ -213,8 +223,11 @@ class Batch:
         )
 
     def steps(self, chosen: slice) -> Batch:
-        """Return a range of the frames of every clip; motions and cameras stay whole."""
-        kept = {name: value[:, chosen] for name, value in self.arrays().items() if name != "camera"}
+        """Return a range of the frames of every clip; what is no sequence of frames stays whole."""
+        whole = ("camera", "contact")
+        kept = {
+            name: value[:, chosen] for name, value in self.arrays().items() if name not in whole
+        }
         return dataclasses.replace(self, **kept)
 
 

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,7 +27,12 @@ from physion.trials.dataset import Dataset
 
 
 def observed_source(
-    dataset: Dataset, spec: Spec, *, look: str | None = None, rendered: bool = False
+    dataset: Dataset,
+    spec: Spec,
+    *,
+    look: str | None = None,
+    rendered: bool = False,
+    last: Mapping[str, int] | None = None,
 ) -> ObservedSource:
     """Return the source of the observed part of the trials of a dataset.
 
@@ -44,6 +49,8 @@ def observed_source(
         Colours: ``redyellow`` or ``free``, by default each trial's own.
     rendered
         Render ``rgb`` from the motion instead of reading movies, as always where no trial has any.
+    last
+        By trial the last frame that may be seen, where it is an earlier one (`ObservedSource`).
 
     Raises
     ------
@@ -51,15 +58,26 @@ def observed_source(
         If the look is unknown. Batches raise it for a file that is missing, damaged, or changed
         since it was made.
     """
-    return ObservedSource(spec, _readers(dataset, spec, look, rendered, observed=True))
+    readers = _readers(dataset, spec, look, rendered, observed=True)
+    return ObservedSource(spec, readers, last or {})
 
 
 def whole_source(
-    dataset: Dataset, spec: Spec, *, look: str | None = None, rendered: bool = False
+    dataset: Dataset,
+    spec: Spec,
+    *,
+    look: str | None = None,
+    rendered: bool = False,
+    last: Mapping[str, int] | None = None,
+    windows: Mapping[str, tuple[int, int]] | None = None,
 ) -> WholeSource:
-    """Return the source of whole trials of a dataset; parameters as of `observed_source`."""
-    context = observed_source(dataset, spec, look=look, rendered=rendered)
-    return WholeSource(context, _readers(dataset, spec, look, rendered, observed=False))
+    """Return the source of whole trials of a dataset; parameters as of `observed_source`.
+
+    ``windows``: see `WholeSource`.
+    """
+    context = observed_source(dataset, spec, look=look, rendered=rendered, last=last)
+    readers = _readers(dataset, spec, look, rendered, observed=False)
+    return WholeSource(context, readers, windows or {})
 
 
 def _readers(

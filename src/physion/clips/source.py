@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -112,10 +113,16 @@ class TrialReaders:
 
 
 class ObservedSource:
-    """Source of the observed part of trials, which are read by ``readers``."""
+    """Source of the observed part of trials, which are read by ``readers``.
 
-    def __init__(self, spec: Spec, readers: TrialReaders) -> None:
-        self._spec, self._readers = spec, readers
+    ``last``: by trial the last frame that may be seen, where it is an earlier one than
+    `LAST_OBSERVED`. Motions are not cut there.
+    """
+
+    def __init__(
+        self, spec: Spec, readers: TrialReaders, last: Mapping[str, int] = MappingProxyType({})
+    ) -> None:
+        self._spec, self._readers, self._last = spec, readers, last
 
     @property
     def spec(self) -> Spec:
@@ -132,14 +139,24 @@ class ObservedSource:
 
         The batch has the ``future`` of the spec, or 0 where it depends on the movies.
         """
-        frames = self._spec.context_frames()
-        if max(frames) > LAST_OBSERVED:
+        frames = [self._context(trial) for trial in trials]
+        latest = max((max(each) for each in frames), default=0)
+        if latest > LAST_OBSERVED:
             raise FutureFrameError(
-                f"frame {max(frames)} comes after the observed part, whose last frame is "
-                f"{LAST_OBSERVED}"
+                f"frame {latest} comes after the observed part, whose last frame is {LAST_OBSERVED}"
             )
-        batch = self._readers.batch(trials, [frames] * len(trials))
+        batch = self._readers.batch(trials, frames)
         return dataclasses.replace(batch, future=self._spec.future or 0)
+
+    def _context(self, trial: str) -> tuple[int, ...]:
+        """Return the frames of the context of a trial."""
+        if trial not in self._last:
+            return self._spec.context_frames()
+        return self._spec.context_frames(min(self._last[trial], LAST_OBSERVED))
+
+    def steps(self, trial: str, part: Part) -> int:
+        """Return the number of frames of a part of a trial's clip."""
+        return self._spec.context
 
     def key(self, trial: str, part: Part) -> str:
         """Return the hexadecimal SHA-256 of all that determines the context of a trial."""
@@ -147,19 +164,26 @@ class ObservedSource:
             raise FutureFrameError(
                 f"trial {trial!r}: a source of the observed part has no part {part!r} of a clip"
             )
-        return clip_key(self._spec, self._spec.context_frames(), self._readers.identity(trial))
+        return clip_key(self._spec, self._context(trial), self._readers.identity(trial))
 
 
 class WholeSource(ObservedSource):
     """Source of whole trials, which are read by ``readers``; the context comes from ``observed``.
 
     Movies of the observed part and of the whole trial are encoded apart, so the first frames of
-    `whole` differ from `context` by the rounding of the encoder.
+    `whole` differ from `context` by the rounding of the encoder. ``windows``: by trial the first
+    and the last frame of `whole`, where it is not the entire trial; frames before or after the
+    trial show its first or last one.
     """
 
-    def __init__(self, observed: ObservedSource, readers: TrialReaders) -> None:
+    def __init__(
+        self,
+        observed: ObservedSource,
+        readers: TrialReaders,
+        windows: Mapping[str, tuple[int, int]] = MappingProxyType({}),
+    ) -> None:
         super().__init__(observed.spec, readers)
-        self._observed = observed
+        self._observed, self._windows = observed, windows
 
     def length(self, trial: str) -> int:
         """Return the number of frames of a trial's motion."""
@@ -172,7 +196,20 @@ class WholeSource(ObservedSource):
     def whole(self, trials: Sequence[str], length: int = 0) -> Batch:
         """Return whole clips, of motions of ``length`` frames; 0: of the longest of the trials."""
         longest = length or max((self.length(trial) for trial in trials), default=0)
-        return self._read(trials, [self.spec.all_frames(longest)] * len(trials))
+        return self._read(trials, [self._whole(trial, longest) for trial in trials])
+
+    def _whole(self, trial: str, length: int) -> tuple[int, ...]:
+        """Return the frames of the whole clip of a trial."""
+        if trial not in self._windows:
+            return self.spec.all_frames(length)
+        first, last = self._windows[trial]
+        return tuple(max(f, 0) for f in range(last, first - 1, -self.spec.stride))[::-1]
+
+    def steps(self, trial: str, part: Part) -> int:
+        """Return the number of frames of a part of a trial's clip."""
+        if part == "context":
+            return self.spec.context
+        return len(self._whole(trial, self.length(trial)))
 
     def window(self, trials: Sequence[str], starts: Sequence[int], length: int) -> Batch:
         """Return ``length`` frames of every trial, ``spec.stride`` apart, from its start frame."""
@@ -200,7 +237,7 @@ class WholeSource(ObservedSource):
         """Return the hexadecimal SHA-256 of all that determines the part of a trial's clip."""
         if part == "context":
             return self._observed.key(trial, part)
-        frames = self.spec.all_frames(self.length(trial))
+        frames = self._whole(trial, self.length(trial))
         return clip_key(self.spec, frames, self._readers.identity(trial))
 
 

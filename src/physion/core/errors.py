@@ -77,13 +77,19 @@ class ExclusionError(BadInputError):
         self.rule, self.scenario, self.flagged, self.sessions = rule, scenario, flagged, sessions
 
 
+OWN_ENVIRONMENT = ("inspect",)
+"""Extras whose dependencies exclude versions of requirements.lock."""
+
+
 class MissingExtraError(PhysionError):
     """Error for a feature whose optional dependencies are not installed."""
 
     def __init__(self, what: str, extra: str) -> None:
+        where, lock = "in the clone", " -c requirements.lock"
+        if extra in OWN_ENVIRONMENT:
+            where, lock = "in the clone, and in a virtual environment of its own", ""
         super().__init__(
-            f"{what} needs the extra {extra!r}; in the clone: "
-            f"pip install -e '.[{extra}]' -c requirements.lock"
+            f"{what} needs the extra {extra!r}; {where}: pip install -e '.[{extra}]'{lock}"
         )
         self.extra = extra
 

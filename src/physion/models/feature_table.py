@@ -8,6 +8,7 @@ A table is an ``.npz`` or HDF5 file with these arrays:
 - ``model``: name of the row; optional, by default, or if blank, the file's name.
 - ``readout``: ``observed`` or ``full``; optional, by default ``observed``, which excludes all
   frames after 44. Features of whole movies are ``full``.
+- ``benchmark``: ``v1`` or ``v1.5``, the rules by which movies were cut; optional, by default v1.
 
 ``train_features.hdf5`` and ``test_features.hdf5`` of neuroailab/physion_evaluator are read too,
 each together with the other one if it is there. They do not say which frames were seen. By its
@@ -88,6 +89,9 @@ class FeatureTable(Model):
                 f"the features of trial {names[row]!r}, time step {step}, are not finite numbers"
             )
         self.answers = _FULL if readout == _FULL else ""
+        self.benchmark = "v1.5" if self._of_evaluator else str(tables[0].get("benchmark", "v1"))
+        if self.benchmark not in ("v1", "v1.5"):
+            raise self._error(f"benchmark must be v1 or v1.5, not {self.benchmark!r}")
         self.spec = Spec(
             inputs=(),
             stride=1,
@@ -123,7 +127,8 @@ class FeatureTable(Model):
                     raise self._error(f"names have the shape {named.shape}, expected one row")
                 table = {"names": [_text(name) for name in named]}
                 table["frames"], values = (np.asarray(file[name][()]) for name in _NEEDED[1:])
-                table |= {n: _text(file[n][()]) for n in ("model", "readout") if n in file}
+                texts = ("model", "readout", "benchmark")
+                table |= {name: _text(file[name][()]) for name in texts if name in file}
         rows, steps = len(table["names"]), table["frames"].size
         if table["frames"].ndim != 1 or table["frames"].dtype.kind not in "iu":
             raise self._error("frames must be integers, one for each time step")

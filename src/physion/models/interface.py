@@ -187,8 +187,8 @@ class Model:
     """Base class of models; each defines ``spec``, `provenance`, `digest` and some of five methods.
 
     The five are `encode` (features of clips), `imagine` (futures), `predict` (P(contact)), `fit`
-    (a predictor, fitted on labelled trials) and `loss` (training without labels, of a torch
-    ``Module``). All other attributes and methods are optional.
+    (a predictor, fitted on labelled trials) and `loss` (training of a torch ``Module``, without
+    labels unless it ``learns_outcomes``). All other attributes and methods are optional.
 
     Attributes
     ----------
@@ -205,11 +205,21 @@ class Model:
         The readout whose row the model makes by `predict` or `fit`: ``observed``,
         ``observed+simulated``, or ``full`` if it is shown the outcome. A model with `encode` sets
         ``full`` if its features always include the outcome, so that they are no other row.
+    benchmark
+        Rules by which its features were made (`physion.readout.benchmark`); empty: any.
+    tokens
+        Tokens in the features of a time step, D / tokens numbers each, one after the other, for the
+        decision *attentive*.
     trained
         Whether the weights are pretrained, so that training is skipped.
     learns_from
         What a model with a `loss` is trained on: ``clips`` (what `Spec` asks for), ``features`` (of
         its own `encode`), or ``states`` (whole motions).
+    learns_outcomes
+        Whether the model is trained on the context of trials with their outcomes
+        (``Batch.contact``), and not on windows without labels.
+    targets
+        Inputs, as in `Spec`, that its training sees too, such as boxes to be predicted.
     window
         Frames of a training clip, at ``spec.stride``, from a random start; 0: context and future
         of the `Spec`, or twice the context where the future depends on the movie.
@@ -225,8 +235,12 @@ class Model:
     seed: int | None = None
     arguments: Mapping[str, tuple[float, ...]] = MappingProxyType({})
     answers: str = ""
+    benchmark: str = ""
+    tokens: int = 1
     trained: bool = False
     learns_from: LearnsFrom = "clips"
+    learns_outcomes: bool = False
+    targets: tuple[str, ...] = ()
     window: int = 0
     training_settings: TrainingSettings = TrainingSettings()
     calibration_trials: int = 0
@@ -297,6 +311,10 @@ class Model:
 
         They must be weights or buffers: a model that is loaded or resumed is not prepared again.
         """
+
+    def note(self, batch: Batch) -> str:
+        """Return what a user must know of the answers of `predict` for these clips, else ""."""
+        return ""
 
     def baseline(self, batch: Batch) -> Tensor:
         """Return the scalar loss of a trivial predictor, in the unit of `loss`."""

@@ -115,16 +115,23 @@ class ChangedTrials:
     """Copy of trials that `take_trials` made, in which the tested ones are changed.
 
     Files that stay as they are are links to the first ones. ``names`` has the name in the copy by
-    the original name of every tested trial. Randomness comes from ``rng``.
+    the original name of every tested trial. Randomness comes from ``rng``. ``splits``: whose trials
+    are changed, where it is not only the tested ones.
     """
 
-    def __init__(self, source: Dataset, folder: Path, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        source: Dataset,
+        folder: Path,
+        rng: np.random.Generator,
+        splits: Sequence[str] = (TESTING,),
+    ) -> None:
         shutil.copytree(source.folder, folder, copy_function=_link)
         self.folder, self.rng = folder, rng
         rows = source.index.to_dict("records")
-        self._fit = [row for row in rows if row["split"] != TESTING]
+        self._fit = [row for row in rows if row["split"] not in splits]
         self._rows: dict[str, dict[Any, Any]] = {
-            str(row["trial"]): row for row in rows if row["split"] == TESTING
+            str(row["trial"]): row for row in rows if row["split"] in splits
         }
         self.names = {trial: trial for trial in self._rows}
 
@@ -158,7 +165,8 @@ class ChangedTrials:
 
     def paths(self, trial: str) -> TrialPaths:
         """Return the paths of a tested trial."""
-        return TrialPaths(self.folder, TESTING, self.row(trial)["scenario"], trial)
+        row = self.row(trial)
+        return TrialPaths(self.folder, row["split"], row["scenario"], trial)
 
     def by_scenario(self) -> dict[str, list[str]]:
         """Return the tested trials of every scenario, sorted by name."""

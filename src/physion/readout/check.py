@@ -12,7 +12,7 @@ import dataclasses
 import functools
 import shutil
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,12 +26,14 @@ from physion.compute.run_tasks import FATAL_ERRNOS
 from physion.compute.tasks import Executor, Progress, tracked
 from physion.core.errors import BadInputError, PhysionError, UnknownNameError, one_line
 from physion.core.seeds import generator
-from physion.models.build import OutOfMemoryError, build_model
+from physion.models.build import FEATURE_FILES, OutOfMemoryError, build_model
 from physion.models.feature_table import FeatureTable
 from physion.models.interface import Model, can
+from physion.readout.benchmark import benchmark_of
 from physion.readout.changes import CHANGES, Change, ChangedTrials, take_trials
 from physion.readout.decisions import Readout
 from physion.readout.evaluate import evaluate
+from physion.readout.folds import READOUT
 from physion.readout.model_calls import check_identity
 from physion.readout.predictor import ways
 from physion.readout.settings import ChosenModel, EvaluationSettings, choose_models
@@ -41,6 +43,10 @@ from physion.trials.making.plan import GenerateSettings
 
 PASSED, REFUSED, SHOWN = "passed", "refused", "shown"
 """Verdicts; ``shown``: the change may move predictions."""
+UNDECIDED = "not decided"
+"""Verdict of a model of which no change was judged."""
+NOT_CHECKED = "not possible: a table"
+"""Verdict of a table of features, which knows trials by their names only."""
 ROUNDING = 1e-3
 """Largest change of P(contact), of the range of all predictions, where trials are in other batches,
 in which sums are rounded differently."""
@@ -98,9 +104,16 @@ class CheckedModel:
         if self.refused:
             return f"{self.model} refused: predictions depend on {', '.join(self.refused)}"
         if not self.passed:
-            return f"{self.model} not decided: {self._undecided()}"
+            return f"{self.model} {UNDECIDED}: {self._undecided()}"
         held = self.table["change"][self.table["verdict"] == PASSED].nunique()
         return f"{self.model} passed: none of {held} changes moved a prediction that must stay"
+
+    @property
+    def outcome(self) -> str:
+        """The result for a table: passed, not decided, or refused with the changes."""
+        if self.refused:
+            return f"{REFUSED}: {', '.join(self.refused)}"
+        return PASSED if self.passed else UNDECIDED
 
     def _undecided(self) -> str:
         """Return why no change was judged."""
@@ -188,7 +201,8 @@ def check(
             "and names are checked when it is evaluated. Check the network that made it, as a model"
         )
     if not settings.readouts:
-        possible = [readout.value for readout in ways(built, settings.decision)]
+        rules = benchmark_of(built, settings.benchmark)
+        possible = [readout.value for readout in ways(built, settings.decision, rules)]
         predicting = tuple(readout for readout in possible if readout != Readout.FULL.value)
         settings = dataclasses.replace(settings, readouts=predicting)
     out = Path(out)
@@ -208,6 +222,41 @@ def check(
             rows += work.rows_of_others(chosen[0].random_twin(built))
         table = pd.DataFrame(rows, columns=list(COLUMNS))
         return CheckedModel(name, table, work.warnings())
+
+
+def check_models(
+    models: Mapping[str, Mapping[str, Any]],
+    dataset: Dataset | Path | str,
+    out: Path | str,
+    settings: EvaluationSettings | None = None,
+    *,
+    trials: int = 80,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> dict[str, str]:
+    """Return the outcome of a check of each model, as `physion.evaluate` takes ``verdicts``.
+
+    Only the changes that must not move a prediction are made. A table of features is not checked.
+
+    Parameters
+    ----------
+    models
+        Options of each model by its name.
+    dataset, out, settings, trials, executor, progress
+        As of `check`.
+    """
+    changes = [change.name for change in CHANGES.values() if change.must_hold]
+    found = {}
+    for name, options in models.items():
+        if Path(name).suffix.lower() in FEATURE_FILES:
+            found[name] = NOT_CHECKED
+            continue
+        done = check(
+            name, dataset, out, settings, options=dict(options), trials=trials, changes=changes,
+            executor=executor, progress=progress,
+        )  # fmt: skip
+        found[name] = done.outcome
+    return found
 
 
 def _made(
@@ -344,11 +393,17 @@ class _Check:
         return set(self._first.index["look"]) == {"redyellow"}
 
     def _predict(self, model: Model, dataset: Dataset, **changes: Any) -> pd.DataFrame:
-        """Return the table of predictions of the tested trials of a dataset."""
-        with tempfile.TemporaryDirectory(dir=self._first.folder.parent) as folder:
+        """Return the table of predictions of the tested trials of a dataset.
+
+        What the model computes of trials that fit the readout, which no change touches, is kept.
+        """
+        near = self._first.folder.parent
+        kept = dict.fromkeys(self._first.trials(READOUT), near / "kept")
+        with tempfile.TemporaryDirectory(dir=near) as folder:
             return evaluate(
-                model, dataset, folder, self._settings, executor=self._executor, **changes
-            ).predictions
+                model, dataset, folder, self._settings, executor=self._executor, stored=kept,
+                **changes,
+            ).predictions  # fmt: skip
 
     def warnings(self) -> list[str]:
         """Return why the check could say less than it should."""

@@ -99,9 +99,11 @@ class Decision:
     - ``labels``: outcomes that it is fitted on: ``simulated``, of the trials as they were made, or
       ``recorded``, which prefers the outcomes of the official recording.
     - ``fits``: whether it is fitted; one that is not receives no fit trials.
+    - ``tokens``: in the features of a time step, as the model says (`Model.tokens`).
     """
 
     settings: LogisticSettings = field(default_factory=LogisticSettings)
+    tokens: int = 1
     fits: ClassVar[bool] = True
     input: ClassVar[str] = "rollouts"
     labels: ClassVar[str] = "simulated"
@@ -117,6 +119,7 @@ decisions: Registry[Callable[[LogisticSettings], Decision]] = Registry(
         "logistic": "physion.readout.decisions:LogisticDecision",
         "released": "physion.readout.decisions:released_decision",
         "trees": "physion.readout.trees:TreesDecision",
+        "attentive": "physion.readout.attentive:AttentiveDecision",
         "end": "physion.readout.decisions:EndDecision",
         "closest": "physion.readout.decisions:ClosestDecision",
         "gap": "physion.readout.decisions:GapDecision",

@@ -10,7 +10,7 @@ import functools
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from physion.core.errors import BadInputError
 from physion.core.files import digest_path, is_whole
 from physion.core.version import __version__
 from physion.models.interface import Model, TrainingSettings, ask, can
+from physion.readout.benchmark import Benchmark, benchmark_of
 from physion.readout.decisions import Readout, decisions
 from physion.readout.folds import (
     TESTING,
@@ -32,7 +33,6 @@ from physion.readout.folds import (
     describe_fit,
     join_for_fit,
     plan_folds,
-    select_scenario,
 )
 from physion.readout.logistic import LogisticSettings
 from physion.readout.model_calls import check_identity, is_network
@@ -60,10 +60,12 @@ from physion.trials.dataset import Dataset, JoinedDataset
 
 NOTHING_TO_FIT = "no trial to fit|one answer only"
 """Notes of `physion.readout.logistic.fit_readout` where it predicts the base rate."""
-_VERSION = 9
+_VERSION = 10
 """To be increased with every change that can alter the table of an evaluation."""
-_NOT_HASHED = ("protocols", "seeds", "encoder_batch", "accelerator", "rollout_errors", "twin")
-"""Settings of where and how an evaluation runs, or of others than this one."""
+_NOT_HASHED = (
+    "protocols", "seeds", "encoder_batch", "accelerator", "rollout_errors", "twin", "benchmark",
+)  # fmt: skip
+"""Settings of where and how an evaluation runs, or of others than this one, or hashed by name."""
 _HASHED_COLUMNS = [
     "trial", "scenario", "split", "contact", "digest", "movie_sha256", "observed_movie_sha256",
     "recorded_contact", "observed_contact",
@@ -162,6 +164,8 @@ def evaluate(
     settings: EvaluationSettings | None = None,
     *,
     fit: Dataset | Path | str | None = None,
+    verdicts: Mapping[str, str] | None = None,
+    stored: Mapping[str, Path] | None = None,
     options: Mapping[str, Any] | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
@@ -191,6 +195,12 @@ def evaluate(
         Another dataset, whose trials of the splits training and readout take the place of the
         dataset's own, as in the paper. No motion may be in both, and look, frame rate and size of
         the movies must agree; a set without movies needs ``rendered``.
+    verdicts
+        By name of a model, as in ``models``, the verdict of its check, for the column ``check``
+        (`physion.readout.check.check_models`).
+    stored
+        By trial the folder of what models compute of it, for trials that several evaluations with
+        different ``out`` share.
     options
         Fields of the settings of the models, or of their training (`TrainingSettings`).
     executor
@@ -242,25 +252,26 @@ def evaluate(
     if fit is not None:
         fit_on = describe_fit(other)
     if elsewhere is None:
-        work = _Evaluate(trials, Path(out), settings, fit_on)
+        work = _Evaluate(trials, Path(out), settings, fit_on, verdicts or {}, stored or {})
         here = functools.partial(work, executor=executor, progress=progress, dry_run=dry_run)
         done = run_cells(cells, here, Path(out), "evaluations", None, progress, finished)
         return Evaluation(*done)
     # Its processes may have another working directory.
-    there = _Evaluate(trials, Path(out).absolute(), settings, fit_on)
+    there = _Evaluate(trials, Path(out).absolute(), settings, fit_on, verdicts or {}, stored or {})
     done = run_cells(cells, there, Path(out), "evaluations", elsewhere, progress, finished)
     return Evaluation(*done)
 
 
 def _is_trained(model: Any, settings: EvaluationSettings) -> bool:
     """Return whether an evaluation trains a model, so that protocol and seed matter."""
+    rules = benchmark_of(model, settings.benchmark)
     if settings.untrained or not (is_network(model) and can(model, "loss")):
         return False
     if ask(model, "trained"):
         return False
     # What is trained on features predicts features, which the other readouts do not need.
-    needed = not settings.readouts or Readout.OBSERVED_SIMULATED.value in settings.readouts
-    return ask(model, "learns_from") != "features" or needed
+    needed = Readout.OBSERVED_SIMULATED.value in (settings.readouts or rules.readouts)
+    return ask(model, "learns_from") != "features" or ask(model, "learns_outcomes") or needed
 
 
 @dataclass(frozen=True)
@@ -271,6 +282,8 @@ class _Evaluate:
     out: Path
     settings: EvaluationSettings
     fit_on: str = ""
+    verdicts: Mapping[str, str] = field(default_factory=dict)
+    stored: Mapping[str, Path] = field(default_factory=dict)
 
     def __call__(
         self,
@@ -281,23 +294,26 @@ class _Evaluate:
         dry_run: bool = False,
     ) -> EvaluatedModel:
         """Predict every testing trial, unless that is done."""
-        model, settings, index = cell.take_model(), self.settings, self.dataset.index
+        model, settings = cell.take_model(), self.settings
+        rules = benchmark_of(model, settings.benchmark)
+        index = rules.select(self.dataset.index)
+        settings = dataclasses.replace(settings, logistic=rules.logistic(settings.logistic))
         if cell.chosen.stays_random(model):
             settings = dataclasses.replace(settings, untrained=True)
         training = cell.chosen.settings_of(model) if cell.protocol is not None else None
         provenance = check_identity(model)
         if isinstance(self.dataset, JoinedDataset):
             check_pictures(index, model.spec, rendered=settings.rendered)
-        ways = choose_readouts(model, settings.readouts, settings.decision)
+        ways = choose_readouts(model, settings.readouts, settings.decision, rules)
         if Way.ROLLOUTS in ways.values():
             # Another decision on the same rollouts is another row.
-            wanted, own = decision_name(model, settings.decision), decision_name(model)
-            name = provenance.model if wanted == own else f"{provenance.model}-{wanted}"
+            asked, own = decision_name(model, settings.decision), decision_name(model)
+            name = provenance.model if asked == own else f"{provenance.model}-{asked}"
             provenance = dataclasses.replace(provenance, model=name)
         if not provenance.inputs:
             provenance = dataclasses.replace(provenance, inputs=", ".join(model.spec.inputs))
-        shipped = self._shipped(model)
-        path = self._table(cell, model, training, provenance, ways, shipped)
+        shipped = None if rules.together else self._shipped(model)
+        path = self._table(cell, model, training, provenance, ways, shipped, rules)
         errors_path = self.out / "rollout-errors" / path.name if settings.rollout_errors else None
         if errors_path is not None:
             from physion.readout.rollout_error import check_moves_objects, rollout_error
@@ -313,9 +329,8 @@ class _Evaluate:
         if done or dry_run:
             return evaluated
         protocol_of_folds = cell.protocol or Protocol.ALL
-        folds = select_scenario(
-            plan_folds(index, protocol_of_folds, settings.folds, cell.seed), settings.scenario
-        )
+        planned = plan_folds(index, protocol_of_folds, settings.folds, cell.seed)
+        folds = rules.arrange(planned, settings.scenario)
         splits = [split for fold in folds for split in fold.scenarios]
         needed = {trial for split in splits for trial in (*split.fit, *split.test)}
         ask(model, "check_trials")(needed, self.dataset.known_trials())
@@ -330,6 +345,8 @@ class _Evaluate:
             folder=self.out,
             shipped=shipped,
             fit_on=self.fit_on,
+            rules=rules,
+            stored=self.stored,
             executor=executor,
             progress=progress,
         )
@@ -345,7 +362,11 @@ class _Evaluate:
                     errors.append(rollout_error(self.dataset, model, known, progress=progress))
         finally:
             predictor.restore()
-        table = make_table(predictions, provenance, index)
+        row = index.iloc[0]
+        rate = round(float(row["frames"] / row["playback_seconds"]), 3)
+        frames = functools.partial(rules.describe_frames, model.spec, rate=rate)
+        verdict = self.verdicts.get(cell.chosen.name, "")
+        table = make_table(predictions, provenance, index, rules.name, frames, verdict)
         if table.empty:
             reason = next(iter(predictor.problems.values()), "there is no trial to predict")
             raise BadInputError(f"{provenance.model} predicts no trial: {reason}")
@@ -384,16 +405,19 @@ class _Evaluate:
         provenance: Provenance,
         ways: Mapping[Readout, Way],
         shipped: ShippedReadouts | None,
+        rules: Benchmark,
     ) -> Path:
         """Return the table, named by a hash of trials, labels, model, settings and code."""
         settings = dataclasses.asdict(self.settings) | {"readouts": [r.value for r in ways]}
         settings |= {"protocol": cell.protocol and cell.protocol.value, "seed": cell.seed}
+        settings |= {"rules": [rules.name, rules.last, rules.window, rules.together, rules.grid]}
         kept = {name: value for name, value in settings.items() if name not in _NOT_HASHED}
         options = dataclasses.asdict(chosen) if (chosen := ask(model, "settings")) else {}
         of_training = dataclasses.asdict(training) if training is not None else {}
         facts = dataclasses.asdict(provenance)
         inputs = [_VERSION, __version__, kept, facts, options, of_training, model.digest()]
         inputs.append(shipped.sha256 if shipped is not None else self.fit_on)
+        inputs += filter(None, [self.verdicts.get(cell.chosen.name)])
         sha = hashlib.sha256(json.dumps(inputs, sort_keys=True, default=str).encode())
         sha.update(self.dataset.index[_HASHED_COLUMNS].to_csv(index=False).encode())
         name = f"{file_name(provenance.model)}-{sha.hexdigest()[:12]}.csv"

@@ -15,6 +15,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -401,12 +402,21 @@ class FeatureStore:
         Clips of `_FRAMES` frames that a model receives at a time, the *encoder batch*.
     executor
         Runs models whose futures are imagined in processes.
+    elsewhere
+        By trial another folder, for trials whose files are shared by several stores.
     """
 
-    def __init__(self, folder: Path, *, batch: int = 4, executor: Executor | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        batch: int = 4,
+        executor: Executor | None = None,
+        elsewhere: Mapping[str, Path] = MappingProxyType({}),
+    ) -> None:
         if batch < 1:
             raise BadInputError(f"the encoder batch must be at least 1, not {batch}")
-        self._folder, self._batch = folder, batch
+        self._folder, self._batch, self._elsewhere = folder, batch, elsewhere
         self._executor: Executor = executor if executor is not None else SerialExecutor()
         self.problems: dict[str, str] = {}
         """Reasons of trials that could not be imagined in processes, by name."""
@@ -451,7 +461,7 @@ class FeatureStore:
 
         digest = ask(model, "encoder_digest")
         work = _Work("features", digest, compute, model_name(model), part)
-        steps = {trial: _clip_steps(source, trial, part) for trial in dict.fromkeys(trials)}
+        steps = {trial: source.steps(trial, part) for trial in dict.fromkeys(trials)}
         rows = self._rows(work, source, steps, progress)
         whole = part == "whole"
         return StoredFeatures(trials, [rows[trial] for trial in trials], repeated=whole)
@@ -634,7 +644,8 @@ class FeatureStore:
         """Return the file of a trial, named by all that its arrays depend on."""
         identity = [_VERSION, digest, key, trial, work.part, work.settings, steps]
         name = digest_of(json.dumps(identity))
-        return self._folder / work.part / digest[:16] / name[:2] / f"{name}.safetensors"
+        folder = self._elsewhere.get(trial, self._folder)
+        return folder / work.part / digest[:16] / name[:2] / f"{name}.safetensors"
 
 
 @dataclass(frozen=True, eq=False)
@@ -674,13 +685,6 @@ def _stored(paths: Mapping[str, Path]) -> dict[str, FeatureFile]:
     """Return what is stored, by trial."""
     opened = ((trial, open_features(path)) for trial, path in paths.items())
     return {trial: file for trial, file in opened if file is not None}
-
-
-def _clip_steps(source: Any, trial: str, part: Part) -> int:
-    """Return the number of frames of a part of a trial's clip."""
-    if part == "context":
-        return int(source.spec.context)
-    return len(source.spec.all_frames(source.length(trial)))
 
 
 def _groups(steps: Mapping[str, int], size: Callable[[int], int]) -> list[tuple[str, ...]]:

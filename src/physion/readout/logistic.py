@@ -435,7 +435,7 @@ def _solve_dual(
     for (fitted, _), (inner, outer) in zip(splits, of_folds, strict=True):
         weights, intercepts = solve_path(inner, labels[fitted], settings.grid)
         scores.append(outer @ weights + intercepts)
-    c, cv_accuracy = _choose(scores, splits, labels, settings)
+    c, cv_accuracy = choose_c(scores, splits, labels, settings)
     # The solution for one C starts from that for the next smaller one.
     weights, intercepts = solve_path(within, labels, tuple(v for v in settings.grid if v <= c))
     chosen, intercept = weights[:, -1], float(intercepts[-1])
@@ -531,7 +531,7 @@ def _solve_released(
         np.column_stack([fit(f, c).decision_function(features[held]) for c in settings.grid])
         for f, held in splits
     ]
-    c, cv_accuracy = _choose(scores, splits, labels, settings)
+    c, cv_accuracy = choose_c(scores, splits, labels, settings)
     chosen = fit(np.arange(len(labels)), c)
     parts = [features, test.array()]
     values: Array = np.concatenate([chosen.decision_function(part) for part in parts if len(part)])
@@ -552,7 +552,7 @@ def stratified_splits(
     return splits, f"only {folds} folds" if folds < settings.folds else ""
 
 
-def _choose(
+def choose_c(
     scores: list[Array],
     splits: list[tuple[Rows, Rows]],
     labels: Booleans,

@@ -7,6 +7,7 @@ from dataclasses import replace
 from enum import Enum
 from functools import cached_property, partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from physion.clips.source import ObservedSource, WholeSource
 from physion.compute.tasks import Executor, Progress
 from physion.core.errors import BadInputError
 from physion.models.interface import Model, TrainingSettings, ask, can
+from physion.readout.benchmark import V1, Benchmark
 from physion.readout.decisions import Decided, Decision, Readout, decisions
 from physion.readout.features import Arguments, FeatureStore, Imagined, StoredFeatures
 from physion.readout.folds import Fold, Protocol, ScenarioSplit
@@ -33,7 +35,7 @@ from physion.readout.model_calls import (
 from physion.readout.settings import EvaluationSettings
 from physion.readout.shipped import ShippedReadout, ShippedReadouts
 from physion.readout.tables import ScenarioPredictions, describe_labels
-from physion.readout.train import Trainer
+from physion.readout.train import Trainer, training_spec
 from physion.trials.dataset import Dataset
 
 # Which readouts a model supports, and how its predictions are made under each.
@@ -58,6 +60,8 @@ def build_decision(model: Model, wanted: str, settings: LogisticSettings) -> Dec
     """Return the decision of a model; raise `BadInputError` if it does not fit the model."""
     name = decision_name(model, wanted)
     decision = decisions.get(name)(settings)
+    if isinstance(decision, Decision):
+        decision = replace(decision, tokens=ask(model, "tokens"))
     method, others = {
         "features": ("encode", "decision gap or noise"),
         "rollouts": ("imagine", "decision logistic"),
@@ -70,8 +74,8 @@ def build_decision(model: Model, wanted: str, settings: LogisticSettings) -> Dec
     return decision
 
 
-def ways(model: Model, decision: str = "") -> dict[Readout, Way]:
-    """Return the readouts that a model supports, and the way of each.
+def ways(model: Model, decision: str = "", rules: Benchmark = V1) -> dict[Readout, Way]:
+    """Return the readouts that a model supports under some rules, and the way of each.
 
     Raises `BadInputError` for a model without any.
     """
@@ -79,7 +83,8 @@ def ways(model: Model, decision: str = "") -> dict[Readout, Way]:
     if can(model, "encode"):
         if ask(model, "answers") != Readout.FULL.value:
             found[Readout.OBSERVED] = Way.FEATURES
-        if model.spec.future != 0:
+        # A window for detection needs no more frames than a model asks for.
+        if model.spec.future != 0 or (rules.window is not None and model.spec.inputs):
             found[Readout.FULL] = Way.FEATURES
     if can(model, "imagine"):
         needs = decisions.get(decision_name(model, decision))(LogisticSettings()).input
@@ -91,15 +96,24 @@ def ways(model: Model, decision: str = "") -> dict[Readout, Way]:
             f"{model_name(model)} has none of the methods encode, imagine, predict and fit, so "
             "that it cannot be evaluated"
         )
-    return {readout: found[readout] for readout in Readout if readout in found}
+    possible = [readout for readout in Readout if readout in found]
+    kept = [readout for readout in possible if readout.value in rules.readouts]
+    if not kept:
+        raise BadInputError(
+            f"{model_name(model)} has the readouts {', '.join(r.value for r in possible)}, but "
+            f"{rules.name} needs one of {', '.join(rules.readouts)}; leave out --benchmark"
+        )
+    return {readout: found[readout] for readout in kept}
 
 
-def choose_readouts(model: Model, names: tuple[str, ...], decision: str = "") -> dict[Readout, Way]:
+def choose_readouts(
+    model: Model, names: tuple[str, ...], decision: str = "", rules: Benchmark = V1
+) -> dict[Readout, Way]:
     """Return the requested readouts, by default all that the model supports.
 
     Raises `BadInputError` for a readout that the model does not support.
     """
-    possible = ways(model, decision)
+    possible = ways(model, decision, rules)
     requested = [Readout.named(name) for name in names]
     impossible = [readout.value for readout in requested if readout not in possible]
     if impossible:
@@ -149,6 +163,10 @@ class Predictor:
         Readouts that ship for the model, which are not fitted here.
     fit_on
         Name and digest of the set with the fit trials; empty if they are the dataset's own.
+    rules
+        Which frames are shown.
+    stored
+        By trial the folder of its features, where it is not in ``folder``.
     executor
         Runs simulations; by default they run in this process.
     progress
@@ -168,10 +186,13 @@ class Predictor:
         seed: int = 0,
         shipped: ShippedReadouts | None = None,
         fit_on: str = "",
+        rules: Benchmark = V1,
+        stored: Mapping[str, Path] = MappingProxyType({}),
         executor: Executor | None = None,
         progress: Progress | None = None,
     ) -> None:
         self.dataset, self.model, self.ways, self.settings = dataset, model, ways, settings
+        self.rules = rules
         self.seed, self.progress = seed, progress
         self._protocol, self._shipped, self._fit_on = protocol, shipped, fit_on
         index = dataset.index.set_index("trial")
@@ -185,7 +206,10 @@ class Predictor:
             }
         )
         self._store = FeatureStore(
-            folder / "features", batch=settings.encoder_batch, executor=executor
+            folder / "features",
+            batch=settings.encoder_batch,
+            executor=executor,
+            elsewhere=stored,
         )
         self.problems: dict[str, str] = self._store.problems
         """Reasons of trials that could not be predicted, by name."""
@@ -197,8 +221,9 @@ class Predictor:
             if training is not None:
                 self._trainer = Trainer(
                     model,
-                    self._whole,
+                    self._training,
                     self._store,
+                    dataset.index,
                     training,
                     folder / "training",
                     make_fabric(Devices(settings.accelerator), training.precision),
@@ -228,11 +253,32 @@ class Predictor:
 
     @cached_property
     def _observed(self) -> ObservedSource:
-        return observed_source(self.dataset, self.model.spec, rendered=self.settings.rendered)
+        return observed_source(
+            self.dataset,
+            self.model.spec,
+            rendered=self.settings.rendered,
+            last=self.rules.last_frames(self.dataset.index),
+        )
 
     @cached_property
     def _whole(self) -> WholeSource:
-        return whole_source(self.dataset, self.model.spec, rendered=self.settings.rendered)
+        index = self.dataset.index
+        return whole_source(
+            self.dataset,
+            self.model.spec,
+            rendered=self.settings.rendered,
+            last=self.rules.last_frames(index),
+            # A table of features needs no frames.
+            windows=self.rules.windows(self.rules.select(index)) if self.model.spec.inputs else {},
+        )
+
+    @property
+    def _training(self) -> WholeSource:
+        """Source of what a training reads."""
+        spec = training_spec(self.model)
+        if spec == self.model.spec:
+            return self._whole
+        return whole_source(self.dataset, spec, rendered=self.settings.rendered)
 
     def _longest(self, split: ScenarioSplit) -> int:
         """Return the frames of the longest trial that the readout of a scenario sees."""
@@ -312,8 +358,10 @@ class Predictor:
     def _decide_on_features(
         self, decision: Decision, split: ScenarioSplit, readout: Readout
     ) -> _Made:
-        trials = [*split.fit, *split.test]
-        parts = self._parts(trials, readout, self._future(split))
+        trials, future = [*split.fit, *split.test], self._future(split)
+        if split.fit:  # so that no batch holds trials of both kinds
+            self._parts(split.fit, readout, future)
+        parts = self._parts(trials, readout, future)
         rows = np.arange(len(trials))
         count = len(split.fit)
         fit = [part.select(rows[:count]) for part in parts]
@@ -360,26 +408,31 @@ class Predictor:
         self, splits: Sequence[ScenarioSplit], decision: Decision
     ) -> dict[Arguments, Imagined]:
         """Return what could be imagined of the trials that a decision needs, with all arguments."""
-        future = {}
+        fit: dict[str, int] = {}
+        test: dict[str, int] = {}
         for split in splits:
             steps = self._future(split)
-            for trial in (*_fit_trials(decision, split), *split.test):
-                future[trial] = steps[trial]
+            fit |= {trial: steps[trial] for trial in _fit_trials(decision, split)}
+            test |= {trial: steps[trial] for trial in split.test}
         samples, seed, arguments = self._rollout_settings()
         model = self.model
         shared = ask(model, "trials_together")
-        return self._store.imagined(
-            model,
-            self._observed,
-            list(future),
-            samples=samples,
-            seed=seed,
-            arguments=arguments,
-            future=future,
-            # A network stays in this process, unless it says otherwise.
-            together=shared if is_network(model) else max(shared, 1),
-            progress=self.progress,
-        )
+        imagined: dict[Arguments, Imagined] = {}
+        # The trials to fit on first, so that no group holds trials of both kinds.
+        for future in ([fit] if fit else []) + [fit | test]:
+            imagined = self._store.imagined(
+                model,
+                self._observed,
+                list(future),
+                samples=samples,
+                seed=seed,
+                arguments=arguments,
+                future=future,
+                # A network stays in this process, unless it says otherwise.
+                together=shared if is_network(model) else max(shared, 1),
+                progress=self.progress,
+            )
+        return imagined
 
     def _decide_on_rollouts(self, decision: Decision, split: ScenarioSplit, _: Readout) -> _Made:
         found = self._imagined([split], decision)
@@ -413,23 +466,34 @@ class Predictor:
             if len(labels):
                 accuracy = float(np.mean((self._probability(asked, fit_batch) > 0.5) == labels))
         predicted: dict[str, float] = {}
+        notes: dict[str, None] = {}
         for start in range(0, len(split.test), _ANSWER_TRIALS):
             group = split.test[start : start + _ANSWER_TRIALS]
-            predicted |= self._ask(asked, read, group)
+            predicted |= self._ask(asked, read, group, notes)
             if self.progress is not None:
                 self.progress("trials", start + len(group), len(split.test))
         probability = np.array(list(predicted.values()), np.float64)
-        return Decided(probability, accuracy), split.fit, tuple(predicted)
+        decided = Decided(probability, accuracy, note="; ".join(notes))
+        return decided, split.fit, tuple(predicted)
 
-    def _ask(self, asked: Any, read: Any, group: Sequence[str]) -> dict[str, float]:
-        """Return the answers by trial; if a trial fails, the others are asked for one by one."""
+    def _ask(
+        self, asked: Any, read: Any, group: Sequence[str], notes: dict[str, None]
+    ) -> dict[str, float]:
+        """Return the answers by trial; if a trial fails, the others are asked for one by one.
+
+        What the model notes of them is added to ``notes``.
+        """
         try:
-            answers = self._probability(asked, read(group))
+            batch = read(group)
+            answers = self._probability(asked, batch)
         except BadInputError as error:
             if len(group) > 1:
-                return {t: p for one in group for t, p in self._ask(asked, read, [one]).items()}
+                singles = [self._ask(asked, read, [one], notes) for one in group]
+                return {t: p for single in singles for t, p in single.items()}
             self.problems[group[0]] = str(error)
             return {}
+        if can(asked, "note") and (note := call_model(asked, "note", batch)):
+            notes[note] = None
         return dict(zip(group, answers.tolist(), strict=True))
 
     def _probability(self, asked: Any, batch: Batch) -> NDArray[np.float64]:

@@ -79,6 +79,10 @@ class TrainSettings(HarnessSettings):
 class EvaluationSettings(HarnessSettings):
     """Settings of evaluations."""
 
+    benchmark: str = ""
+    """Rules: v1, of the paper, or v1.5, of physion_evaluator (seven scenarios, Collide cut at frame
+    15, one readout of all scenarios, detection around the contact). Default: v1, but v1.5 for files
+    of features that physion_evaluator wrote."""
     readouts: tuple[str, ...] = ()
     """Readouts: observed, observed+simulated, full. Default: all that the model supports."""
     decision: str = ""
@@ -146,7 +150,8 @@ class ChosenModel:
 
     def stays_random(self, model: Any) -> bool:
         """Return whether a built model is a twin that is not trained, as dynamics would be."""
-        return self.twin and ask(model, "learns_from") != "features"
+        dynamics = ask(model, "learns_from") == "features" and not ask(model, "learns_outcomes")
+        return self.twin and not dynamics
 
     def build(self, seed: int, *, untrained: bool = False) -> Any:
         """Return the model; ``seed``: of its initial weights if it has one.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,11 +18,11 @@ from physion.readout.decisions import Decided
 
 COLUMNS = (
     "model", "readout", "protocol", "init", "seed", "stimulus", "scenario", "p_contact", "outcome",
-    "recorded_outcome", "observed_contact", "inputs", "decision", "train_accuracy",
-    "test_accuracy", "cv_accuracy", "fit_labels", "fit_trials", "fit_on", "fold", "readout_c",
-    "noise_scale", "gap_threshold", "validation_loss", "copy_last_loss", "encoder_type",
-    "encoder_pretraining_task", "encoder_pretraining_dataset", "encoder_pretraining_seed",
-    "encoder_training_task", "dynamics_type", "dynamics_training_task",
+    "recorded_outcome", "observed_contact", "inputs", "frames", "benchmark", "check", "decision",
+    "train_accuracy", "test_accuracy", "cv_accuracy", "fit_labels", "fit_trials", "fit_on", "fold",
+    "readout_c", "noise_scale", "gap_threshold", "validation_loss", "copy_last_loss",
+    "encoder_type", "encoder_pretraining_task", "encoder_pretraining_dataset",
+    "encoder_pretraining_seed", "encoder_training_task", "dynamics_type", "dynamics_training_task",
     "dynamics_training_dataset", "note", "versions",
 )  # fmt: skip
 """Columns of the table, in their order.
@@ -31,6 +31,9 @@ COLUMNS = (
   all, all-but, only or one; it and ``seed`` are empty for a model that was not trained.
 - ``init``: initial weights of the model. ``inputs``: what the model was given of a trial: names of
   `clips.batch.INPUTS` with commas, ``outcomes``, ``answers of people``, or ``base rate`` (nothing).
+- ``frames``: first and last frame that it sees, and how many a second of the movie, such as
+  ``2 to 44, 5/s``; empty where it sees none here. ``benchmark``: rules (`readout.benchmark`).
+- ``check``: verdict of `physion.check`, such as ``passed``; empty if it was not asked for.
 - ``p_contact``: P(contact). ``outcome``: of the trial as it was shown; ``recorded_outcome``: of the
   official recording, empty where there is none; ``observed_contact``: whether agent and patient
   touched in the observed part already.
@@ -65,7 +68,7 @@ _DTYPES = {
 
 @dataclass(frozen=True)
 class ScenarioPredictions:
-    """Predictions of one scenario under one readout in one fold.
+    """Predictions of one scenario, or of several together, under one readout in one fold.
 
     ``decided`` holds P(contact) of ``trials`` and what was fitted; the other fields are columns of
     the table.
@@ -101,9 +104,14 @@ def describe_labels(recorded: Sequence[bool]) -> str:
 
 
 def make_table(
-    predictions: Sequence[ScenarioPredictions], provenance: Provenance, index: pd.DataFrame
+    predictions: Sequence[ScenarioPredictions],
+    provenance: Provenance,
+    index: pd.DataFrame,
+    benchmark: str = "",
+    frames: Callable[[str, str], str] = lambda readout, scenario: "",
+    verdict: str = "",
 ) -> pd.DataFrame:
-    """Return the sorted table of predictions."""
+    """Return the sorted table of predictions; ``frames``: as text, by readout and scenario."""
     truth = index.set_index("trial")
     facts = dataclasses.asdict(provenance)
     if "physion " not in facts["versions"]:
@@ -116,7 +124,8 @@ def make_table(
             "protocol": part.protocol,
             "dynamics_training_dataset": part.dynamics_training_dataset,
             "seed": part.seed,
-            "scenario": part.scenario,
+            "benchmark": benchmark,
+            "check": verdict,
             "decision": part.decision,
             "train_accuracy": decided.train_accuracy,
             "cv_accuracy": decided.cv_accuracy,
@@ -136,6 +145,8 @@ def make_table(
                 shared
                 | {
                     "stimulus": trial,
+                    "scenario": (scenario := str(truth["scenario"][trial])),
+                    "frames": frames(part.readout, scenario),
                     "p_contact": float(p),
                     "note": "; ".join(filter(None, (part.note, decided.notes.get(trial, "")))),
                     "outcome": bool(truth["contact"][trial]),
@@ -176,7 +187,7 @@ def read_table(path: Path) -> pd.DataFrame:
 
 MEAN = "mean"
 """Name of the rows with the mean of the scenarios."""
-_MODEL = ["model", "init", "protocol", "readout"]
+_MODEL = ["model", "init", "protocol", "benchmark", "readout"]
 _GROUP = [*_MODEL, "scenario"]
 
 
@@ -191,8 +202,8 @@ def summarise_accuracy(table: pd.DataFrame) -> pd.DataFrame:
     Returns
     -------
     pandas.DataFrame
-        Columns ``model``, ``init``, ``protocol``, ``readout``, ``scenario``, ``seeds`` and
-        ``trials`` (numbers of them), ``accuracy`` (0..1, mean of the seeds), ``spread`` (standard
+        Columns ``model``, ``init``, ``protocol``, ``benchmark``, ``readout``, ``scenario``,
+        ``seeds`` and ``trials`` (numbers of them), ``accuracy`` (0..1, mean), ``spread`` (standard
         deviation of a seed, n - 1; NaN for one seed). Rows with the scenario `MEAN` are of the mean
         of the scenarios of each seed, where there are several. Under the protocol *one*,
         ``protocol`` names the scenario that trained, too: ``one: drop``.

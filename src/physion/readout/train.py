@@ -10,11 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import pandas as pd
+
+from physion.clips.batch import Spec
 from physion.clips.clips import whole_source
-from physion.clips.source import WholeSource
+from physion.clips.source import Part, WholeSource
 from physion.compute.tasks import Executor, Progress
 from physion.core.errors import BadInputError, MissingExtraError
-from physion.models.interface import TrainingSettings
+from physion.models.interface import TrainingSettings, ask
 from physion.readout.features import FeatureRow, FeatureStore
 from physion.readout.folds import Fold, Protocol, select_scenario, training_folds
 from physion.readout.settings import (
@@ -64,7 +67,8 @@ class Trainings:
 class Trainer:
     """One model with its initial weights, which is trained on one set of trials after the other.
 
-    - ``source``: clips with the model's ``spec``. ``store``: features that models are trained on.
+    - ``source``: clips with the model's `training_spec`. ``store``: features that models are
+      trained on. ``index``: of the dataset.
     - ``settings``: optimiser and schedule. ``folder``: of all trainings. ``fabric``: devices.
     - ``progress``: called after every step.
     """
@@ -72,6 +76,7 @@ class Trainer:
     model: Any
     source: WholeSource
     store: FeatureStore
+    index: pd.DataFrame
     settings: TrainingSettings
     folder: Path
     fabric: Fabric
@@ -96,6 +101,7 @@ class Trainer:
             folder=self.folder,
             settings=self.settings,
             features=self._features,
+            outcomes=self._outcomes(),
             fabric=self.fabric,
             progress=self.progress,
         )
@@ -105,7 +111,9 @@ class Trainer:
         from physion.models.checkpoint import WEIGHTS
         from physion.training.train import training_inputs, training_path
 
-        inputs = training_inputs(self.model, self.source, fold.train, self.settings, seed)
+        inputs = training_inputs(
+            self.model, self.source, fold.train, self.settings, seed, self._outcomes()
+        )
         path = training_path(self.folder, self.model, fold.training.name, inputs)
         model = self.model.provenance().model
         done = (path / WEIGHTS).is_file()
@@ -116,8 +124,24 @@ class Trainer:
         self.model.load_state_dict(self._initial)
 
     def _features(self, trials: Sequence[str]) -> Sequence[FeatureRow]:
-        stored = self.store.encoded(self.model, self.source, trials, "whole", self.progress)
+        part: Part = "context" if ask(self.model, "learns_outcomes") else "whole"
+        stored = self.store.encoded(self.model, self.source, trials, part, self.progress)
         return stored.by_trial()
+
+    def _outcomes(self) -> Mapping[str, bool] | None:
+        """Return the outcomes that are known: recorded ones, else simulated ones."""
+        if not ask(self.model, "learns_outcomes"):
+            return None
+        recorded = self.index["recorded_contact"]
+        outcomes = recorded.where(recorded.notna(), self.index["contact"])
+        pairs = zip(self.index["trial"], outcomes, strict=True)
+        return {str(trial): bool(value) for trial, value in pairs if not pd.isna(value)}
+
+
+def training_spec(model: Any) -> Spec:
+    """Return what the training of a model reads: its `Spec`, and its targets."""
+    spec: Spec = model.spec
+    return dataclasses.replace(spec, inputs=(*spec.inputs, *ask(model, "targets")))
 
 
 def train(
@@ -132,7 +156,9 @@ def train(
     dry_run: bool = False,
     **changes: Any,
 ) -> Trainings:
-    """Train models without labels, as `evaluate` would, which then finds the results.
+    """Train models as `evaluate` would, which then finds the results.
+
+    No outcome of a trial is used, but by models that learn them (``learns_outcomes``).
 
     Parameters
     ----------
@@ -224,8 +250,9 @@ class _Train:
         assert training is not None, "checked before"
         trainer = Trainer(
             model,
-            whole_source(self.dataset, model.spec, rendered=settings.rendered),
+            whole_source(self.dataset, training_spec(model), rendered=settings.rendered),
             FeatureStore(self.out / "features", batch=settings.encoder_batch),
+            self.dataset.index,
             training,
             self.out / "training",
             _open_devices(

@@ -29,7 +29,13 @@ from physion.analysis.people.results import (
 )
 from physion.analysis.population import PopulationResults
 from physion.analysis.published.tables import PublishedTables, read_published
-from physion.analysis.results import published_rows, results_table, zone_of_people
+from physion.analysis.results import (
+    SEEN,
+    frames_with_benchmark,
+    published_rows,
+    results_table,
+    zone_of_people,
+)
 from physion.analysis.rollout_errors import read_rollout_errors, rollout_error_table
 from physion.analysis.scores import AVERAGES, shown_average
 from physion.analysis.tables import (
@@ -58,12 +64,13 @@ from physion.report.build import build_people_report, build_report
 from physion.report.html import plural
 from physion.report.inputs import PeopleReport, ReportInputs
 from physion.report.people import describe_attributes
+from physion.tasks.logs import is_log, read_answers
 
 ZONE_FILE = "human_accuracy_by_scenario.csv"
 
 Predictions: TypeAlias = Mapping[str, Mapping[str, float]] | pd.DataFrame | Path | str
-"""P(contact) by model and stimulus; a table of `physion.analysis.tables.PREDICTIONS`; or its CSV
-file."""
+"""P(contact) by model and stimulus; a table of `physion.analysis.tables.PREDICTIONS`; its CSV file;
+or a log of answers of a language model (`physion.tasks.logs`)."""
 
 _LOOKS = {
     "plain": "those who saw free colours with flashing overlays, as in the paper",
@@ -172,12 +179,17 @@ class CompareResult:
 def as_text(results: pd.DataFrame) -> pd.DataFrame:
     """Return a table of results (`results_table`) for a terminal.
 
-    Columns: ``model``, ``given``, ``stimuli`` where their number differs, and ``accuracy``,
-    ``r with people`` and ``kappa`` with their intervals, as far as they are known.
+    Columns: ``model``, ``given``, ``frames`` with the benchmark, ``check``, ``stimuli`` where their
+    number differs, and ``accuracy``, ``r with people`` and ``kappa`` with their intervals, as far
+    as they are known.
     """
     table = results[["row"]].set_axis(["model"], axis=1)
     if (results["given"] != "").any():
         table["given"] = results["given"]
+    if (results["frames"] != "").any():
+        table["frames"] = frames_with_benchmark(results)
+    if (results["check"] != "").any():
+        table["check"] = results["check"]
     if results["stimuli"].nunique() > 1:
         table["stimuli"] = results["stimuli"]
     for heading, name in (("accuracy", "accuracy"), ("r with people", "r"), ("kappa", "kappa")):
@@ -222,9 +234,10 @@ def compare(
     Parameters
     ----------
     predictions
-        P(contact) by model and stimulus, tables, CSV files, or several of these. A table needs the
-        columns ``stimulus`` and ``p_contact`` only; `physion.analysis.tables.PREDICTIONS` has the
-        others. None: an analysis of the people in ``responses``.
+        P(contact) by model and stimulus, tables, CSV files, logs of answers of language models
+        (``.eval`` of Inspect, samples of lmms-eval), or several of these. A table needs the columns
+        ``stimulus`` and ``p_contact`` only; `physion.analysis.tables.PREDICTIONS` has the others.
+        None: an analysis of the people in ``responses``.
     humans
         Averages of people: ``official`` for the shipped ones, a folder of
         ``human_accuracy-*.csv``, or a table with ``stimulus``, ``scenario``, ``accuracy`` and
@@ -296,7 +309,7 @@ def compare(
         draws = Bootstrap(resamples, seed=seed)
     except ValueError as error:
         raise BadInputError(f"resamples {resamples}: {error}") from error
-    rows, grouped = _rows(predictions, groups)
+    rows, grouped, missing = _rows(predictions, groups)
     files = [Path(responses)] if isinstance(responses, str | Path) else [*map(Path, responses)]
     if rows is None and not files:
         raise BadInputError(
@@ -345,6 +358,7 @@ def compare(
             zone_origin=averages.zone_origin, **asked, **settings,
         )  # fmt: skip
         results = replace(results, warnings=(*results.warnings, *averages.warnings))
+    results = replace(results, warnings=(*results.warnings, *missing))
     tables, scenarios = None, in_order(results.comparison.stimuli["scenario"])
     if results.comparison.has_people and set(scenarios) <= set(SCENARIOS) and not files:
         tables = _published_of(results.comparison.stimuli["stimulus"])
@@ -354,6 +368,7 @@ def compare(
         published=None if tables is None else published_rows(tables, scenarios),
         zone=None if tables is None else zone_of_people(tables, scenarios),
         model_inputs=_by_model(rows, "inputs"),
+        model_seen=_seen(rows),
         model_weights=_by_model(rows, "init"),
         rollout_errors=None if errors is None else rollout_error_table(errors, draws.level),
     )
@@ -373,16 +388,16 @@ def _released() -> PublishedTables:
 def _rows(
     predictions: Predictions | Sequence[Predictions],
     groups: Sequence[str | Path | pd.DataFrame],
-) -> tuple[pd.DataFrame | None, list[str]]:
-    """Return all predictions as one table with unique names of models, and the columns of groups.
+) -> tuple[pd.DataFrame | None, list[str], list[str]]:
+    """Return all predictions as one table, the columns of groups, and warnings of logs.
 
-    The table is None if there is none.
+    Names of models are unique. The table is None if there is none.
     """
     if isinstance(predictions, Mapping | pd.DataFrame | Path | str):
         given: Sequence[Predictions] = [predictions]
     else:
         given = predictions
-    tables, raw = [], []
+    tables, raw, warnings = [], [], list[str]()
     for one in given:
         if isinstance(one, Mapping):
             for model, values in one.items():
@@ -394,11 +409,16 @@ def _rows(
             tables.append(("a table", check_predictions(one)))
         else:
             path = Path(one)
-            raw.append(read_csv(path))
+            if is_log(path):
+                log = read_answers(path)
+                raw.append(log.predictions)
+                warnings += log.warnings
+            else:
+                raw.append(read_csv(path))
             tables.append((str(path), check_predictions(raw[-1], str(path), path.stem)))
     if not tables:
-        return None, []
-    return _with_groups(join_predictions(tables), raw, groups)
+        return None, [], []
+    return *_with_groups(join_predictions(tables), raw, groups), warnings
 
 
 def _with_groups(
@@ -437,6 +457,13 @@ def _by_model(rows: pd.DataFrame, column: str) -> dict[str, str]:
     return {
         str(model): " or ".join(values) for model, values in pairs.groupby("base_model")[column]
     }
+
+
+def _seen(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return columns `SEEN` by model; frames of several scenarios are joined by ``or``."""
+    return rows.groupby("model", sort=False)[list(SEEN)].agg(
+        lambda values: " or ".join(filter(None, dict.fromkeys(values)))
+    )
 
 
 @dataclass(frozen=True)

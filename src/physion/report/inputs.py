@@ -31,6 +31,7 @@ class ReportInputs(ComparisonResults):
     - ``question``: what people and models were asked, for the movies.
     - ``model_inputs``: what a model was given, by its name: values of the column *Inputs*.
     - ``model_weights``: which weights a model started from, by its name: of the column *Init*.
+    - ``model_seen``: columns `results.SEEN` of the predictions, by model (index), or None.
     - ``published``: from `published_rows`, or None; ``zone``: from `zone_of_people`, or None.
     - ``rollout_errors``: from `rollout_error_table`, or None.
     - ``movie_count``: largest number of disagreements that are shown as movies.
@@ -45,6 +46,7 @@ class ReportInputs(ComparisonResults):
     question: str = "Will the agent touch the patient?"
     model_inputs: Mapping[str, str] = field(default_factory=dict)
     model_weights: Mapping[str, str] = field(default_factory=dict)
+    model_seen: pd.DataFrame | None = None
     published: pd.DataFrame | None = None
     zone: tuple[tuple[float, float], tuple[float, float]] | None = None
     rollout_errors: pd.DataFrame | None = None
@@ -73,7 +75,8 @@ class ReportInputs(ComparisonResults):
 
     def results(self) -> pd.DataFrame:
         """The table of results, see `results_table`."""
-        return results_table(tidy_scores(self), self.model_inputs, self.published)
+        scores = tidy_scores(self)
+        return results_table(scores, self.model_inputs, self.published, self.model_seen)
 
     def tables(self) -> dict[str, pd.DataFrame]:
         """Every table by the name of its file."""

@@ -12,7 +12,7 @@ from physion.analysis.comparison import SETTING, Comparison
 from physion.analysis.metrics import BEYOND_OUTCOME, Metric, score_metrics
 from physion.analysis.mixed.result import effect_name
 from physion.analysis.model_tests import MixedTable, permutations_of
-from physion.analysis.results import MARKED
+from physion.analysis.results import MARKED, frames_with_benchmark
 from physion.analysis.scores import AVERAGES, TWO_PEOPLE, runs_table, shown_average
 from physion.analysis.tables import MEAN, POOLED, in_order
 from physion.core.html import Markup, joined
@@ -94,14 +94,18 @@ def results(inputs: ReportInputs) -> Markup:
     rows = inputs.results()
     measures = {"accuracy": "accuracy", "r with people": "r", "kappa": "kappa"}
     chosen = measures if inputs.comparison.has_people else {"accuracy": "accuracy"}
+    shown = {"frames": frames_with_benchmark(rows), "check": list(rows["check"])}
+    known = {name: of for name, of in shown.items() if (rows[name] != "").any()}
     cells = [
-        [str(row["row"]), str(row["given"]), *(_result(row, key) for key in chosen.values())]
-        for _, row in rows.iterrows()
-    ]
+        [str(row["row"]), str(row["given"]), *(of[k] for of in known.values()),
+         *(_result(row, key) for key in chosen.values())]
+        for k, (_, row) in enumerate(rows.iterrows())
+    ]  # fmt: skip
     published = (rows["source"] != "").any()
     sources = "; ".join(dict.fromkeys(rows.loc[rows["source"] != "", "source"]))
     caption = AVERAGES[shown_average(inputs.comparison.all_scores)].capitalize()
-    listing = table(["", "given", *chosen], cells, f"{caption}, by accuracy")
+    columns = ["", "given", *known, *chosen]
+    listing = table(columns, cells, f"{caption}, by accuracy")
     return listing + (paragraph(f"{MARKED} ({sources}).", "note") if published else Markup())
 
 

@@ -18,7 +18,7 @@ import torch
 from lightning_fabric import Fabric
 from torch import nn
 
-from physion.clips.source import WholeSource
+from physion.clips.source import Part, WholeSource
 from physion.compute.tasks import Progress
 from physion.core.errors import BadInputError
 from physion.core.files import folder_lock, json_digest, remove_leftovers
@@ -43,8 +43,11 @@ from physion.training.loop import (
     evaluating,
 )
 from physion.training.windows import (
+    SAMPLE_CLIPS,
+    SAMPLE_FEATURES,
     ClipWindows,
     FeatureWindows,
+    LabelledContexts,
     TrialFeatures,
     hold_out,
     window_length,
@@ -83,6 +86,7 @@ def model_card(
     counts = Counter(trial.partition("_")[0] for trial in trials)
     scenarios = ", ".join(f"{name} {count}" for name, count in sorted(counts.items()))
     options = dataclasses.asdict(chosen) if (chosen := ask(model, "settings")) else {}
+    labels = "on the outcomes of trials" if ask(model, "learns_outcomes") else "without labels"
     losses = {
         f"training, mean of the last {settings.log_every} steps": state.loss,
         "held-out trials": state.validation,
@@ -91,7 +95,7 @@ def model_card(
     return "\n\n".join(
         [
             f"# {provenance['model']}, trained on {data}",
-            "Model trained without labels by `physion train`. Whether it predicts contacts is "
+            f"Model trained {labels} by `physion train`. Whether it predicts contacts is "
             "measured by `physion evaluate`.",
             "## Model\n" + _table(provenance),
             *(["## Options\n" + _table(options)] if options else []),
@@ -162,6 +166,7 @@ def train_model(
     folder: Path | None,
     settings: TrainingSettings | None = None,
     features: Features | None = None,
+    outcomes: Mapping[str, bool] | None = None,
     accelerator: str = "auto",
     fabric: Fabric | None = None,
     progress: Progress | None = None,
@@ -188,7 +193,10 @@ def train_model(
     settings
         Optimiser and schedule; by default the model's.
     features
-        Returns features (n, T, D) of whole clips, for models that learn from features.
+        Returns features (n, T, D) of whole clips, or of contexts for a model that learns outcomes,
+        for models that learn from features.
+    outcomes
+        Whether agent and patient touch, by trial, for a model that learns outcomes.
     accelerator
         Lightning's name of the device: auto, cpu, cuda, ...
     fabric
@@ -199,7 +207,8 @@ def train_model(
     Raises
     ------
     BadInputError
-        If the model cannot be trained, or a checkpoint is of other versions of the libraries.
+        If the model cannot be trained, a checkpoint is of other versions of the libraries, or the
+        outcome of a trial is needed and not known.
     TrainingStoppedError
         If a loss or weight is not finite.
     OutOfMemoryError
@@ -210,7 +219,7 @@ def train_model(
         raise BadInputError(f"there is no trial to train {model.provenance().model!r} on")
     settings = settings if settings is not None else ask(model, "training_settings")
     fabric = fabric or make_fabric(Devices(accelerator), settings.precision)
-    config = training_inputs(model, source, trials, settings, seed)
+    config = training_inputs(model, source, trials, settings, seed, outcomes)
     config_hash = json_digest(config)
     kept = None
     if folder is not None:
@@ -237,7 +246,7 @@ def train_model(
         if kept is not None and fabric.is_global_zero:
             remove_leftovers(kept.path)
         fabric.barrier()
-        data = _windows(model, source, trials, settings, seed, features, fabric)
+        data = _windows(model, source, trials, settings, seed, features, outcomes, fabric)
         if stored is None:
             _prepare(model, data, seed, fabric)
         loop = TrainingLoop(
@@ -276,12 +285,21 @@ def training_path(folder: Path, model: Any, name: str, inputs: Mapping[str, Any]
 
 
 def training_inputs(
-    model: Any, source: WholeSource, trials: Sequence[str], settings: TrainingSettings, seed: int
+    model: Any,
+    source: WholeSource,
+    trials: Sequence[str],
+    settings: TrainingSettings,
+    seed: int,
+    outcomes: Mapping[str, bool] | None = None,
 ) -> dict[str, Any]:
     """Return JSON values of everything that determines the weights."""
     keys = hashlib.sha256()
+    labelled = ask(model, "learns_outcomes")
+    known = _known_outcomes(model, trials, outcomes) if labelled else {}
     for trial in trials:
-        keys.update(f"{trial} {source.key(trial, 'whole')}\n".encode())
+        end = f" {known[trial]}" if labelled else ""
+        part: Part = "context" if labelled else "whole"
+        keys.update(f"{trial} {source.key(trial, part)}{end}\n".encode())
     chosen = dataclasses.asdict(settings)
     learns_from = ask(model, "learns_from")
     return {
@@ -297,6 +315,20 @@ def training_inputs(
         "learns_from": learns_from,
         "window": window_length(model),
     }
+
+
+def _known_outcomes(
+    model: Any, trials: Sequence[str], outcomes: Mapping[str, bool] | None
+) -> Mapping[str, bool]:
+    """Return the outcomes; raise `BadInputError` if one of a trial is not known."""
+    known = outcomes or {}
+    unknown = [trial for trial in trials if trial not in known]
+    if unknown:
+        raise BadInputError(
+            f"model {model.provenance().model!r} learns outcomes, but {len(unknown)} trials are "
+            f"stored without, such as {unknown[0]!r}; generate trials with labels"
+        )
+    return known
 
 
 @contextlib.contextmanager
@@ -317,12 +349,21 @@ def _windows(
     settings: TrainingSettings,
     seed: int,
     features: Features | None,
+    outcomes: Mapping[str, bool] | None,
     fabric: Fabric,
 ) -> TrainingData:
     rows, held = hold_out(len(trials), settings.held_out, seed)
     window = window_length(model)
+    labelled = ask(model, "learns_outcomes")
+    chosen, rest = (tuple(trials[row] for row in part) for part in (rows, held))
     if ask(model, "learns_from") != "features":
-        chosen, rest = (tuple(trials[row] for row in part) for part in (rows, held))
+        if labelled:
+            known = _known_outcomes(model, trials, outcomes)
+            made = [
+                LabelledContexts(part, known, source.context, SAMPLE_CLIPS)
+                for part in (chosen, rest)
+            ]
+            return TrainingData(made[0], made[1] if len(held) else None)
         chooses = model if can(model, "start_probabilities") else None
         training = ClipWindows(source, chosen, window, chooses)
         held_out = ClipWindows(source, rest, window)
@@ -335,6 +376,13 @@ def _windows(
     first, second = (
         FeatureWindows(model.spec, trials, values, frames, part, window) for part in (rows, held)
     )
+    if labelled:
+        known = _known_outcomes(model, trials, outcomes)
+        one, other = (
+            LabelledContexts(names, known, of_part.context, SAMPLE_FEATURES)
+            for names, of_part in ((chosen, first), (rest, second))
+        )
+        return TrainingData(one, other if len(held) else None)
     return TrainingData(first, second if len(held) else None)
 
 

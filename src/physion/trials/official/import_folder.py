@@ -9,6 +9,9 @@ Two kinds of folders are read, at any depth and mixed:
   ``mp4s-redyellow`` and ``labels.csv``) or in the folder of a configuration: movies, map and label.
   They have no motion: all poses are NaN.
 
+Both are read as version 1.5 has them, too: HDF5 files whose names end with ``_cam0`` and whose
+frames count from 1, and ``physion_mp4s/train`` and ``test`` with ``all_video_labels.json``.
+
 Versions with red agent and yellow patient keep ``-redyellow`` in their names.
 """
 
@@ -65,6 +68,8 @@ from physion.trials.official.movies import (
     stored_frames,
 )
 from physion.trials.official.names import (
+    EVALUATOR_LABELS,
+    EVALUATOR_SPLITS,
     decode_picture,
     redyellow_name,
     split_name,
@@ -279,6 +284,7 @@ def _sources(folder: Path) -> Iterator[Path]:
         trial = plain_name(_trial_name(path))
         # A stimulus in two looks is one trial, found by its movie in free colours.
         shown = path.name.endswith("_img.mp4") and "-redyellow" not in str(path)
+        shown |= path.suffix == ".mp4" and (path.parent / EVALUATOR_LABELS).is_file()
         if shown and trial not in known:
             known.add(trial)
             yield path
@@ -299,6 +305,7 @@ class _FolderLists:
     def __init__(self) -> None:
         self._metadata: dict[Path, dict[str, dict[str, Any]]] = {}
         self._labels: dict[Path, dict[str, bool]] = {}
+        self._evaluated: dict[Path, dict[str, dict[str, Any]]] = {}
 
     def record(self, source: Path, trial: str) -> dict[str, Any]:
         """Return the record of a trial from the lists in the folder of ``source`` and above."""
@@ -308,6 +315,7 @@ class _FolderLists:
         # A folder may have been renamed since its configuration was made.
         key = name if name in records or len(numbered) != 1 else numbered[0]
         found = dict(records.get(key, {}))
+        found |= self._evaluated_in(source.parent).get(source.stem, {})
         for folder in source.parents[:3]:
             if "contact" not in found and name in (labels := self._labels_in(folder)):
                 found["contact"] = labels[name]
@@ -326,6 +334,25 @@ class _FolderLists:
                     known = _read_record(row)
                     self._metadata[folder][plain_name(known["stimulus"])] = known
         return self._metadata[folder]
+
+    def _evaluated_in(self, folder: Path) -> dict[str, dict[str, Any]]:
+        """Return contact, its first frame, and split by name of a movie of version 1.5."""
+        if folder not in self._evaluated:
+            splits = {name: split for split, name in EVALUATOR_SPLITS.items()}
+            about = {"split": splits[folder.name]} if folder.name in splits else {}
+            path = folder / EVALUATOR_LABELS
+            try:
+                rows = parse_json(_read_list(path) or "{}", str(path))
+            except BadInputError:
+                rows = {}
+            self._evaluated[folder] = {}
+            for name, row in rows.items() if isinstance(rows, dict) else ():
+                label = row.get("label") if isinstance(row, dict) else None
+                if label in (0, 1):  # True is 1
+                    first = row.get("contact_frame_label")
+                    known = {"first_frame": first} if label and type(first) is int else {}
+                    self._evaluated[folder][name] = about | {"contact": bool(label), **known}
+        return self._evaluated[folder]
 
     def _labels_in(self, folder: Path) -> dict[str, bool]:
         if folder not in self._labels:

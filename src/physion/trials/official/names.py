@@ -35,6 +35,10 @@ between surfaces of this package; it makes each threshold valid for the other's 
 FLOW_FULL = 0.02
 """Motion per frame with full brightness in ``_flow``, as a fraction of the picture's width."""
 
+EVALUATOR_LABELS = "all_video_labels.json"
+"""File of version 1.5 with outcomes and frames of contacts, next to its movies."""
+EVALUATOR_SPLITS = {"readout": "train", "testing": "test"}
+"""Folders of version 1.5 by split."""
 MARK = "-redyellow"
 """End of the names of configurations with red agent and yellow patient."""
 _DEPTH_RANGE = 100.0 - 0.1

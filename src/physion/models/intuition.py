@@ -1,0 +1,642 @@
+"""Intuition: P(contact) from what was observed, learned from the outcomes of own trials.
+
+One network for all scenarios. It simulates nothing and knows no physics: it has seen many trials
+and how they ended. An object is a token, which holds its track over the observed frames 2, 5, ...,
+44, from the true state (`intuition-states`) or from its mask (`intuition-masks`):
+
+    x_k = f(track_k, track_k - track_agent, track_k - track_patient, constants_k),
+
+and L blocks of attention over the objects, in no order, lead to the answer
+
+    P(contact) = sigmoid( g(x_agent, x_patient, mean_k x_k) ).
+
+The loss is the cross entropy of the outcomes. Which object is agent, patient or probe is one of its
+constants. In training a trial is mirrored at random; an answer is the mean of both images, and of
+several networks if there are ``members``.
+
+References
+----------
+J. Lee et al., Set transformer, ICML 2019: attention over objects without an order.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from physion.clips.batch import (
+    AGENT_ID,
+    FIRST_OTHER_ID,
+    LAST_OBSERVED,
+    PATIENT_ID,
+    Batch,
+    Motion,
+    Provenance,
+    Spec,
+)
+from physion.core.errors import BadInputError
+from physion.models.baselines.motion import F64, motions, observed_motion
+from physion.models.baselines.trees import mask_blob
+from physion.models.checkpoint import load_named
+from physion.models.interface import (
+    RANDOM,
+    LearnsFrom,
+    SizedSettings,
+    Sizes,
+    TrainingSettings,
+    can,
+    settings_of_size,
+)
+from physion.models.torch_model import TorchModel, digest_of, initial_weights
+from physion.numerics.linear_algebra import norm
+from physion.numerics.rotations import rotate_vectors, rotation_matrices
+from physion.scenes.scene import Scene
+from physion.scenes.shapes.primitives import shape
+
+VERSION = 1
+
+# What a token holds. Columns of a track are of every frame, constants of the object. A mirror image
+# of a trial has the same columns in another order, some with the other sign.
+
+STATE, MASK = "states", "masks"
+_CORNERS = tuple(f"corner {x}{y}{z}" for x in "-+" for y in "-+" for z in "-+")
+
+
+@dataclass(frozen=True)
+class TokenColumns:
+    """Columns of tokens.
+
+    - ``track``, ``constants``: names of columns; the first of a track says if the object is there.
+    - ``place``: columns of a track that are also given relative to agent and patient.
+    - ``negated``: columns with the other sign in the mirror image. ``swapped``: pairs of columns
+      that change places there.
+    """
+
+    track: tuple[str, ...]
+    constants: tuple[str, ...]
+    place: tuple[str, ...]
+    negated: frozenset[str]
+    swapped: tuple[tuple[str, str], ...]
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of all columns of a token in one frame."""
+        return self.track + self.constants
+
+    def mirror(self) -> tuple[list[int], list[float]]:
+        """Return from which column each comes in the mirror image, and its factor."""
+        partner = {a: b for pair in self.swapped for a, b in (pair, pair[::-1])}
+        order = [self.columns.index(partner.get(name, name)) for name in self.columns]
+        return order, [-1.0 if name in self.negated else 1.0 for name in self.columns]
+
+
+VIEWS: Mapping[str, TokenColumns] = {
+    STATE: TokenColumns(
+        track=(
+            "there", "x", "y", "z", "axis x", "axis y", "axis z", "up x", "up y", "up z",
+            "vx", "vy", "vz", "wx", "wy", "wz",
+        ),
+        constants=(
+            "agent", "patient", "probe", "cloth", "fixed", "length", "width", "height", "filled",
+            *_CORNERS,
+        ),
+        place=("x", "y", "z"),
+        negated=frozenset(("y", "axis y", "up y", "vy", "wx", "wz")),
+        swapped=tuple((f"corner {x}-{z}", f"corner {x}+{z}") for x in "-+" for z in "-+"),
+    ),
+    MASK: TokenColumns(
+        track=(
+            "there", "area", "x", "y", "width", "height", "slant", "left", "top", "right", "bottom",
+        ),
+        constants=("agent", "patient"),
+        place=("x", "y"),
+        negated=frozenset(("x", "slant", "left", "right")),
+        swapped=(("left", "right"),),
+    ),
+}  # fmt: skip
+"""Columns by what is seen.
+
+- ``states``: centre of the bounding box in metres, directions of two axes of the body, velocity
+  and angular velocity (asinh of m/s and rad/s); size in metres, fraction of the bounding box that
+  the shape fills, and how far it reaches into the corners of the box. The origin lies on the floor
+  below the patient, the first axis points to the agent, both at the last observed frame.
+- ``masks``: square root of the area, mean, standard deviations and covariance of the pixels, and
+  the box around them, in fractions of the picture from its middle.
+"""
+
+
+# Tokens of states.
+
+
+def state_tokens(
+    motion: Motion, trial: str, frames: NDArray[np.int64], objects: int
+) -> NDArray[np.float32]:
+    """Return the tokens (T, K, D) of the observed part of a motion, zeros for absent objects.
+
+    The first three are agent, patient and probe (the object that is pushed; nothing where it is one
+    of these), then come the objects nearest to the line from agent to patient. Scenery is left out.
+    """
+    seen = observed_motion(motion, trial)
+    scene, view = seen.scene, VIEWS[STATE]
+    names, roles = scene.names(), scene.roles
+    tracks, there = _tracks(seen, np.append(frames, LAST_OBSERVED))
+    now = tracks[-1, :, :3]
+    agent, patient = names.index(roles.agent), names.index(roles.patient)
+    chosen = _nearest(scene, now, there[-1], objects)
+    ahead = now[agent, :2] - now[patient, :2]
+    length = float(norm(ahead))
+    x, y = ahead / length if length > 0 else (1.0, 0.0)
+    axes = np.array([[x, y, 0.0], [-y, x, 0.0], [0.0, 0.0, 1.0]])
+    origin = np.array([*now[patient, :2], 0.0])
+    vectors = tracks[:-1, chosen].reshape(len(frames), len(chosen), -1, 3).copy()
+    vectors[:, :, 0] -= origin
+    turned = (vectors @ axes.T).reshape(len(frames), len(chosen), -1)
+    turned[..., -6:] = np.arcsinh(turned[..., -6:])
+    tokens = np.zeros((len(frames), objects, len(view.columns)), np.float32)
+    # The probe has the third place, also where another object takes part in its stead.
+    places = [0, 1, *range(3 - (chosen[2:3] == [_probe(scene)]), objects)][: len(chosen)]
+    present = there[:-1].take(chosen, axis=1)
+    tracked = np.concatenate([present[..., None], turned * present[..., None]], -1)
+    constants = np.array([_constants(scene, index) for index in chosen])
+    ever = np.asarray(present.any(axis=0))
+    repeated = np.broadcast_to(constants, (len(frames), *constants.shape))
+    tokens[:, places] = np.concatenate([tracked, repeated * ever[:, None]], -1)
+    return tokens
+
+
+def _tracks(seen: Motion, frames: NDArray[np.int64]) -> tuple[F64, NDArray[np.bool_]]:
+    """Return of every object (T, N, 15) centre, two axes, velocities; and whether it is there."""
+    scene, trajectory = seen.scene, seen.trajectory
+    bodies = len(scene.bodies)
+    tracks = np.zeros((len(frames), len(scene.names()), 15))
+    rotations = trajectory.rotations[frames].astype(np.float64)
+    boxes = [_bounds(body.shape) * np.asarray(body.scale) for body in scene.bodies]
+    middles = np.array([box.mean(axis=0) for box in boxes]).reshape(-1, 3)
+    turned = rotation_matrices(rotations)
+    tracks[:, :bodies, :3] = trajectory.positions[frames] + rotate_vectors(rotations, middles)
+    tracks[:, :bodies, 3:6], tracks[:, :bodies, 6:9] = turned[..., 0], turned[..., 2]
+    tracks[:, :bodies, 9:12] = trajectory.velocities[frames]
+    tracks[:, :bodies, 12:15] = trajectory.angular_velocities[frames]
+    start = 0
+    for number, cloth in enumerate(scene.cloths):
+        rows = slice(start, start := start + cloth.resolution**2)
+        own = tracks[:, bodies + number]
+        states = [trajectory.state(int(frame)) for frame in frames]
+        own[:, :3] = [state.cloth_vertices[rows].mean(axis=0) for state in states]
+        own[:, 3:9] = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+        own[:, 9:12] = [state.cloth_velocities[rows].mean(axis=0) for state in states]
+    there = np.array([scene.present(int(frame)) for frame in frames])
+    return tracks, there
+
+
+def _probe(scene: Scene) -> int:
+    """Return the index of the probe; -1 if it is agent or patient, or if there is none."""
+    roles = scene.roles
+    named = roles.probe is not None and roles.probe not in (roles.agent, roles.patient)
+    return scene.names().index(roles.probe) if named and roles.probe is not None else -1
+
+
+def _nearest(scene: Scene, now: F64, there: NDArray[np.bool_], objects: int) -> list[int]:
+    """Return agent, patient, probe if there is one, and the objects nearest to the line."""
+    names = scene.names()
+    first = [names.index(scene.roles.agent), names.index(scene.roles.patient)]
+    first += [probe] if (probe := _probe(scene)) >= 0 else []
+    start, way = now[first[1]], now[first[0]] - now[first[1]]
+    along = np.clip((now - start) @ way / (float(way @ way) or 1.0), 0, 1)
+    aside = norm(now - start - along[:, None] * way)
+    scenery = [body.scenery for body in scene.bodies] + [False] * len(scene.cloths)
+    others = [i for i in range(len(names)) if there[i] and not scenery[i] and i not in first]
+    free = objects - (3 if objects > 2 else 2)
+    return [*first[:objects], *sorted(others, key=lambda index: float(aside[index]))[:free]]
+
+
+def _constants(scene: Scene, index: int) -> list[float]:
+    """Return the constants of one object, as in `VIEWS`."""
+    names, roles = scene.names(), scene.roles
+    flags = [float(names[index] == name) for name in (roles.agent, roles.patient, roles.probe)]
+    if index >= len(scene.bodies):
+        return [*flags, 1.0, 0.0, *scene.cloths[index - len(scene.bodies)].size, 0.0, *[0.0] * 8]
+    body = scene.bodies[index]
+    low, high = _bounds(body.shape) * np.asarray(body.scale)
+    return [*flags, 0.0, float(body.kinematic), *(high - low), *_reach(body.shape)]
+
+
+@functools.cache
+def _bounds(name: str) -> F64:
+    """Return the smallest and largest coordinates (2, 3) of a shape at unit scale."""
+    return shape(name).bounds
+
+
+@functools.cache
+def _reach(name: str) -> tuple[float, ...]:
+    """Return which fraction of its bounding box a shape fills, and its reach into the 8 corners.
+
+    The reach is the largest d . v of the vertices v, in coordinates of -1 to 1 in the box, in the
+    direction d of a corner: 1 for a cube, 1 / sqrt(3) for a sphere.
+    """
+    low, high = shape(name).bounds
+    points = (shape(name).mesh.vertices - (low + high) / 2) / ((high - low) / 2)
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    corners = (points @ (signs / 3).T).max(axis=0)
+    return (float(shape(name).volume / np.prod(high - low)), *(float(c) for c in corners))
+
+
+# Tokens of masks.
+
+
+def mask_tokens(ids: NDArray[np.uint8], objects: int) -> NDArray[np.float32]:
+    """Return the tokens (T, K, D) of a clip from the objects of its pixels (T, H, W).
+
+    The first two are agent and patient, then come the others with the most pixels in all frames.
+    """
+    view = VIEWS[MASK]
+    pixels = np.bincount(ids.ravel(), minlength=256)[FIRST_OTHER_ID:]
+    others = [n for n in np.argsort(-pixels, kind="stable")[: objects - 2] if pixels[n] > 0]
+    numbers = [AGENT_ID, PATIENT_ID, *(FIRST_OTHER_ID + int(number) for number in others)]
+    tokens = np.zeros((len(ids), objects, len(view.columns)), np.float32)
+    for place, number in enumerate(numbers):
+        blob = mask_blob(ids == number)
+        seen = blob[:, 0] > 0
+        # Area, mean and box count from the middle of the picture.
+        values = blob - np.array([0, 0.5, 0.5, 0, 0, 0, 0.5, 0.5, 0.5, 0.5], np.float32)
+        values[:, 0] = np.sqrt(blob[:, 0])
+        tokens[:, place, 0] = seen
+        tokens[:, place, 1 : len(view.track)] = values * seen[:, None]
+        tokens[:, place, len(view.track) :] = (place == 0, place == 1)
+    return tokens
+
+
+# Settings.
+
+
+@dataclass(frozen=True, kw_only=True)
+class IntuitionSettings(SizedSettings):
+    """Settings of a model of intuition; also see `SizedSettings`.
+
+    - ``image_size``: pixels per side of the masks.
+    - ``objects``: tokens K. With more objects the largest masks, or the bodies nearest to the line
+      from agent to patient, are kept.
+    - ``width``, ``layers``, ``heads``: of the network. ``dropout``: in training.
+    - ``noise``: standard deviation of noise on the values of tokens in training, in standard
+      deviations of a value.
+    - ``members``: networks, trained at the same time, whose probabilities are averaged.
+    """
+
+    model: str = "intuition-masks"
+    image_size: int = 64
+    objects: int = 8
+    width: int = 96
+    layers: int = 3
+    heads: int = 4
+    dropout: float = 0.1
+    noise: float = 0.02
+    members: int = 1
+
+    sizes: ClassVar[Sizes] = {"small": {}}
+
+    @classmethod
+    def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the settings of a model; it starts from random weights, since none ship."""
+        sized = settings_of_size(model, cls.sizes, options.get("size", "small"))
+        objects = 12 if model == "intuition-states" else 8
+        return {"weights": RANDOM, "objects": objects, **sized}
+
+    def __post_init__(self) -> None:
+        self.at_least(1, "image_size", "width", "layers", "heads", "members")
+        self.at_least(3, "objects")
+        self.at_least(0, "dropout", "noise")
+        if self.width % self.heads:
+            raise BadInputError(
+                f"{self.model}: width {self.width} must be a multiple of heads {self.heads}"
+            )
+
+
+STRIDE, CONTEXT = 3, 15
+"""Frames 2, 5, ..., 38, 41, 44. The last ones are dense, since they tell velocities."""
+
+TRAINING = TrainingSettings(
+    steps=4000,
+    batch=256,
+    optimizer="adamw",
+    learning_rate=1e-3,
+    weight_decay=0.05,
+    schedule="cosine",
+    warmup=200,
+    clip=1.0,
+    validate_every=250,
+    log_every=50,
+    checkpoint_every=250,
+)
+
+
+# The network.
+
+
+class TokenBlock(nn.Module):
+    """Attention over objects and a network of each, both added to what they read (pre-norm)."""
+
+    def __init__(self, width: int, heads: int, dropout: float) -> None:
+        super().__init__()
+        self.heads, self.dropout = heads, dropout
+        self.before = nn.LayerNorm(width)
+        self.mix = nn.Linear(width, 3 * width)
+        self.join = nn.Linear(width, width)
+        self.each = nn.Sequential(
+            nn.LayerNorm(width),
+            nn.Linear(width, 2 * width),
+            nn.GELU(),
+            nn.Linear(2 * width, width),
+            nn.Dropout(dropout),
+        )
+
+    def forward(self, tokens: Tensor, there: Tensor) -> Tensor:
+        """Return tokens (B, K, width); those that are not ``there`` (B, K) are not looked at."""
+        shape = (*tokens.shape[:2], 3, self.heads, -1)
+        query, key, value = self.mix(self.before(tokens)).view(shape).permute(2, 0, 3, 1, 4)
+        mixed = functional.scaled_dot_product_attention(
+            query, key, value, attn_mask=there[:, None, None],
+            dropout_p=self.dropout if self.training else 0.0,
+        )  # fmt: skip
+        tokens = tokens + self.join(mixed.transpose(1, 2).flatten(2))
+        out: Tensor = tokens + self.each(tokens)
+        return out
+
+
+class TokenNetwork(nn.Module):
+    """Tokens of objects, of ``inputs`` values each, to the logit of P(contact)."""
+
+    def __init__(self, inputs: int, width: int, layers: int, heads: int, dropout: float) -> None:
+        super().__init__()
+        self.embed = nn.Sequential(nn.Linear(inputs, width), nn.GELU(), nn.Linear(width, width))
+        self.blocks = nn.ModuleList(TokenBlock(width, heads, dropout) for _ in range(layers))
+        self.answer = nn.Sequential(
+            nn.LayerNorm(3 * width),
+            nn.Dropout(dropout),
+            nn.Linear(3 * width, width),
+            nn.GELU(),
+            nn.Linear(width, 1),
+        )
+
+    def forward(self, values: Tensor, there: Tensor) -> Tensor:
+        """Return logits (B,) of values (B, K, inputs) of tokens that are ``there`` (B, K)."""
+        tokens = self.embed(values)
+        for block in self.blocks:
+            tokens = block(tokens, there)
+        weights = there[..., None].to(tokens.dtype)
+        mean = (tokens * weights).sum(1) / weights.sum(1).clamp(min=1)
+        out: Tensor = self.answer(torch.cat([tokens[:, 0], tokens[:, 1], mean], -1))
+        return out[:, 0]
+
+
+# The model.
+
+
+class Intuition(TorchModel):
+    """Base of models that learn P(contact) from outcomes; subclasses have ``logits``.
+
+    Parameters
+    ----------
+    settings
+        What the user chose.
+    spec
+        What the model asks for.
+    training
+        Optimiser and schedule, which are no part of the digest.
+    """
+
+    answers = "observed"
+    learns_outcomes = True
+    settings: Any
+    sees = ""
+    """What it looks at, for the column *Encoder Type*."""
+
+    def __init__(self, settings: Any, spec: Spec, training: TrainingSettings) -> None:
+        super().__init__()
+        settings.check_shipped()
+        self.name = f"{settings.model}-{settings.size}"
+        self.settings, self.spec, self.training_settings = settings, spec, training
+        self.seed, self.window = settings.seed, spec.context
+        self.base_rate = nn.Buffer(torch.tensor(0.5))
+
+    def logits(self, batch: Batch) -> Tensor:
+        """Return logits (M, B) of the answers of M networks or images."""
+        raise NotImplementedError
+
+    def seen(self, batch: Batch) -> Tensor:
+        """Return whether agent and patient are both seen in some frame (B,)."""
+        raise NotImplementedError
+
+    def predict(self, batch: Batch) -> Tensor:
+        """Return P(contact) (B,), the mean over networks and mirror images.
+
+        Where agent or patient is never seen it is the base rate of the training trials.
+        """
+        if batch.features is None and can(self, "encode"):
+            batch = replace(batch, features=self.encode(batch))
+        answers = self.logits(batch).sigmoid().mean(0)
+        return torch.where(self.seen(batch), answers, self.base_rate)
+
+    def note(self, batch: Batch) -> str:
+        """Return which trials never show agent or patient."""
+        pairs = zip(batch.trials, self.seen(batch).tolist(), strict=True)
+        hidden = [trial for trial, seen in pairs if not seen]
+        return f"agent or patient never visible, base rate: {', '.join(hidden)}" if hidden else ""
+
+    def prepare(self, sample: Batch) -> None:
+        """Set the base rate from training trials."""
+        self.base_rate.copy_(sample.contact.float().mean())
+
+    def baseline(self, batch: Batch) -> Tensor:
+        """Return the cross entropy of the base rate."""
+        rates = self.base_rate.clamp(0.01, 0.99).expand(len(batch))
+        return functional.binary_cross_entropy(rates, batch.contact.float())
+
+    def provenance(self) -> Provenance:
+        """Return name, size and origin of the weights."""
+        return Provenance(
+            model=self.name,
+            init=self.init,
+            encoder_type=self.sees,
+            encoder_training_task="outcomes",
+            dynamics_type="none",
+            versions=f"torch {torch.__version__}",
+        )
+
+    def digest(self) -> str:
+        """Return the SHA-256 of code version, settings and weights."""
+        return digest_of([*self._digested(), torch.__version__], self.state_dict().items())
+
+    def built_as(self) -> dict[str, Any]:
+        """Return what the weights were made for: name, with the size, and version."""
+        return {"model": self.name, "version": VERSION}
+
+    def _digested(self) -> list[Any]:
+        settings = {k: v for k, v in asdict(self.settings).items() if k not in ("weights", "seed")}
+        return [self.name, VERSION, settings, repr(self.spec)]
+
+    def _check_frames(self, batch: Batch) -> None:
+        """Raise `BadInputError` for other frames than those that the model learns from."""
+        wanted = self.spec.context_frames()
+        shown = batch.frames.cpu().numpy() if isinstance(batch.frames, Tensor) else batch.frames
+        for trial, frames in zip(batch.trials, shown.tolist(), strict=True):
+            if tuple(frames) != wanted:
+                listed = ", ".join(str(frame) for frame in (*wanted[:2], "...", wanted[-1]))
+                raise BadInputError(
+                    f"{self.name}, trial {trial!r}: frames {listed} are needed, not "
+                    f"{len(frames)} frames up to {frames[-1]}; read clips with the model's spec"
+                )
+
+
+class TokenIntuition(Intuition):
+    """Intuition from true states or masks, given as tokens of objects."""
+
+    learns_from: LearnsFrom = "features"
+    settings: IntuitionSettings
+
+    def __init__(self, settings: IntuitionSettings) -> None:
+        self.kind = settings.model.partition("-")[2]
+        self.sees = f"{self.kind} of up to {settings.objects} objects"
+        spec = Spec(
+            inputs=("state",) if self.kind == STATE else ("ids",),
+            image_size=settings.image_size, stride=STRIDE, context=CONTEXT, future=0,
+            framewise=False,
+        )  # fmt: skip
+        super().__init__(settings, spec, TRAINING)
+        self.view = VIEWS[self.kind]
+        tracked, places = len(self.view.track), len(self.view.place)
+        inputs = CONTEXT * (tracked + 2 * places) + len(self.view.constants)
+        with initial_weights(settings.model, settings.seed):
+            self.networks = nn.ModuleList(
+                TokenNetwork(
+                    inputs, settings.width, settings.layers, settings.heads, settings.dropout
+                )
+                for _ in range(settings.members)
+            )
+        columns = len(self.view.columns)
+        self.center = nn.Buffer(torch.zeros(columns))
+        self.scale = nn.Buffer(torch.ones(columns))
+        order, signs = self.view.mirror()
+        self.order = nn.Buffer(torch.tensor(order), persistent=False)
+        self.signs = nn.Buffer(torch.tensor(signs), persistent=False)
+        load_named(self, settings.weights)
+
+    def encoder_digest(self) -> str:
+        """Return the SHA-256 of what determines the tokens: no weights."""
+        return digest_of([self.kind, VERSION, self.settings.objects, repr(self.spec)])
+
+    def encode(self, batch: Batch) -> Tensor:
+        """Return the tokens of all objects (B, T, K D), which depend on no weights."""
+        self._check_frames(batch)
+        objects = self.settings.objects
+        if self.kind == STATE:
+            shown = batch.frames.cpu().numpy()
+            rows = zip(motions(batch, self.name), batch.trials, shown, strict=True)
+            tokens = [state_tokens(motion, trial, of, objects) for motion, trial, of in rows]
+        else:
+            tokens = [mask_tokens(ids, objects) for ids in self._ids(batch)]
+        return torch.from_numpy(np.stack(tokens)).flatten(2).to(self.device)
+
+    def note(self, batch: Batch) -> str:
+        """Return which trials never show agent or patient, and which show too many objects."""
+        counts = self._counts(batch)
+        pairs = zip(batch.trials, counts, strict=True)
+        many = [f"{trial} ({count})" for trial, count in pairs if count > self.settings.objects]
+        kept = f"more than {self.settings.objects} objects, others left out: {', '.join(many)}"
+        return "; ".join(filter(None, (super().note(batch), kept if many else "")))
+
+    def logits(self, batch: Batch) -> Tensor:
+        """Return logits (2 members, B), each member of the trial and of its mirror image."""
+        tokens = self._tokens(batch)
+        images = (tokens, self._mirrored(tokens))
+        return torch.stack([net(*self._values(image)) for net in self.networks for image in images])
+
+    def seen(self, batch: Batch) -> Tensor:
+        """Return whether agent and patient are both seen in some frame (B,)."""
+        seen: Tensor = (self._tokens(batch)[:, :, :2, 0] > 0).any(1).all(1)
+        return seen
+
+    def prepare(self, sample: Batch) -> None:
+        """Set the base rate, and mean and standard deviation of the values of present objects."""
+        super().prepare(sample)
+        tokens = self._tokens(sample)
+        values = tokens[tokens[..., 0] > 0]
+        # What says whether something is there keeps its values.
+        kept = torch.tensor([name == "there" for name in self.view.columns], device=values.device)
+        self.center.copy_(values.mean(0).masked_fill(kept, 0.0))
+        self.scale.copy_(values.std(0).clamp(min=1e-3).masked_fill(kept, 1.0))
+
+    def loss(self, batch: Batch) -> dict[str, Tensor]:
+        """Return the mean cross entropy of the outcomes, and how many answers are right."""
+        tokens = self._tokens(batch)
+        logits = []
+        for network in self.networks:
+            turned = torch.rand(len(batch), device=tokens.device) < 0.5
+            image = torch.where(turned[:, None, None, None], self._mirrored(tokens), tokens)
+            logits.append(network(*self._values(image)))
+        answers = torch.stack(logits)
+        contact = batch.contact.float().expand_as(answers)
+        right = ((answers.sigmoid().mean(0) > 0.5) == batch.contact).float().mean()
+        loss = functional.binary_cross_entropy_with_logits(answers, contact)
+        return {"loss": loss, "accuracy": right}
+
+    def _tokens(self, batch: Batch) -> Tensor:
+        """Return tokens (B, T, K, D) from the features of a batch, or made of what it shows."""
+        tokens: Tensor = self.encode(batch) if batch.features is None else batch.features
+        return tokens.view(*tokens.shape[:2], self.settings.objects, -1)
+
+    def _mirrored(self, tokens: Tensor) -> Tensor:
+        """Return the tokens of the mirror image."""
+        image: Tensor = tokens[..., self.order] * self.signs
+        return image
+
+    def _values(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what the network reads of tokens (B, T, K, D), and which objects are there."""
+        view, steps = self.view, tokens.shape[1]
+        present = tokens[..., :1]
+        scaled = ((tokens - self.center) / self.scale).clamp(-10, 10)
+        if self.training and self.settings.noise:
+            scaled = scaled + self.settings.noise * torch.randn_like(scaled)
+        # Presence is 0 or 1 and stays so; values of absent objects are zeros.
+        scaled = torch.cat([present, scaled[..., 1:] * present], -1)
+        columns = [view.columns.index(name) for name in view.place]
+        places, shown = scaled[..., columns], present
+        relative = [
+            (places - places[:, :, who, None]) * shown * shown[:, :, who, None] for who in (0, 1)
+        ]
+        tracks = torch.cat([scaled[..., : len(view.track)], *relative], -1)
+        constants = scaled[..., len(view.track) :].sum(1) / present.sum(1).clamp(min=1)
+        values = tracks.transpose(1, 2).reshape(len(tokens), tokens.shape[2], -1)
+        there = (present[..., 0] > 0).any(1)
+        # Attention needs something to look at.
+        there = there | ~there.any(1, keepdim=True)
+        assert values.shape[2] == steps * tracks.shape[3]
+        return torch.cat([values, constants], -1), there
+
+    def _ids(self, batch: Batch) -> NDArray[np.uint8]:
+        """Return the objects of pixels (B, T, H, W), after a check of their size."""
+        size = self.settings.image_size
+        if batch.ids is None or tuple(batch.ids.shape[2:]) != (size, size):
+            found = "none" if batch.ids is None else tuple(batch.ids.shape[2:])
+            raise BadInputError(
+                f"{self.name}: objects of pixels (input ids) of {size} x {size} are needed, not "
+                f"{found}; give clips of this size, or --option image_size"
+            )
+        ids = batch.ids.cpu().numpy() if isinstance(batch.ids, Tensor) else batch.ids
+        return np.asarray(ids)
+
+    def _counts(self, batch: Batch) -> Sequence[int]:
+        """Return the number of objects of every clip, which may be more than there are tokens."""
+        if self.kind == MASK:
+            return [len(np.unique(ids[ids > 0])) for ids in self._ids(batch)]
+        scenes = [motion.scene for motion in motions(batch, self.name)]
+        return [
+            sum(not body.scenery for body in scene.bodies) + len(scene.cloths) for scene in scenes
+        ]

@@ -1,0 +1,276 @@
+"""Models of intuition: tokens of objects, mirror images, learning from outcomes, bad input."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from physion.clips.batch import Batch, Motion
+from physion.core.errors import BadInputError
+from physion.models.build import build_model
+from physion.models.interface import TrainingSettings
+from physion.models.intuition import VIEWS, mask_tokens, state_tokens
+from physion.models.intuition_pixels import boxes_of_masks
+from physion.physics.trajectory import Contacts, Trajectory
+from physion.scenes.scene import Body, Camera, Cloth, Roles, Scene
+from physion.training.train import train_model
+from support.clip_source import ClipSource
+
+FRAMES = np.arange(2, 45, 3)
+COLUMN = {name: VIEWS["states"].columns.index(name) for name in VIEWS["states"].columns}
+
+
+def scene(*more: Body) -> Scene:
+    bodies = (
+        Body("red", "cone", (0.0, 0.0, 0.0), (0.2, 0.4, 0.6)),
+        Body("yellow", "cube", (0.0, 0.0, 0.0), (1.0, 1.0, 0.5), kinematic=True),
+        *more,
+    )
+    cloth = Cloth("sheet", (0.0, 0.0, 0.0), resolution=2)
+    return Scene("s", "drop", bodies, Roles("red", "yellow"), Camera((3.0, 0.0, 1.0)), (cloth,))
+
+
+def motion(made: Scene, angle: float = 0.0, mirrored: bool = False, shift: Any = 0.0) -> Motion:
+    """Bodies that move on straight lines, in a world that is mirrored, turned and shifted."""
+    count, steps = len(made.bodies), np.arange(60)[:, None, None] / 100
+    rng = np.random.default_rng(0)
+    start, speed, spin, cloth = (rng.normal(size=(count, 3)) for _ in range(4))
+    sine, cosine = np.sin(angle), np.cos(angle)
+    turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+    side = np.diag([1.0, -1.0 if mirrored else 1.0, 1.0])
+    quaternion = np.float32([np.cos(angle / 2), 0, 0, np.sin(angle / 2)])
+    moved = shift * np.array([1.0, 1.0, 0.0])
+
+    def world(vectors: Any) -> Any:
+        return (vectors @ side @ turn.T).astype(np.float32)
+
+    return Motion(
+        made,
+        Trajectory(
+            world(start + steps * speed) + moved.astype(np.float32),
+            np.tile(quaternion, (60, count, 1)),
+            np.tile(world(speed), (60, 1, 1)),
+            # A mirror turns a rotation the other way.
+            np.tile(world(spin) * np.float32(np.linalg.det(side)), (60, 1, 1)),
+            world(np.tile(cloth[:1], (60, 4, 1))) + moved.astype(np.float32),
+            np.full(60, np.nan, np.float32), Contacts.empty(), True, "by hand 1",
+        ),
+    )  # fmt: skip
+
+
+def test_tokens_of_states_have_the_patient_at_the_origin_and_the_agent_ahead() -> None:
+    made = scene(
+        Body("far", "sphere", (0.0, 0.0, 0.0)), Body("tree", "cube", (0, 0, 0), scenery=True)
+    )
+    seen = motion(made)
+    tokens = state_tokens(seen, "t", FRAMES, 6)
+    assert tokens.shape == (15, 6, len(COLUMN))
+    last = tokens[-1]
+    assert last[:, COLUMN["there"]].tolist() == [1, 1, 0, 1, 1, 0], "no probe; no scenery"
+    assert last[1, [COLUMN["x"], COLUMN["y"]]] == pytest.approx([0, 0], abs=1e-6)
+    agent, patient = seen.trajectory.positions[44, :2]
+    middle = [0.0, 0.0, 0.3], [0.0, 0.0, 0.25]  # centres of the boxes above the pivots
+    assert last[0, COLUMN["x"]] == pytest.approx(np.hypot(*(agent - patient)[:2]), rel=1e-5)
+    assert last[0, COLUMN["y"]] == pytest.approx(0, abs=1e-6)
+    assert last[0, COLUMN["z"]] == pytest.approx(agent[2] + middle[0][2], rel=1e-5)
+    speed = seen.trajectory.velocities[44, 0]
+    moved = np.sinh(last[0, [COLUMN["vx"], COLUMN["vy"], COLUMN["vz"]]])
+    assert np.linalg.norm(moved) == pytest.approx(np.linalg.norm(speed), rel=1e-5)
+    assert moved[2] == pytest.approx(speed[2], rel=1e-5)
+    sizes = [COLUMN[name] for name in ("length", "width", "height")]
+    assert last[0, sizes] == pytest.approx([0.2, 0.4, 0.6], rel=0.02)
+    # A cone fills a third of the cylinder, a cube all of its box.
+    assert last[0, COLUMN["filled"]] == pytest.approx(np.pi / 12, rel=0.05)
+    assert last[1, COLUMN["filled"]] == 1 and last[1, COLUMN["fixed"]] == 1
+    assert last[0, COLUMN["corner +++"]] < last[0, COLUMN["corner ++-"]] < 1
+    assert last[3:5, COLUMN["cloth"]].sum() == 1
+
+
+def test_tokens_of_states_turn_with_agent_and_patient_and_mirror_with_the_world() -> None:
+    model: Any = build_model("intuition-states", objects=6)
+    made = scene(Body("far", "cube", (0.0, 0.0, 0.0)))
+    plain = state_tokens(motion(made), "t", FRAMES, 6)
+    turned = state_tokens(motion(made, angle=2.0, shift=5.0), "t", FRAMES, 6)
+    bodies = plain[-1, :, COLUMN["cloth"]] == 0
+    assert turned[:, bodies] == pytest.approx(plain[:, bodies], abs=1e-5)
+    mirrored = state_tokens(motion(made, mirrored=True), "t", FRAMES, 6)
+    image = model._mirrored(torch.from_numpy(plain)).numpy()
+    # Bodies that do not turn have other axes than a mirror image.
+    compared = [i for name, i in COLUMN.items() if not name.startswith(("axis", "up"))]
+    assert mirrored[..., compared] == pytest.approx(image[..., compared], abs=1e-5)
+
+
+def test_tokens_of_masks_hold_the_largest_objects() -> None:
+    ids = np.zeros((2, 8, 8), np.uint8)
+    ids[:, :2, :4], ids[0, 6:, 6:], ids[:, 3:6, 0:2], ids[:, 4, 4] = 1, 2, 5, 3
+    tokens = mask_tokens(ids, 3)
+    columns = VIEWS["masks"].columns
+    first = dict(zip(columns, tokens[0].T, strict=True))
+    assert first["there"].tolist() == [1, 1, 1] and tokens[1, :, 0].tolist() == [1, 0, 1]
+    assert first["area"] == pytest.approx(np.sqrt([8 / 64, 4 / 64, 6 / 64]))
+    assert first["x"] == pytest.approx([0.25 - 0.5, 0.875 - 0.5, 0.125 - 0.5])
+    assert first["bottom"] == pytest.approx([-0.25, 0.5, 0.25])
+    assert (tokens[1, 1, : -len(VIEWS["masks"].constants)] == 0).all()
+    model: Any = build_model("intuition-masks", objects=3)
+    image = model._mirrored(torch.from_numpy(tokens)).numpy()
+    assert image == pytest.approx(mask_tokens(ids[:, :, ::-1], 3), abs=1e-6)
+
+
+def clips(ids: Any, frames: Any = FRAMES) -> Batch:
+    """Return a batch of pictures of objects (B, T, H, W), as tensors."""
+    count, steps = ids.shape[:2]
+    return Batch(
+        tuple(f"t{i}" for i in range(count)), np.tile(np.asarray(frames), (count, 1)),
+        np.ones((count, steps), np.bool_), ids=ids,
+    ).to("cpu")  # fmt: skip
+
+
+class MovingSquares(ClipSource):
+    """Trials in which a square moves right; it touches the other one if that is on its line.
+
+    Objects other than these two are noise.
+    """
+
+    def __init__(self, spec: Any, count: int = 150) -> None:
+        self.spec, rng = spec, np.random.default_rng(0)
+        self.trials = tuple(f"drop_{number:04d}" for number in range(count))
+        self.rows = dict(zip(self.trials, rng.integers(0, 12, (count, 3)), strict=True))
+        self.outcomes = {t: bool(abs(r[0] - r[1]) < 4) for t, r in self.rows.items()}
+
+    def length(self, trial: str) -> int:
+        return 60
+
+    def key(self, trial: str, part: str) -> str:
+        assert part == "context", "the future of a trial is not read"
+        return trial
+
+    def clips(self, trials: Any, frames: Any) -> Batch:
+        ids = np.zeros((len(trials), len(frames[0]), 16, 16), np.uint8)
+        for clip, trial in zip(ids, trials, strict=True):
+            top, other, more = self.rows[trial]
+            for frame, picture in zip(frames[0], clip, strict=True):
+                assert frame < 45
+                picture[more : more + 2, 6:8] = 3
+                picture[other : other + 4, 12:16] = 2
+                picture[top : top + 4, frame // 8 : frame // 8 + 4] = 1
+        return replace(clips(ids, frames[0]), trials=tuple(trials))
+
+
+class ColoredSquares(MovingSquares):
+    """The same as pictures: agent red, patient yellow, the others grey, and the true masks."""
+
+    def clips(self, trials: Any, frames: Any) -> Batch:
+        batch = super().clips(trials, frames)
+        colors = np.array([[90, 90, 90], [220, 20, 20], [220, 210, 20], [50, 50, 60]], np.uint8)
+        return replace(batch, rgb=torch.from_numpy(colors)[batch.ids.long()])
+
+
+QUICK = TrainingSettings(steps=50, batch=64, learning_rate=3e-3, validate_every=50)
+
+
+def test_outcomes_are_learned_from_contexts_and_the_order_of_objects_does_not_matter() -> None:
+    model: Any = build_model("intuition-masks", image_size=16, width=32, layers=1, objects=4)
+    source: Any = MovingSquares(model.spec)
+
+    def features(trials: Any) -> Any:
+        return [row.numpy() for row in model.encode(source.context(trials))]
+
+    settings = {"seed": 0, "name": "all", "folder": None, "accelerator": "cpu", "settings": QUICK}
+    with pytest.raises(BadInputError, match=r"learns outcomes, but 150 trials .* without"):
+        train_model(model, source, source.trials, features=features, **settings)
+    result = train_model(
+        model, source, source.trials, features=features, outcomes=source.outcomes, **settings
+    )
+    assert result.validation < 0.5 * result.baseline
+    assert float(model.base_rate) == pytest.approx(np.mean([*source.outcomes.values()]), abs=0.05)
+    asked = MovingSquares(model.spec, 100)
+    batch = asked.context(asked.trials)
+    with torch.no_grad():
+        answers = model.predict(batch)
+        image = model.predict(replace(batch, ids=batch.ids.flip(3)))
+        other = model.predict(replace(batch, ids=torch.where(batch.ids == 3, 7, batch.ids)))
+    right = (answers.numpy() > 0.5) == np.array([*asked.outcomes.values()])
+    assert right.mean() > 0.9
+    assert torch.allclose(answers, image, atol=1e-5), "a mirror image has the same answer"
+    assert torch.equal(answers, other), "the number of an object means nothing"
+
+
+def test_unusual_trials_get_the_base_rate_or_a_note() -> None:
+    model: Any = build_model("intuition-masks", image_size=16, objects=3)
+    model.base_rate.fill_(0.25)
+    source = MovingSquares(model.spec, 3)
+    batch = source.context(source.trials)
+    batch.ids[1][batch.ids[1] == 2] = 0
+    batch.ids[2, :, 0, 0], batch.ids[2, 0, 0, 1] = 9, 8
+    with torch.no_grad():
+        answers = model.predict(batch)
+    assert answers[1] == 0.25 and (answers[[0, 2]] != 0.25).all()
+    assert model.note(batch) == (
+        "agent or patient never visible, base rate: drop_0001; "
+        "more than 3 objects, others left out: drop_0002 (5)"
+    )
+
+
+def test_other_frames_and_sizes_are_refused_in_one_line() -> None:
+    model: Any = build_model("intuition-masks", image_size=16)
+    ids = np.zeros((1, 15, 16, 16), np.uint8)
+    with pytest.raises(
+        BadInputError, match=r"frames 2, 5, \.\.\., 44 are needed, not 15 frames up to 14"
+    ):
+        model.predict(clips(ids, np.arange(15)))
+    with pytest.raises(BadInputError, match=r"of 16 x 16 are needed, not \(8, 8\)"):
+        model.predict(clips(ids[:, :, :8, :8]))
+    with pytest.raises(BadInputError, match="objects must be at least 3"):
+        build_model("intuition-states", objects=2)
+    with pytest.raises(BadInputError, match="must be a multiple of heads"):
+        build_model("intuition-states", width=30)
+    with pytest.raises(BadInputError, match="no weights are shipped for intuition-states-small"):
+        build_model("intuition-states", weights="shipped")
+
+
+def test_pixels_are_learned_from_with_masks_boxes_and_motion_as_targets() -> None:
+    small = {"image_size": 16, "channels": (8, 16, 16, 16), "width": 32, "layers": 1, "slots": 3}
+    model: Any = build_model("intuition-pixels", **small)
+    source: Any = ColoredSquares(model.spec, 16)
+    batch = replace(
+        source.context(source.trials), contact=torch.tensor([*source.outcomes.values()])
+    )
+    with torch.no_grad():
+        before = model.eval().loss(batch)
+    quick = replace(QUICK, batch=16, steps=40, learning_rate=5e-3, held_out=0.0)
+    settings = {"seed": 0, "name": "all", "folder": None, "accelerator": "cpu", "settings": quick}
+    train_model(model, source, source.trials, outcomes=source.outcomes, **settings)
+    with torch.no_grad():
+        after = model.loss(batch)
+    for part, most in (("outcome", 0.95), ("masks", 0.8), ("boxes", 0.8), ("motion", 0.8)):
+        assert float(after[part]) < most * float(before[part]), part
+    image = model.predict(replace(batch, rgb=batch.rgb.flip(3)))
+    assert torch.allclose(model.predict(batch), image, atol=1e-5)
+    assert torch.equal(model.predict(batch), model.predict(replace(batch, ids=None, contact=None)))
+
+
+def test_boxes_are_the_edges_of_masks() -> None:
+    masks = torch.zeros(2, 8, 4)
+    masks[0, 2:5, 1:3] = 1
+    found, there = boxes_of_masks(masks)
+    assert found.tolist() == [[0.25, 0.25, 0.75, 0.625], [0, 0, 0, 0]]
+    assert there.tolist() == [True, False]
+
+
+def test_a_trial_without_red_and_yellow_is_refused_and_one_without_yellow_noted() -> None:
+    model: Any = build_model("intuition-pixels", image_size=16)
+    source: Any = ColoredSquares(model.spec, 2)
+    batch = source.context(source.trials)
+    batch.rgb[0][batch.ids[0] == 2] = 90
+    with torch.no_grad():
+        assert model.predict(batch)[0] == model.base_rate
+    assert model.note(batch) == "agent or patient never visible, base rate: drop_0000"
+    batch.rgb[1] = 90
+    with pytest.raises(BadInputError, match=r"trial 'drop_0001': nothing is red or yellow"):
+        model.predict(batch)
+    with pytest.raises(BadInputError, match="image_size must be a multiple of 16"):
+        build_model("intuition-pixels", image_size=50)
