@@ -211,7 +211,7 @@ def test_evaluate_prints_a_table(
     shown = capsys.readouterr().out
     assert shown.count("predictions: ") == 4 and "observed+simulated" in shown
     (header,) = (line.split() for line in shown.splitlines() if line.split()[0] == "model")
-    assert header == ["model", "given", "accuracy"]
+    assert header == ["model", "given", "frames", "accuracy"]
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "training").rglob("*")} == before
     assert main([*arguments, "--json"]) == 0
     result = json.loads(capsys.readouterr().out)

@@ -94,7 +94,8 @@ class Shelf:
                         "trial": name, "scenario": "collide", "split": split, "digest": name,
                         "contact": len(path.contacts.frame) > 0, "recorded_contact": i % 2 == 0,
                         "movie_sha256": "", "observed_movie_sha256": "",
-                        "frames": FRAMES, "observed_frames": 45, "observed_contact": False,
+                        "frames": FRAMES, "playback_seconds": FRAMES / 30, "observed_frames": 45,
+                        "observed_contact": False,
                         "look": "redyellow",
                     }
                 )  # fmt: skip
