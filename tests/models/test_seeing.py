@@ -245,8 +245,9 @@ def test_notes_of_a_model_reach_the_table(tmp_path: Any) -> None:
     decided = Decided(np.array([0.5, 0.5]), 0.5, note="fit", notes={"b": imagined.note("b")})
     part = ScenarioPredictions("drop", "full", ("a", "b"), decided, 0, -1, "", note="fit")
     index = pd.DataFrame(
-        {"trial": ["a", "b"], "contact": True, "recorded_contact": None, "observed_contact": False}
-    )
+        {"trial": ["a", "b"], "scenario": "drop", "contact": True, "recorded_contact": None,
+         "observed_contact": False}
+    )  # fmt: skip
     table = make_table([part], Noted().provenance(), index)
     assert table["note"].tolist() == ["fit", "fit; é unseen"]
 
