@@ -39,8 +39,9 @@ def test_each_row_of_predictions_names_the_version(stated: str, written: str) ->
     decided = Decided(np.array([0.2, 0.7]), 1.0)
     part = ScenarioPredictions("drop", "observed", trials, decided, 4, -1, "")
     index = pd.DataFrame(
-        {"trial": trials, "contact": True, "observed_contact": False, "recorded_contact": None}
-    )
+        {"trial": trials, "scenario": "drop", "contact": True, "observed_contact": False,
+         "recorded_contact": None}
+    )  # fmt: skip
     table = make_table([part], Provenance("model", "none", versions=stated), index)
     assert list(table["versions"]) == [written] * 2
 
