@@ -85,6 +85,7 @@ def test_two_columns_are_enough_and_the_terminal_shows_the_results(
     assert lines[-1] == f"report: {tmp_path / 'out' / 'report.html'}"
 
 
+@pytest.mark.slow
 def test_the_recorded_outcome_decides_and_differences_are_listed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -90,6 +90,7 @@ def run(dataset: Dataset, model: Any, folder: Path, *changes: str, **options: An
     return check(model, dataset, folder, changes=changes, trials=2 * TESTED, **options)
 
 
+@pytest.mark.slow
 def test_a_model_that_sees_what_was_observed_passes_exactly(made: Dataset, tmp_path: Path) -> None:
     done = run(made, leaks.Honest(), tmp_path, *CHANGES)
     held = done.table[done.table["change"].isin(HELD)]
@@ -166,6 +167,7 @@ def test_answers_in_a_cache_on_disk_are_refused(made: Dataset, tmp_path: Path) -
     assert done.refused == ["names"]
 
 
+@pytest.mark.slow
 def test_random_numbers_may_follow_the_names(made: Dataset, tmp_path: Path) -> None:
     """But not the outcome: names of the dots are even with a contact."""
     dots = make_dots(tmp_path / "dots", {"readout": 4, "testing": 32}, ("drop",))
@@ -316,6 +318,7 @@ def test_a_trial_that_cannot_be_predicted_after_a_change_is_refused(
     assert "KeyError" in done.table["note"][0]
 
 
+@pytest.mark.slow
 def test_twins_are_shown(made: Dataset, tmp_path: Path) -> None:
     """The random twin of a model with shipped weights, and blobs, on the same trials."""
     done = check("cswm", made, tmp_path, trials=8, accelerator="cpu")

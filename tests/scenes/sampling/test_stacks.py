@@ -342,6 +342,7 @@ def test_stacks_start_at_the_official_height(official: Path) -> None:
             assert abs(float(np.median(ours)) - float(np.median(heights))) < allowed, name
 
 
+@pytest.mark.slow
 def test_official_probes_start_outside_their_stand(official: Path) -> None:
     """No published trial is refused by the check that the probe starts outside its stand."""
     for scenario in ("support", "contain", "link"):
