@@ -124,7 +124,7 @@ def test_command_logs_against_people(
     assert scores["human_accuracy"].notna().any()
     assert "noisy-simulation-people-touch" in set(scores["base_model"])
     methods = json.loads((tmp_path / "report" / "report.json").read_text())["methods"]
-    assert methods["Decision"] == "touch, of every model, in place of its own"
+    assert methods["Decision"] == "touch in place of the own one: noisy-simulation-people"
 
 
 def test_a_larger_limit_adds_to_the_trials_of_a_smaller_one() -> None:
