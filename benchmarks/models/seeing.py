@@ -1,12 +1,13 @@
 """Measure how well `seeing-simulation` recovers scenes, and what it answers.
 
-    OMP_NUM_THREADS=1 python benchmarks/models/seeing.py FOLDER [--each 5] [--write]
+    OMP_NUM_THREADS=1 python benchmarks/models/seeing.py FOLDER [--each 5] [--known] [--write]
 
 Official stimuli that people saw, without cloth and without a contact in the observed part: the
 first ``--each`` with a contact and as many without one, of every scenario, by the hash of their
 names. Of each, the observed part is simulated and rendered, scene and state are fitted to masks and
 depth, and both the fitted and the true state are simulated with the default noise. One line a trial
-is appended to FOLDER/seeing.jsonl; an interrupted run continues there. Printed are, by scenario:
+is appended to FOLDER/seeing.jsonl; an interrupted run continues there, and --known prints what it
+has measured so far. Printed are, by scenario:
 
 1. Accuracy by recorded outcomes (P = 1/2 counts half) with standard error, and area under the curve
    (AUC), of the fitted state, the true state, and constant motion from the fitted state; and
@@ -226,12 +227,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("folder", type=Path)
     parser.add_argument("--each", type=int, default=5)
+    parser.add_argument("--known", action="store_true")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     path = options.folder / "seeing.jsonl"
-    known, rows = read_rows(path), []
-    for scene, contact in chosen_trials(options.each):
+    known = read_rows(path)
+    rows = list(known.values()) if options.known else []
+    for scene, contact in [] if options.known else chosen_trials(options.each):
         if scene.name not in known:
             known[scene.name] = measure(scene, contact)
             with path.open("a") as file:
@@ -246,10 +249,11 @@ def main() -> None:
     text = tables(rows)
     print(text)
     if options.write:
+        today = datetime.date.today().isoformat()
         RESULTS.write_text(
-            f"# Seeing by simulation\n\n`python benchmarks/models/seeing.py FOLDER --each "
-            f"{options.each} --write`, {datetime.date.today().isoformat()}, version {VERSION} of "
-            f"the model, {SAMPLES} simulations per trial.\n\n{text}"
+            f"# Seeing by simulation\n\n`python benchmarks/models/seeing.py FOLDER`, {len(rows)} "
+            f"trials, {today}, version {VERSION} of the model, {SAMPLES} simulations per trial.\n\n"
+            f"{text}"
         )
 
 
