@@ -1,20 +1,21 @@
 """Measure what models that never simulate predict, and how like people they are.
 
+    OMP_NUM_THREADS=1 python benchmarks/models/intuition_trials.py FOLDER --trials 1000 --official
     OMP_NUM_THREADS=1 python benchmarks/models/intuition.py FOLDER [--samples 8] [--write]
 
-FOLDER is one in which ``ship_readouts.py FOLDER --trials N --official`` has computed the features
-of `state-trees`, `mask-trees` and `blob-trees`. Forests are fitted on own trials, one per scenario,
-and tested on the official stimuli that people saw, without those that show a contact in the
-observed part, and without those of Roll with a ledge, as in the study. Five tables:
+Forests on what `state-trees`, `mask-trees` and `blob-trees` see are fitted on the own trials of
+FOLDER, one per scenario, and tested on the official stimuli that people saw, without those that
+show a contact in the observed part, and without those of Roll with a ledge, as in the study. Five
+tables:
 
 1. Accuracy by number of own trials per scenario, and how much a doubling adds.
 2. Accuracy, r with people and r beyond the outcome: with all trials; without trials of the tested
    configuration, or of the tested scenario; with the controls of `intuition_controls`; noisy
    simulation from the true state; mixtures of both, with weights fitted on own trials or, where the
-   name says so, on half of people's answers; predictions of other models (--predictions FILE).
-3. Answers brought to the same spread, and levels of noise fitted to half of people's answers.
-4. What the best model could reach, from halves of the people.
-5. Differences of likeness beyond the outcome between learned and simulated answers, paired over
+   name says so, on half of people's answers; predictions of other models (--predictions FILE);
+   answers brought to the same spread, and levels of noise fitted to half of people's answers.
+3. What the best model could reach, from halves of the people, and the weights of mixtures.
+4. Differences of likeness beyond the outcome between learned and simulated answers, paired over
    stimuli.
 
 With --write they are written to ``results/intuition.md``.
@@ -47,25 +48,20 @@ from intuition_controls import (
     weighted_levels,
     with_spread,
 )
-from physion import Dataset
+from intuition_trials import load, simulated
 from physion.analysis.tables import MEAN, POOLED, read_humans
 from physion.compute.tasks import processor
 from physion.core.names import canonical_name
 from physion.data.official import official
-from physion.readout.decisions import Readout
-from physion.readout.evaluate import evaluate
 from physion.readout.trees import fit_forest
 from physion.report.compare import CompareResult, compare
-from physion.scenes.sampling.sample import load_presets
-from physion.trials.dataset import JoinedDataset
-from ship_readouts import SET, Features, known, make_official
 
 RESULTS = Path(__file__).parents[1] / "results" / "intuition.md"
 MODELS = ("state-trees", "mask-trees", "blob-trees")
 GIVEN = {"state-trees": "states", "mask-trees": "masks", "blob-trees": "blobs"}
 SCALES = (1.0, 2.0, 4.0)
 """Scales of the noise of simulations; the first is the default."""
-COUNTS = (125, 250, 500, 1000)
+COUNTS = (125, 250, 500, 1000, 2000)
 """Own trials of a scenario in the learning curves."""
 ELSEWHERE = 250
 """Own trials of each other scenario, for forests that have not seen the tested one."""
@@ -80,45 +76,25 @@ EDGES = (0.025, 0.975)
 class Trials:
     """Features and outcomes of own trials and of official stimuli, by model and scenario.
 
-    - ``own``: table by trial with ``scenario``, ``configuration`` (without number), ``contact``.
+    - ``own``: table by trial with ``scenario``, ``configuration`` (without number), ``contact``,
+      and ``scene``, in the order in which they were made.
     - ``tested``: the same of official stimuli, by stimulus, with their recorded outcome; stimuli
-      that show a contact in the observed part are left out.
+      that show a contact in the observed part are left out, and scenarios without an own trial.
     """
 
     def __init__(self, folder: Path) -> None:
-        readout, stimuli = Dataset(folder / SET), make_official(folder)
-        official_names = {
-            (scenario, preset.name): preset.official or ""
-            for scenario in readout.index["scenario"].unique()
-            for preset in load_presets(scenario).values()
-        }
-        index = readout.index.set_index("trial")
-        names = [
-            official_names[key] for key in zip(index["scenario"], index["preset"], strict=True)
-        ]
-        self.own = index.assign(configuration=names)[["scenario", "configuration", "contact"]]
-        index = stimuli.index.set_index("trial")
+        made, asked = load(folder / "own", MODELS), load(folder / "official", MODELS)
+        self.own, self.tested = _facts(made), _facts(asked)
         people = set(read_humans(official().humans)["stimulus"])
-        asked = np.array([canonical_name(trial) in people for trial in index.index])
-        tested = asked & (index["split"] == "testing").to_numpy()
-        seen = index[tested & ~index["observed_contact"].astype(bool).to_numpy()]
-        # A name with _2 at its end is a second name of the same configuration.
-        names = [trial.rpartition("_")[0].removesuffix("_2") for trial in seen.index]
-        self.tested = seen.assign(configuration=names, contact=seen["recorded_contact"])[
-            ["scenario", "configuration", "contact"]
-        ]
-        self.stimuli = stimuli
-        of_own, of_tested = Features(folder, readout, MODELS), Features(folder, stimuli, MODELS)
+        kept = ~asked["observed_contact"] & np.isin(asked["trial"], list(people))
+        kept &= np.isin(asked["scenario"], np.unique(made["scenario"]))
+        self.tested = self.tested[kept]
         self.arrays: dict[tuple[str, str], tuple[list[str], NDArray[Any], NDArray[Any]]] = {}
-        for name in MODELS:
-            for scenario, rows in self.own.groupby("scenario"):
-                trials = known(of_own, name, Readout.OBSERVED, list(rows.index))
-                there = list(self.tested.index[self.tested["scenario"] == scenario])
-                fit, test = (
-                    features.parts(name, Readout.OBSERVED, wanted)
-                    for features, wanted in ((of_own, trials), (of_tested, there))
-                )
-                self.arrays[name, str(scenario)] = trials, fit[0].array(), test[0].array()
+        for scenario in np.unique(made["scenario"]):
+            own, test = made["scenario"] == scenario, kept & (asked["scenario"] == scenario)
+            for name in MODELS:
+                trials = [str(trial) for trial in made["trial"][own]]
+                self.arrays[name, str(scenario)] = trials, made[name][own], asked[name][test]
 
     def predict(
         self,
@@ -162,9 +138,8 @@ class Trials:
         """Return P(contact) by stimulus, of a forest fitted on all other scenarios."""
         answers, states = pd.Series(np.nan, self.tested.index), name == "state-trees"
         for scenario, rows in self.tested.groupby("scenario"):
-            others = [s for (n, s) in self.arrays if n == name and s != scenario]
             fit, labels = [], []
-            for other in others:
+            for other in (s for (n, s) in self.arrays if n == name and s != scenario):
                 trials, values, _ = self.arrays[name, other]
                 fit.append(every(values[:ELSEWHERE], states))
                 labels.append(self.own.loc[trials[:ELSEWHERE], "contact"].to_numpy(bool))
@@ -173,8 +148,13 @@ class Trials:
             answers[rows.index] = forest.probability(every(values, states))
         return answers
 
+    def last_own(self, count: int) -> list[str]:
+        """Return the last own trials, ``count`` of each scenario."""
+        lists = [t for (name, _), (t, _, _) in self.arrays.items() if name == MODELS[0]]
+        return [trial for trials in lists for trial in trials[-count:]]
+
     def predict_own(self, name: str, chosen: Sequence[str]) -> pd.Series:
-        """Return P(contact) of own trials, each from a forest without all of them."""
+        """Return P(contact) of own trials, from forests without any of them."""
         answers, states = pd.Series(np.nan, list(chosen)), name == "state-trees"
         for scenario, rows in self.own.loc[list(chosen)].groupby("scenario"):
             trials, values, _ = self.arrays[name, str(scenario)]
@@ -182,8 +162,7 @@ class Trials:
             labels = self.own.loc[trials, "contact"].to_numpy(bool)
             columns = every(values, states)
             forest = fit_forest(columns[~tested], labels[~tested])
-            of_trials = dict(zip(trials, range(len(trials)), strict=True))
-            places = [of_trials[trial] for trial in rows.index]
+            places = [trials.index(trial) for trial in rows.index]
             answers[rows.index] = forest.probability(columns[places])
         return answers
 
@@ -196,34 +175,19 @@ class Trials:
         rates = (counts["sum"] + 1) / (counts["size"] + 2)
         return self.tested["configuration"].map(rates).fillna(0.5).astype(float)
 
-    def simulated(self, folder: Path, scale: float, samples: int) -> pd.Series:
-        """Return the fraction of noisy simulations from the true state with a contact."""
-        table = simulated(self.stimuli, folder / "simulations", scale, samples)
-        return table[[canonical_name(trial) for trial in self.tested.index]].set_axis(
-            self.tested.index
-        )
 
-
-def simulated(dataset: Any, folder: Path, scale: float, samples: int) -> pd.Series:
-    """Return the fraction of noisy simulations with a contact, of all testing trials by name."""
-    options = {"scales": [scale], "samples": samples}
-    done = evaluate({"noisy-simulation": options}, dataset, folder, decision="touch")
-    return done.predictions.set_index("stimulus")["p_contact"].astype(float)
-
-
-def as_tested(dataset: Dataset, chosen: Sequence[str]) -> Dataset:
-    """Return some readout trials of a dataset as its testing trials."""
-    own = JoinedDataset([(dataset, ("readout",))])
-    own.index = own.index[own.index["trial"].isin(chosen)].assign(split="testing")
-    return own
+def _facts(loaded: dict[str, NDArray[Any]]) -> pd.DataFrame:
+    """Return the table of trials, by name."""
+    columns = ("scenario", "configuration", "contact", "scene")
+    names = [str(trial) for trial in loaded["trial"]]
+    return pd.DataFrame({name: loaded[name] for name in columns}, index=names)
 
 
 def answers_of_people(trials: Trials) -> pd.DataFrame:
     """Return how many people say ``yes`` to each stimulus, of how many (``count``)."""
-    table = read_humans(official().humans).set_index("stimulus")
-    rows = table.loc[[canonical_name(trial) for trial in trials.tested.index]]
-    count = rows["count"].to_numpy(np.int64)
-    right = np.rint(rows["accuracy"].to_numpy(float) * count).astype(np.int64)
+    table = read_humans(official().humans).set_index("stimulus").loc[trials.tested.index]
+    count = table["count"].to_numpy(np.int64)
+    right = np.rint(table["accuracy"].to_numpy(float) * count).astype(np.int64)
     yes = np.where(trials.tested["contact"].to_numpy(bool), right, count - right)
     return pd.DataFrame({"yes": yes, "count": count}, index=trials.tested.index)
 
@@ -231,9 +195,7 @@ def answers_of_people(trials: Trials) -> pd.DataFrame:
 def scored(answers: dict[str, pd.Series]) -> CompareResult:
     """Return the comparison of answers with people and outcomes, by name."""
     table = pd.concat(
-        pd.DataFrame(
-            {"stimulus": [canonical_name(t) for t in p.index], "model": name, "p_contact": p.values}
-        )
+        pd.DataFrame({"stimulus": p.index, "model": name, "p_contact": p.values})
         for name, p in answers.items()
     )
     return compare(table.assign(readout="observed"), humans="official")
@@ -242,7 +204,8 @@ def scored(answers: dict[str, pd.Series]) -> CompareResult:
 def rigid_accuracy(trials: Trials, answers: pd.Series) -> float:
     """Return the mean accuracy over the seven rigid scenarios, by recorded outcomes."""
     right = (answers > 0.5) == trials.tested["contact"].astype(bool)
-    return float(right.groupby(trials.tested["scenario"]).mean().drop("drape").mean())
+    by_scenario = right.groupby(trials.tested["scenario"]).mean()
+    return float(by_scenario.drop("drape", errors="ignore").mean())
 
 
 def learning(trials: Trials) -> list[str]:
@@ -316,29 +279,19 @@ def difference_rows(trials: Trials, answers: dict[str, pd.Series]) -> list[str]:
 def mixed_on_own(
     trials: Trials, folder: Path, answers: dict[str, pd.Series], own: int, samples: int
 ) -> tuple[dict[str, pd.Series], list[str]]:
-    """Return mixtures whose weights are fitted on own trials, ``own`` of each scenario, and these.
+    """Return mixtures whose weights are fitted on own trials, and rows of these weights.
 
-    Forests answer trials that they have not seen.
+    ``own`` trials of each scenario are simulated; forests answer trials that they have not seen.
     """
-    mixed, rows = {}, []
-    chosen = [
-        trial
-        for scenario, table in trials.own.groupby("scenario")
-        for trial in trials.arrays[MODELS[0], str(scenario)][0][-own:]
-        if trial in table.index
-    ]
-    tested = as_tested(Dataset(folder / SET), chosen)
-    simulation = simulated(tested, folder / "simulations", SCALES[0], samples)
-    simulation = simulation.set_axis([str(trial) for trial in simulation.index])
+    mixed, rows, chosen = {}, [], trials.last_own(own)
+    scenes = trials.own.loc[chosen, "scene"].to_dict()
+    simulation = simulated(folder, scenes, SCALES[0], samples)
     outcome = trials.own.loc[chosen, "contact"].to_numpy(float)
     for name, given in GIVEN.items():
-        fit = pd.DataFrame(
-            {given: trials.predict_own(name, chosen), "simulation": simulation[chosen]}
-        )
+        fit = pd.DataFrame({given: trials.predict_own(name, chosen), "simulation": simulation})
         weights = logistic_weights(fit, outcome, np.ones(len(outcome)))
-        test = pd.DataFrame(
-            {given: answers[given], "simulation": answers[f"simulation, noise x {SCALES[0]:g}"]}
-        )
+        default = answers[f"simulation, noise x {SCALES[0]:g}"]
+        test = pd.DataFrame({given: answers[given], "simulation": default})
         mixed[f"mixed of {given} and simulation, weights of own trials"] = pd.Series(
             expit(log_odds(test) @ weights), test.index
         )
@@ -349,14 +302,11 @@ def mixed_on_own(
 def predicted(path: Path, trials: Trials) -> dict[str, pd.Series]:
     """Return the answers of a table of predictions, by model."""
     table = pd.read_csv(path)
-    table = table[table["readout"] == "observed"].assign(
-        stimulus=[
-            canonical_name(str(name)) for name in table["stimulus"][table["readout"] == "observed"]
-        ]
-    )
-    names = [canonical_name(trial) for trial in trials.tested.index]
+    if "readout" in table:
+        table = table[table["readout"] == "observed"]
+    table = table.assign(stimulus=table["stimulus"].map(canonical_name))
     return {
-        str(model): rows.set_index("stimulus")["p_contact"][names].set_axis(trials.tested.index)
+        str(model): rows.set_index("stimulus")["p_contact"][trials.tested.index]
         for model, rows in table.groupby("model")
     }
 
@@ -389,10 +339,11 @@ def main() -> None:
     for path in options.predictions:
         answers |= predicted(path, trials)
     answers["base rate of the configuration"] = trials.base_rates()
+    scenes = trials.tested["scene"].to_dict()
     levels = pd.DataFrame(
         {
-            f"simulation, noise x {scale:g}": trials.simulated(
-                options.folder, scale, options.samples
+            f"simulation, noise x {scale:g}": simulated(
+                options.folder, scenes, scale, options.samples
             )
             for scale in SCALES
         }
@@ -422,12 +373,14 @@ def main() -> None:
     differences = difference_rows(trials, answers)
     reliability, most = ceiling(people, outcome)
     print(f"reliability {reliability:.3f}, ceiling {most:.3f}", flush=True)
+    counts = trials.own.groupby("scenario").size()
     text = "\n".join(
         [
             "# Learned intuition and simulation",
             f"`python benchmarks/models/intuition.py FOLDER --samples {options.samples} --write`, "
             f"{datetime.date.today()}, {processor()}: {len(trials.tested)} official stimuli "
-            "without contact in the observed part, recorded outcomes.",
+            f"without contact in the observed part, recorded outcomes; {counts.min()} to "
+            f"{counts.max()} own trials per scenario.",
             "",
             "Accuracy, mean of the seven rigid scenarios, by number of own trials per scenario:",
             "",
@@ -437,10 +390,11 @@ def main() -> None:
             "",
             "With all own trials; r is with people's answers, intervals are of the jackknife over "
             f"stimuli; {options.samples} simulations of a stimulus from the true state. Without "
-            f"the tested scenario, forests saw {ELSEWHERE} trials of each other one:",
+            f"the tested scenario, forests saw {ELSEWHERE} trials of each other one. Weights of "
+            f"own trials are fitted on {options.own} of each scenario:",
             "",
-            "| answers | accuracy, rigid | accuracy, mean of eight | r, pooled "
-            "| r beyond the outcome, pooled | r, mean of eight | r beyond, mean of eight |",
+            "| answers | accuracy, rigid | accuracy, mean of all | r, pooled "
+            "| r beyond the outcome, pooled | r, mean of all | r beyond, mean of all |",
             "|---|---|---|---|---|---|---|",
             *rows,
             "",

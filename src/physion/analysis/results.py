@@ -23,9 +23,9 @@ MARKED = (
 RESULTS = (
     "row", "group", "readout", "given", "frames", "benchmark", "check", "stimuli", "accuracy",
     "accuracy_low", "accuracy_high", "r", "r_low", "r_high", "kappa", "kappa_low", "kappa_high",
-    "source",
+    "beyond", "beyond_low", "beyond_high", "source",
 )  # fmt: skip
-"""Columns of the table of results.
+"""Columns of the table of results. ``beyond``: r with people beyond the outcome.
 
 - ``group``: people, model, baseline or published. ``given``: what a row was given of a trial.
 - ``frames``: first and last frame that it saw, and how many a second, if its predictions say so.
@@ -151,7 +151,8 @@ def results_table(
     for column in SEEN:
         known = {} if seen is None else seen[column].to_dict()
         values[column] = [known.get(name, "") for name in rows["model"]]
-    for name, column in (("accuracy", "accuracy"), ("r", "r"), ("kappa", kappa)):
+    measures = {"accuracy": "accuracy", "r": "r", "kappa": kappa, "beyond": "r_beyond_outcome"}
+    for name, column in measures.items():
         for end in ("", "_low", "_high"):
             values[f"{name}{end}"] = rows.get(f"{column}{end}", np.nan)
     parts = [pd.DataFrame(values).reindex(columns=list(RESULTS))]

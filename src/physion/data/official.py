@@ -118,7 +118,7 @@ def official(folder: Path | str | None = None) -> OfficialData:
     BadInputError
         If the folder holds no official data.
     """
-    data = find_official(PACKAGED if folder is None else folder)
+    data = _packaged() if folder is None else find_official(folder)
     if data is None:
         raise BadInputError(
             f"{folder} holds no official data (there is no {SCENES}); make it from a checkout of "
@@ -133,8 +133,13 @@ def find_official(folder: Path | str) -> OfficialData | None:
     if (path / SCENES).is_file():
         return _opened(path)
     if path == Path(PACKAGED) and not path.exists():
-        return _opened(Path(str(files("physion.data") / "official_study")))
+        return _packaged()
     return None
+
+
+def _packaged() -> OfficialData:
+    """Return the official data of the package."""
+    return _opened(Path(str(files("physion.data") / "official_study")))
 
 
 @lru_cache(maxsize=4)

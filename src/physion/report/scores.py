@@ -92,7 +92,10 @@ def _describe(given: str) -> str:
 def results(inputs: ReportInputs) -> Markup:
     """Return the table of results: people first, then all others by accuracy."""
     rows = inputs.results()
-    measures = {"accuracy": "accuracy", "r with people": "r", "kappa": "kappa"}
+    measures = {
+        "accuracy": "accuracy", "r with people": "r", "kappa": "kappa",
+        "r beyond the outcome": "beyond",
+    }  # fmt: skip
     chosen = measures if inputs.comparison.has_people else {"accuracy": "accuracy"}
     shown = {"frames": frames_with_benchmark(rows), "check": list(rows["check"])}
     known = {name: of for name, of in shown.items() if (rows[name] != "").any()}

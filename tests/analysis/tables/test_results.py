@@ -18,6 +18,7 @@ from physion.analysis.results import (
     results_table,
     zone_of_people,
 )
+from physion.analysis.tables import read_humans
 from physion.core.names import OFFICIAL_SCENARIOS, SCENARIOS
 from physion.data.official import official
 from physion.report.compare import compare
@@ -74,6 +75,21 @@ def test_people_come_first_then_all_by_accuracy() -> None:
     assert accuracies.is_monotonic_decreasing and {"good", "half"} < set(table["row"])
     assert (table["source"] != "").sum() == 1 + len(MODELS) + 1
     assert table["stimuli"].isna().sum() == 1 + len(MODELS) + 1
+
+
+def test_the_table_has_r_beyond_the_outcome() -> None:
+    """The mean over scenarios of the r of deviations from the mean of each outcome."""
+    people = read_humans(official().humans)
+    people = people[~people["stimulus"].str.contains("ledge")].set_index("stimulus")
+    contact = pd.Series(official().labels).loc[people.index]
+    yes = people["accuracy"].where(contact, 1 - people["accuracy"])
+    p = pd.Series(np.random.default_rng(0).random(len(yes)), yes.index) / 2 + yes / 2
+    left = pd.DataFrame({"p": p, "yes": yes}).groupby([people["scenario"], contact])
+    left = left.transform(lambda values: values - values.mean())
+    wanted = left.groupby(people["scenario"]).apply(lambda rows: rows["p"].corr(rows["yes"])).mean()
+    table = compare({"m": p.to_dict()}, humans="official").results.set_index("row")
+    assert table.loc["m", "beyond"] == pytest.approx(wanted, abs=1e-9)
+    assert table.loc["m", "beyond_low"] < wanted < table.loc["m", "beyond_high"]
 
 
 def test_no_published_rows_without_the_study(make_up: pd.DataFrame) -> None:

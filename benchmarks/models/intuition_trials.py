@@ -1,0 +1,274 @@
+"""Make own trials and official stimuli in memory, and keep only what models of intuition see.
+
+    OMP_NUM_THREADS=1 python benchmarks/models/intuition_trials.py FOLDER --trials 1000 [--official]
+    python benchmarks/models/intuition_trials.py FOLDER --trials 2000 --workers 16 --pixels 96
+
+A trial is sampled from the published configurations in turn, simulated until agent and patient
+touch, and drawn at the observed frames. Of trials with the digest of a training trial, without a
+contact in the observed part, and with agent and patient visible in the first frame, the features of
+all `MODELS` are written to FOLDER/own, in files of `EACH` trials; with --pixels the pictures and
+masks too. With --official the same of the stimuli that people saw goes to FOLDER/official. The
+same command continues.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import itertools
+import json
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+
+from physion.clips.batch import Batch, Motion, Spec
+from physion.clips.source import ObservedSource, TrialReaders
+from physion.clips.states import cut_motion
+from physion.core.errors import BadSceneError
+from physion.core.files import write_atomic
+from physion.core.names import SCENARIOS, canonical_name
+from physion.core.seeds import trial_seed
+from physion.data.official import official
+from physion.models.build import build_model
+from physion.models.interface import Model
+from physion.physics.engine import make_engine
+from physion.physics.labels import label_contact
+from physion.readout.decisions import fraction_of_futures
+from physion.readout.model_calls import is_network
+from physion.scenes.sampling.sample import load_presets, sample_scene
+from physion.scenes.scene import OBSERVED_FRAMES, Scene
+from physion.trials.making.choose import split_of
+from ship_readouts import Pictures
+
+MODELS = ("state-trees", "mask-trees", "blob-trees", "intuition-states", "intuition-masks")
+RIGID = tuple(name for name in SCENARIOS if name != "drape")
+EACH = 25
+"""Trials of a file."""
+LOOK = "redyellow"
+VISIBLE = 0.0005
+"""Smallest fraction of the first frame that agent and patient cover, as in `physion generate`."""
+SET = "intuition"
+"""Name of the set, which is the seed of its trials."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What models see of a trial, by the name of the model, and what is known of it.
+
+    ``scene`` is its JSON.
+    """
+
+    trial: str
+    scenario: str
+    configuration: str
+    contact: bool
+    observed_contact: bool
+    scene: str
+    features: Mapping[str, NDArray[Any]]
+
+
+FACTS = ("trial", "scenario", "configuration", "contact", "observed_contact", "scene")
+"""What is stored of a trial besides its features."""
+
+
+@cache
+def encoders() -> dict[str, Model]:
+    """Return the models whose features are made."""
+    return {name: build_model(name) for name in MODELS}
+
+
+def see(motion: Motion, pixels: int) -> dict[str, NDArray[Any]]:
+    """Return the features of a motion, and pictures and masks of ``pixels`` a side, if not 0."""
+    name = motion.scene.name
+    motions, looks = {name: cut_motion(motion)}, {name: LOOK}
+    drawn: dict[int, Pictures] = {}
+
+    def read(spec: Spec) -> Batch:
+        if not spec.sees_pictures:
+            readers = TrialReaders({name: OBSERVED_FRAMES}, [], motions)
+        else:
+            size = spec.image_size
+            shown: Any = drawn.setdefault(size, Pictures(motions, size, looks))  # type: ignore[arg-type]
+            readers = TrialReaders({name: OBSERVED_FRAMES}, [shown.reader(spec)])
+        return ObservedSource(spec, readers).context([name])
+
+    found: dict[str, NDArray[Any]] = {}
+    for model_name, model in encoders().items():
+        batch = read(model.spec)
+        with torch.no_grad():
+            features = model.encode(batch.to("cpu") if is_network(model) else batch)
+        found[model_name] = np.asarray(features[0], np.float32)
+    if pixels:
+        spec = replace(build_model("intuition-pixels").spec, image_size=pixels)
+        batch = read(replace(spec, inputs=("rgb", "ids")))
+        found |= {"rgb": batch.rgb[0], "ids": batch.ids[0]}
+    return found
+
+
+def own_trial(scenario: str, number: int, pixels: int) -> Seen:
+    """Return one own trial, the first of its samples that is accepted."""
+    presets = [p for p in load_presets(scenario).values() if p.official]
+    engine, attempt = make_engine("physion"), -1
+    while True:
+        attempt += 1
+        preset = presets[(number + attempt // 40) % len(presets)]
+        seed = trial_seed(SET, scenario, "training", number, attempt)
+        try:
+            scene = sample_scene(scenario, seed, preset.params)
+        except BadSceneError:
+            continue
+        if split_of(scene.physics_digest()) != "training":
+            continue
+        scene = replace(scene, name=f"{scenario}_training_{number:05d}")
+        trajectory = engine.simulate(scene, until_contact=True)
+        labels = label_contact(scene, trajectory)
+        if labels.observed or len(trajectory) < OBSERVED_FRAMES:
+            continue
+        features = see(Motion(scene, trajectory), pixels)
+        if visible(features["intuition-masks"]):
+            return Seen(
+                scene.name, scenario, preset.official or "", labels.contact, False,
+                scene.to_json(), features,
+            )  # fmt: skip
+
+
+def visible(tokens: NDArray[np.float32]) -> bool:
+    """Return whether agent and patient cover enough of the first frame, by tokens of masks."""
+    objects = build_objects()
+    first = tokens[0].reshape(objects, -1)
+    return bool((first[:2, 1] ** 2 >= VISIBLE).all())
+
+
+@cache
+def build_objects() -> int:
+    """Return the tokens of a trial."""
+    return int(build_model("intuition-masks").settings.objects)
+
+
+def official_scenes() -> list[tuple[Scene, bool]]:
+    """Return the official scenes that people saw, and their recorded outcomes."""
+    data = official()
+    trials = [t for t in data.trials if canonical_name(t.scene.name) in data.labels]
+    unique = {canonical_name(trial.scene.name): trial for trial in trials}
+    return [(trial.scene, bool(trial.outcome.contact)) for trial in unique.values()]
+
+
+def official_trial(scene: Scene, contact: bool, pixels: int) -> Seen:
+    """Return an official stimulus, of which only the observed part is simulated."""
+    trajectory = make_engine("physion").simulate(scene, frames=OBSERVED_FRAMES)
+    labels = label_contact(scene, trajectory)
+    # A name with _2 at its end is a second name of the same configuration.
+    configuration = scene.name.rpartition("_")[0].removesuffix("_2")
+    return Seen(
+        canonical_name(scene.name), scene.scenario, configuration, contact,
+        bool(labels.observed), scene.to_json(), see(Motion(scene, trajectory), pixels),
+    )  # fmt: skip
+
+
+def write(path: Path, trials: Sequence[Seen]) -> None:
+    """Write trials to a file that has all of them or does not exist."""
+    arrays = {n: np.stack([t.features[n] for t in trials]) for n in trials[0].features}
+    facts = {name: np.array([getattr(trial, name) for trial in trials]) for name in FACTS}
+    buffer = io.BytesIO()
+    np.savez(buffer, **facts, **arrays)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, buffer.getvalue())
+
+
+def make_own(folder: Path, pixels: int, task: tuple[str, int]) -> str:
+    """Make one file of own trials, if it is not there."""
+    scenario, part = task
+    path = folder / "own" / f"{scenario}-{part:04d}.npz"
+    if not path.exists():
+        start = time.process_time()
+        numbers = range(part * EACH, (part + 1) * EACH)
+        write(path, [own_trial(scenario, number, pixels) for number in numbers])
+        return f"{path.stem} {(time.process_time() - start) / EACH:.2f} s a trial"
+    return ""
+
+
+def make_official(folder: Path, pixels: int, part: int) -> str:
+    """Make one file of official stimuli, if it is not there."""
+    path = folder / "official" / f"{part:04d}.npz"
+    if not path.exists():
+        scenes = official_scenes()[part * EACH : (part + 1) * EACH]
+        write(path, [official_trial(scene, contact, pixels) for scene, contact in scenes])
+        return f"official {path.stem}"
+    return ""
+
+
+# Noisy simulations of trials, from the true state at the last observed frame.
+
+
+def simulated(folder: Path, trials: Mapping[str, str], scale: float, samples: int) -> pd.Series:
+    """Return the fraction of noisy simulations with a contact, by trial.
+
+    ``trials`` are scenes, as JSON, by name. What was simulated is kept in FOLDER/simulations.
+    """
+    model: Any = build_model("noisy-simulation", scales=[scale], samples=samples)
+    path = folder / "simulations" / f"{scale:g}-{samples}.json"
+    known: dict[str, float] = json.loads(path.read_text()) if path.exists() else {}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for number, (trial, text) in enumerate(trials.items(), start=1):
+        if trial not in known:
+            scene = Scene.from_json(text)
+            seen = cut_motion(
+                Motion(scene, make_engine("physion").simulate(scene, frames=OBSERVED_FRAMES))
+            )
+            frames = np.array([model.spec.context_frames()])
+            batch = Batch((trial,), frames, np.ones(frames.shape, np.bool_), state=(seen,))
+            contact = np.asarray(model.imagine(batch, samples, 0, scale=scale).contact)
+            known[trial] = float(fraction_of_futures(contact)[0])
+        if number % 20 == 0 or number == len(trials):
+            write_atomic(path, json.dumps(known).encode())
+    return pd.Series(known)[list(trials)]
+
+
+def load(folder: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Return what is known of all trials in a folder, and the features of some models, joined."""
+    parts: dict[str, list[NDArray[Any]]] = {name: [] for name in (*FACTS, *names)}
+    for path in sorted(folder.glob("*.npz")):
+        with np.load(path) as stored:
+            for name, arrays in parts.items():
+                arrays.append(stored[name])
+    return {name: np.concatenate(arrays) for name, arrays in parts.items()}
+
+
+def main() -> None:
+    """Make what is missing."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--trials", type=int, default=0, help="own trials, a scenario")
+    parser.add_argument("--scenarios", nargs="*", choices=SCENARIOS, default=list(RIGID))
+    parser.add_argument("--official", action="store_true")
+    parser.add_argument("--pixels", type=int, default=0, help="keep pictures of this size")
+    parser.add_argument("--workers", type=int, default=1)
+    options = parser.parse_args()
+    # Scenarios in turn, so that what is there is always of all of them.
+    tasks = [(s, part) for part in range(options.trials // EACH) for s in options.scenarios]
+    parts = range(-(-len(official_scenes()) // EACH)) if options.official else range(0)
+    official_of = partial(make_official, options.folder, options.pixels)
+    own_of = partial(make_own, options.folder, options.pixels)
+    if options.workers > 1:
+        with ProcessPoolExecutor(options.workers) as pool:
+            for done in itertools.chain(pool.map(official_of, parts), pool.map(own_of, tasks)):
+                print(done, flush=True)
+        return
+    for done in itertools.chain(map(official_of, parts), map(own_of, tasks)):
+        if done:
+            print(f"{time.strftime('%H:%M:%S')} {done}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,265 @@
+"""Train models of intuition on own trials in memory, and compare them with forests.
+
+    OMP_NUM_THREADS=1 python benchmarks/models/intuition_trials.py FOLDER --trials 1000 --official
+    OMP_NUM_THREADS=1 python benchmarks/models/train_intuition.py FOLDER [--write]
+
+The trainer is the one of `physion train`; the same command resumes. The last tenth of the own
+trials of every scenario trains nothing: on them, and on the official stimuli without a contact in
+the observed part, networks are compared with forests that saw the same training trials. Predictions
+of official stimuli go to FOLDER/predictions, where ``intuition.py --predictions`` reads them,
+weights to FOLDER/training. With --all-but every network is also trained without the tested
+scenario. With --write the table is written to ``results/intuition_networks.md``; --weights names
+a folder for the weights of all scenarios as float16.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+
+from intuition_trials import load
+from physion.clips.batch import Batch, Spec
+from physion.compute.tasks import processor
+from physion.core.files import digest_of
+from physion.models.build import build_untrained
+from physion.models.checkpoint import BUILT_AS, tensors_of, write_checkpoint
+from physion.models.interface import ask
+from physion.readout.trees import fit_forest
+from physion.training.train import train_model
+
+RESULTS = Path(__file__).parents[1] / "results" / "intuition_networks.md"
+SAME = {
+    "intuition-states": "state-trees", "intuition-masks": "mask-trees",
+    "intuition-pixels": "blob-trees",
+}  # fmt: skip
+"""Forests that see as much as a network."""
+TOGETHER = 64
+"""Trials that are predicted at a time."""
+
+
+class OwnSource:
+    """Source of the context of trials that are in memory, as the trainer takes it.
+
+    ``made``: what `intuition_trials.load` read.
+    """
+
+    def __init__(self, spec: Spec, made: Mapping[str, NDArray[Any]], folder: Path) -> None:
+        self.spec, self._made, self._folder = spec, made, folder
+        self.rows = {str(trial): row for row, trial in enumerate(made["trial"])}
+
+    def length(self, trial: str) -> int:
+        """Return the observed frames, which are all."""
+        return 45
+
+    def key(self, trial: str, part: str) -> str:
+        """Return a digest of the trial's scene."""
+        return digest_of(str(self._made["scene"][self.rows[trial]]))
+
+    def context(self, trials: Sequence[str]) -> Batch:
+        """Return pictures, and masks, of the observed frames."""
+        rows = [self.rows[trial] for trial in trials]
+        frames = np.tile(np.array(self.spec.context_frames()), (len(rows), 1))
+        pixels = {name: self._made[name][rows] for name in ("rgb", "ids") if name in self._made}
+        return Batch(tuple(trials), frames, np.ones(frames.shape, np.bool_), **pixels)
+
+
+class Learner:
+    """One model, its own trials (training and held out), and the official stimuli."""
+
+    def __init__(self, name: str, folder: Path, options: argparse.Namespace) -> None:
+        self.name, self.folder, self.options = name, folder, options
+        tokens = ask(build_untrained(name), "learns_from") == "features"
+        self.read = (name,) if tokens else ("rgb", "ids")
+        self.own = load(folder / "own", (*self.read, SAME[name]))
+        self.asked = load(folder / "official", (*self.read, SAME[name]))
+        keep = ~self.asked["observed_contact"]
+        keep &= np.isin(self.asked["scenario"], np.unique(self.own["scenario"]))
+        self.asked = {key: values[keep] for key, values in self.asked.items()}
+        self.held = np.zeros(len(self.own["trial"]), np.bool_)
+        for scenario in np.unique(self.own["scenario"]):
+            rows = np.flatnonzero(self.own["scenario"] == scenario)
+            self.held[rows[-max(len(rows) // 10, 1) :]] = True
+
+    def train(self, without: str = "") -> dict[str, NDArray[np.float64]]:
+        """Return P(contact) of held-out and official trials, of a network without a scenario."""
+        model = build_untrained(self.name, **self._options())
+        fit = ~self.held & (self.own["scenario"] != without)
+        trials = [str(trial) for trial in self.own["trial"][fit]]
+        source = OwnSource(model.spec, self.own, self.folder)
+        outcomes = dict(zip(trials, self.own["contact"][fit].tolist(), strict=True))
+        settings = ask(model, "training_settings")
+        changed = {"steps": self.options.steps, "batch": self.options.batch}
+        settings = replace(settings, **{name: value for name, value in changed.items() if value})
+
+        def features(names: Sequence[str]) -> Any:
+            return [self.own[self.name][source.rows[name]] for name in names]
+
+        start = time.process_time()
+        source_of_trials: Any = source
+        done = train_model(
+            model, source_of_trials, trials, seed=0, accelerator=self.options.accelerator,
+            name=f"no_{without}" if without else "all", folder=self.folder / "training",
+            settings=settings, features=features, outcomes=outcomes, progress=_say,
+        )  # fmt: skip
+        if self.options.weights and not without:
+            halves = {
+                k: v.half() if v.is_floating_point() else v for k, v in tensors_of(model).items()
+            }
+            about = {BUILT_AS: model.built_as(), "provenance": asdict(model.provenance())}
+            path = self.options.weights / f"{model.name}.safetensors"
+            write_checkpoint(path, halves, about, kept=True)
+        print(
+            f"{self.name} {without or 'all'}: held-out loss {done.validation:.3f}, base rate "
+            f"{done.baseline:.3f}, {time.process_time() - start:.0f} s, {done.folder}", flush=True,
+        )  # fmt: skip
+        return {
+            "own": self._predict(model, self.own, self.held),
+            "official": self._predict(model, self.asked, np.full(len(self.asked["trial"]), True)),
+        }
+
+    def forests(self) -> dict[str, NDArray[np.float64]]:
+        """Return P(contact) of forests of each scenario, fitted on the same trials."""
+        name = SAME[self.name]
+        counts = {"own": int(self.held.sum()), "official": len(self.asked["trial"])}
+        found = {part: np.full(count, np.nan) for part, count in counts.items()}
+        for scenario in np.unique(self.own["scenario"]):
+            inside = self.own["scenario"] == scenario
+            fit = inside & ~self.held
+            forest = fit_forest(_flat(self.own[name][fit]), self.own["contact"][fit])
+            own = self.own[name][inside & self.held]
+            found["own"][self.own["scenario"][self.held] == scenario] = forest.probability(
+                _flat(own)
+            )
+            there = self.asked["scenario"] == scenario
+            found["official"][there] = forest.probability(_flat(self.asked[name][there]))
+        return found
+
+    def row(self, name: str, answers: Mapping[str, NDArray[np.float64]]) -> str:
+        """Return a row of the table: accuracies of own trials and official stimuli."""
+        own, asked = self.own, self.asked
+        held = {key: own[key][self.held] for key in ("scenario", "contact")}
+        scores = [
+            by_scenario(answers["own"], held["scenario"], held["contact"]),
+            by_scenario(answers["official"], asked["scenario"], asked["contact"]),
+        ]
+        rigid = [one.drop("drape", errors="ignore").mean() for one in scores]
+        each = " | ".join(f"{value:.2f}" for value in scores[1])
+        fit = int((~self.held).sum() / len(scores[0]))
+        return f"| {name} | {fit} | {rigid[0]:.3f} | {rigid[1]:.3f} | {each} |"
+
+    def keep(self, name: str, answers: NDArray[np.float64]) -> None:
+        """Write predictions of official stimuli."""
+        path = self.folder / "predictions" / f"{name.replace(' ', '-')}.csv"
+        path.parent.mkdir(exist_ok=True)
+        table = {"model": name, "stimulus": self.asked["trial"], "p_contact": answers}
+        pd.DataFrame(table).to_csv(path, index=False)
+
+    def _options(self) -> dict[str, Any]:
+        pairs = [pair.split("=") for pair in self.options.option]
+        return {key: float(v) if "." in v else int(v) for key, v in pairs}
+
+    @torch.no_grad()
+    def _predict(
+        self, model: Any, made: Mapping[str, NDArray[Any]], chosen: NDArray[np.bool_]
+    ) -> NDArray[np.float64]:
+        source, found = OwnSource(model.spec, made, self.folder), []
+        names = [str(trial) for trial in made["trial"][chosen]]
+        for start in range(0, len(names), TOGETHER):
+            batch = source.context(names[start : start + TOGETHER])
+            if self.name in made:
+                rows = [source.rows[trial] for trial in batch.trials]
+                batch = replace(batch, features=made[self.name][rows])
+            found.append(model.predict(batch.to(model.device)).cpu().numpy())
+        return np.concatenate(found).astype(np.float64)
+
+
+def device() -> str:
+    """Return the name of the GPU, else of the processor."""
+    return torch.cuda.get_device_name() if torch.cuda.is_available() else processor()
+
+
+def _flat(values: NDArray[Any]) -> NDArray[Any]:
+    return values.reshape(len(values), -1)
+
+
+def _say(what: str, done: int, total: int) -> None:
+    if done % 250 == 0:
+        print(f"{datetime.datetime.now():%H:%M:%S} {what} {done} of {total}", flush=True)
+
+
+def by_scenario(p: NDArray[Any], scenario: NDArray[Any], contact: NDArray[Any]) -> pd.Series:
+    """Return the accuracy of every scenario."""
+    return pd.Series((p > 0.5) == contact).groupby(scenario).mean()
+
+
+def main() -> None:
+    """Train, and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--models", nargs="*", choices=SAME, default=list(SAME)[:2])
+    parser.add_argument("--steps", type=int, default=0, help="of the training; 0: the model's own")
+    parser.add_argument("--batch", type=int, default=0, help="clips a step; 0: the model's own")
+    parser.add_argument("--accelerator", default="auto")
+    parser.add_argument("--weights", type=Path, help="folder for weights")
+    parser.add_argument("--option", nargs="*", default=[], help="NAME=NUMBER of the model")
+    parser.add_argument("--all-but", action="store_true")
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
+    rows = []
+    for name in options.models:
+        learner = Learner(name, options.folder, options)
+        forests = learner.forests()
+        rows.append(learner.row(SAME[name], forests))
+        print(rows[-1], flush=True)
+        answers = learner.train()
+        learner.keep(name, answers["official"])
+        rows.append(learner.row(name, answers))
+        both = {part: (answers[part] + forests[part]) / 2 for part in answers}
+        rows.append(learner.row(f"mean of both, {name}", both))
+        print("\n".join(rows[-2:]), flush=True)
+        if options.all_but:
+            scenarios = np.unique(learner.own["scenario"])
+            apart = {part: np.full(len(values), np.nan) for part, values in answers.items()}
+            for scenario in scenarios:
+                found = learner.train(str(scenario))
+                for part, of in (("own", learner.own["scenario"][learner.held]),
+                                 ("official", learner.asked["scenario"])):  # fmt: skip
+                    apart[part][of == scenario] = found[part][of == scenario]
+            learner.keep(f"{name}, scenario unseen", apart["official"])
+            rows.append(learner.row(f"{name}, scenario unseen", apart))
+            print(rows[-1], flush=True)
+    scenarios = [str(s) for s in np.unique(learner.own["scenario"])]
+    text = "\n".join(
+        [
+            "# Networks of intuition and forests",
+            f"`python benchmarks/models/train_intuition.py FOLDER --models "
+            f"{' '.join(options.models)} --write`, {datetime.date.today()}, {device()}.",
+            "",
+            "Accuracy of networks over all scenarios and of forests, one per scenario, that saw "
+            "the same training trials: on the last tenth of the own trials, and on official "
+            "stimuli without contact in the observed part (recorded outcomes), mean of the rigid "
+            "scenarios; and on official stimuli of each scenario.",
+            "",
+            f"| | trials per scenario | own, rigid | official, rigid | {' | '.join(scenarios)} |",
+            "|---|---|---|---" + "|---" * len(scenarios) + "|",
+            *rows,
+        ]
+    )
+    if options.write:
+        RESULTS.write_text(text + "\n")
+
+
+if __name__ == "__main__":
+    main()
