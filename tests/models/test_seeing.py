@@ -257,7 +257,7 @@ def test_notes_of_a_model_reach_the_table(tmp_path: Any) -> None:
     "scenario", ["collide", "contain", "dominoes", "drop", "link", "roll", "support"]
 )
 def test_scenes_of_every_scenario_are_recovered(scenario: str) -> None:
-    """Half of the movable objects are seen within 1 cm of where they are; 3 of 4 shapes are right."""
+    """Half of the movable objects are seen within 1 cm; three of four have the right shape."""
     errors, right = [], []
     for seed in (1, 2):
         made = sample_scene(scenario, seed)

@@ -44,24 +44,20 @@ def prepare_folder(folder: Path) -> Path:
 
 
 def write_plot(plot: Plot, folder: Path, rehearsal: bool = False) -> Picture:
-    """Write a figure as SVG with text, PDF and PNG with its table; return what the page shows.
+    """Write a figure as SVG, PDF and PNG with its table; return what the page shows.
 
-    The page shows an SVG with outlined letters, which needs no font. ``rehearsal``: as in
-    `write_csv`.
+    ``rehearsal``: as in `write_csv`.
     """
     write_csv(folder / f"{plot.name}.csv", plot.table, rehearsal)
     figure = plot.draw(plot.table, theme.LIGHT)
-    light = {kind: theme.figure_bytes(figure, kind) for kind in ("svg", "png")}
-    # The dark figure is for the page only, so it is made only in the format used there.
-    kind = page_kind(light)
-    dark = {kind: theme.figure_bytes(plot.draw(plot.table, theme.DARK), kind)}
-    files = {
-        "svg": theme.figure_bytes(figure, "svg", text=True),
-        "pdf": theme.figure_bytes(figure, "pdf"),
-        "png": light["png"],
-    }
-    for ending, content in files.items():
+    light = {kind: theme.figure_bytes(figure, kind) for kind in ("svg", "pdf", "png")}
+    for ending, content in light.items():
         write_atomic(folder / f"{plot.name}.{ending}", content)
+    # The dark figure is for the page only, so it is made only in the format used there.
+    if page_kind(light) == "svg":
+        dark = {"svg": theme.darkened(light["svg"])}
+    else:
+        dark = {"png": theme.figure_bytes(plot.draw(plot.table, theme.DARK), "png")}
     return Picture(plot.name, light, dark, plot.words)
 
 

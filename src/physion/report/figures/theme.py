@@ -10,6 +10,7 @@ import importlib
 import io
 import math
 import pkgutil
+import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -118,23 +119,33 @@ _METADATA: dict[str, dict[str, None]] = {
 """Entries that differ with time and program, by format."""
 
 
-def figure_bytes(figure: Figure, kind: str, *, text: bool = False) -> bytes:
+def figure_bytes(figure: Figure, kind: str) -> bytes:
     """Return a figure as ``svg``, ``png`` or ``pdf``, without date, version or random names.
 
-    ``text``: letters of an SVG are text in the font DejaVu Sans, which can be edited and searched;
-    else they are outlines, which look the same everywhere. A PDF embeds its font.
+    Letters of an SVG are outlines, which look the same everywhere. A PDF embeds its font, so that
+    its letters can be edited and searched.
     """
     buffer = io.BytesIO()
-    letters: Any = {
-        "svg.hashsalt": "physion",
-        "svg.fonttype": "none" if text else "path",
-        "pdf.fonttype": 42,
-    }
+    letters: Any = {"svg.hashsalt": "physion", "svg.fonttype": "path", "pdf.fonttype": 42}
     with matplotlib.rc_context(letters):
         figure.savefig(buffer, format=kind, dpi=150, metadata=_METADATA[kind])
     # The layout is the same for every format and slow to compute.
     figure.set_layout_engine("none")
     return buffer.getvalue()
+
+
+def darkened(svg: bytes) -> bytes:
+    """Return the SVG of a light figure in the colours of the dark theme, without drawing it again.
+
+    Colours that are not of the light theme stay.
+    """
+    pairs = zip(_colors(LIGHT), _colors(DARK), strict=True)
+    dark = {old.lower().encode(): new.lower().encode() for old, new in pairs}
+    return re.sub(rb"#[0-9a-f]{6}\b", lambda found: dark.get(found[0], found[0]), svg)
+
+
+def _colors(theme: Theme) -> tuple[str, ...]:
+    return theme.paper, theme.ink, theme.faint, theme.zone, *theme.palette
 
 
 def style(theme: Theme) -> Any:
