@@ -138,6 +138,8 @@ def run_tests(folder: Path, tests: Sequence[str], marks: str) -> tuple[int, str]
         )
     except subprocess.TimeoutExpired:
         return SOME_FAILED, "a test that does not end"
+    if done.returncode < 0:
+        return SOME_FAILED, "a crash of the process"
     failed = FAILED.search(done.stdout)
     if failed is None and done.returncode not in (ALL_PASSED, NONE_FOUND):
         raise SystemExit(f"pytest cannot run:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")

@@ -58,9 +58,6 @@ def test_sampled_scenes_to_report(tmp_path: Path, capsys: pytest.CaptureFixture[
     index = pd.read_parquet(tmp_path / "trials" / "index.parquet")
     splits = {"readout": 12, "testing": 6, "training": 12}
     assert dict(index.groupby("split").size()) == splits
-    first = digests(tmp_path)
-    assert main(command) == 0
-    assert digests(tmp_path) == first, "a second run must change nothing"
 
 
 @pytest.mark.slow
@@ -89,16 +86,14 @@ def test_the_first_command_compares_models_with_people(
     tested = index[index["split"] == "testing"]
     assert (tested.groupby("scenario")["recorded_contact"].sum() == 1).all(), "balanced"
     first = digests(tmp_path)
+    (tmp_path / "report" / "report.html").write_text("changed")
     # No progress on a slow machine but the first line.
     monkeypatch.setattr(output, "_LINE_EVERY", math.inf)
     monkeypatch.setattr(output, "_NAMED_AFTER", math.inf)
     assert main(command) == 0
     again = capsys.readouterr()
     assert json.loads(again.out) == answer and again.err == "building models: 0 of 3\n"
-    assert digests(tmp_path) == first
-    (tmp_path / "report" / "report.html").write_text("changed")
-    assert main(command) == 0
-    assert digests(tmp_path) == first, "what was changed is made again"
+    assert digests(tmp_path) == first, "what was changed is made again, nothing else changes"
 
 
 @pytest.mark.slow
@@ -119,11 +114,10 @@ def test_command_logs_against_people(
     (header,) = (line for line in table if line.startswith("model "))
     assert "accuracy" in header and "r with people" in header
     assert any(line.startswith("chance") for line in table)
-    assert main([*command, "--json"]) == 0
-    scores = pd.DataFrame(json.loads(capsys.readouterr().out)["scores"])
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    scores, methods = pd.DataFrame(report["scores"]), report["methods"]
     assert scores["human_accuracy"].notna().any()
     assert "noisy-simulation-people-touch" in set(scores["base_model"])
-    methods = json.loads((tmp_path / "report" / "report.json").read_text())["methods"]
     assert methods["Decision"] == "touch in place of the own one: noisy-simulation-people"
 
 

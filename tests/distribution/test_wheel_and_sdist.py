@@ -168,14 +168,15 @@ def test_an_installed_wheel_runs_in_another_folder(built: Path, tmp_path: Path) 
         shutil.copyfile(path, target)
     physion_ = bin_folder / "physion"
     assert run(physion_, "--version") == f"physion {physion.__version__}\n"
-    small = ["--size", "64", "--models", "constant-motion,gns"]
-    run(physion_, "run", "--sampled", "--limit", "1", *small)
-    assert (folder / "runs" / "sampled" / "report" / "report.html").is_file()
-    # Templates of the viewer and the pages of the experiment come from the wheel, too.
-    run(physion_, "view", "runs/sampled/trials", "--trials", "1", "--details", "1")
     tiny = ["--width", "64", "--height", "64", "--jitters", "0", "--count", "2"]
     for split in ("testing", "familiarization"):
         run(physion_, "generate", "trials", "--scenario", "drop", "--split", split, *tiny)
+    run(physion_, "evaluate", "gns,state-trees", "trials", "--out", "models")
+    # Data of the study, templates and pages of the experiment come from the wheel, too.
+    tables = (folder / "models" / "predictions").glob("*.csv")
+    run(physion_, "compare", *map(str, tables), "--out", "report")
+    assert (folder / "report" / "report.html").is_file()
+    run(physion_, "view", "trials", "--trials", "1", "--details", "1")
     contact = ["--contact", "Ada, ada@example.org"]
     run(physion_, "experiment", "init", "study", "--trials", "trials", "--practice", "2", *contact)
     assert (folder / "study" / "study.toml").is_file()

@@ -495,17 +495,17 @@ def test_nothing_judged_is_not_passed(
 
 @pytest.fixture(scope="module")
 def few(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return make_late_motions(tmp_path_factory.mktemp("few") / "few", {"readout": 4, "testing": 4})
+    return make_late_motions(tmp_path_factory.mktemp("few") / "few", {"readout": 4, "testing": 2})
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(models.names()))
 def test_every_shipped_model_passes(name: str, few: Dataset, tmp_path: Path) -> None:
     options = OPTIONS.get(name, {})
-    kept = ["future", "labels", "files", "order", "everything"]
+    kept = ["future", "everything"]
     done = check(
-        name, few, tmp_path, options=options, trials=8, changes=kept, accelerator="cpu",
+        name, few, tmp_path, options=options, trials=6, changes=kept, accelerator="cpu",
     )  # fmt: skip
     assert done.passed, done.table.to_string()
-    exact = done.table[~done.table["change"].isin(["order", "everything"])]
+    exact = done.table[done.table["change"] != "everything"]
     assert (exact["largest"] == 0).all()

@@ -82,9 +82,14 @@ def parse_json(text: str, where: str, error: type[BadInputError] = BadInputError
         raise error(f"{where} is nested deeper than {MAX_DEPTH} levels") from None
     except ValueError as problem:
         raise error(f"{where} is not JSON: {problem}") from problem
-    level = [data]
+    level = [data] if isinstance(data, list | dict) else []
     for _ in range(MAX_DEPTH):
-        level = [child for item in level for _, child in _children(item)]
+        level = [
+            child
+            for item in level
+            for child in (item.values() if isinstance(item, dict) else item)
+            if isinstance(child, list | dict)
+        ]
         if not level:
             return data
     raise error(f"{where} is nested deeper than {MAX_DEPTH} levels")
@@ -127,14 +132,14 @@ def read_settings(
 
     try:
         # As JSON, since pydantic takes lists for tuples, and objects for dataclasses, only there.
-        (value,) = _adapter(typing.cast("Any", kind)).validate_json(
-            json.dumps([data], default=_plain)
-        )
+        text = json.dumps([data], default=_plain)
+        (value,) = _adapter(typing.cast("Any", kind)).validate_json(text)
     except ValidationError as problem:
         raise error(_describe(problem, kind, data, where)) from None
     except (TypeError, ValueError) as problem:
         raise error(f"{where}: {problem}") from problem
-    _check_finite(data, where, error)
+    if "NaN" in text or "Infinity" in text:
+        _check_finite(data, where, error)
     return typing.cast("T", value)
 
 

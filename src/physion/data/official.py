@@ -186,7 +186,7 @@ def _trial(line: str, where: str) -> ImportedTrial:
     if not isinstance(values, dict) or set(values) != {"scene", "outcome", "notes"}:
         raise BadInputError(f"{where} holds no trial")
     return ImportedTrial(
-        Scene.from_json(json.dumps(values["scene"])),
+        Scene.from_values(values["scene"]),
         read_settings(RecordedOutcome, values["outcome"], f"{where}: outcome"),
         tuple(str(note) for note in values["notes"]),
     )

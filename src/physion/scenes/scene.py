@@ -327,23 +327,32 @@ class Scene:
 
     def to_json(self) -> str:
         """Return the scene as one line of JSON, from which `from_json` builds an equal scene."""
-        values = dataclasses.asdict(self)
+        values = _fields(self)
         # Scenes without events keep the text that they had before events were known: it decides
         # their digest, and thereby their split.
         if not self.events:
             del values["events"]
-        return json.dumps(values, separators=(",", ":"), sort_keys=True)
+        return json.dumps(values, default=_fields, separators=(",", ":"), sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> Scene:
         """Read what `to_json` wrote; `BadSceneError` names the field that is wrong."""
-        data = parse_json(text, "scene", BadSceneError)
+        return cls.from_values(parse_json(text, "scene", BadSceneError))
+
+    @classmethod
+    def from_values(cls, data: Any) -> Scene:
+        """Read parsed JSON as `from_json` does."""
         # Before every one of them is read.
         for name in ("bodies", "cloths", "events", "pushes", "joints"):
             values = data.get(name) if isinstance(data, dict) else None
             if isinstance(values, list) and len(values) > MAX_THINGS:
                 raise BadSceneError(_too_many("scene", len(values), name))
         return read_settings(cls, data, "scene", BadSceneError)
+
+
+def _fields(value: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass with slots."""
+    return {name: getattr(value, name) for name in value.__slots__}
 
 
 def _too_many(scene: str, count: int, what: str = "bodies and cloths") -> str:
