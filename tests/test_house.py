@@ -88,6 +88,7 @@ def _room_levels() -> dict[str, int]:
     return {room.strip(): level for level, rooms in enumerate(layers) for room in rooms.split(":")}
 
 
+@pytest.mark.slow
 def test_no_import_ring() -> None:
     """Each strongly connected component of the graph of imports is a single module."""
     modules = [_module(path) for path in SOURCES]

@@ -46,6 +46,7 @@ def test_each_row_of_predictions_names_the_version(stated: str, written: str) ->
     assert list(table["versions"]) == [written] * 2
 
 
+@pytest.mark.slow
 def test_numbers_of_a_replay_name_the_version(tmp_path: Path) -> None:
     path = tmp_path / "replay.json"
     command = ["replay", "--scenario", "drop", "--limit", "1", "--workers", "1"]

@@ -117,6 +117,7 @@ def test_the_recorded_outcome_decides_and_differences_are_listed(
     assert set(written["population"]) == {"people", "models"}
 
 
+@pytest.mark.slow
 def test_own_stimuli_need_scenario_and_outcome(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -133,6 +134,7 @@ def test_own_stimuli_need_scenario_and_outcome(
     assert row.split()[1] == "0.500", "p > 0.5 for one of two that never touch"
 
 
+@pytest.mark.slow
 def test_page_and_terminal_show_the_same_average(capsys: pytest.CaptureFixture[str]) -> None:
     """Two stimuli of each scenario leave no r by scenario, so that only the pooled one is known."""
     labels = physion_official().labels

@@ -111,6 +111,7 @@ def test_unknown_scenarios_get_the_closest(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("buffered", [True, False])
 @pytest.mark.parametrize("command", ["--help", "ls", "ls --help", "doctor"])
 def test_a_closed_output_ends_the_command_quietly(command: str, buffered: bool) -> None:
@@ -130,6 +131,7 @@ def test_a_closed_output_ends_the_command_quietly(command: str, buffered: bool) 
     assert (done.returncode, done.stderr) == (OUTPUT_CLOSED, "")
 
 
+@pytest.mark.slow
 def test_no_output_is_no_error() -> None:
     code = "import os, sys; os.close(1); os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"
     done = subprocess.run(

@@ -121,6 +121,7 @@ def test_command_logs_against_people(
     assert methods["Decision"] == "touch in place of the own one: noisy-simulation-people"
 
 
+@pytest.mark.slow
 def test_a_larger_limit_adds_to_the_trials_of_a_smaller_one() -> None:
     trials = official().trials
     few, more = (balanced_trials(trials, limit) for limit in (3, 7))

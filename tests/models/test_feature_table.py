@@ -95,6 +95,7 @@ def encode(request: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_request_is_encoded_without_this_package_and_gives_the_row_of_the_model(
     dots: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

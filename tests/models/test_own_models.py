@@ -43,6 +43,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "protocols"),
     [

@@ -116,6 +116,7 @@ def motions() -> list[Motion]:
     return [Motion(scene, simulate(scene)) for scene in scenes]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PARTICLE_NAMES)
 def test_weights_predict_motion(name: str, motions: list[Motion]) -> None:
     """The error after 0.6 s is at most 0.3 of constant velocity's (0.18 and 0.10 when they were

@@ -97,6 +97,7 @@ def test_the_last_clip_repeats_the_last_frame(name: str) -> None:
         assert torch.equal(model.encode(batch(known)), model.encode(batch(filled)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_tokens_are_averaged_at_one_time_and_in_cells(name: str) -> None:
     model, grid = make(name), make(name, pooling="grid", image_size=64)
@@ -396,6 +397,7 @@ def test_it_is_evaluated_under_observed_and_full(name: str, tmp_path: Path) -> N
     assert (table["model"] == f"random-{name}-small").all() and (table["init"] == "random").all()
 
 
+@pytest.mark.slow
 def test_without_transformers_the_extra_is_named() -> None:
     code = """
 import sys

@@ -166,6 +166,7 @@ def test_a_model_overfits_one_batch(name: str, count: int) -> None:
         assert loss < (0.6 if name == "op3" else 0.2) * trivial
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_equal_steps_give_equal_weights(name: str) -> None:
     digests = []

@@ -35,6 +35,7 @@ print(outer(1), sum(outer.stats.cache_hits.values()))
 """
 
 
+@pytest.mark.slow
 def test_a_changed_callee_in_another_file_is_compiled_again(tmp_path: Path) -> None:
     (tmp_path / "outer.py").write_text(OUTER)
     printed = []
@@ -68,6 +69,7 @@ print(read({name}(3.0)))
 """
 
 
+@pytest.mark.slow
 def test_an_index_that_names_a_renamed_class_is_compiled_again(tmp_path: Path) -> None:
     env = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1", "PYTHONPATH": str(tmp_path)}
     for name in ("Before", "After"):

@@ -213,6 +213,7 @@ def heap() -> Scene:
     )
 
 
+@pytest.mark.slow
 @BOTH
 def test_same_bytes_in_every_process(name: str) -> None:
     here = [run(name, heap(), 60).digest() for _ in range(2)]

@@ -35,6 +35,7 @@ def test_particles_have_the_volume_of_the_solid(name: str) -> None:
     assert (points >= low - 1e-6).all() and (points <= high + 1e-6).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", shapes.names())
 @pytest.mark.parametrize("scale", [1.0, 0.3])
 def test_no_matter_is_far_from_every_particle(name: str, scale: float) -> None:

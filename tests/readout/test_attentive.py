@@ -60,6 +60,7 @@ def marked(trials: int, tokens: int, seed: int = 0) -> tuple[NDArray[np.float32]
     return features, labels
 
 
+@pytest.mark.slow
 def test_a_marked_token_is_read_wherever_it_is() -> None:
     features, labels = marked(300, 12)
     found = decide(features, labels, 200)

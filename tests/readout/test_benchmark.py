@@ -63,6 +63,7 @@ def test_no_frame_after_the_last_one_and_the_first_is_repeated() -> None:
     assert Spec(stride=9).context_frames() == (8, 17, 26, 35, 44)
 
 
+@pytest.mark.slow
 def test_frames_readouts_and_rows(dots: Dataset, tmp_path: Path) -> None:
     model = Watcher()
     table = evaluate(model, dots, tmp_path, V15).predictions

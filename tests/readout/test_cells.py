@@ -67,6 +67,7 @@ def stamps(folder: Path) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
 
 
+@pytest.mark.slow
 def test_trainings_are_models_by_protocols_by_sets_by_seeds(dots: Dataset, tmp_path: Path) -> None:
     given: dict[str, Any] = {"protocols": EVERY, "seeds": 2, "seed": 5, "settings": CPU}
     planned = physion.train(IMAGINING, dots, tmp_path, dry_run=True, **given).planned
@@ -184,6 +185,7 @@ def test_other_inputs_are_another_training(dots: Dataset, tmp_path: Path) -> Non
     assert len({place(), *others}) == 5
 
 
+@pytest.mark.slow
 def test_evaluations_have_all_readouts_and_a_second_run_only_reads(
     dots: Dataset, tmp_path: Path
 ) -> None:
@@ -228,6 +230,7 @@ def test_evaluate_finds_what_was_trained_and_one_protocol_is_a_part_of_all(
     assert set(untrained.predictions["scenario"]) == {"drop"}
 
 
+@pytest.mark.slow
 def test_one_that_fails_does_not_stop_the_others(dots: Dataset, tmp_path: Path) -> None:
     trained = physion.train([FAILS, IMAGINING], dots, tmp_path, protocols=EVERY, settings=CPU)
     assert list(trained.failed) == [f"{FAILS}, {protocol}, seed 0" for protocol in EVERY]

@@ -136,6 +136,7 @@ PLANTED: dict[str, tuple[leaks.Tells, str]] = {
 """What a model reads of the evaluated dataset, and the change that must find it."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("leak", PLANTED)
 def test_a_planted_leak_is_refused(leak: str, made: Dataset, tmp_path: Path) -> None:
     tells, change = PLANTED[leak]
@@ -249,6 +250,7 @@ def test_what_is_changed(made: Dataset, tmp_path: Path) -> None:
     assert not set(sizes[:TESTED]) & set(sizes[TESTED:])
 
 
+@pytest.mark.slow
 def test_the_order_of_frames_and_the_colours(made: Dataset, tmp_path: Path) -> None:
     _, backwards = changed(made, "reversed", tmp_path)
     _, shuffled = changed(made, "shuffled", tmp_path)
@@ -305,6 +307,7 @@ def test_the_verb(
     assert "futur" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_trial_that_cannot_be_predicted_after_a_change_is_refused(
     made: Dataset, tmp_path: Path
 ) -> None:
@@ -356,6 +359,7 @@ def test_trials_that_fit_the_readout_are_encoded_once(made: Dataset, tmp_path: P
     assert all(set(batch) <= fit or set(batch) <= tested for batch in model.batches)
 
 
+@pytest.mark.slow
 def test_evaluate_writes_the_verdict_into_the_table(
     made: Dataset,
     tmp_path: Path,
@@ -453,6 +457,7 @@ def test_what_is_only_shown_may_fail(made: Dataset, tmp_path: Path) -> None:
     assert "reversed is not shown" in warning and "broken" in warning
 
 
+@pytest.mark.slow
 def test_others_may_fail_and_a_twin_decides_as_the_model(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -411,6 +411,7 @@ def test_scores_are_means_and_deviations_over_seeds() -> None:
     assert len(summarise_accuracy(first.iloc[:0])) == 0
 
 
+@pytest.mark.slow
 def test_a_twin_has_random_weights_and_is_the_row_of_the_model_with_random_weights(
     dots: Dataset, tmp_path: Path
 ) -> None:

@@ -166,6 +166,7 @@ def test_absent_bodies_are_not_drawn_and_cast_no_shadow(kinematic: bool) -> None
     assert np.nanmax(np.abs(shown[1].flow)) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_fresh_process_gives_the_same_bytes() -> None:
     scene, trajectory = tumbling()
     code = (
@@ -287,6 +288,7 @@ def test_errors_name_what_is_wrong() -> None:
         finish("wood_ahs")
 
 
+@pytest.mark.slow
 def test_first_trial_of_every_scenario_shows_agent_and_patient(official: Path) -> None:
     trials = read_scenes(official / "scenes", limit=1).trials
     assert len({trial.scene.scenario for trial in trials}) == 8
@@ -334,6 +336,7 @@ def test_an_unknown_room_is_refused_when_the_preset_is_read() -> None:
         parse_presets(PRESET, "my.toml")
 
 
+@pytest.mark.slow
 def test_a_preset_may_use_a_room_of_another_package(tmp_path: Path) -> None:
     (tmp_path / "own_room.py").write_text(PLUG_IN)
     (tmp_path / "own-1.0.dist-info").mkdir()

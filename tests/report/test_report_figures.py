@@ -648,6 +648,7 @@ def test_models_are_held_against_the_first_in_the_files(make_comparison: Maker) 
 # --- one file each ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_figure_of_another_package_is_found(tmp_path: Path) -> None:
     (tmp_path / "own_figure.py").write_text(
         "from physion.report.figures.theme import BY_SCENARIO, register_figure\n"
@@ -724,6 +725,7 @@ def test_model_names_are_text_and_not_formulas(make_comparison: Maker) -> None:
     assert theme.figure_bytes(figure, "png")
 
 
+@pytest.mark.slow
 def test_the_first_picture_has_one_mark_per_model_and_published_ones_hollow() -> None:
     """A reader sees accuracy to the right and kappa upwards, as the table of results has them."""
     labels = official().labels

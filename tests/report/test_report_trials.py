@@ -74,6 +74,7 @@ def some_rows(**columns: object) -> pd.DataFrame:
 # --- which trials ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_opening_trial_is_clear_to_people_and_missed_by_models(make_comparison: Maker) -> None:
     def chosen(**columns: object) -> list[str]:
         return opening_trials(with_stimuli(make_comparison(), some_rows(**columns)))
@@ -214,6 +215,7 @@ def test_movies_play_without_sound_and_with_controls(movie: Path) -> None:
     assert base64.b64decode(data) == movie.read_bytes()
 
 
+@pytest.mark.slow
 def test_movies_stay_within_the_size_of_the_page(make_comparison: Maker, tmp_path: Path) -> None:
     large = tmp_path / "large.mp4"
     noise = np.random.default_rng(0).integers(0, 255, (46, 64, 64, 3), np.uint8)
@@ -228,6 +230,7 @@ def test_movies_stay_within_the_size_of_the_page(make_comparison: Maker, tmp_pat
     assert render_page(ReportInputs(comparison, movies=movies), []).count("<video") == 10
 
 
+@pytest.mark.slow
 def test_the_page_opens_with_the_trials(make_comparison: Maker, movie: Path) -> None:
     comparison = make_comparison()
     movies = dict.fromkeys(comparison.stimuli["stimulus"], movie)

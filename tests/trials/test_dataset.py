@@ -217,6 +217,7 @@ def test_a_changed_file_is_refused_and_can_be_read_on_demand(
     read(folder, tmp_path, False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("column", ["trial_file", "movie"])
 def test_an_export_of_a_changed_file_fails_and_the_others_go_on(
     column: str, made: Path, tmp_path: Path
@@ -242,6 +243,7 @@ def test_movies_of_a_report_are_checked(made: Path, tmp_path: Path) -> None:
         movies_of(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names here")
 @pytest.mark.parametrize("column", ["trial_file", "movie"])
 def test_a_pipe_in_the_place_of_a_file_does_not_hang(

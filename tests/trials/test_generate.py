@@ -80,6 +80,7 @@ def test_index_equals_the_files(finished: Path) -> None:
     assert dataset.index["first_frame"].isna().tolist() == [True, False, True, False]
 
 
+@pytest.mark.slow
 def test_without_labels_training_trials_hold_no_outcome_and_no_roles(tmp_path: Path) -> None:
     tasks = plan_dataset("plain", ("collide",), {"training": 1, "readout": 2, "testing": 2})
     made = {}
@@ -284,6 +285,7 @@ except PhysionError as error:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="needs resource limits")
 def test_the_system_refusing_to_write_more_is_an_error_and_not_a_crash(
     finished: Path, tmp_path: Path
@@ -597,6 +599,7 @@ MUJOCO = GenerateSettings(
 )
 
 
+@pytest.mark.slow
 def test_trials_of_another_engine_are_verified_with_it(tmp_path: Path) -> None:
     tasks = plan_dataset("tests", ["collide"], {"testing": 1})
     report = make_trials(tmp_path, tasks, MUJOCO, executor=SerialExecutor())

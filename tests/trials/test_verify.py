@@ -74,6 +74,7 @@ def test_damaged_trials_are_deleted_and_made_again(
         assert report.made == ["b"] and tree_digest(folder) == whole
 
 
+@pytest.mark.slow
 def test_missing_unlisted_and_relabelled_trials_are_found(folder: Path) -> None:
     Dataset(folder).paths("a").map.unlink()
     extra = TrialPaths(folder, "testing", "drop", "c")
@@ -238,6 +239,7 @@ def test_a_map_in_another_compression_is_the_same_picture(sampled: Path, tmp_pat
     assert result.notes == []
 
 
+@pytest.mark.slow
 def test_trials_of_an_unknown_preset_are_reported_as_not_drawn_again(
     sampled: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -262,6 +264,7 @@ def make_set(folder: Path, names: tuple[str, ...] = ("a", "b", "c")) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_differences_of_two_datasets_are_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

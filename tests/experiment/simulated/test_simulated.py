@@ -78,6 +78,7 @@ def test_people_are_right_as_often_as_they_should_be_and_slower_where_it_is_hard
     assert rt.min() > 0
 
 
+@pytest.mark.slow
 def test_answers_follow_the_rasch_model_and_log_normal_times() -> None:
     people = [SimulatedPerson(0, number) for number in range(200)]
     stimuli = [_stimulus(number, number % 2 == 0) for number in range(60)]
@@ -152,6 +153,7 @@ def served(study: Study) -> tuple[ServerProcess, list[SimulatedVisit], list[Simu
     return server, first, second
 
 
+@pytest.mark.slow
 def test_people_finish_or_leave_and_come_back(
     served: tuple[ServerProcess, list[SimulatedVisit], list[SimulatedVisit]],
 ) -> None:
@@ -240,6 +242,7 @@ def test_without_leave_of_the_study_they_take_their_time(
     assert minutes_each(fast, "collide") == pytest.approx(minutes_each(real, "collide") / 100)
 
 
+@pytest.mark.slow
 def test_another_study_s_server_refuses_the_pilot_link(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -270,6 +273,7 @@ def test_an_unknown_scenario_is_refused_before_anything_is_sent(study: Study) ->
         asyncio.run(simulate(study, Secrets.load(study.folder), plan))
 
 
+@pytest.mark.slow
 def test_simulated_participants_pass_all_checks(tmp_path: Path) -> None:
     study = make_tiny_study(
         tmp_path, test=3, familiarization=1, obvious=1, size=64, languages=("en",),

@@ -135,6 +135,7 @@ def test_stopping_finishes_requests_and_keeps_every_answer(study: Study) -> None
         assert server.end(signal.SIGINT) == (0, "")
 
 
+@pytest.mark.slow
 def test_https_and_printed_url(study: Study, certificate: tuple[Path, Path]) -> None:
     words = ("--https-cert", str(certificate[0]), "--https-key", str(certificate[1]),
              "--log-requests", "--host", "127.0.0.1")  # fmt: skip
@@ -273,6 +274,7 @@ def test_rules_match_the_analysis() -> None:
     assert tuple(RULE_SETS) == get_args(allowed)
 
 
+@pytest.mark.slow
 def test_serving_imports_nothing_slow() -> None:
     found = f"[name for name in {SLOW_TO_IMPORT} if name in sys.modules]"
     code = f"import sys, physion.experiment.server; print({found})"

@@ -375,6 +375,7 @@ def test_later_steps_of_a_training_start_from_the_prediction(name: str, collide:
     assert model.window == batch.frames.shape[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["gns", "dpi"])
 def test_a_network_overfits_one_window(
     name: str, collide: Motion, monkeypatch: pytest.MonkeyPatch

@@ -41,6 +41,7 @@ def digests(paths: Sequence[Trajectory]) -> list[str]:
     return [path.digest() for path in paths]
 
 
+@pytest.mark.slow
 def test_same_bytes_with_any_number_of_threads_and_in_any_order() -> None:
     scenes = [heap(seed) for seed in range(6)]
     alone = digests([RigidEngine().simulate(scene, frames=FRAMES) for scene in scenes])

@@ -125,6 +125,7 @@ def props(scene: Scene, kind: str) -> list[tuple[object, ...]]:
     return [(b.shape, b.scale, b.look) for b in scene.bodies if b.name.startswith(kind)]
 
 
+@pytest.mark.slow
 def test_distractors_and_occluders_have_streams_of_their_own(scenario: Scenario) -> None:
     same = 0
     for index in TRIALS:

@@ -194,6 +194,7 @@ def test_unknown_scenarios_get_the_closest(dataset: Path) -> None:
         choose_trials(dataset, scenarios=["colide"])
 
 
+@pytest.mark.slow
 def test_looks_are_free_unless_asked_otherwise(dataset: Path, tmp_path: Path) -> None:
     for look in ("free", "redyellow"):
         chosen = choose_trials(dataset, test=2, practice=2, scenarios=["roll"], look=look)
