@@ -34,6 +34,7 @@ class Options:
         "hdf5s",
         "webdataset",
         "gltf",
+        "lerobot",
         "features-request",
         "lmms-eval",
         "card",
@@ -45,6 +46,7 @@ class Options:
     would download others); mp4s, hdf5s: the study's downloads of movies (SlotFormer) and of HDF5
     files; webdataset: tar shards;
     gltf: one GLB file for each trial, with its motion, for Blender and other 3D programs;
+    lerobot: a LeRobot dataset (v3.0) of full movies, states and pushes, for world models;
     features-request: movies to be encoded elsewhere, their names, and a script that needs only
     torch; physion evaluate --features takes its result;
     lmms-eval: questions for language models with movies, as tasks of this harness;
@@ -137,6 +139,11 @@ def _trials(options: Options, out: Path, stages: Stages) -> int:
         from physion.trials.share.gltf import export_gltf
 
         made = export_gltf(options.folder, out, verify=options.verify, progress=stages, **chosen)
+        return _print_paths(made, options.json)
+    if options.layout == "lerobot":
+        from physion.trials.share.lerobot import export_lerobot
+
+        made = export_lerobot(options.folder, out, verify=options.verify, progress=stages, **chosen)
         return _print_paths(made, options.json)
     if options.layout == "features-request":
         from physion.trials.share.features_request import export_features_request
