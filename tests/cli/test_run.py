@@ -115,7 +115,7 @@ def test_command_logs_against_people(
     assert "accuracy" in header and "r with people" in header
     assert any(line.startswith("chance") for line in table)
     report = json.loads((tmp_path / "report" / "report.json").read_text())
-    scores, methods = pd.DataFrame(report["scores"]), report["methods"]
+    scores, methods = pd.DataFrame(report["comparison"]), report["methods"]
     assert scores["human_accuracy"].notna().any()
     assert "noisy-simulation-people-touch" in set(scores["base_model"])
     assert methods["Decision"] == "touch in place of the own one: noisy-simulation-people"

@@ -141,7 +141,7 @@ def darkened(svg: bytes) -> bytes:
     """
     pairs = zip(_colors(LIGHT), _colors(DARK), strict=True)
     dark = {old.lower().encode(): new.lower().encode() for old, new in pairs}
-    return re.sub(rb"#[0-9a-f]{6}\b", lambda found: dark.get(found[0], found[0]), svg)
+    return re.sub(rb"#[0-9a-f]{6}\b", lambda match: dark.get(match[0], match[0]), svg)
 
 
 def _colors(theme: Theme) -> tuple[str, ...]:

@@ -44,10 +44,10 @@ from numpy.typing import NDArray
 from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError
 from physion.core.files import folder_for_writing, remove_leftovers, write_atomic
+from physion.physics.trajectory import Trajectory
 from physion.scenes.scene import FRAME_TIME, Scene
 from physion.trials.dataset import Dataset
 from physion.trials.share.questions import WORDINGS
-from physion.trials.trial_file import Trial
 from physion.trials.video import open_movie
 
 VERSION = "v3.0"
@@ -133,7 +133,8 @@ def _write_episodes(
         for number, name in enumerate(tracked(names, "episodes", len(names), progress)):
             fps = _copy_movie(dataset, name, number, out, episodes)
             trial = dataset.trial(name)
-            states, actions = states_of(trial, episodes.slots), actions_of(trial)
+            states = states_of(trial.scene, trial.trajectory, episodes.slots)
+            actions = actions_of(trial.scene, trial.trajectory)
             start, frames = sum(row["length"] for row in episodes.rows), len(states)
             labels = trial.known_labels()
             first = frames if labels.first_frame is None else labels.first_frame
@@ -189,8 +190,8 @@ def _copy_movie(dataset: Dataset, name: str, number: int, out: Path, episodes: _
     found = (*picture.shape[:2], int(rate))
     if rate != int(rate) or episodes.movie not in (None, found):
         raise BadInputError(
-            f"the movie of trial {name!r} has other frames or another rate than those before it; "
-            "export each --scenario or dataset alone"
+            f"the movie of trial {name!r} has other frames or another rate than the movies before "
+            "it; export each scenario or dataset by itself"
         )
     episodes.movie = found
     episodes.pictures.append(picture.reshape(-1, 3) / 255.0)
@@ -207,9 +208,8 @@ def places(scene: Scene) -> list[int]:
     return roles + [index for index in range(len(scene.names())) if index not in roles]
 
 
-def states_of(trial: Trial, slots: int) -> NDArray[np.float32]:
+def states_of(scene: Scene, path: Trajectory, slots: int) -> NDArray[np.float32]:
     """Return the states of all frames (F, slots * 13), as in ``observation.state``."""
-    scene, path = trial.scene, trial.trajectory
     states = np.zeros((len(path), slots, len(NAMES)), np.float32)
     for place, index in enumerate(places(scene)):
         if index < len(scene.bodies):
@@ -225,9 +225,8 @@ def states_of(trial: Trial, slots: int) -> NDArray[np.float32]:
     return states.reshape(len(path), -1)
 
 
-def actions_of(trial: Trial) -> NDArray[np.float32]:
+def actions_of(scene: Scene, path: Trajectory) -> NDArray[np.float32]:
     """Return what is done to the objects before every frame (F, 7), as in ``action``."""
-    scene, path = trial.scene, trial.trajectory
     actions = np.zeros((len(path), len(ACTION)), np.float32)
     actions[:, -1] = -1
     order = places(scene)
