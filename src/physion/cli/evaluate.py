@@ -9,11 +9,18 @@ from __future__ import annotations
 import json as json_module
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from physion.cli.output import Stages, print_line, print_plan, print_scores, print_warnings
+from physion.cli.output import (
+    Stages,
+    print_line,
+    print_plan,
+    print_scores,
+    print_warnings,
+    text_table,
+)
 from physion.compute.run_tasks import ExecutorSettings
 from physion.core.errors import BadInputError
 from physion.core.settings import read_pairs, split_names
@@ -22,7 +29,11 @@ from physion.readout.check import check_models
 from physion.readout.evaluate import EvaluatedModel, Evaluation, evaluate
 from physion.readout.logistic import LogisticSettings
 from physion.readout.settings import EvaluationSettings, options_by_model
+from physion.readout.whatif import MEASURES, whatif_scores
 from physion.trials.dataset import Dataset
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 LOGISTIC = "logistic."
 """Start of the options of the logistic regression."""
@@ -123,6 +134,8 @@ def _print(done: Evaluation, options: Options) -> None:
         }
         if not options.dry_run:
             values["scores"] = json_module.loads(done.scores.to_json(orient="records"))
+            changes = whatif_scores(done.predictions)
+            values["whatif"] = json_module.loads(changes.to_json(orient="records"))
         print(json_module.dumps(values))
         return
     if options.dry_run:
@@ -135,6 +148,7 @@ def _print(done: Evaluation, options: Options) -> None:
     if done.evaluated:
         print_warnings(done.warnings)
         _print_scores(done)
+        _print_whatif(whatif_scores(done.predictions))
     for one in done.evaluated:
         print_line(f"predictions: {one.path}{' (done before)' if one.done else ''}")
         if one.rollout_errors is not None:
@@ -152,6 +166,17 @@ def _print_scores(done: Evaluation) -> None:
         print_scores(physion.compare(done.paths, humans="official" if seen else None))
     except BadInputError as error:
         print_warnings([f"no comparison: {error}"])
+
+
+def _print_whatif(scores: pd.DataFrame) -> None:
+    """Print how predictions change with the scene, if the dataset holds variants of trials."""
+    if scores.empty:
+        return
+    shown = scores[["model", "readout", "change", "pairs", "changed"]].copy()
+    for name in MEASURES:
+        pairs = zip(scores[name], scores[f"{name}_se"], strict=True)
+        shown[name] = ["-" if m != m else f"{m:.3f} ({se:.3f})" for m, se in pairs]
+    print_line(text_table(shown, "One thing changed: mean and standard error over trials"))
 
 
 def _values(one: EvaluatedModel) -> dict[str, Any]:

@@ -32,6 +32,9 @@ class Options:
     presets: tuple[str, ...] = ()
     """Presets that are used in turn (see physion ls presets), or FILE.toml:NAME; default: the
     published configurations. Requires one --scenario."""
+    whatif: tuple[Literal["remove", "mass", "friction", "push"], ...] = ()
+    """Make variants of each trial, too, with one thing changed: a body removed, the agent's mass,
+    all friction, or the push; physion evaluate scores whether predictions change with them."""
     name: str = "physion"
     """Name of the dataset, part of the seed of every trial."""
     settings: Annotated[GenerateSettings, tyro.conf.arg(name="")] = field(
@@ -57,6 +60,7 @@ def main(options: Options) -> int:
                 options.scenario,
                 counts,
                 presets=options.presets,
+                whatif=options.whatif,
                 name=options.name,
                 settings=options.settings,
                 executor=options.compute.open(),

@@ -18,7 +18,7 @@ import pandas as pd
 
 from physion.compute.run_tasks import RunReport, run_tasks
 from physion.compute.tasks import Executor, Progress, TaskOutcome, workers_kept
-from physion.core.errors import BadInputError, PhysionError
+from physion.core.errors import BadInputError, PhysionError, UnknownNameError
 from physion.core.files import (
     folder_for_writing,
     has_digest,
@@ -48,6 +48,7 @@ from physion.trials.making.plan import (
     check_names,
     plan_dataset,
 )
+from physion.trials.making.whatif import KINDS, whatif_tasks
 from physion.trials.trial_file import Trial
 
 
@@ -333,6 +334,7 @@ def generate(
     counts: Mapping[str, int] | int = 10,
     *,
     presets: Sequence[str] = (),
+    whatif: Sequence[str] = (),
     name: str = "physion",
     settings: GenerateSettings | None = None,
     executor: Executor | None = None,
@@ -354,6 +356,9 @@ def generate(
     presets
         Names of presets that the trials of a scenario take in turn, or ``FILE.toml:NAME``; by
         default the published configurations.
+    whatif
+        Changes of `physion.trials.making.whatif.KINDS`: for each trial with labels, each of its
+        variants is made, too.
     name
         Name of the dataset, part of the seed of every trial.
     settings
@@ -391,7 +396,24 @@ def generate(
         raise BadInputError(f"counts must be 1 or more for each split, not {planned}")
     chosen = {names[0]: tuple(presets)} if presets else None
     tasks = plan_dataset(name, names, planned, chosen)
-    report = make_trials(Path(folder), tasks, settings, executor=executor, progress=progress)
+    if unknown := sorted(set(whatif) - set(KINDS)):
+        raise UnknownNameError("change", unknown[0], KINDS)
+    where = Path(folder)
+    report = make_trials(where, tasks, settings, executor=executor, progress=progress)
+    if whatif:
+        made = Dataset(where)
+        known = made.known_trials()
+        labelled = [
+            task.trial for task in tasks if task.trial in known
+            and (settings or GenerateSettings()).stores_labels(task.split)
+        ]  # fmt: skip
+        if changed := whatif_tasks(made, labelled, whatif):
+            more = make_trials(where, changed, settings, executor=executor, progress=progress)
+            report = RunReport(
+                [*report.made, *more.made], [*report.kept, *more.kept],
+                {**report.failed, **more.failed}, more.index,
+            )  # fmt: skip
+            tasks = [*tasks, *changed]
     if report.failed:
         raise FailedTrialsError(report, len(tasks), Path(folder))
     return GeneratedDataset(Path(folder), report)

@@ -1,0 +1,93 @@
+"""Does a model's prediction change where one change of the scene changes the outcome?
+
+A pair is a trial and one of its variants (`physion.trials.making.whatif`). With P and P' the
+predictions of trial and variant, o and o' their outcomes (0 or 1):
+
+- ``accuracy``: fraction of variants with P' on the side of o';
+- ``paired``: of the pairs whose outcomes differ, those with P and P' both on the right side;
+- ``moved``: of the same pairs, those in which P' - P has the sign of o' - o; no change counts half;
+- ``unmoved``: mean of 1 - \\|P' - P\\| over the pairs with equal outcomes.
+
+A constant P has accuracies of the base rate, paired 0, moved .5 and unmoved 1; a coin .25 and .5.
+Standard errors are of means over trials: pairs of one trial are not independent.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from physion.trials.making.whatif import parts_of
+
+MEASURES = ("accuracy", "paired", "moved", "unmoved")
+ALL = "all"
+
+
+def whatif_scores(predictions: pd.DataFrame) -> pd.DataFrame:
+    """Return the scores of every model and kind of change, and of all kinds together.
+
+    Parameters
+    ----------
+    predictions
+        Tables of `physion.evaluate`, one below the other. Pairs of which a part is missing, or has
+        a contact in the observed part, are left out.
+
+    Returns
+    -------
+    scores
+        ``model``, ``readout``, ``change``, ``pairs``, ``changed`` (pairs whose outcomes differ),
+        and for each measure its mean and ``MEASURE_se``; NaN where there is no pair, or no second
+        trial for the error. Empty without variants.
+    """
+    names = ["model", "readout", "change", "pairs", "changed"]
+    columns = [*names, *(f"{m}{end}" for m in MEASURES for end in ("", "_se"))]
+    pairs = _pairs(predictions)
+    if pairs.empty:
+        return pd.DataFrame(columns=columns)
+    groups = ["model", "readout", "protocol", "seed"]
+    rows = []
+    for (model, readout, *_), own in pairs.groupby(groups, sort=False):
+        for change, part in [(ALL, own), *own.groupby("change")]:
+            row = {"model": model, "readout": readout, "change": change, "pairs": len(part)}
+            row["changed"] = int(part["moved"].notna().sum())
+            for measure in MEASURES:
+                row[measure], row[f"{measure}_se"] = _mean(part, measure)
+            rows.append(row)
+    return pd.DataFrame(rows, columns=columns)
+
+
+def _pairs(predictions: pd.DataFrame) -> pd.DataFrame:
+    """Return the measures of each pair; NaN where one does not apply."""
+    table = predictions[~predictions["observed_contact"].astype(bool)].copy()
+    names = [parts_of(name) for name in table["stimulus"]]
+    table["base"] = [base for base, _ in names]
+    table["change"] = [change.partition(".")[0] for _, change in names]
+    keys = ["model", "readout", "protocol", "seed", "base"]
+    table[keys] = table[keys].fillna("")
+    variant, base = table[table["change"] != ""], table[table["change"] == ""]
+    pairs = variant.merge(base, on=keys, suffixes=("", "_base"))
+    after, before = pairs["p_contact"], pairs["p_contact_base"]
+    truth, old = pairs["outcome"].astype(float), pairs["outcome_base"].astype(float)
+    differ = truth != old
+    right, right_before = (after > 0.5) == (truth == 1), (before > 0.5) == (old == 1)
+    pairs["accuracy"] = right.astype(float)
+    pairs["paired"] = (right & right_before).astype(float).where(differ)
+    pairs["moved"] = ((1 + np.sign((after - before) * (truth - old))) / 2).where(differ)
+    pairs["unmoved"] = (1 - (after - before).abs()).where(~differ)
+    return pairs
+
+
+def _mean(part: pd.DataFrame, measure: str) -> tuple[float, float]:
+    """Return the mean of a measure over pairs, and its standard error over trials.
+
+    With residual sums r_i of the n trials and m pairs: se^2 = n / (n - 1) sum r_i^2 / m^2.
+    """
+    known = part[["base", measure]].dropna()
+    if known.empty:
+        return np.nan, np.nan
+    mean = known[measure].mean()
+    sums = (known[measure] - mean).groupby(known["base"]).sum()
+    n = len(sums)
+    if n < 2:
+        return float(mean), np.nan
+    return float(mean), float(np.sqrt(n / (n - 1) * (sums**2).sum()) / len(known))
