@@ -209,10 +209,11 @@ def test_unusual_trials_get_the_base_rate_or_a_note() -> None:
     with torch.no_grad():
         answers = model.predict(batch)
     assert answers[1] == 0.25 and (answers[[0, 2]] != 0.25).all()
-    assert model.note(batch) == (
-        "agent or patient never visible, base rate: drop_0001; "
-        "more than 3 objects, others left out: drop_0002 (5)"
-    )
+    assert model.notes(batch) == [
+        "",
+        "agent or patient never visible: base rate",
+        "5 objects, only 3 are looked at",
+    ]
 
 
 def test_other_frames_and_sizes_are_refused_in_one_line() -> None:
@@ -268,7 +269,7 @@ def test_a_trial_without_red_and_yellow_is_refused_and_one_without_yellow_noted(
     batch.rgb[0][batch.ids[0] == 2] = 90
     with torch.no_grad():
         assert model.predict(batch)[0] == model.base_rate
-    assert model.note(batch) == "agent or patient never visible, base rate: drop_0000"
+    assert model.notes(batch) == ["agent or patient never visible: base rate", ""]
     batch.rgb[1] = 90
     with pytest.raises(BadInputError, match=r"trial 'drop_0001': nothing is red or yellow"):
         model.predict(batch)

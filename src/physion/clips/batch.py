@@ -246,8 +246,6 @@ class Rollout:
       ``things`` (B, P) int64, the index of each one's object in `Scene.names`, both NaN and -1
       where a trial has fewer. Rows follow the context at the stride of the `Spec`. Also masks of
       the frames of the context, context_masks (B, T, K, H, W).
-    - ``notes`` (B): what the model could not see of each trial, for the table of predictions; empty
-      texts for nothing.
     """
 
     features: Any = None
@@ -256,7 +254,6 @@ class Rollout:
     end: Any = None
     closest: Any = None
     shown: Mapping[str, Any] = field(default_factory=dict)
-    notes: Sequence[str] = ()
 
 
 @dataclass(frozen=True, slots=True)

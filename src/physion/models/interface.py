@@ -15,7 +15,7 @@ without it.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -312,9 +312,13 @@ class Model:
         They must be weights or buffers: a model that is loaded or resumed is not prepared again.
         """
 
-    def note(self, batch: Batch) -> str:
-        """Return what a user must know of the answers of `predict` for these clips, else ""."""
-        return ""
+    def notes(self, batch: Batch) -> Sequence[str]:
+        """Return what a user must know of the prediction for each clip, such as what is not seen.
+
+        It is called after `predict` or `imagine` with the same clips, and stands in the column
+        ``note`` of predictions; "" for nothing.
+        """
+        return [""] * len(batch)
 
     def baseline(self, batch: Batch) -> Tensor:
         """Return the scalar loss of a trivial predictor, in the unit of `loss`."""

@@ -444,11 +444,10 @@ class Intuition(TorchModel):
         answers = self.logits(batch).sigmoid().mean(0)
         return torch.where(self.seen(batch), answers, self.base_rate)
 
-    def note(self, batch: Batch) -> str:
-        """Return which trials never show agent or patient."""
-        pairs = zip(batch.trials, self.seen(batch).tolist(), strict=True)
-        hidden = [trial for trial, seen in pairs if not seen]
-        return f"agent or patient never visible, base rate: {', '.join(hidden)}" if hidden else ""
+    def notes(self, batch: Batch) -> list[str]:
+        """Return for each trial whether it never shows agent or patient."""
+        hidden = "agent or patient never visible: base rate"
+        return ["" if seen else hidden for seen in self.seen(batch).tolist()]
 
     def prepare(self, sample: Batch) -> None:
         """Set the base rate from training trials."""
@@ -544,13 +543,15 @@ class TokenIntuition(Intuition):
             tokens = [mask_tokens(ids, objects) for ids in self._ids(batch)]
         return torch.from_numpy(np.stack(tokens)).flatten(2).to(self.device)
 
-    def note(self, batch: Batch) -> str:
-        """Return which trials never show agent or patient, and which show too many objects."""
-        counts = self._counts(batch)
-        pairs = zip(batch.trials, counts, strict=True)
-        many = [f"{trial} ({count})" for trial, count in pairs if count > self.settings.objects]
-        kept = f"more than {self.settings.objects} objects, others left out: {', '.join(many)}"
-        return "; ".join(filter(None, (super().note(batch), kept if many else "")))
+    def notes(self, batch: Batch) -> list[str]:
+        """Return for each trial whether it never shows agent or patient, or too many objects."""
+        most = self.settings.objects
+        many = [
+            f"{count} objects, only {most} are looked at" if count > most else ""
+            for count in self._counts(batch)
+        ]
+        pairs = zip(super().notes(batch), many, strict=True)
+        return ["; ".join(filter(None, pair)) for pair in pairs]
 
     def logits(self, batch: Batch) -> Tensor:
         """Return logits (2 members, B), each member of the trial and of its mirror image."""

@@ -37,6 +37,7 @@ from physion.readout.model_calls import (
     call_model,
     check_finite,
     model_name,
+    notes_of,
     to_array,
 )
 
@@ -280,15 +281,10 @@ def imagine_clips(
         arrays[FEATURES] = features.reshape(clips, samples * future, features.shape[-1])
     for name in {GAP, END, CLOSEST} & set(arrays):
         arrays[name] = arrays[name].astype(np.float64)
-    if len(rollout.notes) not in (0, clips):
-        raise BadInputError(
-            f"model {model_name(model)!r}: imagine gave {len(rollout.notes)} notes for {clips}"
-        )
     rows = _split(arrays, clips)
-    notes = rollout.notes or [""] * clips
     return [
         {**row, NOTE: np.frombuffer(note.encode(), np.uint8)} if note else row
-        for row, note in zip(rows, notes, strict=True)
+        for row, note in zip(rows, notes_of(model, batch), strict=True)
     ]
 
 

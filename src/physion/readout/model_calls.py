@@ -59,6 +59,18 @@ def call_model(model: Model, method: str, batch: Batch, /, *arguments: Any, **op
         raise _explain(error, model, method, batch) from error
 
 
+def notes_of(model: Model, batch: Batch) -> list[str]:
+    """Return what the model says about its prediction for each clip; "" for nothing."""
+    if not can(model, "notes"):
+        return [""] * len(batch)
+    notes = [str(note) for note in call_model(model, "notes", batch)]
+    if len(notes) != len(batch):
+        raise BadInputError(
+            f"model {model_name(model)!r}: notes gave {len(notes)} texts for {len(batch)} clips"
+        )
+    return notes
+
+
 def check_identity(model: Model) -> Provenance:
     """Return the provenance of a model, after it and the digest were found to be well formed.
 

@@ -30,6 +30,7 @@ from physion.readout.model_calls import (
     check_finite,
     is_network,
     model_name,
+    notes_of,
     to_array,
 )
 from physion.readout.settings import EvaluationSettings
@@ -466,22 +467,22 @@ class Predictor:
             if len(labels):
                 accuracy = float(np.mean((self._probability(asked, fit_batch) > 0.5) == labels))
         predicted: dict[str, float] = {}
-        notes: dict[str, None] = {}
+        notes: dict[str, str] = {}
         for start in range(0, len(split.test), _ANSWER_TRIALS):
             group = split.test[start : start + _ANSWER_TRIALS]
             predicted |= self._ask(asked, read, group, notes)
             if self.progress is not None:
                 self.progress("trials", start + len(group), len(split.test))
         probability = np.array(list(predicted.values()), np.float64)
-        decided = Decided(probability, accuracy, note="; ".join(notes))
+        decided = Decided(probability, accuracy, notes=notes)
         return decided, split.fit, tuple(predicted)
 
     def _ask(
-        self, asked: Any, read: Any, group: Sequence[str], notes: dict[str, None]
+        self, asked: Any, read: Any, group: Sequence[str], notes: dict[str, str]
     ) -> dict[str, float]:
         """Return the answers by trial; if a trial fails, the others are asked for one by one.
 
-        What the model notes of them is added to ``notes``.
+        What the model says about them is added to ``notes``.
         """
         try:
             batch = read(group)
@@ -492,8 +493,7 @@ class Predictor:
                 return {t: p for single in singles for t, p in single.items()}
             self.problems[group[0]] = str(error)
             return {}
-        if can(asked, "note") and (note := call_model(asked, "note", batch)):
-            notes[note] = None
+        notes |= zip(group, notes_of(asked, batch), strict=True)
         return dict(zip(group, answers.tolist(), strict=True))
 
     def _probability(self, asked: Any, batch: Batch) -> NDArray[np.float64]:
