@@ -1,23 +1,29 @@
 """Measure how well `seeing-simulation` recovers scenes, and what it answers.
 
     OMP_NUM_THREADS=1 python benchmarks/models/seeing.py FOLDER [--each 5] [--known] [--write]
+    OMP_NUM_THREADS=1 python benchmarks/models/seeing.py --priors
 
 Official stimuli that people saw, without cloth and without a contact in the observed part: the
 first ``--each`` with a contact and as many without one, of every scenario, by the hash of their
 names. Of each, the observed part is simulated and rendered, scene and state are fitted to masks and
-depth, and both the fitted and the true state are simulated with the default noise. One line a trial
-is appended to FOLDER/seeing.jsonl; an interrupted run continues there, and --known prints what it
-has measured so far. Printed are, by scenario:
+depth, and both the fitted and the true state are simulated with the default noise. One line per
+trial is appended to FOLDER/seeing.jsonl; an interrupted run continues there, and --known prints
+what it has measured so far. Printed are, by scenario:
 
 1. Accuracy by recorded outcomes (P = 1/2 counts half) with standard error, and area under the curve
-   (AUC), of the fitted state, the true state, and constant motion from the fitted state; and
-   agreement with the true state. Answers of other fitted trials of the same scenario are right in
-   half of the cases, as there are as many trials with a contact as without one.
-2. Errors at the last observed frame: median and 90 % quantile of the centre of mass and of the
-   velocity of the agent, centre of the other movable objects, how many have the right shape, and
-   seconds per trial.
+   (AUC), of the fitted and the true state; agreement with the true state, and the mean absolute
+   change of P.
+2. Accuracy of other predictions from the same states: simulation without noise, DPI-Net,
+   `state-trees` with the readouts that ship, constant motion, and the answers for the other
+   fitted trials of the scenario.
+3. Differences between the accuracies of these, with standard errors of paired differences, of all
+   trials, and without those that were looked at while the fit was written (``LOOKED_AT``).
+4. Likeness to people, by `physion.compare`.
+5. Errors at the last observed frame, median and 90 % quantile: centre of mass and velocity of the
+   agent, centre of the other movable objects; and how many have the right shape.
 
-With --write they are written to ``results/seeing.md``.
+With --write they are written to ``results/seeing.md``. --priors prints density, friction and
+restitution of the bodies of our own presets, from which the constants of the model come.
 """
 
 from __future__ import annotations
@@ -26,13 +32,18 @@ import argparse
 import datetime
 import itertools
 import json
-import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
 
+import physion
+from physion.analysis.scores import TWO_PEOPLE
 from physion.analysis.tables import read_humans
 from physion.clips.batch import LAST_OBSERVED, Batch, Motion
 from physion.clips.rendered import MotionRenderer, object_ids
@@ -42,78 +53,179 @@ from physion.data.official import official
 from physion.models.baselines.motion import gap_in_constant_motion
 from physion.models.build import build_model
 from physion.models.noisy_simulation import NoiseLevels, cut_trial, simulate_contacts
-from physion.models.seeing.scenes import SeenTrial
+from physion.models.seeing.scenes import (
+    DENSITY,
+    FLAT_TARGET,
+    FRAMES,
+    RAMP,
+    RING_DENSITY,
+    SURFACE,
+    SeenTrial,
+)
 from physion.models.seeing.simulation import VERSION
 from physion.numerics.rotations import rotate_vectors
 from physion.physics.engine import make_engine, simulate
 from physion.physics.rigid.bodies import body_mass
-from physion.scenes.scene import OBSERVED_FRAMES, Body, Scene
+from physion.physics.trajectory import Contacts, Trajectory
+from physion.readout.decisions import Readout
+from physion.readout.shipped import find_readouts
+from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, Body, Roles, Scene
 
 RESULTS = Path(__file__).parents[1] / "results" / "seeing.md"
 SAMPLES = 10
 FRAMES_AHEAD = 106
+PRIOR_SCENES = 12
+RIGID = ("collide", "contain", "dominoes", "drop", "link", "roll", "support")
+LOOKED_AT = {"support": 3}
+"""Trials per scenario and outcome that were looked at while the fit was written; 1 of others."""
+STILL = NoiseLevels(position=0.0, velocity=0.0, mass=0.0)
 ROW = dict[str, Any]
 
 
-def chosen_trials(each: int) -> list[tuple[Scene, bool]]:
-    """Return scenes and recorded outcomes, one of every scenario and outcome after the other."""
+def chosen_trials(each: int, early: Callable[[Scene], bool]) -> Iterator[tuple[Scene, bool, int]]:
+    """Yield scenes, recorded outcomes and numbers, one of every scenario and outcome in turn.
+
+    Those for which ``early`` is true are left out.
+    """
     seen = set(read_humans(official().humans)["stimulus"])
     trials = [t for t in official().trials if canonical_name(t.scene.name) in seen]
     trials = [t for t in trials if not t.scene.cloths]
     trials.sort(key=lambda t: stable_hash("noise", t.scene.name))
-    groups: dict[tuple[str, bool], list[tuple[Scene, bool]]] = {}
+    groups: dict[tuple[str, bool], list[Scene]] = {}
     for trial in trials:
-        contact = bool(trial.outcome.contact)
-        groups.setdefault((trial.scene.scenario, contact), []).append((trial.scene, contact))
-    kept = []
-    for _, group in sorted(groups.items()):
-        unseen = (pair for pair in group if not _touched_early(pair[0]))
-        kept.append(list(itertools.islice(unseen, each)))
-    return [pair for pairs in itertools.zip_longest(*kept) for pair in pairs if pair is not None]
+        key = trial.scene.scenario, bool(trial.outcome.contact)
+        groups.setdefault(key, []).append(trial.scene)
+    late = [
+        zip(itertools.repeat(contact), (s for s in group if not early(s)), range(each))
+        for (_, contact), group in sorted(groups.items())
+    ]
+    for row in itertools.zip_longest(*late):
+        yield from ((s, contact, number) for contact, s, number in filter(None, row))
 
 
-def _touched_early(scene: Scene) -> bool:
-    return cut_trial(scene, simulate(scene, frames=OBSERVED_FRAMES)).observed_contact
-
-
-def measure(scene: Scene, contact: bool) -> ROW:
+def measure(scene: Scene, contact: bool, number: int) -> ROW:
     """Return what is measured of one trial."""
     engine, model = make_engine(), build_model("seeing-simulation", samples=SAMPLES)
     motion = Motion(scene, simulate(scene, frames=OBSERVED_FRAMES))
     batch = _batch(motion, model.spec)
-    start = time.process_time()
-    seen = model.see(batch)[0]  # type: ignore[attr-defined]
-    seeing = time.process_time() - start
-    rollout = model.imagine(batch, SAMPLES, 0)
+    seen: SeenTrial = model.see(batch)[0]  # type: ignore[attr-defined]
     true = cut_trial(scene, motion.trajectory)
-    found = simulate_contacts(true, NoiseLevels(), 1.0, SAMPLES, 0, engine)
+
+    def answer(trial: Any, levels: NoiseLevels, samples: int) -> float:
+        return float(np.mean(simulate_contacts(trial, levels, 1.0, samples, 0, engine)))
+
     row: ROW = {
         "stimulus": scene.name,
         "version": VERSION,
         "scenario": scene.scenario,
         "contact": contact,
-        "fitted": float(np.mean(rollout.contact)),
-        "true": float(np.mean(found)),
-        "seconds": seeing,
+        "looked at": number < LOOKED_AT.get(scene.scenario, 1),
+        "fitted": float(np.mean(model.imagine(batch, SAMPLES, 0).contact)),
+        "true": answer(true, NoiseLevels(), SAMPLES),
+        "true, no noise": answer(true, STILL, 1),
         "note": seen.note,
     }
+    others = {"true": motion}
     if seen.trial is not None:
+        row["fitted, no noise"] = answer(seen.trial, STILL, 1)
         gap = gap_in_constant_motion(seen.trial.scene, seen.trial.state, FRAMES_AHEAD)
-        row["constant motion"] = float(gap <= 0 or seen.trial.observed_contact)
+        row["fitted, constant motion"] = float(gap <= 0 or seen.trial.observed_contact)
         row["objects"] = _errors(seen, motion)
+        others["fitted"] = fitted_motion(seen)
+    for name, observed in others.items():
+        row[f"{name}, DPI-Net"] = _dpi(observed)
+        row[f"{name}, state-trees"] = _trees(observed, scene.scenario)
     return row
 
 
 def _batch(motion: Motion, spec: Any) -> Batch:
-    """Return the observed frames of one motion as the model gets them."""
-    frames = np.array(spec.context_frames(), np.int64)
-    name = motion.scene.name
+    """Return the observed frames of one motion that the model looks at."""
+    frames, name = np.array(FRAMES, np.int64), motion.scene.name
     reader = MotionRenderer(
         {name: motion}, spec.inputs, spec.image_size, spec.objects, {name: "redyellow"}
     )
     arrays = {key: value[None] for key, value in reader.read(name, frames).items()}
+    return Batch((name,), frames[None], np.ones((1, len(frames)), np.bool_), **arrays)
+
+
+def fitted_motion(seen: SeenTrial) -> Motion:
+    """Return what was seen as a motion of the observed frames, without contacts.
+
+    Objects move evenly between the frames in which they are seen; what is not seen in the last one
+    is where the model takes it to be. The movable object that is the first to move counts as the
+    one that is pushed.
+    """
+    assert seen.trial is not None
+    scene, state = seen.trial.scene, seen.trial.state
+    times = np.arange(OBSERVED_FRAMES)
+    poses = []
+    for i, track in enumerate(seen.tracks):
+        last = track.frames[-1] == LAST_OBSERVED
+        frames = [*track.frames[: len(track.frames) - last], LAST_OBSERVED]
+        placed = track.placed[: len(frames) - 1]
+        places = np.array([*(p.position for p in placed), state.positions[i]])
+        quaternion = np.roll(state.rotations[i], -1)
+        turns = Rotation.concatenate(
+            [*(Rotation.from_matrix(p.rotation) for p in placed), Rotation.from_quat(quaternion)]
+        )
+        within = np.clip(times, frames[0], LAST_OBSERVED)
+        moved = np.column_stack([np.interp(within, frames, axis) for axis in places.T])
+        turned = Slerp(frames, turns)(within) if len(frames) > 1 else turns[np.zeros_like(times)]
+        poses.append((moved, turned))
+    positions = np.stack([moved for moved, _ in poses], axis=1)
+    velocities = np.diff(positions, axis=0, prepend=positions[:1]) / FRAME_TIME
+    spins = np.zeros_like(velocities)
+    for i, (_, turned) in enumerate(poses):
+        spins[1:, i] = (turned[1:] * turned[:-1].inv()).as_rotvec() / FRAME_TIME
+    velocities[-1], spins[-1] = state.velocities, state.angular_velocities
+    rotations = np.stack([np.roll(turned.as_quat(), 1, axis=1) for _, turned in poses], axis=1)
+    trajectory = Trajectory(
+        positions.astype(np.float32),
+        rotations.astype(np.float32),
+        velocities.astype(np.float32),
+        spins.astype(np.float32),
+        np.zeros((OBSERVED_FRAMES, 0, 3), np.float32),
+        np.full(OBSERVED_FRAMES, np.nan, np.float32),
+        Contacts.empty(),
+        False,
+        "fitted",
+    )
+    speeds = np.linalg.norm(velocities, axis=2)
+    speeds[:, [body.kinematic for body in scene.bodies]] = 0.0
+    first = np.where((speeds > 0.1).any(axis=0), (speeds > 0.1).argmax(axis=0), OBSERVED_FRAMES)
+    probe = scene.bodies[int(first.argmin())].name if first.min() < OBSERVED_FRAMES else None
+    roles = Roles(scene.roles.agent, scene.roles.patient, probe)
+    return Motion(replace(scene, roles=roles), trajectory)
+
+
+def _state_batch(motion: Motion, spec: Any) -> Batch:
+    frames = np.array(spec.context_frames(), np.int64)
     valid = np.ones((1, len(frames)), np.bool_)
-    return Batch((name,), frames[None], valid, **arrays)
+    return Batch((motion.scene.name,), frames[None], valid, state=(motion,))
+
+
+def _dpi(motion: Motion) -> float:
+    """Return the answer of DPI-Net, by its distance at the end."""
+    model = build_model("dpi")
+    return float(model.imagine(_state_batch(motion, model.spec), 1, 0).end[0, 0] <= 0)
+
+
+def _trees(motion: Motion, scenario: str) -> float:
+    """Return the answer of `state-trees`, fitted to 500 own trials of the scenario."""
+    model = build_model("state-trees")
+    readouts = find_readouts(model)
+    readout = None if readouts is None else readouts.find(Readout.OBSERVED, scenario)
+    assert readout is not None
+    features = model.encode(_state_batch(motion, model.spec))
+    return float(readout.fitted.probability(features.reshape(1, -1))[0])
+
+
+def read_rows(path: Path) -> dict[str, ROW]:
+    """Return what is already measured, by stimulus."""
+    if not path.exists():
+        return {}
+    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    return {row["stimulus"]: row for row in rows if row["version"] == VERSION}
 
 
 def _errors(seen: SeenTrial, motion: Motion) -> list[ROW]:
@@ -136,7 +248,6 @@ def _errors(seen: SeenTrial, motion: Motion) -> list[ROW]:
                 "shape": found.shape == body.shape,
                 "center": float(np.linalg.norm(center - expected)),
                 "velocity": float(np.linalg.norm(state.velocities[other] - true.velocities[index])),
-                "pair": f"{body.shape} as {found.shape}",
             }
         )
     return rows
@@ -146,18 +257,27 @@ def _center(body: Body, position: Any, rotation: Any) -> Any:
     return position + rotate_vectors(rotation, body_mass(body).center)
 
 
-def read_rows(path: Path) -> dict[str, ROW]:
-    """Return what is already measured, by stimulus."""
-    if not path.exists():
-        return {}
-    rows = [json.loads(line) for line in path.read_text().splitlines()]
-    return {row["stimulus"]: row for row in rows if row["version"] == VERSION}
+# Tables.
+
+NAMES = {
+    "true": "true state",
+    "true, no noise": "true state, no noise",
+    "fitted": "fitted state",
+    "fitted, no noise": "fitted state, no noise",
+    "true, DPI-Net": "DPI-Net, true states",
+    "fitted, DPI-Net": "DPI-Net, fitted states",
+    "true, state-trees": "state-trees, true states",
+    "fitted, state-trees": "state-trees, fitted states",
+    "fitted, constant motion": "constant motion, fitted state",
+    "exchanged": "fits exchanged",
+}
+"""Names of the predictions in the tables, by column of the rows."""
 
 
-def accuracy(p: Any, contact: Any) -> float:
-    """Return the fraction of right answers; P = 1/2 counts half."""
-    p = np.asarray(p, float)
-    return float(np.mean(np.where(p == 0.5, 0.5, (p > 0.5) == np.asarray(contact, bool))))
+def right(p: Any, contact: Any) -> NDArray[np.float64]:
+    """Return 1 for right answers, 0 for wrong ones, and 1/2 for P = 1/2 or none."""
+    p = np.nan_to_num(np.asarray(p, float), nan=0.5)
+    return np.where(p == 0.5, 0.5, (p > 0.5) == np.asarray(contact, bool))
 
 
 def area(p: Any, contact: Any) -> float:
@@ -169,45 +289,104 @@ def area(p: Any, contact: Any) -> float:
     return float(np.mean((difference > 0) + 0.5 * (difference == 0)))
 
 
-def tables(rows: list[ROW]) -> str:
-    """Return both tables as Markdown."""
-    table = pd.DataFrame(rows)
-    parts = [(name, part) for name, part in table.groupby("scenario")] + [("all", table)]
-    answers, errors = [], []
-    for name, part in parts:
-        contact = part["contact"]
-        moving = part["constant motion"].fillna(0.5)
-        spread = np.sqrt(
-            accuracy(part["fitted"], contact) * (1 - accuracy(part["fitted"], contact))
-        )
+def _exchanged(table: pd.DataFrame) -> pd.Series:
+    """Return for each trial how often the answers for the others of its scenario are right."""
+    found = pd.Series(np.nan, table.index)
+    for _, part in table.groupby("scenario"):
+        for i in part.index:
+            others = part.drop(i)
+            if len(others):
+                same = np.full(len(others), part.loc[i, "contact"])
+                found[i] = right(others["fitted"], same).mean()
+    return found
+
+
+def tables(rows: Sequence[ROW]) -> str:
+    """Return all tables as Markdown."""
+    table = pd.DataFrame(list(rows))
+    hits = pd.DataFrame({name: right(table[name], table["contact"]) for name in list(NAMES)[:-1]})
+    hits["exchanged"] = _exchanged(table)
+    groups = [*table.groupby("scenario").groups.items(), ("all", table.index)]
+    answers, others, errors = [], [], []
+    for name, chosen in groups:
+        part, hit = table.loc[chosen], hits.loc[chosen]
+        agrees = right(part["fitted"], part["true"] > 0.5)
         answers.append(
             {
                 "scenario": name,
                 "trials": len(part),
-                "fitted": f"{accuracy(part['fitted'], contact):.3f}",
-                "se": f"{spread / np.sqrt(len(part)):.3f}",
-                "AUC": f"{area(part['fitted'], contact):.3f}",
-                "true state": f"{accuracy(part['true'], contact):.3f}",
-                "AUC, true state": f"{area(part['true'], contact):.3f}",
-                "agreement": f"{accuracy(part['fitted'], part['true'] > 0.5):.3f}",
+                **{f"{NAMES[k]} (se)": _mean(hit[k]) for k in ("fitted", "true")},
+                "AUC, fitted": f"{area(part['fitted'], part['contact']):.3f}",
+                "AUC, true": f"{area(part['true'], part['contact']):.3f}",
+                "agreement": f"{agrees.mean():.3f}",
                 "change of P": f"{(part['fitted'] - part['true']).abs().mean():.3f}",
-                "constant motion": f"{accuracy(moving, contact):.3f}",
             }
         )
+        columns = {NAMES[k]: f"{hit[k].mean():.3f}" for k in NAMES if k not in ("fitted", "true")}
+        others.append({"scenario": name, **columns})
         objects = pd.DataFrame([o for listed in part["objects"].dropna() for o in listed])
-        agent, others = objects[objects["agent"]], objects[~objects["agent"]]
+        agent, rest = objects[objects["agent"]], objects[~objects["agent"]]
         errors.append(
             {
                 "scenario": name,
                 "agent, centre, cm": _quantiles(100 * agent["center"]),
                 "agent, velocity, m/s": _quantiles(agent["velocity"]),
-                "others, centre, cm": _quantiles(100 * others["center"]),
+                "others, centre, cm": _quantiles(100 * rest["center"]),
                 "shape right": f"{int(objects['shape'].sum())} of {len(objects)}",
-                "seconds, median": f"{part['seconds'].median():.1f}",
-                "with a note": int((part["note"] != "").sum()),
+                "trials with a note": int((part["note"] != "").sum()),
             }
         )
-    return f"{_markdown(answers)}\n\n{_markdown(errors)}\n"
+    fresh = hits.index[~table["looked at"]]
+    compared = [("fitted", name) for name in NAMES if name != "fitted"]
+    compared.append(("fitted, state-trees", "true, state-trees"))
+    differences = [
+        {
+            "accuracy of": NAMES[a],
+            "minus": NAMES[b],
+            f"all ({len(hits)})": _mean(hits[a] - hits[b]),
+            f"not looked at before ({len(fresh)})": _mean((hits[a] - hits[b])[fresh]),
+        }
+        for a, b in compared
+    ]
+    parts = [answers, others, differences, _people(table), errors]
+    return "\n\n".join(map(_markdown, parts)) + "\n"
+
+
+def _people(table: pd.DataFrame) -> list[ROW]:
+    """Return likeness to people over all stimuli, by `physion.compare`."""
+    chosen = [name for name in NAMES if name in table]
+    given = {
+        NAMES[name]: dict(zip(table["stimulus"], table[name].fillna(0.5), strict=True))
+        for name in chosen
+    }
+    scores = physion.compare(given, humans="official").scores
+    scores = scores[scores["scenario"] == "pooled"].set_index("model")
+    columns = {
+        "accuracy": "accuracy",
+        "r": "r with people",
+        "kappa_from_averages": "kappa with people",
+        "r_beyond_outcome": "r beyond the outcome",
+    }
+    return [
+        {
+            "predictions": name,
+            **{title: _interval(scores.loc[name], key) for key, title in columns.items()},
+        }
+        for name in [*given, TWO_PEOPLE]
+    ]
+
+
+def _interval(row: pd.Series, name: str) -> str:
+    """Return a score with its 95 % interval."""
+    if pd.isna(row[name]):
+        return "-"
+    return f"{row[name]:.3f} ({row[f'{name}_low']:.3f} to {row[f'{name}_high']:.3f})"
+
+
+def _mean(values: Any) -> str:
+    """Return mean and standard error."""
+    values = np.asarray(values, float)
+    return f"{values.mean():.3f} ({values.std(ddof=1) / np.sqrt(len(values)):.3f})"
 
 
 def _quantiles(values: pd.Series) -> str:
@@ -216,33 +395,88 @@ def _quantiles(values: pd.Series) -> str:
     return f"{values.median():.2f} / {values.quantile(0.9):.2f}"
 
 
-def _markdown(rows: list[ROW]) -> str:
+def _markdown(rows: Sequence[ROW]) -> str:
     names = list(rows[0])
     lines = [names, ["---"] * len(names), *([str(row[name]) for name in names] for row in rows)]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
+def priors() -> str:
+    """Return what our own presets have, as Markdown: medians, and quantiles of the density."""
+    scenes = {
+        name: [physion.sample_scene(name, seed) for seed in range(PRIOR_SCENES)] for name in RIGID
+    }
+    bodies = {name: [body for s in made for body in _movable(s)] for name, made in scenes.items()}
+    every = [scene for made in scenes.values() for scene in made]
+    bodies["all"] = [body for s in every for body in _movable(s)]
+    bodies["flat targets"] = [
+        target
+        for s in every
+        if (target := s.bodies[s.index(s.roles.patient)]).kinematic
+        and target.scale[2] < FLAT_TARGET
+    ]
+    bodies["ramps"] = [b for s in every for b in s.bodies if b.shape.startswith(RAMP)]
+    bodies["rings"] = [body for body in bodies["all"] if body.shape == "torus"]
+    rows = [{"bodies": name, **_prior_row(chosen)} for name, chosen in bodies.items()]
+    used = (
+        f"The model takes {DENSITY:g} kg/m3, {RING_DENSITY:g} for rings, friction "
+        f"{SURFACE.dynamic_friction:g} and restitution {SURFACE.restitution:g}."
+    )
+    return f"{_markdown(rows)}\n\n{used}\n"
+
+
+def _movable(scene: Scene) -> Iterable[Body]:
+    return (body for body in scene.bodies if not (body.kinematic or body.scenery))
+
+
+def _prior_row(bodies: Sequence[Body]) -> ROW:
+    density = [body.mass / float(np.prod(body.scale)) for body in bodies]
+    low, middle, high = np.quantile(density, (0.1, 0.5, 0.9))
+    row = {"number": len(bodies), "mass / product of scales, kg/m3": f"{middle:.1f}"}
+    row["10 % to 90 %"] = f"{low:.1f} to {high:.1f}"
+    for name in ("static_friction", "dynamic_friction", "restitution"):
+        values = [getattr(body.contact, name) for body in bodies]
+        row[name.replace("_", " ")] = f"{np.median(values):.2f}"
+    return row
+
+
 def main() -> None:
     """Measure what is missing, and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--each", type=int, default=5)
     parser.add_argument("--known", action="store_true")
     parser.add_argument("--write", action="store_true")
+    parser.add_argument("--priors", action="store_true")
     options = parser.parse_args()
+    if options.priors:
+        print(priors())
+    if options.folder is None:
+        return
     options.folder.mkdir(parents=True, exist_ok=True)
     path = options.folder / "seeing.jsonl"
     known = read_rows(path)
-    rows = list(known.values()) if options.known else []
-    for scene, contact in [] if options.known else chosen_trials(options.each):
+
+    def keep(row: ROW) -> None:
+        known[row["stimulus"]] = row
+        with path.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+
+    def early(scene: Scene) -> bool:
         if scene.name not in known:
-            known[scene.name] = measure(scene, contact)
-            with path.open("a") as file:
-                file.write(json.dumps(known[scene.name]) + "\n")
+            seen = cut_trial(scene, simulate(scene, frames=OBSERVED_FRAMES))
+            if seen.observed_contact:
+                keep({"stimulus": scene.name, "version": VERSION, "early": True})
+        return "early" in known.get(scene.name, {})
+
+    rows = [row for row in known.values() if "early" not in row] if options.known else []
+    for scene, contact, number in [] if options.known else chosen_trials(options.each, early):
+        if scene.name not in known:
+            keep(measure(scene, contact, number))
             row = known[scene.name]
             print(
                 f"{scene.scenario} {scene.name}: contact {contact}, fitted {row['fitted']:.2f}, "
-                f"true state {row['true']:.2f}, {row['seconds']:.1f} s; {row['note']}",
+                f"true state {row['true']:.2f}; {row['note']}",
                 flush=True,
             )
         rows.append(known[scene.name])
@@ -253,7 +487,7 @@ def main() -> None:
         RESULTS.write_text(
             f"# Seeing by simulation\n\n`python benchmarks/models/seeing.py FOLDER`, {len(rows)} "
             f"trials, {today}, version {VERSION} of the model, {SAMPLES} simulations per trial.\n\n"
-            f"{text}"
+            f"{text}\n{priors()}"
         )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,23 +12,30 @@ import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
-from physion import sample_scene
+from physion import evaluate, sample_scene
 from physion.clips.batch import Batch, Motion, Provenance, Rollout, Spec
+from physion.clips.clips import observed_source
 from physion.clips.rendered import MotionRenderer, object_ids
+from physion.compute.local import SerialExecutor
 from physion.core.errors import BadInputError
 from physion.models.build import build_model
 from physion.models.interface import Model
 from physion.models.seeing.bodies import find, follow
 from physion.models.seeing.pixels import Rays, SeenFrame, floor_height, picture_of
-from physion.models.seeing.scenes import Track, see_trial, velocities
+from physion.models.seeing.scenes import Track, joints_of, see_trial, velocities
 from physion.models.seeing.simulation import SeeingSimulation
 from physion.models.seeing.solids import Placed, Prior, cost_of, residuals, solid
 from physion.numerics.rotations import rotation_matrices
 from physion.physics.engine import simulate
 from physion.readout.decisions import Decided
 from physion.readout.features import Imagined, imagine_clips, write_features
+from physion.readout.imagined import imagine_with
 from physion.readout.tables import ScenarioPredictions, make_table
-from physion.scenes.scene import Body, Camera, Push, Roles, Scene
+from physion.scenes.scene import Body, Camera, Joint, Push, Roles, Scene
+from physion.trials.dataset import Dataset
+from physion.trials.official.export_folder import export_official
+from physion.trials.official.import_folder import import_official
+from support.official_hand_made import RIGID, make_dataset
 
 TURNED = (math.cos(0.3), 0.0, 0.0, math.sin(0.3))
 """Rotation by 0.6 about the vertical."""
@@ -198,8 +206,9 @@ def test_what_is_predicted_follows_from_what_is_seen(rolling: Batch) -> None:
 def test_an_agent_that_is_never_seen_leaves_the_answer_open(rolling: Batch) -> None:
     hidden = np.where(rolling.ids == 1, 0, rolling.ids).astype(np.uint8)
     model = build_model("seeing-simulation", samples=4, image_size=128)
-    rollout = model.imagine(replace(rolling, ids=hidden), 4, 0)
-    assert rollout.contact.sum() == 2 and rollout.notes == ("the agent is never seen",)
+    batch = replace(rolling, ids=hidden)
+    assert model.imagine(batch, 4, 0).contact.sum() == 2
+    assert model.notes(batch) == ["the agent is never seen"]
 
 
 def test_bad_input_says_what_is_wrong(rolling: Batch) -> None:
@@ -224,7 +233,13 @@ class Noted(Model):
     spec = Spec(inputs=(), future=0)
 
     def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
-        return Rollout(contact=np.ones((2, samples), np.bool_), notes=("", "é unseen"))
+        return Rollout(contact=np.ones((2, samples), np.bool_))
+
+    def predict(self, batch: Batch) -> NDArray[np.float64]:
+        return np.full(len(batch), 0.5)
+
+    def notes(self, batch: Batch) -> list[str]:
+        return ["é unseen" if trial == "b" else "" for trial in batch.trials]
 
     def provenance(self) -> Provenance:
         return Provenance("noted", "none")
@@ -250,6 +265,78 @@ def test_notes_of_a_model_reach_the_table(tmp_path: Any) -> None:
     )  # fmt: skip
     table = make_table([part], Noted().provenance(), index)
     assert table["note"].tolist() == ["fit", "fit; é unseen"]
+
+
+def test_what_hides_the_lower_end_of_an_object_does_not_shorten_it() -> None:
+    """A domino behind another one, of which only the upper part is seen, stands on the floor."""
+    bodies = (
+        Body("ball", "sphere", (-1.0, 0.0, 0.0), (0.3, 0.3, 0.3)),
+        Body("box", "cube", (0.7, 0.0, 0.0), (0.3, 0.3, 0.3)),
+        Body("domino", "cube", (-0.2, 0.6, 0.0), (0.4, 0.1, 0.8), mass=2.0),
+        Body("wall", "cube", (-0.2, 0.2, 0.0), (0.9, 0.1, 0.5), mass=9.0),
+    )
+    batch = batch_of(replace(scene(), bodies=bodies))
+    seen = see_trial("a", batch.frames[0], batch.ids[0], batch.depth[0], batch.camera[0])
+    lowest = {track.number: track.placed[0].extent_z() for track in seen.tracks}
+    assert lowest[3] == pytest.approx((0.0, 0.8), abs=0.01)
+
+
+def test_a_pole_is_joined_to_its_base_until_they_move_apart() -> None:
+    base = Placed(solid("cylinder"), np.zeros(3), np.eye(3), np.array([0.4, 0.4, 0.2]))
+    pole = Placed(
+        solid("cylinder"), np.array([0.0, 0.0, 0.2]), np.eye(3), np.array([0.1, 0.1, 0.8])
+    )
+    bodies = [Body("3", "cylinder", (0.0, 0.0, 0.0)), Body("4", "cylinder", (0.0, 0.0, 0.2))]
+    tracks = [Track(3, (0, 44), (base, base)), Track(4, (0, 44), (pole, pole))]
+    assert joints_of(tracks, bodies) == (Joint("3", "4"),)
+    fallen = replace(pole, position=np.array([0.3, 0.0, 0.0]))
+    assert joints_of([tracks[0], Track(4, (0, 44), (pole, fallen))], bodies) == ()
+    wide = replace(pole, scale=np.array([0.4, 0.4, 0.8]))
+    assert joints_of([tracks[0], Track(4, (0, 44), (wide, wide))], bodies) == ()
+
+
+@pytest.fixture(scope="module")
+def imported(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """A trial that was written as an official HDF5 file and imported again."""
+    folder = tmp_path_factory.mktemp("seeing")
+    trials = make_dataset(folder / "trials", touch=False)
+    export_official(trials, folder / "official", executor=SerialExecutor())
+    import_official(folder / "official", folder / "imported", executor=SerialExecutor())
+    return Dataset(folder / "imported")
+
+
+@pytest.mark.slow
+def test_an_imported_official_trial_is_seen_and_answered(imported: Dataset, tmp_path: Path) -> None:
+    model: Any = build_model("seeing-simulation")
+    source = observed_source(imported, model.spec)
+    (seen,) = model.see(source.context([RIGID]))
+    true = imported.trial(RIGID)
+    roles = true.scene.roles
+    # Later these bodies, whose motion is made up, turn through the floor.
+    for name, number in ((roles.agent, 1), (roles.probe, 3)):
+        index = true.scene.index(str(name))
+        body, state = true.scene.bodies[index], true.trajectory.state(0)
+        pose = state.positions[index], rotation_matrices(state.rotations[index])
+        expected = Placed(solid(body.shape), *pose, np.array(body.scale))
+        found = next(track.placed[0] for track in seen.tracks if track.number == number)
+        assert found.solid.name == body.shape
+        assert np.linalg.norm(found.middle() - expected.middle()) < 0.005
+    done = evaluate(
+        "seeing-simulation", imported, tmp_path, options={"samples": 4}, executor=SerialExecutor()
+    )
+    (row,) = done.predictions.to_dict("records")
+    assert (row["stimulus"], row["readout"]) == (RIGID, "observed+simulated")
+    assert row["p_contact"] in {0.1, 0.3, 0.5, 0.7, 0.9}, "k + 1/2 of 4 + 1"
+
+
+@pytest.mark.slow
+def test_the_viewer_gets_pictures_of_what_follows(imported: Dataset) -> None:
+    (shown,) = imagine_with(imported, ["seeing-simulation"], {"samples": 2})([RIGID])[RIGID]
+    pictures = shown.shown["rgb"]
+    assert pictures.shape[1:] == (128, 128, 3) and len(pictures) == len(shown.frames)
+    assert shown.frames[0] == 46 and shown.probability in {0.5 / 3, 1.5 / 3, 2.5 / 3}
+    red = (pictures[0, ..., 0] > 90) & (pictures[0, ..., 1] < 60)
+    assert red.any(), "the agent"
 
 
 @pytest.mark.slow

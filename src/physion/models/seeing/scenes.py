@@ -2,7 +2,8 @@
 
 1. Every object is fitted in frame 0, or where most of it is seen (`bodies.find`).
 2. Objects that rest on others are fitted again from the bottom up: their lower end is expected at
-   the top of what they stand on, and their centre above and below their neighbours.
+   the top of what they stand on, and their centre above and below their neighbours. What rests on
+   nothing that is seen reaches down to the floor.
 3. Every object is followed through the later frames (`bodies.follow`).
 4. Velocities of the centres of mass follow from the last three poses, at the times t1, t2, t3. With
    the differences v12, v23 and a = (v23 - v12) / ((t3 - t1) / 2): if a is within 4 m/s2 of gravity
@@ -13,8 +14,10 @@
    ball that is on something has w = min(v / r, 7, 2.5 (v0 - v) / r), with v0 its largest speed:
    friction turns it until it rolls.
 5. What cannot be seen is expected as it is in our own presets: one density per product of scales,
-   one friction, and flat targets, ramps and very large things that do not move. Nothing is
-   concluded from an object that has not moved so far. Joints are not looked for.
+   a lower one of rings, one friction, and flat targets, ramps and very large things that do not
+   move. Nothing is concluded from an object that has not moved so far. A pole, an upright cylinder
+   that is much higher than wide, is expected to be joined to what it stands on and to what lies on
+   it, unless they have moved apart.
 """
 
 from __future__ import annotations
@@ -32,7 +35,7 @@ from physion.core.errors import BadInputError
 from physion.models.gaps import gap_of_bodies
 from physion.models.noisy_simulation import ObservedTrial
 from physion.models.seeing.bodies import find, follow, moved_with, refine
-from physion.models.seeing.pixels import LEAST_PIXELS, SeenFrame, floor_height, picture_of
+from physion.models.seeing.pixels import LEAST_PIXELS, Rays, SeenFrame, floor_height, picture_of
 from physion.models.seeing.solids import FREE, POSE, Placed, Prior, cost_of, fit
 from physion.physics.rigid.bodies import body_mass
 from physion.physics.trajectory import State
@@ -43,6 +46,7 @@ from physion.scenes.scene import (
     Body,
     Camera,
     Ending,
+    Joint,
     Look,
     Roles,
     Scene,
@@ -55,11 +59,11 @@ MOST_OBJECTS = 15
 """Largest number of objects of a trial."""
 CLEAR_PIXELS = 40
 """Pixels in frame 0 with which an object is fitted there."""
-DENSITY = 32.0
-"""kg per product of scales (m3): median over the movable bodies of 12 scenes of the default preset
-of each rigid scenario of ours."""
+DENSITY, RING_DENSITY = 32.0, 4.0
+"""kg per product of scales (m3): medians over the movable bodies, and the rings among them, of 12
+scenes of the default preset of each rigid scenario (benchmarks/models/seeing.py --priors)."""
 SURFACE = SurfaceMaterial(0.5, 0.5, 0.0)
-"""Friction and restitution: the same median, rounded."""
+"""Friction and restitution: the same medians, rounded."""
 TARGET_SURFACE = SurfaceMaterial(1.0, 0.1, 0.0)
 """Surface of flat targets in our presets."""
 FLAT_TARGET, LARGE = 0.15, 3.0
@@ -69,6 +73,14 @@ VESSELS = ("bowl", "pipe", "torus")
 RAMP = "ramp_with_platform"
 RAMP_FRICTION = 0.01
 """Friction of the ramps of our presets."""
+HOLE = 0.6
+"""Width of what may go through a ring, as a fraction of the width of the ring."""
+UPRIGHT = 0.98
+"""Cosine of the largest tilt of what stands upright."""
+POLE = 3.0
+"""Height of a cylinder, in widths, above which it is a pole."""
+APART = 0.02
+"""Metres by which objects have moved against each other that are not joined."""
 POOR_FIT = 0.1
 """Cost above which an object is called no shape of the library."""
 ON_TOP = 0.3
@@ -184,26 +196,33 @@ def see_trial(
 def _stacked(
     fits: Mapping[int, tuple[int, Placed]], pictures: Mapping[int, SeenFrame], floor: float
 ) -> dict[int, tuple[int, Placed]]:
-    """Fit resting objects on others again, from the bottom up."""
+    """Fit resting objects again, from the bottom up, so that they stand on something."""
     frames = sorted(pictures)
     result = dict(fits)
-    resting = [n for n in fits if fits[n][0] == frames[0] and _rests(n, fits[n][1], pictures)]
-    resting.sort(key=lambda n: float(result[n][1].middle()[2]))
-    for number in resting:
+    first = [n for n in fits if fits[n][0] == frames[0]]
+    first.sort(key=lambda n: float(result[n][1].middle()[2]))
+    resting = [n for n in first if _rests(n, fits[n][1], pictures)]
+    for number in first:
         placed = result[number][1]
         bottom, height = placed.extent_z()[0], float(placed.middle()[2])
         below = [
             (top, other)
             for other in resting
-            if other != number
+            if number in resting
+            and other != number
             and (top := result[other][1].extent_z()[1]) < min(bottom + ON_TOP, height)
             and top > bottom - ON_TOP
-            and _overlap(placed, result[other][1])
+            and _carries(result[other][1], placed)
         ]
         if not below:
+            tops = (result[n][1].extent_z()[1] for n in resting if _carries(result[n][1], placed))
+            level = max((top for top in tops if top < bottom), default=floor)
+            longer = _grounded(placed, pictures[frames[0]].rays(number), level)
+            if number in resting or _rests(number, longer, pictures):
+                result[number] = (frames[0], longer)
             continue
         top, support = max(below)
-        if result[support][1].solid.name in ("bowl", "torus", "pipe", RAMP):
+        if result[support][1].solid.name.startswith((*VESSELS, RAMP)):
             continue
         above = [
             n for n in resting if n != number and _stands_on(result[n][1], placed)
@@ -215,6 +234,30 @@ def _stacked(
         if rays is not None:
             result[number] = (frames[0], refine([placed], rays, prior))
     return result
+
+
+def _carries(lower: Placed, upper: Placed) -> bool:
+    """Return whether an object can stand on another below it, and does not go through its hole."""
+    through = lower.solid.name == "torus"
+    through = through and upper.size()[:2].max() < HOLE * lower.size()[:2].min()
+    return lower is not upper and not through and _overlap(upper, lower)
+
+
+def _grounded(placed: Placed, rays: Rays | None, floor: float) -> Placed:
+    """Return a resting object with nothing close below it as one that reaches down to ``floor``.
+
+    What hides its lower end hides how long it is. It stays as it is where that does not fit.
+    """
+    low, high = placed.extent_z()
+    axis = int(np.argmax(np.abs(placed.rotation[2])))
+    if rays is None or low - floor < RAISED or abs(placed.rotation[2, axis]) < UPRIGHT:
+        return placed
+    scale, before = placed.scale.copy(), placed.middle()
+    scale[axis] *= (high - floor) / (high - low)
+    longer = replace(placed, scale=scale)
+    shift = before - longer.middle() - np.array([0, 0, (low - floor) / 2])
+    found = refine([moved_with(longer, shift)], rays, Prior(floor, floor, 3.0))
+    return found if found.cost < placed.cost + CHANGED else placed
 
 
 def _rests(number: int, placed: Placed, pictures: Mapping[int, SeenFrame]) -> bool:
@@ -370,6 +413,7 @@ def _observed(name: str, tracks: Sequence[Track], seen_floor: float, camera: F64
         bodies,
         Roles(str(AGENT_ID), str(PATIENT_ID)),
         Camera(_vec3(origin), _vec3(target), 2 * math.atan(1 / abs(float(projection[1, 1])))),
+        joints=joints_of(tracks, bodies),
         floor=floor,
         ending=Ending(),
     )
@@ -429,6 +473,7 @@ def _body(number: int, placed: Placed, floor: float) -> Body:
     surface = TARGET_SURFACE if flat else SURFACE
     if ramp:
         surface = SurfaceMaterial(RAMP_FRICTION, RAMP_FRICTION, 0.0)
+    density = RING_DENSITY if placed.solid.name == "torus" else DENSITY
     colors = {AGENT_ID: (1.0, 0.0, 0.0), PATIENT_ID: (1.0, 1.0, 0.0)}
     return Body(
         str(number),
@@ -436,11 +481,42 @@ def _body(number: int, placed: Placed, floor: float) -> Body:
         _vec3(placed.position),
         _vec3(placed.scale),
         _quaternion(placed.rotation),
-        max(1e-3, DENSITY * float(np.prod(placed.scale))),
+        max(1e-3, density * float(np.prod(placed.scale))),
         surface,
         kinematic=bool(flat or ramp or placed.size().max() > LARGE),
         look=Look(colors.get(number, (0.6, 0.6, 0.6))),
     )
+
+
+def joints_of(tracks: Sequence[Track], bodies: Sequence[Body]) -> tuple[Joint, ...]:
+    """Return the joints of poles with what they stand on, and with what lies on them."""
+    joints = []
+    movable = [t for t, body in zip(tracks, bodies, strict=True) if not body.kinematic]
+    for pole in movable:
+        placed = pole.placed[0]
+        size, upright = placed.size(), abs(float(placed.rotation[2, 2])) > UPRIGHT
+        if placed.solid.name != "cylinder" or not upright or size[2] < POLE * size[:2].max():
+            continue
+        for other in movable:
+            if other is pole or _moved_apart(pole, other):
+                continue
+            if _stands_on(placed, other.placed[0]):
+                joints.append(Joint(str(other.number), str(pole.number)))
+            elif _stands_on(other.placed[0], placed):
+                joints.append(Joint(str(pole.number), str(other.number)))
+    return tuple(joints)
+
+
+def _moved_apart(a: Track, b: Track) -> bool:
+    """Return whether one object has moved against another."""
+    shared = sorted(set(a.frames) & set(b.frames))
+    if not shared or shared[0] != a.frames[0] or shared[0] != b.frames[0]:
+        return True
+    places = []
+    for frame in (shared[0], shared[-1]):
+        first, second = (track.placed[track.frames.index(frame)] for track in (a, b))
+        places.append(second.rotation.T @ (first.middle() - second.middle()))
+    return bool(np.linalg.norm(places[1] - places[0]) > APART)
 
 
 def _resting_floor(tracks: Sequence[Track], seen: float) -> float:

@@ -32,10 +32,10 @@ from physion.models.seeing.scenes import SeenTrial, see_trial
 from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine, simulate
 from physion.rendering.renderer import Renderer
 
-VERSION = 2
+VERSION = 4
 """To be raised with every change of the code that can alter a prediction."""
 KEPT = 16
-"""Trials whose scenes are kept in memory."""
+"""Trials whose scenes are kept in memory, besides the last batch."""
 SHOWN_SIZE = 128
 """Pixels per side of the pictures for the viewer."""
 
@@ -90,7 +90,14 @@ class SeeingSimulation(Model):
                 f"{self.settings.model} needs masks, depth and camera of every trial (inputs ids, "
                 "depth, camera)"
             )
-        return [self._see(context, row) for row in range(len(context))]
+        seen = [self._see(context, row) for row in range(len(context))]
+        while len(self._seen) > max(KEPT, len(seen)):
+            self._seen.popitem(last=False)
+        return seen
+
+    def notes(self, batch: Batch) -> list[str]:
+        """Return what was not seen, or not well, of each trial."""
+        return [one.note for one in self.see(batch)]
 
     def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
         """Simulate every trial ``samples`` times; ``contact`` says whether agent and patient touch.
@@ -110,7 +117,7 @@ class SeeingSimulation(Model):
         if arguments.get("show"):
             pictures = np.stack([self._pictures(one.trial, context.future) for one in seen])
             shown["rgb"] = np.repeat(pictures[:, None], samples, axis=1)
-        return Rollout(contact=contact, shown=shown, notes=tuple(one.note for one in seen))
+        return Rollout(contact=contact, shown=shown)
 
     @property
     def engine(self) -> Engine:
@@ -145,8 +152,6 @@ class SeeingSimulation(Model):
         if key not in self._seen:
             name, frames = context.trials[row], context.frames[row]
             self._seen[key] = see_trial(name, frames, *arrays)
-            while len(self._seen) > KEPT:
-                self._seen.popitem(last=False)
         return self._seen[key]
 
     def _pictures(self, trial: ObservedTrial | None, steps: int) -> Any:
