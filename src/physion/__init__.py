@@ -8,7 +8,8 @@ The public names are imported when they are first used, so that ``import physion
 - `official`: the data of the original study: scenes, recorded outcomes, answers of people.
 - `build_model`: build a model. `train`: train it. `evaluate`: predict the trials of a dataset.
 - `check`: test whether predictions depend on what they must not depend on.
-- `compare`: compare predictions with people. `run`: all of this in one call.
+- `compare`: compare predictions with people. `judge`: judge generated movies.
+- `run`: all of this in one call.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from physion.core.version import __version__
 if TYPE_CHECKING:
     from physion.clips.clips import clips
     from physion.data.official import official
+    from physion.judging.judge import judge
     from physion.models.build import build_model
     from physion.physics.engine import simulate
     from physion.physics.labels import label_contact
@@ -43,6 +45,7 @@ __all__ = [
     "compare",
     "evaluate",
     "generate",
+    "judge",
     "label_contact",
     "official",
     "run",
@@ -60,6 +63,7 @@ _MODULES = {
     "compare": "physion.report.compare",
     "evaluate": "physion.readout.evaluate",
     "generate": "physion.trials.making.generate",
+    "judge": "physion.judging.judge",
     "label_contact": "physion.physics.labels",
     "official": "physion.data.official",
     "run": "physion.pipeline",

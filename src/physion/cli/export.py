@@ -37,6 +37,7 @@ class Options:
         "lerobot",
         "features-request",
         "lmms-eval",
+        "conditioning",
         "card",
         "result-tables",
     ] = "official"
@@ -50,6 +51,7 @@ class Options:
     features-request: movies to be encoded elsewhere, their names, and a script that needs only
     torch; physion evaluate --features takes its result;
     lmms-eval: questions for language models with movies, as tasks of this harness;
+    conditioning: pictures, movies and a prompt from which movies are generated, for physion judge;
     card: README with Croissant metadata and a table for each split; result-tables: predictions with
     the names of scenarios that the notebooks of the study use."""
     split: Literal["training", "readout", "testing", "familiarization"] | None = None
@@ -157,6 +159,13 @@ def _trials(options: Options, out: Path, stages: Stages) -> int:
         from physion.trials.share.lmms_eval import export_lmms_eval
 
         paths = export_lmms_eval(
+            options.folder, out, verify=options.verify, progress=stages, **chosen
+        )
+        return _print_paths(paths, options.json)
+    if options.layout == "conditioning":
+        from physion.trials.share.conditioning import export_conditioning
+
+        paths = export_conditioning(
             options.folder, out, verify=options.verify, progress=stages, **chosen
         )
         return _print_paths(paths, options.json)

@@ -17,6 +17,7 @@ VERBS = {
     "evaluate": "train models and readouts on trials and write their predictions",
     "check": "test whether predictions depend on what follows, names, order or outcomes",
     "compare": "compare predictions with people",
+    "judge": "judge generated movies: contact, paths, permanence, against truth and people",
     "experiment": "run the experiment with people: init, serve, export",
     "view": "write a page that shows a dataset: movies, passes, motion in 3D",
     "export": "write the official layout, webdataset shards, or a dataset card",
@@ -41,6 +42,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "generate": (
         "physion generate trials --scenario collide --split readout --count 20",
         "physion generate trials --split all --full --workers 16",
+    ),
+    "judge": (
+        "physion judge movies trials",
+        "physion judge movies trials --scenario collide --out runs/collide --json",
     ),
     "replay": (
         "physion replay --scenario drop --limit 20",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -13,10 +14,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.files import write_atomic
 from physion.core.seeds import stable_hash
 from physion.trials.dataset import Dataset
 from physion.trials.files import IndexedFile
+from physion.trials.making.make import make_movies
 from physion.trials.share.questions import CONTACT, YES_NO, item_id, options_of
+from physion.trials.trial_file import Trial
 from physion.trials.video import encode_movie, read_chosen
 
 Shown = Literal["observed", "grey", "still"]
@@ -159,11 +163,33 @@ def _pictures(dataset: Dataset, trial: str, frames: Sequence[int]) -> NDArray[np
     if file is not None:
         file.check()
         return read_chosen(file.path, frames)
+    opened = _with_motion(dataset, trial)
+    shown = {int(frame): opened.render(frame, look="redyellow").color for frame in set(frames)}
+    return np.stack([np.asarray(shown[frame]) for frame in frames])
+
+
+def _with_motion(dataset: Dataset, trial: str) -> Trial:
     opened = dataset.trial(trial)
     if not np.isfinite(opened.trajectory.positions).all():
         raise BadInputError(f"trial {trial!r} has neither a movie in red and yellow nor a motion")
-    shown = {int(frame): opened.render(frame, look="redyellow").color for frame in set(frames)}
-    return np.stack([np.asarray(shown[frame]) for frame in frames])
+    return opened
+
+
+def true_movie(dataset: Dataset, trial: str, made: Path) -> Path:
+    """Return the full movie with a red agent and a yellow patient; render it if there is none.
+
+    It is then written to ``made``, if it is not there.
+    """
+    free = _row(dataset, trial)["look"] != "redyellow"
+    file = None if free else dataset.file(trial, "movie")
+    if file is not None:
+        file.check()
+        return file.path
+    if not made.is_file():
+        opened = _with_motion(dataset, trial)
+        renderer = opened.renderer(look="redyellow")
+        write_atomic(made, make_movies(renderer, opened.metadata.playback_rate)[0])
+    return made
 
 
 def frames_of(dataset: Dataset, item: Item, count: int | None = None) -> NDArray[np.uint8]:

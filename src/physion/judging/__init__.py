@@ -1,0 +1,1 @@
+"""Judgement of generated movies: what moves in them, and whether red touches yellow."""

@@ -1,0 +1,122 @@
+"""Page of judged movies: measures by seed, and generated movies next to the true ones."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from physion.core.html import Markup, joined, macros_of
+from physion.judging.judge import CARD, JUDGED, Judged
+from physion.judging.measure import COLUMNS
+from physion.report.html import (
+    MACROS,
+    PageMovies,
+    Section,
+    number,
+    paragraph,
+    plural,
+    render_document,
+)
+from physion.trials.video import encode_movie, open_movie, read_frames
+
+PAGE_BYTES = 15_000_000
+"""Largest size of a page with its movies."""
+MOST_SHOWN = 6
+"""Trials of a scenario whose movies are shown: those with a wrong outcome first."""
+_TRIALS = macros_of("physion.report", "trials.html")
+
+
+def verdict(judged: Judged) -> str:
+    """Return the state of a folder of movies in one line."""
+    missing, count = len(judged.missing), len(judged.movies)
+    state = "complete" if judged.complete else "not complete"
+    return (
+        f"{judged.card.model}: {state}, {count - missing} of {plural(count, 'movie')} judged by "
+        f"{judged.card.protocol}"
+    )
+
+
+def described(judged: Judged) -> pd.DataFrame:
+    """Return measures as texts: one row per measure, with mean and sd over the seeds."""
+    table = judged.seeds.set_index("seed")
+    meanings = {
+        "right": "fraction of all movies asked for that show the true outcome; a missing one does "
+        "not",
+        **COLUMNS,
+    }
+    rows = [
+        {
+            "measure": name,
+            "mean": number(table.loc["mean", name], 3),
+            "sd of seeds": number(table.loc["sd", name], 3),
+            "meaning": meaning,
+        }
+        for name, meaning in meanings.items()
+        if name in table
+    ]
+    return pd.DataFrame(rows)
+
+
+def judge_page(judged: Judged, generated: Path) -> str:
+    """Return the page: the verdict, measures, what is missing, movies of some trials.
+
+    ``generated``: folder of the movies.
+    """
+    card, table, missing = judged.card, described(judged), judged.missing
+    facts = {
+        "conditioning": card.conditioning,
+        "prompt": card.prompt,
+        "first frame": str(card.first_frame),
+        "seeds": ", ".join(card.seeds),
+    }
+    lead = joined(
+        [
+            paragraph(verdict(judged), "lead"),
+            _table([CARD, ""], pd.DataFrame(facts.items())),
+            _table(list(table.columns), table),
+        ]
+    )
+    sections = []
+    if len(missing):
+        rows = _table(["trial", "seed", "why"], missing[["trial", "seed", "status"]])
+        sections.append(Section("Missing movies, which count as wrong", rows))
+    left = PAGE_BYTES
+    for scenario, own in judged.movies[judged.movies["status"] == JUDGED].groupby("scenario"):
+        right = own["contact"].astype(bool) == own["true_contact"]
+        order = own.assign(right=right).sort_values(["right", "trial"], kind="stable")
+        cards = []
+        for row in order.drop_duplicates("trial").head(MOST_SHOWN).itertuples():
+            trial, seed = str(row.trial), str(row.seed)
+            movie, left = _side_by_side(
+                generated / seed / f"{trial}.mp4", judged.true[trial], card.first_frame, left
+            )
+            words = ["contact" if yes else "no contact" for yes in (row.contact, row.true_contact)]
+            kind = "right" if row.right else "wrong"
+            outcome = _TRIALS.outcome("contact" if row.contact else "none", words[0])
+            name = f"{trial}, seed {seed}. Truly {words[1]}: {kind}."
+            cards.append(_TRIALS.card("generated | true", outcome, movie, "", name))
+        sections.append(Section(str(scenario), Markup(_TRIALS.cards(cards, "pairs"))))
+    return render_document(f"Movies of {card.model}", lead, sections)
+
+
+def _table(header: list[str], rows: pd.DataFrame) -> Markup:
+    return Markup(MACROS.table(header, [("", rows.astype(str).to_numpy().tolist())]))
+
+
+def _side_by_side(generated: Path, true: Path, first: int, left: int) -> tuple[Markup, int]:
+    """Return a generated movie and the true one next to it, and the bytes that are left."""
+    truth = read_frames(true)
+    with open_movie(generated) as one, open_movie(true) as other:
+        step = one.properties.rate / other.properties.rate
+        rate = round(other.properties.rate)
+    frames = read_frames(generated, size=(truth.shape[1], truth.shape[2]))
+    truth = truth[min(first, len(truth) - 1) :]
+    at = np.minimum(np.round(np.arange(len(truth)) * step).astype(int), len(frames) - 1)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "movie.mp4"
+        path.write_bytes(encode_movie(np.concatenate([frames[at], truth], axis=2), rate=rate))
+        movies = PageMovies({"both": path}, left)
+        return movies.show("both", "the generated movie, and next to it the true one"), movies.left
