@@ -8,14 +8,15 @@ first ``--each`` with a contact and as many without one, of every scenario, by t
 names. Of each, the observed part is simulated and rendered, scene and state are fitted to masks and
 depth, and both the fitted and the true state are simulated with the default noise. One line per
 trial is appended to FOLDER/seeing.jsonl; an interrupted run continues there, and --known prints
-what it has measured so far. Printed are, by scenario:
+what it has measured so far, with --version N by an earlier version of the model. Printed are, by
+scenario:
 
 1. Accuracy by recorded outcomes (P = 1/2 counts half) with standard error, and area under the curve
    (AUC), of the fitted and the true state; agreement with the true state, and the mean absolute
    change of P.
-2. Accuracy of other predictions from the same states: simulation without noise, DPI-Net,
-   `state-trees` with the readouts that ship, constant motion, and the answers for the other
-   fitted trials of the scenario.
+2. Accuracy of other predictions from the same states: simulation without noise, or with masses and
+   friction as the model expects them, DPI-Net, `state-trees` with the readouts that ship, constant
+   motion, and the answers for the other fitted trials of the scenario.
 3. Differences between the accuracies of these, with standard errors of paired differences, of all
    trials, and without those that were looked at while the fit was written (``LOOKED_AT``).
 4. Likeness to people, by `physion.compare`.
@@ -52,7 +53,12 @@ from physion.core.seeds import stable_hash
 from physion.data.official import official
 from physion.models.baselines.motion import gap_in_constant_motion
 from physion.models.build import build_model
-from physion.models.noisy_simulation import NoiseLevels, cut_trial, simulate_contacts
+from physion.models.noisy_simulation import (
+    NoiseLevels,
+    ObservedTrial,
+    cut_trial,
+    simulate_contacts,
+)
 from physion.models.seeing.scenes import (
     DENSITY,
     FLAT_TARGET,
@@ -123,6 +129,7 @@ def measure(scene: Scene, contact: bool, number: int) -> ROW:
         "fitted": float(np.mean(model.imagine(batch, SAMPLES, 0).contact)),
         "true": answer(true, NoiseLevels(), SAMPLES),
         "true, no noise": answer(true, STILL, 1),
+        "true, guessed": answer(guessed(true), NoiseLevels(), SAMPLES),
         "note": seen.note,
     }
     others = {"true": motion}
@@ -136,6 +143,21 @@ def measure(scene: Scene, contact: bool, number: int) -> ROW:
         row[f"{name}, DPI-Net"] = _dpi(observed)
         row[f"{name}, state-trees"] = _trees(observed, scene.scenario)
     return row
+
+
+def guessed(trial: ObservedTrial) -> ObservedTrial:
+    """Return a trial with masses and surfaces as the model expects them of movable bodies."""
+    bodies = [
+        body
+        if body.kinematic or body.scenery
+        else replace(
+            body,
+            mass=(RING_DENSITY if body.shape == "torus" else DENSITY) * float(np.prod(body.scale)),
+            contact=SURFACE,
+        )
+        for body in trial.scene.bodies
+    ]
+    return replace(trial, scene=replace(trial.scene, bodies=tuple(bodies)))
 
 
 def _batch(motion: Motion, spec: Any) -> Batch:
@@ -220,12 +242,12 @@ def _trees(motion: Motion, scenario: str) -> float:
     return float(readout.fitted.probability(features.reshape(1, -1))[0])
 
 
-def read_rows(path: Path) -> dict[str, ROW]:
-    """Return what is already measured, by stimulus."""
+def read_rows(path: Path, version: int) -> dict[str, ROW]:
+    """Return what is already measured with a version of the model, by stimulus."""
     if not path.exists():
         return {}
     rows = [json.loads(line) for line in path.read_text().splitlines()]
-    return {row["stimulus"]: row for row in rows if row["version"] == VERSION}
+    return {row["stimulus"]: row for row in rows if row["version"] == version}
 
 
 def _errors(seen: SeenTrial, motion: Motion) -> list[ROW]:
@@ -262,6 +284,7 @@ def _center(body: Body, position: Any, rotation: Any) -> Any:
 NAMES = {
     "true": "true state",
     "true, no noise": "true state, no noise",
+    "true, guessed": "true state, masses and friction guessed",
     "fitted": "fitted state",
     "fitted, no noise": "fitted state, no noise",
     "true, DPI-Net": "DPI-Net, true states",
@@ -446,6 +469,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--each", type=int, default=5)
     parser.add_argument("--known", action="store_true")
+    parser.add_argument("--version", type=int, default=VERSION)
     parser.add_argument("--write", action="store_true")
     parser.add_argument("--priors", action="store_true")
     options = parser.parse_args()
@@ -455,7 +479,8 @@ def main() -> None:
         return
     options.folder.mkdir(parents=True, exist_ok=True)
     path = options.folder / "seeing.jsonl"
-    known = read_rows(path)
+    options.known |= options.version != VERSION
+    known = read_rows(path, options.version)
 
     def keep(row: ROW) -> None:
         known[row["stimulus"]] = row
@@ -486,7 +511,8 @@ def main() -> None:
         today = datetime.date.today().isoformat()
         RESULTS.write_text(
             f"# Seeing by simulation\n\n`python benchmarks/models/seeing.py FOLDER`, {len(rows)} "
-            f"trials, {today}, version {VERSION} of the model, {SAMPLES} simulations per trial.\n\n"
+            f"trials, {today}, version {options.version} of the model, {SAMPLES} simulations per "
+            f"trial.\n\n"
             f"{text}\n{priors()}"
         )
 
