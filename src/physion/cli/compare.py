@@ -144,6 +144,7 @@ def _compare(options: Options) -> int:
         scores = json_module.loads(result.scores.to_json(orient="records", double_precision=15))
         print(json_module.dumps({"report": str(page), "scores": scores, **numbers}))
     else:
+        _print_left_out(result)
         _print_changed(result)
         print_scores(result, page)
         if result.population is not None:
@@ -185,6 +186,17 @@ def _texts(table: pd.DataFrame, columns: Mapping[str, str]) -> dict[str, list[st
         heading: [with_interval(row, name) for _, row in table.iterrows()]
         for heading, name in columns.items()
     }
+
+
+def _print_left_out(result: CompareResult) -> None:
+    """Say how many stimuli of the predictions are left out, and why."""
+    from physion.report.inputs import ReportInputs
+
+    if isinstance(result.inputs, ReportInputs):
+        dropped = result.inputs.comparison.dropped
+        counts = dropped[dropped["model"] != ""].groupby("reason", sort=False)["stimuli"].max()
+        for reason, count in counts.items():
+            _print(f"note: {count} stimuli left out: {reason}")
 
 
 def _print_changed(result: CompareResult) -> None:

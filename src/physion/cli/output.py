@@ -74,6 +74,7 @@ class Stages:
 
     def __init__(self, *, at_once: bool = False) -> None:
         self._at_once = at_once
+        self._compiling = False
 
     def __enter__(self) -> Stages:
         self._begun: dict[str, tuple[float, int]] = {}
@@ -98,12 +99,17 @@ class Stages:
 
     def __call__(self, what: str, done: int, total: int) -> None:
         """Show that ``done`` of ``total`` items of a stage are finished."""
+        if what == "generating" and not (done or self._compiling or _is_compiled()):
+            self._compiling = True
+            self.note("compiling machine code, which takes some minutes the first time")
         if not self._progress.console.is_terminal:
             self._print_line(what, done, total)
             return
         # Not started earlier: bars without a stage would still print an empty line when they stop.
         self._progress.start()
         if what not in self._tasks:
+            for task in self._progress.tasks:
+                self._progress.update(task.id, visible=not task.finished)
             self._tasks[what] = self._progress.add_task(what, total=total)
         self._progress.update(self._tasks[what], completed=done, total=total)
 
@@ -122,6 +128,11 @@ class Stages:
         known = made >= _KNOWN_AFTER
         left = f", {(now - since) * (total - done) / made:.0f} s left" if known else ""
         self.note(f"{what}: {done} of {total}{left}")
+
+
+def _is_compiled() -> bool:
+    """Return whether the renderer was compiled before, with or without changes since."""
+    return any((Path(__file__).parents[1] / "rendering" / "__pycache__").glob("*.nbi"))
 
 
 def print_line(text: str) -> None:

@@ -122,18 +122,17 @@ def _sentence(inputs: ReportInputs) -> str:
         words.append(f"people are right in {html.percent(people['accuracy'])} of their answers")
     if len(known := models.dropna(subset=["accuracy"])):
         best = known.loc[known["accuracy"].idxmax()]
-        words.append(
-            f"the most accurate model, {_named(best)}, in {html.percent(best['accuracy'])}"
-        )
+        which = "the most accurate model" if len(models) > 1 else "the model"
+        words.append(f"{which}, {_named(best)}, in {html.percent(best['accuracy'])}")
     text = f"On {plural(stimuli, 'stimulus')} of {scenarios}, {', '.join(words)}"
     if comparison.has_people and len(known := models.dropna(subset=["kappa"])):
         like = known.loc[known["kappa"].idxmax()]
         same = len(words) > 1 and like["row"] == best["row"]
         who = "it is also most like people" if same else f"{_named(like)} is most like people"
-        text += (
-            f"; {who} (kappa {html.number(like['kappa'])}, where two people with each other reach "
-            f"{html.number(people['kappa'])})"
-        )
+        kappa = html.number(like["kappa"])
+        words_of_like = f"{who} (kappa {kappa}" if len(models) > 1 else f"its kappa is {kappa}"
+        others = f"where two people with each other reach {html.number(people['kappa'])}"
+        text += f"; {words_of_like}, {others}{')' if len(models) > 1 else ''}"
     return f"{text}."
 
 
