@@ -190,11 +190,13 @@ def _texts(table: pd.DataFrame, columns: Mapping[str, str]) -> dict[str, list[st
 
 def _print_left_out(result: CompareResult) -> None:
     """Say how many stimuli of the predictions are left out, and why."""
+    from physion.analysis.comparison import NOT_PREDICTED
     from physion.report.inputs import ReportInputs
 
     if isinstance(result.inputs, ReportInputs):
         dropped = result.inputs.comparison.dropped
-        counts = dropped[dropped["model"] != ""].groupby("reason", sort=False)["stimuli"].max()
+        given = dropped[(dropped["model"] != "") & (dropped["reason"] != NOT_PREDICTED)]
+        counts = given.groupby("reason", sort=False)["stimuli"].max()
         for reason, count in counts.items():
             _print(f"note: {count} stimuli left out: {reason}")
 
