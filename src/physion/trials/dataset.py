@@ -64,6 +64,14 @@ class Dataset:
             table = table[table["scenario"] == scenario]
         return [str(name) for name in table["trial"]]
 
+    def chosen(self, split: str | None = None, scenario: str | None = None) -> list[str]:
+        """Return what `trials` does; raise `BadInputError` if there is none."""
+        if names := self.trials(split, scenario):
+            return names
+        raise BadInputError(
+            f"{self.folder} has no trial of split {split or 'any'} and scenario {scenario or 'any'}"
+        )
+
     def known_trials(self) -> set[str]:
         """Return the names of all trials."""
         return set(self.index["trial"])

@@ -87,9 +87,7 @@ def export_gltf(
     index. Raises `BadInputError` if no trial is chosen or one is damaged.
     """
     dataset = Dataset(folder, verify=verify)
-    trials = dataset.trials(split, scenario)
-    if not trials:
-        raise BadInputError(f"{folder} has no trial of split {split} and scenario {scenario}")
+    trials = dataset.chosen(split, scenario)
     made = []
     for name in tracked(trials, "glTF files", len(trials), progress):
         trial = dataset.trial(name)

@@ -83,10 +83,8 @@ def export_lerobot(
     """
     dataset = Dataset(folder, verify=verify)
     index = dataset.index.sort_values("split", kind="stable").set_index("trial")
-    chosen = set(dataset.trials(split, scenario))
+    chosen = set(dataset.chosen(split, scenario))
     names = [str(name) for name in index.index if name in chosen]
-    if not names:
-        raise BadInputError(f"{folder} has no trial of split {split} and scenario {scenario}")
     if unlabelled := [name for name in names if pd.isna(index.loc[name, "contact"])]:
         raise BadInputError(f"trial {unlabelled[0]!r} has no label: choose a split with labels")
     with folder_for_writing(out):
