@@ -84,14 +84,14 @@ class RunSettings:
     out: Path | None = None
     """Folder for trials, predictions and the report; default: runs/official or runs/sampled."""
     limit: int | None = None
-    """Testing trials per scenario, 10 by default, and as many for the readout (twice as many of
-    sampled ones); 0 takes all official ones. Models that learn get as many sampled training trials
-    as there are for the readout, which show no agent and patient."""
+    """Testing trials per scenario, and as many for the readout (twice as many with --sampled).
+    Default: 10; 0 takes all official ones. Models that learn get as many sampled training trials,
+    which show no agent and patient."""
     size: int = 128
     """Pixels per side of the movies of the page; every model sees pictures of its own size."""
     decision: str = ""
-    """What turns features or rollouts into P(contact) (physion ls decisions), of the models that it
-    fits; default: the model's own."""
+    """What turns features or rollouts into P(contact) (physion ls decisions), for the models that
+    can use it; default: the model's own."""
     engine: str = "physion"
     """Engine of the trials and of noisy-simulation (physion ls engines); mujoco has no cloth."""
     encoder_batch: int = 4

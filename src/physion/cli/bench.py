@@ -1,7 +1,7 @@
 """Measure this machine: simulation, rendering and making of trials, one row for each scenario.
 
 Times are of the processor, on one core. On a machine that does other work at the same time they are
-longer. The README has the same quantities on the project's machine.
+longer.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 The model predicts some trials, and copies of them in which one thing is changed: what follows the
 observed part becomes noise, outcomes are inverted, names and order change. Such changes must not
-move a prediction; of others it is shown how much they do. Exit code 1: a prediction moved, or
-nothing was judged.
+move a prediction. For other changes it is shown how much they move predictions. Exit code 1: a
+prediction moved that must not, or nothing was judged.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class Options:
     out: Path = Path("runs/check")
     """Folder for the page, and for the trials if none are given."""
     trials: int = 80
-    """About how many trials are taken; half of them fit the readout, half are tested (rounded
-    down for each scenario, at least 2 of either half)."""
+    """About how many trials are taken: half of them fit the readout, half are tested. Each half
+    is rounded down for each scenario, to at least 2."""
     changes: tuple[str, ...] = ()
     """Names of the changes to make; default: all, and evaluations of two other models."""
     option: tuple[str, ...] = ()

@@ -1,19 +1,12 @@
 """Compare predictions with people: a table on the terminal, and a report with figures.
 
-`physion compare FILES...`: models next to the people of the original study. A file needs two
-columns, stimulus and p_contact.
-
-`physion compare FILES... --responses FILE`: models next to single participants.
-
-`physion compare FILES... --population`: seeds or checkpoints of a model as one population, people
-as the other: consensus, disagreement, kappa of majorities and of single members.
-
-`physion compare --responses FILE`: the people only.
-
-`physion compare --check FILES...`: check the files and name every bad row; exit code 1 if one has
-an error.
-
-`physion compare --published`: the published numbers, and what the released tables give.
+PREDICTIONS are tables with at least two columns, stimulus and p_contact. What is compared:
+  PREDICTIONS                    models with the people of the original study
+  PREDICTIONS --responses FILE   models with the participants of a study
+  PREDICTIONS --population       seeds or checkpoints of a model with people, as two populations
+  --responses FILE               nothing: a report about the participants
+  --check PREDICTIONS            nothing: names every bad row; exit code 1 if one has an error
+  --published                    the numbers of the paper with what its released tables give
 """
 
 from __future__ import annotations
@@ -40,7 +33,7 @@ class Options:
     """Predictions and people to compare."""
 
     predictions: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """Files of predictions; none with --responses: a report about people."""
+    """Files of predictions. Without any, --responses gives a report about people only."""
     humans: Path | None = None
     """Answers of people by stimulus: official (shipped with the package), or a folder with
     human_accuracy-*.csv; if not given, official for stimuli of the original study."""
@@ -66,19 +59,19 @@ class Options:
     """Only the sessions with these values, such as condition=fast; columns: condition, language,
     recruited_by, gender, education, buttons, study."""
     dataset: Path | None = None
-    """Dataset of the trials: the page shows its testing movies; with --check its splits must not
-    leak."""
+    """Dataset of the trials: the page shows its testing movies; --check tests that no predicted
+    trial, scene or motion is also in another split."""
     attributes: Path | None = None
-    """Elements, distractors, occluders of the stimuli: a table (CSV, parquet) or a dataset; if not
-    given, by official names."""
+    """Properties of the stimuli, such as their numbers of elements, distractors and occluders: a
+    table (CSV, parquet) or a dataset; if not given, as official names say."""
     rollout_errors: tuple[Path, ...] = ()
     """Files of evaluate --rollout-error: a figure of the errors of imagined motion over time."""
     groups: tuple[str, ...] = ()
     """Compare groups of models by these columns of the predictions, such as encoder_type, or by the
     columns of a CSV file with model and any others."""
     population: bool = False
-    """Compare seeds or checkpoints of a model with people as one population: rows that differ in
-    seed or file of weights only; if there are none, all models together."""
+    """Take rows that differ only in their seed or file of weights as one population, and compare
+    it with people as another; if no rows do, take all models together."""
     exclude: Path | None = None
     """File of stimuli to exclude, one per line."""
     fitted: Path | None = None

@@ -49,17 +49,17 @@ class Options:
     dataset: Annotated[Path | None, tyro.conf.Positional] = None
     """Folder of a dataset."""
     features: Path | None = None
-    """File of features that were computed elsewhere (physion export --layout features-request), a
-    row like one of a model: .npz, .hdf5 or .h5."""
+    """File of features that were computed elsewhere (physion export --layout features-request):
+    .npz, .hdf5 or .h5. It is evaluated as a model is."""
     out: Path = Path("runs/models")
     """Folder for predictions and caches."""
     fit: Path | None = None
-    """Folder of another dataset, whose trials of the splits training and readout are used in place
-    of the dataset's own; without movies it needs --rendered."""
+    """Folder of another dataset, whose splits training and readout train models and fit readouts,
+    in place of the dataset's own. If it has no movies, add --rendered."""
     option: tuple[str, ...] = ()
-    """Settings of the models or of their training as NAME=VALUE, such as encoder=resnet50
-    weights=random steps=500; of one of several models as MODEL:NAME=VALUE; of the logistic
-    regression as logistic.NAME=VALUE, such as logistic.folds=3."""
+    """Settings of all models or of their training, such as encoder=resnet50 weights=random
+    steps=500; of one of several models as MODEL:NAME=VALUE; of the logistic regression as
+    logistic.NAME=VALUE, such as logistic.folds=3."""
     settings: Annotated[EvaluationSettings, tyro.conf.arg(name="")] = field(
         default_factory=EvaluationSettings
     )
@@ -70,12 +70,12 @@ class Options:
     """Where tasks run: on Slurm and Ray, one model, protocol and seed is a task; on this machine a
     simulation."""
     check: bool = False
-    """First check on about 80 trials that no prediction depends on the future, names, order, labels
-    or files (physion check), and write the verdict into the table."""
+    """Before, check on about 80 trials that no prediction depends on the future, names, order,
+    labels or files (physion check), and write the verdict into the table."""
     verify: bool = True
     """Compare files with their SHA-256 in the index before they are used."""
     dry_run: bool = False
-    """Print the evaluations and which are done, and evaluate nothing."""
+    """Evaluate nothing; print what would be evaluated, and what is done."""
     json: bool = False
     """Print one JSON object."""
 

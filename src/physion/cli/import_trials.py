@@ -27,7 +27,7 @@ class Options:
     folder: Annotated[Path, tyro.conf.Positional]
     """Folder with official HDF5 files or movies at any depth, or a checkout of the study."""
     out: Annotated[Path, tyro.conf.Positional]
-    """Folder of the dataset: new, or one to resume."""
+    """Folder to write: new, or a dataset to resume."""
     name: str = "imported"
     """Name of the dataset."""
     split: Literal["training", "readout", "testing", "familiarization"] | None = None

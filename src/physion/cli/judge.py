@@ -1,6 +1,8 @@
-"""Judge generated movies: does red touch yellow in them, as truly and as people say, and what else
-differs from the true movies? `physion export --layout conditioning` writes what they are made from.
-Exit code 1: a movie is missing or cannot be judged.
+"""Judge generated movies: does red touch yellow in them, and how do they differ from the truth?
+
+Their contacts are compared with true outcomes and with answers of people. `physion export --layout
+conditioning` writes what movies are generated from. Exit code 1: a movie is missing or cannot be
+judged.
 """
 
 from __future__ import annotations

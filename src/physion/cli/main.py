@@ -65,18 +65,17 @@ def _run_verb(args: list[str]) -> int:
 
         print(f"physion {__version__}")
         return 0
+    # Imported late: it takes time.
+    from physion.cli.arguments import no_such, read_options
+
     if args[0] not in VERBS:
-        from physion.core.errors import UnknownNameError
-
-        raise UnknownNameError("verb", args[0], VERBS)
-    import tyro
-
+        raise no_such("verb", args[0], VERBS, "physion --help")
     module, taken = find_module(args)
-    options = tyro.cli(
+    options = read_options(
         module.Options,
-        args=args[taken:],
-        prog=" ".join(["physion", *args[:taken]]),
-        description=describe(module.__doc__, args[:taken]),
+        args[taken:],
+        " ".join(["physion", *args[:taken]]),
+        describe(module.__doc__, args[:taken]),
     )
     return int(module.main(options))
 

@@ -1,7 +1,8 @@
 """Train models on a dataset without labels; the same command resumes, and evaluate finds the
 results.
 
-Models whose weights ship start from random ones. One training that fails does not stop the others.
+Models whose weights ship are trained from random weights. One training that fails does not stop the
+others.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class Options:
     verify: bool = True
     """Compare files with their SHA-256 in the index before they are used."""
     dry_run: bool = False
-    """Print the trainings and which are done, and train nothing."""
+    """Train nothing; print what would be trained, and what is done."""
     json: bool = False
     """Print one JSON object."""
 

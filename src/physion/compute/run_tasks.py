@@ -122,9 +122,9 @@ class ExecutorSettings:
     workers: int = os.cpu_count() or 1
     """Processes of the executor local, or cores of a Ray that is started on this machine."""
     task: tuple[str, ...] = ()
-    """Limits of a task and what it takes, as NAME=VALUE: tries, minutes, cpus, gpus, memory_gb,
-    logs; for Slurm jobs, per_job, partition, sbatch.account and the like; for Ray address.
-    Example: --task minutes=240 gpus=1 partition=gpu."""
+    """Limits and needs of a task: tries, minutes, cpus, gpus, memory_gb, logs; on Slurm also jobs,
+    per_job, partition and sbatch.NAME; on Ray also address. Example: --task minutes=240 gpus=1
+    partition=gpu."""
 
     def open(self) -> Executor:
         """Return the executor; raise `BadInputError` for limits that it cannot take."""

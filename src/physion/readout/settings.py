@@ -35,13 +35,14 @@ class HarnessSettings:
     """Settings that evaluations and trainings have in common."""
 
     protocols: Annotated[tuple[str, ...], tyro.conf.arg(aliases=("--protocol",))] = ("all",)
-    """Scenarios that train a model: all, all-but the tested one, only the tested one, or each one
-    by itself, tested on all (one); several with commas. Weights that ship saw all: under the others
-    such a model starts from random ones. A model that is not trained is evaluated once."""
+    """Which scenarios train a model: all; all-but, all except the tested one; only, the tested one;
+    or one, each by itself, tested on all. Several with commas. Weights that ship were trained on
+    all: under another protocol such a model is trained from random weights. A model that is not
+    trained is evaluated once."""
     scenario: str = ""
-    """Tested scenario; default: all of them. A training needs it for all-but, only or one."""
+    """Test only this scenario; default: all. For physion train only under all-but, only or one."""
     seeds: int = 1
-    """Number of seeds, from --seed on."""
+    """Number of seeds: --seed and the ones after it."""
     seed: int = 0
     """First seed: of initial weights, folds and training."""
     folds: int = 5
@@ -80,24 +81,24 @@ class EvaluationSettings(HarnessSettings):
     """Settings of evaluations."""
 
     benchmark: str = ""
-    """Rules: v1, of the paper, or v1.5, of physion_evaluator (seven scenarios, Collide cut at frame
-    15, one readout of all scenarios, detection around the contact). Default: v1, but v1.5 for files
-    of features that physion_evaluator wrote."""
+    """Rules of the evaluation: v1, of the paper, or v1.5, of physion_evaluator (seven scenarios,
+    Collide cut at frame 15, one readout of all scenarios, detection around the contact). Default:
+    v1, but v1.5 for files of features that physion_evaluator wrote."""
     readouts: tuple[str, ...] = ()
-    """Readouts: observed, observed+simulated, full. Default: all that the model supports."""
+    """Kinds of readout: observed, observed+simulated, full. Default: all that the model has."""
     decision: str = ""
     """What turns features or rollouts into P(contact) (physion ls decisions); default: the model's
     own."""
     readout: Literal["shipped", "fit"] = "shipped"
-    """Readouts that ship are used where they fit the model, trials are red and yellow, and the
-    split readout has fewer; fit: fit all anew."""
+    """shipped: take a readout of the package where it has one for the model, if trials are red and
+    yellow and the dataset has fewer trials to fit one. fit: fit all readouts on the dataset."""
     untrained: bool = False
-    """Leave the weights of the model as they are; the table says untrained."""
+    """Train no model, and take its weights as they are; the table says untrained."""
     twin: bool = False
-    """Also evaluate the random twin of each model with weights: the same with weights=random, only
-    the dynamics of an encoder being trained."""
+    """Also evaluate a random twin of each model that has weights: the same network with
+    weights=random; if it is an encoder with dynamics, the dynamics are trained."""
     rollout_errors: Annotated[bool, tyro.conf.arg(aliases=("--rollout-error",))] = False
-    """Also write how far imagined motion is from the true one over time, for particle models."""
+    """Also write, for particle models, how far imagined motion is from the true one over time."""
     logistic: Annotated[LogisticSettings, tyro.conf.Suppress] = field(
         default_factory=LogisticSettings
     )

@@ -1,24 +1,15 @@
 """Run the experiment with people: create a study, serve it, export the answers.
 
-`physion experiment init DIR --trials DATASET`: create a study folder (or from --stimuli LISTS).
-
-`physion experiment serve DIR`: run the web server for participants and the experimenter.
-
-`physion experiment links DIR`: print links for Prolific, SONA, MTurk, previews and piloting.
-
-`physion experiment simulate DIR`: run simulated participants, permanently marked as such.
-
-`physion experiment export DIR`: export the answers for the analysis, with a data dictionary.
-
-`physion experiment describe DIR`: write its preregistration and a figure of its trials.
-
-`physion experiment backup DIR`: copy the database, settings and texts while the study is served.
-
-`physion experiment forget DIR`: delete recruiters' ids, or all data of a session.
-
-`physion experiment power`: how many people and stimuli a study needs.
-
-For details, use --help after any of these.
+STUDY is the folder of the study. Sub-verbs, whose options --help lists after each of them:
+  init STUDY       create a study from trials, official scenes, or lists of stimuli
+  serve STUDY      run the web server for participants and the experimenter
+  links STUDY      print links for Prolific, SONA, MTurk, previews and piloting
+  simulate STUDY   run simulated participants, permanently marked as such
+  export STUDY     export the answers for the analysis, with a data dictionary
+  describe STUDY   write the preregistration of the study and a figure of its trials
+  backup STUDY     copy the database, settings and texts while the study is served
+  forget STUDY     delete the ids of recruiters, or all data of a session
+  power            how many people and stimuli a study needs
 """
 
 from __future__ import annotations
@@ -29,7 +20,7 @@ from typing import Annotated
 
 import tyro
 
-from physion.core.errors import MissingExtraError, UnknownNameError
+from physion.core.errors import MissingExtraError
 
 SUBVERBS = {
     "init": "physion.cli.experiment.init",
@@ -51,16 +42,17 @@ NEEDED = ("fastapi", "uvicorn", "sqlalchemy", "argon2", "jinja2", "pydantic")
 class Options:
     """Options of ``physion experiment`` without a sub-verb."""
 
-    words: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    sub_verb: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """One of init, serve, links, simulate, export, describe, backup, forget, power."""
 
 
 def main(options: Options) -> int:
     """Print the sub-verbs; return exit status 2, since nothing was done."""
+    from physion.cli.arguments import no_such
     from physion.cli.output import console
 
-    if options.words:
-        raise UnknownNameError("sub-verb of 'physion experiment'", options.words[0], SUBVERBS)
+    if options.sub_verb:
+        raise no_such("sub-verb", options.sub_verb[0], SUBVERBS, "physion experiment --help")
     console.print((__doc__ or "").strip(), markup=False, soft_wrap=True)
     return 2
 
