@@ -22,7 +22,9 @@ def test_every_name_has_a_line_that_says_what_it_is(
     lines = capsys.readouterr().out.splitlines()
     names = DESCRIBED[kind]().names()
     assert [line.partition(": ")[0] for line in lines] == names and len(names) >= 2
-    assert all(line.endswith(".") and len(line.partition(": ")[2]) > 10 for line in lines)
+    texts = [line.partition(": ")[2] for line in lines]
+    assert all(text.endswith(".") and len(text) > 10 for text in texts)
+    assert len(set(texts)) == len(names), "each says how it differs"
     assert main(["ls", kind, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {kind: names}
 

@@ -6,7 +6,7 @@ import ast
 import importlib
 import importlib.util
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from importlib.metadata import EntryPoints, entry_points
 from pathlib import Path
@@ -25,10 +25,17 @@ class Registry(Generic[T]):
     - ``kind``: what is registered, in the singular; used in messages and in the entry-point group.
     - ``lazy``: ``"module:attribute"`` by name, for objects that `get` imports when they are asked
       for.
+    - ``texts``: what `describe` returns for names that share a class or function with others.
     """
 
-    def __init__(self, kind: str, lazy: dict[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        kind: str,
+        lazy: dict[str, str] | None = None,
+        texts: Mapping[str, str] | None = None,
+    ) -> None:
         self.kind = kind
+        self._texts = dict(texts or {})
         self._values: dict[str, T] = {}
         self._lazy: dict[str, str] = dict(lazy or {})
         self._plugins_read = False
@@ -66,10 +73,13 @@ class Registry(Generic[T]):
         return sorted(self._values.keys() | self._lazy.keys())
 
     def describe(self, name: str) -> str:
-        """Return the first line of the docstring of the value ``name``, without importing it.
+        """Return what the value ``name`` is, in one line, without importing it.
 
-        The line is empty where there is no docstring or no source file.
+        It is the first line of the docstring, unless the registry has a text of its own; empty
+        where there is no docstring or no source file.
         """
+        if name in self._texts:
+            return self._texts[name]
         if name in self._values or name not in self._lazy:
             text = inspect.getdoc(self.get(name)) or ""
         else:

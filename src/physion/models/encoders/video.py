@@ -380,7 +380,7 @@ _VERSION = 1
 
 
 class VideoEncoder(TorchModel):
-    """Frozen transformer on 16 frames of a video; its protocols are *observed* and *full*."""
+    """Frozen transformer on 16 frames of a video; its readouts are *observed* and *full*."""
 
     decision = "logistic"
 
