@@ -71,18 +71,20 @@ def find(page: str, place: str) -> PageTable:
 
 def fixed(digits: int) -> Any:
     def write(x: float) -> str:
-        text = "NaN" if pd.isna(x) else f"{x:.{digits}f}"
+        if pd.isna(x):
+            return "–"
+        text = f"{x:.{digits}f}"
         return text.removeprefix("-") if float(text) == 0 else text.replace("-", "−")
 
     return write
 
 
 def count(x: float) -> str:
-    return "NaN" if pd.isna(x) else str(int(x))
+    return "–" if pd.isna(x) else str(int(x))
 
 
 def p(x: float) -> str:
-    return "NaN" if pd.isna(x) else "< 0.001" if x < 0.001 else f"{x:.3f}"
+    return "–" if pd.isna(x) else "< 0.001" if x < 0.001 else f"{x:.3f}"
 
 
 def spread(name: str, low: str, high: str, digits: int) -> Any:
@@ -90,9 +92,9 @@ def spread(name: str, low: str, high: str, digits: int) -> Any:
 
     def write(row: pd.Series) -> str:
         value, *ends = (fixed(digits)(row[key]) for key in (name, low, high))
-        if value == "NaN":
+        if value == "–":
             return value
-        return f"{value} no interval" if "NaN" in ends else f"{value} {ends[0]} to {ends[1]}"
+        return f"{value} no interval" if "–" in ends else f"{value} {ends[0]} to {ends[1]}"
 
     return write
 

@@ -118,9 +118,9 @@ def test_choices_are_stated_or_said_to_be_missing(make_comparison: Maker) -> Non
 def test_undefined_scores_come_with_their_reason(make_comparison: Maker) -> None:
     page = render(ReportInputs(make_comparison(constant=True)))
     assert "r: undefined in collide, drop" in page.text
-    assert page.text.count("NaN") > 4
-    titles = [attrs["title"] for _, attrs in page.tags if "title" in attrs]
-    assert any("constant" in str(title) for title in titles)
+    dashes = [attrs for _, attrs in page.tags if attrs.get("class") == "none"]
+    assert len(dashes) > 4 and any("constant" in str(one.get("title")) for one in dashes)
+    assert "NaN" not in page.text
 
 
 def test_without_people_there_is_a_page_too(make_comparison: Maker) -> None:
@@ -145,6 +145,12 @@ def test_contents_lead_to_every_section(make_comparison: Maker) -> None:
     page = render(ReportInputs(make_comparison()))
     places = [f"#{attrs['id']}" for tag, attrs in page.tags if tag == "section"]
     assert page.links() == places and len(places) > 6
+    assert "#trials-whose-simulated-outcome-differs" in places
+
+
+def test_without_a_changed_outcome_there_is_no_section_about_them(make_comparison: Maker) -> None:
+    page = render(ReportInputs(make_comparison(with_people=False)))
+    assert "Trials whose simulated outcome differs" not in page.text
 
 
 # --- movies --------------------------------------------------------------------------------------

@@ -69,7 +69,7 @@ def test_the_cells_are_the_scores_and_empty_where_two_people_have_none(
     assert two["r"].split()[0] == f"{row['r']:.2f}"
     assert two["rmsd"] == two["r_beyond_outcome"] == two["difference"] == ""
     outcome = dict(zip(names, baselines[-3], strict=True))
-    assert outcome["r_beyond_outcome"] == "NaN" and outcome["r"] != "NaN"
+    assert outcome["r_beyond_outcome"] == "–" and outcome["r"] != "–"
 
 
 def test_reasons_stand_below_the_table_that_they_are_about(with_baseline: Comparison) -> None:

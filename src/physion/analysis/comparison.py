@@ -36,6 +36,18 @@ SURE = 1e-3
 BELOW_CHANCE = -4.0
 """z of a model's accuracy, against independent answers, below which it is called opposite."""
 
+FEW = 10
+"""Number of stimuli below which a comparison comes with a warning."""
+
+
+def check_size(stimuli: pd.DataFrame) -> list[str]:
+    """Return a warning if a model was compared on fewer than `FEW` stimuli."""
+    fewest = int(stimuli.groupby("model")["stimulus"].nunique().min())
+    if fewest >= FEW:
+        return []
+    counted = "1 stimulus" if fewest == 1 else f"{fewest} stimuli"
+    return [f"compared on only {counted}: intervals and correlations of so few say little"]
+
 
 def check_probabilities(predictions: pd.DataFrame) -> list[str]:
     """Return a warning for each model whose predicted outcomes contradict its probabilities.
@@ -382,7 +394,7 @@ def compare_scores(
             "no stimulus was both seen by people and predicted; people saw for instance "
             f"{seen!r}, the predictions name {rows['stimulus'].iloc[0]!r}"
         )
-    warnings += check_outcomes(stimuli) + check_accuracy(stimuli)
+    warnings += check_outcomes(stimuli) + check_accuracy(stimuli) + check_size(stimuli)
     answered = people[people["stimulus"].isin(stimuli["stimulus"])]
     scores = with_kind(score_table(stimuli, draws.level))
     later, observed = later_scores(stimuli, draws.level)

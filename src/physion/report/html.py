@@ -28,6 +28,8 @@ from physion.scenes.scene import OBSERVED_FRAMES
 
 MACROS = macros_of("physion.report")
 """Macros of all pages."""
+NO_VALUE = "–"
+"""What stands on pages for an undefined number (NaN)."""
 
 
 def plural(count: int, noun: str) -> str:
@@ -42,25 +44,25 @@ def listed(names: Sequence[str]) -> str:
 
 
 def number(value: float, digits: int = 2) -> str:
-    """Return a number with this many decimals, or ``NaN``.
+    """Return a number with this many decimals, or `NO_VALUE`.
 
     Negative numbers have a minus sign (not a hyphen); a rounded zero has none.
     """
     if pd.isna(value):
-        return "NaN"
+        return NO_VALUE
     # Adding zero turns -0.0 into 0.0.
     return f"{round(float(value), digits) + 0.0:.{digits}f}".replace("-", "−")
 
 
 def percent(value: float) -> str:
-    """Return a fraction in percent, or ``NaN``."""
-    return f"{100 * value:.0f} %" if np.isfinite(value) else "NaN"
+    """Return a fraction in percent, or `NO_VALUE`."""
+    return f"{100 * value:.0f} %" if np.isfinite(value) else NO_VALUE
 
 
 def p_value(value: float) -> str:
     """Return a p value with three decimals, or ``< 0.001``."""
     if pd.isna(value):
-        return "NaN"
+        return NO_VALUE
     return "< 0.001" if value < 0.001 else number(value, 3)
 
 
@@ -171,12 +173,12 @@ def warnings(texts: Sequence[str], mark: str = "") -> Markup:
 
 
 def undefined(reason: str) -> Markup:
-    """Return ``NaN`` with its reason on hovering."""
-    return Markup(MACROS.undefined(reason))
+    """Return `NO_VALUE` with its reason on hovering."""
+    return Markup(MACROS.undefined(NO_VALUE, reason))
 
 
 def interval(row: pd.Series, key: str, low: str = "", high: str = "", digits: int = 2) -> Markup:
-    """Return a value with its interval in small print; NaN with its reason if undefined.
+    """Return a value with its interval in small print; a dash with its reason if undefined.
 
     ``low`` and ``high``: columns of the bounds, if they are not ``key`` with _low and _high.
     """

@@ -19,6 +19,7 @@ from physion.core.html import Markup, joined
 from physion.report.html import (
     BASELINES,
     MACROS,
+    NO_VALUE,
     PageColumn,
     compared,
     definition_list,
@@ -367,7 +368,7 @@ def definitions(comparison: Comparison) -> Markup:
         chosen += [one for one in score_metrics() if one.name in BEYOND_OUTCOME]
     meaning = {metric.heading: metric.definition for metric in chosen}
     meaning |= {
-        "NaN": "undefined; the reason is below the table or shown on hovering",
+        NO_VALUE: "undefined; the reason is below the table or shown on hovering",
         "all, all-but, only": "a model's training: on all scenarios, on all but the tested one, "
         "only on the tested one",
     }
@@ -623,12 +624,13 @@ def calibration(inputs: ReportInputs) -> Markup:
 
 
 def changed(comparison: Comparison, links: Mapping[str, str] | None = None) -> Markup:
-    """Return the trials whose simulated outcome is not the official one; ``links``: to their
-    movies.
+    """Return the trials whose simulated outcome is not the official one; nothing without any.
+
+    ``links``: to their movies.
     """
     rows = comparison.changed
     if rows.empty:
-        return paragraph("None.")
+        return Markup()
     counts = rows["scenario"].value_counts()
     totals = comparison.stimuli.groupby("scenario")["stimulus"].nunique()
     words = ", ".join(

@@ -87,6 +87,12 @@ def test_answers_far_below_guessing_are_reported() -> None:
     assert warnings_of(never) == ()
 
 
+def test_a_comparison_on_few_stimuli_is_reported() -> None:
+    (warning,) = warnings_of(predictions().head(9))
+    assert "on only 9 stimuli" in warning
+    assert warnings_of(predictions().head(10)) == ()
+
+
 def test_missing_labels_of_predicted_stimuli_are_reported() -> None:
     known = dict(list(LABELS.items())[:25])
     (warning,) = warnings_of(predictions(), known)
