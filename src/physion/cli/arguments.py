@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 import tyro
 
-# Not a public module of tyro, whose version `requirements.lock` pins: tests/cli/test_arguments.py
+# Not a public module of tyro, whose version is pinned: tests/cli/test_arguments.py
 # fails where it changes.
 from tyro import _errors
 

@@ -29,6 +29,8 @@ from physion.readout.check import check_models
 from physion.readout.evaluate import EvaluatedModel, Evaluation, evaluate
 from physion.readout.logistic import LogisticSettings
 from physion.readout.settings import EvaluationSettings, options_by_model
+from physion.readout.surprise import MEASURES as SURPRISES
+from physion.readout.surprise import pixel_statistics, surprise, surprise_scores
 from physion.readout.whatif import MEASURES, whatif_scores
 from physion.trials.dataset import Dataset
 
@@ -69,6 +71,9 @@ class Options:
     )
     """Where tasks run: on Slurm and Ray, one model, protocol and seed is a task; on this machine a
     simulation."""
+    surprise: bool = False
+    """Instead of predicting outcomes, measure how much possible and impossible movies (physion
+    generate --pairs) surprise the models, which are not trained for it."""
     check: bool = False
     """Before, check on about 80 trials that no prediction depends on the future, names, order,
     labels or files (physion check), and write the verdict into the table."""
@@ -98,6 +103,18 @@ def main(options: Options) -> int:
         models = [*models, str(options.features)]
     chosen = options_by_model(models, of_models)
     trials = Dataset(dataset, verify=options.verify)
+    if options.surprise:
+        with Stages() as stages:
+            table = surprise(
+                chosen,
+                trials,
+                options.out,
+                options.settings,
+                progress=stages,
+            )
+            pixels = pixel_statistics(trials, rendered=options.settings.rendered, progress=stages)
+        _print_surprise(surprise_scores([pixels, table]), options)
+        return 0
     with Stages() as stages:
         verdicts = {}
         if options.check and not options.dry_run:
@@ -168,15 +185,32 @@ def _print_scores(done: Evaluation) -> None:
         print_warnings([f"no comparison: {error}"])
 
 
+def with_errors(scores: pd.DataFrame, name: str) -> list[str]:
+    """Return a column of scores as texts with their standard errors."""
+    pairs = zip(scores[name], scores[f"{name}_se"], strict=True)
+    return ["-" if m != m else f"{m:.3f} ({se:.3f})" for m, se in pairs]
+
+
 def _print_whatif(scores: pd.DataFrame) -> None:
     """Print how predictions change with the scene, if the dataset holds variants of trials."""
     if scores.empty:
         return
     shown = scores[["model", "readout", "change", "pairs", "changed"]].copy()
     for name in MEASURES:
-        pairs = zip(scores[name], scores[f"{name}_se"], strict=True)
-        shown[name] = ["-" if m != m else f"{m:.3f} ({se:.3f})" for m, se in pairs]
+        shown[name] = with_errors(scores, name)
     print_line(text_table(shown, "One thing changed: mean and standard error over trials"))
+
+
+def _print_surprise(scores: pd.DataFrame, options: Options) -> None:
+    """Print how often the impossible movie of a pair surprises more."""
+    if options.json:
+        print(json_module.dumps({"surprise": json_module.loads(scores.to_json(orient="records"))}))
+        return
+    shown = scores[["model", "kind", "hidden", "pairs"]].copy()
+    for name in SURPRISES:
+        shown[name] = with_errors(scores, name)
+    print_line(text_table(shown, "Pairs whose impossible movie surprises more (standard error)"))
+    print_line(f"surprise of every movie: {options.out / 'surprise'}")
 
 
 def _values(one: EvaluatedModel) -> dict[str, Any]:

@@ -35,6 +35,9 @@ class Options:
     whatif: tuple[Literal["remove", "mass", "friction", "push"], ...] = ()
     """Make variants of each trial, too, with one thing changed: a body removed, the agent's mass,
     all friction, or the push; physion evaluate scores whether predictions change with them."""
+    pairs: tuple[Literal["vanish", "teleport", "swap", "stop-in-air", "pass-through"], ...] = ()
+    """Make two possible and two impossible movies of each testing trial and kind, too; physion
+    evaluate --surprise scores which of two surprises a model more."""
     name: str = "physion"
     """Name of the dataset, part of the seed of every trial."""
     settings: Annotated[GenerateSettings, tyro.conf.arg(name="")] = field(
@@ -61,6 +64,7 @@ def main(options: Options) -> int:
                 counts,
                 presets=options.presets,
                 whatif=options.whatif,
+                pairs=options.pairs,
                 name=options.name,
                 settings=options.settings,
                 executor=options.compute.open(),

@@ -287,6 +287,14 @@ class Model:
         """Return the scalar ``loss`` of a batch, and parts of it to be logged."""
         raise NotImplementedError
 
+    def surprise(self, batch: Batch) -> Any:
+        """Return how little the model expected each frame of whole clips from those before (B, T).
+
+        Without this method `physion.readout.surprise` compares what the model encodes with what it
+        imagined, or takes its loss.
+        """
+        raise NotImplementedError
+
     # What else a model may say.
 
     @property

@@ -14,6 +14,7 @@ the same on every machine.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,6 +27,7 @@ from physion.core.errors import BadInputError
 from physion.core.files import json_digest
 from physion.core.seeds import child_generator, stable_hash, trial_seed
 from physion.core.version import __version__
+from physion.models.baselines.motion import bodies_present
 from physion.models.interface import Model, ModelSettings
 from physion.numerics.elementary import cos, exp, sin, standard_normal
 from physion.numerics.linear_algebra import norm
@@ -33,12 +35,14 @@ from physion.numerics.rotations import multiply_quaternions
 from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine, simulate_many
 from physion.physics.labels import label_contact
 from physion.physics.trajectory import State, Trajectory
-from physion.scenes.scene import Scene, SurfaceMaterial
+from physion.scenes.scene import Roles, Scene, SurfaceMaterial
 
 F64 = NDArray[np.float64]
 
 CONTACT_ROUNDS = 3
 """Contacts of one simulation that get noise, the earliest ones."""
+WIDTH = 0.02
+"""Metres by which a simulation may miss a body before it counts as improbable (`surprise`)."""
 MOVING = 1e-3
 """Speed in metres per second above which a body moves."""
 
@@ -483,6 +487,39 @@ class NoisySimulation(Model):
         ]
         return Rollout(contact=np.array(found, np.bool_).reshape(len(found), samples))
 
+    def surprise(self, batch: Batch) -> NDArray[np.float64]:
+        """Return how improbable each frame is (B, T) after the one before.
+
+        From the state of the frame before, ``samples`` noisy simulations lead to this one. With the
+        largest distance d of a body in each, and the width w = `WIDTH`, the surprise is
+        -log mean exp(-d^2 / 2 w^2). Bodies that come or go do not count.
+        """
+        assert batch.state is not None, "the spec asks for states"
+        found = np.zeros(batch.frames.shape)
+        for row, (motion, frames) in enumerate(zip(batch.state, batch.frames, strict=True)):
+            levels, path = self.levels_for(motion.scene), motion.trajectory
+            plain = replace(motion.scene, events=())
+            for step, (before, now) in enumerate(itertools.pairwise(frames.tolist()), start=1):
+                there = bodies_present(motion.scene, before, now)
+                scene, state = _only(plain, path.state(before), there)
+                trial = ObservedTrial(scene, state, False, _touching(path, before, there))
+                starts = [
+                    add_noise(trial, levels, self.settings.scale, sample, self.seed or 0)
+                    for sample in range(self.samples)
+                ]
+                ends = simulate_many(
+                    [one for one, _ in starts],
+                    engine=self.engine,
+                    starts=[one for _, one in starts],
+                    frames=now - before + 1,
+                )
+                true = path.positions[now][there].astype(np.float64)
+                far = [float(norm(end.positions[-1] - true).max(initial=0.0)) for end in ends]
+                squares = (np.array(far) / WIDTH) ** 2 / 2
+                least = float(squares.min())
+                found[row, step] = least - np.log(np.exp(least - squares).mean())
+        return found
+
     def digest(self) -> str:
         """Return the SHA-256 of engine and noise; scales and number of samples are no part."""
         settings = dataclasses.asdict(self.settings)
@@ -510,6 +547,30 @@ class NoisySimulation(Model):
 
 
 # Threshold on a distance that separates contacts from misses best.
+
+
+def _only(scene: Scene, state: State, there: NDArray[np.bool_]) -> tuple[Scene, State]:
+    """Return the bodies of a scene without cloth that are ``there`` (N,), and their state."""
+    names = {body.name for body, stays in zip(scene.bodies, there, strict=True) if stays}
+    roles = [name for name in (scene.roles.agent, scene.roles.patient) if name in names]
+    # The question plays no part: any two names of bodies make the scene whole.
+    agent, patient = (roles + sorted(names))[:2] if len(names) > 1 else (*names, *names)
+    kept = replace(
+        scene,
+        bodies=tuple(body for body in scene.bodies if body.name in names),
+        pushes=tuple(push for push in scene.pushes if push.body in names),
+        joints=tuple(j for j in scene.joints if {j.parent, j.child} <= names),
+        roles=Roles(agent, patient),
+    )
+    arrays = ("positions", "rotations", "velocities", "angular_velocities")
+    return kept, replace(state, **{name: getattr(state, name)[there] for name in arrays})
+
+
+def _touching(path: Trajectory, frame: int, there: NDArray[np.bool_]) -> frozenset[int]:
+    """Return the bodies with a contact in a frame, as numbered among those that are ``there``."""
+    rows = path.contacts.bodies[path.contacts.frame == frame].ravel()
+    numbers = np.cumsum(there) - 1
+    return frozenset(int(numbers[body]) for body in rows if body >= 0 and there[body])
 
 
 def best_threshold(gaps: NDArray[np.float64], labels: NDArray[np.bool_]) -> float:

@@ -6,6 +6,7 @@ are options of the model: ``options={"steps": 500}``.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -28,6 +29,7 @@ from physion.readout.folds import Protocol
 from physion.readout.logistic import LogisticSettings
 from physion.readout.model_calls import is_network
 from physion.trials.dataset import Dataset
+from physion.trials.making.pairs import is_pair
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -236,11 +238,19 @@ def options_by_model(models: Sequence[str], pairs: Sequence[str]) -> dict[str, d
 
 
 def open_dataset(dataset: Dataset | Path | str, executor: Executor | None) -> Dataset:
-    """Return the dataset, with an absolute path for processes of ``executor``."""
+    """Return the dataset, with an absolute path for processes of ``executor``.
+
+    Movies of pairs, half of which are impossible, have no outcome to predict and are left out.
+    """
     opened = Dataset(Path(dataset)) if isinstance(dataset, str | Path) else dataset
-    if executor is None:
-        return opened
-    return Dataset(opened.folder.absolute(), verify=opened.verify)
+    if executor is not None:
+        opened = Dataset(opened.folder.absolute(), verify=opened.verify)
+    paired = opened.index["trial"].map(is_pair).astype(bool)
+    if paired.any():
+        opened = copy.copy(opened)
+        opened.index = opened.index[~paired].reset_index(drop=True)
+        vars(opened).pop("_rows", None)
+    return opened
 
 
 def runner_of_cells(executor: Executor | None) -> Executor | None:

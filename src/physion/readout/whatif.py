@@ -51,7 +51,7 @@ def whatif_scores(predictions: pd.DataFrame) -> pd.DataFrame:
             row = {"model": model, "readout": readout, "change": change, "pairs": len(part)}
             row["changed"] = int(part["moved"].notna().sum())
             for measure in MEASURES:
-                row[measure], row[f"{measure}_se"] = _mean(part, measure)
+                row[measure], row[f"{measure}_se"] = mean_over_trials(part, measure)
             rows.append(row)
     return pd.DataFrame(rows, columns=columns)
 
@@ -77,10 +77,11 @@ def _pairs(predictions: pd.DataFrame) -> pd.DataFrame:
     return pairs
 
 
-def _mean(part: pd.DataFrame, measure: str) -> tuple[float, float]:
+def mean_over_trials(part: pd.DataFrame, measure: str) -> tuple[float, float]:
     """Return the mean of a measure over pairs, and its standard error over trials.
 
-    With residual sums r_i of the n trials and m pairs: se^2 = n / (n - 1) sum r_i^2 / m^2.
+    ``base`` names the trial of each row. With residual sums r_i of the n trials and m pairs:
+    se^2 = n / (n - 1) sum r_i^2 / m^2.
     """
     known = part[["base", measure]].dropna()
     if known.empty:

@@ -80,6 +80,9 @@ _PROP_STYLES: dict[tuple[str, tuple[str, ...]], str] = {
     ("moon", ("moon",)): "moon_globe",
 }
 _STYLE_OF = {prop: style for style, props in _PROP_STYLES.items() for prop in props.split()}
+COLORS_OF = "colors_of"
+"""Key of ``Scene.parameters`` of scenes that look alike though they move differently: digest from
+which replaced colours are drawn, in place of the digest of the physics."""
 
 
 def expand_materials(names: Sequence[str]) -> tuple[str, ...]:
@@ -150,10 +153,11 @@ def in_look(scene: Scene, look: str) -> Scene:
 def with_role_colors(scene: Scene) -> Scene:
     """Return the scene with a red agent and a yellow patient; similar colours are replaced.
 
-    Only colours change. The random replacements are seeded by the physics digest, so that the same
-    trial always looks the same.
+    Only colours change. The random replacements are seeded by the physics digest, or by
+    `COLORS_OF`, so that the same trial always looks the same.
     """
-    rng = child_generator(named_seed(scene.physics_digest()), "role colors")
+    drawn_from = str(scene.parameters.get(COLORS_OF, "")) or scene.physics_digest()
+    rng = child_generator(named_seed(drawn_from), "role colors")
 
     def color_of(thing: Body | Cloth) -> Vec3:
         if thing.name == scene.roles.agent:

@@ -222,10 +222,19 @@ class MovieEncoder:
       placed before the pictures, so that a browser can play while it loads ("faststart").
     - ``rate``: frames per second.
     - ``crf``: quality of x264, lower is better.
+    - ``causal``: encode each frame from those before it only, so that movies with equal pictures up
+      to a frame are equal up to there; it takes more bytes.
     """
 
     def __init__(
-        self, width: int, height: int, frames: int, *, rate: int = PLAYBACK_RATE, crf: int = CRF
+        self,
+        width: int,
+        height: int,
+        frames: int,
+        *,
+        rate: int = PLAYBACK_RATE,
+        crf: int = CRF,
+        causal: bool = False,
     ) -> None:
         if width % 2 or height % 2 or min(width, height) < 2:
             raise BadInputError(
@@ -247,6 +256,8 @@ class MovieEncoder:
             "threads": "1",
             "x264-params": X264,
         }
+        if causal:
+            stream.options = {**stream.options, "tune": "zerolatency"}
         # Without these tags players guess the matrix, which turns saturated red into orange.
         context = stream.codec_context
         context.colorspace = context.color_primaries = context.color_trc = _BT709

@@ -7,6 +7,7 @@ read the observed part of a motion.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -37,7 +38,7 @@ from physion.physics.cloth.solver import CLOTH_CONTACT_GAP
 from physion.physics.labels import label_contact
 from physion.physics.rigid.bodies import body_mass
 from physion.physics.trajectory import State
-from physion.scenes.scene import Body, Scene
+from physion.scenes.scene import FRAME_TIME, Body, Scene
 
 # What baselines read from a motion: its observed part, and nothing after it.
 
@@ -66,6 +67,12 @@ def observed_motion(motion: Motion, trial: str) -> Motion:
     seen = Motion(motion.scene, cut_to_observed(motion.scene, motion.trajectory))
     require_motion(seen, trial)
     return seen
+
+
+def bodies_present(scene: Scene, *frames: int) -> NDArray[np.bool_]:
+    """Return which bodies (N,) are there in all ``frames`` and are no scenery."""
+    there = np.all([scene.present(frame) for frame in frames], axis=0)[: len(scene.bodies)]
+    return np.asarray(there & np.array([not body.scenery for body in scene.bodies]))
 
 
 def touched(motion: Motion) -> bool:
@@ -385,6 +392,24 @@ class ConstantMotion(Baseline):
         gaps = np.array([self._gap(observed_motion(motion, trial)) for motion, trial in pairs])
         repeated = np.repeat(gaps.reshape(-1, 1), samples, axis=1)
         return Rollout(gap=repeated, contact=repeated <= 0)
+
+    def surprise(self, batch: Batch) -> NDArray[np.float64]:
+        """Return how far bodies are from where they were going (B, T), metres, the farthest one.
+
+        With the place x and the velocity v of a body, and frames f: |x(f) - x(f') - (f - f') v(f')|
+        with the frame f' before. Bodies that come or go do not count.
+        """
+        found = np.zeros(batch.frames.shape)
+        for row, (motion, frames) in enumerate(
+            zip(motions(batch, self.name), batch.frames, strict=True)
+        ):
+            path = motion.trajectory
+            for step, (before, now) in enumerate(itertools.pairwise(frames.tolist()), start=1):
+                there = bodies_present(motion.scene, before, now)
+                expected = path.velocities[before] * np.float32((now - before) * FRAME_TIME)
+                off = norm((path.positions[now] - path.positions[before] - expected)[there])
+                found[row, step] = off.max(initial=0.0)
+        return found
 
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions."""

@@ -570,6 +570,42 @@ class ParticleSimulator(TorchModel):
         self.train(was_training)
         return join_futures(observed, imagined, samples)
 
+    @torch.no_grad()
+    def surprise(self, batch: Batch) -> F64:
+        """Return how far an object is from where it was predicted (B, T), metres, the worst one.
+
+        The distance is the root mean square over its particles, after the two steps before; the
+        first two frames have 0. Objects that come or go do not count.
+        """
+        assert batch.state is not None, "the spec asks for states"
+        frames = torch.as_tensor(batch.frames).cpu().numpy()
+        found = np.zeros(frames.shape)
+        for row, motion in enumerate(batch.state):
+            for first in range(2, frames.shape[1], _AT_ONCE):
+                steps = range(first, min(first + _AT_ONCE, frames.shape[1]))
+                shown = np.stack([frames[row, step - 2 : step + 1] for step in steps])
+                windows = Batch(
+                    trials=(batch.trials[row],) * len(steps),
+                    frames=shown,
+                    valid=np.ones(shown.shape, np.bool_),
+                    state=(motion,) * len(steps),
+                )
+                window = read_window(windows, self.settings.sampling, self.device)
+                found[row, steps.start : steps.stop] = self._misses(window, len(steps))
+        return found
+
+    def _misses(self, window: Window, scenes: int) -> F64:
+        """Return the largest distance of an object from its prediction, by scene."""
+        layout = window.layout
+        drift = drift_of(layout, window.before, window.now)
+        robust = self.settings.rigid == RANSAC
+        predicted, _ = self._predict_next(layout, window.now, drift, robust=robust)
+        squares = (predicted - window.later[0].positions(layout)).pow(2).sum(-1)
+        misses = mean_by(squares, layout.owners, layout.objects).sqrt()
+        misses = misses * (layout.kinds != KINEMATIC)
+        worst = misses.new_zeros(scenes).scatter_reduce(0, layout.scene, misses, "amax")
+        return np.asarray(worst.double().cpu().numpy())
+
     def step(self, layout: SceneLayout, before: ObjectState, now: ObjectState) -> ObjectState:
         """Return the state after the next step."""
         drift = drift_of(layout, before, now)

@@ -41,6 +41,7 @@ from physion.trials.index import (
     write_index,
 )
 from physion.trials.making.choose import short
+from physion.trials.making.pairs import check_kinds, pair_tasks
 from physion.trials.making.plan import (
     GenerateJob,
     GenerateSettings,
@@ -335,6 +336,7 @@ def generate(
     *,
     presets: Sequence[str] = (),
     whatif: Sequence[str] = (),
+    pairs: Sequence[str] = (),
     name: str = "physion",
     settings: GenerateSettings | None = None,
     executor: Executor | None = None,
@@ -359,6 +361,9 @@ def generate(
     whatif
         Changes of `physion.trials.making.whatif.KINDS`: for each trial with labels, each of its
         variants is made, too.
+    pairs
+        Kinds of `physion.trials.making.pairs.KINDS`: for each testing trial and each kind that it
+        allows, two possible and two impossible movies are made, too.
     name
         Name of the dataset, part of the seed of every trial.
     settings
@@ -398,16 +403,21 @@ def generate(
     tasks = plan_dataset(name, names, planned, chosen)
     if unknown := sorted(set(whatif) - set(KINDS)):
         raise UnknownNameError("change", unknown[0], KINDS)
-    where = Path(folder)
+    check_kinds(pairs)
+    where, settings = Path(folder), settings or GenerateSettings()
     report = make_trials(where, tasks, settings, executor=executor, progress=progress)
-    if whatif:
+    if whatif or pairs:
         made = Dataset(where)
         known = made.known_trials()
-        labelled = [
-            task.trial for task in tasks if task.trial in known
-            and (settings or GenerateSettings()).stores_labels(task.split)
-        ]  # fmt: skip
-        if changed := whatif_tasks(made, labelled, whatif):
+        there = [task for task in tasks if task.trial in known]
+        changed: list[TrialTask] = []
+        if whatif:
+            labelled = [task.trial for task in there if settings.stores_labels(task.split)]
+            changed += whatif_tasks(made, labelled, whatif)
+        if pairs:
+            tested = [task.trial for task in there if task.split == "testing"]
+            changed += pair_tasks(made, tested, pairs, settings.engine, progress)
+        if changed:
             more = make_trials(where, changed, settings, executor=executor, progress=progress)
             report = RunReport(
                 [*report.made, *more.made], [*report.kept, *more.kept],

@@ -23,7 +23,8 @@ from physion.scenes.sampling.sample import get_preset, sample_scene
 from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, Scene
 from physion.trials.files import Metadata, TrialPaths, encode_png, write_files
 from physion.trials.making.choose import choose
-from physion.trials.making.plan import GenerateJob, TrialTask
+from physion.trials.making.pairs import motion_of
+from physion.trials.making.plan import PAIR, GenerateJob, TrialTask
 from physion.trials.trial_file import Trial, TrialWriter
 from physion.trials.video import MovieEncoder, read_chosen
 
@@ -42,14 +43,14 @@ def make_trial(job: GenerateJob) -> str:
     """
     task, scene = choose(job) if job.task.presets else (job.task, scene_of(job.task))
     job = dataclasses.replace(job, task=task)
-    trajectory = make_engine(job.settings.engine).simulate(scene)
+    trajectory = motion_of(scene, make_engine(job.settings.engine))
     if len(trajectory) <= OBSERVED_FRAMES:
         raise BadInputError(
             f"trial {task.trial!r} has {len(trajectory)} frames; nothing is left to predict after "
             f"the {OBSERVED_FRAMES} observed ones"
         )
     labels = None
-    if job.settings.stores_labels(task.split):
+    if job.labelled:
         labels = dataclasses.replace(label_contact(scene, trajectory), robust=task.robust)
     write_files(job.paths, _files(job, scene, trajectory, labels))
     return task.trial
@@ -84,7 +85,7 @@ def _files(
     files = {}
     if settings.movies:
         rate = settings.playback_rate
-        if settings.stores_labels(job.task.split):
+        if job.labelled:
             files["map"] = encode_png(role_map(ids, scene))
         files["movie"], files["observed_movie"] = make_movies(
             renderer, rate, writer if settings.passes else None
@@ -104,7 +105,13 @@ def make_movies(
     """
     frames = len(renderer.trajectory)
     movie, observed = (
-        MovieEncoder(renderer.width, renderer.height, count, rate=rate)
+        MovieEncoder(
+            renderer.width,
+            renderer.height,
+            count,
+            rate=rate,
+            causal=PAIR in renderer.scene.parameters,
+        )
         for count in (frames, OBSERVED_FRAMES)
     )
     kept = writer.passes if writer else ()

@@ -34,6 +34,8 @@ SPLIT_LOOKS: Mapping[str, tuple[str, ...]] = {
 them, testing and familiarization have both (people see the free colours)."""
 FULL_COUNTS = {"training": 2000, "readout": 1000, "testing": 150, "familiarization": 10}
 """Trials per scenario in each split, as in the original study."""
+PAIR = "pair"
+"""Key of ``Scene.parameters`` of the movies of `physion.trials.making.pairs`."""
 PLAYBACK_RATES = {"slow": PLAYBACK_RATE, "real": round(1 / FRAME_TIME)}
 
 
@@ -197,10 +199,16 @@ class GenerateJob:
         """Looks of the movies to make; the first is the trial's own."""
         return self.settings.looks(self.task.split)
 
+    @property
+    def labelled(self) -> bool:
+        """Whether labels and the map of agent and patient are stored; movies of pairs have none."""
+        scene = self.task.scene
+        paired = scene is not None and PAIR in scene.parameters
+        return self.settings.stores_labels(self.task.split) and not paired
+
     def complete(self) -> bool:
         """Return whether all files of the trial exist."""
-        settings, free = self.settings, len(self.looks) > 1
-        return self.paths.complete(settings.movies, free, settings.stores_labels(self.task.split))
+        return self.paths.complete(self.settings.movies, len(self.looks) > 1, self.labelled)
 
 
 def plan_dataset(

@@ -222,11 +222,12 @@ def _make_again(
     """Sample, simulate and render a trial again; add the differences to ``result``."""
     from physion.physics.engine import engine_of
     from physion.trials.making.make import RENDERER
+    from physion.trials.making.pairs import motion_of
 
     meta = trial.metadata
     if meta.imported:
         return
-    motion = engine_of(meta.engine).simulate(trial.scene)
+    motion = motion_of(trial.scene, engine_of(meta.engine))
     found: list[str] = []
     if meta.preset is not None and meta.preset not in load_presets(meta.scenario):
         result.notes.append(

@@ -19,6 +19,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 from physion.core.errors import BadInputError, UnknownNameError
+from physion.scenes.looks import COLORS_OF
 from physion.scenes.scene import Body, Cloth, Push, Scene
 from physion.trials.dataset import Dataset
 from physion.trials.making.plan import TrialTask
@@ -70,6 +71,7 @@ def whatif_tasks(dataset: Dataset, trials: Sequence[str], kinds: Sequence[str]) 
                 "whatif": change,
                 "base": name,
                 "base_contact": trial.known_labels().contact,
+                COLORS_OF: trial.scene.physics_digest(),
             }
             called = name + MARK + re.sub(r"[^A-Za-z0-9._-]", "-", change)
             named = replace(scene, name=called, parameters={**scene.parameters, **known})

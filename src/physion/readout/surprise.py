@@ -1,0 +1,355 @@
+"""Is the impossible movie of a pair the one that surprises a model more?
+
+The surprise of a frame, given those before it, is
+
+- what ``surprise(batch)`` of the model returns;
+- of a model that encodes and imagines: with the features e(t) of a frame, and those i(t) that it
+  imagines one step after its context, the mean of (e(t) - i(t))^2 over the features; the smallest
+  over its futures;
+- of another network: its loss in the window of training that ends with the frame.
+
+The surprise of a movie is the mean, or the largest, over its frames. A pair is a possible and an
+impossible movie that begin alike (`physion.trials.making.pairs`), and the answer is right if the
+impossible one surprises more; equal surprises count half. Standard errors are of means over trials
+that the movies were made of: pairs of one are not independent.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from physion.clips.batch import Batch, Rollout
+from physion.clips.clips import whole_source
+from physion.compute.tasks import Progress, tracked
+from physion.core.errors import BadInputError
+from physion.core.files import folder_for_writing, json_digest, write_atomic
+from physion.models.interface import Model, ask, can
+from physion.readout.model_calls import (
+    call_model,
+    check_finite,
+    check_identity,
+    is_network,
+    model_name,
+    to_array,
+)
+from physion.readout.settings import EvaluationSettings, Models, choose_models
+from physion.readout.whatif import mean_over_trials
+from physion.trials.dataset import Dataset
+from physion.trials.making.pairs import Pair, is_pair
+
+F64 = NDArray[np.float64]
+COLUMNS = (
+    "model", "init", "scenario", "stimulus", "base", "kind", "hidden", "first", "possible", "mean",
+    "largest",
+)  # fmt: skip
+"""``first``: the world that the movie begins in; the possible and the impossible movie of ``base``,
+``kind`` and ``first`` are a pair."""
+MEASURES = ("mean", "largest")
+ALL, PIXELS = "all", "pixel-statistics"
+_VERSION = 1
+"""To be increased with every change that can alter a surprise."""
+STEP = 6
+"""Frames of a step, where a model asks for every frame: in one nothing has moved far."""
+_TREES = 100
+
+
+def surprise(
+    models: Models,
+    dataset: Dataset | Path | str,
+    out: Path | str = "runs/models",
+    settings: EvaluationSettings | None = None,
+    *,
+    options: Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+    **changes: Any,
+) -> pd.DataFrame:
+    """Return how much each movie of the pairs of a dataset surprises models.
+
+    Parameters
+    ----------
+    models, options
+        Models, as `physion.evaluate` takes them. They are not trained: those without weights that
+        ship are random, unless the option ``weights`` names some.
+    dataset
+        Dataset with pairs (``physion generate --pairs``), or its folder.
+    out
+        Folder of the tables, ``surprise/MODEL-DIGEST.csv``. What is there is not computed again.
+    settings
+        Of these ``seed``, ``rendered`` and ``accelerator`` count.
+    progress
+        Called after every trial.
+    **changes
+        Fields of `EvaluationSettings` to replace in ``settings``.
+
+    Returns
+    -------
+    surprises
+        `COLUMNS`, one row for each model and movie.
+
+    Raises
+    ------
+    BadInputError
+        If the dataset has no pairs, or a model has none of the methods that are needed.
+    """
+    settings = dataclasses.replace(settings or EvaluationSettings(), **changes)
+    trials = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
+    pairs = {name: _pair(trials, name) for name in trials.trials() if is_pair(name)}
+    if not pairs:
+        raise BadInputError(
+            f"{trials.folder} has no pairs of a possible and an impossible movie; make some with "
+            "physion generate --pairs"
+        )
+    chosen = choose_models(models, options)
+    # Every model is built before anything is computed, so that mistakes are found at once.
+    for model in chosen:
+        _way_of(model.build(settings.seed))
+    folder = Path(out) / "surprise"
+    tables = [
+        _of_model(one.build(settings.seed), trials, pairs, folder, settings, progress)
+        for one in chosen
+    ]
+    return pd.concat(tables, ignore_index=True)
+
+
+def _pair(dataset: Dataset, name: str) -> Pair:
+    pair = Pair.of(dataset.trial(name).scene)
+    if pair is None:
+        raise BadInputError(f"trial {name!r} of {dataset.folder} does not say which pair it is of")
+    return pair
+
+
+def _of_model(
+    model: Model,
+    dataset: Dataset,
+    pairs: Mapping[str, Pair],
+    folder: Path,
+    settings: EvaluationSettings,
+    progress: Progress | None,
+) -> pd.DataFrame:
+    """Return the surprises of one model, which are kept in ``folder``."""
+    origin = check_identity(model)
+    digests = dataset.index.set_index("trial")["digest"]
+    inputs = [_VERSION, model.digest(), settings.seed, settings.rendered]
+    inputs += [[name, str(digests[name])] for name in sorted(pairs)]
+    path = folder / f"{origin.model}-{json_digest(inputs)[:16]}.csv"
+    if path.is_file():
+        return pd.read_csv(path, dtype={"init": str}, keep_default_na=False)
+    if is_network(model):
+        from physion.training.devices import Devices, make_fabric, move_to_device
+
+        move_to_device(make_fabric(Devices(settings.accelerator), "32-true"), model)
+    scenarios = dataset.index.set_index("trial")["scenario"]
+    of_clips = _way_of(model)
+    spec = model.spec
+    if spec.stride == 1:
+        spec = dataclasses.replace(spec, stride=STEP, context=1)
+    source = whole_source(dataset, spec, rendered=settings.rendered)
+    rows = []
+    for name in tracked(list(pairs), f"surprise of {origin.model}", len(pairs), progress):
+        start = spec.first % spec.stride
+        steps = (source.length(name) - 1 - start) // spec.stride + 1
+        clip = source.window([name], [start], steps)
+        values = of_clips(clip, settings.seed)
+        check_finite(values, model, "surprises", (name,))
+        pair = pairs[name]
+        rows.append(
+            _row(
+                origin.model, origin.init, scenarios[name], name, pair, values.mean(), values.max()
+            )
+        )
+    table = pd.DataFrame(rows, columns=list(COLUMNS))
+    with folder_for_writing(folder):
+        write_atomic(path, table.to_csv(index=False).encode())
+    return table
+
+
+def _row(
+    model: str, init: str, scenario: str, name: str, pair: Pair, mean: float, largest: float
+) -> tuple[Any, ...]:
+    """Return the values of `COLUMNS`."""
+    of_pair = (pair.base, pair.kind, pair.hidden, pair.first, pair.possible)
+    return (model, init, scenario, name, *of_pair, float(mean), float(largest))
+
+
+# The surprise of each frame, (1, T), of a clip of one trial.
+
+
+def _way_of(model: Model) -> Callable[[Batch, int], F64]:
+    """Return the function of a clip and a seed that gives its surprise."""
+    if can(model, "surprise"):
+        return lambda clip, seed: _own(model, clip)
+    if can(model, "encode") and can(model, "imagine"):
+        return lambda clip, seed: _imagined_error(model, clip, seed)
+    if can(model, "loss") and is_network(model) and ask(model, "learns_from") == "clips":
+        return lambda clip, seed: _losses(model, clip)
+    raise BadInputError(
+        f"model {model_name(model)!r} has no surprise: it needs the method surprise, or encode and "
+        "imagine, or a loss on clips"
+    )
+
+
+def _own(model: Model, clip: Batch) -> F64:
+    values = call_model(model, "surprise", clip)
+    shape: tuple[int | None, ...] = (len(clip), clip.frames.shape[1])
+    kinds = ("float64", "float32")
+    return np.asarray(to_array(values, model, "surprise gave values", shape, kinds), np.float64)
+
+
+def _imagined_error(model: Model, clip: Batch, seed: int) -> F64:
+    """Return the mean square by which imagined features miss the features of each frame."""
+    steps, context = clip.frames.shape[1], model.spec.context
+    windows = [_before(step, context) for step in range(steps)]
+    if model.spec.framewise:
+        whole = _features(model, clip)
+        encoded = np.concatenate([whole[:, window] for window in windows])
+        true = whole[0]
+    else:
+        # Of frames together: of those up to each one, the last one's.
+        encoded = np.concatenate([_features(model, _part(clip, window)) for window in windows])
+        own = [_features(model, _part(clip, _before(step + 1, context))) for step in range(steps)]
+        true = np.concatenate(own)[:, -1]
+    parts = [_part(clip, window) for window in windows]
+    seeds = ask(model, "seed")
+    samples, errors = ask(model, "samples"), np.zeros(steps)
+    for step in range(1, steps):
+        asked = dataclasses.replace(parts[step], features=encoded[step : step + 1], future=1)
+        rollout = call_model(model, "imagine", asked, samples, seed if seeds is None else seeds)
+        if not isinstance(rollout, Rollout) or rollout.features is None:
+            raise BadInputError(f"model {model_name(model)!r}: imagine gave no features")
+        shape = (1, samples, 1, true.shape[-1])
+        imagined = to_array(rollout.features, model, "imagine gave features", shape, ("float32",))
+        squares = (imagined[0, :, 0].astype(np.float64) - true[step]) ** 2
+        errors[step] = squares.mean(axis=-1).min()
+    return errors[None]
+
+
+def _before(step: int, count: int) -> list[int]:
+    """Return the ``count`` steps before one; the first is repeated in front where there are less.
+
+    Nothing comes before step 0, which stands for itself.
+    """
+    return [max(index, 0) for index in range(step - count, step)]
+
+
+def _part(clip: Batch, steps: Sequence[int]) -> Batch:
+    return clip.steps(np.asarray(steps))  # type: ignore[arg-type]
+
+
+def _features(model: Model, clip: Batch) -> NDArray[np.float32]:
+    features = call_model(model, "encode", clip)
+    shape = (len(clip), None, None)
+    return to_array(features, model, "encode gave features", shape, ("float32",))
+
+
+def _losses(model: Model, clip: Batch) -> F64:
+    """Return the loss of the window of training that ends with each frame; 0 before the first."""
+    steps = clip.frames.shape[1]
+    length = min(ask(model, "window") or 2 * model.spec.context, steps)
+    losses = np.zeros(steps)
+    for step in range(length - 1, steps):
+        parts = call_model(model, "loss", _part(clip, range(step - length + 1, step + 1)))
+        losses[step] = float(parts["loss"])
+    return losses[None]
+
+
+# Scores of pairs.
+
+
+def surprise_scores(surprises: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Return the fraction of pairs whose impossible movie surprises a model more.
+
+    Parameters
+    ----------
+    surprises
+        Tables of `surprise`.
+
+    Returns
+    -------
+    scores
+        ``model``, ``kind`` (and all together), ``hidden`` (``yes``, ``no``, or ``all``), ``pairs``,
+        and for each of `MEASURES` the fraction and ``MEASURE_se``, NaN with less than two trials.
+    """
+    keys = ["model", "init", "base", "kind", "hidden", "first"]
+    table = pd.concat(surprises, ignore_index=True)
+    sides = [table[table["possible"].astype(bool) == side] for side in (True, False)]
+    joined = sides[0].merge(sides[1], on=keys, suffixes=("", "_impossible"), validate="one_to_one")
+    for measure in MEASURES:
+        more = joined[f"{measure}_impossible"] - joined[measure]
+        joined[measure] = (1 + np.sign(more)) / 2
+    rows = []
+    for model, own in joined.groupby("model", sort=False):
+        for kind, part in [(ALL, own), *own.groupby("kind")]:
+            seen = part["hidden"].astype(bool)
+            for hidden, some in ((ALL, part), ("no", part[~seen]), ("yes", part[seen])):
+                if some.empty:
+                    continue
+                row = {"model": model, "kind": kind, "hidden": hidden, "pairs": len(some)}
+                for measure in MEASURES:
+                    row[measure], row[f"{measure}_se"] = mean_over_trials(some, measure)
+                rows.append(row)
+    columns = ["model", "kind", "hidden", "pairs"]
+    columns += [f"{measure}{end}" for measure in MEASURES for end in ("", "_se")]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def pixel_statistics(
+    dataset: Dataset | Path | str, *, rendered: bool = False, progress: Progress | None = None
+) -> pd.DataFrame:
+    """Return a table as `surprise` does, of what single pictures tell: a check of the pairs.
+
+    Of each movie it knows mean and standard deviation of red, green and blue, in the whole and in
+    each of nine parts of the picture, each averaged over the first, second and last third of the
+    movie. Extremely randomised trees learn from all other trials which movies
+    are impossible; their P(impossible) stands for the surprise. If movies are well paired, nothing
+    of this tells, and half of the pairs come out right.
+    """
+    from sklearn.ensemble import ExtraTreesClassifier
+
+    from physion.clips.batch import Spec
+
+    trials = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
+    pairs = {name: _pair(trials, name) for name in trials.trials() if is_pair(name)}
+    source = whole_source(trials, Spec(image_size=48), rendered=rendered)
+    features = []
+    for name in tracked(list(pairs), PIXELS, len(pairs), progress):
+        steps = (source.length(name) - 1) // STEP + 1
+        features.append(_statistics(source.window([name], [0], steps).rgb[0]))
+    known = np.array(features)
+    impossible = np.array([not pair.possible for pair in pairs.values()])
+    bases = np.array([pair.base for pair in pairs.values()])
+    probability = np.full(len(pairs), 0.5)
+    folds = np.arange(len(set(bases))) % 10
+    of = dict(zip(sorted(set(bases)), folds.tolist(), strict=True))
+    fold = np.array([of[base] for base in bases])
+    for number in sorted(set(fold.tolist())):
+        tested = fold == number
+        if tested.all():
+            break
+        forest = ExtraTreesClassifier(_TREES, min_samples_leaf=4, random_state=0)
+        forest.fit(known[~tested], impossible[~tested])
+        probability[tested] = forest.predict_proba(known[tested])[:, 1]
+    scenarios = trials.index.set_index("trial")["scenario"]
+    rows = [
+        _row(PIXELS, "none", scenarios[name], name, pair, value, value)
+        for (name, pair), value in zip(pairs.items(), probability.tolist(), strict=True)
+    ]
+    return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+def _statistics(rgb: NDArray[np.uint8]) -> F64:
+    """Return statistics of pictures (T, H, W, 3)."""
+    side = rgb.shape[1] // 3
+    colors = rgb[:, : 3 * side, : 3 * side].astype(np.float64) / 255
+    cells = colors.reshape(len(rgb), 3, side, 3, side, 3)
+    parts = [cells.mean(axis=(2, 4)), cells.std(axis=(2, 4))]
+    each = np.concatenate([part.reshape(len(rgb), -1) for part in parts], axis=1)
+    whole = np.concatenate([colors.mean(axis=(1, 2)), colors.std(axis=(1, 2))], axis=1)
+    each = np.concatenate([whole, each], axis=1)
+    return np.concatenate([part.mean(axis=0) for part in np.array_split(each, 3)])

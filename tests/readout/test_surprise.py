@@ -1,0 +1,195 @@
+"""The impossible movie of a pair surprises more: surprises, and what counts of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from torch import nn
+
+import physion
+from physion.clips.batch import Batch, Motion, Provenance, Rollout, Spec
+from physion.compute.local import SerialExecutor
+from physion.core.errors import BadInputError
+from physion.models.build import build_model
+from physion.models.interface import Model
+from physion.physics.engine import simulate
+from physion.readout.surprise import COLUMNS, pixel_statistics, surprise, surprise_scores
+from physion.trials.dataset import Dataset
+from physion.trials.making.pairs import Pair, is_pair
+from physion.trials.making.plan import GenerateSettings
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("pairs")
+    physion.generate(
+        folder, "dominoes", 2, pairs=["vanish", "teleport"],
+        settings=GenerateSettings(width=32, height=32, jitters=0, movies=False),
+        executor=SerialExecutor(),
+    )  # fmt: skip
+    return folder
+
+
+class Bright(Model):
+    """Features are mean colours; nothing changes in what it imagines."""
+
+    spec = Spec(image_size=32, context=3)
+
+    def provenance(self) -> Provenance:
+        return Provenance("bright", "none")
+
+    def digest(self) -> str:
+        return "ab" * 32
+
+    def encode(self, batch: Batch) -> Any:
+        return np.asarray(batch.rgb.mean(axis=(2, 3)) / 255, np.float32)
+
+    def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
+        last = context.features[:, -1][:, None, None]
+        return Rollout(features=np.repeat(np.repeat(last, samples, 1), context.future, 2))
+
+
+class Knows(Bright):
+    """It is told which movies are impossible, by their states."""
+
+    spec = Spec(inputs=("state",))
+
+    def __init__(self, sign: float) -> None:
+        self.sign = sign
+
+    def provenance(self) -> Provenance:
+        return Provenance(f"knows {self.sign}", "none")
+
+    def surprise(self, batch: Batch) -> Any:
+        assert batch.state is not None
+        found = np.zeros(batch.frames.shape)
+        for row, motion in enumerate(batch.state):
+            pair = Pair.of(motion.scene)
+            assert pair is not None
+            found[row, batch.frames[row] >= pair.start] = self.sign * (not pair.possible)
+        return found
+
+
+class Losing(nn.Module, Bright):
+    """A network whose loss is the squared change of the mean picture within a window of two."""
+
+    window = 2
+    encode = imagine = None  # type: ignore[assignment]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.factor = nn.Parameter(torch.ones(()))
+
+    def provenance(self) -> Provenance:
+        return Provenance("losing", "random")
+
+    def loss(self, batch: Batch) -> Any:
+        mean = batch.rgb.float().mean(dim=(2, 3)) / 255
+        return {"loss": (self.factor * (mean[:, 1] - mean[:, 0])).pow(2).mean()}
+
+
+def test_who_knows_is_right_and_who_has_no_idea_is_half_right(pairs: Path, tmp_path: Path) -> None:
+    table = surprise([Knows(1.0), Knows(-1.0), Knows(0.0)], pairs, tmp_path)
+    names = [name for name in Dataset(pairs).trials() if is_pair(name)]
+    assert list(table.columns) == list(COLUMNS) and len(table) == 3 * len(names)
+    scores = surprise_scores([table]).set_index(["model", "kind", "hidden"])
+    for sign, expected in ((1.0, 1.0), (-1.0, 0.0), (0.0, 0.5)):
+        row = scores.loc[f"knows {sign}", "all", "all"]
+        assert row["pairs"] == len(names) / 2
+        # The mean sees a surprise below 0 as less, the largest sees the frames before, with 0.
+        assert row["mean"] == expected and row["largest"] == max(expected, 0.5)
+
+
+def test_imagined_features_are_compared_with_the_next_frame(pairs: Path, tmp_path: Path) -> None:
+    table = surprise(Bright(), pairs, tmp_path).set_index("stimulus")
+    losses = surprise(Losing(), pairs, tmp_path).set_index("stimulus")
+    dataset = Dataset(pairs)
+    name = str(table.index[0])
+    renderer = dataset.trial(name).renderer(32, 32)
+    frames = range(2, len(dataset.trial(name).trajectory), 6)
+    pictures = [np.asarray(renderer.render(frame).color) for frame in frames]
+    means = np.array([picture.mean(axis=(0, 1)) / 255 for picture in pictures])
+    errors = np.append(0.0, (np.diff(means, axis=0) ** 2).mean(axis=1))
+    assert table.loc[name, "mean"] == pytest.approx(errors.mean(), rel=1e-3)
+    assert table.loc[name, "largest"] == pytest.approx(errors.max(), rel=1e-3)
+    # The same, said by a loss.
+    assert losses.loc[name, "mean"] == pytest.approx(errors.mean(), rel=1e-3)
+
+
+def test_what_is_known_is_not_computed_again(pairs: Path, tmp_path: Path) -> None:
+    first = surprise(Bright(), pairs, tmp_path)
+    asked: list[str] = []
+    again = surprise(
+        Bright(), pairs, tmp_path, progress=lambda what, done, total: asked.append(what)
+    )
+    assert not asked
+    pd.testing.assert_frame_equal(first, again)
+
+
+def test_ties_count_half_and_errors_are_over_trials() -> None:
+    rows = [
+        ("m", "none", "drop", f"{base}{first}{possible}", base, "vanish", False, first, possible,
+         value, value)
+        for base, first, possible, value in (
+            ("a", 0, True, 1.0), ("a", 0, False, 2.0), ("a", 1, True, 1.0), ("a", 1, False, 1.0),
+            ("b", 0, True, 3.0), ("b", 0, False, 2.0),
+        )
+    ]  # fmt: skip
+    scores = surprise_scores([pd.DataFrame(rows, columns=list(COLUMNS))])
+    row = scores[(scores["kind"] == "all") & (scores["hidden"] == "all")].iloc[0]
+    assert row["pairs"] == 3 and row["mean"] == pytest.approx((1 + 0.5 + 0) / 3)
+    # Residuals of trial a: (1 - .5) + (.5 - .5), of trial b: 0 - .5; se^2 = 2/1 (.25 + .25) / 9.
+    assert row["mean_se"] == pytest.approx(1 / 3)
+
+
+def _clip(jump: float) -> tuple[Batch, int]:
+    """Return a clip of a motion in which the agent jumps by ``jump`` metres at frame 60."""
+    scene = physion.sample_scene("dominoes", 0)
+    path = simulate(scene, frames=80)
+    row = scene.index(scene.roles.agent)
+    moved = path.positions.copy()
+    moved[60:, row, 0] += jump
+    frames = np.arange(2, 80, 6)[None]
+    motion = Motion(scene, replace(path, positions=moved))
+    return Batch(("one",), frames, np.ones(frames.shape, bool), state=(motion,)), 10
+
+
+@pytest.mark.parametrize("name", ["constant-motion", "noisy-simulation", "gns", "dpi"])
+def test_models_of_motion_are_surprised_by_a_jump(name: str) -> None:
+    model = build_model(name, **({"samples": 3} if name == "noisy-simulation" else {}))
+    (still, step), (jumped, _) = _clip(0.0), _clip(0.6)
+    calm, found = model.surprise(still)[0], model.surprise(jumped)[0]
+    assert calm.shape == found.shape == (13,)
+    assert np.allclose(calm[:step], found[:step])
+    assert int(np.argmax(found - calm)) == step
+    if name == "constant-motion":
+        # Nothing else moves then: the surprise is the jump.
+        assert found[step] == pytest.approx(0.6, abs=0.02)
+    if name == "noisy-simulation":
+        # -log exp(-d^2 / 2 w^2) with d = .6 and w = .02, less what three samples miss by.
+        assert found[step] == pytest.approx(450, rel=0.2)
+
+
+def test_a_dataset_without_pairs_and_a_model_without_surprise_are_refused(
+    pairs: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(BadInputError, match="has no surprise"):
+        surprise("chance", pairs, tmp_path)
+    plain = physion.generate(
+        tmp_path / "plain", "drop", 1, executor=SerialExecutor(),
+        settings=GenerateSettings(width=32, height=32, jitters=0, movies=False),
+    )  # fmt: skip
+    with pytest.raises(BadInputError, match="generate --pairs"):
+        surprise(Bright(), plain, tmp_path)
+
+
+def test_pixel_statistics_give_a_probability_for_each_movie(pairs: Path) -> None:
+    table = pixel_statistics(pairs)
+    assert table["mean"].between(0, 1).all()
+    assert set(table["stimulus"]) == {name for name in Dataset(pairs).trials() if is_pair(name)}
