@@ -1,0 +1,446 @@
+"""The page of the paper's claims: tables, figure 4 and matrices, published and own.
+
+    python benchmarks/models/paper_page.py --write   # weights of the package only, in a minute
+
+`paper_table` trains models under every protocol, and adds them. The page is
+``docs/results/paper.md``; its figures are those of `physion.report`, with the published models and
+ours as rows or panels of one figure.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from PIL import Image
+
+from paper_claims import (
+    NAMES,
+    NOT_COMPUTED,
+    RESULTS,
+    SIMULATED,
+    Tested,
+    averaged,
+    claims,
+    panel_rows,
+    stored_official,
+    stored_own,
+    tested_of,
+)
+from physion.analysis.comparison import ANOTHER
+from physion.analysis.published.claims import (
+    PublishedResults,
+)
+from physion.analysis.published.tables import (
+    MODELS,
+    PARTICLES,
+    SELECTION,
+    PublishedTables,
+    figure_s1,
+    figure_s3,
+    panel_a,
+    panel_c,
+    panel_d,
+    panel_e,
+    read_published,
+)
+from physion.analysis.tables import ALL_BUT, MEAN, ONLY
+from physion.compute.tasks import processor
+from physion.core.names import SCENARIOS
+from physion.data.official import official
+from physion.report.build import prepare_folder, write_csv, write_plot
+from physion.report.figures.by_scenario import measure_figure
+from physion.report.figures.theme import Plot
+from physion.report.figures.training import generalization_figure, grouped_figure
+from physion.report.published import published_plots
+
+PAGE = Path(__file__).parents[2] / "docs" / "results" / "paper.md"
+HELD_OUT = 0.02
+"""Relative change of the held-out loss in the last third of a training that counts as none."""
+DIFFERENT = ("opposite", "not shown here", "shown only here")
+PUBLISHED, PACKAGE, HERE = "published", "weights of the package", "trained for this page"
+KINDS = {"shipped_official": PACKAGE, "official": HERE}
+"""Kinds of models in the figures, all on official stimuli."""
+SUFFIXES = {PUBLISHED: "", PACKAGE: " (package)", HERE: " (here)"}
+SETS = {
+    "shipped_official": "weights of the package, official stimuli",
+    "shipped_own": "weights of the package, own trials",
+    "official": "trained for this page, official stimuli",
+    "own": "trained for this page, own trials",
+}
+"""Models and the trials that they are tested on. People saw the official stimuli."""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What of a part is finished.
+
+    - ``model``, ``protocol``, ``steps``: the part. ``trainings``: number that it needs.
+    - ``shipped``: whether it has the weights of the package.
+    - ``tested``: sets that it tests. ``predictions``: by finished tested set.
+    - ``folders``: of finished trainings.
+    """
+
+    model: str
+    protocol: str
+    steps: int
+    shipped: bool
+    tested: Sequence[str]
+    predictions: Mapping[str, pd.DataFrame]
+    folders: Sequence[Path]
+    trainings: int
+
+
+def figures(released: PublishedTables, tested: Mapping[str, Tested]) -> list[Plot]:
+    """Return the panels of figure 4 and the matrices, published and own in one figure each."""
+    drawn = {KINDS[name]: of for name, of in tested.items() if name in KINDS}
+    drawn = {kind: of for kind, of in drawn.items() if len(panel_rows(of.tables))}
+    if not drawn:
+        return []
+    plots = {PUBLISHED: {plot.name: plot for plot in published_plots(panels(released, released))}}
+    for kind, of in drawn.items():
+        made = published_plots(panels(averaged(of.tables), released))
+        plots[kind] = {plot.name: plot for plot in made}
+    found = []
+    for name, measure in (("panel_a", "accuracy"), ("panel_c", "kappa")):
+        table = interleaved({kind: of[name].table for kind, of in plots.items()})
+        found.append(Plot(name, "", table, partial(measure_figure, measure=measure)))
+    r = interleaved({kind: of.r for kind, of in drawn.items()})
+    found.insert(1, Plot("panel_b", "", r, partial(measure_figure, measure="r")))
+    for name, column in (("panel_d", "readout"), ("panel_e", "training")):
+        parts = [
+            plot[name].table.assign(panel=kind)
+            for kind, plot in plots.items()
+            if kind == PUBLISHED or drawn[kind].tables.runs[column].nunique() > 1
+        ]
+        if len(parts) > 1:
+            found.append(Plot(name, "", pd.concat(parts, ignore_index=True), grouped_figure))
+    matrices = generalisation(released, [of.matrices for of in drawn.values()])
+    if len(matrices):
+        found.append(Plot("generalisation", "", matrices, generalization_figure))
+    return found
+
+
+def panels(tables: PublishedTables, released: PublishedTables) -> PublishedResults:
+    """Return what the figures of the published results are drawn of, for any tables."""
+    made = {
+        "panel_a": panel_a(tables),
+        "panel_c": panel_c(tables),
+        "panel_d": panel_d(tables),
+        "panel_e": panel_e(tables),
+        "figure_s1": figure_s1(released),
+        "figure_s3": figure_s3(released),
+    }
+    return PublishedResults(made, {"panels": SELECTION})
+
+
+def interleaved(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+    """Return the rows of figures by kind of model, models of one name one below the other.
+
+    Each panel has one line and one band of people: those of the first kind.
+    """
+    first = next(iter(tables.values()))
+    parts = [
+        table.assign(kind=kind, model=table["model"] + SUFFIXES[kind], base=table["model"])
+        for kind, table in tables.items()
+    ]
+    table = pd.concat(parts, ignore_index=True)
+    people = first.drop_duplicates("panel").set_index("panel")
+    for name in ("people", "people_is", "zone_low", "zone_high", "zone"):
+        table[name] = table["panel"].map(people[name])
+    place = {name: at for at, name in enumerate([*SCENARIOS, MEAN])}
+    rank = {name: at for at, name in enumerate(MODELS.values())}
+    table = table.assign(
+        place=table["panel"].map(place), rank=table["base"].map(rank).fillna(len(rank))
+    )
+    return table.sort_values(["place", "rank", "base"], kind="stable", ignore_index=True)
+
+
+def generalisation(released: PublishedTables, own: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Return accuracy less people's by training and tested scenario, published and own.
+
+    Of *only* the released tables have the diagonal: no other scenario was tested.
+    """
+    known = [table for table in own if len(table)]
+    if not known:
+        return pd.DataFrame()
+    ours = pd.concat(known, ignore_index=True)
+    runs = averaged(released).runs
+    runs = runs[runs["model"].isin(set(ours["model"])) & (runs["readout"] == SIMULATED)]
+    people = released.people.set_index("scenario")["accuracy"]
+    theirs = pd.DataFrame(
+        {"model": runs["model"] + " (published)",
+         "trained": runs["training"].where(runs["training"] != ONLY, runs["scenario"]),
+         "tested": runs["scenario"], "stimuli": np.nan, "accuracy": runs["accuracy"],
+         "people": runs["scenario"].map(people)}
+    )  # fmt: skip
+    theirs = theirs[theirs["tested"].isin(set(ours["tested"]))]
+    theirs = theirs.assign(difference=theirs["accuracy"] - theirs["people"])
+    table = pd.concat([ours.assign(model=ours["model"] + SUFFIXES[HERE]), theirs])
+    order = {name: rank for rank, name in enumerate(["all", ALL_BUT, *SCENARIOS])}
+    table = table.assign(row=table["trained"].map(order), column=table["tested"].map(order))
+    return table.sort_values(["row", "column", "model"], ignore_index=True)
+
+
+# Trainings, and the page.
+
+
+def held_out(folder: Path) -> tuple[float, bool]:
+    """Return the last held-out loss, and whether it hardly changed in the last third."""
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    found = [(row["step"], row["validation/loss"]) for row in map(json.loads, lines)
+             if "validation/loss" in row]  # fmt: skip
+    last_step, last = found[-1]
+    before = [loss for step, loss in found if step <= 2 * last_step / 3] or [found[0][1]]
+    return last, abs(last / before[-1] - 1) <= HELD_OUT
+
+
+def trainings(parts: Sequence[Finished]) -> pd.DataFrame:
+    """Return how many trainings of each part are finished, and how many are trained enough."""
+    records = []
+    for part in parts:
+        if part.protocol == "one":
+            continue
+        losses = [held_out(folder) for folder in part.folders]
+        state = ", ".join(part.predictions) or "no"
+        records.append(
+            {"model": part.model, "protocol": part.protocol, "steps": part.steps,
+             "finished": f"{len(losses)} of {part.trainings}",
+             "held-out loss within 2 %": sum(steady for _, steady in losses),
+             "evaluated": state}
+        )  # fmt: skip
+    return pd.DataFrame(records)
+
+
+def accuracies(tested: Mapping[str, Tested]) -> pd.DataFrame:
+    """Return the mean accuracy over scenarios by model, training, readout and set."""
+    keys = ["model", "training", "readout"]
+    columns = {}
+    for name, of in tested.items():
+        across = of.across.runs
+        runs = pd.concat([of.tables.runs, across[across["training"] == ANOTHER]])
+        by_scenario = runs.groupby([*keys, "scenario"], sort=False)["accuracy"].mean()
+        columns[SETS[name]] = by_scenario.groupby(keys, sort=False).mean()
+    order = {name: at for at, name in enumerate([*MODELS.values(), "all", ALL_BUT, ONLY, ANOTHER,
+                                                 "observed", SIMULATED, "full"])}  # fmt: skip
+    table = pd.DataFrame(columns).rename_axis(keys).reset_index()
+    table = table.sort_values(keys, key=lambda v: v.map(order).fillna(-1), kind="stable")
+    for name in columns:
+        table[name] = table[name].map("{:.3f}".format).replace("nan", "-")
+    return table.rename(columns={"training": "trained on"})
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """Return a table as Markdown."""
+    head = [str(name) for name in table.columns]
+    lines = [head, ["---"] * len(head), *table.astype(str).to_numpy().tolist()]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+CAPTIONS = {
+    "panel_a": "**A.** Accuracy, trained on all scenarios, *observed+simulated*. Dashed: people; "
+    "grey: the middle 95 % of participants; hatched: the paper's band. All three as published, for "
+    "all stimuli of the study.",
+    "panel_b": "**B.** r with the average person. The released tables do not determine the "
+    "published one. Dashed: the noise ceiling. NaN: the answers are constant.",
+    "panel_c": "**C.** Cohen's kappa with people: published, the median over participants; here, "
+    "with a person drawn anew for each stimulus (the answers of single participants are not "
+    "released).",
+    "panel_d": "**D.** Accuracy by readout, trained on all scenarios. Dashed: people, on the same "
+    "stimuli. Particle models have one readout.",
+    "panel_e": "**E.** Accuracy by training protocol, *observed+simulated*. Dashed: people.",
+    "generalisation": "Accuracy less people's: trained on (rows), tested on (columns). The "
+    "released tables hold no training on another scenario than the tested one, so that of the "
+    "published matrix only the diagonal is known.",
+}
+STORED_ABOUT = (
+    "**Weights of the package.** The scores are those of [the page on models and people]"
+    "(models.md): {official} official stimuli with readouts of about 33 trials per scenario "
+    "([official_all.csv](../../benchmarks/results/official_all.csv)), and {own} own trials with "
+    "readouts of 200 ([small.txt](../../benchmarks/results/small.txt)). These models have the size "
+    "`small`, were trained on our own trials of all scenarios, see frames 0, 6, ..., 36, and under "
+    "*full* frames up to 144, as in the published code; particle models have the decision *touch*. "
+    "With so few trials on official stimuli the readouts of vision models answer mostly the same: "
+    "in {constant} of {cells} pairs of vision model and scenario kappa is 0."
+)
+
+
+def write_page(
+    parts: Sequence[Finished], folder: Path, scale: Mapping[str, Any], command: str, *, write: bool
+) -> str:
+    """Return the page of what is finished; draw the figures into FOLDER/page.
+
+    With ``write`` the page goes to `PAGE` and the pictures to `RESULTS`.
+    """
+    released = read_published(official().results.parent)
+    tested = {"shipped_official": stored_official(released), "shipped_own": stored_own(released)}
+    for name in ("official", "own"):
+        tables = [part.predictions[name] for part in parts if name in part.predictions]
+        if tables:
+            joined = pd.concat(tables, ignore_index=True)
+            tested[name] = tested_of(joined, released, people=name == "official")
+    table = claims(released, tested)
+    pictures = prepare_folder(folder / "page")
+    write_csv(folder / "page" / "tables" / "claims.csv", table)
+    plots = figures(released, tested)
+    for plot in plots:
+        write_plot(plot, pictures)
+        if write:
+            # Few colours, for a third of the bytes.
+            drawn = Image.open(pictures / f"{plot.name}.png").convert("RGB").quantize(64)
+            drawn.save(RESULTS / f"paper_{plot.name}.png", optimize=True)
+    text = page_text(parts, scale, command, tested, table, [plot.name for plot in plots])
+    if write:
+        PAGE.write_text(text)
+    return text
+
+
+def page_text(
+    parts: Sequence[Finished], scale: Mapping[str, Any], command: str, tested: Mapping[str, Tested],
+    table: pd.DataFrame, drawn: Sequence[str],
+) -> str:  # fmt: skip
+    """Return the page as Markdown."""
+    differ = []
+    for _, row in table.iterrows():
+        other = [name for name in tested if row[f"{name}_verdict"] in DIFFERENT]
+        if other:
+            ours = "; ".join(
+                f"{SETS[name]}: {row[name]} (**{row[f'{name}_verdict']}**)" for name in other
+            )
+            differ.append(
+                f"- *{row['claim']}*: {row['sentence']}. Compared: {row['compared']}. "
+                f"Released tables: {row['released']}. {ours[0].upper()}{ours[1:]}."
+            )
+    shown = table[["claim", "compared", "published", "released"]].copy()
+    shown["claim"] = "*" + table["claim"] + "*: " + table["sentence"]
+    for name in tested:
+        shown[SETS[name]] = [
+            ours if of == NOT_COMPUTED else f"{ours} (**{of}**)"
+            for ours, of in zip(table[name], table[f"{name}_verdict"], strict=True)
+        ]
+    missing = [
+        f"- {NAMES[part.model]}, *{part.protocol}*: {SETS[name]}"
+        for part in parts for name in part.tested if name not in part.predictions
+    ]  # fmt: skip
+    known = {part.model for part in parts if part.predictions}
+    rest = [paper for name, paper in NAMES.items() if name not in known]
+    if rest:
+        missing.append(f"- every protocol but *all* of {', '.join(rest)}")
+    if not any(part.protocol == "one" and part.predictions for part in parts):
+        missing.append("- *one*, and with it the matrices of generalisation")
+    missing.append("- pVGG and pDeIT: their ImageNet weights cannot be had here")
+    stored = {name: tested[f"shipped_{name}"].trials for name in ("official", "own")}
+    vision = panel_rows(tested["shipped_official"].tables)
+    vision = vision[~vision["model"].isin(PARTICLES)]
+    stored |= {"cells": len(vision), "constant": int((vision["kappa"].abs() < 5e-4).sum())}
+    lines = [
+        "# Results: the paper's claims",
+        "Are the claims of the paper's Results section true of models of this package? Each is "
+        "tested as the paper tested it: accuracy by a mixed model, with random intercepts of "
+        "scenario, readout and training. This page was written by",
+        "",
+        "```sh",
+        command,
+        "```",
+        "",
+        f"{datetime.date.today()}, {processor()}. {STORED_ABOUT.format(**stored)}",
+        "",
+        _trained(parts, scale, tested),
+        "",
+        "## What does not come out the same",
+        "Claims whose test has another sign than in the released tables, or is significant "
+        "(p < .05) in one of the two only. *Not shown here* is no refutation: the models are "
+        "small, and fewer. Rows of one model and scenario share their stimuli, which these tests "
+        "do not know, so that their p are too small, there and here. Claims about people only are "
+        "those of `physion compare --published`.",
+        "",
+        *(differ or ["Nothing of what was computed."]),
+        "",
+        *[_counted(SETS[name], table[f"{name}_verdict"]) for name in tested],
+        "",
+        "## Claims",
+        "*Published*: as printed. *Released*: what the sentence asks for, from the released "
+        "tables, each row once (`physion compare --published` has more). Then the same test on our "
+        "models, which are named. In the place of pVGG and pDeIT stand encoders with weights of "
+        "ImageNet that are here.",
+        "",
+        markdown(shown),
+        "",
+        "## Figure 4",
+        "Official stimuli. Models that are missing were not computed.",
+        "",
+        *[line for name in drawn if name != "generalisation" for line in _picture(name)],
+        *([] if "panel_e" in drawn else [f"**E.** Training protocols: {NOT_COMPUTED}.", ""]),
+        "## Generalisation",
+        *(_picture("generalisation") if "generalisation" in drawn else [f"{NOT_COMPUTED}.", ""]),
+        "## Accuracies",
+        "Means over scenarios, of seeds too.",
+        "",
+        markdown(accuracies(tested)),
+        "",
+        "## Not computed",
+        *missing,
+    ]
+    return "\n".join(map(_wrapped, "\n".join(lines).split("\n"))) + "\n"
+
+
+def _counted(name: str, verdicts: pd.Series) -> str:
+    """Return how many claims come out the same, as a line of a list."""
+    known = verdicts[verdicts.isin(["same", *DIFFERENT])]
+    same = int((known == "same").sum())
+    return f"- {name[0].upper()}{name[1:]}: {same} of {len(known)} claims come out the same."
+
+
+def _wrapped(line: str) -> str:
+    """Return a line of text in lines of at most 100 characters; tables and headings stay."""
+    if line.startswith(("|", "#", "!", "python")):
+        return line
+    rest = "  " if line.startswith("- ") else ""
+    return textwrap.fill(line, 100, subsequent_indent=rest, break_on_hyphens=False)
+
+
+def _trained(
+    parts: Sequence[Finished], scale: Mapping[str, Any], tested: Mapping[str, Tested]
+) -> str:
+    """Return what was trained for the page, with the table of trainings."""
+    table = trainings([part for part in parts if not part.shipped])
+    about = "**Trained for this page.** "
+    if table.empty or not any(part.folders for part in parts):
+        return f"{about}Nothing yet: `benchmarks/models/paper_table.py` does it, for days."
+    counts = [f"{tested[name].trials} {name}" for name in ("official", "own") if name in tested]
+    return (
+        f"{about}Size `small`, {scale['trials']} training trials per scenario (the paper: 2000), "
+        f"without labels, {scale['steps']:g} of the default number of steps, {scale['seeds']} "
+        f"seed(s) of *all*; readouts of {scale['readout']} trials per scenario (1000). Tested "
+        f"trials: {', '.join(counts) or 'none'}. Particle models have the decision *end*. The "
+        "held-out loss at the end is compared with the one after two thirds of the steps.\n\n"
+        f"{markdown(table)}"
+    )
+
+
+def _picture(name: str) -> list[str]:
+    return [CAPTIONS[name], "", f"![{name}](../../benchmarks/results/paper_{name}.png)", ""]
+
+
+def main() -> None:
+    """Make the page of weights that ship only."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--write", action="store_true")
+    chosen = parser.parse_args()
+    with TemporaryDirectory() as folder:
+        command = "python benchmarks/models/paper_page.py --write"
+        print(write_page([], Path(folder), {}, command, write=chosen.write))
+
+
+if __name__ == "__main__":
+    main()
