@@ -62,7 +62,7 @@ def test_the_tests_of_the_paper_find_what_was_put_in(claims: Any) -> None:
     assert "reason" in claims.fitted(contrasts["DPI-Net and people"], own)  # nobody saw these
 
 
-def test_stored_scores_are_those_of_their_files(claims: Any) -> None:
+def test_stored_scores_equal_their_files(claims: Any) -> None:
     released = read_published(official().results.parent)
     scores = pd.read_csv(claims.RESULTS / "official_all.csv")
     means = scores[scores["scenario"] == "mean"].set_index(["model", "readout"])["accuracy"]
