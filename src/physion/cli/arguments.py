@@ -20,8 +20,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 import tyro
 
-# Not a public module of tyro, whose version is pinned: tests/cli/test_arguments.py
-# fails where it changes.
+# Not a public module of tyro, so pyproject.toml asks for one version of tyro only.
 from tyro import _errors
 
 from physion.core.errors import BadInputError
