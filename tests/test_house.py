@@ -99,6 +99,7 @@ def test_no_import_ring() -> None:
     assert not [ring for ring in rings if len(ring) > 1]
 
 
+@pytest.mark.slow
 def test_every_import_by_name_is_known() -> None:
     found = set()
     for path in SOURCES:

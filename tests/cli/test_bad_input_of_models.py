@@ -75,6 +75,7 @@ MOVIES = {
 """Verb that reads a movie, split of its trial, and frames that it should have."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["cut", *CHANGES])
 @pytest.mark.parametrize("read", list(MOVIES))
 @pytest.mark.parametrize("known", [True, False], ids=["indexed", "changed"])

@@ -12,6 +12,7 @@ from physion.cli.main import main
 from physion.core.version import MADE_WITH
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_every_quantity_of_a_scenario_is_measured(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "--scenario", "drop", "--count", "1", "--json"]) == 0

@@ -159,6 +159,7 @@ def test_page_and_terminal_show_the_same_average(capsys: pytest.CaptureFixture[s
             assert shown["m"].startswith(f"{r:.3f}")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_files_with_official_headers_write_the_report(
     official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -240,6 +241,7 @@ def own_study(folder: Path) -> Own:
     return Own(folder / "m.csv", folder / "trials.csv", dataset, folder / "lists.csv")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_every_option_of_a_comparison_reaches_the_report(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -278,6 +280,7 @@ def test_every_option_of_a_comparison_reaches_the_report(
     assert "32 by the table that was given" in page
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_python_of_the_documentation_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -352,6 +355,7 @@ def test_published_prints_and_writes_the_published_numbers(
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_published_as_json(official: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["compare", "--published", "--humans", str(official), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)

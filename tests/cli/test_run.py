@@ -46,6 +46,7 @@ def digests(folder: Path) -> dict[str, str]:
     }
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_sampled_scenes_to_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["run", "--sampled", "--out", str(tmp_path), *SMALL, *FEW, "--json"]
@@ -96,6 +97,7 @@ def test_the_first_command_compares_models_with_people(
     assert digests(tmp_path) == first, "what was changed is made again, nothing else changes"
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_command_logs_against_people(
     official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -131,6 +133,7 @@ def test_a_larger_limit_adds_to_the_trials_of_a_smaller_one() -> None:
     assert len(balanced_trials(trials, None)) == len(trials)
 
 
+@pytest.mark.slow
 def test_scenarios_begin_with_either_outcome_in_turn() -> None:
     ones = balanced_trials(official().trials, 1)
     scenarios = sorted({trial.scene.scenario for trial in ones})
@@ -145,6 +148,7 @@ def test_sampled_trials_are_twice_as_many_for_the_readout() -> None:
     assert all(counts[scenario, "readout"] == 6 for scenario, _ in counts)
 
 
+@pytest.mark.slow
 def test_what_learns_is_trained_on_trials_that_show_no_roles() -> None:
     """As many as fit the readout, of another split, whose movies have the free colours."""
     tasks = plan_sampled(3, learn=True).tasks

@@ -73,6 +73,7 @@ def test_a_second_run_does_nothing_and_says_so(
     assert result["validation"] < 1 and files_of(tmp_path) == before
 
 
+@pytest.mark.slow
 def test_protocols_and_settings_make_trainings_of_their_own(
     dots: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -140,6 +141,7 @@ def test_a_training_that_is_killed_ends_with_the_same_bytes(dots: Dataset, tmp_p
     assert one == other
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_two_processes_train_as_one_that_accumulates(dots: Dataset, tmp_path: Path) -> None:
     """Each process gets its part of the clips of a step; the gradients are averaged."""
@@ -164,6 +166,7 @@ def test_two_processes_train_as_one_that_accumulates(dots: Dataset, tmp_path: Pa
     assert len(losses) == 40 and losses[-1] < 0.5 * losses[0]
 
 
+@pytest.mark.slow
 def test_evaluate_finds_what_was_trained(
     dots: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -198,6 +201,7 @@ def test_models_protocols_and_seeds(
     assert len(result["failed"]) == 4
 
 
+@pytest.mark.slow
 def test_evaluate_prints_a_table(
     dots: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -233,6 +237,7 @@ def test_predictions_without_a_trial_to_fit_are_named(
     assert "are the same number, since the readout had no trial to fit" in capsys.readouterr().err
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_what_is_interrupted_continues_and_a_second_run_trains_nothing(
     dots: Dataset, tmp_path: Path

@@ -149,6 +149,7 @@ SHOWN = {
 """What is shown of frames that were seen, of true ones after them, and of imagined ones."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(SHOWN))
 def test_vision_models_show_what_they_saw_and_imagined(folder: Path, name: str) -> None:
     model: Any = build_model(name, weights="shipped")

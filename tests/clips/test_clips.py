@@ -98,6 +98,7 @@ def test_wrong_passes_and_looks_are_refused_at_once(made: Dataset) -> None:
         physion.clips(made, look="blue")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_workers_of_a_loader_give_the_same_clips(method: str, made: Dataset) -> None:
@@ -118,6 +119,7 @@ def test_workers_of_a_loader_give_the_same_clips(method: str, made: Dataset) -> 
         assert torch.equal(here[0][name], there[0][name]), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", ["physion.clips.batch", "physion"])
 def test_the_package_of_this_name_is_the_function_too(made: Dataset, first: str) -> None:
     """Whichever of both is imported first, and without torch."""

@@ -142,6 +142,7 @@ def test_exit_code_of_a_worker_is_reported() -> None:
     assert outcome.error == "the worker process ended with exit code 7"
 
 
+@pytest.mark.slow
 def test_a_hanging_task_is_ended_and_the_others_go_on() -> None:
     executor = LocalExecutor(1, tries=1, timeout=5.0)
     outcomes = {o.key: o for o in executor.map(hang, numbers(1, 2, 3))}

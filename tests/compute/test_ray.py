@@ -17,7 +17,7 @@ from support.paths import FIND_TESTS, ROOT
 from support.tasks import die_on_two, die_once, fail_on_three, square
 
 ray = pytest.importorskip("ray", reason="the extra 'ray' is not installed")
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.nightly]
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -73,6 +73,7 @@ def test_the_data_takes_at_most_four_megabytes() -> None:
     assert {"SOURCE.md", "LICENSE.official.txt"} <= {path.name for path in files}
 
 
+@pytest.mark.slow
 def test_published_tables_are_read_from_the_package() -> None:
     assert set(published_results(official().results.parent).tables) >= {"accuracies", "panel_a"}
 
@@ -103,6 +104,7 @@ def test_other_folders_are_refused(copy: Path, tmp_path: Path) -> None:
         make_official(tmp_path / "nowhere", tmp_path / "out")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_package_is_what_the_official_files_give(checkout: Path, tmp_path: Path) -> None:
     made = make_official(checkout, tmp_path / "made")
@@ -145,6 +147,7 @@ def test_a_line_of_a_trial_comes_back_whole() -> None:
     assert json.loads(trial_line(trial))["scene"]["name"] == trial.scene.name
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_checkout_is_converted_and_read_in_place_of_the_package(
     checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -82,6 +82,7 @@ def sdist_files(folder: Path) -> dict[str, bytes]:
     return files
 
 
+@pytest.mark.slow
 def test_the_wheel_is_the_package_and_its_metadata(built: Path) -> None:
     files = wheel_files(built)
     info = f"physion_benchmark-{physion.__version__}.dist-info/"
@@ -125,6 +126,7 @@ def test_no_path_of_this_machine_is_packed(built: Path) -> None:
         assert not [text for text in private if text in content], name
 
 
+@pytest.mark.slow
 def test_the_wheel_of_the_sdist_is_the_same(built: Path, tmp_path: Path) -> None:
     (path,) = built.glob("*.tar.gz")
     with tarfile.open(path) as archive:
@@ -134,6 +136,7 @@ def test_the_wheel_of_the_sdist_is_the_same(built: Path, tmp_path: Path) -> None
     assert wheel_files(tmp_path / "again") == wheel_files(built)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_an_installed_wheel_runs_in_another_folder(built: Path, tmp_path: Path) -> None:
     """Dependencies come from this environment, the package itself only from the wheel."""

@@ -28,6 +28,7 @@ def test_outputs_are_stripped(path: Path) -> None:
     assert not any(cell["metadata"] for cell in notebook["cells"])
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_every_cell_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -103,6 +103,7 @@ def test_counts_of_the_paper_match_its_rows() -> None:
     assert sorted(listed, key=int) == impossible
 
 
+@pytest.mark.slow
 def test_places_of_the_paper_exist() -> None:
     for number, _, _, cell in paper_rows():
         places = re.findall(r"`([^`]+)`", cell)
@@ -149,6 +150,7 @@ def test_commands_are_accepted(page: Path) -> None:
             tyro.cli(module.Options, args=words[taken:])
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("page", RUNNING)
 def test_python_runs(page: str, tmp_path: Path) -> None:
@@ -187,6 +189,7 @@ def first_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_first_report_is_made(first_report: Path) -> None:
     assert (first_report / "runs" / "first" / "report" / "report.html").is_file()
@@ -194,6 +197,7 @@ def test_the_first_report_is_made(first_report: Path) -> None:
     assert len(list((first_report / "runs" / "models" / "predictions").glob("*.csv"))) == 2
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_page_on_own_models_leads_to_a_report(first_report: Path, tmp_path: Path) -> None:
     page = DOCS / "tutorials" / "own-model.md"

@@ -82,6 +82,7 @@ def write_card(folder: Path, **values: Any) -> None:
     (folder / "card.json").write_text(json.dumps(card | values))
 
 
+@pytest.mark.slow
 def test_movies_are_judged_and_bad_ones_named(
     dataset: Dataset, generated: Path, tmp_path: Path
 ) -> None:

@@ -97,6 +97,7 @@ def test_an_answer_depends_only_on_its_own_trial(name: str) -> None:
     assert alone.tobytes() == together.tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["already-touched", "constant-motion"])
 def test_noise_after_the_observed_part_changes_no_answer(name: str) -> None:
     fit, labels = some_crossings(60, 0)

@@ -240,6 +240,7 @@ def test_vgg_features_come_before_the_last_relu() -> None:
     assert (features < 0).any() and (features > 0).any()
 
 
+@pytest.mark.slow
 def test_no_module_reads_anything_that_could_run_code() -> None:
     """Of all modules of the package, seen as syntax trees."""
     found = []
@@ -453,6 +454,7 @@ def keras_network(path: Path, bgr: Tensor) -> tuple[list[Tensor], Tensor]:
     return maps, fused.sigmoid()[0, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", [CHINA, GRACE_HOPPER], ids=["china", "hopper"])
 def test_the_trunk_is_the_network_that_finds_edges_in_photographs(path: Path) -> None:
     package, weights = installed(HED), EncoderWeights(f"package:{HED}")

@@ -48,6 +48,7 @@ from support.trained_models import MovingValues
 ALL = [(family, size) for family, sizes in FAMILIES.items() for size in sizes]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("family", "size"), ALL)
 def test_family_and_size_stand_in_the_name(family: str, size: str) -> None:
     model: Any = build_model(f"{family}-lstm", size=size, hidden=2)
@@ -527,6 +528,7 @@ def testing(source: SquaresSource) -> Batch:
     return encoded(SquaresSource(source.spec, TESTED, seed=99))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_next_feature_is_nearer_than_the_last_one(

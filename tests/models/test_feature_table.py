@@ -138,6 +138,7 @@ def test_a_request_of_whole_movies_is_a_row_of_full_only(dots: Dataset, tmp_path
     assert right.mean() > 0.9, "the dot ends where it touches"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ["npz", "hdf5"])
 def test_rows_are_matched_by_name_in_any_order(dots: Dataset, tmp_path: Path, ending: str) -> None:
     given, order = arrays(dots), np.random.default_rng(1).permutation(len(named(dots)))

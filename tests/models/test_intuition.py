@@ -233,6 +233,7 @@ def test_other_frames_and_sizes_are_refused_in_one_line() -> None:
         build_model("intuition-states", weights="shipped")
 
 
+@pytest.mark.slow
 def test_pixels_are_learned_from_with_masks_boxes_and_motion_as_targets() -> None:
     small = {"image_size": 16, "channels": (8, 16, 16, 16), "width": 32, "layers": 1, "slots": 3}
     model: Any = build_model("intuition-pixels", **small)

@@ -119,6 +119,7 @@ def fraction(simulation: NoisySimulation, trial: Scene, truth: Trajectory) -> fl
     return float(found.contact.mean())
 
 
+@pytest.mark.slow
 def test_the_fraction_of_contacts_has_a_closed_form_for_straight_lines() -> None:
     """Ball and box touch if they pass each other closer than 0.5 m. With noise of their places
     only, the lateral distance d has the standard deviation 0.1 sqrt(2), and
@@ -321,6 +322,7 @@ def test_contacts_that_count_as_new(
     assert [start.frame for start in kicked(ScriptedEngine(*contacts), samples=1)] == frames
 
 
+@pytest.mark.slow
 def test_lapses_are_answers_at_random() -> None:
     trial = scene(0.0)
     question = observed(trial)

@@ -65,6 +65,7 @@ def test_the_examples_predict_every_trial(
     assert len(list(tmp_path.glob("training/*"))) == (QUICK.folds if trained else 0)
 
 
+@pytest.mark.slow
 def test_evaluation_finds_what_was_trained_before(made: Dataset, tmp_path: Path) -> None:
     model: Any = physion.build_model(f"{EXAMPLES / 'my_dynamics.py'}:MyDynamics", channels=4)
     initial = model.digest()
@@ -162,6 +163,7 @@ WRONG = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", WRONG)
 def test_what_a_model_does_wrong_is_an_error_that_says_it(
     case: str, dots: Dataset, tmp_path: Path
@@ -265,6 +267,7 @@ def test_the_digest_of_a_class_without_a_file_covers_its_code() -> None:
     assert digest(1) == digest(1) != digest(2)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_simulator_in_a_file_runs_in_worker_processes(
     dots: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

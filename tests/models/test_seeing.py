@@ -95,6 +95,7 @@ def ray(y: float, depth: float, on: bool) -> Rays:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "y", "depth", "on", "expected"),
     [
@@ -125,6 +126,7 @@ def test_a_hole_is_free() -> None:
     assert [float(residuals(each, rays)[0]) for each in placed] == [0.0, 0.5]
 
 
+@pytest.mark.slow
 def test_shapes_scales_and_poses_are_found(first: SeenFrame) -> None:
     for number, body in zip(object_ids(scene())[1:].tolist(), scene().bodies, strict=True):
         rays = first.rays(number)
@@ -339,6 +341,7 @@ def test_the_viewer_gets_pictures_of_what_follows(imported: Dataset) -> None:
     assert red.any(), "the agent"
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "scenario", ["collide", "contain", "dominoes", "drop", "link", "roll", "support"]

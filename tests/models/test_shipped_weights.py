@@ -69,6 +69,7 @@ def movies(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return make_movies(folder, TESTED, SCENARIOS[::2], name="never-seen")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("name", VISION_NAMES)
 def test_predictions_of_new_movies_beat_those_without_training(name: str, movies: Dataset) -> None:

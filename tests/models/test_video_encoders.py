@@ -388,6 +388,7 @@ def test_settings_that_make_no_network_are_refused(options: dict[str, Any], mess
         make("VideoMAE", **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_it_is_evaluated_under_observed_and_full(name: str, tmp_path: Path) -> None:
     dots = make_dots(tmp_path / "dots", {"readout": 8, "testing": 4}, ("collide",))

@@ -146,6 +146,7 @@ def steps(model: Any, batch: Batch, count: int, rate: float = 2e-3) -> list[floa
     return losses
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "count"), OVERFITTED.items())
 def test_a_model_overfits_one_batch(name: str, count: int) -> None:
@@ -215,6 +216,7 @@ def test_a_resumed_training_gives_the_bytes_of_an_uninterrupted_one(
     assert model_of(name, weights=str(path.parent)).digest() == resumed.digest()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_saved_weights_give_the_same_features(name: str, tmp_path: Path) -> None:
     model = model_of(name, seed=3)
@@ -255,6 +257,7 @@ def test_weights_of_another_architecture_are_refused_by_name(tmp_path: Path) -> 
         model_of("svg", weights=str(path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_digest_belongs_to_the_size(name: str) -> None:
     sizes = ("small", "paper", "released")

@@ -27,7 +27,7 @@ from support.moving_dots import make_dots
 from support.moving_squares import BACKGROUND, squares
 from support.squares_source import SquaresSource
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.nightly]
 
 SETTINGS = TrainingSettings(
     batch=8, learning_rate=3e-3, schedule="cosine", warmup=20, clip=1.0, held_out=0.1,

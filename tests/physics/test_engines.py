@@ -320,6 +320,7 @@ def test_engines_are_known_by_name() -> None:
         make_engine("mujocco")
 
 
+@pytest.mark.slow
 def test_mujoco_is_loaded_only_by_its_engine() -> None:
     code = (
         "import sys, physion.physics.engine, physion.physics.replay; print('mujoco' in sys.modules)"

@@ -272,6 +272,7 @@ def test_outcomes_agree_with_the_recorded_ones(
     check_agreement(official, folder, limit, floor)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(("folder", "limit", "floor"), SLOW_FLOORS)
 def test_outcomes_agree_in_whole_scenarios(

@@ -26,6 +26,7 @@ SPACING = 0.05
 PRIMITIVES = [name for name in shapes.names() if not name.startswith("prop:")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRIMITIVES)
 def test_particles_have_the_volume_of_the_solid(name: str) -> None:
     points = sample_particles(name, (1.0, 1.0, 1.0), SPACING, limit=None)
@@ -35,6 +36,7 @@ def test_particles_have_the_volume_of_the_solid(name: str) -> None:
     assert (points >= low - 1e-6).all() and (points <= high + 1e-6).all()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("name", shapes.names())
 @pytest.mark.parametrize("scale", [1.0, 0.3])

@@ -85,6 +85,7 @@ def test_frames_readouts_and_rows(dots: Dataset, tmp_path: Path) -> None:
         assert rows["readout_c"].nunique() == 1 and set(rows["readout_c"]) <= set(GRID)
 
 
+@pytest.mark.slow
 def test_both_benchmarks_are_named_in_the_table_of_results(dots: Dataset, tmp_path: Path) -> None:
     settings = EvaluationSettings(accelerator="cpu", readouts=("observed",))
     first = evaluate(Watcher(), dots, tmp_path, settings)

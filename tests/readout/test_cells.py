@@ -90,6 +90,7 @@ def test_trainings_are_models_by_protocols_by_sets_by_seeds(dots: Dataset, tmp_p
     assert all(one.done for one in planned)
 
 
+@pytest.mark.slow
 def test_each_scenario_trains_a_model_that_is_tested_on_all(dots: Dataset, tmp_path: Path) -> None:
     given: dict[str, Any] = {"protocols": ("only", "one"), "settings": QUICK}
     table = physion.evaluate(IMAGINING, dots, tmp_path, **given).predictions
@@ -211,6 +212,7 @@ def test_evaluations_have_all_readouts_and_a_second_run_only_reads(
     assert set(done.scores["seeds"]) == {1, 2}
 
 
+@pytest.mark.slow
 def test_evaluate_finds_what_was_trained_and_one_protocol_is_a_part_of_all(
     dots: Dataset, tmp_path: Path
 ) -> None:
@@ -288,6 +290,7 @@ def test_weights_that_ship_are_the_default_and_trainings_start_from_random_ones(
     assert shipped.build(0, untrained=True).trained
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_cells_on_an_executor_match_this_process(dots: Dataset, tmp_path: Path) -> None:
     given: dict[str, Any] = {"seed": 3, "settings": CPU}
@@ -313,6 +316,7 @@ def test_a_full_disk_ends_all(dots: Dataset, tmp_path: Path) -> None:
             function(IMAGINING, dots, tmp_path, seeds=2, settings=settings, executor=FullDisk())
 
 
+@pytest.mark.slow
 def test_an_executor_of_this_machine_has_no_cells_as_tasks(dots: Dataset, tmp_path: Path) -> None:
     given: dict[str, Any] = {"executor": FullDiskHere(1), "seeds": 2}
     assert len(physion.train(IMAGINING, dots, tmp_path, settings=CPU, **given).trained) == 2

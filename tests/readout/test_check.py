@@ -90,6 +90,7 @@ def run(dataset: Dataset, model: Any, folder: Path, *changes: str, **options: An
     return check(model, dataset, folder, changes=changes, trials=2 * TESTED, **options)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_model_that_sees_what_was_observed_passes_exactly(made: Dataset, tmp_path: Path) -> None:
     done = run(made, leaks.Honest(), tmp_path, *CHANGES)
@@ -168,6 +169,7 @@ def test_answers_in_a_cache_on_disk_are_refused(made: Dataset, tmp_path: Path) -
     assert done.refused == ["names"]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_random_numbers_may_follow_the_names(made: Dataset, tmp_path: Path) -> None:
     """But not the outcome: names of the dots are even with a contact."""
@@ -194,6 +196,7 @@ def changed(dataset: Dataset, change: str, folder: Path) -> tuple[ChangedTrials,
     return trials, trials.finish()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", HELD)
 def test_no_observed_byte_changes_that_must_not(change: str, made: Dataset, tmp_path: Path) -> None:
     """Otherwise an honest model could be refused. The fitting trials are the same files."""
@@ -215,6 +218,7 @@ def test_no_observed_byte_changes_that_must_not(change: str, made: Dataset, tmp_
         assert longest, f"{column}: how far models imagine stays"
 
 
+@pytest.mark.slow
 def test_what_is_changed(made: Dataset, tmp_path: Path) -> None:
     """The copies say what they should, by values that are read independently."""
     tested = made.trials("testing")
@@ -272,6 +276,7 @@ def test_the_order_of_frames_and_the_colours(made: Dataset, tmp_path: Path) -> N
         assert corner[1] == pytest.approx(0.8 * corner[0][::-1], abs=6)
 
 
+@pytest.mark.slow
 def test_half_of_the_tested_trials_fit_where_there_are_no_others(tmp_path: Path) -> None:
     dots = make_dots(tmp_path / "dots", {"testing": 12}, ("drop", "collide"))
     taken = take_trials(dots, tmp_path / "taken", 16)
@@ -282,6 +287,7 @@ def test_half_of_the_tested_trials_fit_where_there_are_no_others(tmp_path: Path)
         take_trials(make_dots(tmp_path / "none", {"readout": 2}, ("drop",)), tmp_path / "x", 8)
 
 
+@pytest.mark.slow
 def test_the_verb(
     made: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
 ) -> None:
@@ -321,6 +327,7 @@ def test_a_trial_that_cannot_be_predicted_after_a_change_is_refused(
     assert "KeyError" in done.table["note"][0]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_twins_are_shown(made: Dataset, tmp_path: Path) -> None:
     """The random twin of a model with shipped weights, and blobs, on the same trials."""
@@ -432,6 +439,7 @@ def test_files_are_copied_where_they_cannot_be_linked(
         assert before.stat().st_mtime_ns == after.stat().st_mtime_ns
 
 
+@pytest.mark.slow
 def test_a_failure_that_no_change_made_ends_the_check(made: Dataset, tmp_path: Path) -> None:
     for error, message in (
         (OutOfMemoryError("too few bytes"), "too few bytes"),
@@ -487,6 +495,7 @@ def test_changes_of_movies_are_skipped_where_pictures_are_rendered(
     assert not done.passed and not done.refused and "not decided: no change" in done.verdict
 
 
+@pytest.mark.slow
 def test_nothing_judged_is_not_passed(
     made: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

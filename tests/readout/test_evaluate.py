@@ -75,6 +75,7 @@ def test_full_is_far_above_chance_and_observed_is_not(done: Evaluation) -> None:
         assert abs(accuracy(table, protocol) - 0.5) < 3 * np.sqrt(0.25 / 40)
 
 
+@pytest.mark.slow
 def test_the_table_has_one_row_per_trial_and_readout(done: Evaluation, dots: Dataset) -> None:
     table = done.predictions
     assert tuple(table.columns) == COLUMNS
@@ -139,6 +140,7 @@ def test_accuracies_are_known_as_soon_as_a_model_has_predicted(dots: Dataset, wo
         assert list(opposite.accuracies().values()) == [pytest.approx(1 - accuracy)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", ["cut", "empty", "no text", "another number"])
 def test_a_damaged_table_is_made_again(
     done: Evaluation, dots: Dataset, work: Path, damage: str
@@ -268,6 +270,7 @@ class Known:
         return Rollout(features=np.array(futures, np.float32))
 
 
+@pytest.mark.slow
 def test_each_readout_is_scikit_learns_on_the_frames_that_it_may_see(
     dots: Dataset, tmp_path: Path
 ) -> None:
@@ -465,6 +468,7 @@ def test_models_have_one_twin_for_each_name_and_none_if_they_are_random_themselv
     assert len(planned(*choose_models(f"{own}:Own"))) == 1, "its weights may mean anything"
 
 
+@pytest.mark.slow
 def test_the_twin_of_a_trained_model_is_not_trained(dots: Dataset, tmp_path: Path) -> None:
     """Where training makes the features, random weights must stay random."""
     settings = replace(QUICK, readouts=("observed",))

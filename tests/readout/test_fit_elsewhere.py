@@ -54,6 +54,7 @@ def changed(folder: Path, name: str, **columns: object) -> Path:
     return folder / name
 
 
+@pytest.mark.slow
 def test_a_motion_that_is_tested_fits_nothing(folder: Path) -> None:
     tested = Dataset(folder / "tested").index
     digest = tested["digest"][tested["split"] == "testing"].iloc[0]
@@ -93,6 +94,7 @@ def test_two_trials_of_one_name_are_refused(folder: Path) -> None:
         evaluate("blob-centroids", folder / "tested", folder / "c", fit=folder / "names")
 
 
+@pytest.mark.slow
 def test_a_file_of_features_may_have_all_trials_of_both_sets(folder: Path) -> None:
     sets = [Dataset(folder / "tested").index, Dataset(folder / "fit").index]
     chosen = pd.concat(sets).drop_duplicates("trial")
@@ -118,6 +120,7 @@ def test_a_file_of_features_may_have_all_trials_of_both_sets(folder: Path) -> No
     assert (tables[0]["p_contact"] == tables[1]["p_contact"]).all() and len(tables[0]) == 12
 
 
+@pytest.mark.slow
 def test_labels_of_other_scenarios_are_not_needed(folder: Path) -> None:
     index = Dataset(folder / "fit").index.copy()
     index["contact"] = index["contact"].astype("boolean")

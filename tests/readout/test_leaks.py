@@ -95,6 +95,7 @@ def check_predictions(name: str, made: Dataset, poisoned: Dataset, folder: Path)
         assert not before[~kept].equals(after[~kept]), "the noise is seen where it may be"
 
 
+@pytest.mark.slow
 def test_the_copy_is_poisoned_where_it_should_be(made: Dataset, poisoned: Dataset) -> None:
     for trial in made.trials("testing"):
         clean, changed = made.trial(trial).trajectory, poisoned.trial(trial).trajectory
@@ -112,6 +113,7 @@ def test_the_copy_is_poisoned_where_it_should_be(made: Dataset, poisoned: Datase
         with_poisoned_futures(made, poisoned.folder)
 
 
+@pytest.mark.slow
 def test_motions_continue_like_another_trial(tmp_path: Path) -> None:
     """The trials have different lengths; clips of the copy can be read, and their boxes."""
     made = make_late_motions(tmp_path / "data", {"testing": 4}, more=3)

@@ -139,6 +139,7 @@ def test_the_released_setting_stops_after_200_iterations() -> None:
     assert np.abs(longer - released.probability).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_the_released_decision_is_the_published_grid_search() -> None:
     """17 values of C, 5 folds, lbfgs with 200 iterations, on equally many trials of each label."""
     features, labels = problem(90, 30, seed=5)

@@ -172,6 +172,7 @@ def test_other_settings_have_no_readouts() -> None:
     assert find_readouts(build_model("noisy-simulation")) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fit_trials", "fit_on"), [(8, ""), (9, "set 0123")])
 def test_own_trials_are_fitted_where_there_are_as_many(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fit_trials: int, fit_on: str

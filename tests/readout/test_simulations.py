@@ -133,6 +133,7 @@ def fitted_scale(shelf: Any, model: Any, folder: Path) -> tuple[float, np.ndarra
     return answers.decided.fitted["scale"], answers.decided.probability
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("column", ["contact", "recorded_contact"])
 def test_the_noise_is_fitted_only_on_readout_trials(tmp_path: Path, column: str) -> None:
     """The fit uses recorded outcomes, or simulated ones where there is no record."""

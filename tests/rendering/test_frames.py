@@ -84,6 +84,7 @@ def test_a_frame_does_not_depend_on_the_frames_after_the_next() -> None:
     assert digest(whole.render(0, ALL)) == digest(part.render(0, ALL))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", sorted(scenarios.names()))
 @pytest.mark.parametrize("size", [(40, 56), (96, 96)])
 def test_what_is_kept_between_frames_changes_no_byte(scenario: str, size: tuple[int, int]) -> None:
@@ -105,6 +106,7 @@ def test_what_is_kept_between_frames_changes_no_byte(scenario: str, size: tuple[
         assert digest(kept.render(frame, passes)) == digest(fresh.render(frame, passes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(12))
 def test_what_is_kept_does_not_depend_on_where_things_move(seed: int) -> None:
     """Bodies that leap anywhere, also over the edges of the depth maps, and a crumpled cloth."""

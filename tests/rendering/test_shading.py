@@ -131,6 +131,7 @@ def shaded(angle: float, light: NDArray[np.void] | None = None, **material: obje
     return shaded_points(inputs, buffer)[MIDDLE * SIZE + MIDDLE]
 
 
+@pytest.mark.slow
 def test_the_point_is_where_the_ray_meets_the_plane() -> None:
     inputs, buffer = plane(0.6, light_from(), material_of())
     assert (buffer.triangle_ids[..., 0] == 0).all()

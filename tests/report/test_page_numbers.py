@@ -200,6 +200,7 @@ SCORES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("place", "scenario"),
     [("Scores / Mean over scenarios", MEAN), ("All stimuli pooled", POOLED)],

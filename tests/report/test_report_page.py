@@ -156,6 +156,7 @@ def test_without_a_changed_outcome_there_is_no_section_about_them(make_compariso
 # --- movies --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_changed_trials_link_to_their_movies(make_comparison: Maker, tmp_path: Path) -> None:
     comparison = make_comparison()
     name = comparison.changed["stimulus"].iloc[0]

@@ -60,6 +60,7 @@ def text_of(page: Path) -> str:
     return plain(page.read_text(encoding="utf-8"))
 
 
+@pytest.mark.nightly
 def test_every_figure_has_its_files(report: Path) -> None:
     stems = {path.stem for path in (report.parent / "figures").iterdir()}
     assert stems == {
@@ -156,6 +157,7 @@ def test_hypotheses_without_their_attribute_give_a_reason(report: Path) -> None:
     )
 
 
+@pytest.mark.nightly
 def test_bytes_repeat(report: Path, tmp_path: Path) -> None:
     again = compare_small(tmp_path).report(tmp_path / "another name")
     for path in sorted(report.parent.rglob("*")):
@@ -214,6 +216,7 @@ def test_confirmed_rules_are_listed(report: Path, tmp_path: Path) -> None:
     assert "streak (drop 4 of 8); slow (no scenario needed it)" in text
 
 
+@pytest.mark.nightly
 def test_a_rehearsal_with_simulated_participants_is_marked_on_every_page(
     report: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

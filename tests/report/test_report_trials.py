@@ -272,6 +272,7 @@ def test_one_sentence_says_what_each_model_was_given(
     assert inputs_sentence(ReportInputs(comparison)) == ""
 
 
+@pytest.mark.slow
 def test_one_sentence_says_which_weights_each_model_started_from(
     make_comparison: Maker,
 ) -> None:
@@ -288,6 +289,7 @@ def test_one_sentence_says_which_weights_each_model_started_from(
 # --- a page for each stimulus ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_trial_pages_are_linked_both_ways(make_comparison: Maker, movie: Path) -> None:
     comparison = make_comparison()
     names = list(dict.fromkeys(comparison.stimuli["stimulus"]))

@@ -44,6 +44,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return dict(json.loads(done.stdout.splitlines()[-1]))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("run", "accuracy", "bias", "flips"),
     [("yes", 0.5, 0.5, 0), ("no", 0.5, -0.5, 0), ("first", 0.5, 0, 1)],

@@ -23,6 +23,7 @@ def test_gymnasium_accepts_it(observation: str) -> None:
     assert env.unwrapped.render().shape == (64, 64, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_some_pushes_make_red_touch_yellow_and_others_do_not(scenario: str) -> None:
     env = PushEnv(scenario)

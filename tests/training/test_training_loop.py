@@ -82,6 +82,7 @@ def files_of(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("learns_from", ["clips", "features", "states"])
 def test_a_model_learns_from_every_input(learns_from: Any) -> None:
     first = run(NextBrightness(learns_from), settings=replace(QUICK, steps=1, learning_rate=1e-9))
@@ -92,6 +93,7 @@ def test_a_model_learns_from_every_input(learns_from: Any) -> None:
     assert not model.training and result.steps == 200 and not result.loaded
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("learns_from", ["clips", "features"])
 @pytest.mark.parametrize("settings", [QUICK, ALL_AT_ONCE, PLATEAU], ids=["adam", "all", "plateau"])
 def test_resumed_training_is_the_uninterrupted_one_to_the_bit(

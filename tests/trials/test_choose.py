@@ -89,6 +89,7 @@ def few_scenes(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
     monkeypatch.setattr(choosing, "sample_scene", draw)
 
 
+@pytest.mark.slow
 def test_copies_are_refused_and_scarce_physics_is_said(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -104,6 +105,7 @@ def test_copies_are_refused_and_scarce_physics_is_said(
         assert "another trial has the same physics: 5" in reason
 
 
+@pytest.mark.slow
 def test_scenes_do_not_depend_on_order_or_on_what_else_is_asked(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

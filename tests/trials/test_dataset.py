@@ -97,6 +97,7 @@ def test_generate_makes_a_damaged_index_again(finished: Path, tmp_path: Path) ->
     assert len(Dataset(folder)) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("column", "value", "says"),
     [
@@ -201,6 +202,7 @@ def damage(folder: Path, column: str) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", READERS)
 def test_a_changed_file_is_refused_and_can_be_read_on_demand(
     name: str, made: Path, tmp_path: Path

@@ -58,6 +58,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_new_rows_of_the_index_equal_their_files(
     finished: Path,
 ) -> None:
@@ -412,6 +413,7 @@ def test_broken_trials_are_found_when_the_index_is_made(finished: Path, tmp_path
     assert report.kept == ["a"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("indexed", [True, False])
 @pytest.mark.parametrize("column", ["trial_file", "movie"])
 def test_a_file_of_another_size_is_made_again(

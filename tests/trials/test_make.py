@@ -178,6 +178,7 @@ def test_fresh_processes_make_the_same_bytes_whatever_their_environment(
     assert tree_digest(tmp_path / "made") == tree_digest(job.folder)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_dataset_of_every_scenario_with_real_workers(tmp_path: Path) -> None:
     tasks = plan_dataset("tests", scenarios.names(), {"testing": 1})

@@ -43,6 +43,7 @@ def test_an_untouched_dataset_has_no_fault(folder: Path) -> None:
     assert verify_dataset(folder, again=0).faults == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["trial_file", "movie", "observed_movie", "map"])
 def test_one_changed_byte_in_any_file_is_found(name: str, folder: Path) -> None:
     path = Dataset(folder).paths("b").all()[name]
@@ -55,6 +56,7 @@ def test_one_changed_byte_in_any_file_is_found(name: str, folder: Path) -> None:
         assert any(f"b: {name}_sha256 is" in fault for fault in faults)
 
 
+@pytest.mark.slow
 def test_damaged_trials_are_deleted_and_made_again(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -94,6 +96,7 @@ def test_movies_of_a_wrong_length_are_found(folder: Path) -> None:
     assert any("has 50 frames, not 45" in fault for fault in verify_dataset(folder, again=0).faults)
 
 
+@pytest.mark.slow
 def test_simulating_again_finds_another_motion(folder: Path, tmp_path: Path) -> None:
     scene = make_scene("real", cloth=False)
     job = GenerateJob(
@@ -137,10 +140,12 @@ def sampled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_sampled_dataset_comes_out_the_same_again(sampled: Path) -> None:
     assert verify_dataset(sampled, again=-1).faults == []
 
 
+@pytest.mark.slow
 def test_strangers_and_trials_of_other_splits_are_named(sampled: Path, tmp_path: Path) -> None:
     folder = tmp_path / "d"
     shutil.copytree(sampled, folder)
@@ -205,6 +210,7 @@ def test_a_movie_with_another_end_is_found(sampled: Path, tmp_path: Path) -> Non
     assert f"frame {len(frames) - 1} differs" in fault
 
 
+@pytest.mark.slow
 def test_trials_of_another_version_are_no_faults(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -222,6 +228,7 @@ def test_trials_of_another_version_are_no_faults(
     assert "made by another version" in newer.other_versions[0]
 
 
+@pytest.mark.slow
 def test_a_map_in_another_compression_is_the_same_picture(sampled: Path, tmp_path: Path) -> None:
     folder = tmp_path / "d"
     shutil.copytree(sampled, folder)

@@ -184,6 +184,7 @@ BOTH = pytest.mark.parametrize(
 FEW = settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
 
 
+@pytest.mark.slow
 @BOTH
 @FEW
 @given(seed=st.integers(0, 10_000))

@@ -166,6 +166,7 @@ def test_one_person_makes_no_pair() -> None:
 # --- beyond the outcome --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("contacts", [60, 110])
 def test_independent_errors_give_no_kappa_beyond_the_outcome(contacts: int) -> None:
     """Draw models of accuracy .8 and people of .7 whose errors do not depend on each other."""
@@ -238,6 +239,7 @@ def test_baselines_that_come_as_predictions_are_marked_and_follow_the_models() -
     assert kind_of("my outcome · observed") == "model" and kind_of("outcome · full") == "baseline"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "computed"), [("outcome", OUTCOME), ("majority-of-people", MAJORITY)]
 )
@@ -313,6 +315,7 @@ def test_scores_without_observed_contacts_match_the_other_stimuli() -> None:
     assert found.settings[SETTING] == "4 of 24 stimuli (collide 2 of 12, drop 2 of 12)"
 
 
+@pytest.mark.slow
 def test_one_model_that_knows_the_observed_contacts_suffices() -> None:
     knows = predictions(**{"Observed Contact": observed()})
     found = compared(pd.concat([predictions("other", 2), knows]))
@@ -368,6 +371,7 @@ def test_with_participants_baselines_stand_next_to_models() -> None:
 # --- official data -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_baselines_of_the_official_people(official: Path) -> None:
     people = read_humans(official / "humans")
     labels = read_labels(official / "stimuli" / "stimulus_names_and_labels.csv")

@@ -375,6 +375,7 @@ def test_labels_of_one_class_are_said() -> None:
         assert "labels: all no contact" in score(never.scores, model, scenario)["reason"]
 
 
+@pytest.mark.slow
 def test_the_settings_say_where_the_zone_comes_from_and_what_is_drawn() -> None:
     people = humans()
     zone = pd.DataFrame({"scenario": ["collide", "drop"], "low": 0.6, "high": 0.8})

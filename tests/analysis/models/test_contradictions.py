@@ -141,6 +141,7 @@ def cut_study(official: Path, folder: Path) -> Path:
     return folder / "humans"
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_cut_official_table_is_reported_on_page_and_terminal(
     official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

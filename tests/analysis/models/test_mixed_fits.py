@@ -53,6 +53,7 @@ def fits() -> dict[str, MixedTable]:
     return {one.name: one for one in fits_of_people(timed_study(30, 60))}
 
 
+@pytest.mark.slow
 def test_the_parameters_of_log_normal_response_times_are_found_again(
     fits: dict[str, MixedTable],
 ) -> None:
@@ -79,6 +80,7 @@ def test_each_hypothesis_has_a_model_with_slopes_of_people(fits: dict[str, Mixed
     assert fits["h1_slopes"].fit is None and "elements" in fits["h1_slopes"].reason
 
 
+@pytest.mark.slow
 def test_attributes_of_stimuli_enter_the_model_of_single_answers() -> None:
     """A known effect of an attribute on the log odds is found, in standard deviations."""
     trials, _ = simulate_study(40, 60, seed=3)
@@ -127,6 +129,7 @@ def trained_models() -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
+@pytest.mark.slow
 def test_contrasts_of_groups_match_the_balanced_design() -> None:
     """Without further random terms the balanced model is least squares with fixed scenarios."""
     rows = trained_models()
@@ -183,6 +186,7 @@ def test_readout_and_training_are_terms_of_their_own() -> None:
     assert one["p"] == pytest.approx(trainings.table["p"].iloc[1])
 
 
+@pytest.mark.slow
 def test_bad_groups_are_refused() -> None:
     rows = trained_models()
     named = name_models(rows.drop(columns="family"))

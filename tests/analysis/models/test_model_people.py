@@ -140,6 +140,7 @@ def test_every_measure_is_what_it_says(models: Models, answers: ScenarioAnswers)
     assert undefined["reason"].str.contains("P\\(contact\\) is constant").all()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_intervals_match_leaving_out_people_or_stimuli(
     models: Models, answers: ScenarioAnswers
@@ -172,6 +173,7 @@ def test_intervals_match_leaving_out_people_or_stimuli(
                 assert 0.85 < width <= 1 + 1e-9, (what, measure)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drawn", ["people", "both"])
 def test_a_perfect_model_lies_in_its_interval_as_often_as_it_should(drawn: Resampled) -> None:
     """The noise of people's averages counts once: in the value, not again in the interval."""
@@ -462,6 +464,7 @@ def test_r_within_thirds_matches_their_stimuli(answers: ScenarioAnswers, models:
 # --- one table of everything ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_tidy_table_takes_intervals_about_people_and_stimuli_where_it_has_them() -> None:
     people = analyse_people(study(people=8, stimuli=16, scenarios=("collide", "roll"), seed=2),
                             bootstrap=FEW)  # fmt: skip

@@ -472,6 +472,7 @@ def robust_slope(x: np.ndarray, y: np.ndarray, scenario: np.ndarray) -> tuple[fl
     return b[0], np.sqrt((bread @ scaled.T @ scaled @ bread)[0, 0])
 
 
+@pytest.mark.slow
 def test_accuracy_by_attributes_single_and_together() -> None:
     generator = np.random.default_rng(1)
     stimuli = stimuli_table(0, -0.05)
@@ -566,6 +567,7 @@ def test_slopes_and_robust_errors_match_statsmodels() -> None:
     assert found.loc["H1", "reason"].str.contains("not known").all()
 
 
+@pytest.mark.slow
 def test_as_predicted_needs_a_test() -> None:
     """The sign of b alone is right for one half of all effects that do not exist."""
     for effect, verdict in ((-0.05, "yes"), (0.05, "opposite")):

@@ -146,6 +146,7 @@ def plain_detection(said: pd.Series, outcome: pd.Series) -> tuple[float, float]:
     return z[0] - z[1], -(z[0] + z[1]) / 2
 
 
+@pytest.mark.slow
 @given(pairs, st.integers(0, 99))
 def test_metrics_from_sums_are_the_plain_ones(pair: Array, seed: int) -> None:
     rows = rows_of(pair, seed)

@@ -36,6 +36,7 @@ def by_scikit_learn(a: Array, b: Array) -> float:
         return float(cohen_kappa_score(a[shared], b[shared]))
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(with_gaps)
 def test_every_pair_is_as_scikit_learn_has_it(values: Array) -> None:

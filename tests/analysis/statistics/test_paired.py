@@ -67,6 +67,7 @@ def step_down(p: Array) -> Array:
     return found
 
 
+@pytest.mark.slow
 def test_corrections_match_statsmodels() -> None:
     rng = np.random.default_rng(0)
     for p in (rng.random(7), rng.integers(1, 5, 12) / 100, np.array([0.03])):

@@ -64,6 +64,7 @@ def test_the_zone_of_people_is_the_mean_of_its_bounds() -> None:
     assert 0 < kappa[0] < kappa[1] < 1
 
 
+@pytest.mark.slow
 def test_people_come_first_then_all_by_accuracy() -> None:
     labels = official().labels
     p = {name: 0.9 if contact else 0.2 for name, contact in labels.items()}
@@ -77,6 +78,7 @@ def test_people_come_first_then_all_by_accuracy() -> None:
     assert table["stimuli"].isna().sum() == 1 + len(MODELS) + 1
 
 
+@pytest.mark.slow
 def test_the_table_has_r_beyond_the_outcome() -> None:
     """The mean over scenarios of the r of deviations from the mean of each outcome."""
     people = read_humans(official().humans)

@@ -30,6 +30,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
         yield found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
 def test_nothing_is_shown_without_login(served: Lab, page: str) -> None:
     for cookie in (None, "wrong", "x" * 5000):

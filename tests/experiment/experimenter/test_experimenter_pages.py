@@ -117,6 +117,7 @@ def test_spans_of_time_and_strange_texts_in_words() -> None:
     assert visible("ab\u202ecd\x00") == "ab\\u202ecd\\u0000"
 
 
+@pytest.mark.slow
 def test_progress_counts_people_and_their_answers(busy: tuple[Lab, Visitor]) -> None:
     found, visitor = busy
     labels = {stimulus.stimulus: stimulus.label for stimulus in found.study.stimuli}
@@ -195,6 +196,7 @@ def test_recruitment_is_paused_and_resumed(small: tuple[Lab, Visitor]) -> None:
 # --- sessions ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_sessions_are_chosen(busy: tuple[Lab, Visitor]) -> None:
     found, visitor = busy
     people = sorted(sessions_of(found), key=lambda row: -row.started_at)
@@ -428,6 +430,7 @@ def finish(found: Lab, person: str, right: int) -> sa.Row:
     return session_of(found, token)
 
 
+@pytest.mark.slow
 def test_each_person_is_paid_for_the_own_session(tmp_path: Path) -> None:
     settings = {"bonus": Bonus(per_correct=0.25, above=0.5), "participants": 9, "test": 4}
     with lab(tmp_path, **ONE | settings) as found:

@@ -41,6 +41,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Store]:
     store.close()
 
 
+@pytest.mark.slow
 def test_every_row_has_block_and_scenario(exported: tuple[Path, Store]) -> None:
     out, store = exported
     trials = pd.read_csv(out / "trials.csv")

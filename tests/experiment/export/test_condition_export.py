@@ -43,6 +43,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, S
     store.close()
 
 
+@pytest.mark.slow
 def test_sessions_and_trials_name_the_condition(exported: tuple[Path, Store]) -> None:
     out, store = exported
     of_session = {row.session: row.condition for row in rows(store, SESSIONS)}

@@ -103,6 +103,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 # --- what is in it ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_analysis_reads_what_is_exported(
     engine: sa.Engine, study: Study, tmp_path: Path
 ) -> None:
@@ -388,6 +389,7 @@ def test_others_on_the_machine_cannot_read_it(
     assert out.stat().st_mode & 0o077 == 0
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_physion_compare_takes_the_export(
     study: Study, tmp_path: Path, capsys: pytest.CaptureFixture[str]

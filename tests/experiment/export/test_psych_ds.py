@@ -49,6 +49,7 @@ def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     return make_export(tmp_path_factory.mktemp("study"), request.param)
 
 
+@pytest.mark.slow
 def test_psych_ds_has_the_files_and_metadata_that_it_asks_for(exported: Exported) -> None:
     folder = exported[0] / "psych-ds"
     metadata = json.loads((folder / "dataset_description.json").read_bytes())

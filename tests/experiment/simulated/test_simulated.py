@@ -61,6 +61,7 @@ def test_a_person_answers_the_same_again_and_others_differ() -> None:
     assert {one.response for one in first} == {"yes", "no"}
 
 
+@pytest.mark.slow
 def test_people_are_right_as_often_as_they_should_be_and_slower_where_it_is_hard() -> None:
     people = [SimulatedPerson(0, number) for number in range(100)]
     stimuli = [_stimulus(number, number % 2 == 0) for number in range(60)]
@@ -168,6 +169,7 @@ def test_people_finish_or_leave_and_come_back(
             assert right == 4 and 0 <= before.result.accuracy <= 1
 
 
+@pytest.mark.slow
 def test_simulated_is_written_in_the_data_for_good(
     study: Study, served: tuple[ServerProcess, list[SimulatedVisit], list[SimulatedVisit]]
 ) -> None:

@@ -125,6 +125,7 @@ def test_a_token_opens_only_its_session(store: Store) -> None:
     assert len({(row.session, row.trial) for row in rows(store) if row.phase == "test"}) == 2
 
 
+@pytest.mark.slow
 def test_details_are_bounded_plain_json(store: Store) -> None:
     token = walk(store, enter(store), "familiarization")
     deep: Any = []

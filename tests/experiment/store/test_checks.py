@@ -130,6 +130,7 @@ def test_interrupted_checks_and_repeated_answers_do_not_count(checked_store: Sto
     assert (session.attention_failed, session.failed_checks) == (0, None)
 
 
+@pytest.mark.slow
 def test_checks_are_no_trials_of_the_analysis(checked_store: Store, tmp_path: Path) -> None:
     store, study = checked_store, checked_store.study
     for name, failed in (("Ada", 0), ("Bo", 3)):
@@ -254,6 +255,7 @@ def practise(store: Store, token: str, name: str, *responses: str) -> SessionSta
     return state
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("responses", "right"),
     [(("yes", "no", "yes"), 3), (("yes", "yes", "yes"), 2), (("yes", "yes", "no"), 1),

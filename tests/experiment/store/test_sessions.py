@@ -425,6 +425,7 @@ BAD_PAGES: list[tuple[str, dict[str, Any], str]] = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "data", "said"), BAD_PAGES)
 def test_bad_pages_name_the_field(store: Store, name: Any, data: dict[str, Any], said: str) -> None:
     token = walk(store, enter(store), name)

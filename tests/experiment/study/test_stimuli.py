@@ -47,6 +47,7 @@ def stimuli_lists(draw: st.DrawFn) -> list[Stimulus]:
     return found
 
 
+@pytest.mark.slow
 @given(stimuli_lists())
 @settings(
     max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]

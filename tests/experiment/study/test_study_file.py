@@ -122,6 +122,7 @@ STUDIES = st.builds(
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @given(STUDIES)
 @settings(max_examples=60, deadline=None)
 def test_what_is_written_is_read_back(study: Study) -> None:

@@ -362,6 +362,7 @@ JSON = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.dictionaries(st.sampled_from(sorted(wire.Answer.model_fields)), JSON), st.booleans())
 def test_any_json_is_a_message_or_refused(values: dict[str, Any], whole: bool) -> None:

@@ -27,6 +27,7 @@ def random_objects(seed: int) -> tuple[F64, F64, NDArray[np.int64], NDArray[np.i
     return points, steps, starts, scene
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_swept_pairs_are_those_that_come_close(seed: int) -> None:
     points, steps, starts, scene = random_objects(seed)

@@ -100,6 +100,7 @@ def last_states(model: ParticleSimulator, *motions: Motion):  # type: ignore[no-
     return layout, join_poses(poses, 0, model.device), join_poses(poses, 1, model.device)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_shift_of_scene_and_floor_shifts_the_prediction(name: str, collide: Motion) -> None:
     model = model_of(name)
@@ -236,6 +237,7 @@ def test_the_graph_of_the_size_paper_joins_near_particles_of_one_body(
     assert set(moves[layout.owners].nonzero()[:, 0].tolist()) <= set(graph.rows.tolist())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_scenes_in_one_graph_do_not_touch_each_other(name: str, collide: Motion) -> None:
     model = model_of(name)

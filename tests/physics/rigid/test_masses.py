@@ -56,6 +56,7 @@ def test_a_cylinder_rests_on_its_rim_and_not_on_its_middle() -> None:
     assert np.linalg.norm(hull.corners[:, :2], axis=1).min() == pytest.approx(0.2)
 
 
+@pytest.mark.slow
 @settings(max_examples=50, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_the_inner_box_lies_inside(seed: int) -> None:

@@ -333,6 +333,7 @@ JUNK = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.sampled_from([field.name for field in dataclasses.fields(Sample)]), JUNK)
 def test_any_value_is_read_or_refused_by_its_key(key: str, value: Any) -> None:

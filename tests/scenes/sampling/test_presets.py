@@ -94,6 +94,7 @@ def test_every_preset_draws_sound_scenes(preset: Preset, index: int) -> None:
     assert sum(one.scenery for one in scene.bodies) == scenery.distractors + scenery.occluders
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_familiarization_has_both_outcomes(scenario: str) -> None:

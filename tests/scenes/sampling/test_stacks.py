@@ -84,6 +84,7 @@ def test_rise_of_a_ball_above_curved_shapes() -> None:
     assert required_rise(wide, (ring,)) == pytest.approx(0.19 + edge, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("holder", ["bowl", "torus", "pipe", "cone", "prop:basket"])
 @pytest.mark.parametrize("shape", ["sphere", "cube", "cylinder", "torus"])
 def test_raised_bodies_do_not_overlap_and_are_not_too_high(holder: str, shape: str) -> None:
@@ -222,6 +223,7 @@ def test_links_are_on_the_pole_and_below_the_cap() -> None:
                 )
 
 
+@pytest.mark.slow
 def test_what_cannot_be_placed_is_an_error_with_reason() -> None:
     tall = dataclasses.replace(link.LINKS, count=(3, 3))
     short = dataclasses.replace(link.STAND.attachment, scale=((0.1, 0.1), (0.1, 0.1), (0.2, 0.2)))
@@ -272,6 +274,7 @@ def limits(axes: object, axis: int) -> Range:
     return found
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["support", "contain", "link"])
 def test_official_trials_could_have_been_drawn(scenario: str, official: Path) -> None:

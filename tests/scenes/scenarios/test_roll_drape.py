@@ -75,6 +75,7 @@ def inside(outer: Sequence[Any], inner: Sequence[Any], slack: float = 0.0) -> bo
 # Roll.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", published("roll"), ids=lambda preset: preset.name)
 def test_roll_is_drawn_as_the_official_scenes(official: Path, preset: Preset) -> None:
     real = official_scenes(official, "roll", preset)

@@ -80,6 +80,7 @@ def test_json_round_trip(scenario: Scenario) -> None:
     assert Scene.from_json(scene.to_json()) == scene
 
 
+@pytest.mark.slow
 def test_agent_and_patient_are_in_the_image(scenario: Scenario) -> None:
     for index in TRIALS:
         assert_seen(draw(scenario, index))
@@ -90,6 +91,7 @@ def test_nothing_overlaps_at_the_start(scenario: Scenario) -> None:
         assert not overlapping(draw(scenario, index)), index
 
 
+@pytest.mark.slow
 def test_scenery_is_outside_the_bodies(scenario: Scenario) -> None:
     for index in TRIALS:
         scene = draw(scenario, index, distractors=2, occluders=2)
@@ -111,6 +113,7 @@ def stands(scene: Scene) -> list[Body]:
     return [one for one in scene.bodies if not one.scenery and one.name not in flat]
 
 
+@pytest.mark.slow
 def test_scenery_changes_neither_motion_nor_camera_nor_looks(scenario: Scenario) -> None:
     for index in TRIALS:
         bare, full = draw(scenario, index, 0, 0), draw(scenario, index, 3, 2)
@@ -354,6 +357,7 @@ DRAWN: dict[str, list[tuple[Callable[[Scene], float], float, float]]] = {
 rules (docs/official-system.md, sections 2 and 3)."""
 
 
+@pytest.mark.slow
 def test_values_are_drawn_from_the_whole_of_their_official_range(scenario: Scenario) -> None:
     params = scenario.params()
     seeds = [trial_seed("range", scenario.name, "train", index) for index in range(60)]

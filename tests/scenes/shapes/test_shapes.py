@@ -132,6 +132,7 @@ def test_pieces_are_convex_and_inside_the_bounds(any_shape: Shape) -> None:
             assert piece.center == pytest.approx((corners.min(axis=0) + corners.max(axis=0)) / 2)
 
 
+@pytest.mark.slow
 def test_pieces_fill_the_mesh(any_shape: Shape) -> None:
     total = sum(solid_properties(piece.mesh)[0] for piece in any_shape.pieces)
     assert total == pytest.approx(any_shape.volume, rel=0.04)

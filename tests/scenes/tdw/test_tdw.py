@@ -489,6 +489,7 @@ def test_a_packed_log_is_not_unpacked_beyond_its_limit(tmp_path: Path) -> None:
     assert peak < 3 * MAX_LINE_BYTES
 
 
+@pytest.mark.slow
 def test_a_packed_log_of_many_lines_is_bounded_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

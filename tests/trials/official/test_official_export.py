@@ -125,6 +125,7 @@ def order(path: Path, trial: Trial) -> list[int]:
     return [starts.index(start) for start in static(path, "initial_position").tolist()]
 
 
+@pytest.mark.slow
 def test_motion_is_the_same_in_the_other_axes(exported: Path, rigid: Trial) -> None:
     path = exported / f"{CONFIGS['collide']}.hdf5"
     state, ours, at = read_state(path), rigid.trajectory, order(path, rigid)

@@ -103,6 +103,7 @@ def pairs(one: Trial, other: Trial) -> list[tuple[int, int]]:
     return [(i, shapes.index(body.shape)) for i, body in enumerate(one.scene.bodies)]
 
 
+@pytest.mark.slow
 def test_motion_comes_back(dataset: Path, imported: Path) -> None:
     for name in (RIGID, CLOTH):
         ours, back = Dataset(dataset).trial(name), Dataset(imported).trial(name)
@@ -188,6 +189,7 @@ def test_the_dataset_is_whole(imported: Path) -> None:
     assert index["recorded_contact"].all() and set(index["split"]) == {"testing"}
 
 
+@pytest.mark.slow
 def test_movies_are_copied_and_the_observed_part_is_cut(dataset: Path, imported: Path) -> None:
     ours, back = Dataset(dataset).paths(RIGID), Dataset(imported).paths(RIGID)
     assert back.movie.read_bytes() == ours.free_movie.read_bytes()
@@ -204,6 +206,7 @@ def test_a_second_run_keeps_everything(plain: Path, imported: Path) -> None:
     assert Dataset(imported).paths(RIGID).trial_file.stat().st_mtime_ns == stamp
 
 
+@pytest.mark.slow
 def test_name_and_split_are_chosen_or_come_from_metadata(
     dataset: Path, exported: Path, tmp_path: Path
 ) -> None:
@@ -287,6 +290,7 @@ def test_arrays_of_physics_may_cover_scenery_and_texts_have_one_length(
     assert trial.trajectory.contacts.frame.max() == PART - 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "note"),
     [
@@ -478,6 +482,7 @@ def group(file: h5py.File, path: str) -> None:
 HARM = [outside, soft, huge, stored_elsewhere, virtual, pointers, group]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("harm", HARM)
 @pytest.mark.parametrize("path", ["static/mass", "frames/0020/objects/positions"])
 def test_hostile_files_are_refused_by_file_and_field(
@@ -502,6 +507,7 @@ BROKEN: dict[str, tuple[str, object]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", BROKEN)
 def test_broken_fields_are_named(edited: Callable[..., Path], path: str) -> None:
     what, value = BROKEN[path]
@@ -640,6 +646,7 @@ def test_a_movie_without_label_fails_without_the_others(core: Path) -> None:
     assert report.made == (CLOTH,) and "labels.csv" in report.failed[RIGID]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [44, 45])
 @pytest.mark.parametrize("kind", ["movie", "state"])
 def test_a_contact_up_to_frame_44_is_observed(

@@ -264,6 +264,7 @@ def bench_labels(src_dir: Path, scene: str, kind: str, train: bool) -> dict[str,
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("images", [True, False])
 def test_physion_particles_reads_its_folder(dataset: Path, tmp_path: Path, images: bool) -> None:
     out = export(dataset, tmp_path / "out", "physion-particles", images=images)
@@ -397,6 +398,7 @@ def test_the_notebook_reads_configurations(exported: Path) -> None:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layout", ["physopt", "physion-evaluator", "physion-particles"])
 def test_a_second_run_keeps_what_is_whole(dataset: Path, tmp_path: Path, layout: str) -> None:
     options = {"images": False} if layout == "physion-particles" else {}

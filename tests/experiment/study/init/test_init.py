@@ -45,6 +45,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # --- which trials --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_choice_is_balanced_and_always_the_same(dataset: Path) -> None:
     chosen = choose_trials(dataset, test=4, practice=4)
     assert chosen == choose_trials(dataset, test=4, practice=4)
@@ -58,6 +59,7 @@ def test_the_choice_is_balanced_and_always_the_same(dataset: Path) -> None:
             assert all(s.label == (int(s.stimulus[-1]) % 2 == 0) for s in part)
 
 
+@pytest.mark.slow
 def test_another_seed_chooses_otherwise(dataset: Path) -> None:
     """Which trials, and their places; drawn apart for trials with and without contact."""
     few = [choose_trials(dataset, test=2, scenarios=["roll"], seed=seed) for seed in range(12)]
@@ -101,6 +103,7 @@ def test_presets_alternate_in_the_draw(tmp_path: Path) -> None:
     assert len(first) > 1, "which preset begins is drawn too"
 
 
+@pytest.mark.slow
 def test_an_unusable_trial_is_replaced_by_the_next_of_its_preset_and_outcome(
     tmp_path: Path,
 ) -> None:
@@ -223,6 +226,7 @@ def test_trials_without_movies_are_refused(dataset: Path, tmp_path: Path) -> Non
 # --- the folder ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_study_shows_what_the_trials_show(dataset: Path, tmp_path: Path) -> None:
     chosen = choose_trials(dataset)
     study = make_study(_study(tmp_path / "study"), chosen.sources, "a password")
@@ -310,6 +314,7 @@ def test_the_command_makes_a_study(
     assert "collide: 6 test and 4 familiarization trials" in out
 
 
+@pytest.mark.slow
 def test_the_preset_of_the_paper(
     dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -349,6 +354,7 @@ def test_the_command_takes_a_password_and_prints_json(
     assert check_password(Secrets.load(study.folder), "correct horse battery")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "message"),
     [

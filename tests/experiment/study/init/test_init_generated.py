@@ -16,7 +16,7 @@ from physion.trials.files import TrialPaths
 from physion.trials.video import read_frames
 from support.experiment.tiny_study import CONTACT
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.nightly]
 OBSERVED = 45
 
 

@@ -35,6 +35,7 @@ def collide() -> list[ImportedTrial]:
     return [trial for trial in official().trials if trial.scene.scenario == "collide"]
 
 
+@pytest.mark.slow
 def test_test_trials_were_seen_by_people_and_familiarization_is_apart(seen: set[str]) -> None:
     tasks = choose(collide(), seen).tasks
     assert tasks == choose(collide(), seen).tasks
@@ -74,6 +75,7 @@ def test_scenes_with_a_hidden_agent_or_patient_are_left_out(seen: set[str]) -> N
     assert faults[hidden] == HIDDEN and "" in faults.values()
 
 
+@pytest.mark.slow
 def test_familiarization_trials_of_the_study_come_first(seen: set[str]) -> None:
     drape = [trial for trial in official().trials if trial.scene.scenario == "drape"]
     chosen = choose(drape, seen, test=2).tasks
