@@ -77,21 +77,28 @@ def test_stored_scores_equal_their_files(claims: Any) -> None:
 
 
 @pytest.mark.slow
-def test_a_tiny_run_is_resumed_and_makes_the_page(claims: Any, tmp_path: Path, capsys: Any) -> None:
+def test_a_tiny_run_is_resumed_and_tests_other_scenarios(
+    claims: Any, tmp_path: Path, capsys: Any
+) -> None:
     table = importlib.import_module("paper_table")
-    chosen = ["--scale", "tiny", "--rendered", "--models", "cswm", "--protocols", "all", "one"]
-    chosen += ["--scenarios", "collide", "roll"]
-    arguments = [str(tmp_path), *chosen]
-    (tmp_path / "speed.json").write_text('{"trial": 1, "cswm: step": 0.5, "cswm: trial": 0.25}')
-    table.main([*arguments, "--plan"])
-    assert "0 trainings" not in (planned := capsys.readouterr().out)
-    assert "1 trainings, about 0.0 hours" in planned
+    (tmp_path / "speed.json").write_text('{"trial": 1, "cswm: step": 36, "cswm: trial": 1}')
+    chosen = ["--scale", "tiny", "--scenarios", "collide", "roll", "--models", "cswm"]
+    table.main([str(tmp_path), *chosen, "--plan"])
+    # 1 + 2 + 2 trainings of 6 steps; 20 trials are made, 16 encoded three times, 12 twice
+    assert "5 trainings, about 0.3 hours" in capsys.readouterr().out
     assert not (tmp_path / "fit").exists()
-    table.main(arguments)
-    first = capsys.readouterr().out
-    page = first[first.index("# Results") :]
-    assert "cswm | all | 6 | 1 of 1" in page
-    assert "| CSWM | another scenario | observed+simulated |" in page
-    part = table.Part(tmp_path, "cswm", "all", table.SCALES["tiny"], rendered=True)
-    assert part.train().trained[0].loaded
-    assert all(part.evaluate(name).evaluated[0].done for name in part.tested)
+    scale = table.SCALES["tiny"]
+    assert table.make_sets(tmp_path, scale, ["collide", "roll"], rendered=True) == 20
+    part = table.Part(tmp_path, "cswm", "one", scale, rendered=True)
+    assert not part.finished().predictions
+    first = part.train()
+    assert [one.name for one in first.trained] == ["collide", "roll"] and not first.failed
+    assert all(one.loaded for one in part.train().trained)
+    assert not part.evaluate("official").failed
+    done = part.finished()
+    assert list(done.predictions) == ["official"] and len(done.folders) == done.trainings == 2
+    released = read_published(official().results.parent)
+    tested = claims.tested_of(done.predictions["official"], released, people=True)
+    pairs = tested.across.runs.groupby("training").size()
+    assert pairs.to_dict() == {"only": 2, "another scenario": 2} and tested.tables.runs.empty
+    assert set(tested.matrices["trained"]) == {"collide", "roll"} and len(tested.matrices) == 4

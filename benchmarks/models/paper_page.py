@@ -252,7 +252,8 @@ CAPTIONS = {
     "grey: the middle 95 % of participants; hatched: the paper's band. All three as published, for "
     "all stimuli of the study.",
     "panel_b": "**B.** r with the average person. The released tables do not determine the "
-    "published one. Dashed: the noise ceiling. NaN: the answers are constant.",
+    "published one. Dashed: the noise ceiling. Without a number: undefined, since the answers are "
+    "constant.",
     "panel_c": "**C.** Cohen's kappa with people: published, the median over participants; here, "
     "with a person drawn anew for each stimulus (the answers of single participants are not "
     "released).",
@@ -416,7 +417,11 @@ def _trained(
     table = trainings([part for part in parts if not part.shipped])
     about = "**Trained for this page.** "
     if table.empty or not any(part.folders for part in parts):
-        return f"{about}Nothing yet: `benchmarks/models/paper_table.py` does it, for days."
+        return (
+            f"{about}Nothing yet: `benchmarks/models/paper_table.py` does it, for days. DPI-Net "
+            "trained only on Collide, and without it, is in [particle models]"
+            "(../reference/particle-models.md#results)."
+        )
     counts = [f"{tested[name].trials} {name}" for name in ("official", "own") if name in tested]
     return (
         f"{about}Size `small`, {scale['trials']} training trials per scenario (the paper: 2000), "

@@ -43,6 +43,7 @@ import pandas as pd
 import physion
 from paper_claims import GENERALISED, IMAGENET, NAMES
 from paper_page import Finished, write_page
+from physion.analysis.published.tables import PARTICLES
 from physion.cli.output import text_table
 from physion.compute.local import SerialExecutor
 from physion.core.files import write_atomic
@@ -86,7 +87,7 @@ class Scale:
 
 
 SCALES = {
-    "full": Scale(1000, 1000, 150, 0, 0.5, 3),
+    "full": Scale(1000, 1000, 150, 0, 0.25, 3),
     "small": Scale(60, 100, 30, 30, 0.1, 1),
     "tiny": Scale(2, 4, 2, 2, 0.001, 1),
 }
@@ -127,6 +128,11 @@ class Part:
     def seeds(self) -> int:
         """Number of seeds."""
         return self.scale.seeds if self.protocol == "all" else 1
+
+    @property
+    def fitted(self) -> int:
+        """Number of trials a scenario that fit a decision: none of particle models."""
+        return 0 if NAMES[self.model] in PARTICLES else self.scale.readout
 
     def options(self, steps: int = 0) -> dict[str, dict[str, Any]]:
         """Return the model with its options: random weights, steps, and how often it validates."""
@@ -246,7 +252,7 @@ def measure(folder: Path, parts: Sequence[Part]) -> dict[str, float]:
         ends.append(time.process_time())
         known[f"{name}: step"] = max(0.0, ends[2] - 2 * ends[1] + ends[0]) / 20
         part.evaluate("official", steps=4)
-        encoded = (scale.readout + scale.official) * len(SCENARIOS)
+        encoded = (part.fitted + scale.official) * len(SCENARIOS)
         known[f"{name}: trial"] = (time.process_time() - ends[2]) / encoded
         write_atomic(path, json.dumps(known, indent=1).encode())
     return known
@@ -266,10 +272,9 @@ def plan(folder: Path, parts: Sequence[Part], scale: Scale, scenarios: Sequence[
     rows = [("sets", 0, 0, 0.0, made, made * speed["trial"])]
     for part in parts:
         trained = {"all": part.seeds, "one": 0}.get(part.protocol, count) * (not part.shipped)
-        seen = (scale.readout + scale.tested) * count + stimuli
-        seen *= part.seeds
+        seen = part.seeds * ((part.fitted + scale.tested) * count + stimuli)
         if part.protocol == "one":
-            seen = count * (scale.readout * count + stimuli)
+            seen = count * (part.fitted * count + stimuli)
         training = trained * part.steps * speed[f"{part.model}: step"]
         rows.append((part.name, trained, part.steps, training, seen,
                      seen * speed[f"{part.model}: trial"]))  # fmt: skip
