@@ -76,6 +76,7 @@ def test_stored_scores_equal_their_files(claims: Any) -> None:
     assert accuracy == pytest.approx(float(mean.split()[-1]), abs=1e-3) and own.trials == 480
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_tiny_run_is_resumed_and_tests_other_scenarios(
     claims: Any, tmp_path: Path, capsys: Any
