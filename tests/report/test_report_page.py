@@ -210,6 +210,7 @@ def predictions_file(path: Path) -> Path:
     return path
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_files_in_report_out(tmp_path: Path) -> None:
     humans = people_folder(tmp_path)
@@ -239,6 +240,7 @@ def test_files_in_report_out(tmp_path: Path) -> None:
     assert people.loc["collide", "zone_high"] == 0.9
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_official_people_make_a_page(official: Path, tmp_path: Path) -> None:
     names = pd.read_csv(official / "stimuli" / "stimulus_names_and_labels.csv")

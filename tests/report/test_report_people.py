@@ -72,6 +72,7 @@ def test_every_figure_has_its_files(report: Path) -> None:
             assert (report.parent / "figures" / f"{stem}.{kind}").stat().st_size > 100
 
 
+@pytest.mark.nightly
 def test_flagged_session_is_counted_and_left_out(report: Path) -> None:
     flags = pd.read_csv(report.parent / "tables" / "people_flags.csv")
     assert flags.loc[flags["flagged"], "session"].tolist() == ["collide-7"]

@@ -27,6 +27,7 @@ def built(results: PublishedResults, tmp_path_factory: pytest.TempPathFactory) -
     return build_published_report(results, tmp_path_factory.mktemp("pub"))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_page_shows_published_and_expected_means(built: Path) -> None:
     whole = re.sub(r"<(style|figure)>.*?</\1>", " ", built.read_text(encoding="utf-8"), flags=re.S)

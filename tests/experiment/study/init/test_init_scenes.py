@@ -89,6 +89,7 @@ def test_a_scenario_without_scenes_of_one_kind_is_refused(seen: set[str]) -> Non
         choose(never, seen)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_command_renders_official_scenes_and_makes_a_study(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], seen: set[str]
