@@ -189,7 +189,8 @@ def test_a_dataset_without_pairs_and_a_model_without_surprise_are_refused(
         surprise(Bright(), plain, tmp_path)
 
 
-def test_pixel_statistics_give_a_probability_for_each_movie(pairs: Path) -> None:
-    table = pixel_statistics(pairs)
+def test_pixel_statistics_give_a_probability_for_each_movie(pairs: Path, tmp_path: Path) -> None:
+    table = pixel_statistics(pairs, tmp_path)
+    pd.testing.assert_frame_equal(pixel_statistics(pairs, tmp_path), table)
     assert table["mean"].between(0, 1).all()
     assert set(table["stimulus"]) == {name for name in Dataset(pairs).trials() if is_pair(name)}

@@ -112,7 +112,9 @@ def main(options: Options) -> int:
                 options.settings,
                 progress=stages,
             )
-            pixels = pixel_statistics(trials, rendered=options.settings.rendered, progress=stages)
+            pixels = pixel_statistics(
+                trials, options.out, rendered=options.settings.rendered, progress=stages
+            )
         _print_surprise(surprise_scores([pixels, table]), options)
         return 0
     with Stages() as stages:

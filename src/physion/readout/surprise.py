@@ -140,7 +140,7 @@ def _of_model(
     inputs += [[name, str(digests[name])] for name in sorted(pairs)]
     path = folder / f"{origin.model}-{json_digest(inputs)[:16]}.csv"
     if path.is_file():
-        return pd.read_csv(path, dtype={"init": str}, keep_default_na=False)
+        return _read(path)
     if is_network(model):
         from physion.training.devices import Devices, make_fabric, move_to_device
 
@@ -165,7 +165,15 @@ def _of_model(
             )
         )
     table = pd.DataFrame(rows, columns=list(COLUMNS))
-    with folder_for_writing(folder):
+    return _keep(path, table)
+
+
+def _read(path: Path) -> pd.DataFrame:
+    return pd.read_csv(path, dtype={"init": str}, keep_default_na=False)
+
+
+def _keep(path: Path, table: pd.DataFrame) -> pd.DataFrame:
+    with folder_for_writing(path.parent):
         write_atomic(path, table.to_csv(index=False).encode())
     return table
 
@@ -300,7 +308,11 @@ def surprise_scores(surprises: Sequence[pd.DataFrame]) -> pd.DataFrame:
 
 
 def pixel_statistics(
-    dataset: Dataset | Path | str, *, rendered: bool = False, progress: Progress | None = None
+    dataset: Dataset | Path | str,
+    out: Path | str = "runs/models",
+    *,
+    rendered: bool = False,
+    progress: Progress | None = None,
 ) -> pd.DataFrame:
     """Return a table as `surprise` does, of what single pictures tell: a check of the pairs.
 
@@ -308,7 +320,7 @@ def pixel_statistics(
     each of nine parts of the picture, each averaged over the first, second and last third of the
     movie. Extremely randomised trees learn from all other trials which movies
     are impossible; their P(impossible) stands for the surprise. If movies are well paired, nothing
-    of this tells, and half of the pairs come out right.
+    of this tells, and half of the pairs come out right. The table is kept in ``out``.
     """
     from sklearn.ensemble import ExtraTreesClassifier
 
@@ -316,6 +328,11 @@ def pixel_statistics(
 
     trials = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
     pairs = {name: _pair(trials, name) for name in trials.trials() if is_pair(name)}
+    digests = trials.index.set_index("trial")["digest"]
+    inputs = [_VERSION, rendered, [[name, str(digests[name])] for name in sorted(pairs)]]
+    path = Path(out) / "surprise" / f"{PIXELS}-{json_digest(inputs)[:16]}.csv"
+    if path.is_file():
+        return _read(path)
     source = whole_source(trials, Spec(image_size=48), rendered=rendered)
     features = []
     for name in tracked(list(pairs), PIXELS, len(pairs), progress):
@@ -340,7 +357,7 @@ def pixel_statistics(
         _row(PIXELS, "none", scenarios[name], name, pair, value, value)
         for (name, pair), value in zip(pairs.items(), probability.tolist(), strict=True)
     ]
-    return pd.DataFrame(rows, columns=list(COLUMNS))
+    return _keep(path, pd.DataFrame(rows, columns=list(COLUMNS)))
 
 
 def _statistics(rgb: NDArray[np.uint8]) -> F64:
