@@ -13,16 +13,20 @@ import torch
 from torch import nn
 
 import physion
+from physion.cli.main import main
 from physion.clips.batch import Batch, Motion, Provenance, Rollout, Spec
 from physion.compute.local import SerialExecutor
 from physion.core.errors import BadInputError
 from physion.models.build import build_model
 from physion.models.interface import Model
+from physion.models.noisy_simulation import NoisySimulation
 from physion.physics.engine import simulate
 from physion.readout.surprise import COLUMNS, pixel_statistics, surprise, surprise_scores
 from physion.trials.dataset import Dataset
 from physion.trials.making.pairs import Pair, is_pair
 from physion.trials.making.plan import GenerateSettings
+from physion.trials.official.export_folder import export_official
+from physion.trials.share.items import items_of
 
 
 @pytest.fixture(scope="module")
@@ -132,6 +136,33 @@ def test_what_is_known_is_not_computed_again(pairs: Path, tmp_path: Path) -> Non
     pd.testing.assert_frame_equal(first, again)
 
 
+def test_surprises_with_other_options_are_computed_anew(
+    pairs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def found(self: Any, batch: Batch) -> Any:
+        return np.full(batch.frames.shape, float(self.samples))
+
+    monkeypatch.setattr(NoisySimulation, "surprise", found)
+    for samples in (2, 3):
+        table = surprise("noisy-simulation", pairs, tmp_path, options={"samples": samples})
+        assert set(table["mean"]) == {samples}
+
+
+@pytest.mark.parametrize("option", ["--dry-run", "--check", "--fit=other"])
+def test_options_that_do_not_apply_to_surprise_are_refused(
+    option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["evaluate", "chance", "unused", "--surprise", option]) == 2
+    assert f"{option.split('=')[0]} does not apply to --surprise" in capsys.readouterr().err
+
+
+def test_questions_and_exports_leave_pairs_out(pairs: Path, tmp_path: Path) -> None:
+    rest = [name for name in Dataset(pairs).trials() if not is_pair(name)]
+    assert {item.trial for item in items_of(Dataset(pairs), split="testing")} == set(rest)
+    report = export_official(pairs, tmp_path, layout="hdf5s", images=False)
+    assert set(report.made) == set(rest)
+
+
 def test_ties_count_half_and_errors_are_over_trials() -> None:
     rows = [
         ("m", "none", "drop", f"{base}{first}{possible}", base, "vanish", False, first, possible,
@@ -174,6 +205,18 @@ def test_models_of_motion_are_surprised_by_a_jump(name: str) -> None:
     if name == "noisy-simulation":
         # -log exp(-d^2 / 2 w^2) with d = .6 and w = .02, less what three samples miss by.
         assert found[step] == pytest.approx(450, rel=0.2)
+
+
+def test_noisy_simulation_is_surprised_alike_before_movies_of_a_pair_differ() -> None:
+    model, (clip, step) = build_model("noisy-simulation", samples=2), _clip(0.0)
+    assert clip.state is not None
+    found = []
+    for number in range(2):
+        scene = replace(clip.state[0].scene, name=f"a_trial+pair.teleport.{number}")
+        motion = Motion(scene, clip.state[0].trajectory)
+        start = clip.steps(np.arange(step // 2))
+        found.append(model.surprise(replace(start, state=(motion,))))
+    assert found[0].any() and np.array_equal(*found)
 
 
 def test_a_dataset_without_pairs_and_a_model_without_surprise_are_refused(

@@ -209,6 +209,20 @@ def test_cloth_has_no_pairs_and_kinds_are_known() -> None:
         physion.generate("unused", "drop", 1, pairs=["teleprot"])
 
 
+def test_what_was_asked_for_and_not_made_is_said(tmp_path: Path) -> None:
+    settings = GenerateSettings(width=32, height=32, jitters=0, movies=False)
+
+    def make(split: str) -> physion.trials.making.generate.GeneratedDataset:
+        return physion.generate(
+            tmp_path, "dominoes", {split: 1}, pairs=["vanish", "stop-in-air"], settings=settings,
+            executor=SerialExecutor(),
+        )  # fmt: skip
+
+    assert make("testing").report.notes == {"pairs of stop-in-air": ("no trial allows them",)}
+    with pytest.raises(BadInputError, match="there are none: --split testing"):
+        make("training")
+
+
 def test_movies_are_equal_up_to_the_change(tmp_path: Path) -> None:
     start = found("teleport")[0].start
     parts = four("teleport", base_with("teleport", hidden=False))

@@ -87,6 +87,11 @@ class Options:
 
 def main(options: Options) -> int:
     """Write the tables of predictions; return 1 if some trials, or evaluations, have none."""
+    if options.surprise:
+        given = {"--fit": options.fit, "--check": options.check, "--dry-run": options.dry_run}
+        for name, value in given.items():
+            if value:
+                raise BadInputError(f"{name} does not apply to --surprise: leave it out")
     of_models = tuple(pair for pair in options.option if not pair.startswith(LOGISTIC))
     fitted = [pair.removeprefix(LOGISTIC) for pair in options.option if pair not in of_models]
     logistic = read_pairs(LogisticSettings, fitted, "--option logistic")
@@ -188,9 +193,9 @@ def _print_scores(done: Evaluation) -> None:
 
 
 def with_errors(scores: pd.DataFrame, name: str) -> list[str]:
-    """Return a column of scores as texts with their standard errors."""
+    """Return a column of scores as texts with their standard errors, where there are any."""
     pairs = zip(scores[name], scores[f"{name}_se"], strict=True)
-    return ["-" if m != m else f"{m:.3f} ({se:.3f})" for m, se in pairs]
+    return ["-" if m != m else f"{m:.3f}" if se != se else f"{m:.3f} ({se:.3f})" for m, se in pairs]
 
 
 def _print_whatif(scores: pd.DataFrame) -> None:

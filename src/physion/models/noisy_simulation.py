@@ -498,7 +498,8 @@ class NoisySimulation(Model):
         found = np.zeros(batch.frames.shape)
         for row, (motion, frames) in enumerate(zip(batch.state, batch.frames, strict=True)):
             levels, path = self.levels_for(motion.scene), motion.trajectory
-            plain = replace(motion.scene, events=())
+            # The noise is drawn by name: movies of a pair, TRIAL+..., get that of their trial.
+            plain = replace(motion.scene, events=(), name=motion.scene.name.partition("+")[0])
             for step, (before, now) in enumerate(itertools.pairwise(frames.tolist()), start=1):
                 there = bodies_present(motion.scene, before, now)
                 scene, state = _only(plain, path.state(before), there)

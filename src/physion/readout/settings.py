@@ -6,7 +6,6 @@ are options of the model: ``options={"steps": 500}``.
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -29,7 +28,7 @@ from physion.readout.folds import Protocol
 from physion.readout.logistic import LogisticSettings
 from physion.readout.model_calls import is_network
 from physion.trials.dataset import Dataset
-from physion.trials.making.pairs import is_pair
+from physion.trials.making.pairs import without_pairs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,12 +244,7 @@ def open_dataset(dataset: Dataset | Path | str, executor: Executor | None) -> Da
     opened = Dataset(Path(dataset)) if isinstance(dataset, str | Path) else dataset
     if executor is not None:
         opened = Dataset(opened.folder.absolute(), verify=opened.verify)
-    paired = opened.index["trial"].map(is_pair).astype(bool)
-    if paired.any():
-        opened = copy.copy(opened)
-        opened.index = opened.index[~paired].reset_index(drop=True)
-        vars(opened).pop("_rows", None)
-    return opened
+    return without_pairs(opened)
 
 
 def runner_of_cells(executor: Executor | None) -> Executor | None:

@@ -30,6 +30,7 @@ from physion.clips.clips import whole_source
 from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError
 from physion.core.files import folder_for_writing, json_digest, write_atomic
+from physion.core.version import __version__
 from physion.models.interface import Model, ask, can
 from physion.readout.model_calls import (
     call_model,
@@ -53,7 +54,7 @@ COLUMNS = (
 ``kind`` and ``first`` are a pair."""
 MEASURES = ("mean", "largest")
 ALL, PIXELS = "all", "pixel-statistics"
-_VERSION = 1
+_VERSION = 2
 """To be increased with every change that can alter a surprise."""
 STEP = 6
 """Frames of a step, where a model asks for every frame: in one nothing has moved far."""
@@ -135,9 +136,11 @@ def _of_model(
 ) -> pd.DataFrame:
     """Return the surprises of one model, which are kept in ``folder``."""
     origin = check_identity(model)
-    digests = dataset.index.set_index("trial")["digest"]
-    inputs = [_VERSION, model.digest(), settings.seed, settings.rendered]
-    inputs += [[name, str(digests[name])] for name in sorted(pairs)]
+    files = dataset.index.set_index("trial")[["digest", "movie_sha256"]]
+    # What evaluate's tables depend on, too: a digest leaves out numbers of samples, for example.
+    own = dataclasses.asdict(chosen) if (chosen := ask(model, "settings")) else {}
+    inputs = [_VERSION, __version__, model.digest(), own, settings.seed, settings.rendered]
+    inputs += [[name, *map(str, files.loc[name])] for name in sorted(pairs)]
     path = folder / f"{origin.model}-{json_digest(inputs)[:16]}.csv"
     if path.is_file():
         return _read(path)

@@ -43,6 +43,7 @@ from physion.trials.index import (
 from physion.trials.making.choose import short
 from physion.trials.making.pairs import check_kinds, pair_tasks
 from physion.trials.making.plan import (
+    PAIR,
     GenerateJob,
     GenerateSettings,
     TrialTask,
@@ -422,6 +423,11 @@ def generate(
             report = RunReport(
                 [*report.made, *more.made], [*report.kept, *more.kept],
                 {**report.failed, **more.failed}, more.index,
+                {
+                    f"pairs of {kind}": ("no trial allows them",)
+                    for kind in pairs
+                    if not any(f"{PAIR}.{kind}." in task.trial for task in changed)
+                },
             )  # fmt: skip
             tasks = [*tasks, *changed]
     if report.failed:

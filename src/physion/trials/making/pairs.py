@@ -29,6 +29,7 @@ F. Bordes and others, IntPhys 2, arXiv 2506.09849, 2025.
 
 from __future__ import annotations
 
+import copy
 import itertools
 import json
 import math
@@ -119,6 +120,17 @@ class Pair:
 def is_pair(trial: str) -> bool:
     """Return whether a trial is one of four, by its name."""
     return f"{MARK}{PAIR}." in trial
+
+
+def without_pairs(dataset: Dataset) -> Dataset:
+    """Return the dataset without movies of pairs, which have no outcome."""
+    paired = dataset.index["trial"].map(is_pair).astype(bool)
+    if not paired.any():
+        return dataset
+    rest = copy.copy(dataset)
+    rest.index = dataset.index[~paired].reset_index(drop=True)
+    vars(rest).pop("_rows", None)
+    return rest
 
 
 def motion_of(scene: Scene, engine: Engine) -> Trajectory:
@@ -221,10 +233,12 @@ def pair_tasks(
 ) -> list[TrialTask]:
     """Return tasks for four trials of each of ``trials`` and each kind that its scene allows.
 
-    Raises `UnknownNameError` for a kind that is not one of `KINDS`, and `BadInputError` if no trial
-    allows any of them.
+    Raises `UnknownNameError` for a kind that is not one of `KINDS`, and `BadInputError` if there is
+    no trial, or none that allows any of them.
     """
     check_kinds(kinds)
+    if not trials:
+        raise BadInputError("pairs are made of testing trials, and there are none: --split testing")
     known, run, tasks = dataset.known_trials(), make_engine(engine), []
     for name in tracked(trials, "finding pairs", len(trials), progress):
         trial = dataset.trial(name)
@@ -233,7 +247,7 @@ def pair_tasks(
             found = None
             if not known.issuperset(names):
                 found = quadruple(trial.scene, trial.trajectory, kind, run)
-            elif all(is_pair(one) for one in names):
+            else:
                 tasks += [_task(trial, dataset.trial(one).scene) for one in names]
             if found is not None:
                 scenes = four_scenes(found, name, len(trial.trajectory), run)

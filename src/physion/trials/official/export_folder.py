@@ -79,6 +79,7 @@ from physion.core.names import FOLDERS, evaluator_name
 from physion.core.seeds import stable_hash
 from physion.trials.dataset import Dataset
 from physion.trials.files import IndexedFile, Metadata, TrialPaths, encode_png
+from physion.trials.making.pairs import without_pairs
 from physion.trials.official.names import (
     EVALUATOR_LABELS,
     EVALUATOR_SPLITS,
@@ -422,7 +423,7 @@ def export_official(
     """
     if layout not in LAYOUTS:
         raise UnknownNameError("layout", layout, LAYOUTS)
-    source = Dataset(dataset, verify=verify)
+    source = without_pairs(Dataset(dataset, verify=verify))
     names = source.trials(split, scenario)
     if not names:
         raise BadInputError(

@@ -17,6 +17,7 @@ from physion.core.files import folder_for_writing, remove_leftovers, write_atomi
 from physion.scenes.scene import OBSERVED_FRAMES
 from physion.trials.dataset import Dataset
 from physion.trials.files import IndexedFile
+from physion.trials.making.pairs import without_pairs
 
 SPLITS = ("readout", "testing")
 """Splits of an evaluation: trials that fit a readout, and trials that are predicted."""
@@ -104,7 +105,7 @@ def export_features_request(
     BadInputError
         If there is no such trial, or one without a movie.
     """
-    dataset = Dataset(folder, verify=verify)
+    dataset = without_pairs(Dataset(folder, verify=verify))
     index = dataset.index.sort_values("trial")
     for column, wanted in (("split", split), ("scenario", scenario)):
         if wanted is not None and wanted not in set(index[column]):

@@ -19,6 +19,7 @@ from physion.core.seeds import stable_hash
 from physion.trials.dataset import Dataset
 from physion.trials.files import IndexedFile
 from physion.trials.making.make import make_movies
+from physion.trials.making.pairs import without_pairs
 from physion.trials.share.questions import CONTACT, YES_NO, item_id, options_of
 from physion.trials.trial_file import Trial
 from physion.trials.video import encode_movie, read_chosen
@@ -80,7 +81,7 @@ def items_of(
     BadInputError
         For a trial without a label.
     """
-    index = dataset.index.sort_values("trial")
+    index = without_pairs(dataset).index.sort_values("trial")
     for column, wanted in (("split", split), ("scenario", scenario)):
         if wanted is not None and wanted not in set(index[column]):
             raise UnknownNameError(column, wanted, set(index[column]))

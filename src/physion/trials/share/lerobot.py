@@ -47,6 +47,7 @@ from physion.core.files import folder_for_writing, remove_leftovers, write_atomi
 from physion.physics.trajectory import Trajectory
 from physion.scenes.scene import FRAME_TIME, Scene
 from physion.trials.dataset import Dataset
+from physion.trials.making.pairs import without_pairs
 from physion.trials.share.questions import WORDINGS
 from physion.trials.video import open_movie
 
@@ -81,7 +82,7 @@ def export_lerobot(
     BadInputError
         If no trial is chosen, one has no label or no movie, or movies differ in size or rate.
     """
-    dataset = Dataset(folder, verify=verify)
+    dataset = without_pairs(Dataset(folder, verify=verify))
     index = dataset.index.sort_values("split", kind="stable").set_index("trial")
     chosen = set(dataset.chosen(split, scenario))
     names = [str(name) for name in index.index if name in chosen]
