@@ -55,6 +55,8 @@ class Bright(Model):
         return np.asarray(batch.rgb.mean(axis=(2, 3)) / 255, np.float32)
 
     def imagine(self, context: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
+        # What is random may be drawn by name: both movies of a pair are called alike.
+        assert context.trials[0].startswith("dominoes") and "+" not in context.trials[0]
         last = context.features[:, -1][:, None, None]
         return Rollout(features=np.repeat(np.repeat(last, samples, 1), context.future, 2))
 

@@ -44,6 +44,7 @@ from physion.readout.settings import EvaluationSettings, Models, choose_models
 from physion.readout.whatif import mean_over_trials
 from physion.trials.dataset import Dataset
 from physion.trials.making.pairs import Pair, is_pair
+from physion.trials.making.whatif import MARK
 
 F64 = NDArray[np.float64]
 COLUMNS = (
@@ -227,10 +228,14 @@ def _imagined_error(model: Model, clip: Batch, seed: int) -> F64:
         own = [_features(model, _part(clip, _before(step + 1, context))) for step in range(steps)]
         true = np.concatenate(own)[:, -1]
     parts = [_part(clip, window) for window in windows]
+    # Random futures are drawn by name: movies of a pair get those of the trial they are made of.
+    named = tuple(trial.partition(MARK)[0] for trial in clip.trials)
     seeds = ask(model, "seed")
     samples, errors = ask(model, "samples"), np.zeros(steps)
     for step in range(1, steps):
-        asked = dataclasses.replace(parts[step], features=encoded[step : step + 1], future=1)
+        asked = dataclasses.replace(
+            parts[step], trials=named, features=encoded[step : step + 1], future=1
+        )
         rollout = call_model(model, "imagine", asked, samples, seed if seeds is None else seeds)
         if not isinstance(rollout, Rollout) or rollout.features is None:
             raise BadInputError(f"model {model_name(model)!r}: imagine gave no features")
