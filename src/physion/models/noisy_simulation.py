@@ -498,7 +498,7 @@ class NoisySimulation(Model):
         found = np.zeros(batch.frames.shape)
         for row, (motion, frames) in enumerate(zip(batch.state, batch.frames, strict=True)):
             levels, path = self.levels_for(motion.scene), motion.trajectory
-            # The noise is drawn by name: movies of a pair, TRIAL+..., get that of their trial.
+            # The noise is drawn by name, and movies of a pair, TRIAL+..., have the same noise.
             plain = replace(motion.scene, events=(), name=motion.scene.name.partition("+")[0])
             for step, (before, now) in enumerate(itertools.pairwise(frames.tolist()), start=1):
                 there = bodies_present(motion.scene, before, now)

@@ -228,7 +228,7 @@ def _imagined_error(model: Model, clip: Batch, seed: int) -> F64:
         own = [_features(model, _part(clip, _before(step + 1, context))) for step in range(steps)]
         true = np.concatenate(own)[:, -1]
     parts = [_part(clip, window) for window in windows]
-    # Random futures are drawn by name: movies of a pair get those of the trial they are made of.
+    # Random futures are drawn by name, and movies of a pair have the same ones.
     named = tuple(trial.partition(MARK)[0] for trial in clip.trials)
     seeds = ask(model, "seed")
     samples, errors = ask(model, "samples"), np.zeros(steps)
