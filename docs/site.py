@@ -120,7 +120,8 @@ def help_text(*words: str) -> str:
         textwrap.fill(line, 96) if len(line) > 96 else line for line in text.splitlines()
     )
     # Defaults that differ from machine to machine.
-    text = re.sub(r"(--workers INTEGER\s.*?default: )\d+", r"\g<1>number of cores", text, flags=re.S)
+    workers = r"(--workers INTEGER\s.*?default: )\d+"
+    text = re.sub(workers, r"\g<1>number of cores", text, flags=re.S)
     return f"```text\n{text}\n```\n"
 
 
