@@ -232,6 +232,8 @@ def test_a_dataset_without_pairs_and_a_model_without_surprise_are_refused(
     )  # fmt: skip
     with pytest.raises(BadInputError, match="generate --pairs"):
         surprise(Bright(), plain, tmp_path)
+    with pytest.raises(BadInputError, match="generate --pairs"):
+        pixel_statistics(plain, tmp_path)
 
 
 def test_pixel_statistics_give_a_probability_for_each_movie(pairs: Path, tmp_path: Path) -> None:

@@ -222,8 +222,8 @@ class Batch:
             **{name: value[chosen] for name, value in self.arrays().items()},
         )
 
-    def steps(self, chosen: slice) -> Batch:
-        """Return a range of the frames of every clip; what is no sequence of frames stays whole."""
+    def steps(self, chosen: slice | NDArray[np.int64]) -> Batch:
+        """Return some frames of every clip, by range or number; what has no frames stays whole."""
         whole = ("camera", "contact")
         kept = {
             name: value[:, chosen] for name, value in self.arrays().items() if name not in whole

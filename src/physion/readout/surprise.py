@@ -102,12 +102,7 @@ def surprise(
     """
     settings = dataclasses.replace(settings or EvaluationSettings(), **changes)
     trials = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
-    pairs = {name: _pair(trials, name) for name in trials.trials() if is_pair(name)}
-    if not pairs:
-        raise BadInputError(
-            f"{trials.folder} has no pairs of a possible and an impossible movie; make some with "
-            "physion generate --pairs"
-        )
+    pairs = _pairs(trials)
     chosen = choose_models(models, options)
     # Every model is built before anything is computed, so that mistakes are found at once.
     for model in chosen:
@@ -120,11 +115,20 @@ def surprise(
     return pd.concat(tables, ignore_index=True)
 
 
-def _pair(dataset: Dataset, name: str) -> Pair:
-    pair = Pair.of(dataset.trial(name).scene)
-    if pair is None:
-        raise BadInputError(f"trial {name!r} of {dataset.folder} does not say which pair it is of")
-    return pair
+def _pairs(dataset: Dataset) -> dict[str, Pair]:
+    """Return what each movie of a pair says of itself, by its name."""
+    found = {name: Pair.of(dataset.trial(name).scene) for name in dataset.trials() if is_pair(name)}
+    if not found:
+        raise BadInputError(
+            f"{dataset.folder} has no pairs of a possible and an impossible movie; make some with "
+            "physion generate --pairs"
+        )
+    pairs = {name: pair for name, pair in found.items() if pair is not None}
+    if silent := sorted(found.keys() - pairs.keys()):
+        raise BadInputError(
+            f"trial {silent[0]!r} of {dataset.folder} does not say which pair it is of"
+        )
+    return pairs
 
 
 def _of_model(
@@ -138,8 +142,8 @@ def _of_model(
     """Return the surprises of one model, which are kept in ``folder``."""
     origin = check_identity(model)
     files = dataset.index.set_index("trial")[["digest", "movie_sha256"]]
-    # What evaluate's tables depend on, too: a digest leaves out numbers of samples, for example.
-    own = dataclasses.asdict(chosen) if (chosen := ask(model, "settings")) else {}
+    # A digest leaves out some settings, such as the number of samples.
+    own = repr(ask(model, "settings"))
     inputs = [_VERSION, __version__, model.digest(), own, settings.seed, settings.rendered]
     inputs += [[name, *map(str, files.loc[name])] for name in sorted(pairs)]
     path = folder / f"{origin.model}-{json_digest(inputs)[:16]}.csv"
@@ -255,7 +259,7 @@ def _before(step: int, count: int) -> list[int]:
 
 
 def _part(clip: Batch, steps: Sequence[int]) -> Batch:
-    return clip.steps(np.asarray(steps))  # type: ignore[arg-type]
+    return clip.steps(np.asarray(steps, np.int64))
 
 
 def _features(model: Model, clip: Batch) -> NDArray[np.float32]:
@@ -335,7 +339,7 @@ def pixel_statistics(
     from physion.clips.batch import Spec
 
     trials = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
-    pairs = {name: _pair(trials, name) for name in trials.trials() if is_pair(name)}
+    pairs = _pairs(trials)
     digests = trials.index.set_index("trial")["digest"]
     inputs = [_VERSION, rendered, [[name, str(digests[name])] for name in sorted(pairs)]]
     path = Path(out) / "surprise" / f"{PIXELS}-{json_digest(inputs)[:16]}.csv"
