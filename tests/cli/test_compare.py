@@ -56,6 +56,7 @@ def test_help_imports_nothing_heavy() -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_two_columns_are_enough_and_the_terminal_shows_the_results(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -85,6 +86,7 @@ def test_two_columns_are_enough_and_the_terminal_shows_the_results(
     assert lines[-1] == f"report: {tmp_path / 'out' / 'report.html'}"
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_recorded_outcome_decides_and_differences_are_listed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -335,6 +337,7 @@ def test_options_that_do_not_fit_are_one_line(
 # --- published numbers --------------------------------------------------------------------------
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_published_prints_and_writes_the_published_numbers(
     official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -41,6 +41,7 @@ def log(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_every_engine_has_a_row_and_every_column_a_legend(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

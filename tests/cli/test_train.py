@@ -53,6 +53,7 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_second_run_does_nothing_and_says_so(
     dots: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -179,6 +180,7 @@ def test_evaluate_finds_what_was_trained(
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "training").rglob("*")} == before
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_models_protocols_and_seeds(
     dots: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]

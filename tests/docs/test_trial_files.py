@@ -35,6 +35,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return namespace
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_examples_compute_what_they_say(names: dict[str, Any]) -> None:
     trial: Trial = names["trial"]

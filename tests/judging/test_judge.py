@@ -149,6 +149,7 @@ def test_the_request_tells_no_outcome(dataset: Dataset, tmp_path: Path) -> None:
     assert "4 movies of each trial" in readme.read_text()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_verb_writes_page_and_comparison(
     dataset: Dataset, generated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

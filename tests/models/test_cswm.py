@@ -233,6 +233,7 @@ def test_maps_are_shown_for_every_state() -> None:
     assert bool((maps > 0).all()) and bool((maps < 1).all())
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_learned_transition_ranks_the_next_state_better_than_a_copy() -> None:
     """Two pictures determine how squares at constant speed go on."""

@@ -240,6 +240,7 @@ def test_vgg_features_come_before_the_last_relu() -> None:
     assert (features < 0).any() and (features > 0).any()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_no_module_reads_anything_that_could_run_code() -> None:
     """Of all modules of the package, seen as syntax trees."""

@@ -411,6 +411,7 @@ class _WithoutDistillation(FineTunedEncoder):
         return {"loss": functional.mse_loss(self.step(windows), target), "variance": variance}
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_features_of_different_pictures_stay_different() -> None:
     """Where the loss of the next feature alone makes them equal."""
@@ -479,6 +480,7 @@ def test_statistics_of_batch_normalisation_stay_as_they_are() -> None:
     assert kept and all(torch.equal(value, now[name]) for name, value in kept.items())
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_evaluation_trains_the_encoder_of_each_fold_and_reads_its_features(tmp_path: Path) -> None:
     counts = {"training": 4, "readout": 8, "testing": 4}

@@ -95,6 +95,7 @@ def encode(request: Path) -> None:
     )
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_request_is_encoded_without_this_package_and_gives_the_row_of_the_model(
     dots: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -125,6 +126,7 @@ def test_a_request_is_encoded_without_this_package_and_gives_the_row_of_the_mode
     assert expected.std() > 0.01
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_request_of_whole_movies_is_a_row_of_full_only(dots: Dataset, tmp_path: Path) -> None:
     request = tmp_path / "request"

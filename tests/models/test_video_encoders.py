@@ -398,6 +398,7 @@ def test_it_is_evaluated_under_observed_and_full(name: str, tmp_path: Path) -> N
     assert (table["model"] == f"random-{name}-small").all() and (table["init"] == "random").all()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_without_transformers_the_extra_is_named() -> None:
     code = """

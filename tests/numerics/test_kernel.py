@@ -54,6 +54,29 @@ def test_a_changed_callee_in_another_file_is_compiled_again(tmp_path: Path) -> N
     assert printed == ["4 0", "4 1", "12 0"]
 
 
+CONSTANTS = """
+from physion.numerics.kernel import kernel
+
+@kernel
+def added(x, y):
+    return x + y
+
+@kernel
+def total(x):
+    return added(x, 1) + added(x, 2) + added(1, x)
+
+print(total(5), len(added.signatures))
+"""
+
+
+@pytest.mark.slow
+def test_constants_in_calls_compile_a_kernel_once(tmp_path: Path) -> None:
+    (tmp_path / "constants.py").write_text(CONSTANTS)
+    command = [sys.executable, "-c", "import constants"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["19", "1"]
+
+
 RECORD = """
 from typing import NamedTuple
 from physion.numerics.kernel import kernel

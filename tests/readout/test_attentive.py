@@ -60,6 +60,7 @@ def marked(trials: int, tokens: int, seed: int = 0) -> tuple[NDArray[np.float32]
     return features, labels
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_marked_token_is_read_wherever_it_is() -> None:
     features, labels = marked(300, 12)
@@ -102,6 +103,7 @@ def test_models_say_how_many_tokens_they_have() -> None:
     )
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_an_encoder_with_attentive_pooling_finds_where_the_dot_ends(tmp_path: Path) -> None:
     dots = make_dots(tmp_path / "dots", {"readout": 24, "testing": 20}, ("drop",))

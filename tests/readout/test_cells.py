@@ -133,6 +133,7 @@ def test_each_scenario_trains_a_model_that_is_tested_on_all(dots: Dataset, tmp_p
         physion.train(IMAGINING, dots, tmp_path, dry_run=True, scenario="drop", settings=CPU)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_trainings_on_one_scenario_fill_the_heat_map(dots: Dataset, tmp_path: Path) -> None:
     """From trainings to the figure's table: each cell is the accuracy in the predictions."""
@@ -186,6 +187,7 @@ def test_other_inputs_are_another_training(dots: Dataset, tmp_path: Path) -> Non
     assert len({place(), *others}) == 5
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_evaluations_have_all_readouts_and_a_second_run_only_reads(
     dots: Dataset, tmp_path: Path

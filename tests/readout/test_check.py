@@ -218,6 +218,7 @@ def test_no_observed_byte_changes_that_must_not(change: str, made: Dataset, tmp_
         assert longest, f"{column}: how far models imagine stays"
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_what_is_changed(made: Dataset, tmp_path: Path) -> None:
     """The copies say what they should, by values that are read independently."""
@@ -513,7 +514,13 @@ def few(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(models.names()))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.nightly if name.startswith("gns") else ())
+        for name in sorted(models.names())
+    ],
+)
 def test_every_shipped_model_passes(name: str, few: Dataset, tmp_path: Path) -> None:
     options = OPTIONS.get(name, {})
     kept = ["future", "everything"]

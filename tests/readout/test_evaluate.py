@@ -66,6 +66,7 @@ def accuracy(table: pd.DataFrame, protocol: str) -> float:
     return float(((rows["p_contact"] > 0.5) == rows["outcome"]).mean())
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_full_is_far_above_chance_and_observed_is_not(done: Evaluation) -> None:
     """The dot changes direction after the observed part, which therefore does not predict it."""

@@ -665,6 +665,7 @@ def test_a_pickled_particle_model_is_the_same(name: str, weights: str) -> None:
     )  # fmt: skip
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_particle_models_imagine_the_same_in_processes(tmp_path: Path) -> None:
     motions = []

@@ -28,6 +28,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_predictions_are_equal_to_one_dataset_with_both_parts(folder: Path) -> None:
     apart = evaluate("blob-centroids", folder / "tested", folder / "a", fit=folder / "fit")

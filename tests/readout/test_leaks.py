@@ -169,6 +169,7 @@ def accuracy_of_full(dataset: Dataset, folder: Path, **options: Any) -> float:
     return float(((table["p_contact"] > 0.5) == table["outcome"]).mean())
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("fine_tuned", [False, True], ids=["frozen", "fine-tuned"])
 def test_full_falls_to_chance_with_exchanged_futures_and_permuted_labels(

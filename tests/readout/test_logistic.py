@@ -376,6 +376,7 @@ print(json.dumps({
 """
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_readout_needs_less_memory_than_its_features(tmp_path: Path) -> None:
     """The features take 240 MB, their standardised float64 copy would take twice as much."""

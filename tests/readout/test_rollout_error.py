@@ -186,6 +186,7 @@ def test_what_cannot_have_an_error_is_refused(dataset: Dataset) -> None:
         evaluate("constant-motion", dataset, "nowhere", rollout_errors=True)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_evaluate_writes_them_next_to_the_predictions(dataset: Dataset, tmp_path: Path) -> None:
     config = EvaluationSettings(untrained=True, folds=2, accelerator="cpu")

@@ -96,6 +96,7 @@ def test_bars_have_the_length_of_the_answers(browser: Browser, page: Path) -> No
     assert all(length == pytest.approx(said, abs=0.01) for said, length in lengths)
 
 
+@pytest.mark.nightly
 def test_a_name_leads_to_the_page_of_its_trial_and_back(browser: Browser, page: Path) -> None:
     browser.open(page)
     name = browser.ask("document.querySelector('.name a').textContent")

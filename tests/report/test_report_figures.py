@@ -648,6 +648,7 @@ def test_models_are_held_against_the_first_in_the_files(make_comparison: Maker) 
 # --- one file each ------------------------------------------------------------------------------
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_figure_of_another_package_is_found(tmp_path: Path) -> None:
     (tmp_path / "own_figure.py").write_text(
@@ -696,6 +697,7 @@ def test_marks_stand_out_from_the_paper(look: theme.Theme) -> None:
     assert min(contrast(colour, look.paper) for colour in look.palette) > 1.5
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_figures_are_sound_files(make_comparison: Maker) -> None:
     for plot in make_plots(ReportInputs(make_comparison())):
@@ -707,6 +709,7 @@ def test_figures_are_sound_files(make_comparison: Maker) -> None:
         assert image.width > 900 and np.asarray(image.convert("L")).std() > 10
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_darkened_figure_is_the_one_drawn_in_the_dark_theme(make_comparison: Maker) -> None:
     names = re.compile(rb"\b[mphC][0-9a-f]{10}(_\w+)?\b")  # of markers, clips and hatches

@@ -72,7 +72,6 @@ def test_every_figure_has_its_files(report: Path) -> None:
             assert (report.parent / "figures" / f"{stem}.{kind}").stat().st_size > 100
 
 
-@pytest.mark.nightly
 def test_flagged_session_is_counted_and_left_out(report: Path) -> None:
     flags = pd.read_csv(report.parent / "tables" / "people_flags.csv")
     assert flags.loc[flags["flagged"], "session"].tolist() == ["collide-7"]
@@ -202,6 +201,7 @@ def test_no_session_left_is_refused(tmp_path: Path) -> None:
         compare_small(tmp_path, answers, accept_rules=["streak"])
 
 
+@pytest.mark.nightly
 def test_confirmed_rules_are_listed(report: Path, tmp_path: Path) -> None:
     answers = responses()
     lazy = (answers["scenario"] == "drop") & answers["participant"].isin(
@@ -245,6 +245,7 @@ def test_a_rehearsal_with_simulated_participants_is_marked_on_every_page(
         assert "rehearsal" not in pd.read_csv(original).columns if original.exists() else True
 
 
+@pytest.mark.nightly
 def test_warnings_stand_above_everything(tmp_path: Path) -> None:
     answers = responses()
     stray = answers.tail(1).assign(stimulus="drop_elsewhere", trial=99)
@@ -257,6 +258,7 @@ def test_warnings_stand_above_everything(tmp_path: Path) -> None:
     assert "drop_elsewhere" in warning
 
 
+@pytest.mark.nightly
 def test_the_source_of_attributes_is_the_one_used(tmp_path: Path) -> None:
     answers = responses()
     own = answers[["stimulus", "scenario"]].drop_duplicates().assign(elements=range(2 * STIMULI))
@@ -264,6 +266,7 @@ def test_the_source_of_attributes_is_the_one_used(tmp_path: Path) -> None:
     assert "Attributes: of 32 stimuli 32 by the table that was given, 0 by their official" in text
 
 
+@pytest.mark.nightly
 def test_answers_without_times_say_so(tmp_path: Path) -> None:
     result = compare_small(tmp_path, responses().assign(rt_ms=np.nan))
     assert isinstance(result.inputs, ReportInputs)
@@ -276,6 +279,7 @@ def test_permutations_let_holm_find_something() -> None:
         assert pairs / (1 + permutations_of(pairs)) < 0.05
 
 
+@pytest.mark.nightly
 def test_only_people(report: Path, tmp_path: Path) -> None:
     responses().to_csv(tmp_path / "responses.csv", index=False)
     page = compare(responses=tmp_path / "responses.csv", resamples=60).report(tmp_path / "one")
@@ -302,6 +306,7 @@ def test_only_people(report: Path, tmp_path: Path) -> None:
     assert numbers["people_by_scenario"] and "comparison" not in numbers
 
 
+@pytest.mark.nightly
 def test_a_rehearsal_with_only_people_is_marked(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -362,6 +362,7 @@ def test_imagined_particles_are_shown_next_to_the_true_motion(
     assert browser.complaints() == []
 
 
+@pytest.mark.nightly
 def test_trials_are_marked_and_the_file_is_offered(browser: Browser, page: Path) -> None:
     """The page keeps what is typed, and makes the file for the folder of the dataset."""
     browser.open(page, "#trial=drop_1")

@@ -58,6 +58,7 @@ def test_answers_are_counted_by_outcome_and_order(
     assert got["d_prime"] == pytest.approx(0)
 
 
+@pytest.mark.nightly
 def test_the_standard_error_is_clustered_by_stimulus(found: dict[str, Any]) -> None:
     """Two stimuli of two right answers and two of none: sqrt(sum d^2 C / (C - 1)) / n, d = 1."""
     assert found["yes"]["stderr"] == pytest.approx(math.sqrt(4 * 4 / 3) / 8)

@@ -81,6 +81,7 @@ def test_index_equals_the_files(finished: Path) -> None:
     assert dataset.index["first_frame"].isna().tolist() == [True, False, True, False]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_without_labels_training_trials_hold_no_outcome_and_no_roles(tmp_path: Path) -> None:
     tasks = plan_dataset("plain", ("collide",), {"training": 1, "readout": 2, "testing": 2})

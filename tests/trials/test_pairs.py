@@ -236,6 +236,7 @@ def test_movies_are_equal_up_to_the_change(tmp_path: Path) -> None:
     assert not np.array_equal(shown[0][start:], shown[1][start:])
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_pairs_are_trials_without_labels(tmp_path: Path) -> None:
     settings = GenerateSettings(width=64, height=64, jitters=0)

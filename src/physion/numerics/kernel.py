@@ -11,11 +11,12 @@ import pickle
 import re
 import sys
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba import types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 
@@ -54,7 +55,18 @@ def _compiled(function: Function, options: dict[str, Any]) -> Function:
         return function  # NUMBA_DISABLE_JIT is set: nothing is compiled
     compiled: Any = dispatcher
     compiled._cache = _KernelCache(function)
+    compiled.get_call_template = partial(_call_template, compiled)
     return cast("Function", dispatcher)
+
+
+def _call_template(dispatcher: Any, args: Any, kwargs: Any) -> Any:
+    """Return how another kernel calls ``dispatcher``, the same for all values of an argument.
+
+    Numba would compile a kernel again for each constant in a call: six times for six numbers.
+    """
+    args = tuple(types.unliteral(arg) for arg in args)
+    kwargs = {name: types.unliteral(arg) for name, arg in kwargs.items()}
+    return type(dispatcher).get_call_template(dispatcher, args, kwargs)
 
 
 class _KernelCache(FunctionCache):

@@ -160,6 +160,7 @@ def test_contrasts_of_groups_match_the_balanced_design() -> None:
     assert (with_models["df"] < first["df"].to_numpy()).all()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_readout_and_training_are_terms_of_their_own() -> None:
     named = name_models(trained_models().drop(columns="family"))

@@ -389,6 +389,7 @@ def test_clustered_errors_of_two_groups_match_the_means_of_people() -> None:
     )
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_few_participants_with_a_property_have_wide_intervals() -> None:
     """6 of 40 differ in nothing: the normal distribution would hold 0 in 88 % of the studies."""

@@ -567,6 +567,7 @@ def test_slopes_and_robust_errors_match_statsmodels() -> None:
     assert found.loc["H1", "reason"].str.contains("not known").all()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_as_predicted_needs_a_test() -> None:
     """The sign of b alone is right for one half of all effects that do not exist."""

@@ -154,6 +154,7 @@ def served(study: Study) -> tuple[ServerProcess, list[SimulatedVisit], list[Simu
     return server, first, second
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_people_finish_or_leave_and_come_back(
     served: tuple[ServerProcess, list[SimulatedVisit], list[SimulatedVisit]],
@@ -219,6 +220,7 @@ def test_models_are_not_compared_with_only_simulated_participants(
     assert not (tmp_path / "report").exists()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_verb_serves_by_itself_and_prints(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -244,6 +246,7 @@ def test_without_leave_of_the_study_they_take_their_time(
     assert minutes_each(fast, "collide") == pytest.approx(minutes_each(real, "collide") / 100)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_another_study_s_server_refuses_the_pilot_link(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -275,6 +278,7 @@ def test_an_unknown_scenario_is_refused_before_anything_is_sent(study: Study) ->
         asyncio.run(simulate(study, Secrets.load(study.folder), plan))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_simulated_participants_pass_all_checks(tmp_path: Path) -> None:
     study = make_tiny_study(

@@ -114,6 +114,7 @@ def result() -> Result:
     return Result(contacts, model.gaps(cut, futures)[:, 0], float(error), float(constant))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_contacts_are_distinguished_from_misses(result: Result) -> None:
     assert 15 < result.contacts.sum() < 45

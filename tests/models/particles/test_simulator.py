@@ -557,6 +557,7 @@ def test_the_end_and_the_smallest_distance_of_points() -> None:
         assert closest[0, 0] + limit == pytest.approx(0.06, abs=1e-6)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_surfaces_that_touch_have_points_within_the_fixed_distance() -> None:
     """Cubes, cylinders and spheres, turned at random and moved together until they touch."""

@@ -381,6 +381,7 @@ def test_label_asks_for_pressure_not_for_a_touch() -> None:
     assert labels.contact and labels.first_frame == 1
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_official_trials_are_distinguished_above_chance(official: Path) -> None:
     """A quarter of the official cloth trials: enough to see skill, too few to measure it well."""

@@ -59,6 +59,7 @@ def test_the_choice_is_balanced_and_always_the_same(dataset: Path) -> None:
             assert all(s.label == (int(s.stimulus[-1]) % 2 == 0) for s in part)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_another_seed_chooses_otherwise(dataset: Path) -> None:
     """Which trials, and their places; drawn apart for trials with and without contact."""
@@ -85,6 +86,7 @@ def _draw_of_roll(folder: Path, test: int) -> list[str]:
     return [source.stimulus for source in chosen.sources if source.phase == "test"]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_presets_alternate_in_the_draw(tmp_path: Path) -> None:
     """Of 24 trials, 12 with contact, 8 of each outcome have preset a, 3 b and 1 c."""

@@ -35,6 +35,7 @@ def collide() -> list[ImportedTrial]:
     return [trial for trial in official().trials if trial.scene.scenario == "collide"]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_test_trials_were_seen_by_people_and_familiarization_is_apart(seen: set[str]) -> None:
     tasks = choose(collide(), seen).tasks
@@ -53,6 +54,7 @@ def test_a_larger_study_adds_trials_to_a_smaller_one(seen: set[str]) -> None:
     assert {task.trial for task in few.tasks} < {task.trial for task in many.tasks}
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_scenes_whose_simulation_ends_otherwise_are_left_out_and_counted(seen: set[str]) -> None:
     trials = collide()
@@ -75,6 +77,7 @@ def test_scenes_with_a_hidden_agent_or_patient_are_left_out(seen: set[str]) -> N
     assert faults[hidden] == HIDDEN and "" in faults.values()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_familiarization_trials_of_the_study_come_first(seen: set[str]) -> None:
     drape = [trial for trial in official().trials if trial.scene.scenario == "drape"]
