@@ -251,19 +251,22 @@ def test_planted_faults_are_in_the_right_measures(dataset: Dataset) -> None:
 
 
 @pytest.mark.parametrize("angle", [0.0, 20.0, 65.0])
-def test_an_outline_says_where_the_agent_stands(angle: float) -> None:
-    """A cuboid is drawn by its corners, with an edge on the patient or 5 cm next to it."""
+@pytest.mark.parametrize("cut", [0.0, 0.4])
+def test_an_outline_says_where_the_agent_stands(angle: float, cut: float) -> None:
+    """A cuboid is drawn by its corners, with an edge on the patient or 5 cm next to it.
+
+    A wall in front may hide the lower part of it.
+    """
     half = np.deg2rad(angle) / 2
     rotation = (float(np.cos(half)), 0.0, 0.0, float(np.sin(half)))
     agent = Body("agent", "cube", (0.0, 0.0, 0.0), (0.2, 0.3, 0.4), rotation=rotation)
     patient = Body("patient", "cube", (0.0, 0.0, 0.0), (1.0, 0.6, 0.01))
     camera = Camera((0.3, -2.2, 1.3), (0.0, 0.0, 0.1))
+    wall = Body("wall", "cube", (0.3, -1.2, 0.0), (1.0, 0.1, 0.5), kinematic=True, scenery=True)
     scene = Scene(
         name="stands", scenario="collide", camera=camera, roles=Roles("agent", "patient"),
-        bodies=(agent, patient),
+        bodies=(agent, patient, wall),
     )  # fmt: skip
-    ground = Ground.of(scene, 256, 256)
-    assert ground is not None
     base = shape("cube").mesh.vertices * agent.scale @ rotation_matrix(np.array(rotation)).T
     across = np.ptp(base[:, 0]) / 2
     for gap, touches in ((-0.05, True), (0.05, False), (-0.3, True), (0.4, False)):
@@ -273,6 +276,12 @@ def test_an_outline_says_where_the_agent_stands(angle: float) -> None:
         around = pixels[ConvexHull(pixels).vertices]
         ImageDraw.Draw(picture).polygon([tuple(p - 0.5) for p in around], fill=1)
         mask = np.asarray(picture) > 0
+        rows = np.flatnonzero(mask.any(axis=1))
+        ids = np.zeros((256, 256), np.int16)
+        ids[int(rows[-1] + 1 - cut * len(rows)) :] = 3
+        mask &= ids == 0
+        ground = Ground.of(scene, ids)
+        assert ground is not None
         outline = np.argwhere(mask & ~ndimage.binary_erosion(mask))[:, ::-1].astype(float)
         assert ground.touches(outline) == touches, gap
 

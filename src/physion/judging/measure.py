@@ -16,7 +16,7 @@ Contact is judged by rule, frame by frame:
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -31,6 +31,7 @@ from physion.judging.track import (
     U8,
     Floats,
     Mask,
+    Seen,
     Tracker,
     hue_between,
     shift_between,
@@ -119,7 +120,7 @@ def reference_of(trial: Trial, pictures: U8, rate: float) -> KnownMovie:
     agent, patient = (scene.index(name) + 1 for name in (scene.roles.agent, scene.roles.patient))
     roles = np.where(trial.ids == agent, AGENT, np.where(trial.ids == patient, PATIENT, 0))
     roles = roles.astype(np.uint8)
-    ground = Ground.of(scene, pictures.shape[2], pictures.shape[1])
+    ground = Ground.of(scene, trial.ids)
     some = pictures[:: max(len(pictures) // 12, 1)].astype(np.int16)
     frames = np.arange(len(pictures), dtype=np.float64)
     return KnownMovie(
@@ -130,16 +131,24 @@ def reference_of(trial: Trial, pictures: U8, rate: float) -> KnownMovie:
         ground=ground,
         contacts=contact_frames(scene, trial.trajectory),
         still=np.asarray((np.ptp(some, axis=0) <= STILL).all(axis=-1)),
-        tracks=follow(Tracker(pictures[0], roles), pictures, frames, ground),
+        tracks=follow(Tracker(pictures[0], roles), pictures, frames),
     )
 
 
 def follow(
-    tracker: Tracker, pictures: Iterable[U8], frames: Floats, ground: Ground | None
+    tracker: Tracker,
+    pictures: Iterable[U8],
+    frames: Floats,
+    touches: Callable[[Seen, float, int], bool] = lambda agent, distance, width: False,
+    observed: int = 0,
 ) -> Tracks:
-    """Return what a tracker sees in pictures, of which the ``frames`` of the trial are known."""
+    """Return what a tracker sees in pictures, of which the ``frames`` of the trial are known.
+
+    ``touches(agent, distance, width)`` is asked in frames that are not ``observed`` and show both;
+    by default nothing touches.
+    """
     rows = []
-    for picture in pictures:
+    for frame, picture in zip(frames, pictures, strict=True):
         agent, patient = tracker.see(picture)
         distance, lowest, touching = np.nan, np.full(2, np.nan), False
         if agent.area:
@@ -147,10 +156,7 @@ def follow(
             lowest = np.array([across[down == down.max()].mean() + 0.5, down.max() + 1])
         if agent.area and patient.area:
             distance = float(KDTree(patient.outline).query(agent.outline)[0].min())
-            if ground is None:
-                touching = distance <= np.sqrt(2)
-            elif distance <= NEAR * picture.shape[1]:
-                touching = ground.touches(agent.outline)
+            touching = frame >= observed and touches(agent, distance, picture.shape[1])
         rows.append((agent, patient, lowest, distance, touching))
     return Tracks(
         frames=frames,
@@ -182,7 +188,14 @@ def measure(
     if hue:
         movie = with_hue(movie, -hue)
     tracker = Tracker(reference.pictures[0], reference.roles)
-    tracks = follow(tracker, movie, frames, reference.ground)
+
+    def touches(agent: Seen, distance: float, width: int) -> bool:
+        ground = reference.ground
+        if ground is None:
+            return bool(distance <= np.sqrt(2))
+        return distance <= NEAR * width and ground.touches(agent.outline)
+
+    tracks = follow(tracker, movie, frames, touches, reference.observed)
     new = (frames >= reference.observed) & (frames <= last + 0.5)
     own, true = tracks.at(new), truth.at(np.minimum(np.round(frames[new]).astype(int), last))
     still = reference.still

@@ -79,8 +79,11 @@ def palette_of(first: U8, roles: U8) -> RoleColors:
 
 def _bins(rgb: U8) -> NDArray[np.uint16]:
     """Return the row of `_COLORS` next to each pixel (H, W, 3): 32 steps of each channel."""
-    red, green, blue = (np.moveaxis(rgb, -1, 0) >> 3).astype(np.uint16)
-    return np.asarray((red << 10) | (green << 5) | blue)
+    bins = rgb[..., 0].astype(np.uint16) >> 3
+    for channel in (1, 2):
+        bins <<= 5
+        bins |= rgb[..., channel] >> 3
+    return np.asarray(bins)
 
 
 _LEVELS = np.arange(32) * 8 + 4
@@ -148,33 +151,43 @@ class Tracker:
         return roles
 
     def _find(self, rgb: U8, roles: U8, role: int) -> Seen:
-        labels, count = ndimage.label(roles == role, _EIGHT)
-        flat = np.flatnonzero(labels)
-        part, (y, x) = labels.reshape(-1)[flat], np.divmod(flat, roles.shape[1])
-        size = np.bincount(part, minlength=count + 1)
+        mask = roles == role
+        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        if not len(rows):
+            return NOWHERE
+        # All that follows needs only the rectangle around the pixels of the role.
+        top, left = int(rows[0]), int(columns[0])
+        box = (slice(top, int(rows[-1]) + 1), slice(left, int(columns[-1]) + 1))
+        labels, count = ndimage.label(mask[box], _EIGHT)
+        size = np.bincount(labels.reshape(-1), minlength=count + 1)
+        size[0] = 0  # what has no label
         kept = size >= max(SMALLEST, PART * size.max())
         if not kept.any():
             return NOWHERE
         if role == AGENT and self._last is not None:
             middle, radius = self._last
+            flat = np.flatnonzero(labels)
+            part, (y, x) = labels.reshape(-1)[flat], np.divmod(flat, labels.shape[1])
             across, down = (
-                np.bincount(part, places, minlength=count + 1) / np.maximum(size, 1)
-                for places in (x, y)
+                np.bincount(part, places, minlength=count + 1) / np.maximum(size, 1) + start
+                for places, start in ((x, left), (y, top))
             )
             apart = np.hypot(across - middle[0], down - middle[1])
             near = (size >= SMALLEST) & (apart <= REACH * roles.shape[1] + radius)
             if near.any():
                 kept = near & (size >= PART * size[near].max())
-        own = kept[part]
-        inside = np.pad(kept[labels], 1)
-        edge = inside[1:-1, 1:-1].copy()
-        edge &= ~(inside[:-2, 1:-1] & inside[2:, 1:-1] & inside[1:-1, :-2] & inside[1:-1, 2:])
-        outline = np.argwhere(edge)[:, ::-1].astype(np.float64)
-        center = np.array([x[own].mean(), y[own].mean()])
+        around = np.zeros((labels.shape[0] + 2, labels.shape[1] + 2), np.bool_)
+        own = around[1:-1, 1:-1]
+        own[:] = kept[labels]
+        edge = own & ~(around[:-2, 1:-1] & around[2:, 1:-1] & around[1:-1, :-2] & around[1:-1, 2:])
+        outline = (np.argwhere(edge)[:, ::-1] + (left, top)).astype(np.float64)
+        area = int(np.count_nonzero(own))
+        sums = [own.sum(axis=0) @ np.arange(own.shape[1]), own.sum(axis=1) @ np.arange(len(own))]
+        center = np.array(sums) / area + (left, top)
         if role == AGENT:
             self._last = center, float(np.hypot(*(outline - center).T).max())
-        color = rgb.reshape(-1, 3)[flat[own]].mean(axis=0)
-        return Seen(int(own.sum()), center, color, outline)
+        color = own.reshape(-1).astype(np.float32) @ rgb[box].reshape(-1, 3).astype(np.float32)
+        return Seen(area, center, color.astype(np.float64) / area, outline)
 
 
 def shift_between(one: U8, other: U8) -> tuple[int, int]:
