@@ -41,6 +41,8 @@ SHAPES = 0.02
 RATES = (4.0, 240.0)
 """Smallest and largest rate of a movie, frames a second."""
 JUDGED = "judged"
+_VERSION = 2
+"""To be increased with every change that can alter a measure."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +149,7 @@ def judge(
     jobs = {}
     for trial in trials:
         there = [seed for seed in card.seeds if status[trial, seed] == JUDGED]
-        facts = [PROTOCOL, card.first_frame, [[s, digests[trial, s]] for s in there]]
+        facts = [_VERSION, PROTOCOL, card.first_frame, [[s, digests[trial, s]] for s in there]]
         own = str(rows.loc[trial, "trial_file_sha256"])
         jobs[trial] = _Job(
             dataset=known.folder,
