@@ -237,3 +237,18 @@ def test_an_observed_movie_that_shows_the_future_is_refused(made: Dataset, tmp_p
     paths.observed_movie.write_bytes(paths.movie.read_bytes())
     with pytest.raises(BadInputError, match=r"50 frames .* not 45"):
         observed_source(Dataset(copy.folder, verify=False), SPECS["rgb"]).context([RIGID])
+
+
+def test_no_scene_tells_the_answer_by_its_parameters(made: Dataset, tmp_path: Path) -> None:
+    shutil.copytree(made.folder, tmp_path / "set")
+    known = {"pair": {"first": 0, "then": 1}, "base_contact": True, "mass": 2.0}
+    path = Dataset(tmp_path / "set").paths(RIGID).trial_file
+    trial = Trial.open(path)
+    scene = dataclasses.replace(trial.scene, parameters=known)
+    write_trial(path, trial.metadata, scene, trial.trajectory, trial.labels, trial.ids)
+    changed = Dataset(tmp_path / "set", verify=False)
+    assert changed.trial(RIGID).scene.parameters == known
+    observed = observed_source(changed, SPECS["state"]).context([RIGID])
+    whole = whole_source(changed, SPECS["state"]).whole([RIGID])
+    for batch in (observed, whole):
+        assert batch.state is not None and dict(batch.state[0].scene.parameters) == {"mass": 2.0}

@@ -16,15 +16,16 @@ import physion
 from physion.cli.main import main
 from physion.clips.batch import Batch, Motion, Provenance, Rollout, Spec
 from physion.compute.local import SerialExecutor
-from physion.core.errors import BadInputError
+from physion.core.errors import BadInputError, PhysionError
 from physion.models.build import build_model
 from physion.models.interface import Model
 from physion.models.noisy_simulation import NoisySimulation
 from physion.physics.engine import simulate
 from physion.readout.surprise import COLUMNS, pixel_statistics, surprise, surprise_scores
+from physion.report.viewer import facts as viewer_facts
 from physion.trials.dataset import Dataset
 from physion.trials.making.pairs import Pair, is_pair
-from physion.trials.making.plan import GenerateSettings
+from physion.trials.making.plan import PAIR, GenerateSettings
 from physion.trials.official.export_folder import export_official
 from physion.trials.share.items import items_of
 
@@ -62,12 +63,12 @@ class Bright(Model):
 
 
 class Knows(Bright):
-    """It is told which movies are impossible, by their states."""
+    """It knows which movies are impossible; what it receives does not say so."""
 
     spec = Spec(inputs=("state",))
 
-    def __init__(self, sign: float) -> None:
-        self.sign = sign
+    def __init__(self, sign: float, folder: Path) -> None:
+        self.sign, self.dataset = sign, Dataset(folder)
 
     def provenance(self) -> Provenance:
         return Provenance(f"knows {self.sign}", "none")
@@ -75,9 +76,10 @@ class Knows(Bright):
     def surprise(self, batch: Batch) -> Any:
         assert batch.state is not None
         found = np.zeros(batch.frames.shape)
-        for row, motion in enumerate(batch.state):
-            pair = Pair.of(motion.scene)
-            assert pair is not None
+        for row, (name, motion) in enumerate(zip(batch.trials, batch.state, strict=True)):
+            pair = Pair.of(self.dataset.trial(name).scene)
+            assert pair is not None and Pair.of(motion.scene) is None
+            assert not {PAIR, "possible", "worlds"} & motion.scene.parameters.keys()
             found[row, batch.frames[row] >= pair.start] = self.sign * (not pair.possible)
         return found
 
@@ -101,7 +103,7 @@ class Losing(nn.Module, Bright):
 
 
 def test_who_knows_is_right_and_who_has_no_idea_is_half_right(pairs: Path, tmp_path: Path) -> None:
-    table = surprise([Knows(1.0), Knows(-1.0), Knows(0.0)], pairs, tmp_path)
+    table = surprise([Knows(sign, pairs) for sign in (1.0, -1.0, 0.0)], pairs, tmp_path).table
     names = [name for name in Dataset(pairs).trials() if is_pair(name)]
     assert list(table.columns) == list(COLUMNS) and len(table) == 3 * len(names)
     scores = surprise_scores([table]).set_index(["model", "kind", "hidden"])
@@ -113,8 +115,8 @@ def test_who_knows_is_right_and_who_has_no_idea_is_half_right(pairs: Path, tmp_p
 
 
 def test_imagined_features_are_compared_with_the_next_frame(pairs: Path, tmp_path: Path) -> None:
-    table = surprise(Bright(), pairs, tmp_path).set_index("stimulus")
-    losses = surprise(Losing(), pairs, tmp_path).set_index("stimulus")
+    table = surprise(Bright(), pairs, tmp_path).table.set_index("stimulus")
+    losses = surprise(Losing(), pairs, tmp_path).table.set_index("stimulus")
     dataset = Dataset(pairs)
     name = str(table.index[0])
     renderer = dataset.trial(name).renderer(32, 32)
@@ -128,12 +130,38 @@ def test_imagined_features_are_compared_with_the_next_frame(pairs: Path, tmp_pat
     assert losses.loc[name, "mean"] == pytest.approx(errors.mean(), rel=1e-3)
 
 
+class Breaks(Bright):
+    """It fails on every clip."""
+
+    def provenance(self) -> Provenance:
+        return Provenance("breaks", "none")
+
+    def encode(self, batch: Batch) -> Any:
+        raise ValueError("no features today")
+
+
+def test_a_model_that_fails_does_not_stop_the_others(
+    pairs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done = surprise([Breaks(), Bright()], pairs, tmp_path)
+    assert set(done.table["model"]) == {"bright"}
+    assert list(done.failed) == ["breaks"] and "no features today" in done.failed["breaks"]
+    with pytest.raises(PhysionError, match="no features today"):
+        surprise(Breaks(), pairs, tmp_path)
+    models = f"constant-motion,{__file__}:Breaks"
+    arguments = ["evaluate", models, str(pairs), "--surprise", "--rendered", "--out", str(tmp_path)]
+    assert main(arguments) == 1
+    printed = capsys.readouterr().out
+    assert "Breaks: model 'breaks': encode raised ValueError" in printed
+    assert "constant-motion" in printed
+
+
 def test_what_is_known_is_not_computed_again(pairs: Path, tmp_path: Path) -> None:
-    first = surprise(Bright(), pairs, tmp_path)
+    first = surprise(Bright(), pairs, tmp_path).table
     asked: list[str] = []
     again = surprise(
         Bright(), pairs, tmp_path, progress=lambda what, done, total: asked.append(what)
-    )
+    ).table
     assert not asked
     pd.testing.assert_frame_equal(first, again)
 
@@ -146,7 +174,7 @@ def test_surprises_with_other_options_are_computed_anew(
 
     monkeypatch.setattr(NoisySimulation, "surprise", found)
     for samples in (2, 3):
-        table = surprise("noisy-simulation", pairs, tmp_path, options={"samples": samples})
+        table = surprise("noisy-simulation", pairs, tmp_path, options={"samples": samples}).table
         assert set(table["mean"]) == {samples}
 
 
@@ -156,6 +184,26 @@ def test_options_that_do_not_apply_to_surprise_are_refused(
 ) -> None:
     assert main(["evaluate", "chance", "unused", "--surprise", option]) == 2
     assert f"{option.split('=')[0]} does not apply to --surprise" in capsys.readouterr().err
+
+
+def test_the_viewer_says_which_movies_are_impossible(pairs: Path) -> None:
+    dataset = Dataset(pairs)
+    said = {}
+    for name in dataset.trials():
+        trial = dataset.trial(name)
+        rows = {table["title"]: dict(table["rows"]) for table in viewer_facts.tables(trial)
+                if not table["header"]}  # fmt: skip
+        assert not [key for key in rows["Parameters of the scenario"] if "pair" in key]
+        said[name] = viewer_facts.card(trial)["pair"], rows.get("Pair", {}).get("possible", "")
+    for name, (badge, possible) in said.items():
+        if not is_pair(name):
+            assert (badge, possible) == ("", "")
+            continue
+        start = dataset.trial(name).scene.parameters[PAIR]["start"]
+        kind = name.rpartition("pair.")[2].rpartition(".")[0]
+        word = "possible" if possible == "yes" else f"impossible at frame {start}"
+        assert badge in (f"{kind}: {word}", f"{kind}: {word}, behind a screen")
+    assert [answer for _, answer in said.values()].count("no") == (len(said) - 2) / 2
 
 
 def test_questions_and_exports_leave_pairs_out(pairs: Path, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ done again, and one evaluation that fails does not stop the others.
 from __future__ import annotations
 
 import json as json_module
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -110,7 +111,7 @@ def main(options: Options) -> int:
     trials = Dataset(dataset, verify=options.verify)
     if options.surprise:
         with Stages() as stages:
-            table = surprise(
+            found = surprise(
                 chosen,
                 trials,
                 options.out,
@@ -120,8 +121,8 @@ def main(options: Options) -> int:
             pixels = pixel_statistics(
                 trials, options.out, rendered=options.settings.rendered, progress=stages
             )
-        _print_surprise(surprise_scores([pixels, table]), options)
-        return 0
+        _print_surprise(surprise_scores([pixels, found.table]), found.failed, options)
+        return 1 if found.failed else 0
     with Stages() as stages:
         verdicts = {}
         if options.check and not options.dry_run:
@@ -208,11 +209,17 @@ def _print_whatif(scores: pd.DataFrame) -> None:
     print_line(text_table(shown, "One thing changed: mean and standard error over trials"))
 
 
-def _print_surprise(scores: pd.DataFrame, options: Options) -> None:
-    """Print how often the impossible movie of a pair surprises more."""
+def _print_surprise(scores: pd.DataFrame, failed: Mapping[str, str], options: Options) -> None:
+    """Print how often the impossible movie of a pair surprises more, and which models failed."""
     if options.json:
-        print(json_module.dumps({"surprise": json_module.loads(scores.to_json(orient="records"))}))
+        values = {
+            "surprise": json_module.loads(scores.to_json(orient="records")),
+            "failed": [{"model": name, "reason": why} for name, why in failed.items()],
+        }
+        print(json_module.dumps(values))
         return
+    for name, reason in failed.items():
+        print_line(f"failed: {name}: {reason}")
     shown = scores[["model", "kind", "hidden", "pairs"]].copy()
     for name in SURPRISES:
         shown[name] = with_errors(scores, name)

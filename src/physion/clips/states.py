@@ -15,8 +15,18 @@ import numpy as np
 from physion.clips.batch import Motion, cut_to_observed
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import digest_of
+from physion.scenes.scene import Scene
 from physion.trials.files import IndexedFile
+from physion.trials.making.plan import ANSWERS
 from physion.trials.trial_file import Trial
+
+
+def without_answers(scene: Scene) -> Scene:
+    """Return a scene whose parameters do not tell what a model is asked (`ANSWERS`)."""
+    known = {name: value for name, value in scene.parameters.items() if name not in ANSWERS}
+    same = len(known) == len(scene.parameters)
+    return scene if same else dataclasses.replace(scene, parameters=known)
+
 
 # Motions cut at the last observed frame, such that nothing leads to what was cut off.
 
@@ -56,6 +66,7 @@ _LEAST_BYTES, _FRACTION = 2**28, 8
 class TrialMotions(Mapping[str, Motion]):
     """Motions of trials by name, each read from its file when it is asked for.
 
+    The parameters of their scenes lack what would tell the answer (`without_answers`).
     With ``observed``, a motion is cut at the last observed frame when it is read.
     """
 
@@ -73,7 +84,7 @@ class TrialMotions(Mapping[str, Motion]):
             raise UnknownNameError("trial", trial, self._files)
         stored = self._files[trial]
         opened = Trial(stored.read(), f"trial file {stored.path}")
-        motion = Motion(opened.scene, opened.trajectory)
+        motion = Motion(without_answers(opened.scene), opened.trajectory)
         if np.isnan(motion.trajectory.positions).all():
             raise BadInputError(
                 f"trial {trial!r} has no state, since it was imported from a movie; use a model "

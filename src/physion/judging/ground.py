@@ -136,6 +136,12 @@ class Ground:
         """Return on which of `SIDES` (8,) something in front, or the edge, cuts an outline off."""
         found = np.zeros(len(SIDES), np.bool_)
         height, width = self.hidden.shape
+        (left, top), (right, bottom) = (
+            np.rint(end).astype(int) for end in (outline.min(axis=0) - 3, outline.max(axis=0) + 3)
+        )
+        free = left >= 0 and top >= 0 and right < width and bottom < height
+        if free and not self.hidden[top : bottom + 1, left : right + 1].any():
+            return found
         for place, side in enumerate(SIDES):
             last = outline[along[:, place] >= along[:, place].max() - 1.0]
             next_to = np.round(last + OUTSIDE * side).astype(int)

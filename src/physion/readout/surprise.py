@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,14 @@ from physion.readout.model_calls import (
     model_name,
     to_array,
 )
-from physion.readout.settings import EvaluationSettings, Models, choose_models
+from physion.readout.settings import (
+    Cell,
+    EvaluationSettings,
+    Models,
+    choose_models,
+    plan_cells,
+    run_cells,
+)
 from physion.readout.whatif import mean_over_trials
 from physion.trials.dataset import Dataset
 from physion.trials.making.pairs import Pair, is_pair
@@ -62,6 +70,18 @@ STEP = 6
 _TREES = 100
 
 
+@dataclass(frozen=True)
+class Surprises:
+    """What `surprise` did.
+
+    - ``table``: `COLUMNS`, one row for each model and movie.
+    - ``failed``: reasons of the models that failed, by name.
+    """
+
+    table: pd.DataFrame
+    failed: Mapping[str, str]
+
+
 def surprise(
     models: Models,
     dataset: Dataset | Path | str,
@@ -71,7 +91,7 @@ def surprise(
     options: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
     **changes: Any,
-) -> pd.DataFrame:
+) -> Surprises:
     """Return how much each movie of the pairs of a dataset surprises models.
 
     Parameters
@@ -92,27 +112,32 @@ def surprise(
 
     Returns
     -------
-    surprises
-        `COLUMNS`, one row for each model and movie.
+    Surprises
+        A table of models and movies, and what failed; one model that fails does not stop the
+        others.
 
     Raises
     ------
     BadInputError
-        If the dataset has no pairs, or a model has none of the methods that are needed.
+        If the dataset has no pairs, a model has none of the methods that are needed, or the only
+        model fails.
     """
     settings = dataclasses.replace(settings or EvaluationSettings(), **changes)
     trials = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
     pairs = _pairs(trials)
-    chosen = choose_models(models, options)
     # Every model is built before anything is computed, so that mistakes are found at once.
-    for model in chosen:
-        _way_of(model.build(settings.seed))
+    once = dataclasses.replace(settings, seeds=1, protocols=("all",))
+    cells = plan_cells(choose_models(models, options), once, lambda model: False)
+    for cell in cells:
+        _way_of(cell.built)
     folder = Path(out) / "surprise"
-    tables = [
-        _of_model(one.build(settings.seed), trials, pairs, folder, settings, progress)
-        for one in chosen
-    ]
-    return pd.concat(tables, ignore_index=True)
+
+    def run(cell: Cell) -> pd.DataFrame:
+        return _of_model(cell.take_model(), trials, pairs, folder, settings, progress)
+
+    tables, failed = run_cells(cells, run, Path(out), "models", None, None)
+    known = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=list(COLUMNS))
+    return Surprises(known, {label.rpartition(",")[0]: why for label, why in failed.items()})
 
 
 def _pairs(dataset: Dataset) -> dict[str, Pair]:
@@ -288,7 +313,7 @@ def surprise_scores(surprises: Sequence[pd.DataFrame]) -> pd.DataFrame:
     Parameters
     ----------
     surprises
-        Tables of `surprise`.
+        Tables of `surprise` or `pixel_statistics`.
 
     Returns
     -------
@@ -297,7 +322,7 @@ def surprise_scores(surprises: Sequence[pd.DataFrame]) -> pd.DataFrame:
         and for each of `MEASURES` the fraction and ``MEASURE_se``, NaN with less than two trials.
     """
     keys = ["model", "init", "base", "kind", "hidden", "first"]
-    table = pd.concat(surprises, ignore_index=True)
+    table = pd.concat([one for one in surprises if len(one)], ignore_index=True)
     sides = [table[table["possible"].astype(bool) == side] for side in (True, False)]
     joined = sides[0].merge(sides[1], on=keys, suffixes=("", "_impossible"), validate="one_to_one")
     for measure in MEASURES:

@@ -168,14 +168,15 @@ class TimeLine {
   describe(runs) {
     const { card } = this;
     const observed = `Shaded: the ${card.observedFrames} observed frames.`;
+    const pair = card.pair ? [createElement("span", { class: "answer" }, ` Pair: ${card.pair}.`)] : [];
     if (card.firstContact === null) {
-      return [observed, createElement("span", { class: "answer" }, " Agent and patient never touch.")];
+      return [observed, ...pair, createElement("span", { class: "answer" }, " Agent and patient never touch.")];
     }
     const spans = runs.map(([from, to]) => (from === to ? `${from}` : `${from}–${to}`));
     const shown = spans.slice(0, 8).join(", ");
     const more = spans.length > 8 ? ` and ${spans.length - 8} more` : "";
     const contacts = ` First contact: frame ${card.firstContact}. Agent and patient touch in: ${shown}${more}.`;
-    return [observed, createElement("span", { class: "answer" }, contacts)];
+    return [observed, ...pair, createElement("span", { class: "answer" }, contacts)];
   }
 
   show(frame, frameTime) {

@@ -15,6 +15,8 @@ from physion.physics.labels import Labels, contact_frames, label_contact
 from physion.report.viewer.movies import thing_colors
 from physion.scenes.scene import Scene
 from physion.scenes.shapes.primitives import shape
+from physion.trials.making.pairs import Pair
+from physion.trials.making.plan import PAIR
 from physion.trials.share.gltf import role_of
 from physion.trials.state import outside_picture
 from physion.trials.trial_file import Trial
@@ -38,6 +40,8 @@ _NAMES = {
 }
 """Labels of fields whose names are not readable."""
 _OUTCOME = ("contact", "first_frame", "observed", "min_distance", "robust", "recorded_contact")
+
+_IMPOSSIBLE = ("world before", "world after", "possible")
 
 
 def labels_of(trial: Trial) -> Labels:
@@ -64,8 +68,18 @@ def card(trial: Trial, unusable: str = "") -> dict[str, Any]:
         "frameTime": meta.frame_time,
         "outside": sorted(outside_picture(trial)),
         "unusable": unusable,
+        "pair": _pair_text(trial),
         "searchText": _search_text(trial),
     }
+
+
+def _pair_text(trial: Trial) -> str:
+    """Return kind of a movie of a pair, and whether it is possible; empty for other trials."""
+    pair = Pair.of(trial.scene)
+    if pair is None:
+        return ""
+    kept = "possible" if pair.possible else f"impossible at frame {pair.start}"
+    return f"{pair.kind}: {kept}{', behind a screen' if pair.hidden else ''}"
 
 
 def _search_text(trial: Trial) -> str:
@@ -147,13 +161,15 @@ def legend(scene: Scene) -> list[dict[str, Any]]:
 def tables(trial: Trial) -> list[Table]:
     """Return tables of the scene, the settings and the outcome of a trial."""
     scene = trial.scene
+    parameters = {name: value for name, value in scene.parameters.items() if name != PAIR}
     result = [
         _bodies_table(scene),
         _cloths_table(scene),
         _pushes_table(scene),
         _table("Joints", ("parent", "child"), [(j.parent, j.child) for j in scene.joints]),
         _trial_table(trial),
-        _table("Parameters of the scenario", None, _flat("", scene.parameters)),
+        _pair_table(scene),
+        _table("Parameters of the scenario", None, _flat("", parameters)),
         _stage_table(scene),
     ]
     return [table for table in result if table["rows"]]
@@ -176,6 +192,25 @@ def _trial_table(trial: Trial) -> Table:
     rows = [(_NAMES.get(name, name.replace("_", " ")), value) for name, value in facts.items()]
     table = _table("Trial", None, rows)
     return table | {"outcome": [i for i, name in enumerate(facts) if name in _OUTCOME]}
+
+
+def _pair_table(scene: Scene) -> Table:
+    """Return what a movie of a pair says of itself; no rows for other trials."""
+    pair = Pair.of(scene)
+    if pair is None:
+        return _table("Pair", None, [])
+    facts = {
+        "kind": pair.kind,
+        "trial of both worlds": pair.base,
+        "body": pair.body,
+        "behind a screen": pair.hidden,
+        "first frame of the second world": pair.start,
+        "world before": "AB"[pair.first],
+        "world after": "AB"[pair.then],
+        "possible": pair.possible,
+    }
+    rows = _table("Pair", None, list(facts.items()))
+    return rows | {"outcome": [i for i, name in enumerate(facts) if name in _IMPOSSIBLE]}
 
 
 def _bodies_table(scene: Scene) -> Table:

@@ -57,6 +57,7 @@ function badges(card) {
   const spans = [];
   const add = (label, kind) => spans.push(createElement("span", { class: `badge ${kind}` }, label));
   add(card.contact ? `contact at ${card.firstContact}` : "no contact", `answer ${card.contact ? "yes" : ""}`);
+  if (card.pair) add(card.pair, "answer");
   if (card.observed) add("while observed", "answer yes");
   if (card.robust !== null) add(`robust ${card.robust.toFixed(2)}`, "answer");
   add(card.split, "");

@@ -22,7 +22,7 @@ from physion.core.errors import BadInputError, UnknownNameError
 from physion.scenes.looks import COLORS_OF
 from physion.scenes.scene import Body, Cloth, Push, Scene
 from physion.trials.dataset import Dataset
-from physion.trials.making.plan import TrialTask
+from physion.trials.making.plan import BASE_CONTACT, TrialTask
 
 KINDS = ("remove", "mass", "friction", "push")
 FACTORS = {"quarter": 0.25, "fourfold": 4.0}
@@ -70,7 +70,7 @@ def whatif_tasks(dataset: Dataset, trials: Sequence[str], kinds: Sequence[str]) 
             known = {
                 "whatif": change,
                 "base": name,
-                "base_contact": trial.known_labels().contact,
+                BASE_CONTACT: trial.known_labels().contact,
                 COLORS_OF: trial.scene.physics_digest(),
             }
             called = name + MARK + re.sub(r"[^A-Za-z0-9._-]", "-", change)
