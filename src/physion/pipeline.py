@@ -272,7 +272,11 @@ def model_options(
     """Return the models of a run and the options of each; ``options`` come before our own."""
     presets: dict[str, dict[str, Any]] = {
         "frozen-encoder": {"encoder": "resnet18", "weights": "random"},
-        **{name: {"samples": 20, "engine": settings.engine} for name in SIMULATIONS},
+        # One level of noise: choosing among three would take six times as many simulations.
+        **{
+            name: {"samples": 20, "scales": (1.0,), "engine": settings.engine}
+            for name in SIMULATIONS
+        },
     }
     return {
         name: {**TRAINING, **presets.get(name, {}), **options.get(name, {})}

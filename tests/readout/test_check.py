@@ -35,6 +35,8 @@ from support.moving_dots import make_dots
 from support.tiny_models import OPTIONS
 
 TESTED = 8
+PARTICLES = {"dpi", "gns", "gns-ransac"}
+"""Models whose check takes longest; the nightly tests check them."""
 HELD = [name for name, change in CHANGES.items() if change.must_hold]
 
 
@@ -517,7 +519,7 @@ def few(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.nightly if name.startswith("gns") else ())
+        pytest.param(name, marks=pytest.mark.nightly if name in PARTICLES else ())
         for name in sorted(models.names())
     ],
 )

@@ -21,7 +21,7 @@ from physion.compute.tasks import Executor, Progress
 from physion.core.errors import BadInputError
 from physion.models.interface import Model, TrainingSettings, ask, can
 from physion.readout.benchmark import V1, Benchmark
-from physion.readout.decisions import Decided, Decision, Readout, decisions
+from physion.readout.decisions import Decided, Decision, NoiseDecision, Readout, decisions
 from physion.readout.features import Arguments, FeatureStore, Imagined, StoredFeatures
 from physion.readout.folds import Fold, Protocol, ScenarioSplit
 from physion.readout.logistic import LogisticSettings
@@ -125,9 +125,11 @@ def choose_readouts(
     return {r: way for r, way in possible.items() if not requested or r in requested}
 
 
-def _fit_trials(decision: Decision, split: ScenarioSplit) -> tuple[str, ...]:
+def _fit_trials(model: Model, decision: Decision, split: ScenarioSplit) -> tuple[str, ...]:
     """Return the fit trials of a scenario; none for a decision on which nothing is fitted."""
-    return tuple(split.fit) if getattr(decision, "fits", True) else ()
+    values = ask(model, "arguments").values()
+    no_choice = isinstance(decision, NoiseDecision) and all(len(of_one) == 1 for of_one in values)
+    return () if no_choice or not getattr(decision, "fits", True) else tuple(split.fit)
 
 
 _UNKNOWN = float("nan")
@@ -413,7 +415,7 @@ class Predictor:
         test: dict[str, int] = {}
         for split in splits:
             steps = self._future(split)
-            fit |= {trial: steps[trial] for trial in _fit_trials(decision, split)}
+            fit |= {trial: steps[trial] for trial in _fit_trials(self.model, decision, split)}
             test |= {trial: steps[trial] for trial in split.test}
         samples, seed, arguments = self._rollout_settings()
         model = self.model
@@ -437,7 +439,7 @@ class Predictor:
 
     def _decide_on_rollouts(self, decision: Decision, split: ScenarioSplit, _: Readout) -> _Made:
         found = self._imagined([split], decision)
-        wanted = _fit_trials(decision, split)
+        wanted = _fit_trials(self.model, decision, split)
         fit = tuple(trial for trial in wanted if trial not in self.problems)
         test = tuple(trial for trial in split.test if trial not in self.problems)
         if wanted and not fit:
