@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 
 import physion
 from physion import Dataset
+from physion.analysis.statistics.paired import mcnemar_exact
 from physion.analysis.tables import POOLED
 from physion.clips.batch import Spec
 from physion.clips.rendered import MotionRenderer
@@ -341,7 +342,7 @@ def score(folder: Path, dataset: Dataset, names: Sequence[str]) -> str:
     Intervals of accuracy are of the mean of scenarios: 1.96 times sqrt(sum of p (1 - p) / n) /
     scenarios. r is pooled over stimuli, with the jackknife intervals of `physion.compare`.
     """
-    rows = []
+    rows, hit = [], {}
     for name in names:
         model_name, options, readouts = MODELS[name]
         done = evaluate(
@@ -356,6 +357,7 @@ def score(folder: Path, dataset: Dataset, names: Sequence[str]) -> str:
         pooled = scores[of_model & (scores["scenario"] == POOLED)].set_index("readout")
         for readout in readouts:
             own = table[table["readout"] == readout.value]
+            hit[name, readout] = own.set_index("stimulus")["hit"]
             hits = own.groupby("scenario")["hit"].agg(["mean", "size"])
             variance = hits["mean"] * (1 - hits["mean"]) / hits["size"]
             mean, half = hits["mean"].mean(), 1.96 * np.sqrt(variance.sum()) / len(hits)
@@ -375,6 +377,15 @@ def score(folder: Path, dataset: Dataset, names: Sequence[str]) -> str:
             )
             scenarios = [*hits.index]
             print(rows[-1], flush=True)
+    twins = []
+    for (name, readout), of_model in hit.items():
+        of_twin = hit.get((f"random-{name}", readout))
+        if of_twin is not None:
+            found = mcnemar_exact(of_model, of_twin[of_model.index])
+            twins.append(
+                f"| {name} | *{readout.value}* | {of_model.mean() - of_twin.mean():+.3f} | "
+                f"{found.only_first} | {found.only_second} | {found.p:.2g} |"
+            )
     stimuli = int((dataset.index["split"] == "testing").sum())
     columns = ["model", "readout", "trials fitted", "own trials", "official", "rigid"]
     columns += ["r with people", "r beyond the outcome", *scenarios]
@@ -394,6 +405,14 @@ def score(folder: Path, dataset: Dataset, names: Sequence[str]) -> str:
             head,
             "|---" * (head.count("|") - 1) + "|",
             *rows,
+            "",
+            "Against the random twin, the same network with random weights: difference of the "
+            "accuracies over all stimuli, stimuli on which only one of both is right, and p of "
+            "McNemar's exact test.",
+            "",
+            "| model | readout | difference | only the model | only the twin | p |",
+            "|---|---|---|---|---|---|",
+            *twins,
         ]
     )
 
