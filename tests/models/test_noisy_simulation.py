@@ -22,15 +22,25 @@ from physion.models.noisy_simulation import (
     NoisySimulationSettings,
     ObservedTrial,
     add_noise,
+    believed_scene,
     configuration_half,
     cut_trial,
     fitted_levels,
     simulate_contacts,
 )
 from physion.numerics.elementary import exp_of, standard_normal
-from physion.physics.engine import simulate
+from physion.physics.engine import make_engine, simulate
 from physion.physics.trajectory import Contacts, State, Trajectory
-from physion.scenes.scene import Body, Camera, Cloth, Joint, Roles, Scene
+from physion.scenes.scene import (
+    Body,
+    Camera,
+    Cloth,
+    Joint,
+    Push,
+    Roles,
+    Scene,
+    SurfaceMaterial,
+)
 from support.paths import ROOT
 
 FRAMES = 120
@@ -358,10 +368,39 @@ def test_noise_comes_from_the_platform_independent_functions() -> None:
     assert noisy.bodies[1].mass == trial.bodies[1].mass * factor
 
 
+@pytest.mark.parametrize(("mass", "friction"), [(0.25, 0.5), (4.0, 0.5), (1.0, 0.0), (1.0, 1.0)])
+def test_mass_and_friction_are_inferred_from_what_was_observed(
+    mass: float, friction: float
+) -> None:
+    surface = SurfaceMaterial(friction, friction)
+    bodies = (
+        Body("box", "cube", (0.0, 0.0, 0.0), (0.4, 0.4, 0.2), mass=mass, contact=surface),
+        Body("ball", "sphere", (-0.4, 0.0, 0.0), (0.2, 0.2, 0.2)),
+        Body("goal", "cube", (5.0, 0.0, 0.0)),
+    )
+    hit = Scene(
+        "hit", "collide", bodies, Roles("box", "goal"), Camera((3.0, 0.0, 1.0)),
+        pushes=(Push("ball", (3.0, 0.0, 0.0)),),
+    )  # fmt: skip
+    engine = make_engine()
+    seen = Motion(hit, simulate(hit, frames=60))
+    assert believed_scene(seen, "given", engine) is hit
+    found = believed_scene(seen, "inferred", engine).bodies[0]
+    assert found == bodies[0]
+    default = replace(bodies[0], mass=1.0, contact=SurfaceMaterial(0.5, 0.5))
+    assert believed_scene(seen, "default", engine).bodies == (default, *bodies[1:])
+    # Without the hit there is nothing to infer from.
+    untouched = replace(hit, pushes=())
+    rest = Motion(untouched, simulate(untouched, frames=60))
+    assert believed_scene(rest, "inferred", engine).bodies[0] == default
+
+
 def test_the_digest_follows_all_that_decides_a_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
     before = model().digest()
     same = model(samples=3, scales=(1.0, 9.0), seed=4)
     assert same.digest() == before, "what the harness passes to `imagine` is no part of it"
+    properties = [model(properties=name).digest() for name in ("given", "default", "inferred")]
+    assert properties[0] == before and len(set(properties)) == 3
     assert len({before, *(model(**{name: 0.7}).digest() for name in ("position", "mass"))}) == 3
     monkeypatch.setattr("physion.models.noisy_simulation.NOISE_VERSION", 1)
     assert model().digest() != before

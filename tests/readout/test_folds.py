@@ -182,3 +182,20 @@ def test_a_scenario_that_is_not_there_is_refused() -> None:
     (fold,) = select_scenario(plan_folds(table, Protocol.ALL, 5, 0), "roll")
     assert [part.scenario for part in fold.scenarios] == ["roll"]
     assert fold.training.trained == ("drop", "roll")
+
+
+def test_variants_share_the_fold_of_their_trial() -> None:
+    table = index({"testing": 6}, ("drop",))
+    changed = [
+        {**row, "trial": f"{row['trial']}+mass.{change}", "digest": row["digest"] + change}
+        for row in table.to_dict("records")
+        for change in ("quarter", "fourfold")
+    ]
+    numbers = assign_folds(pd.concat([table, pd.DataFrame(changed)]), 3, 0)
+    assert len(numbers) == 18
+    for trial, number in numbers.items():
+        assert number == numbers[trial.partition("+")[0]]
+    plain = assign_folds(table, 3, 0)
+    assert len(set(plain.values())) == 3
+    without = assign_folds(pd.DataFrame(changed), 3, 0)
+    assert all(without[f"{t}+mass.quarter"] == without[f"{t}+mass.fourfold"] for t in plain)

@@ -51,6 +51,34 @@ def test_every_measure_is_counted_by_hand() -> None:
     assert removed["moved_se"] == pytest.approx(np.sqrt(2 * 2 * 0.75**2) / 4)
 
 
+def test_trials_of_a_test_with_two_cues_are_a_pair() -> None:
+    cues = {
+        "e": (0.9, False, False),  # in no pair
+        "e+cue-mass.0.0": (0.2, False, False),  # both right
+        "e+cue-mass.0.1": (0.8, True, False),
+        "e+cue-mass.1.0": (0.6, True, False),  # first right, moved wrongly
+        "e+cue-mass.1.1": (0.7, False, False),
+        "e+cue-friction.0.0": (0.5, True, True),  # left out with the other
+        "e+cue-friction.0.1": (0.5, False, False),
+        "f+cue-mass.1.0": (0.3, False, False),  # first right, not moved
+        "f+cue-mass.1.1": (0.3, True, False),
+    }
+    rows = [
+        {"model": "m", "readout": "observed", "protocol": "", "seed": "", "stimulus": name,
+         "p_contact": p, "outcome": outcome, "observed_contact": early}
+        for name, (p, outcome, early) in cues.items()
+    ]  # fmt: skip
+    scores = whatif_scores(pd.DataFrame(rows)).set_index("change")
+    assert list(scores.index) == ["all", "cue-mass"]
+    mass = scores.loc["cue-mass"]
+    assert (mass["pairs"], mass["changed"]) == (3, 3)
+    assert mass["accuracy"] == pytest.approx((1 + 0.5 + 0.5) / 3)
+    assert mass["paired"] == pytest.approx(1 / 3)
+    assert mass["moved"] == pytest.approx((1 + 0 + 0.5) / 3)
+    # Two trials, e with two pairs and f with one, with residual sums 1/3 and -1/3 of `paired`.
+    assert mass["paired_se"] == pytest.approx(np.sqrt(2 * 2 / 9) / 3)
+
+
 def test_models_are_scored_apart_and_sets_without_variants_not() -> None:
     both = pd.concat([table("m"), table("always", **dict.fromkeys(P, 0.9))])
     scores = whatif_scores(both).set_index(["model", "change"])

@@ -32,9 +32,12 @@ class Options:
     presets: tuple[str, ...] = ()
     """Presets that are used in turn (see physion ls presets), or FILE.toml:NAME; default: the
     published configurations. Requires one --scenario."""
-    whatif: tuple[Literal["remove", "mass", "friction", "push"], ...] = ()
+    whatif: tuple[
+        Literal["remove", "mass", "friction", "push", "cue-mass", "cue-friction"], ...
+    ] = ()
     """Make variants of each trial, too, with one thing changed: a body removed, the agent's mass,
-    all friction, or the push; physion evaluate scores whether predictions change with them."""
+    all friction, or the push; or four trials that show the agent's mass or friction before they ask
+    about it. physion evaluate scores whether predictions change with them."""
     pairs: tuple[Literal["vanish", "teleport", "swap", "stop-in-air", "pass-through"], ...] = ()
     """Make two possible and two impossible movies of each testing trial and kind, too; physion
     evaluate --surprise scores which of two surprises a model more."""

@@ -17,12 +17,20 @@ import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.clips.batch import LAST_OBSERVED, Batch, Provenance, Rollout, Spec, cut_to_observed
+from physion.clips.batch import (
+    LAST_OBSERVED,
+    Batch,
+    Motion,
+    Provenance,
+    Rollout,
+    Spec,
+    cut_to_observed,
+)
 from physion.core.errors import BadInputError
 from physion.core.files import json_digest
 from physion.core.seeds import child_generator, stable_hash, trial_seed
@@ -35,7 +43,7 @@ from physion.numerics.rotations import multiply_quaternions
 from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine, simulate_many
 from physion.physics.labels import label_contact
 from physion.physics.trajectory import State, Trajectory
-from physion.scenes.scene import Roles, Scene, SurfaceMaterial
+from physion.scenes.scene import OBSERVED_FRAMES, Body, Roles, Scene, SurfaceMaterial
 
 F64 = NDArray[np.float64]
 
@@ -45,6 +53,10 @@ WIDTH = 0.02
 """Metres by which a simulation may miss a body before it counts as improbable (`surprise`)."""
 MOVING = 1e-3
 """Speed in metres per second above which a body moves."""
+Properties = Literal["given", "default", "inferred"]
+MASSES, FRICTIONS = (1.0, 0.25, 0.5, 2.0, 4.0), (0.5, 0.0, 0.25, 0.75, 1.0)
+"""Masses (kg) and frictions of the agent among which the inferred ones are; the first are the
+default ones."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +104,36 @@ class ObservedTrial:
     state: State
     observed_contact: bool
     touching: frozenset[int] = frozenset()
+
+
+def believed_scene(motion: Motion, properties: Properties, engine: Engine) -> Scene:
+    """Return a scene whose agent has the true, the default or the inferred mass and friction.
+
+    Inferred are those of `MASSES` and `FRICTIONS` with which a simulation without noise from frame
+    0 to `LAST_OBSERVED` comes nearest to the observed positions p of the agent: the least sum of
+    |p - q|^2 over frames; of equals, the first. A cloth, or an agent that cannot move, stays as it
+    is.
+    """
+    scene = motion.scene
+    row = scene.index(scene.roles.agent)
+    if properties == "given" or row >= len(scene.bodies) or scene.bodies[row].kinematic:
+        return scene
+    pairs = list(itertools.product(MASSES, FRICTIONS))
+    scenes = [
+        replace(scene, bodies=(*scene.bodies[:row], one, *scene.bodies[row + 1 :]))
+        for one in (_with_properties(scene.bodies[row], *pair) for pair in pairs)
+    ]
+    if properties == "default":
+        return scenes[0]
+    seen = cut_to_observed(scene, motion.trajectory).positions[:, row].astype(np.float64)
+    paths = simulate_many(scenes, engine=engine, frames=OBSERVED_FRAMES)
+    errors = [float((norm(path.positions[:, row] - seen) ** 2).sum()) for path in paths]
+    return scenes[int(np.argmin(errors))]
+
+
+def _with_properties(body: Body, mass: float, friction: float) -> Body:
+    surface = replace(body.contact, static_friction=friction, dynamic_friction=friction)
+    return replace(body, mass=mass, contact=surface)
 
 
 def add_noise(
@@ -383,6 +425,8 @@ class NoisySimulationSettings(NoiseLevels, ModelSettings):
     - ``scales``: values of ``scale`` among which a decision chooses; with one value nothing is
       fitted.
     - ``samples``: simulations per trial. ``engine``: name of the engine. ``seed``: of the noise.
+    - ``properties``: mass and friction of the agent: *given*, as they are; *default*, 1 kg and 0.5;
+      or *inferred* from the observed part (`believed_scene`).
     """
 
     model: str = NAME
@@ -391,6 +435,7 @@ class NoisySimulationSettings(NoiseLevels, ModelSettings):
     samples: int = 20
     engine: str = DEFAULT_ENGINE
     seed: int = 0
+    properties: Properties = "given"
 
     @classmethod
     def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -461,6 +506,10 @@ class NoisySimulation(Model):
             self._built = self._given or make_engine(self.settings.engine)
         return self._built
 
+    def believed(self, motion: Motion) -> Scene:
+        """Return the scene as the model takes it to be (`believed_scene`)."""
+        return believed_scene(motion, self.settings.properties, self.engine)
+
     def levels_for(self, scene: Scene) -> NoiseLevels:
         """Return the levels of the noise for a scene."""
         fitted = self.settings.fitted_to
@@ -476,7 +525,7 @@ class NoisySimulation(Model):
         assert context.state is not None, "the spec asks for states"
         found = [
             simulate_contacts(
-                cut_trial(motion.scene, motion.trajectory),
+                cut_trial(self.believed(motion), motion.trajectory),
                 self.levels_for(motion.scene),
                 scale,
                 samples,
@@ -499,7 +548,9 @@ class NoisySimulation(Model):
         for row, (motion, frames) in enumerate(zip(batch.state, batch.frames, strict=True)):
             levels, path = self.levels_for(motion.scene), motion.trajectory
             # The noise is drawn by name, and movies of a pair, TRIAL+..., have the same noise.
-            plain = replace(motion.scene, events=(), name=motion.scene.name.partition("+")[0])
+            plain = replace(
+                self.believed(motion), events=(), name=motion.scene.name.partition("+")[0]
+            )
             for step, (before, now) in enumerate(itertools.pairwise(frames.tolist()), start=1):
                 there = bodies_present(motion.scene, before, now)
                 scene, state = _only(plain, path.state(before), there)
@@ -526,17 +577,21 @@ class NoisySimulation(Model):
         settings = dataclasses.asdict(self.settings)
         levels = {field.name: settings[field.name] for field in dataclasses.fields(NoiseLevels)}
         parts: list[Any] = [NOISE_VERSION, self.engine.name, levels]
+        if self.settings.properties != "given":
+            parts.append(self.settings.properties)
         if fitted := self.settings.fitted_to:
             parts += [dataclasses.asdict(levels) for levels in FITTED[fitted]]
         return json_digest(parts)
 
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions, and what noise was fitted to."""
-        fitted = self.settings.fitted_to
+        fitted, known = self.settings.fitted_to, self.settings.properties
         return Provenance(
             model=self.settings.model,
             init="none",
-            encoder_type="true state",
+            encoder_type=f"true state, {known} mass and friction"
+            if known != "given"
+            else "true state",
             dynamics_type="physics engine",
             dynamics_training_task=f"noise fitted to {fitted}" if fitted else "",
             versions=f"{self.engine.name}, physion {__version__}",

@@ -19,6 +19,7 @@ from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import digest_of
 from physion.core.seeds import stable_hash
 from physion.trials.dataset import Dataset, JoinedDataset
+from physion.trials.making.whatif import parts_of
 
 TRAINING, READOUT, TESTING = "training", "readout", "testing"
 """Names of the splits in the index."""
@@ -271,11 +272,12 @@ def select_scenario(folds: Sequence[Fold], scenario: str) -> list[Fold]:
 def assign_folds(table: pd.DataFrame, folds: int, seed: int) -> Mapping[str, int]:
     """Return the fold (0 to folds - 1) of each trial, balanced by scenario and label.
 
-    Trials with equal digests get the same fold. The result depends on seed, digests and labels
-    only, not on the order of rows.
+    Trials with equal digests get the same fold, and so do a trial and its variants. The result
+    depends on seed, digests and labels only, not on the order of rows.
     """
     assigned: dict[str, int] = {}
     for _, rows in table.groupby("scenario", sort=True):
+        rows = rows.assign(digest=_digests_of_groups(rows))
         groups = rows.groupby("digest")["contact"].mean()
         order = sorted(groups.index, key=lambda d: (groups[d] > 0.5, stable_hash(seed, str(d))))
         numbers = {digest: i % folds for i, digest in enumerate(order)}
@@ -284,6 +286,21 @@ def assign_folds(table: pd.DataFrame, folds: int, seed: int) -> Mapping[str, int
             for trial, digest in zip(rows["trial"], rows["digest"], strict=True)
         }
     return assigned
+
+
+def _digests_of_groups(rows: pd.DataFrame) -> list[str]:
+    """Return for each trial the digest of the one that it is a variant of, or its own.
+
+    Variants without their trial have the digest of the first of them by name.
+    """
+    names = [parts_of(str(name)) for name in rows["trial"]]
+    found: dict[str, str] = {}
+    for (base, change), digest in sorted(zip(names, map(str, rows["digest"]), strict=True)):
+        if change == "":
+            found[base] = digest
+        else:
+            found.setdefault(base, digest)
+    return [found[base] for base, _ in names]
 
 
 def _make_fold(

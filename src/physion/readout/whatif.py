@@ -1,9 +1,10 @@
 """Does a model's prediction change where one change of the scene changes the outcome?
 
-A pair is a trial and one of its variants (`physion.trials.making.whatif`). With P and P' the
-predictions of trial and variant, o and o' their outcomes (0 or 1):
+A pair is a trial and one of its variants (`physion.trials.making.whatif`), or two trials with the
+same test whose cues differ (`physion.trials.making.cues`). With P and P' the predictions of trial
+and variant, o and o' their outcomes (0 or 1):
 
-- ``accuracy``: fraction of variants with P' on the side of o';
+- ``accuracy``: fraction of variants with P' on the side of o'; with a cue, of both trials;
 - ``paired``: of the pairs whose outcomes differ, those with P and P' both on the right side;
 - ``moved``: of the same pairs, those in which P' - P has the sign of o' - o; no change counts half;
 - ``unmoved``: mean of 1 - \\|P' - P\\| over the pairs with equal outcomes.
@@ -17,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from physion.trials.making.whatif import parts_of
+from physion.trials.making.whatif import CUES, pair_of, parts_of
 
 MEASURES = ("accuracy", "paired", "moved", "unmoved")
 ALL = "all"
@@ -62,15 +63,18 @@ def _pairs(predictions: pd.DataFrame) -> pd.DataFrame:
     names = [parts_of(name) for name in table["stimulus"]]
     table["base"] = [base for base, _ in names]
     table["change"] = [change.partition(".")[0] for _, change in names]
-    keys = ["model", "readout", "protocol", "seed", "base"]
+    table["pair"] = [pair_of(name)[0] for name in table["stimulus"]]
+    changed = np.array([pair_of(name)[1] for name in table["stimulus"]], np.bool_)
+    keys = ["model", "readout", "protocol", "seed", "base", "pair"]
     table[keys] = table[keys].fillna("")
-    variant, base = table[table["change"] != ""], table[table["change"] == ""]
+    variant, base = table[changed], table[~changed]
     pairs = variant.merge(base, on=keys, suffixes=("", "_base"))
     after, before = pairs["p_contact"], pairs["p_contact_base"]
     truth, old = pairs["outcome"].astype(float), pairs["outcome_base"].astype(float)
     differ = truth != old
     right, right_before = (after > 0.5) == (truth == 1), (before > 0.5) == (old == 1)
-    pairs["accuracy"] = right.astype(float)
+    both = (right.astype(float) + right_before) / 2
+    pairs["accuracy"] = right.astype(float).where(~pairs["change"].isin(CUES), both)
     pairs["paired"] = (right & right_before).astype(float).where(differ)
     pairs["moved"] = ((1 + np.sign((after - before) * (truth - old))) / 2).where(differ)
     pairs["unmoved"] = (1 - (after - before).abs()).where(~differ)

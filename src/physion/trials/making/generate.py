@@ -41,6 +41,7 @@ from physion.trials.index import (
     write_index,
 )
 from physion.trials.making.choose import short
+from physion.trials.making.cues import cue_tasks
 from physion.trials.making.pairs import check_kinds, pair_tasks
 from physion.trials.making.plan import (
     PAIR,
@@ -50,7 +51,7 @@ from physion.trials.making.plan import (
     check_names,
     plan_dataset,
 )
-from physion.trials.making.whatif import KINDS, whatif_tasks
+from physion.trials.making.whatif import CUES, KINDS, whatif_tasks
 from physion.trials.trial_file import Trial
 
 
@@ -361,7 +362,8 @@ def generate(
         default the published configurations.
     whatif
         Changes of `physion.trials.making.whatif.KINDS`: for each trial with labels, each of its
-        variants is made, too.
+        variants is made, too. With one of ``CUES``, four trials with a cue
+        (`physion.trials.making.cues`).
     pairs
         Kinds of `physion.trials.making.pairs.KINDS`: for each testing trial and each kind that it
         allows, two possible and two impossible movies are made, too.
@@ -402,8 +404,8 @@ def generate(
         raise BadInputError(f"counts must be 1 or more for each split, not {planned}")
     chosen = {names[0]: tuple(presets)} if presets else None
     tasks = plan_dataset(name, names, planned, chosen)
-    if unknown := sorted(set(whatif) - set(KINDS)):
-        raise UnknownNameError("change", unknown[0], KINDS)
+    if unknown := sorted(set(whatif) - {*KINDS, *CUES}):
+        raise UnknownNameError("change", unknown[0], (*KINDS, *CUES))
     check_kinds(pairs)
     where, settings = Path(folder), settings or GenerateSettings()
     report = make_trials(where, tasks, settings, executor=executor, progress=progress)
@@ -414,7 +416,11 @@ def generate(
         changed: list[TrialTask] = []
         if whatif:
             labelled = [task.trial for task in there if settings.stores_labels(task.split)]
-            changed += whatif_tasks(made, labelled, whatif)
+            changes, cues = (
+                [kind for kind in whatif if (kind in CUES) == cued] for cued in (False, True)
+            )
+            changed += whatif_tasks(made, labelled, changes)
+            changed += cue_tasks(made, labelled, cues, settings.engine)
         if pairs:
             tested = [task.trial for task in there if task.split == "testing"]
             changed += pair_tasks(made, tested, pairs, settings.engine, progress)

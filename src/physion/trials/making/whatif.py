@@ -25,6 +25,8 @@ from physion.trials.dataset import Dataset
 from physion.trials.making.plan import BASE_CONTACT, TrialTask
 
 KINDS = ("remove", "mass", "friction", "push")
+CUES = ("cue-mass", "cue-friction")
+"""Kinds of `physion.trials.making.cues`: their variants are compared with each other."""
 FACTORS = {"quarter": 0.25, "fourfold": 4.0}
 """Factors of mass and friction."""
 PUSHES = {"weaker": 0.5, "stronger": 1.5}
@@ -86,6 +88,19 @@ def parts_of(trial: str) -> tuple[str, str]:
     """Return the trial that a variant belongs to, and its change; the latter is empty for none."""
     base, _, change = trial.partition(MARK)
     return base, change
+
+
+def pair_of(trial: str) -> tuple[str, bool]:
+    """Return the name of the pair that a trial belongs to, and whether it is the variant of it.
+
+    A variant is paired with its trial, whose name the pair has; it may have several variants. With
+    a cue, the trials of the same test are a pair, the second of which counts as the variant.
+    """
+    base, change = parts_of(trial)
+    if not change.startswith(tuple(f"{kind}." for kind in CUES)):
+        return base, change != ""
+    pair, _, value = trial.rpartition(".")
+    return pair, value == "1"
 
 
 def _removed(scene: Scene) -> Iterator[tuple[str, Scene]]:
