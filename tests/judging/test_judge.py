@@ -22,7 +22,7 @@ from physion.core.errors import BadInputError
 from physion.judging.ground import Ground
 from physion.judging.judge import judge
 from physion.judging.measure import KnownMovie, measure, reference_of
-from physion.judging.track import hsv, shift_between
+from physion.judging.track import AGENT, PATIENT, Tracker, hsv, shift_between
 from physion.numerics.rotations import rotation_matrix
 from physion.rendering.camera import View
 from physion.scenes.scene import Body, Camera, Roles, Scene
@@ -284,6 +284,22 @@ def test_an_outline_says_where_the_agent_stands(angle: float, cut: float) -> Non
         assert ground is not None
         outline = np.argwhere(mask & ~ndimage.binary_erosion(mask))[:, ::-1].astype(float)
         assert ground.touches(outline) == touches, gap
+
+
+def test_the_agent_is_looked_for_where_it_was_last() -> None:
+    """A red rest of it is left there, and there is red elsewhere, of 25 or of 9 pixels."""
+    first = np.full((64, 64, 3), 90, np.uint8)
+    roles = np.zeros((64, 64), np.uint8)
+    roles[10:18, 10:18], roles[40:50, 5:15] = AGENT, PATIENT
+    first[roles == AGENT], first[roles == PATIENT] = (200, 20, 20), (220, 220, 20)
+    hidden = np.where((roles == AGENT)[..., None], np.uint8(90), first)
+    rest, other, small = hidden.copy(), hidden.copy(), hidden.copy()
+    rest[12:15, 12:15] = other[50:55, 50:55] = small[50:53, 50:53] = (200, 20, 20)
+    rest[50:55, 50:55] = (200, 20, 20)
+    place = np.array([13.5, 13.5]), 8.0, 64.0
+    for picture, center in ((rest, (13, 13)), (other, (52, 52)), (small, (np.nan, np.nan))):
+        agent, _ = Tracker(first, roles, place).see(picture)
+        np.testing.assert_array_equal(agent.center, center)
 
 
 def test_shifts_are_found_only_where_they_help() -> None:

@@ -41,7 +41,7 @@ SHAPES = 0.02
 RATES = (4.0, 240.0)
 """Smallest and largest rate of a movie, frames a second."""
 JUDGED = "judged"
-_VERSION = 2
+_VERSION = 3
 """To be increased with every change that can alter a measure."""
 
 

@@ -187,7 +187,7 @@ def measure(
     hue = hue_between(movie[0], start)
     if hue:
         movie = with_hue(movie, -hue)
-    tracker = Tracker(reference.pictures[0], reference.roles)
+    tracker = Tracker(reference.pictures[0], reference.roles, _last_seen(truth, first_frame))
 
     def touches(agent: Seen, distance: float, width: int) -> bool:
         ground = reference.ground
@@ -209,6 +209,15 @@ def measure(
         "hue": hue,
     }
     return {name: found[name] for name in COLUMNS}, tracks
+
+
+def _last_seen(truth: Tracks, frame: int) -> tuple[Floats, float, float] | None:
+    """Return where the agent truly is up to a frame, as `Tracker` takes it; None if nowhere."""
+    area = truth.area[: frame + 1, 0]
+    seen = np.flatnonzero(area)
+    if not len(seen):
+        return None
+    return truth.centers[seen[-1], 0], float(np.sqrt(area[seen[-1]])), float(area.max())
 
 
 def _contact(

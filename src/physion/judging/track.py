@@ -3,8 +3,9 @@
 A pixel has the colour of a role if its hue is within `HUES` degrees of the role's, and its
 saturation and value are not much less. The role's colour is measured where the trial knows it: in
 its first frame, whose ids are stored. Pixels that already had such a colour there, without being
-the object, do not count as long as they do not change. Of the connected parts that remain, those
-near the last position are the object, or all large ones if there are none.
+the object, do not count as long as they do not change. The object is all large connected parts that
+remain; the agent those near its last position, or where there are none, those that are not much
+smaller than it was.
 """
 
 from __future__ import annotations
@@ -128,15 +129,19 @@ class Tracker:
         First frame of the trial (H, W, 3).
     roles
         Pixels (H, W) of the agent (1) and the patient (2) in it.
+    last
+        Where the agent was before the movie: middle (x, y), radius, and its largest area so far.
     """
 
-    def __init__(self, first: U8, roles: U8) -> None:
+    def __init__(
+        self, first: U8, roles: U8, last: tuple[Floats, float, float] | None = None
+    ) -> None:
         self._table = _table(palette_of(first, roles))
         # Smooth edges of an object are not something else of its colour.
         near = ndimage.binary_dilation(roles > 0, _EIGHT, iterations=2)
         self._same = np.flatnonzero((self._table[_bins(first)] > 0) & ~near)
         self._first = first.reshape(-1, 3)[self._same].astype(np.int16)
-        self._last: tuple[Floats, float] | None = None
+        self._last = last
 
     def see(self, rgb: U8) -> tuple[Seen, Seen]:
         """Return agent and patient in the next frame (H, W, 3)."""
@@ -165,7 +170,7 @@ class Tracker:
         if not kept.any():
             return NOWHERE
         if role == AGENT and self._last is not None:
-            middle, radius = self._last
+            middle, radius, largest = self._last
             flat = np.flatnonzero(labels)
             part, (y, x) = labels.reshape(-1)[flat], np.divmod(flat, labels.shape[1])
             across, down = (
@@ -176,6 +181,10 @@ class Tracker:
             near = (size >= SMALLEST) & (apart <= REACH * roles.shape[1] + radius)
             if near.any():
                 kept = near & (size >= PART * size[near].max())
+            else:
+                kept &= size >= PART * largest  # what is elsewhere must be as large
+                if not kept.any():
+                    return NOWHERE
         around = np.zeros((labels.shape[0] + 2, labels.shape[1] + 2), np.bool_)
         own = around[1:-1, 1:-1]
         own[:] = kept[labels]
@@ -185,7 +194,8 @@ class Tracker:
         sums = [own.sum(axis=0) @ np.arange(own.shape[1]), own.sum(axis=1) @ np.arange(len(own))]
         center = np.array(sums) / area + (left, top)
         if role == AGENT:
-            self._last = center, float(np.hypot(*(outline - center).T).max())
+            largest = max(area, self._last[2] if self._last else 0)
+            self._last = center, float(np.hypot(*(outline - center).T).max()), largest
         color = own.reshape(-1).astype(np.float32) @ rgb[box].reshape(-1, 3).astype(np.float32)
         return Seen(area, center, color.astype(np.float64) / area, outline)
 
