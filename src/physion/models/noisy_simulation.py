@@ -109,10 +109,10 @@ class ObservedTrial:
 def believed_scene(motion: Motion, properties: Properties, engine: Engine) -> Scene:
     """Return a scene whose agent has the true, the default or the inferred mass and friction.
 
-    Inferred are those of `MASSES` and `FRICTIONS` with which a simulation without noise from frame
-    0 to `LAST_OBSERVED` comes nearest to the observed positions p of the agent: the least sum of
-    |p - q|^2 over frames; of equals, the first. A cloth, or an agent that cannot move, stays as it
-    is.
+    Inferred are the values from `MASSES` and `FRICTIONS` with which a simulation without noise from
+    frame 0 to `LAST_OBSERVED` comes nearest to the observed positions p of the agent: the least sum
+    of |p - q|^2 over frames; of equals, the first. A cloth, or an agent that cannot move, stays as
+    it is.
     """
     scene = motion.scene
     row = scene.index(scene.roles.agent)

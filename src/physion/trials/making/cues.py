@@ -138,19 +138,19 @@ def four_scenes(base: Scene, kind: str, engine: Engine) -> list[Scene]:
     )
 
 
-Found = dict[tuple[str, str], Scene]
+Scenes = dict[tuple[str, str], Scene]
 """Scenes by test and value."""
 
 
-def _named(found: Found, base: Scene, kind: str) -> list[Scene]:
+def _named(made: Scenes, base: Scene, kind: str) -> list[Scene]:
     """Return scenes by test and value with their names, whose numbers tell nothing."""
-    colors = next(iter(found.values())).physics_digest()
+    colors = next(iter(made.values())).physics_digest()
     scenes = []
     for number, test in enumerate(_shuffled(TESTS, base.name, kind)):
         for place, value in enumerate(_shuffled(VALUES[kind], base.name, kind, test)):
             known = {"whatif": f"{kind}.{test}.{value}", "base": base.name, COLORS_OF: colors}
             name = f"{base.name}{MARK}{kind}.{number}.{place}"
-            scenes.append(replace(found[test, value], name=name, parameters=known))
+            scenes.append(replace(made[test, value], name=name, parameters=known))
     return scenes
 
 
@@ -158,7 +158,7 @@ def _shuffled(pair: tuple[str, ...], *names: str) -> tuple[str, ...]:
     return pair[::-1] if stable_hash("order", *names) % 2 else pair
 
 
-def _draw(base: Scene, kind: str, seed: np.random.SeedSequence, engine: Engine) -> Found | None:
+def _draw(base: Scene, kind: str, seed: np.random.SeedSequence, engine: Engine) -> Scenes | None:
     """Return the four scenes of a seed; None if they have not the outcomes that they should have.
 
     The agent slides along x. Without a patient in its way it stops at a with the first value and
