@@ -99,6 +99,9 @@ def test_cues_are_made_verified_and_kept(tmp_path: Path) -> None:
     assert set(index["split"]) == {"readout"}
     assert index.loc[cued, "contact"].sum() == 4
     assert verify_dataset(tmp_path / "trials", again=3).faults == []
+    for one, other in zip(cued[::2], cued[1::2], strict=True):
+        shown = [dataset.trial(name).render(44).color for name in (one, other)]
+        np.testing.assert_array_equal(*shown)
     (tmp_path / "trials" / "readout" / "collide" / f"{cued[0]}.h5").unlink()
     again = make()
     assert again.report.made == [cued[0]] and len(again.report.kept) == 10

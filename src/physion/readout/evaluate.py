@@ -60,7 +60,7 @@ from physion.trials.dataset import Dataset, JoinedDataset
 
 NOTHING_TO_FIT = "no trial to fit|one answer only"
 """Notes of `physion.readout.logistic.fit_readout` where it predicts the base rate."""
-_VERSION = 10
+_VERSION = 11
 """To be increased with every change that can alter the table of an evaluation."""
 _NOT_HASHED = (
     "protocols", "seeds", "encoder_batch", "accelerator", "rollout_errors", "twin", "benchmark",
