@@ -123,7 +123,7 @@ class Browser:
         assert "exceptionDetails" not in reply, reply["exceptionDetails"]
         return reply["result"].get("value")
 
-    def until(self, expression: str, seconds: float = 30.0) -> Any:
+    def until(self, expression: str, seconds: float = 120.0) -> Any:
         """Wait for an expression to be true; the value."""
         end = time.monotonic() + seconds
         while not (value := self.ask(expression)):
