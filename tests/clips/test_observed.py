@@ -242,6 +242,7 @@ def test_an_observed_movie_that_shows_the_future_is_refused(made: Dataset, tmp_p
 def test_no_scene_tells_the_answer_by_its_parameters(made: Dataset, tmp_path: Path) -> None:
     shutil.copytree(made.folder, tmp_path / "set")
     known = {"pair": {"first": 0, "then": 1}, "base_contact": True, "mass": 2.0}
+    known |= {"whatif": "cue-mass.far.light"}
     path = Dataset(tmp_path / "set").paths(RIGID).trial_file
     trial = Trial.open(path)
     scene = dataclasses.replace(trial.scene, parameters=known)

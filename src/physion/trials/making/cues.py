@@ -60,7 +60,7 @@ from physion.scenes.scene import (
     SurfaceMaterial,
 )
 from physion.trials.dataset import Dataset
-from physion.trials.making.plan import TrialTask
+from physion.trials.making.plan import WHATIF, TrialTask
 from physion.trials.making.whatif import AFTER, MARK
 
 CUT = 32
@@ -148,7 +148,7 @@ def _named(made: Scenes, base: Scene, kind: str) -> list[Scene]:
     scenes = []
     for number, test in enumerate(_shuffled(TESTS, base.name, kind)):
         for place, value in enumerate(_shuffled(VALUES[kind], base.name, kind, test)):
-            known = {"whatif": f"{kind}.{test}.{value}", "base": base.name, COLORS_OF: colors}
+            known = {WHATIF: f"{kind}.{test}.{value}", "base": base.name, COLORS_OF: colors}
             name = f"{base.name}{MARK}{kind}.{number}.{place}"
             scenes.append(replace(made[test, value], name=name, parameters=known))
     return scenes

@@ -36,9 +36,10 @@ FULL_COUNTS = {"training": 2000, "readout": 1000, "testing": 150, "familiarizati
 """Trials per scenario in each split, as in the original study."""
 PAIR = "pair"
 """Key of ``Scene.parameters`` of the movies of `physion.trials.making.pairs`."""
-BASE_CONTACT = "base_contact"
-"""Key of ``Scene.parameters`` of the variants of `physion.trials.making.whatif`."""
-ANSWERS = (PAIR, BASE_CONTACT)
+WHATIF, BASE_CONTACT = "whatif", "base_contact"
+"""Keys of ``Scene.parameters`` of the variants of `physion.trials.making.whatif`: what was changed
+(with a cue, which test and value, which decide the outcome), and the outcome without the change."""
+ANSWERS = (PAIR, WHATIF, BASE_CONTACT)
 """Keys of ``Scene.parameters`` that tell what a model is asked: no model receives them."""
 PLAYBACK_RATES = {"slow": PLAYBACK_RATE, "real": round(1 / FRAME_TIME)}
 

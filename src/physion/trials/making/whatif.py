@@ -22,7 +22,7 @@ from physion.core.errors import BadInputError, UnknownNameError
 from physion.scenes.looks import COLORS_OF
 from physion.scenes.scene import Body, Cloth, Push, Scene
 from physion.trials.dataset import Dataset
-from physion.trials.making.plan import BASE_CONTACT, TrialTask
+from physion.trials.making.plan import BASE_CONTACT, WHATIF, TrialTask
 
 KINDS = ("remove", "mass", "friction", "push")
 CUES = ("cue-mass", "cue-friction")
@@ -70,7 +70,7 @@ def whatif_tasks(dataset: Dataset, trials: Sequence[str], kinds: Sequence[str]) 
             raise BadInputError(f"trial {name!r} is a variant: give trials that were sampled")
         for change, scene in variants(trial.scene, kinds):
             known = {
-                "whatif": change,
+                WHATIF: change,
                 "base": name,
                 BASE_CONTACT: trial.known_labels().contact,
                 COLORS_OF: trial.scene.physics_digest(),
