@@ -63,7 +63,7 @@ SET = "readout-1000"
 """Name of the set, which is the seed of its trials."""
 COMMAND = (
     "physion generate FOLDER/readout-1000 --split readout --count {count} --no-movies --look "
-    "redyellow --jitters 0 --observed-contact --name readout-1000"
+    "redyellow --jitters 0 --option observed_contact=true --name readout-1000"
 )
 MODELS: Mapping[str, tuple[str, Mapping[str, Any], tuple[Readout, ...]]] = {
     "state-trees": ("state-trees", {}, (Readout.OBSERVED,)),

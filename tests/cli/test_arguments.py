@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from physion.cli.arguments import take_pairs
 from physion.cli.main import main
+from physion.readout.logistic import LogisticSettings
+from physion.readout.settings import EvaluationSettings
 
 
 @pytest.mark.parametrize(
@@ -50,5 +53,33 @@ def test_negative_numbers_and_underscores_are_no_unknown_options(
 ) -> None:
     assert main(["verify", "/nowhere", "--again", "-1"]) == 2
     assert "/nowhere" in capsys.readouterr().err
-    assert main(["generate", "/nowhere", "--min_visible", "-1"]) == 2
-    assert "visible fraction" in capsys.readouterr().err
+    assert main(["generate", "/nowhere", "--jitters", "-1"]) == 2
+    assert "jitters -1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("generate /nowhere --option min_visible=-1", "visible fraction -1"),
+        ("generate /nowhere --option robust=0.5 robust=0.6", "--option: robust is given twice"),
+        ("generate /nowhere --option compatible=2", "--option compatible must be true or false"),
+        ("generate /nowhere --option speed=2", "generate has no --option speed=2"),
+        ("evaluate mean /nowhere --option folds=1", "folds at least 2"),
+        ("evaluate mean /nowhere --option logistic.fold=2", "did you mean 'folds'?"),
+        ("train cswm /nowhere --option encoder_batch=x", "--option encoder_batch must be a whole"),
+        ("generate /nowhere --robust 0.9", "no such option --robust"),
+    ],
+)
+def test_settings_without_an_option_of_their_own_are_checked(
+    line: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(line.split()) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_settings_without_an_option_of_their_own_are_set() -> None:
+    given, rest = take_pairs(
+        EvaluationSettings(seeds=2), ["folds=3", "logistic.folds=4", "steps=5", "gns:folds=6"]
+    )
+    assert rest == ["steps=5", "gns:folds=6"]
+    assert given == EvaluationSettings(seeds=2, folds=3, logistic=LogisticSettings(folds=4))

@@ -180,7 +180,13 @@ def test_what_cannot_have_an_error_is_refused(dataset: Dataset) -> None:
 
     with pytest.raises(BadInputError, match="trial 'drop_0': positions that are not finite"):
         rollout_error(dataset, Lost(), ["drop_0"])
-    arguments = ["evaluate", "constant-motion", str(dataset.folder), "--rollout-error"]
+    arguments = [
+        "evaluate",
+        "constant-motion",
+        str(dataset.folder),
+        "--option",
+        "rollout_errors=true",
+    ]
     assert main(arguments) == 2
     with pytest.raises(BadInputError, match=r"imagines no motion of objects.*such as dpi"):
         evaluate("constant-motion", dataset, "nowhere", rollout_errors=True)

@@ -29,7 +29,7 @@ ERRORS: tuple[Column, ...] = (
     must("constant_velocity_error", "number", "The same of objects that keep their last velocity",
          unit="m", low=0, high=1e6, also=("Constant Velocity Error",)),
 )  # fmt: skip
-"""Columns of a file of errors, which ``physion evaluate --rollout-error`` writes."""
+"""Columns of a file of errors, which ``physion evaluate --option rollout_errors=true`` writes."""
 COLUMNS = ("panel", "model", "kind", "seconds", "trials", "value", "low", "high")
 """``panel``: scenario or `MEAN`; ``kind``: model or baseline; ``seconds`` of physics after the last
 observed frame; ``value``: mean error in metres, with its interval."""

@@ -12,11 +12,21 @@ import inspect
 import re
 import types
 from collections.abc import Iterable, Sequence
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, is_dataclass, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import tyro
 
@@ -24,6 +34,12 @@ import tyro
 from tyro import _errors
 
 from physion.core.errors import BadInputError
+from physion.core.settings import PAIR_ONLY, field_types, parse_pairs, read_pairs, read_settings
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+    T = TypeVar("T", bound=DataclassInstance)
 
 VALUES = {
     "option": "NAME=VALUE",
@@ -84,6 +100,45 @@ def read_options(options: Any, args: Sequence[str], prog: str, description: str)
         )
 
 
+def take_pairs(settings: T, pairs: Iterable[str]) -> tuple[T, list[str]]:
+    """Return settings whose fields without an option of their own come from ``--option``.
+
+    Parameters
+    ----------
+    settings
+        Dataclass, whose fields with `PAIR_ONLY` are taken from ``pairs``; a field that holds
+        settings itself takes ``FIELD.NAME=VALUE``.
+    pairs
+        Texts NAME=VALUE.
+
+    Returns
+    -------
+    settings, rest
+        The settings with these values, and the pairs that name none of these fields.
+
+    Raises
+    ------
+    BadInputError
+        If a value has another type, is out of range or given twice.
+    """
+    kinds = field_types(type(settings))
+    own: dict[str, list[str]] = {k: [] for k, kind in kinds.items() if PAIR_ONLY in get_args(kind)}
+    rest: list[str] = []
+    for pair in pairs:
+        name = re.split(r"[.=]", pair, maxsplit=1)[0]
+        own.get(name, rest).append(pair)
+    values: dict[str, Any] = {}
+    for name, given in own.items():
+        current = getattr(settings, name)
+        if given and is_dataclass(current):
+            nested = [pair.removeprefix(f"{name}.") for pair in given]
+            values[name] = read_pairs(type(current), nested, f"--option {name}")
+        elif given:
+            found = parse_pairs(given, "--option")[name]
+            values[name] = read_settings(kinds[name], found, f"--option {name}")
+    return replace(settings, **values), rest
+
+
 def no_such(kind: str, name: str, known: Iterable[str], where: str) -> BadInputError:
     """Return the error for an unknown verb or option, with the closest known one.
 
@@ -106,7 +161,7 @@ def _described(options: Any) -> tuple[str, ...]:
     """Return all options of a dataclass, and write into its annotations how the help shows them.
 
     Values get names, defaults that say nothing (None, no text, no names, False) are left out, and
-    a switch that is off has no ``--no-`` form.
+    a switch that is off has no ``--no-`` form. A field with `PAIR_ONLY` is no option.
     """
     names = ["-h", "--help"]
     hints, texts = get_type_hints(options, include_extras=True), _texts(options)
@@ -115,7 +170,9 @@ def _described(options: Any) -> tuple[str, ...]:
         parts = get_args(hint) if get_origin(hint) is Annotated else (hint,)
         kind: Any = parts[0]
         extras = list(parts[1:])
-        if tyro.conf.Suppress in extras:
+        if PAIR_ONLY in extras:
+            # The marker stays, for `take_pairs`.
+            options.__annotations__[field.name] = Annotated[kind, PAIR_ONLY, tyro.conf.Suppress]
             continue
         if hasattr(kind, "__dataclass_fields__"):  # further options, without a name of their own
             names += _described(kind)

@@ -65,7 +65,8 @@ class Options:
     """Properties of the stimuli, such as their numbers of elements, distractors and occluders: a
     table (CSV, parquet) or a dataset; if not given, as official names say."""
     rollout_errors: tuple[Path, ...] = ()
-    """Files of evaluate --rollout-error: a figure of the errors of imagined motion over time."""
+    """Files of evaluate --option rollout_errors=true: a figure of the errors of imagined motion
+    over time."""
     groups: tuple[str, ...] = ()
     """Compare groups of models by these columns of the predictions, such as encoder_type, or by the
     columns of a CSV file with model and any others."""

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import json as json_module
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from physion.cli.arguments import take_pairs
 from physion.cli.output import (
     Stages,
     print_line,
@@ -24,11 +25,10 @@ from physion.cli.output import (
 )
 from physion.compute.run_tasks import ExecutorSettings
 from physion.core.errors import BadInputError
-from physion.core.settings import read_pairs, split_names
+from physion.core.settings import split_names
 from physion.models.build import FEATURE_FILES
 from physion.readout.check import check_models
 from physion.readout.evaluate import EvaluatedModel, Evaluation, evaluate
-from physion.readout.logistic import LogisticSettings
 from physion.readout.settings import EvaluationSettings, options_by_model
 from physion.readout.surprise import MEASURES as SURPRISES
 from physion.readout.surprise import pixel_statistics, surprise, surprise_scores
@@ -37,9 +37,6 @@ from physion.trials.dataset import Dataset
 
 if TYPE_CHECKING:
     import pandas as pd
-
-LOGISTIC = "logistic."
-"""Start of the options of the logistic regression."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +58,10 @@ class Options:
     in place of the dataset's own. If it has no movies, add --rendered."""
     option: tuple[str, ...] = ()
     """Settings of all models or of their training, such as encoder=resnet50 weights=random
-    steps=500; of one of several models as MODEL:NAME=VALUE; of the logistic regression as
-    logistic.NAME=VALUE, such as logistic.folds=3."""
+    steps=500; of one of several models as MODEL:NAME=VALUE. Of the evaluation: folds=5 of the
+    cross-validation of a dataset without a readout split; encoder_batch=4, clips that a network
+    encodes at a time; rollout_errors=true, which also writes how far motion that particle models
+    imagine is from the true one; logistic.folds=3 and other settings of the logistic regression."""
     settings: Annotated[EvaluationSettings, tyro.conf.arg(name="")] = field(
         default_factory=EvaluationSettings
     )
@@ -78,8 +77,6 @@ class Options:
     check: bool = False
     """Before, check on about 80 trials that no prediction depends on the future, names, order,
     labels or files (physion check), and write the verdict into the table."""
-    verify: bool = True
-    """Compare files with their SHA-256 in the index before they are used."""
     dry_run: bool = False
     """Evaluate nothing; print what would be evaluated, and what is done."""
     json: bool = False
@@ -93,9 +90,7 @@ def main(options: Options) -> int:
         for name, value in given.items():
             if value:
                 raise BadInputError(f"{name} does not apply to --surprise: leave it out")
-    of_models = tuple(pair for pair in options.option if not pair.startswith(LOGISTIC))
-    fitted = [pair.removeprefix(LOGISTIC) for pair in options.option if pair not in of_models]
-    logistic = read_pairs(LogisticSettings, fitted, "--option logistic")
+    settings, of_models = take_pairs(options.settings, options.option)
     models, dataset = split_names(options.models, "model"), options.dataset
     if dataset is None:  # the only word is the dataset
         if options.features is None:
@@ -108,18 +103,18 @@ def main(options: Options) -> int:
             )
         models = [*models, str(options.features)]
     chosen = options_by_model(models, of_models)
-    trials = Dataset(dataset, verify=options.verify)
+    trials = Dataset(dataset)
     if options.surprise:
         with Stages() as stages:
             found = surprise(
                 chosen,
                 trials,
                 options.out,
-                options.settings,
+                settings,
                 progress=stages,
             )
             pixels = pixel_statistics(
-                trials, options.out, rendered=options.settings.rendered, progress=stages
+                trials, options.out, rendered=settings.rendered, progress=stages
             )
         _print_surprise(surprise_scores([pixels, found.table]), found.failed, options)
         return 1 if found.failed else 0
@@ -130,7 +125,7 @@ def main(options: Options) -> int:
                 chosen,
                 trials,
                 options.out / "check",
-                replace(options.settings, logistic=logistic),
+                settings,
                 executor=options.compute.open(),
                 progress=stages,
             )
@@ -138,10 +133,9 @@ def main(options: Options) -> int:
             chosen,
             trials,
             options.out,
-            options.settings,
-            fit=None if options.fit is None else Dataset(options.fit, verify=options.verify),
+            settings,
+            fit=None if options.fit is None else Dataset(options.fit),
             verdicts=verdicts,
-            logistic=logistic,
             executor=options.compute.open(),
             progress=stages,
             dry_run=options.dry_run,

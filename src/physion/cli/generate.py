@@ -8,8 +8,10 @@ from typing import Annotated, Literal
 
 import tyro
 
+from physion.cli.arguments import take_pairs
 from physion.cli.output import Stages, print_report
 from physion.compute.run_tasks import ExecutorSettings
+from physion.core.errors import BadInputError
 from physion.trials.making.generate import FailedTrialsError, generate
 from physion.trials.making.plan import FULL_COUNTS, SPLITS, GenerateSettings
 
@@ -47,6 +49,11 @@ class Options:
         default_factory=GenerateSettings
     )
     """How trials are chosen, rendered and stored."""
+    option: tuple[str, ...] = ()
+    """Further settings: robust=0.9 and min_visible=0.01 are the smallest accepted fractions of
+    jittered simulations with the trial's outcome, and of the first frame that agent and patient
+    each cover; observed_contact=true accepts trials whose contact is in the observed part;
+    labels=false stores no labels in the split training; compatible=true compresses with gzip."""
     compute: Annotated[ExecutorSettings, tyro.conf.arg(name="")] = field(
         default_factory=ExecutorSettings
     )
@@ -57,6 +64,9 @@ class Options:
 
 def main(options: Options) -> int:
     """Make the missing trials; 1 if one failed."""
+    settings, unknown = take_pairs(options.settings, options.option)
+    if unknown:
+        raise BadInputError(f"generate has no --option {unknown[0]} (physion generate --help)")
     splits = SPLITS if options.split == "all" else (options.split,)
     counts = {split: FULL_COUNTS[split] if options.full else options.count for split in splits}
     try:
@@ -69,7 +79,7 @@ def main(options: Options) -> int:
                 whatif=options.whatif,
                 pairs=options.pairs,
                 name=options.name,
-                settings=options.settings,
+                settings=settings,
                 executor=options.compute.open(),
                 progress=stages,
             ).report

@@ -16,6 +16,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from physion.cli.arguments import take_pairs
 from physion.cli.output import Stages, print_line, print_plan
 from physion.compute.run_tasks import ExecutorSettings
 from physion.core.settings import split_names
@@ -36,7 +37,9 @@ class Options:
     """Folder for trainings and features, as for physion evaluate."""
     option: tuple[str, ...] = ()
     """Settings of the models or of their training as NAME=VALUE, such as size=paper steps=500
-    batch=16 learning_rate=1e-3; of one of several models as MODEL:NAME=VALUE."""
+    batch=16 learning_rate=1e-3; of one of several models as MODEL:NAME=VALUE. Of all trainings:
+    folds=5 of the cross-validation of a dataset without a readout split, and encoder_batch=4, clips
+    that a network encodes at a time."""
     settings: Annotated[TrainSettings, tyro.conf.arg(name="")] = field(
         default_factory=TrainSettings
     )
@@ -46,8 +49,6 @@ class Options:
     )
     """Where trainings run: on Slurm and Ray, one model, protocol and seed is a task; on this
     machine one runs after the other."""
-    verify: bool = True
-    """Compare files with their SHA-256 in the index before they are used."""
     dry_run: bool = False
     """Train nothing; print what would be trained, and what is done."""
     json: bool = False
@@ -56,12 +57,13 @@ class Options:
 
 def main(options: Options) -> int:
     """Train what is missing; return 1 if a training of several failed."""
+    settings, of_models = take_pairs(options.settings, options.option)
     with Stages() as stages:
         done = train(
-            options_by_model(split_names(options.models, "model"), options.option),
-            Dataset(options.dataset, verify=options.verify),
+            options_by_model(split_names(options.models, "model"), of_models),
+            Dataset(options.dataset),
             options.out,
-            options.settings,
+            settings,
             executor=options.compute.open(),
             progress=stages,
             dry_run=options.dry_run,

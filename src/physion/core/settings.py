@@ -41,6 +41,10 @@ MAX_BYTES = 1 << 28
 STRICT: ConfigDict = {"strict": True, "extra": "forbid", "allow_inf_nan": False}
 """Configuration of all that is read; pydantic models take it as their ``model_config``."""
 
+PAIR_ONLY = "only by --option"
+"""In the type of a field, ``Annotated[int, PAIR_ONLY]``: the command line sets it by
+``--option NAME=VALUE``, and has no option of its own for it."""
+
 _REPR = reprlib.Repr()
 _REPR.maxlevel, _REPR.maxlist, _REPR.maxdict, _REPR.maxstring, _REPR.maxlong = 3, 4, 4, 60, 40
 

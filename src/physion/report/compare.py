@@ -283,7 +283,7 @@ def compare(
     zone
         Official table of participants' percentiles; None: looked for next to ``humans``.
     rollout_errors
-        Files of ``physion evaluate --rollout-error``, for a figure of them.
+        Files of ``physion evaluate --option rollout_errors=true``, for a figure of them.
     resamples, seed
         Draws of people for their accuracy and agreement, of halves, and of permutations.
 

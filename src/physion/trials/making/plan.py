@@ -7,12 +7,13 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.seeds import trial_seed
+from physion.core.settings import PAIR_ONLY
 from physion.physics.engine import DEFAULT_ENGINE, engines
 from physion.scenes.sampling.build import scenarios as known_scenarios
 from physion.scenes.sampling.sample import default_presets, get_preset
@@ -107,25 +108,25 @@ class GenerateSettings:
     with movies also has a map of agent and patient."""
     movies: bool = True
     """Make movies and maps; otherwise trials have only trial files."""
-    labels: bool = True
-    """Store labels of all trials. With --no-labels trials of the split training have neither labels
-    nor a map of agent and patient."""
+    labels: Annotated[bool, PAIR_ONLY] = True
+    """Store labels of all trials. If false, trials of the split training have neither labels nor
+    a map of agent and patient."""
     playback: Literal["slow", "real"] = "slow"
     """Slow movies show 0.01 s of physics per frame at 30 frames per second, as the official ones:
     3.33 times slower than real time. Real ones show 100 frames per second."""
     passes: tuple[str, ...] = ()
     """Image passes to store (color depth normals ids flow). All can also be rendered later."""
-    compatible: bool = False
+    compatible: Annotated[bool, PAIR_ONLY] = False
     """Compress with gzip, which every HDF5 reader supports, instead of zstd."""
     jitters: int = 8
     """Number of jittered simulations that measure how robust each label is; 0 for none."""
-    robust: float = 0.0
+    robust: Annotated[float, PAIR_ONLY] = 0.0
     """Smallest accepted fraction of jittered simulations with the trial's outcome."""
-    min_visible: float = 0.0005
+    min_visible: Annotated[float, PAIR_ONLY] = 0.0005
     """Smallest accepted fraction of the first frame that agent and patient each cover."""
     engine: str = DEFAULT_ENGINE
     """Engine that moves the bodies (see physion ls engines); mujoco has no cloth."""
-    observed_contact: bool = False
+    observed_contact: Annotated[bool, PAIR_ONLY] = False
     """Accept trials for readout, testing and familiarization also if agent and patient touch in the
     observed part, as the official sets do."""
 
