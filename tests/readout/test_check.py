@@ -35,7 +35,6 @@ from support.moving_dots import make_dots
 from support.tiny_models import OPTIONS
 
 TESTED = 8
-PARTICLES = {"dpi", "gns", "gns-ransac"}
 """Models whose check takes longest; the nightly tests check them."""
 HELD = [name for name, change in CHANGES.items() if change.must_hold]
 
@@ -515,14 +514,9 @@ def few(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return make_late_motions(tmp_path_factory.mktemp("few") / "few", {"readout": 4, "testing": 2})
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.nightly if name in PARTICLES else ())
-        for name in sorted(models.names())
-    ],
-)
+@pytest.mark.parametrize("name", sorted(models.names()))
 def test_every_shipped_model_passes(name: str, few: Dataset, tmp_path: Path) -> None:
     options = OPTIONS.get(name, {})
     kept = ["future", "everything"]

@@ -119,7 +119,8 @@ ENVIRONMENTS = {
 TOGETHER = (
     ("blas of prescott", "numpy without AVX2", "C library without FMA", "two threads"),
     ("blas of haswell", "numpy without AVX-512", "one thread", "hash seed, time zone and locale"),
-    ("blas of skylake", "generic processor for numba"),
+    ("blas of skylake",),
+    ("generic processor for numba",),
 )
 """Environments whose settings are made together: bytes that none of them changes are equal."""
 
@@ -178,7 +179,15 @@ def test_every_environment_is_tested() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("names", TOGETHER, ids=" + ".join)
+@pytest.mark.parametrize(
+    "names",
+    [
+        # All kernels are compiled for it, which takes minutes.
+        pytest.param(names, marks=pytest.mark.nightly if "generic" in names[0] else ())
+        for names in TOGETHER
+    ],
+    ids=" + ".join,
+)
 def test_other_processors_give_the_same_bytes(names: tuple[str, ...]) -> None:
     """The effect of the settings is checked first: ignored ones would prove nothing."""
     several = ("collide", "contain", "drape", "roll")

@@ -121,6 +121,7 @@ def test_contacts_are_distinguished_from_misses(result: Result) -> None:
     assert roc_auc_score(result.contacts, -result.gaps) >= 0.9
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_objects_are_nearer_to_the_truth_than_with_constant_velocity(result: Result) -> None:
     print(result.error, result.constant)
