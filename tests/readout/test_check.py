@@ -35,7 +35,6 @@ from support.moving_dots import make_dots
 from support.tiny_models import OPTIONS
 
 TESTED = 8
-"""Models whose check takes longest; the nightly tests check them."""
 HELD = [name for name, change in CHANGES.items() if change.must_hold]
 
 

@@ -128,6 +128,7 @@ def test_objects_are_nearer_to_the_truth_than_with_constant_velocity(result: Res
     assert result.error <= 0.30 * result.constant
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_permuted_labels_are_not_predicted(result: Result) -> None:
     """For n/2 contacts, the AUC of chance has the variance (n + 1) / (3 n^2)."""
