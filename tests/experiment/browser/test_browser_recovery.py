@@ -199,6 +199,7 @@ def test_the_second_tab_takes_over(chromium: Any, site: tuple[Study, str]) -> No
         visit.page.get_by_text("Trial 2 of 3").wait_for()
         first, visit.page = visit.page, visit.open_tab()
         visit.go()
+        visit.page.bring_to_front()  # a page that is hidden waits
         visit.page.get_by_text("Trial 2 of 3").wait_for()
         first.get_by_text("The study continues in another tab").wait_for()
         assert first.locator(".answer").count() == 0
