@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,7 @@ from physion.rendering.rasterizer import (
 )
 from physion.rendering.rooms import Room, rooms
 from physion.rendering.shading import KeptPixels, keep_nothing, shade
+from physion.rendering.textures.atlas import build_atlas
 from physion.rendering.triangles import Assembly, assemble, hide_absent, pose_meshes
 from physion.scenes.scene import Scene
 
@@ -130,26 +132,14 @@ class Renderer:
         self._check_trajectory()
         self.room: Room = rooms.get(scene.room)
         view = View(scene.camera, width, height)
-        self._projection = view.to_pixels
+        self._view, self._projection = view, view.to_pixels
         self._assembly = a = assemble(scene, self.room)
         self._kept_triangles = a.first_triangle if settings.keep_static else 0
         # Of vertices and normals, all those that never move are written here and stay.
         self._vertices = np.zeros((a.vertex_count, 3))
         self._normals = np.zeros((len(a.faces), 3, 3), np.float32)
         pose_meshes(a, scene, trajectory, 0, False, self._vertices, self._normals)
-        edges = np.zeros((len(a.faces), 3, 3))
-        self._triangles = Triangles(a.faces, a.two_sided, edges)
-        self._inputs = ShadingInputs(
-            camera=_pack_camera(view),
-            edges=edges,
-            surfaces=_pack_surfaces(a, self._normals),
-            groups=a.groups,
-            materials=a.materials,
-            atlas=a.atlas,
-            lights=pack_light(self.room),
-            tones=tone_table(self.room.exposure),
-        )
-        self._shadow, self._occlusion = self._draw_static_maps()
+        self._triangles = Triangles(a.faces, a.two_sided, np.zeros((len(a.faces), 3, 3)))
         self._static_points = self._to_pixels(self._vertices)
         self._static_buffer = self._draw_static()
         ids, nearness, drawn = self._static_buffer
@@ -174,8 +164,24 @@ class Renderer:
                 f"{len(scene.bodies)} bodies and {cloth} cloth vertices"
             )
 
-    def _draw_static_maps(self) -> tuple[StaticDepthMap, StaticDepthMap]:
-        """Return shadow and occlusion map with what never moves, without the room."""
+    @cached_property
+    def _inputs(self) -> ShadingInputs:
+        """What shading reads; only the colour pass needs it, and its textures take time."""
+        assembly = self._assembly
+        return ShadingInputs(
+            camera=_pack_camera(self._view),
+            edges=self._triangles.edges,
+            surfaces=_pack_surfaces(assembly, self._normals),
+            groups=assembly.groups,
+            materials=assembly.materials,
+            atlas=build_atlas(assembly.textures),
+            lights=pack_light(self.room),
+            tones=tone_table(self.room.exposure),
+        )
+
+    @cached_property
+    def _static_maps(self) -> tuple[StaticDepthMap, StaticDepthMap]:
+        """Shadow and occlusion map with what never moves, without the room."""
         maps, assembly = empty_maps(self.scene, self.room), self._assembly
         first, last = assembly.room_triangles, assembly.first_triangle
         for static in maps:
@@ -256,11 +262,11 @@ class Renderer:
 
     def _shade(self, vertices: F64, normals: F32) -> U8:
         """Return the colour pass (H, W, 3) of the frame that was drawn last."""
-        inputs, assembly = self._inputs, self._assembly
+        assembly, inputs = self._assembly, self._inputs
         faces, first = assembly.faces, assembly.first_triangle
         inputs.surfaces["normals"][first:] = normals[first:]
         moving = vertices, assembly.first_vertex, faces, first
-        maps = LightMaps(self._shadow.with_moving(*moving), self._occlusion.with_moving(*moving))
+        maps = LightMaps(*(static.with_moving(*moving) for static in self._static_maps))
         if self._kept_pixels is None:
             self._kept_pixels = keep_nothing(self.height, self.width, maps)
         colors = self._kept_pixels.colors.copy()

@@ -23,7 +23,7 @@ from physion.physics.trajectory import Trajectory
 from physion.rendering.light import to_linear
 from physion.rendering.rasterizer import MATERIAL, Records
 from physion.rendering.rooms import Panel, Room
-from physion.rendering.textures.atlas import Atlas, Finish, build_atlas, finish
+from physion.rendering.textures.atlas import Finish, finish
 from physion.scenes.scene import Look, Scene
 from physion.scenes.shapes.primitives import Shape, shape
 from physion.scenes.shapes.prop_shapes import PropShape
@@ -299,7 +299,7 @@ class Assembly:
       (T,), ``material`` (T,): as in `MeshPart`, with indices into all vertices, all surfaces and
       ``materials``.
     - ``object_ids`` (T,): 0 is the room, i + 1 the i-th of `Scene.names`.
-    - ``materials``, ``atlas``: surface materials and their textures.
+    - ``materials``, ``textures``: surface materials, and the names of their textures.
     - ``first_vertex``, ``first_triangle``: where the moving ones begin.
     - ``vertex_count``: all vertices. ``room_triangles``: triangles of the room, the first ones.
     """
@@ -313,7 +313,7 @@ class Assembly:
     tangents: F32
     material: I32
     materials: Records
-    atlas: Atlas
+    textures: tuple[str, ...]
     first_vertex: int
     first_triangle: int
     vertex_count: int
@@ -419,7 +419,7 @@ def _concatenate(
         tangents=np.concatenate([part.tangents for part, _ in parts]),
         material=np.concatenate([part.materials for part, _ in parts]),
         materials=table.materials(),
-        atlas=build_atlas(tuple(table.textures)),
+        textures=tuple(table.textures),
         first_vertex=last_static.vertices.stop,
         first_triangle=last_static.triangles.stop,
         vertex_count=vertex,
