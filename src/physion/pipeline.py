@@ -79,7 +79,8 @@ class RunSettings:
     sampled: bool = False
     """Sample scenes of Dominoes, Collide and Drop instead; nobody has seen them."""
     models: str | None = None
-    """Names of models with commas (physion ls models); default: ten for official scenes."""
+    """Names of models with commas (physion ls models); default: for official scenes nine, and the
+    random twin of one."""
     out: Path | None = None
     """Folder for trials, predictions and the report; default: runs/official or runs/sampled."""
     limit: int | None = None

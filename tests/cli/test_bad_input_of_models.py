@@ -127,8 +127,8 @@ def test_memory_that_is_used_up_names_what_to_lower(
         train[1] = f"{file}:{name}"
         assert message in refused(capsys, *train, "--option", "batch=4")
     evaluate = ["evaluate", f"{file}:HugeFeatures", str(made.folder), "--out", str(tmp_path)]
-    assert "lower encoder_batch (--option), now 4" in refused(capsys, *evaluate, *ENCODE)
-    one = [*ENCODE, "--option", "encoder_batch=1"]
+    assert "lower --encoder-batch, now 4" in refused(capsys, *evaluate, *ENCODE)
+    one = [*ENCODE, "--encoder-batch", "1"]
     assert "use a smaller image_size or size of the model" in refused(capsys, *evaluate, *one)
 
 
@@ -140,7 +140,7 @@ def test_memory_that_numpy_lacks_is_one_line(
         return 0
 
     monkeypatch.setattr("physion.cli.main._run_verb", exhausted)
-    assert "lower encoder_batch" in refused(capsys, "ls")
+    assert "lower --encoder-batch" in refused(capsys, "ls")
 
 
 def test_weights_of_another_network_name_the_tensors(

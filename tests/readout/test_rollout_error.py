@@ -171,7 +171,9 @@ def test_errors_of_a_dataset_come_only_from_the_observed_part(dataset: Dataset) 
     assert [len(motion.trajectory) for motion in model.asked] == [45, 45]
 
 
-def test_what_cannot_have_an_error_is_refused(dataset: Dataset) -> None:
+def test_what_cannot_have_an_error_is_refused(
+    dataset: Dataset, capsys: pytest.CaptureFixture[str]
+) -> None:
     class Lost(Standstill):
         def futures(self, *rest: Any) -> Any:
             results = super().futures(*rest)
@@ -180,14 +182,9 @@ def test_what_cannot_have_an_error_is_refused(dataset: Dataset) -> None:
 
     with pytest.raises(BadInputError, match="trial 'drop_0': positions that are not finite"):
         rollout_error(dataset, Lost(), ["drop_0"])
-    arguments = [
-        "evaluate",
-        "constant-motion",
-        str(dataset.folder),
-        "--option",
-        "rollout_errors=true",
-    ]
-    assert main(arguments) == 2
+    command = f"evaluate constant-motion {dataset.folder} --option rollout_errors=true"
+    assert main(command.split()) == 2
+    assert "imagines no motion of objects" in capsys.readouterr().err
     with pytest.raises(BadInputError, match=r"imagines no motion of objects.*such as dpi"):
         evaluate("constant-motion", dataset, "nowhere", rollout_errors=True)
 

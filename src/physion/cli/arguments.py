@@ -14,7 +14,7 @@ import types
 from collections.abc import Iterable, Sequence
 from dataclasses import MISSING, fields, is_dataclass, replace
 from functools import cache
-from itertools import pairwise
+from itertools import pairwise, zip_longest
 from pathlib import Path
 from typing import (
     TYPE_CHECKING,
@@ -34,7 +34,7 @@ import tyro
 from tyro import _errors
 
 from physion.core.errors import BadInputError
-from physion.core.settings import PAIR_ONLY, field_types, parse_pairs, read_pairs, read_settings
+from physion.core.settings import OPTION_ONLY, field_types, parse_pairs, read_pairs, read_settings
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -84,12 +84,21 @@ def read_options(options: Any, args: Sequence[str], prog: str, description: str)
         After ``--help`` was printed.
     """
     known = _described(options)
-    for word in args:
+    seen: set[str] = set()
+    for word, following in zip_longest(args, args[1:], fillvalue="--"):
         if word == "--":
             break
         name = word.partition("=")[0].replace("_", "-")
-        if re.match(r"--?[A-Za-z]", word) and name not in known:
+        if not re.match(r"--?[A-Za-z]", word):
+            continue
+        if name not in known:
             raise no_such("option", name, known, f"{prog} --help")
+        if name in seen:  # tyro would take the last one
+            raise BadInputError(f"{name} is given twice: write all its values after one {name}")
+        seen.add(name)
+        value = VALUES.get(name[2:], "")
+        if word == name and "=" in value and following.startswith("--"):
+            raise BadInputError(f"{name} needs a value: {value} ({prog} --help explains it)")
     with _errors.on_parse_error(_refuse):
         return tyro.cli(
             options,
@@ -100,13 +109,13 @@ def read_options(options: Any, args: Sequence[str], prog: str, description: str)
         )
 
 
-def take_pairs(settings: T, pairs: Iterable[str]) -> tuple[T, list[str]]:
+def take_options(settings: T, pairs: Iterable[str]) -> tuple[T, list[str]]:
     """Return settings whose fields without an option of their own come from ``--option``.
 
     Parameters
     ----------
     settings
-        Dataclass, whose fields with `PAIR_ONLY` are taken from ``pairs``; a field that holds
+        Dataclass, whose fields with `OPTION_ONLY` are taken from ``pairs``; a field that holds
         settings itself takes ``FIELD.NAME=VALUE``.
     pairs
         Texts NAME=VALUE.
@@ -122,15 +131,24 @@ def take_pairs(settings: T, pairs: Iterable[str]) -> tuple[T, list[str]]:
         If a value has another type, is out of range or given twice.
     """
     kinds = field_types(type(settings))
-    own: dict[str, list[str]] = {k: [] for k, kind in kinds.items() if PAIR_ONLY in get_args(kind)}
+    own: dict[str, list[str]] = {
+        k: [] for k, kind in kinds.items() if OPTION_ONLY in get_args(kind)
+    }
     rest: list[str] = []
     for pair in pairs:
-        name = re.split(r"[.=]", pair, maxsplit=1)[0]
-        own.get(name, rest).append(pair)
+        key, sign, _ = pair.partition("=")
+        if not sign:
+            raise BadInputError(
+                f"--option takes NAME=VALUE, not {pair!r}; other words stand before it"
+            )
+        # A file of a model, logistic.py:Net:NAME, may have the name of a setting.
+        own.get("" if ":" in key else key.partition(".")[0], rest).append(pair)
     values: dict[str, Any] = {}
     for name, given in own.items():
         current = getattr(settings, name)
         if given and is_dataclass(current):
+            if plain := [pair for pair in given if not pair.startswith(f"{name}.")]:
+                raise BadInputError(f"--option takes {name}.NAME=VALUE, not {plain[0]!r}")
             nested = [pair.removeprefix(f"{name}.") for pair in given]
             values[name] = read_pairs(type(current), nested, f"--option {name}")
         elif given:
@@ -161,7 +179,7 @@ def _described(options: Any) -> tuple[str, ...]:
     """Return all options of a dataclass, and write into its annotations how the help shows them.
 
     Values get names, defaults that say nothing (None, no text, no names, False) are left out, and
-    a switch that is off has no ``--no-`` form. A field with `PAIR_ONLY` is no option.
+    a switch that is off has no ``--no-`` form. A field with `OPTION_ONLY` is no option.
     """
     names = ["-h", "--help"]
     hints, texts = get_type_hints(options, include_extras=True), _texts(options)
@@ -170,9 +188,9 @@ def _described(options: Any) -> tuple[str, ...]:
         parts = get_args(hint) if get_origin(hint) is Annotated else (hint,)
         kind: Any = parts[0]
         extras = list(parts[1:])
-        if PAIR_ONLY in extras:
-            # The marker stays, for `take_pairs`.
-            options.__annotations__[field.name] = Annotated[kind, PAIR_ONLY, tyro.conf.Suppress]
+        if OPTION_ONLY in extras:
+            # The marker stays, for `take_options`.
+            options.__annotations__[field.name] = Annotated[kind, OPTION_ONLY, tyro.conf.Suppress]
             continue
         if hasattr(kind, "__dataclass_fields__"):  # further options, without a name of their own
             names += _described(kind)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from physion.cli.arguments import take_pairs
+from physion.cli.arguments import take_options
 from physion.cli.output import (
     Stages,
     print_line,
@@ -58,10 +58,11 @@ class Options:
     in place of the dataset's own. If it has no movies, add --rendered."""
     option: tuple[str, ...] = ()
     """Settings of all models or of their training, such as encoder=resnet50 weights=random
-    steps=500; of one of several models as MODEL:NAME=VALUE. Of the evaluation: folds=5 of the
-    cross-validation of a dataset without a readout split; encoder_batch=4, clips that a network
-    encodes at a time; rollout_errors=true, which also writes how far motion that particle models
-    imagine is from the true one; logistic.folds=3 and other settings of the logistic regression."""
+    steps=500; of one of several models as MODEL:NAME=VALUE. Of the evaluation: folds=3, parts into
+    which trials are divided where a dataset without a readout split is cross-validated (default:
+    5); rollout_errors=true: also write how far the motion that particle models imagine is from the
+    true one. Of the logistic regression: logistic.folds=3 (for the choice of its penalty),
+    logistic.grid, logistic.seed, logistic.balance, logistic.released."""
     settings: Annotated[EvaluationSettings, tyro.conf.arg(name="")] = field(
         default_factory=EvaluationSettings
     )
@@ -90,7 +91,9 @@ def main(options: Options) -> int:
         for name, value in given.items():
             if value:
                 raise BadInputError(f"{name} does not apply to --surprise: leave it out")
-    settings, of_models = take_pairs(options.settings, options.option)
+    settings, of_models = take_options(options.settings, options.option)
+    if options.surprise and len(of_models) < len(options.option):
+        raise BadInputError("--surprise takes options of models only: leave the others out")
     models, dataset = split_names(options.models, "model"), options.dataset
     if dataset is None:  # the only word is the dataset
         if options.features is None:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-from physion.cli.arguments import take_pairs
+from physion.cli.arguments import take_options
 from physion.cli.output import Stages, print_report
 from physion.compute.run_tasks import ExecutorSettings
 from physion.core.errors import BadInputError
+from physion.core.settings import check_keys
 from physion.trials.making.generate import FailedTrialsError, generate
 from physion.trials.making.plan import FULL_COUNTS, SPLITS, GenerateSettings
 
@@ -50,10 +51,11 @@ class Options:
     )
     """How trials are chosen, rendered and stored."""
     option: tuple[str, ...] = ()
-    """Further settings: robust=0.9 and min_visible=0.01 are the smallest accepted fractions of
-    jittered simulations with the trial's outcome, and of the first frame that agent and patient
-    each cover; observed_contact=true accepts trials whose contact is in the observed part;
-    labels=false stores no labels in the split training; compatible=true compresses with gzip."""
+    """Further settings. robust=0.9: at least 90 % of the jittered simulations have the trial's
+    outcome (default: 0). min_visible=0.01: agent and patient each cover at least 1 % of the first
+    frame (default: 0.0005). observed_contact=true: also readout, testing and familiarization trials
+    with a contact in the observed part. labels=false: neither labels nor maps in the split
+    training. compatible=true: compression by gzip instead of zstd."""
     compute: Annotated[ExecutorSettings, tyro.conf.arg(name="")] = field(
         default_factory=ExecutorSettings
     )
@@ -64,9 +66,12 @@ class Options:
 
 def main(options: Options) -> int:
     """Make the missing trials; 1 if one failed."""
-    settings, unknown = take_pairs(options.settings, options.option)
+    settings, unknown = take_options(options.settings, options.option)
+    own = [field.name for field in fields(GenerateSettings)]
+    check_keys((pair.partition("=")[0] for pair in unknown), own, "--option")
     if unknown:
-        raise BadInputError(f"generate has no --option {unknown[0]} (physion generate --help)")
+        name = unknown[0].partition("=")[0]
+        raise BadInputError(f"{name} has an option of its own: --{name.replace('_', '-')}")
     splits = SPLITS if options.split == "all" else (options.split,)
     counts = {split: FULL_COUNTS[split] if options.full else options.count for split in splits}
     try:

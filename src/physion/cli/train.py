@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from physion.cli.arguments import take_pairs
+from physion.cli.arguments import take_options
 from physion.cli.output import Stages, print_line, print_plan
 from physion.compute.run_tasks import ExecutorSettings
 from physion.core.settings import split_names
@@ -38,8 +38,8 @@ class Options:
     option: tuple[str, ...] = ()
     """Settings of the models or of their training as NAME=VALUE, such as size=paper steps=500
     batch=16 learning_rate=1e-3; of one of several models as MODEL:NAME=VALUE. Of all trainings:
-    folds=5 of the cross-validation of a dataset without a readout split, and encoder_batch=4, clips
-    that a network encodes at a time."""
+    folds=3, parts into which trials are divided where a dataset without a readout split is
+    cross-validated (default: 5)."""
     settings: Annotated[TrainSettings, tyro.conf.arg(name="")] = field(
         default_factory=TrainSettings
     )
@@ -57,7 +57,7 @@ class Options:
 
 def main(options: Options) -> int:
     """Train what is missing; return 1 if a training of several failed."""
-    settings, of_models = take_pairs(options.settings, options.option)
+    settings, of_models = take_options(options.settings, options.option)
     with Stages() as stages:
         done = train(
             options_by_model(split_names(options.models, "model"), of_models),

@@ -14,6 +14,7 @@ import difflib
 import functools
 import json
 import math
+import re
 import reprlib
 import tomllib
 import types
@@ -41,9 +42,9 @@ MAX_BYTES = 1 << 28
 STRICT: ConfigDict = {"strict": True, "extra": "forbid", "allow_inf_nan": False}
 """Configuration of all that is read; pydantic models take it as their ``model_config``."""
 
-PAIR_ONLY = "only by --option"
-"""In the type of a field, ``Annotated[int, PAIR_ONLY]``: the command line sets it by
-``--option NAME=VALUE``, and has no option of its own for it."""
+OPTION_ONLY = "only by --option"
+"""In the type of a field, ``Annotated[int, OPTION_ONLY]``: the command line sets it by
+``--option NAME=VALUE`` only."""
 
 _REPR = reprlib.Repr()
 _REPR.maxlevel, _REPR.maxlist, _REPR.maxdict, _REPR.maxstring, _REPR.maxlong = 3, 4, 4, 60, 40
@@ -185,7 +186,9 @@ def parse_pairs(pairs: Iterable[str], where: str) -> dict[str, Any]:
         try:
             values[name] = json.loads(text)
         except (ValueError, RecursionError):
-            values[name] = text
+            # Also .9 and 1., which are no JSON.
+            number = re.fullmatch(r"[+-]?(\d+\.|\.\d+)", text)
+            values[name] = float(text) if number else text
     return values
 
 

@@ -699,7 +699,7 @@ def _read_clips(read: Callable[[tuple[str, ...]], Batch], group: tuple[str, ...]
         return read(group)
     except MemoryError as error:
         count = len(group)
-        advice = MEMORY_ADVICE if count == 1 else f"lower encoder_batch (--option), now {count}"
+        advice = MEMORY_ADVICE if count == 1 else f"lower --encoder-batch, now {count}"
         raise OutOfMemoryError(
             f"reading {count} clips at a time ran out of memory; {advice}"
         ) from error

@@ -51,7 +51,7 @@ def check_moves_objects(model: Model) -> Any:
     if not callable(getattr(model, "futures", None)):
         raise BadInputError(
             f"model {model_name(model)!r} imagines no motion of objects, so that its rollout has "
-            "no error; choose a particle model such as dpi, or leave rollout_errors away"
+            "no error; choose a particle model such as dpi, or leave rollout_errors out"
         )
     return model
 

@@ -20,7 +20,7 @@ from physion.compute.local import LocalExecutor, SerialExecutor
 from physion.compute.run_tasks import run_tasks
 from physion.compute.tasks import Executor, Progress
 from physion.core.errors import BadInputError, PhysionError
-from physion.core.settings import PAIR_ONLY, field_types, parse_pairs, read_settings, split_names
+from physion.core.settings import OPTION_ONLY, field_types, parse_pairs, read_settings, split_names
 from physion.models.build import build_model, build_untrained, option_names
 from physion.models.interface import RANDOM, Model, TrainingSettings, ask, can
 from physion.models.user_files import is_file_name
@@ -46,9 +46,9 @@ class HarnessSettings:
     """Number of seeds: --seed and the ones after it."""
     seed: int = 0
     """First seed: of initial weights, folds and training."""
-    folds: Annotated[int, PAIR_ONLY] = 5
+    folds: Annotated[int, OPTION_ONLY] = 5
     """Folds of the cross-validation of a dataset without a readout split."""
-    encoder_batch: Annotated[int, PAIR_ONLY] = 4
+    encoder_batch: int = 4
     """Clips that a network encodes at a time; lower it when memory runs out."""
     rendered: bool = False
     """Render the pictures from the stored motions instead of reading the movies."""
@@ -98,9 +98,9 @@ class EvaluationSettings(HarnessSettings):
     twin: bool = False
     """Also evaluate a random twin of each model that has weights: the same network with
     weights=random; if it is an encoder with dynamics, the dynamics are trained."""
-    rollout_errors: Annotated[bool, PAIR_ONLY] = False
+    rollout_errors: Annotated[bool, OPTION_ONLY] = False
     """Also write, for particle models, how far imagined motion is from the true one over time."""
-    logistic: Annotated[LogisticSettings, PAIR_ONLY] = field(default_factory=LogisticSettings)
+    logistic: Annotated[LogisticSettings, OPTION_ONLY] = field(default_factory=LogisticSettings)
     """Settings of the logistic regression."""
 
 

@@ -26,7 +26,7 @@ class Options:
     base_url: str = "http://127.0.0.1:8000"
     """Public root URL of the server."""
     ids: Path | None = None
-    """Text file with one id a line; prints a signed link for each."""
+    """Text file with one id per line; prints a signed link for each."""
     source: Literal["link", "prolific", "sona", "mturk"] = "link"
     """Recruiter of these ids."""
     json: bool = False

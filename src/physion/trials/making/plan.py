@@ -13,7 +13,7 @@ import numpy as np
 
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.seeds import trial_seed
-from physion.core.settings import PAIR_ONLY
+from physion.core.settings import OPTION_ONLY
 from physion.physics.engine import DEFAULT_ENGINE, engines
 from physion.scenes.sampling.build import scenarios as known_scenarios
 from physion.scenes.sampling.sample import default_presets, get_preset
@@ -108,7 +108,7 @@ class GenerateSettings:
     with movies also has a map of agent and patient."""
     movies: bool = True
     """Make movies and maps; otherwise trials have only trial files."""
-    labels: Annotated[bool, PAIR_ONLY] = True
+    labels: Annotated[bool, OPTION_ONLY] = True
     """Store labels of all trials. If false, trials of the split training have neither labels nor
     a map of agent and patient."""
     playback: Literal["slow", "real"] = "slow"
@@ -116,17 +116,17 @@ class GenerateSettings:
     3.33 times slower than real time. Real ones show 100 frames per second."""
     passes: tuple[str, ...] = ()
     """Image passes to store (color depth normals ids flow). All can also be rendered later."""
-    compatible: Annotated[bool, PAIR_ONLY] = False
+    compatible: Annotated[bool, OPTION_ONLY] = False
     """Compress with gzip, which every HDF5 reader supports, instead of zstd."""
     jitters: int = 8
     """Number of jittered simulations that measure how robust each label is; 0 for none."""
-    robust: Annotated[float, PAIR_ONLY] = 0.0
+    robust: Annotated[float, OPTION_ONLY] = 0.0
     """Smallest accepted fraction of jittered simulations with the trial's outcome."""
-    min_visible: Annotated[float, PAIR_ONLY] = 0.0005
+    min_visible: Annotated[float, OPTION_ONLY] = 0.0005
     """Smallest accepted fraction of the first frame that agent and patient each cover."""
     engine: str = DEFAULT_ENGINE
     """Engine that moves the bodies (see physion ls engines); mujoco has no cloth."""
-    observed_contact: Annotated[bool, PAIR_ONLY] = False
+    observed_contact: Annotated[bool, OPTION_ONLY] = False
     """Accept trials for readout, testing and familiarization also if agent and patient touch in the
     observed part, as the official sets do."""
 
@@ -146,13 +146,13 @@ class GenerateSettings:
             raise BadInputError(f"unknown look {self.look!r}; known: redyellow, free, split")
         if self.playback not in PLAYBACK_RATES:
             raise BadInputError(f"unknown playback {self.playback!r}; known: slow, real")
-        if self.jitters < 0 or not 0 <= self.robust <= 1 or not 0 <= self.min_visible < 1:
-            raise BadInputError(
-                f"jitters {self.jitters} must not be below 0, robust {self.robust} and least "
-                f"visible fraction {self.min_visible} must lie in 0..1"
-            )
+        if self.jitters < 0:
+            raise BadInputError(f"jitters must be at least 0, not {self.jitters}")
+        for name, value in (("robust", self.robust), ("min_visible", self.min_visible)):
+            if not 0 <= value <= 1:
+                raise BadInputError(f"{name} must lie in 0..1, not {value}")
         if self.robust and not self.jitters:
-            raise BadInputError("a least robustness needs jittered simulations; jitters is 0")
+            raise BadInputError("robust needs jittered simulations, and jitters is 0")
         if self.passes and not self.movies:
             raise BadInputError("image passes are stored with movies only; leave one of them out")
 
