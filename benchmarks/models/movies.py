@@ -152,10 +152,10 @@ def write_movies(name: str, dataset: Dataset, folder: Path) -> None:
 def row_of(name: str, dataset: Dataset, folder: Path) -> dict[str, object]:
     """Return the row of a generator: the means over seeds, and the comparison with people."""
     done = judge(folder, dataset.folder, folder / "judged", executor=SerialExecutor())
-    assert not len(done.missing), done.missing
     means = done.seeds.set_index("seed").loc["mean"]
     row: dict[str, object] = {"generator": name, "given": GENERATORS[name][0]}
-    row |= {"seeds": len(done.card.seeds)} | {measure: means[measure] for measure in MEASURES}
+    row |= {"seeds": len(done.card.seeds), "not judged": len(done.missing)}
+    row |= {measure: means[measure] for measure in MEASURES}
     seen = done.movies["contact_seen"] == done.movies["true_contact"]
     row["contact_seen"] = float(seen.groupby(done.movies["seed"]).mean().mean())
     scores = physion.compare(done.paths["predictions"], humans="official").scores
@@ -189,7 +189,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         f"`python benchmarks/models/movies.py FOLDER --count {options.count}`, "
         f"{len(dataset.trials('testing'))} official stimuli, {datetime.date.today()}. Measures of "
         "docs/how-to/judge-movies.md, means over movies and seeds; `contact_seen` is the fraction "
-        "of movies in which it is the true outcome.",
+        "of movies in which it is the true outcome. Not judged is a movie that equals one of another "
+        "seed; it counts as wrong.",
         "",
         *(f"| {' | '.join(row)} |" for row in cells),
     ]
