@@ -189,8 +189,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         f"`python benchmarks/models/movies.py FOLDER --count {options.count}`, "
         f"{len(dataset.trials('testing'))} official stimuli, {datetime.date.today()}. Measures of "
         "docs/how-to/judge-movies.md, means over movies and seeds; `contact_seen` is the fraction "
-        "of movies in which it is the true outcome. Not judged are movies that equal one of another "
-        "seed; they count as wrong.",
+        "of movies in which it is the true outcome. Not judged are movies that equal one of "
+        "another seed; they count as wrong.",
         "",
         *(f"| {' | '.join(row)} |" for row in cells),
     ]

@@ -34,7 +34,7 @@ from physion.scenes.tdw.read_logs import TrialSet
 from physion.trials.making.plan import GenerateSettings
 
 SMALL = ["--limit", "2", "--size", "64", "--workers", "2"]
-FEW = ["--option", "steps=10", "noisy-simulation:samples=4"]
+FEW = ["--option", "steps=10", "noisy-simulation:samples=2"]
 
 
 def digests(folder: Path) -> dict[str, str]:
