@@ -93,11 +93,13 @@ def read_options(options: Any, args: Sequence[str], prog: str, description: str)
             continue
         if name not in known:
             raise no_such("option", name, known, f"{prog} --help")
+        value = VALUES.get(name[2:], "")
+        if "=" not in value:
+            continue
         if name in seen:  # tyro would take the last one
             raise BadInputError(f"{name} is given twice: write all its values after one {name}")
         seen.add(name)
-        value = VALUES.get(name[2:], "")
-        if word == name and "=" in value and following.startswith("--"):
+        if word == name and following.startswith("--"):
             raise BadInputError(f"{name} needs a value: {value} ({prog} --help explains it)")
     with _errors.on_parse_error(_refuse):
         return tyro.cli(
