@@ -153,14 +153,23 @@ def row_of(name: str, dataset: Dataset, folder: Path) -> dict[str, object]:
     """Return the row of a generator: the means over seeds, and the comparison with people."""
     done = judge(folder, dataset.folder, folder / "judged", executor=SerialExecutor())
     means = done.seeds.set_index("seed").loc["mean"]
+    asked = done.movies[done.movies["trial"].isin(unanswered(dataset))]
     row: dict[str, object] = {"generator": name, "given": GENERATORS[name][0]}
     row |= {"seeds": len(done.card.seeds), "not judged": len(done.missing)}
     row |= {measure: means[measure] for measure in MEASURES}
-    seen = done.movies["contact_seen"] == done.movies["true_contact"]
-    row["contact_seen"] = float(seen.groupby(done.movies["seed"]).mean().mean())
-    scores = physion.compare(done.paths["predictions"], humans="official").scores
+    for name in ("contact", "contact_seen"):
+        row["right" if name == "contact" else name] = (asked[name] == asked["true_contact"]).mean()
+    predictions = pd.read_csv(done.paths["predictions"])
+    predictions = predictions[predictions["stimulus"].isin(unanswered(dataset))]
+    scores = physion.compare(predictions, humans="official").scores
     own = scores[(scores["scenario"] == "pooled") & (scores["kind"] == "model")].iloc[0]
-    return row | {"r with people": own["r"], "kappa": own["kappa"]}
+    return row | {"r with people": own["r"]}
+
+
+def unanswered(dataset: Dataset) -> list[str]:
+    """Return the stimuli without a contact in the observed part, which would be the answer."""
+    index = dataset.index
+    return list(index["trial"][~index["observed_contact"].astype(bool)])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -188,9 +197,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "",
         f"`python benchmarks/models/movies.py FOLDER --count {options.count}`, "
         f"{len(dataset.trials('testing'))} official stimuli, {datetime.date.today()}. Measures of "
-        "docs/how-to/judge-movies.md, means over movies and seeds; `contact_seen` is the fraction "
-        "of movies in which it is the true outcome. Not judged are movies that equal one of "
-        "another seed; they count as wrong.",
+        "docs/how-to/judge-movies.md, means over movies and seeds. `right`, `contact_seen` (the "
+        "fraction of movies in which it is the true outcome) and r are of the "
+        f"{len(unanswered(dataset))} stimuli without a contact in the observed part. Not judged "
+        "are movies that equal one of another seed; they count as wrong.",
         "",
         *(f"| {' | '.join(row)} |" for row in cells),
     ]
