@@ -35,6 +35,8 @@ from support.moving_dots import make_dots
 from support.tiny_models import OPTIONS
 
 TESTED = 8
+QUICK = {"blob-trees", "constant-motion", "cswm", "state-trees"}
+"""Models of different kinds whose check is quick; the nightly tests check the others."""
 HELD = [name for name, change in CHANGES.items() if change.must_hold]
 
 
@@ -513,9 +515,14 @@ def few(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return make_late_motions(tmp_path_factory.mktemp("few") / "few", {"readout": 4, "testing": 2})
 
 
-@pytest.mark.nightly
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(models.names()))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in QUICK else pytest.mark.nightly)
+        for name in sorted(models.names())
+    ],
+)
 def test_every_shipped_model_passes(name: str, few: Dataset, tmp_path: Path) -> None:
     options = OPTIONS.get(name, {})
     kept = ["future", "everything"]
