@@ -1,7 +1,7 @@
 """Measure how often `physion judge` sees what a movie shows.
 
-    OMP_NUM_THREADS=1 python benchmarks/models/judge.py FOLDER [--count 12] [--workers 2] [--clean]
-                                                            [--known] [--write]
+    OMP_NUM_THREADS=1 python benchmarks/models/judge.py FOLDER [--count 12] [--workers 2] [--known]
+                                                            [--write]
 
 Testing trials in red and yellow are made in FOLDER/trials, ``--count`` of each scenario. Of each,
 the true continuation is encoded again, by itself and after each of `CORRUPTIONS` and `FAULTS`, and
@@ -16,9 +16,7 @@ Printed are:
 3. Processor seconds for a movie of 150 frames, decoding included, with a quarter of the time that
    the true movie takes: four seeds share it.
 
-With --clean only clean movies are measured, which takes a tenth of the time; their lines are in
-FOLDER/clean.jsonl. With --known nothing more is measured. With --write the tables are written to
-``results/judge.md`` or ``results/judge-clean.md``.
+With --known nothing more is measured. With --write the tables are written to ``results/judge.md``.
 """
 
 from __future__ import annotations
@@ -46,7 +44,7 @@ from physion.trials.making.plan import GenerateSettings
 from physion.trials.share.conditioning import SEEDS
 from physion.trials.video import encode_movie, read_frames
 
-RESULTS = Path(__file__).parents[1] / "results"
+RESULTS = Path(__file__).parents[1] / "results" / "judge.md"
 U8 = NDArray[np.uint8]
 RATE = 30
 
@@ -112,9 +110,9 @@ def faulty(frames: U8, first: int, reference: KnownMovie) -> dict[str, U8]:
     return {"freeze": frozen} | found
 
 
-def judge_trial(task: tuple[Path, str, bool]) -> dict[str, Any]:
-    """Return the measures of all movies of a trial, or only of the clean one."""
-    folder, trial, clean = task
+def judge_trial(task: tuple[Path, str]) -> dict[str, Any]:
+    """Return the measures of all movies of a trial."""
+    folder, trial = task
     dataset = Dataset(folder)
     opened, frames = dataset.trial(trial), dataset.frames(trial)
     first = opened.metadata.observed_frames
@@ -122,10 +120,8 @@ def judge_trial(task: tuple[Path, str, bool]) -> dict[str, Any]:
     reference = reference_of(opened, frames, RATE)
     shared = (time.process_time() - start) / len(frames) / SEEDS
     movies = {name: (change(frames[first:]), rate, crf)
-              for name, (change, rate, crf) in CORRUPTIONS.items()
-              if name == "clean" or not clean}  # fmt: skip
-    faults = {} if clean else faulty(frames, first, reference)
-    movies |= {name: (movie, RATE, 18) for name, movie in faults.items()}
+              for name, (change, rate, crf) in CORRUPTIONS.items()}  # fmt: skip
+    movies |= {name: (movie, RATE, 18) for name, movie in faulty(frames, first, reference).items()}
     shown = float((reference.tracks.area[(first + len(frames)) // 2 :, 0] > 0).mean())
     labels, rows, spent, count = opened.known_labels(), {}, 0.0, 0
     with tempfile.TemporaryDirectory() as temporary:
@@ -142,7 +138,6 @@ def judge_trial(task: tuple[Path, str, bool]) -> dict[str, Any]:
 
 def tables(rows: list[dict[str, Any]]) -> list[pd.DataFrame]:
     """Return the tables of contacts, of the movie only, and of faults."""
-    changes = [name for name in CORRUPTIONS if name in rows[0]["movies"]]
     contact: list[dict[str, Any]] = []
     seen: list[dict[str, Any]] = []
     scenarios = sorted({row["scenario"] for row in rows})
@@ -153,11 +148,11 @@ def tables(rows: list[dict[str, Any]]) -> list[pd.DataFrame]:
         for key, out in (("contact", contact), ("contact_seen", seen)):
             right = {
                 change: [row["movies"][change][key] == row["contact"] for row in own]
-                for change in changes
+                for change in CORRUPTIONS
             }
             out.append(line | {change: float(np.mean(all_of)) for change, all_of in right.items()})
     faults = []
-    for fault, (measured, sign) in FAULTS.items() if len(changes) > 1 else ():
+    for fault, (measured, sign) in FAULTS.items():
         shown = [row for row in rows if visible(row, fault)]
         worse = [
             all(
@@ -168,7 +163,7 @@ def tables(rows: list[dict[str, Any]]) -> list[pd.DataFrame]:
         ]
         faults.append({"fault": fault, "measure": measured, "trials": len(shown),
                        "worse than clean and corrupted": float(np.mean(worse))})  # fmt: skip
-    return [pd.DataFrame(table) for table in (contact, seen, faults) if table]
+    return [pd.DataFrame(table) for table in (contact, seen, faults)]
 
 
 def visible(row: dict[str, Any], fault: str) -> bool:
@@ -182,10 +177,7 @@ def visible(row: dict[str, Any], fault: str) -> bool:
 
 def mistakes(row: dict[str, Any]) -> list[str]:
     """Return the corruptions after which the contact of a trial is wrong."""
-    return [
-        name for name, movie in row["movies"].items()
-        if name in CORRUPTIONS and movie["contact"] != row["contact"]
-    ]  # fmt: skip
+    return [name for name in CORRUPTIONS if row["movies"][name]["contact"] != row["contact"]]
 
 
 def main() -> None:
@@ -194,7 +186,6 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--count", type=int, default=12)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--clean", action="store_true")
     parser.add_argument("--known", action="store_true")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
@@ -206,15 +197,11 @@ def main() -> None:
     # One trial of each scenario after the other, so that an interrupted run has some of all.
     order = index.groupby("scenario", observed=True).cumcount()
     trials = index.assign(order=order)[order < options.count].sort_values("order")["trial"]
-    name = "clean" if options.clean else "judge"
-    done = options.folder / f"{name}.jsonl"
+    done = options.folder / "judge.jsonl"
     rows = [json.loads(line) for line in done.read_text().splitlines()] if done.exists() else []
     there = {row["trial"] for row in rows}
     known = set() if options.known else set(map(str, trials))
-    todo = {
-        trial: (folder, trial, options.clean)
-        for trial in sorted(known - there, key=list(trials).index)
-    }
+    todo = {trial: (folder, trial) for trial in sorted(known - there, key=list(trials).index)}
     with done.open("a") as out:
         for outcome in LocalExecutor(options.workers).map(judge_trial, todo):
             assert outcome.value is not None, outcome.error
@@ -224,10 +211,9 @@ def main() -> None:
     lines = [
         "# Judging movies",
         "",
-        f"`python benchmarks/models/judge.py FOLDER --count {options.count}"
-        f"{' --clean' if options.clean else ''}`, {len(rows)} trials, "
+        f"`python benchmarks/models/judge.py FOLDER --count {options.count}`, {len(rows)} trials, "
         f"{datetime.date.today()}. Fraction of movies whose contact is right; then by the movie "
-        f"only{'' if options.clean else '; then faults'}.",
+        "only; then faults.",
     ]
     for table in tables(rows):
         cells = [[f"{v:.3f}" if isinstance(v, float) else str(v) for v in row]
@@ -240,8 +226,7 @@ def main() -> None:
               f"Wrong contacts: {'; '.join(wrong) or 'none'}."]  # fmt: skip
     print("\n".join(lines))
     if options.write:
-        path = RESULTS / f"judge{'-clean' if options.clean else ''}.md"
-        path.write_text("\n".join([*lines, ""]))
+        RESULTS.write_text("\n".join([*lines, ""]))
 
 
 if __name__ == "__main__":

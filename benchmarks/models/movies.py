@@ -157,17 +157,17 @@ def row_of(name: str, dataset: Dataset, folder: Path) -> dict[str, object]:
     row: dict[str, object] = {"generator": name, "given": GENERATORS[name][0]}
     row |= {"seeds": len(done.card.seeds), "not judged": len(done.missing)}
     row |= {measure: means[measure] for measure in MEASURES}
-    for name in ("contact", "contact_seen"):
-        row["right" if name == "contact" else name] = (asked[name] == asked["true_contact"]).mean()
+    row["right"] = (asked["contact"] == asked["true_contact"]).mean()
+    row["contact_seen"] = (asked["contact_seen"] == asked["true_contact"]).mean()
     predictions = pd.read_csv(done.paths["predictions"])
-    predictions = predictions[predictions["stimulus"].isin(unanswered(dataset))]
+    predictions = predictions[predictions["stimulus"].isin(asked["trial"])]
     scores = physion.compare(predictions, humans="official").scores
     own = scores[(scores["scenario"] == "pooled") & (scores["kind"] == "model")].iloc[0]
     return row | {"r with people": own["r"]}
 
 
 def unanswered(dataset: Dataset) -> list[str]:
-    """Return the stimuli without a contact in the observed part, which would be the answer."""
+    """Return the stimuli whose observed part shows no contact: the answer is still open."""
     index = dataset.index
     return list(index["trial"][~index["observed_contact"].astype(bool)])
 
@@ -192,6 +192,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for row in [table.columns, *table.to_numpy().tolist()]
     ]
     cells.insert(1, ["---"] * len(table.columns))
+    index = dataset.index.set_index("trial")
+    contacts = int(index.loc[unanswered(dataset), "contact"].sum())
     lines = [
         "# Generated movies, judged",
         "",
@@ -199,7 +201,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         f"{len(dataset.trials('testing'))} official stimuli, {datetime.date.today()}. Measures of "
         "docs/how-to/judge-movies.md, means over movies and seeds. `right`, `contact_seen` (the "
         "fraction of movies in which it is the true outcome) and r are of the "
-        f"{len(unanswered(dataset))} stimuli without a contact in the observed part. Not judged "
+        f"{len(unanswered(dataset))} stimuli without a contact in the observed part, of which "
+        f"{contacts} have one later. Not judged "
         "are movies that equal one of another seed; they count as wrong.",
         "",
         *(f"| {' | '.join(row)} |" for row in cells),
