@@ -3,22 +3,29 @@
 #
 #     bash benchmarks/gpu.sh [OUT] [DATA]
 #
-# It makes own trials on all cores for MAKE seconds (default 240), keeps what was made, trains, and
-# writes tables and weights as float16 (under 16 MB each) to OUT. DATA holds trials and trainings;
-# the same command continues. PIXELS, STEPS and BATCH set picture size and length of the training.
-# It needs the package's dependencies and torch with CUDA; on a CPU it does the same, slowly.
+# It makes own trials on all cores for MAKE seconds (default 240), keeps what was made, trains the
+# three models at the same time for STEPS steps, and writes tables, predictions and weights as
+# float16 to OUT/gpu.tar. DATA holds trials and trainings, in memory where there is room; the same
+# command continues. PIXELS and SIZE are the side of the pictures and the size of the model of
+# pixels. It needs the package's dependencies and torch with CUDA; on a CPU it does the same, slowly.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-out=${1:-${OUT:-runs/gpu}} data=${2:-runs/gpu-data}
-export PYTHONPATH=$PWD/src OMP_NUM_THREADS=1 PYTHONUNBUFFERED=1
-mkdir -p "$out"
-trials=(python benchmarks/models/intuition_trials.py "$data" --workers "$(nproc)" --pixels "${PIXELS:-96}")
+out=${1:-${OUT:-runs/gpu}} data=${2:-runs/gpu-data} pixels=${PIXELS:-96} steps=${STEPS:-4000}
+export PYTHONPATH=$PWD/src${PYTHONPATH:+:$PYTHONPATH} OMP_NUM_THREADS=1 PYTHONUNBUFFERED=1
+mkdir -p "$out" "$data/said" "$data/weights"
+trials=(python benchmarks/models/intuition_trials.py "$data" --workers "$(nproc)" --pixels "$pixels")
 "${trials[@]}" --official | tail -n 1
-timeout --signal=INT "${MAKE:-240}" "${trials[@]}" --trials "${TRIALS:-20000}" > "$out/made.txt" || true
-tail -n 1 "$out/made.txt"
-unset OMP_NUM_THREADS
-for model in intuition-states intuition-masks intuition-pixels; do
-    python benchmarks/models/train_intuition.py "$data" --models "$model" --weights "$out" \
-        --steps "${STEPS:-4000}" --batch "${BATCH:-128}" | tee "$out/$model.txt"
-done
-cp -r "$data/predictions" "$out/"
+timeout --signal=INT "${MAKE:-240}" "${trials[@]}" --trials "${TRIALS:-20000}" > "$data/said/made.txt" 2>&1 || true
+ls "$data/own" | wc -l
+train() {
+    local model=$1
+    shift
+    python benchmarks/models/train_intuition.py "$data" --models "$model" --weights "$data/weights" \
+        --steps "$steps" "$@" > "$data/said/$model.txt" 2>&1 || echo "$model failed" >> "$data/said/$model.txt"
+}
+train intuition-states --batch 512 &
+train intuition-masks --batch 512 --option image_size="$pixels" &
+train intuition-pixels --option image_size="$pixels" size="${SIZE:-medium}" &
+wait
+tail -n 5 "$data"/said/intuition-*.txt
+tar -C "$data" -cf "$out/gpu.tar" said weights predictions

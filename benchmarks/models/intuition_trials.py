@@ -7,8 +7,8 @@ A trial is sampled from the published configurations in turn, simulated until ag
 touch, and drawn at the observed frames. Of trials with the digest of a training trial, without a
 contact in the observed part, and with agent and patient visible in the first frame, the features of
 all `MODELS` are written to FOLDER/own, in files of `EACH` trials; with --pixels the pictures and
-masks too. With --official the same of the stimuli that people saw goes to FOLDER/official. The
-same command continues.
+masks, and not what forests see. With --official the same of the stimuli that people saw goes to
+FOLDER/official. The same command continues.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ import torch
 from numpy.typing import NDArray
 
 from physion.clips.batch import Batch, Motion, Spec
+from physion.clips.rendered import object_ids
 from physion.clips.source import ObservedSource, TrialReaders
 from physion.clips.states import cut_motion
 from physion.core.errors import BadSceneError
@@ -39,11 +40,14 @@ from physion.core.names import SCENARIOS, canonical_name
 from physion.core.seeds import trial_seed
 from physion.data.official import official
 from physion.models.build import build_model
-from physion.models.interface import Model
+from physion.models.intuition import mask_tokens
+from physion.models.intuition_pixels import SEEN
 from physion.physics.engine import make_engine
 from physion.physics.labels import label_contact
 from physion.readout.decisions import fraction_of_futures
 from physion.readout.model_calls import is_network
+from physion.rendering.renderer import Renderer
+from physion.scenes.looks import in_look
 from physion.scenes.sampling.sample import load_presets, sample_scene
 from physion.scenes.scene import OBSERVED_FRAMES, Scene
 from physion.trials.making.choose import split_of
@@ -81,13 +85,17 @@ FACTS = ("trial", "scenario", "configuration", "contact", "observed_contact", "s
 
 
 @cache
-def encoders() -> dict[str, Model]:
-    """Return the models whose features are made."""
-    return {name: build_model(name) for name in MODELS}
+def encoder(name: str, **settings: Any) -> Any:
+    """Return a model whose features are made."""
+    return build_model(name, **settings)
 
 
 def see(motion: Motion, pixels: int) -> dict[str, NDArray[Any]]:
-    """Return the features of a motion, and pictures and masks of ``pixels`` a side, if not 0."""
+    """Return the features of a motion by model; with ``pixels``, also pictures and masks.
+
+    Pictures and masks have ``pixels`` a side, and the frames that `intuition-pixels` looks at; then
+    only tokens of `intuition-states` and `intuition-masks` are made, and no features of forests.
+    """
     name = motion.scene.name
     motions, looks = {name: cut_motion(motion)}, {name: LOOK}
     drawn: dict[int, Pictures] = {}
@@ -101,17 +109,29 @@ def see(motion: Motion, pixels: int) -> dict[str, NDArray[Any]]:
             readers = TrialReaders({name: OBSERVED_FRAMES}, [shown.reader(spec)])
         return ObservedSource(spec, readers).context([name])
 
-    found: dict[str, NDArray[Any]] = {}
-    for model_name, model in encoders().items():
+    def features(model: Any) -> NDArray[np.float32]:
         batch = read(model.spec)
         with torch.no_grad():
-            features = model.encode(batch.to("cpu") if is_network(model) else batch)
-        found[model_name] = np.asarray(features[0], np.float32)
-    if pixels:
-        spec = replace(build_model("intuition-pixels").spec, image_size=pixels)
-        batch = read(replace(spec, inputs=("rgb", "ids")))
-        found |= {"rgb": batch.rgb[0], "ids": batch.ids[0]}
-    return found
+            found = model.encode(batch.to("cpu") if is_network(model) else batch)
+        return np.asarray(found[0], np.float32)
+
+    if not pixels:
+        return {model: features(encoder(model)) for model in MODELS}
+    masks = encoder("intuition-masks", image_size=pixels)
+    frames = np.array(masks.spec.context_frames())
+    late = frames[list(SEEN)]
+    renderer = Renderer(in_look(motion.scene, LOOK), motion.trajectory, pixels, pixels)
+    numbers = object_ids(motion.scene)
+    shown = [
+        renderer.render(int(frame), ("color", "ids") if frame in late else ("ids",))
+        for frame in frames
+    ]
+    ids = numbers[np.stack([frame.ids for frame in shown])]  # type: ignore[misc]
+    return {
+        "intuition-states": features(encoder("intuition-states")),
+        "intuition-masks": mask_tokens(ids, masks.settings.objects).reshape(len(frames), -1),
+        "rgb": np.stack([shown[row].color for row in SEEN]), "ids": ids[list(SEEN)],
+    }  # fmt: skip
 
 
 def own_trial(scenario: str, number: int, pixels: int) -> Seen:
@@ -143,15 +163,8 @@ def own_trial(scenario: str, number: int, pixels: int) -> Seen:
 
 def visible(tokens: NDArray[np.float32]) -> bool:
     """Return whether agent and patient cover enough of the first frame, by tokens of masks."""
-    objects = build_objects()
-    first = tokens[0].reshape(objects, -1)
+    first = tokens[0].reshape(encoder("intuition-masks").settings.objects, -1)
     return bool((first[:2, 1] ** 2 >= VISIBLE).all())
-
-
-@cache
-def build_objects() -> int:
-    """Return the tokens of a trial."""
-    return int(build_model("intuition-masks").settings.objects)
 
 
 def official_scenes() -> list[tuple[Scene, bool]]:
@@ -233,14 +246,32 @@ def simulated(folder: Path, trials: Mapping[str, str], scale: float, samples: in
     return pd.Series(known)[list(trials)]
 
 
+def names_stored(folder: Path) -> list[str]:
+    """Return the names of what is stored of the trials in a folder."""
+    with np.load(min(folder.glob("*.npz"))) as stored:
+        return list(stored.files)
+
+
 def load(folder: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Return what is known of all trials in a folder, and the features of some models, joined."""
-    parts: dict[str, list[NDArray[Any]]] = {name: [] for name in (*FACTS, *names)}
-    for path in sorted(folder.glob("*.npz")):
+    paths = sorted(folder.glob("*.npz"))
+    facts: dict[str, list[NDArray[Any]]] = {name: [] for name in FACTS}
+    for path in paths:
         with np.load(path) as stored:
-            for name, arrays in parts.items():
-                arrays.append(stored[name])
-    return {name: np.concatenate(arrays) for name, arrays in parts.items()}
+            for name, parts in facts.items():
+                parts.append(stored[name])
+    out = {name: np.concatenate(parts) for name, parts in facts.items()}
+    # Pictures are large: they are read into one array, which is not copied.
+    start = 0
+    for path in paths:
+        with np.load(path) as stored:
+            for name in names:
+                part = stored[name]
+                if name not in out:
+                    out[name] = np.empty((len(out["trial"]), *part.shape[1:]), part.dtype)
+                out[name][start : start + len(part)] = part
+            start += len(stored["trial"])
+    return out
 
 
 def main() -> None:

@@ -18,6 +18,7 @@ import argparse
 import datetime
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -26,14 +27,17 @@ import numpy as np
 import pandas as pd
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from intuition_trials import load
+from intuition_trials import load, names_stored
 from physion.clips.batch import Batch, Spec
 from physion.compute.tasks import processor
 from physion.core.files import digest_of
+from physion.models.baselines.trees import blob_features
 from physion.models.build import build_untrained
 from physion.models.checkpoint import BUILT_AS, tensors_of, write_checkpoint
 from physion.models.interface import ask
+from physion.models.intuition_pixels import SEEN, blobs_of_masks, colored
 from physion.readout.trees import fit_forest
 from physion.training.train import train_model
 
@@ -50,11 +54,13 @@ TOGETHER = 64
 class OwnSource:
     """Source of the context of trials that are in memory, as the trainer takes it.
 
-    ``made``: what `intuition_trials.load` read.
+    ``made``: what `intuition_trials.load` read; ``pixels``: its pictures and masks, on the device.
     """
 
-    def __init__(self, spec: Spec, made: Mapping[str, NDArray[Any]], folder: Path) -> None:
-        self.spec, self._made, self._folder = spec, made, folder
+    def __init__(
+        self, spec: Spec, made: Mapping[str, NDArray[Any]], pixels: Mapping[str, Tensor]
+    ) -> None:
+        self.spec, self._made, self._pixels = spec, made, pixels
         self.rows = {str(trial): row for row, trial in enumerate(made["trial"])}
 
     def length(self, trial: str) -> int:
@@ -66,10 +72,20 @@ class OwnSource:
         return digest_of(str(self._made["scene"][self.rows[trial]]))
 
     def context(self, trials: Sequence[str]) -> Batch:
-        """Return pictures, and masks, of the observed frames."""
+        """Return pictures, and masks, of the observed frames.
+
+        A frame that the model does not look at shows the next one that it looks at.
+        """
         rows = [self.rows[trial] for trial in trials]
-        frames = np.tile(np.array(self.spec.context_frames()), (len(rows), 1))
-        pixels = {name: self._made[name][rows] for name in ("rgb", "ids") if name in self._made}
+        wanted = self.spec.context_frames()
+        frames = np.tile(np.array(wanted), (len(rows), 1))
+        pixels: dict[str, Tensor] = {}
+        if self._pixels:
+            stored = torch.tensor(np.searchsorted(SEEN, np.arange(len(wanted))))
+            chosen = torch.tensor(rows)
+            for name, values in self._pixels.items():
+                device = values.device
+                pixels[name] = values[chosen.to(device)][:, stored.to(device)]
         return Batch(tuple(trials), frames, np.ones(frames.shape, np.bool_), **pixels)
 
 
@@ -79,12 +95,17 @@ class Learner:
     def __init__(self, name: str, folder: Path, options: argparse.Namespace) -> None:
         self.name, self.folder, self.options = name, folder, options
         tokens = ask(build_untrained(name), "learns_from") == "features"
-        self.read = (name,) if tokens else ("rgb", "ids")
-        self.own = load(folder / "own", (*self.read, SAME[name]))
-        self.asked = load(folder / "official", (*self.read, SAME[name]))
+        # Trials with pictures have no features of forests; those of blobs are made of pictures.
+        stored = [n for n in (name, SAME[name]) if n in names_stored(folder / "own")]
+        read = stored if tokens else ["rgb", "ids"]
+        self.own, self.asked = load(folder / "own", read), load(folder / "official", read)
         keep = ~self.asked["observed_contact"]
         keep &= np.isin(self.asked["scenario"], np.unique(self.own["scenario"]))
         self.asked = {key: values[keep] for key, values in self.asked.items()}
+        self.pixels = {id(made): _on_device(made) for made in (self.own, self.asked)}
+        for made in (self.own, self.asked):
+            if pictures := self.pixels[id(made)]:
+                made["blob-trees"] = _blobs(pictures["rgb"])
         self.held = np.zeros(len(self.own["trial"]), np.bool_)
         for scenario in np.unique(self.own["scenario"]):
             rows = np.flatnonzero(self.own["scenario"] == scenario)
@@ -95,7 +116,7 @@ class Learner:
         model = build_untrained(self.name, **self._options())
         fit = ~self.held & (self.own["scenario"] != without)
         trials = [str(trial) for trial in self.own["trial"][fit]]
-        source = OwnSource(model.spec, self.own, self.folder)
+        source = OwnSource(model.spec, self.own, self.pixels[id(self.own)])
         outcomes = dict(zip(trials, self.own["contact"][fit].tolist(), strict=True))
         settings = ask(model, "training_settings")
         changed = {"steps": self.options.steps, "batch": self.options.batch}
@@ -128,20 +149,23 @@ class Learner:
         }
 
     def forests(self) -> dict[str, NDArray[np.float64]]:
-        """Return P(contact) of forests of each scenario, fitted on the same trials."""
+        """Return P(contact) of forests of each scenario, fitted on the same trials, if possible."""
         name = SAME[self.name]
+        if name not in self.own:
+            return {}
         counts = {"own": int(self.held.sum()), "official": len(self.asked["trial"])}
         found = {part: np.full(count, np.nan) for part, count in counts.items()}
-        for scenario in np.unique(self.own["scenario"]):
+
+        def answer(scenario: str) -> None:
             inside = self.own["scenario"] == scenario
-            fit = inside & ~self.held
+            fit, rest = inside & ~self.held, self.own["scenario"][self.held] == scenario
             forest = fit_forest(_flat(self.own[name][fit]), self.own["contact"][fit])
-            own = self.own[name][inside & self.held]
-            found["own"][self.own["scenario"][self.held] == scenario] = forest.probability(
-                _flat(own)
-            )
+            found["own"][rest] = forest.probability(_flat(self.own[name][inside & self.held]))
             there = self.asked["scenario"] == scenario
             found["official"][there] = forest.probability(_flat(self.asked[name][there]))
+
+        with ThreadPoolExecutor() as pool:
+            list(pool.map(answer, np.unique(self.own["scenario"])))
         return found
 
     def row(self, name: str, answers: Mapping[str, NDArray[np.float64]]) -> str:
@@ -166,13 +190,13 @@ class Learner:
 
     def _options(self) -> dict[str, Any]:
         pairs = [pair.split("=") for pair in self.options.option]
-        return {key: float(v) if "." in v else int(v) for key, v in pairs}
+        return {k: float(v) if "." in v else int(v) if v.isdigit() else v for k, v in pairs}
 
     @torch.no_grad()
     def _predict(
         self, model: Any, made: Mapping[str, NDArray[Any]], chosen: NDArray[np.bool_]
     ) -> NDArray[np.float64]:
-        source, found = OwnSource(model.spec, made, self.folder), []
+        source, found = OwnSource(model.spec, made, self.pixels[id(made)]), []
         names = [str(trial) for trial in made["trial"][chosen]]
         for start in range(0, len(names), TOGETHER):
             batch = source.context(names[start : start + TOGETHER])
@@ -190,6 +214,18 @@ def device() -> str:
 
 def _flat(values: NDArray[Any]) -> NDArray[Any]:
     return values.reshape(len(values), -1)
+
+
+def _on_device(made: dict[str, NDArray[Any]]) -> dict[str, Tensor]:
+    """Move pictures and masks to the GPU, if there is one."""
+    target = "cuda" if torch.cuda.is_available() else "cpu"
+    return {n: torch.from_numpy(made.pop(n)).to(target) for n in ("rgb", "ids") if n in made}
+
+
+def _blobs(rgb: Tensor) -> NDArray[np.float32]:
+    """Return what red and yellow pixels of pictures (N, T, H, W, 3) tell, as `blob-trees` does."""
+    told = torch.cat([blobs_of_masks(colored(part).float()).cpu() for part in rgb.split(TOGETHER)])
+    return np.stack([blob_features((of[:, 0], of[:, 1])) for of in told.numpy()])
 
 
 def _say(what: str, done: int, total: int) -> None:
@@ -213,22 +249,23 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=0, help="clips a step; 0: the model's own")
     parser.add_argument("--accelerator", default="auto")
     parser.add_argument("--weights", type=Path, help="folder for weights")
-    parser.add_argument("--option", nargs="*", default=[], help="NAME=NUMBER of the model")
+    parser.add_argument("--option", nargs="*", default=[], help="NAME=VALUE of the model")
     parser.add_argument("--all-but", action="store_true")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     rows = []
     for name in options.models:
         learner = Learner(name, options.folder, options)
-        forests = learner.forests()
-        rows.append(learner.row(SAME[name], forests))
-        print(rows[-1], flush=True)
         answers = learner.train()
         learner.keep(name, answers["official"])
         rows.append(learner.row(name, answers))
-        both = {part: (answers[part] + forests[part]) / 2 for part in answers}
-        rows.append(learner.row(f"mean of both, {name}", both))
-        print("\n".join(rows[-2:]), flush=True)
+        print(rows[-1], flush=True)
+        if forests := learner.forests():
+            learner.keep(SAME[name], forests["official"])
+            rows.append(learner.row(SAME[name], forests))
+            both = {part: (answers[part] + forests[part]) / 2 for part in answers}
+            rows.append(learner.row(f"mean of both, {name}", both))
+            print("\n".join(rows[-2:]), flush=True)
         if options.all_but:
             scenarios = np.unique(learner.own["scenario"])
             apart = {part: np.full(len(values), np.nan) for part, values in answers.items()}

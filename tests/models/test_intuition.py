@@ -11,10 +11,12 @@ import torch
 
 from physion.clips.batch import Batch, Motion
 from physion.core.errors import BadInputError
+from physion.models.baselines.pixels import color_masks
+from physion.models.baselines.trees import mask_blob
 from physion.models.build import build_model
 from physion.models.interface import TrainingSettings
 from physion.models.intuition import VIEWS, mask_tokens, state_tokens
-from physion.models.intuition_pixels import boxes_of_masks
+from physion.models.intuition_pixels import _moved, blobs_of_masks, boxes_of_masks, colored
 from physion.physics.trajectory import Contacts, Trajectory
 from physion.scenes.scene import Body, Camera, Cloth, Roles, Scene
 from physion.training.train import train_model
@@ -236,6 +238,7 @@ def test_other_frames_and_sizes_are_refused_in_one_line() -> None:
 @pytest.mark.slow
 def test_pixels_are_learned_from_with_masks_boxes_and_motion_as_targets() -> None:
     small = {"image_size": 16, "channels": (8, 16, 16, 16), "width": 32, "layers": 1, "slots": 3}
+    small["shift"] = 1
     model: Any = build_model("intuition-pixels", **small)
     source: Any = ColoredSquares(model.spec, 16)
     batch = replace(
@@ -255,6 +258,28 @@ def test_pixels_are_learned_from_with_masks_boxes_and_motion_as_targets() -> Non
     assert torch.equal(model.predict(batch), model.predict(replace(batch, ids=None, contact=None)))
 
 
+def test_colours_and_blobs_are_those_of_the_baseline() -> None:
+    rng = np.random.default_rng(3)
+    rgb = rng.integers(0, 256, (4, 9, 7, 3), dtype=np.uint8)
+    rgb[0], rgb[1, 2:6, 3:5], rgb[2, :, :] = 90, (200, 20, 30), (220, 190, 20)
+    red, yellow = color_masks(rgb)
+    found = colored(torch.from_numpy(rgb))
+    assert red.any() and yellow.any()
+    assert np.array_equal(found.numpy(), np.stack([red, yellow], 1))
+    told = blobs_of_masks(found.float())
+    expected = np.stack([mask_blob(red), mask_blob(yellow)], 1)
+    assert np.allclose(told.numpy(), expected, atol=2e-6)
+
+
+def test_pictures_are_moved_and_what_comes_in_is_empty() -> None:
+    maps = torch.arange(24.0).reshape(1, 2, 3, 4).repeat(3, 1, 1, 1)
+    out = _moved(maps, torch.tensor([[0, 1, 3], [0, -2, 0]]))
+    assert torch.equal(out[0], maps[0])
+    expected = torch.zeros(2, 3, 4)
+    expected[:, 1:, :2] = maps[1, :, :2, 2:]
+    assert torch.equal(out[1], expected) and not out[2].any()
+
+
 def test_boxes_are_the_edges_of_masks() -> None:
     masks = torch.zeros(2, 8, 4)
     masks[0, 2:5, 1:3] = 1
@@ -271,8 +296,8 @@ def test_a_trial_without_red_and_yellow_is_refused_and_one_without_yellow_noted(
     with torch.no_grad():
         assert model.predict(batch)[0] == model.base_rate
     assert model.notes(batch) == ["agent or patient never visible: base rate", ""]
-    batch.rgb[1] = 90
-    with pytest.raises(BadInputError, match=r"trial 'drop_0001': nothing is red or yellow"):
+    batch.rgb[:] = 90
+    with pytest.raises(BadInputError, match=r"in 2 trials, such as .*nothing is red or yellow"):
         model.predict(batch)
     with pytest.raises(BadInputError, match="image_size must be a multiple of 16"):
         build_model("intuition-pixels", image_size=50)

@@ -6,7 +6,9 @@ weights w_s = sigmoid(m_s) / sum sigmoid(m_s) over the pixels p,
 
     area a_s = mean_p sigmoid(m_sp),   place c_s = sum_p w_sp p,   content h_s = sum_p w_sp F_p.
 
-What a slot holds over time is a token of the network that the other models of intuition have
+Agent and patient also hold what the red and the yellow pixels tell at full resolution: area, mean,
+deviations, covariance and box, as `physion.models.baselines.trees` has them. What a slot holds over
+time is a token of the network that the other models of intuition have
 (`physion.models.intuition`). The loss is
 
     cross entropy of the outcome + targets * ( cross entropy of the masks of agent and patient
@@ -22,20 +24,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from physion.clips.batch import AGENT_ID, PATIENT_ID, Batch, Spec
 from physion.core.errors import BadInputError
-from physion.models.baselines.pixels import color_masks
 from physion.models.checkpoint import load_named
 from physion.models.interface import RANDOM, SizedSettings, Sizes, TrainingSettings
 from physion.models.interface import settings_of_size as of_size
 from physion.models.intuition import CONTEXT, STRIDE, Intuition, TokenNetwork
 from physion.models.torch_model import initial_weights
 from physion.models.vision import normalized_pictures
+from physion.scenes.looks import RED, ROLE_HUES, STRONG_SATURATION, STRONG_VALUE, YELLOW
 
 SEEN = (0, 2, 5, 7, 9, 11, 12, 13, 14)
 """Which frames of the context are looked at: 2, 8, 17, 23, 29, 35, 38, 41 and 44."""
@@ -43,7 +44,7 @@ LATE = 2
 """Seen frames over which motion is measured, from 38 to 44."""
 
 _MEDIUM: Mapping[str, Any] = {
-    "image_size": 128, "channels": (32, 64, 128, 256), "width": 192, "layers": 4, "content": 32,
+    "channels": (32, 64, 128, 192), "width": 192, "layers": 4, "content": 32,
 }  # fmt: skip
 
 
@@ -58,6 +59,7 @@ class PixelIntuitionSettings(SizedSettings):
     - ``width``, ``layers``, ``heads``, ``dropout``: of the network that reads tokens.
     - ``targets``: weight of masks, boxes and motion in the loss; 0 learns the outcome only.
     - ``jitter``: standard deviation of the change of brightness and contrast in training.
+    - ``shift``: largest number of pixels by which pictures are moved in training.
     """
 
     model: str = "intuition-pixels"
@@ -71,6 +73,7 @@ class PixelIntuitionSettings(SizedSettings):
     dropout: float = 0.1
     targets: float = 1.0
     jitter: float = 0.1
+    shift: int = 6
 
     sizes: ClassVar[Sizes] = {"small": {}, "medium": _MEDIUM}
 
@@ -82,7 +85,7 @@ class PixelIntuitionSettings(SizedSettings):
     def __post_init__(self) -> None:
         self.at_least(1, "image_size", "content", "width", "layers", "heads")
         self.at_least(2, "slots")
-        self.at_least(0, "dropout", "targets", "jitter")
+        self.at_least(0, "dropout", "targets", "jitter", "shift")
         if self.image_size % 16 or self.width % self.heads or min(self.channels) < 1:
             raise BadInputError(
                 f"{self.model}: image_size must be a multiple of 16, width of heads, and channels "
@@ -96,7 +99,9 @@ _SMALL_TRAINING = TrainingSettings(
 )  # fmt: skip
 TRAINING: Mapping[str, TrainingSettings] = {
     "small": _SMALL_TRAINING,
-    "medium": replace(_SMALL_TRAINING, steps=12000, batch=128, precision="bf16-mixed"),
+    "medium": replace(
+        _SMALL_TRAINING, steps=12000, batch=256, precision="bf16-mixed", checkpoint_every=1000
+    ),
 }
 
 
@@ -132,12 +137,13 @@ class _Residual(nn.Module):
 
 
 class Eye(nn.Module):
-    """Pictures (N, 3, H, W) to features and mask logits of slots at a quarter of the resolution."""
+    """Pictures (N, 5, H, W) to features and mask logits of slots at a quarter of the resolution."""
 
     def __init__(self, channels: tuple[int, int, int, int], slots: int) -> None:
         super().__init__()
         first, second, third, fourth = channels
-        self.stem = nn.Sequential(nn.Conv2d(3, first, 5, stride=2, padding=2), nn.GELU())
+        # Three colours, and which pixels are red and which yellow.
+        self.stem = nn.Sequential(nn.Conv2d(5, first, 5, stride=2, padding=2), nn.GELU())
         self.stages = nn.ModuleList(
             [_stage(first, second), _stage(second, third), _stage(third, fourth)]
         )
@@ -155,6 +161,53 @@ class Eye(nn.Module):
         quarter = quarter + functional.interpolate(self.join(eighth), scale_factor=2)
         features = self.last(quarter)
         return features, self.masks(features)
+
+
+# What red and yellow pixels tell.
+
+_BLOB = 10
+
+
+def colored(rgb: Tensor) -> Tensor:
+    """Return which pixels of pictures (..., H, W, 3), uint8, are red, and yellow: (..., 2, H, W).
+
+    The rule is that of `physion.models.baselines.pixels.color_masks`.
+    """
+    colors = rgb.float() / 255
+    red, green, blue = colors.unbind(-1)
+    value, spread = colors.amax(-1), colors.amax(-1) - colors.amin(-1)
+    strong = (spread >= STRONG_SATURATION * value) & (value >= STRONG_VALUE) & (spread > 0)
+    strong &= value > blue
+    hue = torch.where(red >= green, green - blue, 2 * spread + blue - red)
+    hue = hue / (6 * spread.clamp(min=1e-6))
+    ranges = [ROLE_HUES[color] for color in (RED, YELLOW)]
+    return torch.stack([strong & (low <= hue) & (hue <= high) for low, high in ranges], -3)
+
+
+def blobs_of_masks(masks: Tensor) -> Tensor:
+    """Return area, mean, deviations, covariance and box (..., 10) of masks (..., H, W).
+
+    The values are those of `physion.models.baselines.trees.mask_blob`.
+    """
+    height, width = masks.shape[-2:]
+    x, y = (
+        (torch.arange(side, device=masks.device, dtype=masks.dtype) + 0.5) / side
+        for side in (width, height)
+    )
+    rows, columns = masks.sum(-1), masks.sum(-2)
+    counts = rows.sum(-1)
+    most = counts.clamp(min=1)
+    center_x, center_y = (columns * x).sum(-1) / most, (rows * y).sum(-1) / most
+    # From the mean, since differences of squares lose digits.
+    from_x, from_y = x - center_x[..., None], y - center_y[..., None]
+    spread_x = ((columns * from_x**2).sum(-1) / most).sqrt()
+    spread_y = ((rows * from_y**2).sum(-1) / most).sqrt()
+    slant = ((masks * from_x[..., None, :]).sum(-1) * from_y).sum(-1) / most
+    box, there = boxes_of_masks(masks)
+    values = [counts / (height * width), center_x, center_y, spread_x, spread_y, slant]
+    found = torch.cat([torch.stack(values, -1), box], -1)
+    nothing = found.new_tensor([0, 0.5, 0.5, 0, 0, 0, 0.5, 0.5, 0.5, 0.5])
+    return torch.where(there[..., None], found, nothing)
 
 
 # The model.
@@ -176,7 +229,7 @@ class PixelIntuition(Intuition):
         )  # fmt: skip
         super().__init__(settings, spec, TRAINING[settings.size])
         slots, second = settings.slots, settings.channels[1]
-        track = 3 + _BOX + settings.content
+        track = 3 + _BOX + settings.content + _BLOB
         with initial_weights(settings.model, settings.seed):
             self.eye = Eye(settings.channels, slots)
             self.content = nn.Linear(second, settings.content)
@@ -190,7 +243,18 @@ class PixelIntuition(Intuition):
                 len(SEEN) * track + slots, settings.width, settings.layers, settings.heads,
                 settings.dropout,
             )  # fmt: skip
+        self.center = nn.Buffer(torch.zeros(_BLOB))
+        self.scale = nn.Buffer(torch.ones(_BLOB))
         load_named(self, settings.weights)
+
+    def prepare(self, sample: Batch) -> None:
+        """Set the base rate, and mean and standard deviation of what a colour tells."""
+        super().prepare(sample)
+        blobs = blobs_of_masks(self._pictures(sample)[:, :, 3:])
+        shown = blobs[blobs[..., 0] > 0]
+        if len(shown) > 1:
+            self.center.copy_(shown.mean(0))
+            self.scale.copy_(shown.std(0).clamp(min=1e-4))
 
     def logits(self, batch: Batch) -> Tensor:
         """Return logits (2, B) of the trial and of its mirror image."""
@@ -200,29 +264,30 @@ class PixelIntuition(Intuition):
     def seen(self, batch: Batch) -> Tensor:
         """Return whether red and yellow are both seen in some frame (B,).
 
-        Raises `BadInputError` for a trial that shows neither.
+        Raises `BadInputError` if none of several trials shows any: they have another look.
         """
-        shown = batch.rgb.cpu().numpy()
-        masks = [[mask.any() for mask in color_masks(frames)] for frames in shown]
-        for trial, colors in zip(batch.trials, masks, strict=True):
-            if not any(colors):
-                raise BadInputError(
-                    f"{self.name}, trial {trial!r}: nothing is red or yellow; it sees agent and "
-                    "patient by these colours only, so take trials in the look redyellow"
-                )
-        return torch.tensor(np.array(masks).all(axis=1), device=self.device)
+        shown = colored(batch.rgb.to(self.device)).flatten(-2).any(-1).any(1)
+        if len(shown) > 1 and not shown.any():
+            raise BadInputError(
+                f"{self.name}: in {len(shown)} trials, such as {batch.trials[0]!r}, nothing is red "
+                "or yellow; it sees agent and patient by these colours only, so take trials in the "
+                "look redyellow"
+            )
+        return shown.all(1)
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return the loss, its parts, and how many answers are right."""
         pictures, ids = self._pictures(batch), self._ids(batch)
         turned = torch.rand(len(batch), device=pictures.device) < 0.5
-        pictures = _flipped(pictures, turned)
-        ids = _flipped(ids, turned)
+        by = torch.randint(-self.settings.shift, self.settings.shift + 1, (2, len(batch)))
+        pictures = _moved(_flipped(pictures, turned), by.to(turned.device))
+        ids = _moved(_flipped(ids, turned), by.to(turned.device))
         spread = self.settings.jitter
-        gain, shift = (
+        gain, lift = (
             torch.randn(len(batch), 1, 1, 1, 1, device=pictures.device) * spread for _ in range(2)
         )
-        answers, masks, boxes, motion = self._look(pictures * (1 + gain) + shift)
+        colors = pictures[:, :, :3] * (1 + gain) + lift
+        answers, masks, boxes, motion = self._look(torch.cat([colors, pictures[:, :, 3:]], 2))
         contact = batch.contact.to(answers.dtype)
         outcome = functional.binary_cross_entropy_with_logits(answers, contact)
         right = ((answers > 0) == batch.contact).float().mean()
@@ -243,7 +308,7 @@ class PixelIntuition(Intuition):
         }  # fmt: skip
 
     def _look(self, pictures: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return what is found in pictures (B, T, 3, H, W).
+        """Return what is found in pictures (B, T, 5, H, W).
 
         Returns
         -------
@@ -256,8 +321,17 @@ class PixelIntuition(Intuition):
         motion : Tensor
             Change of the place (B, S, 2) over the last `LATE` frames.
         """
-        clips, steps = pictures.shape[:2]
         features, masks = self.eye(pictures.flatten(0, 1))
+        # Places and motion need all digits of float32, also where the eye computes with half.
+        with torch.autocast(pictures.device.type, enabled=False):
+            blobs = blobs_of_masks((pictures[:, :, 3:] > 0.5).float())
+            return self._judge(features.float(), masks.float(), blobs)
+
+    def _judge(
+        self, features: Tensor, masks: Tensor, blobs: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return what `_look` does, from the maps of the eye and the blobs (B, T, 2, 10)."""
+        clips, steps = blobs.shape[:2]
         shown = masks.sigmoid()
         height, width = shown.shape[-2:]
         weights = shown / shown.sum((-2, -1), keepdim=True).clamp(min=1e-4)
@@ -271,7 +345,10 @@ class PixelIntuition(Intuition):
         # Half sizes of the box: the root of the area, times what the features say.
         half = area[..., :1] * self.box(inside).exp().clamp(max=10)
         boxes = torch.cat([place - half[..., :2], place + half[..., 2:]], -1)
-        held = torch.cat([place - 0.5, area, half, self.content(inside)], -1)
+        # Slots that are not named have no colour.
+        scaled = ((blobs - self.center) / self.scale).clamp(-10, 10)
+        told = functional.pad(scaled, (0, 0, 0, masks.shape[1] - 2)).flatten(0, 1)
+        held = torch.cat([place - 0.5, area, half, self.content(inside), told], -1)
         shape = (clips, steps, masks.shape[1])
         tracks = held.view(*shape, -1).transpose(1, 2).flatten(2)
         motion = self.motion(tracks)
@@ -281,9 +358,10 @@ class PixelIntuition(Intuition):
         return logits, masks.view(*shape, height, width), boxes.view(*shape, -1), motion
 
     def _pictures(self, batch: Batch) -> Tensor:
-        """Return the pictures (B, 9, 3, H, W) that are looked at."""
+        """Return the pictures (B, 9, 5, H, W) that are looked at: colours, red, yellow."""
         self._check_frames(batch)
-        return normalized_pictures(batch, self.spec, self.name)[:, list(SEEN)]
+        pictures = normalized_pictures(batch, self.spec, self.name)[:, list(SEEN)]
+        return torch.cat([pictures, colored(batch.rgb[:, list(SEEN)]).float()], 2)
 
     def _ids(self, batch: Batch) -> Tensor:
         """Return the true objects of pixels (B, 9, H, W)."""
@@ -297,6 +375,20 @@ def _flipped(pictures: Tensor, mirrored: Tensor) -> Tensor:
     """Return pictures (B, ..., W), where ``mirrored`` (B) says so in their mirror image."""
     chosen = mirrored.view(-1, *[1] * (pictures.ndim - 1))
     return torch.where(chosen, pictures.flip(-1), pictures)
+
+
+def _moved(pictures: Tensor, by: Tensor) -> Tensor:
+    """Return pictures (B, ..., H, W) moved by pixels (2, B), zeros where nothing was."""
+    out = pictures
+    for axis, moved in zip((-2, -1), by, strict=True):
+        side = pictures.shape[axis]
+        source = torch.arange(side, device=by.device) - moved[:, None]
+        place = [len(moved), *[1] * (pictures.ndim - 1)]
+        place[axis] = side
+        inside = ((source >= 0) & (source < side)).view(place)
+        index = source.clamp(0, side - 1).view(place).expand_as(out)
+        out = out.gather(axis, index) * inside
+    return out
 
 
 def boxes_of_masks(masks: Tensor) -> tuple[Tensor, Tensor]:

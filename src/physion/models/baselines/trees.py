@@ -52,7 +52,11 @@ def mask_features(masks: Sequence[NDArray[np.bool_]]) -> NDArray[np.float32]:
 
     The first two masks show agent and patient.
     """
-    blobs = [mask_blob(mask) for mask in masks]
+    return blob_features([mask_blob(mask) for mask in masks])
+
+
+def blob_features(blobs: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Return the features of a clip (T, D) from what `mask_blob` tells (T, 10) of each mask."""
     red, yellow = blobs[:2]
     apart = yellow[:, 1:3] - red[:, 1:3]
     # Distance of boxes (left, top, right, bottom) along each axis.
