@@ -15,13 +15,13 @@ export PYTHONPATH=$PWD/src${PYTHONPATH:+:$PYTHONPATH} OMP_NUM_THREADS=1 PYTHONUN
 mkdir -p "$out" "$data/said" "$data/weights"
 trials=(python benchmarks/models/intuition_trials.py "$data" --workers "$(nproc)" --pixels "$pixels")
 "${trials[@]}" --official | tail -n 1
-timeout --signal=INT "${MAKE:-240}" "${trials[@]}" --trials "${TRIALS:-20000}" > "$data/said/made.txt" 2>&1 || true
+"${trials[@]}" --trials "${TRIALS:-20000}" --seconds "${MAKE:-240}" > "$data/said/made.txt" 2>&1
 ls "$data/own" | wc -l
 train() {
     local model=$1
     shift
-    python benchmarks/models/train_intuition.py "$data" --models "$model" --weights "$data/weights" \
-        --steps "$steps" "$@" > "$data/said/$model.txt" 2>&1 || echo "$model failed" >> "$data/said/$model.txt"
+    python benchmarks/models/train_intuition.py "$data" --models "$model" --steps "$steps" \
+        --weights "$data/weights" "$@" > "$data/said/$model.txt" 2>&1 || echo "$model failed"
 }
 train intuition-states --batch 512 &
 train intuition-masks --batch 512 --option image_size="$pixels" &

@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import argparse
 import io
-import itertools
 import json
+import math
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -285,20 +285,23 @@ def main() -> None:
     parser.add_argument("--official", action="store_true")
     parser.add_argument("--pixels", type=int, default=0, help="keep pictures of this size")
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--seconds", type=float, default=math.inf, help="stop after this time")
     options = parser.parse_args()
     # Scenarios in turn, so that what is there is always of all of them.
     tasks = [(s, part) for part in range(options.trials // EACH) for s in options.scenarios]
     parts = range(-(-len(official_scenes()) // EACH)) if options.official else range(0)
     official_of = partial(make_official, options.folder, options.pixels)
     own_of = partial(make_own, options.folder, options.pixels)
-    if options.workers > 1:
-        with ProcessPoolExecutor(options.workers) as pool:
-            for done in itertools.chain(pool.map(official_of, parts), pool.map(own_of, tasks)):
-                print(done, flush=True)
-        return
-    for done in itertools.chain(map(official_of, parts), map(own_of, tasks)):
-        if done:
-            print(f"{time.strftime('%H:%M:%S')} {done}", flush=True)
+    end = time.monotonic() + options.seconds
+    with ProcessPoolExecutor(options.workers) as pool:
+        made = [pool.submit(official_of, part) for part in parts]
+        made += [pool.submit(own_of, task) for task in tasks]
+        for future in made:
+            if done := future.result():
+                print(f"{time.strftime('%H:%M:%S')} {done}", flush=True)
+            if time.monotonic() > end:
+                pool.shutdown(cancel_futures=True)
+                break
 
 
 if __name__ == "__main__":

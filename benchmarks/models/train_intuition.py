@@ -229,7 +229,7 @@ def _blobs(rgb: Tensor) -> NDArray[np.float32]:
 
 
 def _say(what: str, done: int, total: int) -> None:
-    if done % 250 == 0:
+    if done % 100 == 0:
         print(f"{datetime.datetime.now():%H:%M:%S} {what} {done} of {total}", flush=True)
 
 
