@@ -78,7 +78,13 @@ MOVIES = {
 @pytest.mark.slow
 @pytest.mark.parametrize("change", ["cut", *CHANGES])
 @pytest.mark.parametrize("read", list(MOVIES))
-@pytest.mark.parametrize("known", [True, False], ids=["indexed", "changed"])
+@pytest.mark.parametrize(
+    "known",
+    [
+        pytest.param(True, id="indexed"),
+        pytest.param(False, id="changed", marks=pytest.mark.nightly),
+    ],
+)
 def test_a_movie_that_does_not_fit_is_named(
     change: str, read: str, known: bool, dots: Dataset, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -111,7 +111,14 @@ def test_unknown_scenarios_get_the_closest(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("buffered", [True, False])
-@pytest.mark.parametrize("command", ["--help", "ls", "ls --help", "doctor"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "--help",
+        "ls",
+        *(pytest.param(c, marks=pytest.mark.nightly) for c in ("ls --help", "doctor")),
+    ],
+)
 def test_a_closed_output_ends_the_command_quietly(command: str, buffered: bool) -> None:
     reader, writer = os.pipe()
     os.close(reader)

@@ -61,6 +61,7 @@ def test_sampled_scenes_to_report(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert dict(index.groupby("split").size()) == splits
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_first_command_compares_models_with_people(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

@@ -115,6 +115,7 @@ def test_mistakes_are_one_line(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_training_that_is_killed_ends_with_the_same_bytes(dots: Dataset, tmp_path: Path) -> None:
     arguments = [str(dots.folder), "--option", "steps=60", "checkpoint_every=7", "dropout=0.2"]

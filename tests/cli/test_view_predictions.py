@@ -189,6 +189,7 @@ def test_the_weights_of_particle_models_are_named(folder: Path) -> None:
         assert one.frames[0] == 47 and len(one.frames) == len(one.shown["particles"])
 
 
+@pytest.mark.slow
 def test_the_verb_puts_them_into_the_page(folder: Path, file: Path, tmp_path: Path) -> None:
     out = tmp_path / "v.html"
     wanted = ["--trials", "1", "--details", "1", "--scenario", "drape"]

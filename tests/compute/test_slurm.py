@@ -56,6 +56,7 @@ def test_an_exception_fails_only_its_task(tmp_path: Path, states: Path) -> None:
     assert {key: o.value for key, o in outcomes.items()} == numbers(1, 2, 4)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_poison_task_is_put_aside_and_the_others_of_its_job_are_done(
     tmp_path: Path, states: Path
@@ -66,6 +67,7 @@ def test_a_poison_task_is_put_aside_and_the_others_of_its_job_are_done(
     assert outcomes["task 2"].tries == 2 and "FAILED" in str(outcomes["task 2"].error)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_job_that_was_ended_runs_again(tmp_path: Path, states: Path) -> None:
     (outcome,) = make(tmp_path).map(die_once, {"a": str(tmp_path / "marker")})

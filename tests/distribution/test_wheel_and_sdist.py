@@ -99,6 +99,7 @@ def test_the_wheel_is_the_package_and_its_metadata(built: Path) -> None:
     assert f"\nVersion: {physion.__version__}\n" in files[f"{info}METADATA"].decode()
 
 
+@pytest.mark.slow
 def test_the_sdist_has_tests_docs_and_licences_and_nothing_else(built: Path) -> None:
     files = sdist_files(built)
     assert {name.partition("/")[0] for name in files} <= TOP
@@ -110,6 +111,7 @@ def test_the_sdist_has_tests_docs_and_licences_and_nothing_else(built: Path) -> 
     assert not [name for name in files if {"__pycache__", "node_modules"} & set(name.split("/"))]
 
 
+@pytest.mark.slow
 def test_only_what_git_knows_is_packed(built: Path) -> None:
     listed = subprocess.run(
         ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
@@ -120,6 +122,7 @@ def test_only_what_git_knows_is_packed(built: Path) -> None:
     assert set(sdist_files(built)) - {"PKG-INFO"} <= set(listed.stdout.splitlines())
 
 
+@pytest.mark.slow
 def test_no_path_of_this_machine_is_packed(built: Path) -> None:
     private = [str(path).encode() for path in (ROOT, Path.home()) if len(path.parts) > 2]
     for name, content in (sdist_files(built) | wheel_files(built)).items():

@@ -221,6 +221,7 @@ def test_the_page_on_own_models_leads_to_a_report(first_report: Path, tmp_path: 
     assert "MyEncoder" in report and "my rule" in report
 
 
+@pytest.mark.slow
 def test_the_datasheet_lists_the_licence_of_every_dependency() -> None:
     """Those of the extra ``dev`` are tools; licences are compared with the installed packages."""
     page = (DOCS / "reference" / "datasheet.md").read_text()

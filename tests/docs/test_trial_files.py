@@ -55,6 +55,7 @@ def test_the_examples_compute_what_they_say(names: dict[str, Any]) -> None:
     assert isinstance(names["index"], pd.DataFrame)
 
 
+@pytest.mark.slow
 def test_the_folders_are_as_shown(names: dict[str, Any]) -> None:
     shown = re.search(r"## Folders\n\n```\n(.*?)```", PAGE, re.DOTALL)
     assert shown is not None

@@ -21,6 +21,7 @@ SCRIPTS = [
 ]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_no_archive_is_unpacked() -> None:
     """A path with ``..`` or a link in an archive cannot lead out of a folder that nothing makes."""

@@ -456,7 +456,13 @@ def keras_network(path: Path, bgr: Tensor) -> tuple[list[Tensor], Tensor]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", [CHINA, GRACE_HOPPER], ids=["china", "hopper"])
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(CHINA, id="china"),
+        pytest.param(GRACE_HOPPER, id="hopper", marks=pytest.mark.nightly),
+    ],
+)
 def test_the_trunk_is_the_network_that_finds_edges_in_photographs(path: Path) -> None:
     package, weights = installed(HED), EncoderWeights(f"package:{HED}")
     picture = photograph(path, 128, *input_statistics("vgg16", weights))

@@ -48,6 +48,7 @@ from support.trained_models import MovingValues
 ALL = [(family, size) for family, sizes in FAMILIES.items() for size in sizes]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(("family", "size"), ALL)
 def test_family_and_size_stand_in_the_name(family: str, size: str) -> None:
@@ -292,6 +293,8 @@ def test_weights_of_another_training_are_refused(tmp_path: Path) -> None:
         make(weights=str(tmp_path / "absent")).encode(MovingValues(1).context(["drop_0000"]))
 
 
+@pytest.mark.nightly
+@pytest.mark.slow
 def test_an_evaluation_does_not_train_it_again(tmp_path: Path) -> None:
     counts = {"training": 4, "readout": 8, "testing": 4}
     dots = make_dots(tmp_path / "dots", counts, ("collide",))

@@ -185,6 +185,7 @@ def evaluator_files(folder: Path, dots: Dataset, given: dict[str, Any]) -> Path:
     return folder / "test_features.hdf5"
 
 
+@pytest.mark.slow
 def test_files_of_the_evaluator_give_the_predictions_of_the_same_features(
     dots: Dataset, tmp_path: Path
 ) -> None:

@@ -147,6 +147,7 @@ def test_random_weights_follow_the_seed(published: dict[str, Path]) -> None:
     assert one.name() == "random-dinov3-tiny" and one.provenance().init == "random"
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_it_is_evaluated_with_its_twin(published: dict[str, Path], tmp_path: Path) -> None:
     dots = make_dots(tmp_path / "dots", {"readout": 8, "testing": 4}, ("collide",))

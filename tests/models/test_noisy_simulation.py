@@ -332,6 +332,7 @@ def test_contacts_that_count_as_new(
     assert [start.frame for start in kicked(ScriptedEngine(*contacts), samples=1)] == frames
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_lapses_are_answers_at_random() -> None:
     trial = scene(0.0)

@@ -243,6 +243,7 @@ def test_the_published_loss_of_given_values() -> None:
     assert model._published(imagined, last, targets).item() == pytest.approx(525, rel=1e-4)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_published_boxes_keep_their_size() -> None:
     model = model_of(size="released")

@@ -144,6 +144,7 @@ def test_shapes_scales_and_poses_are_found(first: SeenFrame) -> None:
         assert found.cost <= cost_of(true, rays) + 0.005
 
 
+@pytest.mark.slow
 def test_what_has_turned_and_moved_is_followed(first: SeenFrame, rolling: Batch) -> None:
     rays = first.rays(2)
     assert rays is not None
@@ -179,6 +180,7 @@ def test_velocities_of_falling_rolling_and_still_objects() -> None:
     assert not velocity.any() and not spin.any()
 
 
+@pytest.mark.slow
 def test_the_scene_at_the_last_frame_is_near_the_true_one(rolling: Batch) -> None:
     seen = see_trial("a", rolling.frames[0], rolling.ids[0], rolling.depth[0], rolling.camera[0])
     assert seen.trial is not None and seen.note == ""
@@ -194,6 +196,7 @@ def test_the_scene_at_the_last_frame_is_near_the_true_one(rolling: Batch) -> Non
     assert not any(body.kinematic for body in found.bodies)
 
 
+@pytest.mark.slow
 def test_what_is_predicted_follows_from_what_is_seen(rolling: Batch) -> None:
     model: SeeingSimulation = build_model("seeing-simulation", samples=4, image_size=128)  # type: ignore[assignment]
     hit = model.imagine(rolling, 4, 0)
@@ -205,6 +208,7 @@ def test_what_is_predicted_follows_from_what_is_seen(rolling: Batch) -> None:
     assert red.sum() > 20
 
 
+@pytest.mark.slow
 def test_an_agent_that_is_never_seen_leaves_the_answer_open(rolling: Batch) -> None:
     hidden = np.where(rolling.ids == 1, 0, rolling.ids).astype(np.uint8)
     model = build_model("seeing-simulation", samples=4, image_size=128)
@@ -269,6 +273,7 @@ def test_notes_of_a_model_reach_the_table(tmp_path: Any) -> None:
     assert table["note"].tolist() == ["fit", "fit; é unseen"]
 
 
+@pytest.mark.slow
 def test_what_hides_the_lower_end_of_an_object_does_not_shorten_it() -> None:
     """A domino behind another one, of which only the upper part is seen, stands on the floor."""
     bodies = (

@@ -118,7 +118,9 @@ def motions() -> list[Motion]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PARTICLE_NAMES)
+@pytest.mark.parametrize(
+    "name", ["gns", pytest.param("gns-ransac", marks=pytest.mark.nightly), "dpi"]
+)
 def test_weights_predict_motion(name: str, motions: list[Motion]) -> None:
     """The error after 0.6 s is at most 0.3 of constant velocity's (0.18 and 0.10 when they were
     made); with random weights it is above 4."""

@@ -389,7 +389,9 @@ def test_settings_that_make_no_network_are_refused(options: dict[str, Any], mess
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [NAMES[0], *(pytest.param(name, marks=pytest.mark.nightly) for name in NAMES[1:])]
+)
 def test_it_is_evaluated_under_observed_and_full(name: str, tmp_path: Path) -> None:
     dots = make_dots(tmp_path / "dots", {"readout": 8, "testing": 4}, ("collide",))
     config = EvaluationSettings(accelerator="cpu", logistic=LogisticSettings(grid=(1e-2,)))

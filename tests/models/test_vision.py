@@ -36,6 +36,8 @@ from support.squares_source import SquaresSource
 from support.tiny_models import TINY
 
 NAMES = ("cswm", "rpin", "svg", "op3")
+FIRST = ("cswm", *(pytest.param(name, marks=pytest.mark.nightly) for name in NAMES[1:]))
+"""For what is the same code in all: the nightly tests have the others."""
 OF_PICTURES = ("svg", "op3")
 """Those that predict pictures."""
 ENCODERS = {"pVGG": "test_resnet", "pDeIT": "test_vit", "pEffNetLite0": "test_efficientnet"}
@@ -168,7 +170,7 @@ def test_a_model_overfits_one_batch(name: str, count: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FIRST)
 def test_equal_steps_give_equal_weights(name: str) -> None:
     digests = []
     for _ in range(2):
@@ -202,7 +204,7 @@ def train(model: Any, folder: Path, last: int = 4) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FIRST)
 def test_a_resumed_training_gives_the_bytes_of_an_uninterrupted_one(
     name: str, tmp_path: Path
 ) -> None:
@@ -217,7 +219,7 @@ def test_a_resumed_training_gives_the_bytes_of_an_uninterrupted_one(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FIRST)
 def test_saved_weights_give_the_same_features(name: str, tmp_path: Path) -> None:
     model = model_of(name, seed=3)
     steps(model, squares(3, model.window, model.spec), 2)

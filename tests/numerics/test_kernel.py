@@ -92,6 +92,7 @@ print(read({name}(3.0)))
 """
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_an_index_that_names_a_renamed_class_is_compiled_again(tmp_path: Path) -> None:
     env = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1", "PYTHONPATH": str(tmp_path)}
@@ -146,6 +147,7 @@ def _run_step(folder: Path, number: int, killed_after: int | None = None) -> str
     return done.stdout.strip()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_code_of_equal_sources_is_read_in_another_folder(tmp_path: Path) -> None:
     (tmp_path / "first").mkdir()
@@ -158,6 +160,7 @@ def _cache_files(folder: Path) -> set[str]:
     return {path.name for path in (folder / "__pycache__").iterdir() if path.name[:5] == "step."}
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("files", [1, 2])
 def test_a_worker_killed_between_two_files_leaves_no_older_code(tmp_path: Path, files: int) -> None:
@@ -168,6 +171,7 @@ def test_a_worker_killed_between_two_files_leaves_no_older_code(tmp_path: Path, 
     assert _run_step(tmp_path, 5) == "6 1"
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_an_older_worker_that_ends_later_leaves_no_older_code(tmp_path: Path) -> None:
     """Numba's own files have one name for all sources, so the last writer would win."""
@@ -184,6 +188,7 @@ def test_an_older_worker_that_ends_later_leaves_no_older_code(tmp_path: Path) ->
     assert _run_step(tmp_path, 1) == "2 1"
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_files_of_older_sources_are_deleted(tmp_path: Path) -> None:
     _run_step(tmp_path, 1)

@@ -213,6 +213,7 @@ def heap() -> Scene:
     )
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @BOTH
 def test_same_bytes_in_every_process(name: str) -> None:

@@ -23,7 +23,7 @@ from physion.scenes.shapes.meshes import box, merge
 from physion.scenes.shapes.primitives import PIPE_INNER, TORUS_INNER, shape, shapes
 
 SPACING = 0.05
-PRIMITIVES = [name for name in shapes.names() if not name.startswith("prop:")]
+PRIMITIVES = [name for name in shapes.names() if ":" not in name]
 
 
 @pytest.mark.slow

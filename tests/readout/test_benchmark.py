@@ -99,6 +99,7 @@ def test_both_benchmarks_are_named_in_the_table_of_results(dots: Dataset, tmp_pa
     }
 
 
+@pytest.mark.slow
 def test_a_tested_scenario_is_read_out_from_all(dots: Dataset, tmp_path: Path) -> None:
     table = evaluate(Watcher(), dots, tmp_path, V15, scenario="drop").predictions
     assert set(table["scenario"]) == {"drop"} and set(table["fit_trials"]) == {16}

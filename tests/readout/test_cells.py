@@ -90,6 +90,7 @@ def test_trainings_are_models_by_protocols_by_sets_by_seeds(dots: Dataset, tmp_p
     assert all(one.done for one in planned)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_each_scenario_trains_a_model_that_is_tested_on_all(dots: Dataset, tmp_path: Path) -> None:
     given: dict[str, Any] = {"protocols": ("only", "one"), "settings": QUICK}
@@ -156,6 +157,7 @@ def test_trainings_on_one_scenario_fill_the_heat_map(dots: Dataset, tmp_path: Pa
         assert cell["difference"] == pytest.approx(right - 0.5), "without people: to guessing"
 
 
+@pytest.mark.slow
 def test_a_training_that_is_missing_or_was_changed_is_done_again(
     dots: Dataset, tmp_path: Path
 ) -> None:
@@ -234,6 +236,7 @@ def test_evaluate_finds_what_was_trained_and_one_protocol_is_a_part_of_all(
     assert set(untrained.predictions["scenario"]) == {"drop"}
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_one_that_fails_does_not_stop_the_others(dots: Dataset, tmp_path: Path) -> None:
     trained = physion.train([FAILS, IMAGINING], dots, tmp_path, protocols=EVERY, settings=CPU)
@@ -318,6 +321,7 @@ def test_a_full_disk_ends_all(dots: Dataset, tmp_path: Path) -> None:
             function(IMAGINING, dots, tmp_path, seeds=2, settings=settings, executor=FullDisk())
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_an_executor_of_this_machine_has_no_cells_as_tasks(dots: Dataset, tmp_path: Path) -> None:
     given: dict[str, Any] = {"executor": FullDiskHere(1), "seeds": 2}

@@ -137,10 +137,18 @@ PLANTED: dict[str, tuple[leaks.Tells, str]] = {
     "the number in the index": (leaks.number_in_the_index, "order"),
 }
 """What a model reads of the evaluated dataset, and the change that must find it."""
+FIRST = {change: leak for leak, (_, change) in reversed(PLANTED.items())}
+"""The first leak of each change; the nightly tests plant the others."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("leak", PLANTED)
+@pytest.mark.parametrize(
+    "leak",
+    [
+        pytest.param(leak, marks=() if leak in FIRST.values() else pytest.mark.nightly)
+        for leak in PLANTED
+    ],
+)
 def test_a_planted_leak_is_refused(leak: str, made: Dataset, tmp_path: Path) -> None:
     tells, change = PLANTED[leak]
     done = run(made, leaks.Cheater(tells), tmp_path, change)
@@ -159,7 +167,13 @@ MODELS: dict[str, tuple[Callable[[], Any], str]] = {
 """Models that leak in their own way, and the change that must find it."""
 
 
-@pytest.mark.parametrize("leak", MODELS)
+@pytest.mark.parametrize(
+    "leak",
+    [
+        pytest.param(leak, marks=pytest.mark.slow if change in ("labels", "everything") else ())
+        for leak, (_, change) in MODELS.items()
+    ],
+)
 def test_a_model_with_a_planted_leak_is_refused(leak: str, made: Dataset, tmp_path: Path) -> None:
     model, change = MODELS[leak]
     assert run(made, model(), tmp_path, change).refused == [change]
@@ -199,7 +213,13 @@ def changed(dataset: Dataset, change: str, folder: Path) -> tuple[ChangedTrials,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("change", HELD)
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param(name, marks=() if name == "everything" else pytest.mark.nightly)
+        for name in HELD
+    ],
+)
 def test_no_observed_byte_changes_that_must_not(change: str, made: Dataset, tmp_path: Path) -> None:
     """Otherwise an honest model could be refused. The fitting trials are the same files."""
     trials, copy = changed(made, change, tmp_path)
@@ -257,6 +277,7 @@ def test_what_is_changed(made: Dataset, tmp_path: Path) -> None:
     assert not set(sizes[:TESTED]) & set(sizes[TESTED:])
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_order_of_frames_and_the_colours(made: Dataset, tmp_path: Path) -> None:
     _, backwards = changed(made, "reversed", tmp_path)
@@ -279,6 +300,7 @@ def test_the_order_of_frames_and_the_colours(made: Dataset, tmp_path: Path) -> N
         assert corner[1] == pytest.approx(0.8 * corner[0][::-1], abs=6)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_half_of_the_tested_trials_fit_where_there_are_no_others(tmp_path: Path) -> None:
     dots = make_dots(tmp_path / "dots", {"testing": 12}, ("drop", "collide"))
@@ -316,6 +338,7 @@ def test_the_verb(
     assert "futur" in capsys.readouterr().err
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_trial_that_cannot_be_predicted_after_a_change_is_refused(
     made: Dataset, tmp_path: Path
@@ -442,6 +465,7 @@ def test_files_are_copied_where_they_cannot_be_linked(
         assert before.stat().st_mtime_ns == after.stat().st_mtime_ns
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_failure_that_no_change_made_ends_the_check(made: Dataset, tmp_path: Path) -> None:
     for error, message in (
@@ -461,6 +485,7 @@ def _caused_by(error: OSError) -> BadInputError:
     return told
 
 
+@pytest.mark.slow
 def test_what_is_only_shown_may_fail(made: Dataset, tmp_path: Path) -> None:
     done = run(made, Failing(ValueError("broken"), 2), tmp_path, "labels", "reversed")
     assert done.passed and set(done.table["change"]) == {"labels"}
@@ -468,6 +493,7 @@ def test_what_is_only_shown_may_fail(made: Dataset, tmp_path: Path) -> None:
     assert "reversed is not shown" in warning and "broken" in warning
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_others_may_fail_and_a_twin_decides_as_the_model(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -97,12 +97,14 @@ def test_the_table_has_one_row_per_trial_and_readout(done: Evaluation, dots: Dat
     assert table["validation_loss"].notna().all() and table["copy_last_loss"].gt(0).all()
 
 
+@pytest.mark.slow
 def test_the_comparison_reads_the_table(done: Evaluation) -> None:
     checked = check_predictions(pd.read_csv(done.paths[0]))
     assert set(checked["readout"]) == {"observed", "observed+simulated", "full"}
     assert len(checked) == len(done.predictions)
 
 
+@pytest.mark.slow
 def test_a_second_run_does_nothing_and_says_the_same(
     done: Evaluation, dots: Dataset, work: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -121,6 +123,7 @@ def test_a_second_run_does_nothing_and_says_the_same(
     assert done.paths[0].read_bytes() == content
 
 
+@pytest.mark.slow
 def test_accuracies_are_known_as_soon_as_a_model_has_predicted(dots: Dataset, work: Path) -> None:
     finished: list[EvaluatedModel] = []
     models, settings = ["chance", "blob-centroids"], replace(QUICK, readouts=("observed",))
@@ -160,6 +163,7 @@ def test_a_damaged_table_is_made_again(
     pd.testing.assert_frame_equal(again.predictions, done.predictions)
 
 
+@pytest.mark.slow
 def test_other_dynamics_share_the_features(done: Evaluation, dots: Dataset, work: Path) -> None:
     steps: list[str] = []
     settings = replace(QUICK, readouts=("observed+simulated",))
@@ -171,6 +175,7 @@ def test_other_dynamics_share_the_features(done: Evaluation, dots: Dataset, work
     assert set(evaluation.predictions["model"]) == {"random-test_vit-lstm"}
 
 
+@pytest.mark.slow
 def test_without_a_readout_split_the_tested_trials_are_cross_fitted(
     dots: Dataset, work: Path, done: Evaluation
 ) -> None:
@@ -207,6 +212,7 @@ def test_unknown_and_impossible_readouts_are_refused(dots: Dataset, tmp_path: Pa
     assert "frozen-encoder" in models
 
 
+@pytest.mark.slow
 def test_an_encoder_without_dynamics_has_two_readouts(
     dots: Dataset, work: Path, done: Evaluation
 ) -> None:
@@ -228,6 +234,7 @@ def test_an_encoder_without_dynamics_has_two_readouts(
     assert np.allclose(same["p_contact"], again["p_contact"])
 
 
+@pytest.mark.slow
 def test_tables_survive_their_file(done: Evaluation, tmp_path: Path) -> None:
     write_table(done.predictions, tmp_path / "t.csv")
     read = read_table(tmp_path / "t.csv")
@@ -326,6 +333,7 @@ class Remembers(NextBrightness):
         return np.full(len(batch), float(self.fraction))
 
 
+@pytest.mark.slow
 def test_a_scenario_is_predicted_by_the_dynamics_that_its_protocol_trained(
     dots: Dataset, tmp_path: Path
 ) -> None:
@@ -415,6 +423,7 @@ def test_scores_are_means_and_deviations_over_seeds() -> None:
     assert len(summarise_accuracy(first.iloc[:0])) == 0
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_twin_has_random_weights_and_is_the_row_of_the_model_with_random_weights(
     dots: Dataset, tmp_path: Path

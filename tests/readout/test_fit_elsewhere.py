@@ -64,6 +64,7 @@ def test_a_motion_that_is_tested_fits_nothing(folder: Path) -> None:
         evaluate("blob-centroids", folder / "tested", folder / "c", fit=both)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("column", "value", "what"),
     [
@@ -80,12 +81,14 @@ def test_pictures_of_another_kind_are_refused(
         evaluate("blob-centroids", folder / "tested", folder / "c", fit=other)
 
 
+@pytest.mark.slow
 def test_a_scenario_without_trials_is_named(folder: Path) -> None:
     make_dots(folder / "drops", {"readout": 4}, ("drop",))
     with pytest.raises(BadInputError, match="has no trial of collide in the split readout"):
         evaluate("blob-centroids", folder / "tested", folder / "c", fit=folder / "drops")
 
 
+@pytest.mark.slow
 def test_two_trials_of_one_name_are_refused(folder: Path) -> None:
     index = Dataset(folder / "tested").index
     index["split"] = "readout"

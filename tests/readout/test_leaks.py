@@ -32,6 +32,11 @@ from support.viewer_dataset import make_dataset
 
 QUICK = EvaluationSettings(accelerator="cpu", logistic=LogisticSettings(grid=(1e-2, 1.0)))
 TREES = {"blob-trees", "mask-trees", "state-trees"}
+KINDS = {
+    "VideoMAE", "blob-centroids", "chance", "constant-motion", "copy-last-frame", "cswm",
+    "frozen-encoder", "gns", "intuition-states", "noisy-simulation",
+}  # fmt: skip
+"""One quick model of each kind; the nightly tests have the others, and trees."""
 PREDICTING = ("observed", "observed+simulated")
 
 
@@ -70,13 +75,20 @@ def predict(dataset: Dataset, name: str, folder: Path) -> pd.DataFrame:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted({*models.names()} - TREES))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in KINDS else pytest.mark.nightly)
+        for name in sorted({*models.names()} - TREES)
+    ],
+)
 def test_what_follows_the_observed_part_changes_no_prediction(
     name: str, made: Dataset, poisoned: Dataset, tmp_path: Path
 ) -> None:
     check_predictions(name, made, poisoned, tmp_path)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(TREES))
 def test_what_follows_the_observed_part_changes_no_tree(

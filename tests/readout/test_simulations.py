@@ -153,6 +153,7 @@ def test_the_noise_is_fitted_only_on_readout_trials(tmp_path: Path, column: str)
     assert fitted(truth ^ ~tested)[0] != scale, "labels of readout trials must matter"
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(("known", "expected"), [(12, "recorded"), (0, "simulated"), (5, "mixed")])
 def test_the_table_names_the_outcomes_that_were_fitted(

@@ -114,6 +114,7 @@ def test_who_knows_is_right_and_who_has_no_idea_is_half_right(pairs: Path, tmp_p
         assert row["mean"] == expected and row["largest"] == max(expected, 0.5)
 
 
+@pytest.mark.slow
 def test_imagined_features_are_compared_with_the_next_frame(pairs: Path, tmp_path: Path) -> None:
     table = surprise(Bright(), pairs, tmp_path).table.set_index("stimulus")
     losses = surprise(Losing(), pairs, tmp_path).table.set_index("stimulus")
@@ -140,6 +141,7 @@ class Breaks(Bright):
         raise ValueError("no features today")
 
 
+@pytest.mark.slow
 def test_a_model_that_fails_does_not_stop_the_others(
     pairs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -166,6 +168,7 @@ def test_what_is_known_is_not_computed_again(pairs: Path, tmp_path: Path) -> Non
     pd.testing.assert_frame_equal(first, again)
 
 
+@pytest.mark.slow
 def test_surprises_with_other_options_are_computed_anew(
     pairs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -206,6 +209,7 @@ def test_the_viewer_says_which_movies_are_impossible(pairs: Path) -> None:
     assert [answer for _, answer in said.values()].count("no") == (len(said) - 2) / 2
 
 
+@pytest.mark.slow
 def test_questions_and_exports_leave_pairs_out(pairs: Path, tmp_path: Path) -> None:
     rest = [name for name in Dataset(pairs).trials() if not is_pair(name)]
     assert {item.trial for item in items_of(Dataset(pairs), split="testing")} == set(rest)
@@ -284,6 +288,7 @@ def test_a_dataset_without_pairs_and_a_model_without_surprise_are_refused(
         pixel_statistics(plain, tmp_path)
 
 
+@pytest.mark.slow
 def test_pixel_statistics_give_a_probability_for_each_movie(pairs: Path, tmp_path: Path) -> None:
     table = pixel_statistics(pairs, tmp_path)
     pd.testing.assert_frame_equal(pixel_statistics(pairs, tmp_path), table)

@@ -106,6 +106,7 @@ def test_what_is_kept_between_frames_changes_no_byte(scenario: str, size: tuple[
         assert digest(kept.render(frame, passes)) == digest(fresh.render(frame, passes))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(12))
 def test_what_is_kept_does_not_depend_on_where_things_move(seed: int) -> None:
@@ -168,6 +169,7 @@ def test_absent_bodies_are_not_drawn_and_cast_no_shadow(kinematic: bool) -> None
     assert np.nanmax(np.abs(shown[1].flow)) < 1e-3
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_fresh_process_gives_the_same_bytes() -> None:
     scene, trajectory = tumbling()
@@ -247,6 +249,7 @@ def test_color_is_anti_aliased() -> None:
     assert between
 
 
+@pytest.mark.slow
 def test_textures_keep_their_mean_over_the_levels_and_their_bytes() -> None:
     names = tuple(sorted({f.texture for f in FINISHES.values()}))
     atlas = build_atlas(names)
@@ -290,6 +293,7 @@ def test_errors_name_what_is_wrong() -> None:
         finish("wood_ahs")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_first_trial_of_every_scenario_shows_agent_and_patient(official: Path) -> None:
     trials = read_scenes(official / "scenes", limit=1).trials

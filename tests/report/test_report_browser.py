@@ -69,6 +69,7 @@ def test_with_reduced_motion_a_movie_plays_only_on_request(browser: Browser, pag
     assert browser.ask(f"getComputedStyle({first}.querySelector('label')).display") == "none"
 
 
+@pytest.mark.nightly
 def test_no_page_is_wider_than_the_screen(
     browser: Browser, page: Path, make_comparison: Maker
 ) -> None:

@@ -72,6 +72,7 @@ def test_every_figure_has_its_files(report: Path) -> None:
             assert (report.parent / "figures" / f"{stem}.{kind}").stat().st_size > 100
 
 
+@pytest.mark.nightly
 def test_flagged_session_is_counted_and_left_out(report: Path) -> None:
     flags = pd.read_csv(report.parent / "tables" / "people_flags.csv")
     assert flags.loc[flags["flagged"], "session"].tolist() == ["collide-7"]
@@ -82,6 +83,7 @@ def test_flagged_session_is_counted_and_left_out(report: Path) -> None:
     assert people.loc["collide", "people"] == PEOPLE - 1 and people.loc["drop", "people"] == PEOPLE
 
 
+@pytest.mark.nightly
 def test_with_and_without_flagged_sessions(report: Path) -> None:
     table = pd.read_csv(report.parent / "tables" / "people_with_and_without.csv")
     own = table[table["scenario"] == "collide"].set_index("sessions")
@@ -95,6 +97,7 @@ def test_with_and_without_flagged_sessions(report: Path) -> None:
     assert not np.allclose(tables[0]["r"], tables[1]["r"])
 
 
+@pytest.mark.nightly
 def test_kappa_of_the_figure_is_the_mean_over_people(report: Path) -> None:
     table = pd.read_csv(report.parent / "figures" / "kappa.csv").set_index(["panel", "model"])
     answers = responses()
@@ -107,6 +110,7 @@ def test_kappa_of_the_figure_is_the_mean_over_people(report: Path) -> None:
     assert row["zone"] == "95 % of participants"
 
 
+@pytest.mark.nightly
 def test_band_of_the_paper_bears_its_name(report: Path) -> None:
     table = pd.read_csv(report.parent / "figures" / "r.csv")
     zones = pd.read_csv(report.parent / "tables" / "zones.csv")
@@ -116,6 +120,7 @@ def test_band_of_the_paper_bears_its_name(report: Path) -> None:
     assert mean["zone_high"].iloc[0] == pytest.approx(halves["high"].mean())
 
 
+@pytest.mark.nightly
 def test_tests_and_mixed_models_are_reported(report: Path) -> None:
     text = text_of(report)
     assert "test of McNemar" in text and "Holm" in text
@@ -128,6 +133,7 @@ def test_tests_and_mixed_models_are_reported(report: Path) -> None:
     assert {"flagged", "sd of participant", "sd of stimulus"} <= fitted
 
 
+@pytest.mark.nightly
 def test_items_and_paired_measures_have_tables_that_the_page_names(report: Path) -> None:
     text, tables = text_of(report), report.parent / "tables"
     items = pd.read_csv(tables / "people_items.csv")
@@ -143,11 +149,13 @@ def test_items_and_paired_measures_have_tables_that_the_page_names(report: Path)
         assert f"tables/{name}.csv" in text
 
 
+@pytest.mark.nightly
 def test_attributes_by_name_are_said_to_be_so(report: Path) -> None:
     words = "Attributes: of 32 stimuli 0 by the table that was given, 32 by their official"
     assert words in text_of(report)
 
 
+@pytest.mark.nightly
 def test_hypotheses_without_their_attribute_give_a_reason(report: Path) -> None:
     values = json.loads((report.parent / "report.json").read_text())
     first = next(row for row in values["people_hypotheses"] if row["hypothesis"] == "H1")

@@ -45,6 +45,7 @@ def test_page_shows_published_and_expected_means(built: Path) -> None:
     assert "interval by the paper's way" in text
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_four_panels_with_their_tables(built: Path) -> None:
     names = {path.name for path in (built.parent / "figures").iterdir()}

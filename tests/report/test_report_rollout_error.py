@@ -61,6 +61,7 @@ def test_no_errors_no_figure(make_comparison: Maker) -> None:
     assert plot is not None and plot.table.equals(table())
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_compare_draws_the_errors_that_it_is_given(tmp_path: Path) -> None:
     predictions = pd.DataFrame(

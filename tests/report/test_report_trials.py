@@ -215,6 +215,7 @@ def test_movies_play_without_sound_and_with_controls(movie: Path) -> None:
     assert base64.b64decode(data) == movie.read_bytes()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_movies_stay_within_the_size_of_the_page(make_comparison: Maker, tmp_path: Path) -> None:
     large = tmp_path / "large.mp4"
@@ -289,6 +290,7 @@ def test_one_sentence_says_which_weights_each_model_started_from(
 # --- a page for each stimulus ---------------------------------------------------------------------
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_trial_pages_are_linked_both_ways(make_comparison: Maker, movie: Path) -> None:
     comparison = make_comparison()

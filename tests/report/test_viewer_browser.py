@@ -246,7 +246,7 @@ def test_a_telephone_shows_a_trial_without_scrolling_sideways(browser: Browser, 
     assert browser.complaints() == []
 
 
-@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("dark", [pytest.param(False, marks=pytest.mark.nightly), True])
 def test_small_screens_hold_everything_in_both_themes(
     browser: Browser, page: Path, dark: bool
 ) -> None:
@@ -322,7 +322,7 @@ def imagined_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build_viewer(folder, place / "v.html", options, imagine=lambda _: imagined).page
 
 
-@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("dark", [pytest.param(False, marks=pytest.mark.nightly), True])
 def test_imagined_particles_are_shown_next_to_the_true_motion(
     browser: Browser, imagined_page: Path, dark: bool
 ) -> None:

@@ -129,6 +129,7 @@ def test_change_of_slots_counts_from_the_last_frame_that_was_seen() -> None:
         packed(dataclasses.replace(one, shown={"slots": np.zeros((4, 3, 4))}))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_large_pictures_take_less_than_a_megabyte() -> None:
     frames = np.arange(45, 300)

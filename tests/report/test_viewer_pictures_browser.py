@@ -62,7 +62,10 @@ def painted(browser: Browser, name: str) -> None:
     )
 
 
-@pytest.mark.parametrize("name", list(TILES))
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=() if name == "cswm" else pytest.mark.nightly) for name in TILES],
+)
 def test_every_vision_model_is_shown(
     browser: Browser, folder: Path, tmp_path: Path, name: str
 ) -> None:

@@ -1,6 +1,7 @@
 """The tasks of Inspect with the released harness and its mock model, and what is read of its logs.
 
-Inspect lives in an environment of its own (`.ci/run`); PHYSION_INSPECT is the path of its Python.
+Inspect lives in an environment of its own, made by `.ci/run --nightly`; PHYSION_INSPECT is the path
+of its Python.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from support.paths import ROOT
 from support.programs import find_program
 from support.red_and_yellow import make_dataset
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.nightly]
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +45,6 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return dict(json.loads(done.stdout.splitlines()[-1]))
 
 
-@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("run", "accuracy", "bias", "flips"),
     [("yes", 0.5, 0.5, 0), ("no", 0.5, -0.5, 0), ("first", 0.5, 0, 1)],
@@ -58,7 +58,6 @@ def test_answers_are_counted_by_outcome_and_order(
     assert got["d_prime"] == pytest.approx(0)
 
 
-@pytest.mark.nightly
 def test_the_standard_error_is_clustered_by_stimulus(found: dict[str, Any]) -> None:
     """Two stimuli of two right answers and two of none: sqrt(sum d^2 C / (C - 1)) / n, d = 1."""
     assert found["yes"]["stderr"] == pytest.approx(math.sqrt(4 * 4 / 3) / 8)

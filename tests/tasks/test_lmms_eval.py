@@ -1,6 +1,7 @@
 """The exported task in the released lmms-eval, with its mock model.
 
-It lives in an environment of its own (`.ci/run`); PHYSION_LMMS_EVAL is the path of its Python.
+It lives in an environment of its own, made by `.ci/run --nightly`; PHYSION_LMMS_EVAL is the path of
+its Python.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from support.programs import find_program
 from support.red_and_yellow import make_dataset
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_released_harness_runs_the_task(tmp_path: Path) -> None:
     python = find_program(variable="PHYSION_LMMS_EVAL", what="lmms-eval")

@@ -95,7 +95,14 @@ def test_a_model_learns_from_every_input(learns_from: Any) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("learns_from", ["clips", "features"])
-@pytest.mark.parametrize("settings", [QUICK, ALL_AT_ONCE, PLATEAU], ids=["adam", "all", "plateau"])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        pytest.param(QUICK, id="adam", marks=pytest.mark.nightly),
+        pytest.param(ALL_AT_ONCE, id="all"),
+        pytest.param(PLATEAU, id="plateau", marks=pytest.mark.nightly),
+    ],
+)
 def test_resumed_training_is_the_uninterrupted_one_to_the_bit(
     learns_from: Any, settings: TrainingSettings, tmp_path: Path
 ) -> None:

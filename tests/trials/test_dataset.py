@@ -220,7 +220,7 @@ def test_a_changed_file_is_refused_and_can_be_read_on_demand(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("column", ["trial_file", "movie"])
+@pytest.mark.parametrize("column", ["trial_file", pytest.param("movie", marks=pytest.mark.nightly)])
 def test_an_export_of_a_changed_file_fails_and_the_others_go_on(
     column: str, made: Path, tmp_path: Path
 ) -> None:

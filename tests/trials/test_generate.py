@@ -152,6 +152,7 @@ def test_second_run_does_nothing(finished: Path) -> None:
     assert {p: t for p, t in after.items() if p != finished} == before
 
 
+@pytest.mark.slow
 def test_any_missing_file_is_made_again(finished: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, tmp_path / "set")
     for index, path in enumerate(Dataset(tmp_path / "set").paths("b").all().values()):
@@ -185,6 +186,7 @@ def test_a_failing_trial_is_reported_and_the_others_continue(tmp_path: Path) -> 
     assert Dataset(tmp_path / "s").trials() == ["a", "c"]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_poison_trial_is_put_aside(tmp_path: Path) -> None:
     report = run(tmp_path / "s", scenes_named("a", "die", "c"), executor=LocalExecutor(1))
@@ -236,8 +238,8 @@ def check_only_whole_files(folder: Path) -> None:
     ("name", "code"),
     [
         ("write", errno.ENOSPC),
-        ("replace", errno.EIO),
-        pytest.param("fsync", errno.EIO, marks=pytest.mark.slow),
+        pytest.param("replace", errno.EIO, marks=pytest.mark.slow),
+        pytest.param("fsync", errno.EIO, marks=[pytest.mark.slow, pytest.mark.nightly]),
     ],
 )
 def test_a_fault_at_every_step_leaves_only_whole_files(
@@ -354,7 +356,10 @@ def run_and_kill(folder: Path, trials: int, after: int, delay: float) -> int:
     return code
 
 
-@pytest.mark.parametrize(("kills", "trials"), [(1, 8), pytest.param(5, 16, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("kills", "trials"),
+    [(1, 8), pytest.param(5, 16, marks=[pytest.mark.slow, pytest.mark.nightly])],
+)
 def test_killed_runs_resume_to_the_same_tree(kills: int, trials: int, tmp_path: Path) -> None:
     chance = random.Random(kills)
     killed = [
@@ -414,6 +419,7 @@ def test_broken_trials_are_found_when_the_index_is_made(finished: Path, tmp_path
     assert report.kept == ["a"]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("indexed", [True, False])
 @pytest.mark.parametrize("column", ["trial_file", "movie"])
@@ -602,6 +608,7 @@ MUJOCO = GenerateSettings(
 )
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_trials_of_another_engine_are_verified_with_it(tmp_path: Path) -> None:
     tasks = plan_dataset("tests", ["collide"], {"testing": 1})

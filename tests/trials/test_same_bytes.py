@@ -182,8 +182,8 @@ def test_every_environment_is_tested() -> None:
 @pytest.mark.parametrize(
     "names",
     [
-        # All kernels are compiled for it, which takes minutes.
-        pytest.param(names, marks=pytest.mark.nightly if "generic" in names[0] else ())
+        # For a generic processor all kernels are compiled, which takes minutes.
+        pytest.param(names, marks=() if "one thread" in names else pytest.mark.nightly)
         for names in TOGETHER
     ],
     ids=" + ".join,

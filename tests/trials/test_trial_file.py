@@ -387,8 +387,8 @@ def without_checksums(data: bytes) -> bytes:
     [
         ("state", 150),
         ("passes", 20),
-        ("unchecked", 150),
-        pytest.param("unchecked", 500, marks=pytest.mark.slow),
+        pytest.param("unchecked", 150, marks=pytest.mark.slow),
+        pytest.param("unchecked", 500, marks=[pytest.mark.slow, pytest.mark.nightly]),
     ],
 )
 def test_mutations_with_a_right_seal_never_crash(

@@ -163,6 +163,7 @@ def test_strangers_and_trials_of_other_splits_are_named(sampled: Path, tmp_path:
     assert "the same physics as" in faults
 
 
+@pytest.mark.slow
 def test_a_trial_made_again_is_indexed_again(sampled: Path, tmp_path: Path) -> None:
     folder = tmp_path / "d"
     shutil.copytree(sampled, folder)
@@ -210,6 +211,7 @@ def test_a_movie_with_another_end_is_found(sampled: Path, tmp_path: Path) -> Non
     assert f"frame {len(frames) - 1} differs" in fault
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_trials_of_another_version_are_no_faults(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -228,6 +230,7 @@ def test_trials_of_another_version_are_no_faults(
     assert "made by another version" in newer.other_versions[0]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_map_in_another_compression_is_the_same_picture(sampled: Path, tmp_path: Path) -> None:
     folder = tmp_path / "d"
@@ -246,6 +249,7 @@ def test_a_map_in_another_compression_is_the_same_picture(sampled: Path, tmp_pat
     assert result.notes == []
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_trials_of_an_unknown_preset_are_reported_as_not_drawn_again(
     sampled: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

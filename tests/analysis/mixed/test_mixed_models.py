@@ -184,6 +184,7 @@ BOTH = pytest.mark.parametrize(
 FEW = settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @BOTH
 @FEW

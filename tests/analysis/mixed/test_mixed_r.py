@@ -25,7 +25,7 @@ SHARE = {"glmmTMB": 1e-3, "lme4": 1e-2}
 
 def cases(kind: str) -> list[object]:
     names = [name for name, case in CASES.items() if case.kind == kind]
-    marks = {True: [pytest.mark.slow], False: []}
+    marks = {True: [pytest.mark.slow, pytest.mark.nightly], False: []}
     return [pytest.param(name, marks=marks[name in BIG]) for name in names]
 
 

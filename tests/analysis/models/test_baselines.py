@@ -166,6 +166,7 @@ def test_one_person_makes_no_pair() -> None:
 # --- beyond the outcome --------------------------------------------------------------------------
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("contacts", [60, 110])
 def test_independent_errors_give_no_kappa_beyond_the_outcome(contacts: int) -> None:

@@ -53,6 +53,7 @@ def fits() -> dict[str, MixedTable]:
     return {one.name: one for one in fits_of_people(timed_study(30, 60))}
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_parameters_of_log_normal_response_times_are_found_again(
     fits: dict[str, MixedTable],
@@ -129,6 +130,7 @@ def trained_models() -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_contrasts_of_groups_match_the_balanced_design() -> None:
     """Without further random terms the balanced model is least squares with fixed scenarios."""
@@ -187,6 +189,7 @@ def test_readout_and_training_are_terms_of_their_own() -> None:
     assert one["p"] == pytest.approx(trainings.table["p"].iloc[1])
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_bad_groups_are_refused() -> None:
     rows = trained_models()

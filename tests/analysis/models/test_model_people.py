@@ -173,6 +173,7 @@ def test_intervals_match_leaving_out_people_or_stimuli(
                 assert 0.85 < width <= 1 + 1e-9, (what, measure)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("drawn", ["people", "both"])
 def test_a_perfect_model_lies_in_its_interval_as_often_as_it_should(drawn: Resampled) -> None:

@@ -64,6 +64,7 @@ def test_the_zone_of_people_is_the_mean_of_its_bounds() -> None:
     assert 0 < kappa[0] < kappa[1] < 1
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_people_come_first_then_all_by_accuracy() -> None:
     labels = official().labels

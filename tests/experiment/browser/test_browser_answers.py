@@ -49,6 +49,7 @@ FOREIGN: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.nightly
 def test_responses_of_others_are_not_refusals(chromium: Any, site: tuple[Study, str]) -> None:
     study, url = site
     with Visit(chromium, url) as visit:
@@ -110,6 +111,7 @@ def test_a_lost_token(chromium: Any, site: tuple[Study, str]) -> None:
     assert [row.response for row in answers_to_test(study, "Gone")] == ["no", "yes", "yes"]
 
 
+@pytest.mark.nightly
 def test_a_refused_answer_is_stored_as_event_before_removal(
     chromium: Any, site: tuple[Study, str]
 ) -> None:
@@ -196,6 +198,7 @@ WATCH_TROUBLE = """() => {
 """Function that keeps what the page says about the connection from now on."""
 
 
+@pytest.mark.nightly
 def test_answers_that_are_too_early_are_sent_again(chromium: Any, tmp_path: Path) -> None:
     """After the time that the server says; the participant notices nothing and continues."""
     timing = replace(SHORT, cue_ms=2000)

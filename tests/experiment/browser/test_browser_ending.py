@@ -99,6 +99,7 @@ def test_declining_is_asked_once_more_and_leaves_nothing(
     assert session.withdrawn_at is not None and stored(study)["sessions"] == before["sessions"] + 1
 
 
+@pytest.mark.nightly
 def test_an_implausible_session_gets_neither_code_nor_link(
     chromium: Any, strict: tuple[Study, str]
 ) -> None:
@@ -140,6 +141,7 @@ def test_an_implausible_session_gets_neither_code_nor_link(
 # --- stopping ------------------------------------------------------------------------------------
 
 
+@pytest.mark.nightly
 def test_the_trial_continues_behind_the_question(chromium: Any, site: tuple[Study, str]) -> None:
     study, url = site
     with Visit(chromium, url, "question") as visit:
@@ -219,6 +221,7 @@ def correct(study: Study, name: str) -> int:
     return sum((row.response == "yes") == labels[row.stimulus] for row in test)
 
 
+@pytest.mark.nightly
 def test_accuracy_and_percentile_of_the_result(chromium: Any, site: tuple[Study, str]) -> None:
     """As computed from the stored answers: others with fewer right ones, and half of the equal."""
     study, url = site
@@ -247,6 +250,7 @@ def test_accuracy_and_percentile_of_the_result(chromium: Any, site: tuple[Study,
     assert f"you are at percentile {round(percentile)}" in said
 
 
+@pytest.mark.nightly
 def test_the_form_of_mturk_stays_in_its_frame(chromium: Any, site: tuple[Study, str]) -> None:
     """The whole session runs in a frame of MTurk's page, and is submitted there."""
     _, url = site

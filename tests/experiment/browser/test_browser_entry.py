@@ -247,6 +247,7 @@ def test_entering_twice_begins_one_session(chromium: Any, site: tuple[Study, str
     assert len(references(study)) == len(before) + 1
 
 
+@pytest.mark.nightly
 def test_the_next_person_at_this_computer(chromium: Any, site: tuple[Study, str]) -> None:
     """Also where the token of a finished session was lost."""
     study, url = site

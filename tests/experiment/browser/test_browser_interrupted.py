@@ -46,7 +46,7 @@ new MutationObserver(() => {{
 """Script that hides the page for a moment as soon as the first element of `hideAt` appears."""
 
 
-@pytest.fixture(scope="module", params=["repeat", "void"])
+@pytest.fixture(scope="module", params=[pytest.param("repeat", marks=pytest.mark.nightly), "void"])
 def slow(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[Study, str]]:
@@ -94,6 +94,7 @@ def test_a_question_or_a_small_window_interrupts_a_trial(
     assert reasons == (["dialog", "window"] if repeats else [])
 
 
+@pytest.mark.nightly
 def test_a_trial_whose_movie_is_hidden_each_time_is_void(
     chromium: Any, slow: tuple[Study, str]
 ) -> None:
@@ -168,6 +169,7 @@ def test_a_trial_that_was_hidden_is_shown_again(chromium: Any, site: tuple[Study
         assert row.frames_shown > 0
 
 
+@pytest.mark.nightly
 def test_trials_wait_while_the_window_is_too_small(chromium: Any, site: tuple[Study, str]) -> None:
     study, url = site
     # As on a laptop with scaling or zoom: everything but the trials is possible.

@@ -361,6 +361,7 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Study, str]]
         yield study, server.url
 
 
+@pytest.mark.nightly
 def test_full_screen_is_offered_until_it_is_declined(chromium: Any, two: tuple[Study, str]) -> None:
     study, url = two
     with Visit(chromium, url, "fullscreen") as visit:
@@ -383,6 +384,7 @@ def test_full_screen_is_offered_until_it_is_declined(chromium: Any, two: tuple[S
     assert ("fullscreen", {"on": True}) in events and ("fullscreen", {"on": False}) in events
 
 
+@pytest.mark.nightly
 def test_feedback_shows_the_map_and_is_kept_over_a_reload(
     chromium: Any, two: tuple[Study, str]
 ) -> None:

@@ -68,6 +68,7 @@ def test_the_consent_states_payment_and_wage(
         assert visit.unexpected() == []
 
 
+@pytest.mark.nightly
 def test_mental_rotation_is_asked_at_the_end_and_judged_in_the_export(
     chromium: Any, paper: tuple[Study, str], tmp_path: Path
 ) -> None:

@@ -142,6 +142,7 @@ def test_answers_wait_while_the_browser_is_offline(chromium: Any, site: tuple[St
     assert {"offline", "online"} <= kinds
 
 
+@pytest.mark.nightly
 def test_a_browser_that_is_closed_offline(chromium: Any, site: tuple[Study, str]) -> None:
     """Answers are sent when the page is opened again; a form stays until it is stored."""
     study, url = site
@@ -191,6 +192,7 @@ def test_a_browser_that_is_closed_offline(chromium: Any, site: tuple[Study, str]
     assert [row.resumed for row in test] == [False, False, True]
 
 
+@pytest.mark.nightly
 def test_the_second_tab_takes_over(chromium: Any, site: tuple[Study, str]) -> None:
     study, url = site
     with Visit(chromium, url, "tabs") as visit:
@@ -255,6 +257,7 @@ def test_another_device_answers_meanwhile(chromium: Any, site: tuple[Study, str]
     assert [event.data["code"] for event in refused] == ["already_answered"]
 
 
+@pytest.mark.nightly
 def test_a_server_that_is_killed_and_has_other_keys(chromium: Any, tmp_path: Path) -> None:
     """Answers wait for the server; media URLs that became invalid are requested anew."""
     with (

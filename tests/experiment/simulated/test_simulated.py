@@ -79,6 +79,7 @@ def test_people_are_right_as_often_as_they_should_be_and_slower_where_it_is_hard
     assert rt.min() > 0
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_answers_follow_the_rasch_model_and_log_normal_times() -> None:
     people = [SimulatedPerson(0, number) for number in range(200)]
@@ -196,6 +197,7 @@ def test_simulated_is_written_in_the_data_for_good(
             assert visit.result.correct == sum(right)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_sessions", [False, True])
 def test_models_are_not_compared_with_only_simulated_participants(
     study: Study,

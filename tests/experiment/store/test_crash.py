@@ -27,7 +27,6 @@ from physion.experiment.study.study import Study
 from support.experiment.serving import QuickServer, stored_answers, stored_sessions
 from support.experiment.tiny_study import make_tiny_study
 
-KILLS = 50
 PHASES = {"familiarization": 3, "test": 12}
 LONGEST_RUN_S = 0.4
 """Longest time in seconds between the start of the server and a kill."""
@@ -118,11 +117,14 @@ def make_study(folder: Path) -> Study:
 
 
 @pytest.mark.slow
-def test_nothing_is_lost_when_the_server_is_killed_again_and_again(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kills", [10, pytest.param(50, marks=pytest.mark.nightly)])
+def test_nothing_is_lost_when_the_server_is_killed_again_and_again(
+    kills: int, tmp_path: Path
+) -> None:
     study = make_study(tmp_path / "study")
     with QuickServer(study.folder) as server, Load(study, server.url, people=5) as load:
-        kill_again_and_again(server, KILLS, seed=1)
-    assert sum(visit.retries for visit in load.visits) > KILLS, "the kills met no load"
+        kill_again_and_again(server, kills, seed=1)
+    assert sum(visit.retries for visit in load.visits) > kills, "the kills met no load"
     check(study, load.visits)
     engine = open_database(study.folder)
     with engine.connect() as connection:

@@ -250,6 +250,7 @@ def test_conditions_are_filled_equally_and_places_are_given_back(groups_store: S
     assert conditions_of(store)["plain"] == 4, "nobody continues the session that was left"
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_ties_are_broken_by_seed(groups: Study, tmp_path: Path) -> None:
     first = []

@@ -162,6 +162,7 @@ def test_single_participants_are_forgotten(
     assert raw_id(5).encode() in found
 
 
+@pytest.mark.slow
 def test_ids_are_forgotten_while_the_study_is_served(
     tmp_path: Path, small_study: Study, small_secrets: Secrets
 ) -> None:

@@ -98,6 +98,7 @@ def ask(port: int, method: str, path: str, body: Any = None, token: str = "") ->
     return json.loads(connection.getresponse().read())
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_stopping_finishes_requests_and_keeps_every_answer(study: Study) -> None:
     with started(study.folder) as server:

@@ -177,7 +177,7 @@ def test_the_steps_of_a_rollout_can_be_limited(collide: Motion) -> None:
         model_of("dpi", future=0)
 
 
-@pytest.mark.parametrize("size", ["small", "paper"])
+@pytest.mark.parametrize("size", ["small", pytest.param("paper", marks=pytest.mark.slow)])
 def test_gns_and_gns_ransac_are_one_network_with_one_training(size: str, collide: Motion) -> None:
     own, robust = (model_of(name, seed=1, size=size) for name in ("gns", "gns-ransac"))
     batch = window(collide, motion("drape", 1), steps=4)
@@ -377,6 +377,7 @@ def test_later_steps_of_a_training_start_from_the_prediction(name: str, collide:
     assert model.window == batch.frames.shape[1]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["gns", "dpi"])
 def test_a_network_overfits_one_window(
@@ -466,6 +467,8 @@ def test_errors_of_a_falling_body_count_alike_for_short_and_long_steps(name: str
     assert np.isfinite(poses.centers).all() and len(poses.centers) == 45 + 15
 
 
+@pytest.mark.nightly
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_size_paper_learns_and_imagines(name: str) -> None:
     """With fewer particles, so that it is quick, but all of its network."""
@@ -484,7 +487,7 @@ def test_the_size_paper_learns_and_imagines(name: str) -> None:
     assert np.isfinite(model.gaps(motions, futures)).all()
 
 
-@pytest.mark.parametrize("scenario", ["collide", "drape"])
+@pytest.mark.parametrize("scenario", ["collide", pytest.param("drape", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", NAMES)
 def test_what_follows_the_observed_part_is_not_seen(name: str, scenario: str) -> None:
     model, straight = model_of(name, samples=2), silent(name, samples=2)

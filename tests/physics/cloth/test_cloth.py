@@ -356,6 +356,7 @@ print(hashlib.sha256(still(draped(ball()), 61).vertices.tobytes()).hexdigest())
 """
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_same_bytes_in_another_process() -> None:
     here = hashlib.sha256(still(draped(ball()), 61).vertices.tobytes()).hexdigest()

@@ -80,7 +80,10 @@ def test_presets_of_our_own_come_first(scenario: str) -> None:
     assert not set(practised) & set(default_presets(scenario, "testing"))
 
 
-@pytest.mark.parametrize("index", [0, *(pytest.param(i, marks=pytest.mark.slow) for i in (1, 2))])
+@pytest.mark.parametrize(
+    "index",
+    [0, *(pytest.param(i, marks=[pytest.mark.slow, pytest.mark.nightly]) for i in (1, 2))],
+)
 @pytest.mark.parametrize("preset", all_presets(), ids=lambda p: f"{p.scenario}/{p.name}")
 def test_every_preset_draws_sound_scenes(preset: Preset, index: int) -> None:
     check_params(preset.params, preset.name)

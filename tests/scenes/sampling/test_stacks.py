@@ -84,6 +84,7 @@ def test_rise_of_a_ball_above_curved_shapes() -> None:
     assert required_rise(wide, (ring,)) == pytest.approx(0.19 + edge, abs=0.01)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("holder", ["bowl", "torus", "pipe", "cone", "prop:basket"])
 @pytest.mark.parametrize("shape", ["sphere", "cube", "cylinder", "torus"])
@@ -223,6 +224,7 @@ def test_links_are_on_the_pole_and_below_the_cap() -> None:
                 )
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_what_cannot_be_placed_is_an_error_with_reason() -> None:
     tall = dataclasses.replace(link.LINKS, count=(3, 3))
@@ -323,6 +325,7 @@ def test_official_trials_could_have_been_drawn(scenario: str, official: Path) ->
             assert len(scene.joints) == params.stand.attached + params.stand.capped
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_stacks_start_at_the_official_height(official: Path) -> None:
     """Height of the lowest body above the top of the stand: equal medians within 3 cm."""
@@ -345,6 +348,7 @@ def test_stacks_start_at_the_official_height(official: Path) -> None:
             assert abs(float(np.median(ours)) - float(np.median(heights))) < allowed, name
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_official_probes_start_outside_their_stand(official: Path) -> None:
     """No published trial is refused by the check that the probe starts outside its stand."""

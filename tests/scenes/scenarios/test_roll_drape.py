@@ -231,6 +231,7 @@ def test_probes_of_collisions_are_tumbled_and_start_above_the_floor() -> None:
 # Drape.
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", published("drape"), ids=lambda preset: preset.name)
 def test_drape_is_drawn_as_the_official_scenes(official: Path, preset: Preset) -> None:

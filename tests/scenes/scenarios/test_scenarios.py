@@ -128,6 +128,7 @@ def props(scene: Scene, kind: str) -> list[tuple[object, ...]]:
     return [(b.shape, b.scale, b.look) for b in scene.bodies if b.name.startswith(kind)]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_distractors_and_occluders_have_streams_of_their_own(scenario: Scenario) -> None:
     same = 0
@@ -357,6 +358,7 @@ DRAWN: dict[str, list[tuple[Callable[[Scene], float], float, float]]] = {
 rules (docs/official-system.md, sections 2 and 3)."""
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_values_are_drawn_from_the_whole_of_their_official_range(scenario: Scenario) -> None:
     params = scenario.params()

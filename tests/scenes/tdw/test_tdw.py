@@ -452,6 +452,7 @@ def test_folders_without_logs_are_refused(tmp_path: Path) -> None:
         read_scenes(tmp_path / "nowhere")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_official_logs_are_imported_completely(official: Path) -> None:
     found = read_scenes(official / "scenes")

@@ -265,7 +265,7 @@ def bench_labels(src_dir: Path, scene: str, kind: str, train: bool) -> dict[str,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("images", [True, False])
+@pytest.mark.parametrize("images", [pytest.param(True, marks=pytest.mark.nightly), False])
 def test_physion_particles_reads_its_folder(dataset: Path, tmp_path: Path, images: bool) -> None:
     out = export(dataset, tmp_path / "out", "physion-particles", images=images)
     rigid = particles_preprocess(str(out / "testing"), "Collide")

@@ -320,6 +320,7 @@ def _validate(path: Path) -> str:
     return done.stdout + done.stderr
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_reference_validator_agrees(
     dataset: Path, metadata: dict[str, Any], tmp_path: Path

@@ -417,6 +417,7 @@ def test_a_missing_extra_is_said_in_one_line(
     assert said.endswith(f": {found[1]} {found[2]}experiment{found[3]}\n")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="kills a process")
 def test_a_killed_command_can_be_repeated(tmp_path: Path) -> None:
