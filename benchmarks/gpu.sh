@@ -11,9 +11,10 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 out=${1:-${OUT:-runs/gpu}} data=${2:-runs/gpu-data} pixels=${PIXELS:-96} steps=${STEPS:-4000}
+workers=$(nproc)  # before OMP_NUM_THREADS, which it heeds
 export PYTHONPATH=$PWD/src${PYTHONPATH:+:$PYTHONPATH} OMP_NUM_THREADS=1 PYTHONUNBUFFERED=1
 mkdir -p "$out" "$data/said" "$data/weights"
-trials=(python benchmarks/models/intuition_trials.py "$data" --workers "$(nproc)" --pixels "$pixels")
+trials=(python benchmarks/models/intuition_trials.py "$data" --workers "$workers" --pixels "$pixels")
 "${trials[@]}" --official | tail -n 1
 "${trials[@]}" --trials "${TRIALS:-20000}" --seconds "${MAKE:-240}" > "$data/said/made.txt" 2>&1
 ls "$data/own" | wc -l

@@ -8,7 +8,7 @@ touch, and drawn at the observed frames. Of trials with the digest of a training
 contact in the observed part, and with agent and patient visible in the first frame, the features of
 all `MODELS` are written to FOLDER/own, in files of `EACH` trials; with --pixels the pictures and
 masks, and not what forests see. With --official the same of the stimuli that people saw goes to
-FOLDER/official. The same command continues.
+FOLDER/official; with --stored the trials of a dataset go to FOLDER/own. The same command continues.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -30,16 +30,17 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
+from physion import Dataset
 from physion.clips.batch import Batch, Motion, Spec
 from physion.clips.rendered import object_ids
 from physion.clips.source import ObservedSource, TrialReaders
-from physion.clips.states import cut_motion
+from physion.clips.states import TrialMotions, cut_motion
 from physion.core.errors import BadSceneError
 from physion.core.files import write_atomic
 from physion.core.names import SCENARIOS, canonical_name
 from physion.core.seeds import trial_seed
 from physion.data.official import official
-from physion.models.build import build_model
+from physion.models.build import build_model, build_untrained
 from physion.models.intuition import mask_tokens
 from physion.models.intuition_pixels import SEEN
 from physion.physics.engine import make_engine
@@ -86,11 +87,20 @@ FACTS = ("trial", "scenario", "configuration", "contact", "observed_contact", "s
 
 @cache
 def encoder(name: str, **settings: Any) -> Any:
-    """Return a model whose features are made."""
-    return build_model(name, **settings)
+    """Return a model whose features are made; they depend on no weights."""
+    return build_untrained(name, **settings)
 
 
-def see(motion: Motion, pixels: int) -> dict[str, NDArray[Any]]:
+@dataclass(frozen=True)
+class Kept:
+    """What is kept of trials: features of ``models``, or pictures of ``pixels`` a side."""
+
+    folder: Path
+    models: Sequence[str] = MODELS
+    pixels: int = 0
+
+
+def see(motion: Motion, kept: Kept) -> dict[str, NDArray[Any]]:
     """Return the features of a motion by model; with ``pixels``, also pictures and masks.
 
     Pictures and masks have ``pixels`` a side, and the frames that `intuition-pixels` looks at; then
@@ -115,8 +125,8 @@ def see(motion: Motion, pixels: int) -> dict[str, NDArray[Any]]:
             found = model.encode(batch.to("cpu") if is_network(model) else batch)
         return np.asarray(found[0], np.float32)
 
-    if not pixels:
-        return {model: features(encoder(model)) for model in MODELS}
+    if not (pixels := kept.pixels):
+        return {model: features(encoder(model)) for model in kept.models}
     masks = encoder("intuition-masks", image_size=pixels)
     frames = np.array(masks.spec.context_frames())
     late = frames[list(SEEN)]
@@ -134,7 +144,7 @@ def see(motion: Motion, pixels: int) -> dict[str, NDArray[Any]]:
     }  # fmt: skip
 
 
-def own_trial(scenario: str, number: int, pixels: int) -> Seen:
+def own_trial(scenario: str, number: int, kept: Kept) -> Seen:
     """Return one own trial, the first of its samples that is accepted."""
     presets = [p for p in load_presets(scenario).values() if p.official]
     engine, attempt = make_engine("physion"), -1
@@ -153,7 +163,7 @@ def own_trial(scenario: str, number: int, pixels: int) -> Seen:
         labels = label_contact(scene, trajectory)
         if labels.observed or len(trajectory) < OBSERVED_FRAMES:
             continue
-        features = see(Motion(scene, trajectory), pixels)
+        features = see(Motion(scene, trajectory), kept)
         if visible(features["intuition-masks"]):
             return Seen(
                 scene.name, scenario, preset.official or "", labels.contact, False,
@@ -175,7 +185,7 @@ def official_scenes() -> list[tuple[Scene, bool]]:
     return [(trial.scene, bool(trial.outcome.contact)) for trial in unique.values()]
 
 
-def official_trial(scene: Scene, contact: bool, pixels: int) -> Seen:
+def official_trial(scene: Scene, contact: bool, kept: Kept) -> Seen:
     """Return an official stimulus, of which only the observed part is simulated."""
     trajectory = make_engine("physion").simulate(scene, frames=OBSERVED_FRAMES)
     labels = label_contact(scene, trajectory)
@@ -183,7 +193,15 @@ def official_trial(scene: Scene, contact: bool, pixels: int) -> Seen:
     configuration = scene.name.rpartition("_")[0].removesuffix("_2")
     return Seen(
         canonical_name(scene.name), scene.scenario, configuration, contact,
-        bool(labels.observed), scene.to_json(), see(Motion(scene, trajectory), pixels),
+        bool(labels.observed), scene.to_json(), see(Motion(scene, trajectory), kept),
+    )  # fmt: skip
+
+
+def stored_trial(trial: str, row: Mapping[str, Any], motion: Motion, kept: Kept) -> Seen:
+    """Return a trial that is stored in a dataset, with its row of the index."""
+    return Seen(
+        trial, row["scenario"], row["preset"], bool(row["contact"]), bool(row["observed_contact"]),
+        motion.scene.to_json(), see(motion, kept),
     )  # fmt: skip
 
 
@@ -197,25 +215,39 @@ def write(path: Path, trials: Sequence[Seen]) -> None:
     write_atomic(path, buffer.getvalue())
 
 
-def make_own(folder: Path, pixels: int, task: tuple[str, int]) -> str:
+def make_own(kept: Kept, task: tuple[str, int]) -> str:
     """Make one file of own trials, if it is not there."""
     scenario, part = task
-    path = folder / "own" / f"{scenario}-{part:04d}.npz"
+    path = kept.folder / "own" / f"{scenario}-{part:04d}.npz"
     if not path.exists():
         start = time.process_time()
         numbers = range(part * EACH, (part + 1) * EACH)
-        write(path, [own_trial(scenario, number, pixels) for number in numbers])
+        write(path, [own_trial(scenario, number, kept) for number in numbers])
         return f"{path.stem} {(time.process_time() - start) / EACH:.2f} s a trial"
     return ""
 
 
-def make_official(folder: Path, pixels: int, part: int) -> str:
+def make_official(kept: Kept, part: int) -> str:
     """Make one file of official stimuli, if it is not there."""
-    path = folder / "official" / f"{part:04d}.npz"
+    path = kept.folder / "official" / f"{part:04d}.npz"
     if not path.exists():
         scenes = official_scenes()[part * EACH : (part + 1) * EACH]
-        write(path, [official_trial(scene, contact, pixels) for scene, contact in scenes])
+        write(path, [official_trial(scene, contact, kept) for scene, contact in scenes])
         return f"official {path.stem}"
+    return ""
+
+
+def make_stored(dataset: Path, kept: Kept, part: int) -> str:
+    """Make one file of trials of a dataset, without those with a contact in the observed part."""
+    path = kept.folder / "own" / f"stored-{part:04d}.npz"
+    if not path.exists():
+        opened = Dataset(dataset)
+        index = opened.index.set_index("trial")
+        index = index[~index["observed_contact"].astype(bool)].iloc[part * EACH : (part + 1) * EACH]
+        motions = TrialMotions(opened.files("trial_file"), observed=True)
+        rows = {str(trial): row for trial, row in index.iterrows()}
+        write(path, [stored_trial(trial, row, motions[trial], kept) for trial, row in rows.items()])
+        return path.stem
     return ""
 
 
@@ -283,6 +315,8 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=0, help="own trials, a scenario")
     parser.add_argument("--scenarios", nargs="*", choices=SCENARIOS, default=list(RIGID))
     parser.add_argument("--official", action="store_true")
+    parser.add_argument("--stored", type=Path, help="dataset whose trials are taken, too")
+    parser.add_argument("--models", nargs="*", choices=MODELS, default=list(MODELS))
     parser.add_argument("--pixels", type=int, default=0, help="keep pictures of this size")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=math.inf, help="stop after this time")
@@ -290,12 +324,18 @@ def main() -> None:
     # Scenarios in turn, so that what is there is always of all of them.
     tasks = [(s, part) for part in range(options.trials // EACH) for s in options.scenarios]
     parts = range(-(-len(official_scenes()) // EACH)) if options.official else range(0)
-    official_of = partial(make_official, options.folder, options.pixels)
-    own_of = partial(make_own, options.folder, options.pixels)
+    kept = Kept(options.folder, options.models, options.pixels)
+    count = 0
+    if options.stored:
+        count = int((~Dataset(options.stored).index["observed_contact"].astype(bool)).sum())
     end = time.monotonic() + options.seconds
     with ProcessPoolExecutor(options.workers) as pool:
-        made = [pool.submit(official_of, part) for part in parts]
-        made += [pool.submit(own_of, task) for task in tasks]
+        made = [pool.submit(make_official, kept, part) for part in parts]
+        made += [
+            pool.submit(make_stored, options.stored, kept, part)
+            for part in range(-(-count // EACH))
+        ]
+        made += [pool.submit(make_own, kept, task) for task in tasks]
         for future in made:
             if done := future.result():
                 print(f"{time.strftime('%H:%M:%S')} {done}", flush=True)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import json
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -39,6 +40,7 @@ from physion.models.checkpoint import BUILT_AS, tensors_of, write_checkpoint
 from physion.models.interface import ask
 from physion.models.intuition_pixels import SEEN, blobs_of_masks, colored
 from physion.readout.trees import fit_forest
+from physion.training.loop import CARD
 from physion.training.train import train_model
 
 RESULTS = Path(__file__).parents[1] / "results" / "intuition_networks.md"
@@ -119,7 +121,10 @@ class Learner:
         source = OwnSource(model.spec, self.own, self.pixels[id(self.own)])
         outcomes = dict(zip(trials, self.own["contact"][fit].tolist(), strict=True))
         settings = ask(model, "training_settings")
-        changed = {"steps": self.options.steps, "batch": self.options.batch}
+        changed = {
+            "steps": self.options.steps, "batch": self.options.batch,
+            "learning_rate": self.options.learning_rate,
+        }  # fmt: skip
         settings = replace(settings, **{name: value for name, value in changed.items() if value})
 
         def features(names: Sequence[str]) -> Any:
@@ -139,6 +144,9 @@ class Learner:
             about = {BUILT_AS: model.built_as(), "provenance": asdict(model.provenance())}
             path = self.options.weights / f"{model.name}.safetensors"
             write_checkpoint(path, halves, about, kept=True)
+            card = (done.folder / CARD).read_text().split("## Use")[0]
+            card += f"## Hardware\n{device()}\n\nThe weights are rounded to float16.\n"
+            path.with_suffix(".md").write_text(card)
         print(
             f"{self.name} {without or 'all'}: held-out loss {done.validation:.3f}, base rate "
             f"{done.baseline:.3f}, {time.process_time() - start:.0f} s, {done.folder}", flush=True,
@@ -190,7 +198,7 @@ class Learner:
 
     def _options(self) -> dict[str, Any]:
         pairs = [pair.split("=") for pair in self.options.option]
-        return {k: float(v) if "." in v else int(v) if v.isdigit() else v for k, v in pairs}
+        return {key: json.loads(value) if value[0].isdigit() else value for key, value in pairs}
 
     @torch.no_grad()
     def _predict(
@@ -247,6 +255,7 @@ def main() -> None:
     parser.add_argument("--models", nargs="*", choices=SAME, default=list(SAME)[:2])
     parser.add_argument("--steps", type=int, default=0, help="of the training; 0: the model's own")
     parser.add_argument("--batch", type=int, default=0, help="clips a step; 0: the model's own")
+    parser.add_argument("--learning-rate", type=float, default=0.0, help="0: the model's own")
     parser.add_argument("--accelerator", default="auto")
     parser.add_argument("--weights", type=Path, help="folder for weights")
     parser.add_argument("--option", nargs="*", default=[], help="NAME=VALUE of the model")

@@ -47,13 +47,11 @@ from physion.models.baselines.motion import F64, motions, observed_motion
 from physion.models.baselines.trees import mask_blob
 from physion.models.checkpoint import load_named
 from physion.models.interface import (
-    RANDOM,
     LearnsFrom,
     SizedSettings,
     Sizes,
     TrainingSettings,
     can,
-    settings_of_size,
 )
 from physion.models.torch_model import TorchModel, digest_of, initial_weights
 from physion.numerics.linear_algebra import norm
@@ -291,7 +289,7 @@ class IntuitionSettings(SizedSettings):
     """
 
     model: str = "intuition-masks"
-    image_size: int = 64
+    image_size: int = 96
     objects: int = 8
     width: int = 96
     layers: int = 3
@@ -304,10 +302,9 @@ class IntuitionSettings(SizedSettings):
 
     @classmethod
     def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the settings of a model; it starts from random weights, since none ship."""
-        sized = settings_of_size(model, cls.sizes, options.get("size", "small"))
+        """Return the settings of a model, which has more tokens of states than of masks."""
         objects = 12 if model == "intuition-states" else 8
-        return {"weights": RANDOM, "objects": objects, **sized}
+        return {"objects": objects, **super().defaults(model, options)}
 
     def __post_init__(self) -> None:
         self.at_least(1, "image_size", "width", "layers", "heads", "members")
@@ -450,13 +447,14 @@ class Intuition(TorchModel):
         return ["" if seen else hidden for seen in self.seen(batch).tolist()]
 
     def prepare(self, sample: Batch) -> None:
-        """Set the base rate from training trials."""
-        self.base_rate.copy_(sample.contact.float().mean())
+        """Set the base rate from training trials, unless weights were given."""
+        if not self.trained:
+            self.base_rate.copy_(sample.contact.float().mean())
 
     def baseline(self, batch: Batch) -> Tensor:
         """Return the cross entropy of the base rate."""
-        rates = self.base_rate.clamp(0.01, 0.99).expand(len(batch))
-        return functional.binary_cross_entropy(rates, batch.contact.float())
+        odds = torch.logit(self.base_rate.clamp(0.01, 0.99)).expand(len(batch))
+        return functional.binary_cross_entropy_with_logits(odds, batch.contact.float())
 
     def provenance(self) -> Provenance:
         """Return name, size and origin of the weights."""
@@ -567,6 +565,8 @@ class TokenIntuition(Intuition):
     def prepare(self, sample: Batch) -> None:
         """Set the base rate, and mean and standard deviation of the values of present objects."""
         super().prepare(sample)
+        if self.trained:
+            return
         tokens = self._tokens(sample)
         values = tokens[tokens[..., 0] > 0]
         # What says whether something is there keeps its values.

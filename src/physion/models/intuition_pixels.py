@@ -250,6 +250,8 @@ class PixelIntuition(Intuition):
     def prepare(self, sample: Batch) -> None:
         """Set the base rate, and mean and standard deviation of what a colour tells."""
         super().prepare(sample)
+        if self.trained:
+            return
         blobs = blobs_of_masks(self._pictures(sample)[:, :, 3:])
         shown = blobs[blobs[..., 0] > 0]
         if len(shown) > 1:
