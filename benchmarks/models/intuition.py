@@ -336,8 +336,10 @@ def main() -> None:
             answers[f"{given}, {control.name}"] = trials.predict(
                 name, fit=control.fit, test=control.test
             )
+    given_answers: dict[str, pd.Series] = {}
     for path in options.predictions:
-        answers |= predicted(path, trials)
+        given_answers |= predicted(path, trials)
+    answers |= given_answers
     answers["base rate of the configuration"] = trials.base_rates()
     scenes = trials.tested["scene"].to_dict()
     levels = pd.DataFrame(
@@ -358,7 +360,7 @@ def main() -> None:
     for given in GIVEN.values():
         answers[f"{given}, spread of simulation"] = with_spread(answers[given], default, scenario)
         answers[f"simulation, spread of {given}"] = with_spread(default, answers[given], scenario)
-    for given in GIVEN.values():
+    for given in (*GIVEN.values(), *given_answers):
         both = (answers[given] + answers["simulation, mean of the levels"]) / 2
         answers[f"mean of {given} and simulation"] = both
         pair = pd.DataFrame({given: answers[given], **levels})

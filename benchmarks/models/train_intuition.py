@@ -115,7 +115,8 @@ class Learner:
 
     def train(self, without: str = "") -> dict[str, NDArray[np.float64]]:
         """Return P(contact) of held-out and official trials, of a network without a scenario."""
-        model = build_untrained(self.name, **self._options())
+        model: Any = build_untrained(self.name, **self._options())
+        self.title = model.name
         fit = ~self.held & (self.own["scenario"] != without)
         trials = [str(trial) for trial in self.own["trial"][fit]]
         source = OwnSource(model.spec, self.own, self.pixels[id(self.own)])
@@ -198,6 +199,8 @@ class Learner:
 
     def _options(self) -> dict[str, Any]:
         pairs = [pair.split("=") for pair in self.options.option]
+        if self.options.start:
+            pairs.append(["weights", str(self.options.start / f"{self.name}-small.safetensors")])
         return {key: json.loads(value) if value[0].isdigit() else value for key, value in pairs}
 
     @torch.no_grad()
@@ -258,6 +261,7 @@ def main() -> None:
     parser.add_argument("--learning-rate", type=float, default=0.0, help="0: the model's own")
     parser.add_argument("--accelerator", default="auto")
     parser.add_argument("--weights", type=Path, help="folder for weights")
+    parser.add_argument("--start", type=Path, help="folder of weights to start from")
     parser.add_argument("--option", nargs="*", default=[], help="NAME=VALUE of the model")
     parser.add_argument("--all-but", action="store_true")
     parser.add_argument("--write", action="store_true")
@@ -266,8 +270,8 @@ def main() -> None:
     for name in options.models:
         learner = Learner(name, options.folder, options)
         answers = learner.train()
-        learner.keep(name, answers["official"])
-        rows.append(learner.row(name, answers))
+        learner.keep(learner.title, answers["official"])
+        rows.append(learner.row(learner.title, answers))
         print(rows[-1], flush=True)
         if forests := learner.forests():
             learner.keep(SAME[name], forests["official"])
@@ -291,14 +295,16 @@ def main() -> None:
         [
             "# Networks of intuition and forests",
             f"`python benchmarks/models/train_intuition.py FOLDER --models "
-            f"{' '.join(options.models)} --write`, {datetime.date.today()}, {device()}.",
+            f"{' '.join(options.models)}{' --start WEIGHTS' if options.start else ''} --write`, "
+            f"{datetime.date.today()}, {device()}.",
             "",
             "Accuracy of networks over all scenarios and of forests, one per scenario, that saw "
             "the same training trials: on the last tenth of the own trials, and on official "
             "stimuli without contact in the observed part (recorded outcomes), mean of the rigid "
             "scenarios; and on official stimuli of each scenario.",
             "",
-            f"| | trials per scenario | own, rigid | official, rigid | {' | '.join(scenarios)} |",
+            "| model | trials per scenario | own, rigid | official, rigid "
+            f"| {' | '.join(scenarios)} |",
             "|---|---|---|---" + "|---" * len(scenarios) + "|",
             *rows,
         ]

@@ -93,7 +93,7 @@ def test_tokens_of_states_have_the_patient_at_the_origin_and_the_agent_ahead() -
 
 
 def test_tokens_of_states_turn_with_agent_and_patient_and_mirror_with_the_world() -> None:
-    model: Any = build_model("intuition-states", objects=6)
+    model: Any = build_model("intuition-states", objects=6, weights="random")
     made = scene(Body("far", "cube", (0.0, 0.0, 0.0)))
     plain = state_tokens(motion(made), "t", FRAMES, 6)
     turned = state_tokens(motion(made, angle=2.0, shift=5.0), "t", FRAMES, 6)
@@ -117,7 +117,7 @@ def test_tokens_of_masks_hold_the_largest_objects() -> None:
     assert first["x"] == pytest.approx([0.25 - 0.5, 0.875 - 0.5, 0.125 - 0.5])
     assert first["bottom"] == pytest.approx([-0.25, 0.5, 0.25])
     assert (tokens[1, 1, : -len(VIEWS["masks"].constants)] == 0).all()
-    model: Any = build_model("intuition-masks", objects=3)
+    model: Any = build_model("intuition-masks", objects=3, weights="random")
     image = model._mirrored(torch.from_numpy(tokens)).numpy()
     assert image == pytest.approx(mask_tokens(ids[:, :, ::-1], 3), abs=1e-6)
 
@@ -175,7 +175,9 @@ QUICK = TrainingSettings(steps=50, batch=64, learning_rate=3e-3, validate_every=
 
 
 def test_outcomes_are_learned_from_contexts_and_the_order_of_objects_does_not_matter() -> None:
-    model: Any = build_model("intuition-masks", image_size=16, width=32, layers=1, objects=4)
+    model: Any = build_model(
+        "intuition-masks", image_size=16, width=32, layers=1, objects=4, weights="random"
+    )
     source: Any = MovingSquares(model.spec)
 
     def features(trials: Any) -> Any:
@@ -202,7 +204,7 @@ def test_outcomes_are_learned_from_contexts_and_the_order_of_objects_does_not_ma
 
 
 def test_unusual_trials_get_the_base_rate_or_a_note() -> None:
-    model: Any = build_model("intuition-masks", image_size=16, objects=3)
+    model: Any = build_model("intuition-masks", image_size=16, objects=3, weights="random")
     model.base_rate.fill_(0.25)
     source = MovingSquares(model.spec, 3)
     batch = source.context(source.trials)
@@ -219,7 +221,7 @@ def test_unusual_trials_get_the_base_rate_or_a_note() -> None:
 
 
 def test_other_frames_and_sizes_are_refused_in_one_line() -> None:
-    model: Any = build_model("intuition-masks", image_size=16)
+    model: Any = build_model("intuition-masks", image_size=16, weights="random")
     ids = np.zeros((1, 15, 16, 16), np.uint8)
     with pytest.raises(
         BadInputError, match=r"frames 2, 5, \.\.\., 44 are needed, not 15 frames up to 14"
@@ -228,11 +230,11 @@ def test_other_frames_and_sizes_are_refused_in_one_line() -> None:
     with pytest.raises(BadInputError, match=r"of 16 x 16 are needed, not \(8, 8\)"):
         model.predict(clips(ids[:, :, :8, :8]))
     with pytest.raises(BadInputError, match="objects must be at least 3"):
-        build_model("intuition-states", objects=2)
+        build_model("intuition-states", objects=2, weights="random")
     with pytest.raises(BadInputError, match="must be a multiple of heads"):
-        build_model("intuition-states", width=30)
-    with pytest.raises(BadInputError, match="no weights are shipped for intuition-states-small"):
-        build_model("intuition-states", weights="shipped")
+        build_model("intuition-states", width=30, weights="random")
+    with pytest.raises(BadInputError, match="no weights are shipped for intuition-pixels-small"):
+        build_model("intuition-pixels", weights="shipped")
 
 
 @pytest.mark.slow

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from physion import sample_scene
-from physion.clips.batch import Motion, cut_to_observed
+from physion import label_contact, sample_scene
+from physion.clips.batch import Batch, Motion, cut_to_observed
+from physion.clips.rendered import MotionRenderer
 from physion.core.names import SCENARIOS
 from physion.models.build import build_model
 from physion.models.checkpoint import shipped_digests
@@ -24,10 +25,11 @@ from support.small_movies import early_windows, make_movies, read_whole
 
 NAMES = tuple(sorted(shipped_digests()))
 PARTICLES, VISION = {"dpi", "gns", "gns-ransac"}, {"svg", "op3", "cswm", "rpin"}
+INTUITION = {"intuition-states", "intuition-masks"}
 
 
 def test_all_models_that_must_have_weights_do() -> None:
-    assert set(NAMES) == {f"{name}-small" for name in PARTICLES | VISION}
+    assert set(NAMES) == {f"{name}-small" for name in PARTICLES | VISION | INTUITION}
 
 
 @pytest.mark.parametrize("key", NAMES)
@@ -54,6 +56,38 @@ def test_weights_have_a_card_and_load(key: str) -> None:
     assert all(weight.dtype == torch.float32 for weight in model.parameters())
     if hasattr(model, "touch"):
         assert model.touch.isfinite().all()
+
+
+# Trained weights of intuition, on scenes that they never saw.
+
+SCENES = 6
+"""Scenes of each scenario."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(INTUITION))
+@torch.no_grad()
+def test_intuition_knows_how_new_scenes_end(name: str) -> None:
+    model: Any = build_model(name)
+    frames = np.array(model.spec.context_frames())
+    right, certain = [], []
+    for scenario in SCENARIOS:
+        for seed in range(SCENES):
+            scene = sample_scene(scenario, 7000 + seed)
+            motion = Motion(scene, simulate(scene))
+            cut = Motion(scene, cut_to_observed(scene, motion.trajectory))
+            given: dict[str, Any] = {"state": (cut,)}
+            if "ids" in model.spec.inputs:
+                size, looks = model.spec.image_size, {"new": "redyellow"}
+                drawn = MotionRenderer({"new": cut}, ("ids",), size, 1, looks).read("new", frames)
+                given = {"ids": drawn["ids"][None]}
+            batch = Batch(("new",), frames[None], np.ones((1, len(frames)), np.bool_), **given)
+            answer = float(model.predict(batch.to("cpu"))[0])
+            right.append((answer > 0.5) == label_contact(scene, motion.trajectory).contact)
+            certain.append(abs(answer - 0.5))
+    print(f"{name}: {np.mean(right):.3f} right")
+    # Chance level is .5; 48 answers of a model that is right in .75 are below .6 in 1 of 100 sets.
+    assert np.mean(right) >= 0.6 and np.mean(certain) > 0.1
 
 
 # Trained weights of vision models in the package, on movies that they never saw.

@@ -23,6 +23,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     **dict.fromkeys(FROZEN, TINY),
     **dict.fromkeys(("VideoMAE", "VideoMAEv2", "V-JEPA2", "V-JEPA2.1"), VIDEO),
     **dict.fromkeys(("svg", "op3", "cswm", "rpin", "gns", "gns-ransac", "dpi"), UNTRAINED),
+    **dict.fromkeys(("intuition-states", "intuition-masks"), UNTRAINED),
     "intuition-pixels": {"image_size": 32},
     "noisy-simulation": {"samples": 3},
     "seeing-simulation": {"samples": 3, "image_size": 96},

@@ -320,8 +320,8 @@ STRIDE, CONTEXT = 3, 15
 """Frames 2, 5, ..., 38, 41, 44. The last ones are dense, since they tell velocities."""
 
 TRAINING = TrainingSettings(
-    steps=4000,
-    batch=256,
+    steps=2500,
+    batch=512,
     optimizer="adamw",
     learning_rate=1e-3,
     weight_decay=0.05,
