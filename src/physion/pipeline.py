@@ -49,9 +49,11 @@ OFFICIAL_MODELS = (
     "constant-motion",
     "already-touched",
     "chance",
+    "intuition-states",
     "noisy-simulation",
     "dpi",
     "gns",
+    "intuition-masks",
     "blob-trees",
     "pEffNetLite0-mlp",
 )
@@ -79,8 +81,8 @@ class RunSettings:
     sampled: bool = False
     """Sample scenes of Dominoes, Collide and Drop instead; nobody has seen them."""
     models: str | None = None
-    """Names of models with commas (physion ls models); default: for official scenes nine, and the
-    random twin of one."""
+    """Names of models with commas (physion ls models); default: for official scenes eleven, and
+    the random twin of one."""
     out: Path | None = None
     """Folder for trials, predictions and the report; default: runs/official or runs/sampled."""
     limit: int | None = None
@@ -133,7 +135,7 @@ def run(
     """Make trials, let models predict them, compare all with people, and write the report.
 
     Without settings, a balanced sample of the official scenes that ship with the package is
-    simulated, and nine models, with the random twin of one, are compared with the people of the
+    simulated, and eleven models, with the random twin of one, are compared with the people of the
     original study. A second run resumes, and a larger ``limit`` only adds.
 
     Parameters
