@@ -260,7 +260,7 @@ def test_pixels_are_learned_from_with_masks_boxes_and_motion_as_targets() -> Non
     assert torch.equal(model.predict(batch), model.predict(replace(batch, ids=None, contact=None)))
 
 
-def test_colours_and_blobs_are_those_of_the_baseline() -> None:
+def test_colours_and_blobs_equal_the_baselines() -> None:
     rng = np.random.default_rng(3)
     rgb = rng.integers(0, 256, (4, 9, 7, 3), dtype=np.uint8)
     rgb[0], rgb[1, 2:6, 3:5], rgb[2, :, :] = 90, (200, 20, 30), (220, 190, 20)

@@ -171,7 +171,7 @@ _BLOB = 10
 def colored(rgb: Tensor) -> Tensor:
     """Return which pixels of pictures (..., H, W, 3), uint8, are red, and yellow: (..., 2, H, W).
 
-    The rule is that of `physion.models.baselines.pixels.color_masks`.
+    The rule is the one of `physion.models.baselines.pixels.color_masks`.
     """
     colors = rgb.float() / 255
     red, green, blue = colors.unbind(-1)
@@ -187,7 +187,7 @@ def colored(rgb: Tensor) -> Tensor:
 def blobs_of_masks(masks: Tensor) -> Tensor:
     """Return area, mean, deviations, covariance and box (..., 10) of masks (..., H, W).
 
-    The values are those of `physion.models.baselines.trees.mask_blob`.
+    These are the values of `physion.models.baselines.trees.mask_blob`.
     """
     height, width = masks.shape[-2:]
     x, y = (
