@@ -17,12 +17,12 @@ mkdir -p "$out" "$data/said" "$data/weights"
 trials=(python benchmarks/models/intuition_trials.py "$data" --workers "$workers" --pixels "$pixels")
 "${trials[@]}" --official | tail -n 1
 "${trials[@]}" --trials "${TRIALS:-20000}" --seconds "${MAKE:-240}" > "$data/said/made.txt" 2>&1
-ls "$data/own" | wc -l
+echo "$(ls "$data/own" | wc -l) files of own trials"
 train() {
     local model=$1
     shift
     python benchmarks/models/train_intuition.py "$data" --models "$model" --steps "$steps" \
-        --weights "$data/weights" "$@" > "$data/said/$model.txt" 2>&1 || echo "$model failed"
+        --weights "$data/weights" "$@" > "$data/said/$model.txt" 2>&1 || touch "$data/failed"
 }
 train intuition-states --batch 512 &
 train intuition-masks --batch 512 --option image_size="$pixels" &
@@ -30,3 +30,4 @@ train intuition-pixels --option image_size="$pixels" size="${SIZE:-medium}" &
 wait
 tail -n 5 "$data"/said/intuition-*.txt
 tar -C "$data" -cf "$out/gpu.tar" said weights predictions
+[[ ! -e "$data/failed" ]]

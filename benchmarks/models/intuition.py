@@ -12,8 +12,9 @@ tables:
 2. Accuracy, r with people and r beyond the outcome: with all trials; without trials of the tested
    configuration, or of the tested scenario; with the controls of `intuition_controls`; noisy
    simulation from the true state; mixtures of both, with weights fitted on own trials or, where the
-   name says so, on half of people's answers; predictions of other models (--predictions FILE);
-   answers brought to the same spread, and levels of noise fitted to half of people's answers.
+   name says so, to people's answers to one half of the stimuli, and tested on the other half;
+   predictions of other models (--predictions FILE); answers that have the values of another, by
+   rank; levels of noise fitted to people in the same way.
 3. What the best model could reach, from halves of the people, and the weights of mixtures.
 4. Differences of likeness beyond the outcome between learned and simulated answers, paired over
    stimuli.
@@ -67,7 +68,7 @@ ELSEWHERE = 250
 """Own trials of each other scenario, for forests that have not seen the tested one."""
 COMPARED = (
     "simulation, noise x 1", "simulation, mean of the levels",
-    "simulation, levels weighted on half of people",
+    "simulation, levels weighted to people",
 )  # fmt: skip
 """Simulations with which learned answers are compared."""
 EDGES = (0.025, 0.975)
@@ -177,10 +178,15 @@ class Trials:
 
 
 def _facts(loaded: dict[str, NDArray[Any]]) -> pd.DataFrame:
-    """Return the table of trials, by name."""
+    """Return the table of trials, by name.
+
+    A name of a configuration with _2 at its end is its second name.
+    """
     columns = ("scenario", "configuration", "contact", "scene")
     names = [str(trial) for trial in loaded["trial"]]
-    return pd.DataFrame({name: loaded[name] for name in columns}, index=names)
+    table = pd.DataFrame({name: loaded[name] for name in columns}, index=names)
+    table["configuration"] = table["configuration"].astype(str).str.removesuffix("_2")
+    return table
 
 
 def answers_of_people(trials: Trials) -> pd.DataFrame:
@@ -352,10 +358,8 @@ def main() -> None:
     )
     answers |= {str(name): levels[name] for name in levels}
     answers["simulation, mean of the levels"] = levels.mean(axis=1)
-    answers["simulation, level fitted to half of people"] = best_level(levels, people, scenario)
-    answers["simulation, levels weighted on half of people"] = weighted_levels(
-        levels, people, scenario
-    )
+    answers["simulation, level fitted to people"] = best_level(levels, people, scenario)
+    answers["simulation, levels weighted to people"] = weighted_levels(levels, people, scenario)
     default, weights = answers[str(levels.columns[0])], []
     for given in GIVEN.values():
         answers[f"{given}, spread of simulation"] = with_spread(answers[given], default, scenario)
@@ -365,7 +369,7 @@ def main() -> None:
         answers[f"mean of {given} and simulation"] = both
         pair = pd.DataFrame({given: answers[given], **levels})
         mixed, found = fitted_to_people(pair, people, scenario)
-        answers[f"mixed of {given} and simulation, weights of half of people"] = mixed
+        answers[f"mixed of {given} and simulation, weights fitted to people"] = mixed
         weights.append(
             f"| {given}, people | {found[:, 0].mean():.2f} | {found[:, 1:-1].sum(1).mean():.2f} |"
         )
@@ -404,8 +408,8 @@ def main() -> None:
             "of the people of each stimulus, Spearman-Brown, pooled), so that no model has a "
             f"higher r beyond the outcome than {most:.3f}.",
             "",
-            "Weights of log odds in the mixtures, fitted on own trials or to people (mean of two "
-            "halves; the weights of all levels of simulation are added):",
+            "Weights of log odds in the mixtures, fitted on own trials or to people (mean of "
+            "two halves of the stimuli; the weights of all levels of simulation are added):",
             "",
             "| learned, fitted on | weight of learned | weight of simulation |",
             "|---|---|---|",

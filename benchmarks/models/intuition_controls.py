@@ -135,11 +135,15 @@ CONTROLS = (
 
 
 def with_spread(answers: pd.Series, other: pd.Series, scenario: pd.Series) -> pd.Series:
-    """Return answers that have the values of others, in their own order, within each scenario."""
+    """Return answers that have the values of others, in their own order, within each scenario.
+
+    Equal answers get the mean of their values.
+    """
     out = answers.copy()
     for _, rows in answers.groupby(scenario):
         ranks = rows.rank(method="first").astype(int).to_numpy() - 1
-        out[rows.index] = np.sort(other[rows.index].to_numpy())[ranks]
+        values = pd.Series(np.sort(other[rows.index].to_numpy())[ranks], rows.index)
+        out[rows.index] = values.groupby(rows).transform("mean")
     return out
 
 
@@ -174,7 +178,7 @@ def best_level(levels: pd.DataFrame, people: pd.DataFrame, scenario: pd.Series) 
 
 
 def weighted_levels(levels: pd.DataFrame, people: pd.DataFrame, scenario: pd.Series) -> pd.Series:
-    """Return a sum of levels, a constant and weights above 0 fitted to people's other half."""
+    """Return a sum of levels, a constant and weights above 0, fitted on the other stimuli."""
     first, out = halves(scenario), pd.Series(np.nan, levels.index)
     design = np.column_stack([levels.to_numpy(), np.ones(len(levels))])
     fraction = (people["yes"] / people["count"])[levels.index].to_numpy()
@@ -206,7 +210,7 @@ def log_odds(answers: pd.DataFrame) -> F64:
 def fitted_to_people(
     answers: pd.DataFrame, people: pd.DataFrame, scenario: pd.Series
 ) -> tuple[pd.Series, F64]:
-    """Return a mixture of answers whose weights are fitted to people's other half, and the weights.
+    """Return a mixture of answers whose weights are fitted on the other half of stimuli, and they.
 
     The weights (2, m + 1) are of both halves.
     """

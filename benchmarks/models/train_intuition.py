@@ -5,7 +5,8 @@
 
 The trainer is the one of `physion train`; the same command resumes. The last tenth of the own
 trials of every scenario trains nothing: on them, and on the official stimuli without a contact in
-the observed part, networks are compared with forests that saw the same training trials. Predictions
+the observed part, networks are tested, and compared with forests that saw the same training trials,
+where their features are stored. With --start a training begins from other weights. Predictions
 of official stimuli go to FOLDER/predictions, where ``intuition.py --predictions`` reads them,
 weights to FOLDER/training. With --all-but every network is also trained without the tested
 scenario. With --write the table is written to ``results/intuition_networks.md``; --weights names
@@ -200,7 +201,8 @@ class Learner:
     def _options(self) -> dict[str, Any]:
         pairs = [pair.split("=") for pair in self.options.option]
         if self.options.start:
-            pairs.append(["weights", str(self.options.start / f"{self.name}-small.safetensors")])
+            size = dict(pairs).get("size", "small")
+            pairs.append(["weights", str(self.options.start / f"{self.name}-{size}.safetensors")])
         return {key: json.loads(value) if value[0].isdigit() else value for key, value in pairs}
 
     @torch.no_grad()
@@ -298,10 +300,13 @@ def main() -> None:
             f"{' '.join(options.models)}{' --start WEIGHTS' if options.start else ''} --write`, "
             f"{datetime.date.today()}, {device()}.",
             "",
-            "Accuracy of networks over all scenarios and of forests, one per scenario, that saw "
-            "the same training trials: on the last tenth of the own trials, and on official "
-            "stimuli without contact in the observed part (recorded outcomes), mean of the rigid "
-            "scenarios; and on official stimuli of each scenario.",
+            "Accuracy of networks over all scenarios, and of forests, one per scenario, where "
+            "features for them are stored: on the last tenth of the own trials, and on "
+            f"{len(learner.asked['trial'])} official stimuli without contact in the observed part "
+            "(recorded outcomes), mean of the rigid scenarios; and on official stimuli of each "
+            "scenario."
+            + " The training began from weights that may have seen these own trials, also those "
+            "that are held out." * bool(options.start),
             "",
             "| model | trials per scenario | own, rigid | official, rigid "
             f"| {' | '.join(scenarios)} |",

@@ -34,9 +34,10 @@ QUICK = EvaluationSettings(accelerator="cpu", logistic=LogisticSettings(grid=(1e
 TREES = {"blob-trees", "mask-trees", "state-trees"}
 KINDS = {
     "VideoMAE", "blob-centroids", "chance", "constant-motion", "copy-last-frame", "cswm",
-    "frozen-encoder", "gns", "intuition-states", "noisy-simulation",
+    "dpi", "frozen-encoder", "gns", "intuition-masks", "intuition-states", "mask-trees",
+    "noisy-simulation",
 }  # fmt: skip
-"""One quick model of each kind; the nightly tests have the others, and trees."""
+"""Quick models of each kind; the nightly tests have the others."""
 PREDICTING = ("observed", "observed+simulated")
 
 
@@ -88,9 +89,14 @@ def test_what_follows_the_observed_part_changes_no_prediction(
     check_predictions(name, made, poisoned, tmp_path)
 
 
-@pytest.mark.nightly
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(TREES))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in KINDS else pytest.mark.nightly)
+        for name in sorted(TREES)
+    ],
+)
 def test_what_follows_the_observed_part_changes_no_tree(
     name: str, trees: tuple[Dataset, Dataset], tmp_path: Path
 ) -> None:

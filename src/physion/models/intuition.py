@@ -563,7 +563,7 @@ class TokenIntuition(Intuition):
         return seen
 
     def prepare(self, sample: Batch) -> None:
-        """Set the base rate, and mean and standard deviation of the values of present objects."""
+        """Set base rate, mean and deviation of the values of objects, unless weights were given."""
         super().prepare(sample)
         if self.trained:
             return

@@ -248,7 +248,7 @@ class PixelIntuition(Intuition):
         load_named(self, settings.weights)
 
     def prepare(self, sample: Batch) -> None:
-        """Set the base rate, and mean and standard deviation of what a colour tells."""
+        """Set base rate, mean and deviation of what a colour tells, unless weights were given."""
         super().prepare(sample)
         if self.trained:
             return
