@@ -14,6 +14,7 @@ out=${1:-${OUT:-runs/gpu}} data=${2:-runs/gpu-data} pixels=${PIXELS:-96} steps=$
 workers=$(nproc)  # before OMP_NUM_THREADS, which it heeds
 export PYTHONPATH=$PWD/src${PYTHONPATH:+:$PYTHONPATH} OMP_NUM_THREADS=1 PYTHONUNBUFFERED=1
 mkdir -p "$out" "$data/said" "$data/weights"
+rm -f "$data/failed"
 trials=(python benchmarks/models/intuition_trials.py "$data" --workers "$workers" --pixels "$pixels")
 "${trials[@]}" --official | tail -n 1
 "${trials[@]}" --trials "${TRIALS:-20000}" --seconds "${MAKE:-240}" > "$data/said/made.txt" 2>&1

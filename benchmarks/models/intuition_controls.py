@@ -210,7 +210,7 @@ def log_odds(answers: pd.DataFrame) -> F64:
 def fitted_to_people(
     answers: pd.DataFrame, people: pd.DataFrame, scenario: pd.Series
 ) -> tuple[pd.Series, F64]:
-    """Return a mixture of answers whose weights are fitted on the other half of stimuli, and they.
+    """Return a mixture of answers, weighted as fits the other half of stimuli, and the weights.
 
     The weights (2, m + 1) are of both halves.
     """

@@ -308,6 +308,8 @@ def main() -> None:
             + " The training began from weights that may have seen these own trials, also those "
             "that are held out." * bool(options.start),
             "",
+            "**Accuracy; with --start, own trials may have had a part in the first training**",
+            "",
             "| model | trials per scenario | own, rigid | official, rigid "
             f"| {' | '.join(scenarios)} |",
             "|---|---|---|---" + "|---" * len(scenarios) + "|",
