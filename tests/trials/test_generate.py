@@ -28,10 +28,16 @@ from physion.physics.engine import make_engine
 from physion.readout.evaluate import evaluate
 from physion.trials.dataset import Dataset
 from physion.trials.files import TrialPaths, find_trials
-from physion.trials.index import build_index, index_row
+from physion.trials.index import build_index, index_row, read_index
 from physion.trials.making import generate as module
 from physion.trials.making.generate import make_trials
-from physion.trials.making.plan import GenerateSettings, TrialTask, plan_dataset, plan_scenes
+from physion.trials.making.plan import (
+    GenerateJob,
+    GenerateSettings,
+    TrialTask,
+    plan_dataset,
+    plan_scenes,
+)
 from physion.trials.making.verify import verify_dataset
 from physion.trials.trial_file import Trial
 from physion.trials.video import read_frames
@@ -267,6 +273,30 @@ def test_a_full_disk_stops_the_run_at_once(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(PhysionError, match=r"No space left.*1 of . are complete"):
         run(tmp_path / "s", scenes_named("a", "b", "c"))
     assert counter.calls == 10, "no later trial is tried"
+
+
+def test_a_stopped_run_leaves_an_index_and_reads_no_listed_trial_again(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "s"
+    monkeypatch.setattr(module, "INDEX_EVERY", 2)
+
+    def stop_at_last(job: GenerateJob) -> str:
+        if job.task.trial == "d":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return make_by_hand(job)
+
+    tasks = scenes_named("a", "b", "c", "d")
+    with pytest.raises(PhysionError, match="3 of 4 are complete"):
+        make_trials(folder, tasks, make=stop_at_last, executor=SerialExecutor())
+    listed = list(read_index(folder)["trial"])
+    assert len(listed) == 2
+    read: list[str] = []
+    real = Trial.open
+    monkeypatch.setattr(Trial, "open", lambda path: read.append(Path(path).stem) or real(path))
+    run(folder, tasks)
+    assert sorted(set(read)) == sorted({"a", "b", "c", "d"} - set(listed))
+    assert tree_digest(folder) == tree_digest(finished)
 
 
 LIMITED = """

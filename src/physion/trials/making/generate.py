@@ -54,6 +54,9 @@ from physion.trials.making.plan import (
 from physion.trials.making.whatif import CUES, KINDS, whatif_tasks
 from physion.trials.trial_file import Trial
 
+INDEX_EVERY = 500
+"""Trials after which a run writes the index."""
+
 
 def make_trials(
     folder: Path,
@@ -115,6 +118,7 @@ def make_trials(
         listed = {str(row["trial"]): row for row in index.to_dict("records")}
         missing = [n for n, job in jobs.items() if not _is_made(job, listed.get(n))]
         todo, made, failed = missing, dict[str, dict[str, Any] | None](), dict[str, str]()
+        note = _Notes(folder, jobs, dict(listed))
         while True:
             new, refused = run_tasks(
                 _MakeAndRead(make),
@@ -123,7 +127,7 @@ def make_trials(
                 what="generating",
                 executor=executor,
                 progress=progress,
-                on_outcome=lambda outcome: _note_outcome(folder, outcome, jobs[outcome.key]),
+                on_outcome=note,
             )
             made, failed = {**made, **new}, {**failed, **refused}
             index, problems = _update_index(folder, made)
@@ -204,11 +208,31 @@ def _is_made(job: GenerateJob, row: Mapping[Any, Any] | None) -> bool:
     return True
 
 
-def _note_outcome(folder: Path, outcome: TaskOutcome[Any], job: GenerateJob) -> None:
-    """Write the traceback of a failed trial and its scene, if imported, into ``failures/``.
+@dataclass
+class _Notes:
+    """What is written into the folder after each outcome.
 
-    The file of an earlier failure is removed if the trial succeeded.
+    For a failed trial, its traceback and its scene, if imported, into ``failures/``; the file of an
+    earlier failure is removed if the trial succeeded. After every `INDEX_EVERY` trials the index,
+    so that a run that was killed continues without reading the files of all trials that it made.
     """
+
+    folder: Path
+    jobs: Mapping[str, GenerateJob]
+    rows: dict[str, Mapping[Any, Any]]
+    new: int = 0
+
+    def __call__(self, outcome: TaskOutcome[dict[str, Any] | None]) -> None:
+        _note_failure(self.folder, outcome, self.jobs[outcome.key])
+        if outcome.result is None:
+            return
+        self.rows[outcome.key] = outcome.result
+        self.new += 1
+        if self.new % INDEX_EVERY == 0:
+            write_index(self.folder, as_table(list(self.rows.values())))
+
+
+def _note_failure(folder: Path, outcome: TaskOutcome[Any], job: GenerateJob) -> None:
     path = folder / FAILURES / f"{outcome.key}.txt"
     if outcome.error is None:
         path.unlink(missing_ok=True)
