@@ -1,16 +1,23 @@
 """How fast trials are made, what they take, and what that means for the whole study.
 
     python benchmarks/trials/generation.py [--count 4] [--write]
+    python benchmarks/trials/generation.py [--count 4] --profile
 
 For each scenario, trials of the readout split (state, two movies, map) are chosen and made one by
 one in this process, after everything is compiled: processor time a trial, frames a second and
 bytes. Then a batch is made by two worker processes: how much of two cores is in use, and how much
 memory a worker takes. Hours and gigabytes of all 25,200 trials follow from these.
+
+``--profile`` prints instead where the processor time of a readout trial goes, as a Markdown table:
+the eight simulations that measure robustness, judging of candidates for its scene (a simulation and
+a picture each), its own simulation, pictures, encoding of both movies, map, trial file, and what is
+left.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import os
 import resource
@@ -19,8 +26,13 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from contextlib import ExitStack
 from datetime import date
+from importlib import import_module
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import numpy as np
 
@@ -103,12 +115,76 @@ def whole_study(rows: dict[str, dict[str, dict[str, float]]]) -> dict[str, float
     return {"core_hours": hours, "gigabytes": size}
 
 
+PARTS: dict[str, tuple[str, ...]] = {
+    "repeats": ("physion.trials.making.choose:robustness",),
+    "candidates": ("physion.trials.making.choose:judge",),
+    "own simulation": ("physion.trials.making.make:motion_of",),
+    "pictures": tuple(f"physion.rendering.renderer:Renderer.{n}" for n in ("__init__", "render")),
+    "encoding": tuple(f"physion.trials.video:MovieEncoder.{n}" for n in ("add", "finish")),
+    "map": ("physion.trials.making.make:encode_png",),
+    "trial file": ("physion.trials.trial_file:TrialWriter.__init__",
+                   "physion.trials.trial_file:TrialWriter.finish"),
+    "disk": ("physion.trials.making.make:write_files",),
+}  # fmt: skip
+"""Parts of making a trial, and the functions whose time they are; inner parts are not counted in
+outer ones."""
+
+
+def profile(scenario: str, count: int) -> dict[str, float]:
+    """Mean seconds of processor time of each part of a readout trial."""
+    spent, running = dict.fromkeys(PARTS, 0.0), []
+
+    def timed(part: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(function)
+        def run(*arguments: Any, **options: Any) -> Any:
+            running.append(0.0)
+            begin = time.process_time()
+            try:
+                return function(*arguments, **options)
+            finally:
+                whole = time.process_time() - begin
+                spent[part] += whole - running.pop()
+                if running:
+                    running[-1] += whole
+
+        return run
+
+    with ExitStack() as stack:
+        for part, names in PARTS.items():
+            for name in names:
+                module, _, path = name.partition(":")
+                *owners, last = path.split(".")
+                owner = functools.reduce(getattr, owners, import_module(module))
+                stack.enter_context(
+                    mock.patch.object(owner, last, timed(part, getattr(owner, last)))
+                )
+        row = measure(scenario, "readout", count, GenerateSettings())
+    spent = {part: seconds / count for part, seconds in spent.items()}
+    whole = row["choose_s"] + row["make_s"]
+    return {**spent, "rest": whole - sum(spent.values()), "all": whole}
+
+
+def print_profile(count: int) -> None:
+    """Print `profile` of all scenarios."""
+    columns = (*PARTS, "rest", "all")
+    print(f"| scenario | {' | '.join(columns)} |\n|---{'|---' * len(columns)}|")
+    for name in scenarios.names():
+        measure(name, "readout", 1, GenerateSettings(jitters=1))
+        row = profile(name, count)
+        cells = [f"{row[c] / row['all']:.2f}" for c in columns[:-1]] + [f"{row['all']:.2f} s"]
+        print(f"| {name} | {' | '.join(cells)} |", flush=True)
+
+
 def main() -> None:
     """Measure, print, and write if asked to."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=4)
     parser.add_argument("--write", action="store_true")
+    parser.add_argument("--profile", action="store_true")
     options = parser.parse_args()
+    if options.profile:
+        print_profile(options.count)
+        return
     settings = GenerateSettings()
     warm = GenerateSettings(jitters=1)
     rows: dict[str, dict[str, dict[str, float]]] = {}
