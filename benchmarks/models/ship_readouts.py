@@ -276,7 +276,10 @@ def fit(features: Features, name: str, readout: Readout) -> dict[str, ShippedRea
 
 
 def ship(features: Features, dataset: Dataset, name: str) -> None:
-    """Fit the readouts of a model, and write them with a card."""
+    """Fit the readouts of a model, and write them with a card.
+
+    The command on the card makes features of at least as many trials as were fitted.
+    """
     model_name, options, readouts = MODELS[name]
     fitted = {
         (readout, scenario): one
@@ -304,6 +307,8 @@ def ship(features: Features, dataset: Dataset, name: str) -> None:
     ]
     rows = [f"| *{r.value}* | {' | '.join(a)} |" for r, a in zip(readouts, accuracies, strict=True)]
     count = int(dataset.index.groupby("scenario").size().min())
+    whole = max(trials.get(Readout.FULL, []), default=0)
+    most = max(max(n, default=0) for n in trials.values())
     use = f"physion evaluate {model_name} TRIALS" + "".join(
         f" --option {key}={value}" for key, value in options.items()
     )
@@ -328,7 +333,8 @@ def ship(features: Features, dataset: Dataset, name: str) -> None:
         "",
         "The set was made by",
         f"`{COMMAND.format(count=count)}`, features and readouts by",
-        "`python benchmarks/models/ship_readouts.py FOLDER`.",
+        f"`python benchmarks/models/ship_readouts.py FOLDER --only {name} --trials {most} "
+        f"--full {whole}`.",
     ]
     path.with_suffix(".md").write_text("\n".join(text) + "\n")
     print(name, path.stat().st_size, "bytes", *rows, sep="\n  ", flush=True)
