@@ -46,6 +46,7 @@ from physion.models.intuition_pixels import SEEN
 from physion.physics.engine import make_engine
 from physion.physics.labels import label_contact
 from physion.readout.decisions import fraction_of_futures
+from physion.readout.folds import describe_fit
 from physion.readout.model_calls import is_network
 from physion.rendering.renderer import Renderer
 from physion.scenes.looks import in_look
@@ -215,11 +216,25 @@ def write(path: Path, trials: Sequence[Seen]) -> None:
     write_atomic(path, buffer.getvalue())
 
 
+def there(path: Path, kept: Kept) -> bool:
+    """Return whether a file was made; exit if it keeps something else."""
+    if not path.exists():
+        return False
+    with np.load(path) as stored:
+        pictures = "rgb" in stored.files
+        missing = [name for name in kept.models if name not in stored.files]
+        if pictures != bool(kept.pixels) or (missing and not pictures):
+            raise SystemExit(f"{path} was made with other --models or --pixels; take a new FOLDER")
+        if pictures and stored["rgb"].shape[-2] != kept.pixels:
+            raise SystemExit(f"{path} has pictures of another size; take a new FOLDER")
+    return True
+
+
 def make_own(kept: Kept, task: tuple[str, int]) -> str:
     """Make one file of own trials, if it is not there."""
     scenario, part = task
     path = kept.folder / "own" / f"{scenario}-{part:04d}.npz"
-    if not path.exists():
+    if not there(path, kept):
         start = time.process_time()
         numbers = range(part * EACH, (part + 1) * EACH)
         write(path, [own_trial(scenario, number, kept) for number in numbers])
@@ -230,7 +245,7 @@ def make_own(kept: Kept, task: tuple[str, int]) -> str:
 def make_official(kept: Kept, part: int) -> str:
     """Make one file of official stimuli, if it is not there."""
     path = kept.folder / "official" / f"{part:04d}.npz"
-    if not path.exists():
+    if not there(path, kept):
         scenes = official_scenes()[part * EACH : (part + 1) * EACH]
         write(path, [official_trial(scene, contact, kept) for scene, contact in scenes])
         return f"official {path.stem}"
@@ -239,9 +254,10 @@ def make_official(kept: Kept, part: int) -> str:
 
 def make_stored(dataset: Path, kept: Kept, part: int) -> str:
     """Make one file of trials of a dataset, without those with a contact in the observed part."""
-    path = kept.folder / "own" / f"stored-{part:04d}.npz"
-    if not path.exists():
-        opened = Dataset(dataset)
+    opened = Dataset(dataset)
+    digest = describe_fit(opened).split()[-1]
+    path = kept.folder / "own" / f"stored-{digest}-{part:04d}.npz"
+    if not there(path, kept):
         index = opened.index.set_index("trial")
         index = index[~index["observed_contact"].astype(bool)].iloc[part * EACH : (part + 1) * EACH]
         motions = TrialMotions(opened.files("trial_file"), observed=True)
@@ -324,7 +340,9 @@ def main() -> None:
     # Scenarios in turn, so that what is there is always of all of them.
     tasks = [(s, part) for part in range(options.trials // EACH) for s in options.scenarios]
     parts = range(-(-len(official_scenes()) // EACH)) if options.official else range(0)
-    kept = Kept(options.folder, options.models, options.pixels)
+    # Masks tell whether agent and patient are visible.
+    models = tuple(dict.fromkeys((*options.models, "intuition-masks")))
+    kept = Kept(options.folder, models, options.pixels)
     count = 0
     if options.stored:
         count = int((~Dataset(options.stored).index["observed_contact"].astype(bool)).sum())
