@@ -9,6 +9,7 @@ package all columns have the names of the description.
 from __future__ import annotations
 
 import io
+import json
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -74,6 +75,12 @@ def _read_checked(path: Path) -> bytes:
     digest = digest_path(path).name
     check_digest(path, content, f"make it again, or delete {digest} to use the table as it is")
     return content
+
+
+def records(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the rows of a table as plain values for JSON; NaN becomes null."""
+    rows: list[dict[str, Any]] = json.loads(table.to_json(orient="records", double_precision=15))
+    return rows
 
 
 # Descriptions of tables.

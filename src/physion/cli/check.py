@@ -15,6 +15,7 @@ from typing import Annotated
 
 import tyro
 
+from physion.analysis.tables import records
 from physion.cli.output import Stages, print_line, print_warnings, text_table, write_text
 from physion.compute.local import LocalExecutor
 from physion.compute.run_tasks import ExecutorSettings
@@ -88,7 +89,7 @@ def main(options: Options) -> int:
 
 def _print(done: CheckedModel, page: Path, options: Options) -> None:
     if options.json:
-        rows = json_module.loads(done.table.to_json(orient="records"))
+        rows = records(done.table)
         values = {"model": done.model, "passed": done.passed, "refused": done.refused}
         values["verdict"] = done.verdict
         print(json_module.dumps(values | {"changes": rows, "page": str(page)}))

@@ -134,8 +134,10 @@ def _compare(options: Options) -> int:
     )
     print_warnings(result.warnings)
     if options.json:
+        from physion.analysis.tables import records
+
         numbers = json_module.loads((page.parent / "report.json").read_text(encoding="utf-8"))
-        scores = json_module.loads(result.scores.to_json(orient="records", double_precision=15))
+        scores = records(result.scores)
         print(json_module.dumps({"report": str(page), "scores": scores, **numbers}))
     else:
         _print_left_out(result)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from physion.analysis.tables import records
 from physion.cli.arguments import take_options
 from physion.cli.output import (
     Stages,
@@ -155,9 +156,9 @@ def _print(done: Evaluation, options: Options) -> None:
             "failed": [{"cell": label, "reason": why} for label, why in done.failed.items()],
         }
         if not options.dry_run:
-            values["scores"] = json_module.loads(done.scores.to_json(orient="records"))
+            values["scores"] = records(done.scores)
             changes = whatif_scores(done.predictions)
-            values["whatif"] = json_module.loads(changes.to_json(orient="records"))
+            values["whatif"] = records(changes)
         print(json_module.dumps(values))
         return
     if options.dry_run:
@@ -210,7 +211,7 @@ def _print_surprise(scores: pd.DataFrame, failed: Mapping[str, str], options: Op
     """Print how often the impossible movie of a pair surprises more, and which models failed."""
     if options.json:
         values = {
-            "surprise": json_module.loads(scores.to_json(orient="records")),
+            "surprise": records(scores),
             "failed": [{"model": name, "reason": why} for name, why in failed.items()],
         }
         print(json_module.dumps(values))

@@ -14,6 +14,7 @@ from typing import Annotated
 
 import tyro
 
+from physion.analysis.tables import records
 from physion.cli.output import (
     Stages,
     print_line,
@@ -66,8 +67,7 @@ def main(options: Options) -> int:
     if options.json:
         values = {"complete": done.complete, "page": str(page), "report": str(report)}
         values |= {
-            name: json_module.loads(table.to_json(orient="records"))
-            for name, table in (("movies", done.movies), ("seeds", done.seeds))
+            name: records(table) for name, table in (("movies", done.movies), ("seeds", done.seeds))
         }
         print(json_module.dumps(values))
         return 1 if len(missing) else 0

@@ -14,6 +14,7 @@ from typing import Annotated
 
 import tyro
 
+from physion.analysis.tables import records
 from physion.cli.output import Stages, print_line, print_scores, print_warnings
 from physion.pipeline import RunSettings, chosen_models, run
 from physion.readout.settings import options_by_model
@@ -42,7 +43,7 @@ def main(options: Options) -> int:
         )
     print_warnings(done.warnings)
     if options.json:
-        rows = json_module.loads(done.result.scores.to_json(orient="records"))
+        rows = records(done.result.scores)
         answer = {"report": str(done.report), "scores": rows, "failures": done.failures}
         print(json_module.dumps(answer, indent=1))
         return 1 if done.failures else 0

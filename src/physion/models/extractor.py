@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from physion.clips.batch import LAST_OBSERVED, Batch, Provenance, Spec
 from physion.core.errors import BadInputError
-from physion.models.torch_model import TorchModel, digest_of, source_of
+from physion.models.torch_model import TorchModel, source_of, weights_digest
 
 _VERSION = 1
 """To be raised with every change that alters features."""
@@ -62,7 +62,7 @@ class ExtractorModel(TorchModel):
             framewise=False,
         )
         weights = extractor.state_dict()
-        self.init = f"local:{digest_of([], weights.items())}" if weights else "none"
+        self.init = f"local:{weights_digest([], weights.items())}" if weights else "none"
 
     def encode(self, batch: Batch) -> Tensor:
         """Return features (B, 1, D) of all frames of the clips."""
@@ -101,7 +101,7 @@ class ExtractorModel(TorchModel):
         """Return the SHA-256 of the extractor's source, what it asks for, and its weights."""
         source = source_of(type(self.extractor))
         settings = [_VERSION, source, repr(self.spec), self._least, torch.__version__]
-        return digest_of(settings, self.extractor.state_dict().items())
+        return weights_digest(settings, self.extractor.state_dict().items())
 
 
 def _settings(extractor: Any, name: str) -> tuple[Any, int, int]:

@@ -53,7 +53,7 @@ from physion.models.interface import (
     TrainingSettings,
     can,
 )
-from physion.models.torch_model import TorchModel, digest_of, initial_weights
+from physion.models.torch_model import TorchModel, initial_weights, weights_digest
 from physion.numerics.linear_algebra import norm
 from physion.numerics.rotations import rotate_vectors, rotation_matrices
 from physion.scenes.scene import Scene
@@ -469,7 +469,7 @@ class Intuition(TorchModel):
 
     def digest(self) -> str:
         """Return the SHA-256 of code version, settings and weights."""
-        return digest_of([*self._digested(), torch.__version__], self.state_dict().items())
+        return weights_digest([*self._digested(), torch.__version__], self.state_dict().items())
 
     def built_as(self) -> dict[str, Any]:
         """Return what the weights were made for: name, with the size, and version."""
@@ -527,7 +527,7 @@ class TokenIntuition(Intuition):
 
     def encoder_digest(self) -> str:
         """Return the SHA-256 of what determines the tokens: no weights."""
-        return digest_of([self.kind, VERSION, self.settings.objects, repr(self.spec)])
+        return weights_digest([self.kind, VERSION, self.settings.objects, repr(self.spec)])
 
     def encode(self, batch: Batch) -> Tensor:
         """Return the tokens of all objects (B, T, K D), which depend on no weights."""

@@ -45,7 +45,7 @@ class TorchModel(nn.Module, Model):
         Add to it what else determines the results, such as code in other files.
         """
         parts = [source_of(type(self)), repr(self.spec), repr(self.settings), torch.__version__]
-        return digest_of(parts, self.state_dict().items())
+        return weights_digest(parts, self.state_dict().items())
 
     @property
     def device(self) -> torch.device:
@@ -65,7 +65,7 @@ def initial_weights(*key: str | int) -> Iterator[None]:
         yield
 
 
-def digest_of(settings: Any, weights: Iterable[tuple[str, Tensor]] = ()) -> str:
+def weights_digest(settings: Any, weights: Iterable[tuple[str, Tensor]] = ()) -> str:
     """Return the hexadecimal SHA-256 of JSON settings and of named weights."""
 
     def parts() -> Iterator[bytes]:

@@ -18,7 +18,7 @@ from physion.clips.batch import Batch, Provenance, Spec
 from physion.core.errors import BadInputError
 from physion.core.seeds import generator
 from physion.models.interface import SizedSettings, TrainingSettings
-from physion.models.torch_model import TorchModel, digest_of
+from physion.models.torch_model import TorchModel, weights_digest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,11 +78,11 @@ class VisionModel(TorchModel):
 
     def digest(self) -> str:
         """Return the SHA-256 of code version, settings and weights."""
-        return digest_of([*self._digested(), torch.__version__], self.state_dict().items())
+        return weights_digest([*self._digested(), torch.__version__], self.state_dict().items())
 
     def readout_digest(self) -> str:
         """Return the SHA-256 of code version, settings and weights."""
-        return digest_of(self._digested(), self.state_dict().items())
+        return weights_digest(self._digested(), self.state_dict().items())
 
     def _digested(self) -> list[Any]:
         settings = {k: v for k, v in asdict(self.settings).items() if k not in ("weights", "seed")}

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any, Protocol, runtime_checkable
 
 from physion.core.errors import BadInputError
+from physion.core.files import json_digest
 from physion.core.registry import Registry
 from physion.physics.trajectory import State, Trajectory
 from physion.scenes.scene import Scene
@@ -197,5 +196,4 @@ def simulate_many(
 
 def settings_tag(settings: Any) -> str:
     """Return eight hexadecimal digits that change whenever a field of a dataclass does."""
-    text = json.dumps(asdict(settings), sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:8]
+    return json_digest(asdict(settings))[:8]

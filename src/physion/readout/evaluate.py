@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -20,7 +18,7 @@ import pandas as pd
 from physion.clips.batch import Provenance
 from physion.compute.tasks import Executor, Progress, tracked
 from physion.core.errors import BadInputError
-from physion.core.files import digest_path, is_whole
+from physion.core.files import digest_path, is_whole, json_digest
 from physion.core.version import __version__
 from physion.models.interface import Model, TrainingSettings, ask, can
 from physion.readout.benchmark import Benchmark, benchmark_of
@@ -418,7 +416,6 @@ class _Evaluate:
         inputs = [_VERSION, __version__, kept, facts, options, of_training, model.digest()]
         inputs.append(shipped.sha256 if shipped is not None else self.fit_on)
         inputs += filter(None, [self.verdicts.get(cell.chosen.name)])
-        sha = hashlib.sha256(json.dumps(inputs, sort_keys=True, default=str).encode())
-        sha.update(self.dataset.index[_HASHED_COLUMNS].to_csv(index=False).encode())
-        name = f"{file_name(provenance.model)}-{sha.hexdigest()[:12]}.csv"
+        trials = self.dataset.index[_HASHED_COLUMNS].to_csv(index=False).encode()
+        name = f"{file_name(provenance.model)}-{json_digest(inputs, [trials])[:12]}.csv"
         return self.out / "predictions" / name

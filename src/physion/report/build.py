@@ -12,6 +12,7 @@ import pandas as pd
 from physion.analysis.figure_tables import response_time_table
 from physion.analysis.people.effects import below_chance_level
 from physion.analysis.people.results import PeopleResults
+from physion.analysis.tables import records
 from physion.core.errors import BadInputError
 from physion.core.files import write_atomic
 from physion.core.version import MADE_WITH
@@ -124,10 +125,7 @@ def report_numbers(inputs: ReportInputs) -> dict[str, Any]:
 def _numbers(
     methods: Mapping[str, str], warnings: Sequence[str], tables: Mapping[str, pd.DataFrame]
 ) -> dict[str, Any]:
-    values = {
-        name: json.loads(table.to_json(orient="records", double_precision=15))
-        for name, table in tables.items()
-    }
+    values = {name: records(table) for name, table in tables.items()}
     return {"package": MADE_WITH, "methods": methods, "warnings": list(warnings), **values}
 
 

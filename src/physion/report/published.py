@@ -18,7 +18,7 @@ from physion.analysis.figure_tables import (
 )
 from physion.analysis.published.claims import TITLES, PublishedResults
 from physion.analysis.published.tables import grid
-from physion.analysis.tables import MEAN
+from physion.analysis.tables import MEAN, records
 from physion.core.files import write_atomic
 from physion.core.html import Markup, joined
 from physion.core.version import MADE_WITH
@@ -65,10 +65,7 @@ def build_published_report(results: PublishedResults, folder: Path) -> Path:
 
 def published_numbers(results: PublishedResults) -> dict[str, Any]:
     """Return every table, as a list of rows, and its description for JSON; NaN becomes null."""
-    tables = {
-        name: json.loads(rows.to_json(orient="records", double_precision=15))
-        for name, rows in results.tables.items()
-    }
+    tables = {name: records(rows) for name, rows in results.tables.items()}
     return {"package": MADE_WITH, "tables": tables, "words": dict(results.descriptions)}
 
 

@@ -9,7 +9,6 @@ back without loss.
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import math
 from collections import Counter
@@ -18,6 +17,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 from physion.core.errors import BadInputError, BadSceneError
+from physion.core.files import digest_of
 from physion.core.settings import parse_json, read_settings, shown
 
 Vec3: TypeAlias = tuple[float, float, float]
@@ -323,7 +323,7 @@ class Scene:
             cloths=tuple(dataclasses.replace(cloth, look=Look()) for cloth in self.cloths),
             events=tuple(event for event in self.events if event.body not in scenery),
         )
-        return hashlib.sha256(plain.to_json().encode()).hexdigest()
+        return digest_of(plain.to_json())
 
     def to_json(self) -> str:
         """Return the scene as one line of JSON, from which `from_json` builds an equal scene."""

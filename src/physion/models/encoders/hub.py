@@ -48,7 +48,7 @@ from physion.models.encoders.weights import (
     weights_sha256,
 )
 from physion.models.interface import ModelSettings
-from physion.models.torch_model import TorchModel, digest_of, initial_weights
+from physion.models.torch_model import TorchModel, initial_weights, weights_digest
 from physion.models.vision import normalized_pictures
 from physion.scenes.scene import OBSERVED_FRAMES
 
@@ -187,7 +187,7 @@ class HubEncoder(TorchModel):
                 )
             local = sorted(Path(self.source).glob("*.safetensors"))
             digests = [weights_sha256(path) for path in local]
-            sha256 = digests[0] if len(digests) == 1 else digest_of(digests)
+            sha256 = digests[0] if len(digests) == 1 else weights_digest(digests)
             self.init = f"local:{sha256[:12]}" if local else f"hub:{self.source}"
         network = getattr(network, "vision_model", network)
         if config.model_type == "vjepa2":  # without its predictor
@@ -281,7 +281,7 @@ class HubEncoder(TorchModel):
         settings = dataclasses.asdict(self.settings)
         settings.pop("weights")  # which count as they are
         parts = [_VERSION, settings, repr(self.spec), torch.__version__, transformers.__version__]
-        return digest_of(parts, self.state_dict().items())
+        return weights_digest(parts, self.state_dict().items())
 
     def name(self) -> str:
         """Return the name for tables: the last part of the name of repository or folder."""

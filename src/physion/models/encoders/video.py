@@ -43,7 +43,7 @@ from physion.models.encoders.weights import (
     weights_sha256,
 )
 from physion.models.interface import ModelSettings, settings_of_size
-from physion.models.torch_model import TorchModel, digest_of, initial_weights
+from physion.models.torch_model import TorchModel, initial_weights, weights_digest
 from physion.models.vision import normalized_pictures
 
 # Networks of video encoders of the library transformers, and their weights.
@@ -422,7 +422,7 @@ class VideoEncoder(TorchModel):
         if (settings["mlp"], settings["layer"]) == (4.0, None):  # as before these could be set
             del settings["mlp"], settings["layer"]
         parts = [_VERSION, self.family.name, settings, torch.__version__, transformers.__version__]
-        return digest_of(parts, self.state_dict().items())
+        return weights_digest(parts, self.state_dict().items())
 
     def name(self) -> str:
         """Return the name for tables, such as ``VideoMAE-paper`` or ``random-VideoMAE-paper``."""

@@ -89,7 +89,7 @@ from physion.models.particles.rollout import (
     smallest_distance,
     start_probabilities,
 )
-from physion.models.torch_model import TorchModel, digest_of, initial_weights
+from physion.models.torch_model import TorchModel, initial_weights, weights_digest
 from physion.physics.labels import label_contact
 from physion.scenes.scene import FRAME_TIME
 
@@ -470,7 +470,7 @@ class ParticleSimulator(TorchModel):
         if settings["future"] is None:
             del settings["future"]  # as before there was this setting
         parts = [self._weights_version, _DISTANCES, settings, torch.__version__]
-        return digest_of(parts, self.state_dict().items())
+        return weights_digest(parts, self.state_dict().items())
 
     def built_as(self) -> dict[str, Any]:
         """Return what the weights were made for: name, version, step, edges."""

@@ -8,7 +8,6 @@ for every harness. The samples that lmms-eval logs are read by `physion.tasks.lo
 
 from __future__ import annotations
 
-import hashlib
 import json
 from pathlib import Path
 
@@ -17,7 +16,7 @@ import pyarrow.parquet as pq
 
 from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError
-from physion.core.files import folder_for_writing, remove_leftovers, write_atomic
+from physion.core.files import digest_of, folder_for_writing, remove_leftovers, write_atomic
 from physion.trials.dataset import Dataset
 from physion.trials.share import questions
 from physion.trials.share.items import Item, items_of, movie_of
@@ -164,7 +163,7 @@ def export_lmms_eval(
         digests = {}
         for name, item in tracked(list(movies.items()), "movies", len(movies), progress):
             content = movie_of(dataset, item)
-            digests[name] = hashlib.sha256(content).hexdigest()
+            digests[name] = digest_of(content)
             write_atomic(out / name, content)
         made = {"README.md": _README.format(
             count=len({item.trial for item in items["contact"]}), folder=where,
