@@ -37,7 +37,7 @@ from physion.clips.source import ObservedSource, TrialReaders
 from physion.clips.states import TrialMotions, cut_motion
 from physion.core.errors import BadSceneError
 from physion.core.files import write_atomic
-from physion.core.names import SCENARIOS, canonical_name
+from physion.core.names import RIGID, SCENARIOS, canonical_name
 from physion.core.seeds import trial_seed
 from physion.data.official import official
 from physion.models.build import build_model, build_untrained
@@ -56,7 +56,6 @@ from physion.trials.making.choose import split_of
 from ship_readouts import Pictures
 
 MODELS = ("state-trees", "mask-trees", "blob-trees", "intuition-states", "intuition-masks")
-RIGID = tuple(name for name in SCENARIOS if name != "drape")
 EACH = 25
 """Trials of a file."""
 LOOK = "redyellow"

@@ -115,7 +115,7 @@ MORE = (
         "only and all, particle models",
         "Protocols differ more for particle models: *only* against *all*",
         {},
-        Contrast("only against all", PARTICLES, column="training", high=(ONLY,), beside=(ALL_BUT,),
+        Contrast("only against all", PARTICLES, column="training", high=(ONLY,), further=(ALL_BUT,),
                  groups=("scenario",)),
     ),
     Claim(
@@ -308,7 +308,7 @@ def claims(released: PublishedTables, tested: Mapping[str, Tested]) -> pd.DataFr
         row = {
             "claim": claim.name,
             "sentence": claim.sentence,
-            "compared": here(contrast).words,
+            "compared": here(contrast).text,
             "published": ", ".join(f"{k} {v}" for k, v in claim.printed.items()) or "no number",
             "released": words(paper, models=False),
         }

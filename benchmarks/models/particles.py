@@ -55,7 +55,7 @@ from physion.analysis.tables import MEAN, POOLED, read_humans, read_predictions
 from physion.clips.batch import LAST_OBSERVED, Batch, Motion, cut_to_observed
 from physion.clips.clips import observed_source, whole_source
 from physion.compute.tasks import processor
-from physion.core.names import SCENARIOS, canonical_name
+from physion.core.names import RIGID, canonical_name
 from physion.data.official import PACKAGED, humans_folder, official
 from physion.models.build import build_untrained
 from physion.models.particles.bodies import poses_of, rotation_from_vector, scene_particles
@@ -91,7 +91,6 @@ COLLIDE_STEPS = 2600
 TRANSFER_STEPS = 5000
 NAMES = ("dpi", "gns", "gns-ransac")
 DECISIONS = ("end", "closest", "touch", "gap")
-RIGID = tuple(name for name in SCENARIOS if name != "drape")
 
 Rows = list[list[str]]
 

@@ -48,7 +48,7 @@ from physion.analysis.scores import TWO_PEOPLE
 from physion.analysis.tables import read_humans
 from physion.clips.batch import LAST_OBSERVED, Batch, Motion
 from physion.clips.rendered import MotionRenderer, object_ids
-from physion.core.names import canonical_name
+from physion.core.names import RIGID, canonical_name
 from physion.core.seeds import stable_hash
 from physion.data.official import official
 from physion.models.baselines.motion import gap_in_constant_motion
@@ -81,7 +81,6 @@ RESULTS = Path(__file__).parents[1] / "results" / "seeing.md"
 SAMPLES = 10
 FRAMES_AHEAD = 106
 PRIOR_SCENES = 12
-RIGID = ("collide", "contain", "dominoes", "drop", "link", "roll", "support")
 LOOKED_AT = {"support": 3}
 """Trials per scenario and outcome that were looked at while the fit was written; 1 of others."""
 STILL = NoiseLevels(position=0.0, velocity=0.0, mass=0.0)
@@ -427,7 +426,8 @@ def _markdown(rows: Sequence[ROW]) -> str:
 def priors() -> str:
     """Return what our own presets have, as Markdown: medians, and quantiles of the density."""
     scenes = {
-        name: [physion.sample_scene(name, seed) for seed in range(PRIOR_SCENES)] for name in RIGID
+        name: [physion.sample_scene(name, seed) for seed in range(PRIOR_SCENES)]
+        for name in sorted(RIGID)
     }
     bodies = {name: [body for s in made for body in _movable(s)] for name, made in scenes.items()}
     every = [scene for made in scenes.values() for scene in made]

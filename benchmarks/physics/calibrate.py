@@ -42,7 +42,7 @@ import numpy as np
 
 from calibration_quantities import QUANTITIES, Quantity
 from physion.compute.tasks import processor
-from physion.core.names import SCENARIOS
+from physion.core.names import RIGID
 from physion.core.seeds import child_generator, trial_seed
 from physion.physics.labels import jitter_scene, label_contact
 from physion.physics.rigid import bodies as hulls
@@ -66,7 +66,6 @@ PARTS = ("outcome", "first contact", "first motion", "frames", "final position")
 MOTION_RECORDED = ("MultiDominoes", "Collision", "RollingSliding")
 """Controllers that record the first motion of the target. The others replace the target after they
 have noted where it is, or count from the origin."""
-RIGID = tuple(name for name in SCENARIOS if name != "drape")
 
 
 @dataclass(frozen=True)

@@ -156,7 +156,7 @@ def page(inputs: ReportInputs) -> str:
 @pytest.fixture(scope="module")
 def filled(inputs: ReportInputs) -> tuple[ReportInputs, str]:
     """Inputs whose tables hold a different number in every cell, and their page."""
-    assert inputs.people is not None and inputs.beside is not None
+    assert inputs.people is not None and inputs.with_people is not None
     assert inputs.paired is not None and inputs.paired_measures is not None
     assert inputs.calibration is not None
     kept = ("by_stimulus", "items", "flags", "flag_counts", "attributes", "left_out")
@@ -171,13 +171,15 @@ def filled(inputs: ReportInputs) -> tuple[ReportInputs, str]:
         {"question": ["age"], "sessions": [8], "test": ["Spearman"], "statistic": [0.31],
          "p": [0.04], "reason": [""]}
     )  # fmt: skip
-    beside = dataclasses.replace(
-        inputs.beside, scores=distinct(inputs.beside.scores), zones=distinct(inputs.beside.zones)
+    with_people = dataclasses.replace(
+        inputs.with_people,
+        scores=distinct(inputs.with_people.scores),
+        zones=distinct(inputs.with_people.zones),
     )
     changed = dataclasses.replace(
         inputs,
         people=dataclasses.replace(inputs.people, tables=tables),
-        beside=beside,
+        with_people=with_people,
         paired=distinct(inputs.paired),
         paired_measures=distinct(inputs.paired_measures),
         calibration=distinct(inputs.calibration),
@@ -338,8 +340,8 @@ def test_calibration(filled: tuple[ReportInputs, str]) -> None:
 
 def test_measures_with_single_people(filled: tuple[ReportInputs, str]) -> None:
     inputs, page = filled
-    assert inputs.beside is not None
-    scores = inputs.beside.scores
+    assert inputs.with_people is not None
+    scores = inputs.with_people.scores
     whole = find(page, "Every measure as a table")
     table = PageTable(
         whole.place, whole.header, [row for row in whole.rows if row[2] == "accuracy"]
@@ -356,8 +358,8 @@ def test_measures_with_single_people(filled: tuple[ReportInputs, str]) -> None:
 
 
 def test_kappa_of_models_with_each_other(inputs: ReportInputs, page: str) -> None:
-    assert inputs.beside is not None
-    mean = inputs.beside.pairs.groupby(["first", "second"])["kappa"].mean()
+    assert inputs.with_people is not None
+    mean = inputs.with_people.pairs.groupby(["first", "second"])["kappa"].mean()
     table = find(page, "kappa of models with each other")
     names = [row[0].partition(" ")[2] for row in table.rows]
     assert len(names) == 2, "readout full is not next to people"
@@ -441,8 +443,8 @@ def test_hypotheses(filled: tuple[ReportInputs, str]) -> None:
 
 def test_zones_of_single_people(filled: tuple[ReportInputs, str]) -> None:
     inputs, page = filled
-    assert inputs.beside is not None
-    check(find(page, "What single people reach"), inputs.beside.zones, {
+    assert inputs.with_people is not None
+    check(find(page, "What single people reach"), inputs.with_people.zones, {
         "scenario": "scenario", "measure": "measure", "of": "of", "values": ("values", count),
         "mean": ("mean", fixed(3)), "2.5 %": ("low", fixed(3)), "97.5 %": ("high", fixed(3)),
         "undefined": ("undefined", count),

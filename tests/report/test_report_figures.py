@@ -607,7 +607,7 @@ def test_panels_inside_have_neither_ticks_nor_numbers(make_comparison: Maker) ->
 
 def pictures(inputs: ReportInputs) -> list[Picture]:
     blank = {"svg": b"<svg/>", "png": b""}
-    return [Picture(plot.name, blank, blank, plot.words) for plot in make_plots(inputs)]
+    return [Picture(plot.name, blank, blank, plot.caption) for plot in make_plots(inputs)]
 
 
 def test_columns_of_simulated_outcomes_stand_only_where_these_differ(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from physion.clips.imagined import ImaginedTrial
+from physion.clips.batch import ImaginedTrial
 from physion.report.viewer.build import ViewerOptions, build_viewer
 from physion.trials.video import read_frames
 from support.browser import Browser

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from physion.clips.imagined import ImaginedTrial
+from physion.clips.batch import ImaginedTrial
 from physion.core.errors import BadInputError
 from physion.report.viewer.build import ViewerOptions, build_viewer
 from physion.report.viewer.imagined import REACH, STEPS, caption, pack_imagined

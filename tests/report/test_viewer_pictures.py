@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from physion.clips.imagined import ImaginedTrial
+from physion.clips.batch import ImaginedTrial
 from physion.core.errors import BadInputError
 from physion.report.viewer.imagined import ROWS, SIDE, SLOTS, pack_imagined
 from support.viewer_dataset import PLANS, make_scene

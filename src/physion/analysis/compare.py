@@ -138,7 +138,8 @@ class ComparisonResults:
     - ``comparison``: from `compare_scores`.
     - ``predictions``: from `read_predictions`, for what needs readout and training.
     - ``people``: results about single participants; None if only their averages are known.
-    - ``beside``: models and single participants, from `compare_everywhere`, without `DETECTION`.
+    - ``with_people``: models and single participants, from `compare_everywhere`, without
+      `DETECTION`.
     - ``comparison_all``: the comparison with all complete sessions, including flagged ones.
     - ``paired``: from `paired_tests`, all scenarios pooled; None for one model.
     - ``paired_measures``: from `paired_measures`; None for one model or no people.
@@ -152,7 +153,7 @@ class ComparisonResults:
     comparison: Comparison
     predictions: pd.DataFrame | None = None
     people: PeopleResults | None = None
-    beside: PeopleComparison | None = None
+    with_people: PeopleComparison | None = None
     comparison_all: Comparison | None = None
     paired: pd.DataFrame | None = None
     paired_measures: pd.DataFrame | None = None
@@ -215,7 +216,7 @@ def all_results(
     }
     predictions = name_models(predictions)
     predicted = set(predictions["stimulus"])
-    whole, beside, about_people = None, None, []
+    whole, with_people, about_people = None, None, []
     if people is None:
         seen = set() if humans is None else set(humans["stimulus"])
         check_excluded_names(settings["exclude"], {*predicted, *seen, *(labels or {})})
@@ -239,7 +240,7 @@ def all_results(
         everybody = accuracy_by_stimulus(people.whole.test, draws)
         whole = compare_scores(predictions, everybody, known, **settings)
         predicting = main.stimuli[main.stimuli["readout"] != DETECTION]
-        beside = compare_everywhere(predicting, test, draws)
+        with_people = compare_everywhere(predicting, test, draws)
         about_people = fits_of_people(people)
     pooled = pool_comparison(main)
     several = len(main.names) > 1
@@ -247,7 +248,7 @@ def all_results(
         main,
         predictions=predictions,
         people=people,
-        beside=beside,
+        with_people=with_people,
         comparison_all=whole,
         paired=paired_tests(pooled, draws) if several else None,
         paired_measures=paired_measures(pooled, draws) if several and main.has_people else None,
@@ -271,9 +272,9 @@ def tidy_scores(results: ComparisonResults) -> pd.DataFrame:
     kind = table["kind"].mask(table["model"] == TWO_PEOPLE, "people")
     table = table.assign(kind=kind, kappa=np.nan, kappa_low=np.nan, kappa_high=np.nan)
     table["interval"] = "stimuli"
-    if results.beside is not None:
+    if results.with_people is not None:
         keys = pd.MultiIndex.from_frame(table[["model", "scenario"]])
-        measures = results.beside.scores.set_index(["model", "scenario"])
+        measures = results.with_people.scores.set_index(["model", "scenario"])
         table["interval"] = np.where(keys.isin(measures.index), "people and stimuli", "stimuli")
         for name, rows in measures.groupby("measure"):
             if f"{name}_low" not in table:

@@ -13,6 +13,7 @@ from physion.cli.output import print_line
 from physion.compute.tasks import executors
 from physion.core.errors import BadInputError
 from physion.core.registry import Registry
+from physion.core.settings import flatten
 from physion.models import models
 from physion.physics.engine import engines
 from physion.rendering.rooms import rooms
@@ -136,7 +137,7 @@ def _print_preset(preset: Preset, as_json: bool) -> int:
         print(json_module.dumps(_facts(preset)))
         return 0
     limits = describe_limits(preset.params)
-    for key, value in _flat(as_record(preset.params)).items():
+    for key, value in flatten(as_record(preset.params)).items():
         line = f"{key} = {json_module.dumps(value)}   # {limits.get(key, '')}"
         print_line(line)
     return 0
@@ -153,14 +154,3 @@ def _facts(preset: Preset) -> dict[str, Any]:
         "published": None if published is None else vars(published),
         "params": as_record(preset.params),
     }
-
-
-def _flat(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Flatten nested keys to dotted ones, as preset files may have them."""
-    flat: dict[str, Any] = {}
-    for key, value in record.items():
-        if isinstance(value, Mapping):
-            flat |= {f"{key}.{name}": part for name, part in _flat(value).items()}
-        else:
-            flat[key] = value
-    return flat

@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from physion.cli.output import Stages, print_line
-from physion.clips.imagined import Imagine
+from physion.clips.batch import Imagine
 from physion.core.errors import BadInputError
 from physion.core.settings import parse_pairs
 from physion.report.viewer.build import ViewerOptions, build_viewer

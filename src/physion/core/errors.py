@@ -85,11 +85,12 @@ class MissingExtraError(PhysionError):
     """Error for a feature whose optional dependencies are not installed."""
 
     def __init__(self, what: str, extra: str) -> None:
-        where, lock = "in the clone", " -c requirements.lock"
+        where, lock = "", " -c requirements.lock"
         if extra in OWN_ENVIRONMENT:
-            where, lock = "in the clone, and in a virtual environment of its own", ""
+            where, lock = "in a virtual environment of its own: ", ""
         super().__init__(
-            f"{what} needs the extra {extra!r}; {where}: pip install -e '.[{extra}]'{lock}"
+            f"{what} needs the extra {extra!r}; {where}pip install 'physion-benchmark[{extra}]', "
+            f"or in the clone pip install -e '.[{extra}]'{lock}"
         )
         self.extra = extra
 

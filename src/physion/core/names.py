@@ -41,6 +41,9 @@ NAMES = {
 SCENARIOS = tuple(NAMES)
 """The eight scenarios in the order of the paper."""
 
+RIGID = tuple(scenario for scenario in SCENARIOS if scenario != "drape")
+"""The scenarios without cloth."""
+
 FOLDERS = {scenario: names.folder for scenario, names in NAMES.items()}
 """Folder of the published archives by scenario."""
 

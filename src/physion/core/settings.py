@@ -212,6 +212,31 @@ def _cached_field_types(kind: Any) -> Mapping[str, Any]:
     return types.MappingProxyType({name: hints[name] for name in names})
 
 
+def flatten(values: Mapping[Any, Any], *, lists: bool = False) -> dict[str, Any]:
+    """Return nested values by their paths, such as ``camera.fov``.
+
+    With ``lists``, also the parts of lists of objects or lists, as in ``bodies[0].mass``.
+    """
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        parts: Any = None
+        if isinstance(value, Mapping):
+            parts = {f"{key}.{name}": part for name, part in value.items()}
+        elif lists and isinstance(value, list) and any(map(_is_nested, value)):
+            parts = {f"{key}[{place}]": part for place, part in enumerate(value)}
+        flat |= {str(key): value} if parts is None else flatten(parts, lists=lists)
+    return flat
+
+
+def _is_nested(value: Any) -> bool:
+    return isinstance(value, Mapping | list)
+
+
+def as_json(values: Any, default: Callable[[Any], Any] | None = None) -> Any:
+    """Return values as JSON reads them again; ``default`` is the one of `json.dumps`."""
+    return json.loads(json.dumps(values, default=default))
+
+
 def shown(value: Any) -> str:
     """Return a value as short text for an error message, whatever its size."""
     return _REPR.repr(value)

@@ -28,6 +28,7 @@ from physion.core.files import (
     write_atomic,
     write_with_digest,
 )
+from physion.core.settings import flatten
 from physion.core.version import __version__
 from physion.models.interface import RANDOM, SHIPPED, ask
 
@@ -169,7 +170,7 @@ def check_same(
     advice: str = "delete it to start again",
 ) -> None:
     """Raise `BadInputError` that names the values of ``what`` that differ, and what to do."""
-    old, new = _flat(stored), _flat(current)
+    old, new = flatten(stored), flatten(current)
     differences = [
         f"{key} was {_shown(old, key)} and is {_shown(new, key)}"
         for key in sorted({*old, *new})
@@ -208,15 +209,6 @@ def compare_tensors(
 def _listed(differences: list[str]) -> str:
     more = len(differences) - _NAMED
     return "; ".join(differences[:_NAMED]) + (f"; and {more} more" if more > 0 else "")
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        flat |= (
-            _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
-        )
-    return flat
 
 
 def _shown(values: Mapping[str, Any], key: str) -> str:

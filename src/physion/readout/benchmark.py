@@ -28,7 +28,7 @@ import pandas as pd
 
 from physion.clips.batch import LAST_OBSERVED, Spec
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.core.names import SCENARIOS, canonical_name
+from physion.core.names import RIGID, canonical_name
 from physion.models.interface import ask
 from physion.readout.decisions import Readout
 from physion.readout.folds import TESTING, Fold, ScenarioSplit, select_scenario
@@ -181,7 +181,7 @@ class Benchmark:
 V1 = Benchmark("v1")
 V1_5 = Benchmark(
     "v1.5",
-    scenarios=tuple(name for name in SCENARIOS if name != "drape"),
+    scenarios=RIGID,
     last={"collide": 15},
     window=(-30, 15),
     readouts=(Readout.OBSERVED.value, Readout.FULL.value),

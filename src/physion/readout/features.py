@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from physion.clips.batch import Batch, Rollout
+from physion.clips.batch import Batch
 from physion.clips.source import ObservedSource, Part
 from physion.compute.local import SerialExecutor
 from physion.compute.tasks import Executor, Progress, tracked
@@ -34,8 +34,9 @@ from physion.models.interface import Model, ask
 from physion.models.user_files import LoadedFiles
 from physion.readout.model_calls import (
     MEMORY_ADVICE,
-    call_model,
     check_finite,
+    encoded,
+    imagined,
     model_name,
     notes_of,
     to_array,
@@ -233,9 +234,7 @@ def encode_clips(model: Model, batch: Batch) -> list[Arrays]:
     bounds = np.linspace(0, steps, (-(-steps // _FRAMES) if framewise else 1) + 1).astype(int)
     parts = []
     for start, stop in itertools.pairwise(bounds.tolist()):
-        value = call_model(model, "encode", batch.steps(slice(start, stop)))
-        shape = (clips, stop - start if framewise else None, None)
-        parts.append(to_array(value, model, what, shape, ("float32",)))
+        parts.append(encoded(model, batch.steps(slice(start, stop))))
     features = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
     if features.shape[1] > steps:
         raise BadInputError(
@@ -253,11 +252,7 @@ def imagine_clips(
 
     Also a note, the bytes of a text, of clips that have one.
     """
-    rollout = call_model(model, "imagine", batch, samples, seed, **arguments)
-    if not isinstance(rollout, Rollout):
-        raise BadInputError(
-            f"model {model_name(model)!r}: imagine gave {type(rollout).__name__}, expected Rollout"
-        )
+    rollout = imagined(model, batch, samples, seed, **arguments)
     clips, future = len(batch), batch.future
     expected: dict[str, tuple[tuple[int | None, ...], tuple[str, ...]]] = {
         FEATURES: ((clips, samples, future, None), ("float32",)),

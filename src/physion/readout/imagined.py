@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.clips.batch import Batch, Rollout
+from physion.clips.batch import SHOWABLE, Batch, Imagine, ImaginedTrial, Rollout
 from physion.clips.clips import whole_source
-from physion.clips.imagined import SHOWABLE, Imagine, ImaginedTrial
 from physion.clips.source import WholeSource
 from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError
@@ -19,7 +18,14 @@ from physion.models.build import OutOfMemoryError, build_model
 from physion.models.interface import Model, ask, can
 from physion.readout.decisions import EndDecision, Futures, TouchDecision
 from physion.readout.features import Outcomes
-from physion.readout.model_calls import call_model, check_identity, is_network, model_name, to_array
+from physion.readout.model_calls import (
+    check_identity,
+    encoded,
+    imagined,
+    model_name,
+    to_array,
+    use_device,
+)
 from physion.trials.dataset import Dataset
 
 Arrays = NDArray[Any]
@@ -96,10 +102,7 @@ def _imagine_trials(
     dataset: Dataset, model: Model, trials: Sequence[str], progress: Progress | None
 ) -> dict[str, ImaginedTrial]:
     """Return what one model imagines of the trials."""
-    if is_network(model):
-        from physion.training.devices import Devices, make_fabric, move_to_device
-
-        move_to_device(make_fabric(Devices(), "32-true"), model)
+    use_device(model)
     source = whole_source(dataset, model.spec, rendered=_without_movies(dataset, trials))
     groups = [trials[row : row + _TRIALS] for row in range(0, len(trials), _TRIALS)]
     imagined: dict[str, ImaginedTrial] = {}
@@ -128,11 +131,7 @@ def _imagine_group(model: Model, source: WholeSource, trials: Sequence[str]) -> 
     longest = max(source.length(trial) for trial in trials)
     batch = dataclasses.replace(batch, future=model.spec.steps_after(longest))
     samples, seed = ask(model, "samples"), ask(model, "seed") or 0
-    rollout = call_model(model, "imagine", batch, samples, seed, show=1.0)
-    if not isinstance(rollout, Rollout):
-        raise BadInputError(
-            f"model {model_name(model)!r}: imagine gave {type(rollout).__name__}, expected Rollout"
-        )
+    rollout = imagined(model, batch, samples, seed, show=1.0)
     shown, steps = _shown_arrays(model, rollout, len(batch), samples)
     seen = _seen_arrays(model, rollout, batch, shown)
     true = _true_arrays(model, source, trials, shown, steps) if steps == batch.future else {}
@@ -164,14 +163,7 @@ def _context(model: Model, batch: Batch) -> Batch:
     """Return the context of trials, with its features if the model also encodes."""
     if not can(model, "encode"):
         return batch
-    return dataclasses.replace(batch, features=_encoded(model, batch))
-
-
-def _encoded(model: Model, batch: Batch) -> Arrays:
-    """Return the features (B, T', D) of a batch."""
-    features = call_model(model, "encode", batch)
-    what, shape = "encode gave features", (len(batch), None, None)
-    return to_array(features, model, what, shape, ("float32",))
+    return dataclasses.replace(batch, features=encoded(model, batch))
 
 
 def _shown_arrays(
@@ -229,7 +221,7 @@ def _true_arrays(
     whole = source.window(trials, [spec.first] * len(trials), spec.context + steps)
     true = {} if whole.rgb is None else {"rgb": whole.rgb[:, spec.context :]}
     if "slots" in shown and can(model, "encode"):
-        features = _encoded(model, whole)[:, spec.context :]
+        features = encoded(model, whole)[:, spec.context :]
         true["slots"] = _as_slots(model, features, shown["slots"])
     return true
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.clips.batch import Batch, Provenance
+from physion.clips.batch import Batch, Provenance, Rollout
 from physion.core.errors import BadInputError, PhysionError
 from physion.models.build import OutOfMemoryError, describe_raised, is_out_of_memory
 from physion.models.interface import Model, can
@@ -57,6 +57,32 @@ def call_model(model: Model, method: str, batch: Batch, /, *arguments: Any, **op
         raise
     except Exception as error:
         raise _explain(error, model, method, batch) from error
+
+
+def encoded(model: Model, batch: Batch) -> NDArray[np.float32]:
+    """Return the features (B, T', D) that a model gives for clips; of every frame if framewise."""
+    features = call_model(model, "encode", batch)
+    clips, steps = batch.frames.shape[:2]
+    shape = (clips, steps if model.spec.framewise else None, None)
+    return to_array(features, model, "encode gave features", shape, ("float32",))
+
+
+def imagined(model: Model, batch: Batch, samples: int, seed: int, **arguments: float) -> Rollout:
+    """Return what a model imagines after clips; `BadInputError` unless it is a `Rollout`."""
+    rollout = call_model(model, "imagine", batch, samples, seed, **arguments)
+    if not isinstance(rollout, Rollout):
+        raise BadInputError(
+            f"model {model_name(model)!r}: imagine gave {type(rollout).__name__}, expected Rollout"
+        )
+    return rollout
+
+
+def use_device(model: Model, accelerator: str = "auto") -> None:
+    """Move a network to the device of Lightning's name; another model has none."""
+    if is_network(model):
+        from physion.training.devices import Devices, make_fabric, move_to_device
+
+        move_to_device(make_fabric(Devices(accelerator)), model)
 
 
 def notes_of(model: Model, batch: Batch) -> list[str]:

@@ -32,6 +32,7 @@ from physion.readout.model_calls import (
     model_name,
     notes_of,
     to_array,
+    use_device,
 )
 from physion.readout.settings import EvaluationSettings
 from physion.readout.shipped import ShippedReadout, ShippedReadouts
@@ -217,21 +218,20 @@ class Predictor:
         self.problems: dict[str, str] = self._store.problems
         """Reasons of trials that could not be predicted, by name."""
         self._trainer: Trainer | None = None
-        if is_network(model):
-            from physion.training.devices import Devices, make_fabric, move_to_device
+        use_device(model, settings.accelerator)
+        if training is not None:  # of networks only
+            from physion.training.devices import Devices, make_fabric
 
-            move_to_device(make_fabric(Devices(settings.accelerator), "32-true"), model)
-            if training is not None:
-                self._trainer = Trainer(
-                    model,
-                    self._training,
-                    self._store,
-                    dataset.index,
-                    training,
-                    folder / "training",
-                    make_fabric(Devices(settings.accelerator), training.precision),
-                    progress,
-                )
+            self._trainer = Trainer(
+                model,
+                self._training,
+                self._store,
+                dataset.index,
+                training,
+                folder / "training",
+                make_fabric(Devices(settings.accelerator), training.precision),
+                progress,
+            )
 
     def predict(self, fold: Fold) -> list[ScenarioPredictions]:
         """Return the predictions of a fold, one entry per scenario and readout."""

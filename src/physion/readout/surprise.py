@@ -26,20 +26,23 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from physion.clips.batch import Batch, Rollout
+from physion.clips.batch import Batch
 from physion.clips.clips import whole_source
 from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError
-from physion.core.files import folder_for_writing, json_digest, write_atomic
+from physion.core.files import folder_for_writing, is_whole, json_digest
 from physion.core.version import __version__
 from physion.models.interface import Model, ask, can
 from physion.readout.model_calls import (
     call_model,
     check_finite,
     check_identity,
+    encoded,
+    imagined,
     is_network,
     model_name,
     to_array,
+    use_device,
 )
 from physion.readout.settings import (
     Cell,
@@ -49,6 +52,7 @@ from physion.readout.settings import (
     plan_cells,
     run_cells,
 )
+from physion.readout.tables import write_table
 from physion.readout.whatif import mean_over_trials
 from physion.trials.dataset import Dataset
 from physion.trials.making.pairs import Pair, is_pair
@@ -172,12 +176,9 @@ def _of_model(
     inputs = [_VERSION, __version__, model.digest(), own, settings.seed, settings.rendered]
     inputs += [[name, *map(str, files.loc[name])] for name in sorted(pairs)]
     path = folder / f"{origin.model}-{json_digest(inputs)[:16]}.csv"
-    if path.is_file():
+    if is_whole(path):
         return _read(path)
-    if is_network(model):
-        from physion.training.devices import Devices, make_fabric, move_to_device
-
-        move_to_device(make_fabric(Devices(settings.accelerator), "32-true"), model)
+    use_device(model, settings.accelerator)
     scenarios = dataset.index.set_index("trial")["scenario"]
     of_clips = _way_of(model)
     spec = model.spec
@@ -207,7 +208,7 @@ def _read(path: Path) -> pd.DataFrame:
 
 def _keep(path: Path, table: pd.DataFrame) -> pd.DataFrame:
     with folder_for_writing(path.parent):
-        write_atomic(path, table.to_csv(index=False).encode())
+        write_table(table, path)
     return table
 
 
@@ -248,13 +249,13 @@ def _imagined_error(model: Model, clip: Batch, seed: int) -> F64:
     steps, context = clip.frames.shape[1], model.spec.context
     windows = [_before(step, context) for step in range(steps)]
     if model.spec.framewise:
-        whole = _features(model, clip)
-        encoded = np.concatenate([whole[:, window] for window in windows])
+        whole = encoded(model, clip)
+        before = np.concatenate([whole[:, window] for window in windows])
         true = whole[0]
     else:
         # Of frames together: of those up to each one, the last one's.
-        encoded = np.concatenate([_features(model, _part(clip, window)) for window in windows])
-        own = [_features(model, _part(clip, _before(step + 1, context))) for step in range(steps)]
+        before = np.concatenate([encoded(model, _part(clip, window)) for window in windows])
+        own = [encoded(model, _part(clip, _before(step + 1, context))) for step in range(steps)]
         true = np.concatenate(own)[:, -1]
     parts = [_part(clip, window) for window in windows]
     # Random futures are drawn by name, and movies of a pair have the same ones.
@@ -263,14 +264,14 @@ def _imagined_error(model: Model, clip: Batch, seed: int) -> F64:
     samples, errors = ask(model, "samples"), np.zeros(steps)
     for step in range(1, steps):
         asked = dataclasses.replace(
-            parts[step], trials=named, features=encoded[step : step + 1], future=1
+            parts[step], trials=named, features=before[step : step + 1], future=1
         )
-        rollout = call_model(model, "imagine", asked, samples, seed if seeds is None else seeds)
-        if not isinstance(rollout, Rollout) or rollout.features is None:
+        rollout = imagined(model, asked, samples, seed if seeds is None else seeds)
+        if rollout.features is None:
             raise BadInputError(f"model {model_name(model)!r}: imagine gave no features")
         shape = (1, samples, 1, true.shape[-1])
-        imagined = to_array(rollout.features, model, "imagine gave features", shape, ("float32",))
-        squares = (imagined[0, :, 0].astype(np.float64) - true[step]) ** 2
+        future = to_array(rollout.features, model, "imagine gave features", shape, ("float32",))
+        squares = (future[0, :, 0].astype(np.float64) - true[step]) ** 2
         errors[step] = squares.mean(axis=-1).min()
     return errors[None]
 
@@ -285,12 +286,6 @@ def _before(step: int, count: int) -> list[int]:
 
 def _part(clip: Batch, steps: Sequence[int]) -> Batch:
     return clip.steps(np.asarray(steps, np.int64))
-
-
-def _features(model: Model, clip: Batch) -> NDArray[np.float32]:
-    features = call_model(model, "encode", clip)
-    shape = (len(clip), None, None)
-    return to_array(features, model, "encode gave features", shape, ("float32",))
 
 
 def _losses(model: Model, clip: Batch) -> F64:
@@ -368,7 +363,7 @@ def pixel_statistics(
     digests = trials.index.set_index("trial")["digest"]
     inputs = [_VERSION, rendered, [[name, str(digests[name])] for name in sorted(pairs)]]
     path = Path(out) / "surprise" / f"{PIXELS}-{json_digest(inputs)[:16]}.csv"
-    if path.is_file():
+    if is_whole(path):
         return _read(path)
     source = whole_source(trials, Spec(image_size=48), rendered=rendered)
     features = []

@@ -59,7 +59,7 @@ def write_plot(plot: Plot, folder: Path, rehearsal: bool = False) -> Picture:
         dark = {"svg": theme.darkened(light["svg"])}
     else:
         dark = {"png": theme.figure_bytes(plot.draw(plot.table, theme.DARK), "png")}
-    return Picture(plot.name, light, dark, plot.words)
+    return Picture(plot.name, light, dark, plot.caption)
 
 
 def write_csv(path: Path, table: pd.DataFrame, rehearsal: bool = False) -> None:

@@ -75,13 +75,13 @@ SVG_LIMIT = 500_000
 @dataclass(frozen=True)
 class Picture:
     """Figure in two themes as bytes by kind: ``svg`` and ``png``, of the dark one only the kind
-    that `page_kind` names; ``words``: the caption.
+    that `page_kind` names; ``caption``: the text below it.
     """
 
     name: str
     light: Mapping[str, bytes]
     dark: Mapping[str, bytes]
-    words: str = ""
+    caption: str = ""
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def figure(picture: Picture) -> Markup:
     kind = page_kind(picture.light)
     mime = {"svg": "image/svg+xml", "png": "image/png"}[kind]
     light, dark = (data_uri(mime, theme[kind]) for theme in (picture.light, picture.dark))
-    return Markup(MACROS.figure(light, dark, picture.words, f"figures/{picture.name}.csv"))
+    return Markup(MACROS.figure(light, dark, picture.caption, f"figures/{picture.name}.csv"))
 
 
 def data_uri(mime: str, data: bytes) -> Markup:

@@ -100,12 +100,12 @@ class ReportInputs(ComparisonResults):
             if self.comparison_all is None
             else self._with_init(self.comparison_all.all_scores),
         }
-        if self.beside is not None:
+        if self.with_people is not None:
             found |= {
-                "measures": self.beside.scores,
-                "zones": self.beside.zones,
-                "model_pairs": self.beside.pairs,
-                "left_out_beside_people": self.beside.dropped,
+                "measures": self.with_people.scores,
+                "zones": self.with_people.zones,
+                "model_pairs": self.with_people.pairs,
+                "left_out_beside_people": self.with_people.dropped,
             }
         if self.population is not None:
             found |= {f"population_{one.name}": getattr(self.population, one.name)

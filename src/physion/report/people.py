@@ -76,7 +76,7 @@ def people(inputs: ReportInputs) -> Markup:
     parts = [averages(inputs.comparison)]
     if inputs.people is None:
         return joined(parts)
-    zones = Markup() if inputs.beside is None else _zones(inputs.beside.zones)
+    zones = Markup() if inputs.with_people is None else _zones(inputs.with_people.zones)
     on_predicted = averages(inputs.comparison)
     return joined([
         people_only(inputs.people, zones),
@@ -356,9 +356,9 @@ _ATTRIBUTE_EFFECTS = "tables/people_attribute_effects.csv"
 
 def measures(inputs: ReportInputs) -> Markup:
     """Return every measure of every model with its three intervals, and kappa among models."""
-    if inputs.beside is None:
+    if inputs.with_people is None:
         return Markup()
-    scores = inputs.beside.scores
+    scores = inputs.with_people.scores
     labels = {metric.name: metric.label for metric in measure_metrics()}
     rows = scores.assign(measure=scores["measure"].map(labels))
     rows = rows[rows["measure"] != ""]
@@ -383,7 +383,7 @@ def measures(inputs: ReportInputs) -> Markup:
     shown = rows[rows["scenario"] == last].drop(columns="reason")
     words = "Measures with single participants: "
     words += f"mean over scenarios; {MORE}" if last == MEAN else last
-    pairs = _mean_pairs(inputs.beside.pairs)
+    pairs = _mean_pairs(inputs.with_people.pairs)
     return details("Every measure as a table", rows_table(shown, columns, words)) + details(
         "Cohen's kappa of models with each other", pairs
     )
@@ -569,8 +569,8 @@ def describe_rules(rules: ExclusionRules) -> str:
         )
     if rules.alternation is not None:
         words.append(f"{rules.alternation} or more alternating answers in a row")
-    if rules.familiarization_share is not None:
-        words.append(f"{rules.familiarization_share:.0%} or fewer of the practice trials right")
+    if rules.familiarization_fraction is not None:
+        words.append(f"{rules.familiarization_fraction:.0%} or fewer of the practice trials right")
     if rules.accuracy_sd is not None:
         words.append(f"accuracy {rules.accuracy_sd:g} sd below the {rules.accuracy_centre}")
     if rules.rt_sd is not None:

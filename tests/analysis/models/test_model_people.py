@@ -476,8 +476,8 @@ def test_the_tidy_table_takes_intervals_about_people_and_stimuli_where_it_has_th
     table = tidy_scores(results).set_index(["model", "scenario"])
     assert table.index.get_level_values("model").unique().tolist() == [TWO_PEOPLE, "m", OUTCOME,
                                                                        MAJORITY]  # fmt: skip
-    assert results.beside is not None
-    measured = results.beside.scores.set_index(["model", "scenario", "measure"])
+    assert results.with_people is not None
+    measured = results.with_people.scores.set_index(["model", "scenario", "measure"])
     plain = results.comparison.all_scores.set_index(["model", "scenario"])
     for scenario in ("collide", "roll", MEAN):
         row = table.loc[("m", scenario)]

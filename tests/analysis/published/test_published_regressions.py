@@ -64,7 +64,7 @@ def test_the_earlier_state_has_the_rows_of_the_released_notebook(
         ),
         (
             Contrast("", (*VISION, *PARTICLES), "training", ("only",), ("scenario",),
-                     beside=("all-but",)),
+                     further=("all-but",)),
             0.02053, 0.004708, 1718.0, 4.361,
         ),
         (
@@ -151,5 +151,5 @@ def test_a_contrast_of_nothing_is_refused(released: PublishedTables) -> None:
         Contrast("nobody", ("nobody",), high=("x",)),
         Contrast("one side", ("SVG",), high=("SVG",)),
     ):
-        with pytest.raises(BadInputError, match=contrast.words):
+        with pytest.raises(BadInputError, match=contrast.text):
             contrast_rows(contrast, released, "once")

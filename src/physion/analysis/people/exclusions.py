@@ -308,7 +308,7 @@ class ExclusionRules:
     - ``alternation``: answers in a row that alternate, from which on a session is flagged.
     - ``alternation_phase``: count only alternations that begin with ``first``, the first answer of
       the scenario's table, as the released code did; None: either.
-    - ``familiarization_share``: fraction of right practice trials up to which it is flagged.
+    - ``familiarization_fraction``: fraction of right practice trials up to which it is flagged.
     - ``accuracy_sd``: standard deviations below the ``accuracy_centre`` of the scenario.
     - ``rt_sd``: standard deviations above the median of the participants' ``rt_summary`` of log
       response times.
@@ -321,7 +321,7 @@ class ExclusionRules:
     streak_percentile: float | None = 97.5
     alternation: int | None = 24
     alternation_phase: Literal["first"] | None = None
-    familiarization_share: float | None = 0.3
+    familiarization_fraction: float | None = 0.3
     accuracy_sd: float | None = 3.0
     accuracy_centre: Literal["median", "mean"] = "median"
     rt_sd: float | None = 3.0
@@ -388,10 +388,10 @@ def _by_thresholds(measures: pd.DataFrame, rules: ExclusionRules) -> dict[str, p
     if rules.alternation is not None:
         which = "longest_alternation" + ("_from_first" if rules.alternation_phase else "")
         flags["alternation"] = measures[which] >= rules.alternation
-    if rules.familiarization_share is not None:
+    if rules.familiarization_fraction is not None:
         # Without recorded practice the fraction is NaN, and a session is not flagged.
         fraction = measures["familiarization_correct"] / measures["familiarization_trials"]
-        limit = rules.familiarization_share + 1e-9  # so that 3 of 10 counts as 0.3
+        limit = rules.familiarization_fraction + 1e-9  # so that 3 of 10 counts as 0.3
         flags["familiarization"] = fraction <= limit
     if rules.accuracy_sd is not None:
         base = _reference(measures, "accuracy", rules.accuracy_centre, rules.ddof)

@@ -58,19 +58,19 @@ class Contrast:
     """Comparison of accuracies: accuracy ~ x + a random intercept for each of ``groups``.
 
     ``models``: whose rows. ``column``, ``high``: x is 1 if the column has one of these values and 0
-    else. ``readouts``, ``trainings``: the rows to take (empty: all). ``beside``: further values of
+    else. ``readouts``, ``trainings``: the rows to take (empty: all). ``further``: more values of
     the column that get terms of their own, so that x is compared with the rest. ``intercept``: the
     tested term is the intercept, not x. ``chance``: there is no x, the mean is tested against 0.5.
     """
 
-    words: str
+    text: str
     models: tuple[str, ...]
     column: str = "model"
     high: tuple[str, ...] = ()
     groups: tuple[str, ...] = ("scenario", "readout", "training")
     readouts: tuple[str, ...] = ()
     trainings: tuple[str, ...] = ()
-    beside: tuple[str, ...] = ()
+    further: tuple[str, ...] = ()
     intercept: bool = False
 
 
@@ -263,7 +263,7 @@ CLAIMS = (
             "only against all, all models",
             (*VISION, *PARTICLES),
             high=("only",),
-            beside=("all-but",),
+            further=("all-but",),
             column="training",
             groups=("scenario",),
         ),
@@ -272,7 +272,7 @@ CLAIMS = (
             "only against all, all eight vision models",
             VISION,
             high=("only",),
-            beside=("all-but",),
+            further=("all-but",),
             column="training",
             groups=("scenario", "readout"),
         ),
@@ -287,7 +287,7 @@ CLAIMS = (
             "all-but against all, all models",
             (*VISION, *PARTICLES),
             high=("all-but",),
-            beside=("only",),
+            further=("only",),
             column="training",
             groups=("scenario",),
         ),
@@ -296,7 +296,7 @@ CLAIMS = (
             "all-but against all, all eight vision models",
             VISION,
             high=("all-but",),
-            beside=("only",),
+            further=("only",),
             column="training",
             groups=("scenario", "readout"),
         ),
@@ -359,11 +359,11 @@ def _record(claim: Claim, tables: PublishedTables) -> dict[str, Any]:
     }
     record: dict[str, Any] = {"claim": claim.name, "sentence": claim.sentence}
     record |= {f"printed_{key}": claim.printed.get(key, "") for key in ("b", "t", "p")}
-    record |= {"compared": claim.run.words, "state": f"rows {claim.rows}"}
+    record |= {"compared": claim.run.text, "state": f"rows {claim.rows}"}
     for fit, values in found.items():
         record |= {f"{fit}_{name}": values[name] for name in ESTIMATES}
     met = _met(claim, found["run"])
-    return {**record, "asked": asked.words, "met": met, "differs": claim.differs}
+    return {**record, "asked": asked.text, "met": met, "differs": claim.differs}
 
 
 def contrast_rows(contrast: Contrast, tables: PublishedTables, rows: Rows) -> pd.DataFrame:
@@ -377,10 +377,10 @@ def contrast_rows(contrast: Contrast, tables: PublishedTables, rows: Rows) -> pd
         if wanted:
             table = table[table[column].isin(wanted)]
     table = table.assign(x=table[contrast.column].isin(contrast.high).astype(np.float64))
-    for at, value in enumerate(contrast.beside):
+    for at, value in enumerate(contrast.further):
         table[f"beside_{at}"] = (table[contrast.column] == value).astype(np.float64)
     if table.empty or (contrast.high and table["x"].nunique() < 2):
-        raise BadInputError(f"the released tables hold nothing to compare: {contrast.words}")
+        raise BadInputError(f"the released tables hold nothing to compare: {contrast.text}")
     return table.reset_index(drop=True)
 
 

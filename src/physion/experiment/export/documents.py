@@ -95,7 +95,7 @@ class TrialPanel:
     title: str
     duration: str
     picture: str = ""
-    words: tuple[str, ...] = ()
+    text: tuple[str, ...] = ()
     buttons: tuple[str, str] | None = None
     cross: bool = False
 
@@ -122,7 +122,7 @@ def trial_figure(study: Study) -> str:
     prompt = TrialPanel(
         "Prediction",
         "until the answer",
-        words=tuple(wrap(texts["trial.prompt"], LETTERS)),
+        text=tuple(wrap(texts["trial.prompt"], LETTERS)),
         buttons=(texts["trial.yes"], texts["trial.no"]),
     )
     said = texts["practice.contact" if shown.label else "practice.no_contact"]
@@ -130,7 +130,7 @@ def trial_figure(study: Study) -> str:
         "Feedback, full movie",
         f"{1000 * len(whole) / shown.rate:.0f} ms, then at will",
         _encoded(whole[-1]),
-        words=(*wrap(texts["practice.correct"], LETTERS), *wrap(said, LETTERS)),
+        text=(*wrap(texts["practice.correct"], LETTERS), *wrap(said, LETTERS)),
     )
     practice = [cross] if timing.fixation_in_familiarization else []
     practice += [cue, movie, prompt]
@@ -150,7 +150,7 @@ def trial_figure(study: Study) -> str:
             rows=rows,
             columns=max(len(panels) for _, panels in rows),
             side=SIDE,
-            lines=max(len(panel.words) for _, panels in rows for panel in panels),
+            lines=max(len(panel.text) for _, panels in rows for panel in panels),
         )
     )
 

@@ -15,6 +15,7 @@ from sqlalchemy import ColumnElement, Connection, Engine, func, insert, select, 
 from sqlalchemy.exc import OperationalError
 
 from physion.core.errors import BadInputError
+from physion.core.settings import as_json
 from physion.experiment.protocol import (
     ENDED,
     Answer,
@@ -479,7 +480,8 @@ def _settings(study: Study) -> dict[str, Any]:
     """Return settings and texts as JSON values, without stimuli, whose labels stay private."""
     left_out = {"folder", "stimuli", "allowed_ids"}
     shallow = {name: value for name, value in vars(study).items() if name not in left_out}
-    return json.loads(json.dumps(shallow, default=_plain))  # type: ignore[no-any-return]
+    settings: dict[str, Any] = as_json(shallow, _plain)
+    return settings
 
 
 def _plain(value: Any) -> Any:

@@ -25,7 +25,7 @@ from typing import Any
 
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import read_plain
-from physion.core.settings import parse_toml
+from physion.core.settings import flatten, parse_toml
 
 TEXTS_FOLDER = "texts"
 MAX_BYTES = 1_000_000
@@ -161,21 +161,11 @@ def parse_bytes(path: Path, content: bytes) -> dict[str, Any]:
 
 def _parse(path: Path, content: bytes) -> dict[str, str]:
     """Return the texts of a file by their full keys, such as ``consent.title``."""
-    texts: dict[str, str] = {}
-    _flatten(path, "", parse_bytes(path, content), texts)
-    return texts
-
-
-def _flatten(path: Path, prefix: str, table: Mapping[str, Any], texts: dict[str, str]) -> None:
-    """Add the texts of a table and its sub-tables to ``texts``."""
-    for name, value in table.items():
-        key = f"{prefix}{name}"
-        if isinstance(value, Mapping):
-            _flatten(path, f"{key}.", value, texts)
-        elif not isinstance(value, str) or not value.strip() or len(value) > MAX_TEXT:
+    texts = flatten(parse_bytes(path, content))
+    for key, value in texts.items():
+        if not isinstance(value, str) or not value.strip() or len(value) > MAX_TEXT:
             raise BadInputError(
                 f"{path}: {key} must be a text in quotes of 1 to {MAX_TEXT} characters, "
                 f"not {repr(value)[:100]}"
             )
-        else:
-            texts[key] = value
+    return texts

@@ -203,10 +203,10 @@ def _several(placed: Sequence[Placed], count: int) -> list[Placed]:
 
 def _upright(each: Solid, rays: Rays, floor: float, flat: bool) -> Iterator[Placed]:
     """Yield starts of an upright shape; what is seen near the floor stands on it."""
-    turns = FLAT_YAWS if flat else YAWS + (each.turn > math.pi)
-    turns = 1 if each.turn == 0.0 else turns
+    turns = FLAT_YAWS if flat else YAWS + (each.symmetry > math.pi)
+    turns = 1 if each.symmetry == 0.0 else turns
     for number in range(turns):
-        yaw = each.turn * number / turns
+        yaw = each.symmetry * number / turns
         rotation = axis_angle_matrix(np.array([0.0, 0.0, 1.0]), yaw)
         low, high = _box(rotation, rays)
         if low[2] < floor + NEAR_FLOOR:

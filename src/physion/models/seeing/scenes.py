@@ -372,7 +372,7 @@ def velocities(track: Track) -> tuple[F64, F64, bool]:
 def _with_unseen_spin(placed: Placed, spin: F64, velocity: F64, fastest: float, flies: bool) -> F64:
     """Return an angular velocity which about an axis of symmetry is set by rolling."""
     solid = placed.solid
-    if solid.turn != 0.0:
+    if solid.symmetry != 0.0:
         return spin
     axis = placed.rotation[:, 2]
     seen = np.zeros(3) if solid.ball else spin - axis * (axis @ spin)

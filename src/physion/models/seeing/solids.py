@@ -51,7 +51,7 @@ class Solid:
     - ``planes`` (P, 4): outward unit normal n and d of n . u <= d. ``starts`` (K + 1,): rows at
       which the pieces begin, and P; a ball has none.
     - ``corners`` (V, 3). ``low``, ``high`` (3,): bounds.
-    - ``turn``: smallest rotation about the vertical that changes nothing, radians; 0 for any.
+    - ``symmetry``: smallest rotation about the vertical that changes nothing, radians; 0 for any.
     """
 
     name: str
@@ -60,7 +60,7 @@ class Solid:
     corners: F64
     low: F64
     high: F64
-    turn: float
+    symmetry: float
 
     @property
     def ball(self) -> bool:
@@ -85,7 +85,7 @@ TURNS = {
     "ramp_with_platform_30": 2 * math.pi,
     "ramp_with_platform_60": 2 * math.pi,
 }
-"""Shapes of the library, simple ones first, with `Solid.turn`."""
+"""Shapes of the library, simple ones first, with `Solid.symmetry`."""
 
 
 @cache

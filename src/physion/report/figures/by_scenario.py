@@ -200,7 +200,7 @@ def correlation(inputs: ReportInputs) -> Plot | None:
     """Return Pearson's r with the average person, by scenario and model."""
     if not inputs.comparison.has_people:
         return None
-    zones = None if inputs.beside is None else inputs.beside.zones
+    zones = None if inputs.with_people is None else inputs.with_people.zones
     caption = (
         "Pearson's r of P(contact) with the fraction of people who say yes, with intervals by "
         "drawing stimuli. Dashed: the noise ceiling, which a model that knows the true fractions "
@@ -225,14 +225,14 @@ def correlation(inputs: ReportInputs) -> Plot | None:
 )
 def kappa(inputs: ReportInputs) -> Plot | None:
     """Return Cohen's kappa with participants, by scenario and model."""
-    if inputs.beside is None:
+    if inputs.with_people is None:
         return None
     caption = (
         "Cohen's kappa of a model with each participant, mean over participants; intervals draw "
         "people and stimuli. Dashed: the mean kappa of people with each other; grey: the middle "
         "95 % of participants, each by the mean kappa with the others." + BAND
     )
-    table = tables.kappa_table(inputs.comparison, inputs.beside)
+    table = tables.kappa_table(inputs.comparison, inputs.with_people)
     return Plot("kappa", caption, table, partial(measure_figure, measure="kappa"))
 
 

@@ -54,11 +54,11 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 class Plot:
     """Figure as data: it draws ``table`` and nothing else.
 
-    ``name``: of its files; ``words``: its caption; ``draw``: draws the table in a theme.
+    ``name``: of its files; ``caption``: the text below it; ``draw``: draws the table in a theme.
     """
 
     name: str
-    words: str
+    caption: str
     table: pd.DataFrame
     draw: Callable[[pd.DataFrame, Theme], Figure]
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import pandas as pd
 
-from physion.clips.imagined import Imagine, ImaginedTrial
+from physion.clips.batch import Imagine, ImaginedTrial
 from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import write_atomic

@@ -5,11 +5,12 @@ from __future__ import annotations
 import base64
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
+from physion.core.settings import flatten
 from physion.numerics.rotations import rotate_vectors
 from physion.physics.labels import Labels, contact_frames, label_contact
 from physion.report.viewer.movies import thing_colors
@@ -169,7 +170,7 @@ def tables(trial: Trial) -> list[Table]:
         _table("Joints", ("parent", "child"), [(j.parent, j.child) for j in scene.joints]),
         _trial_table(trial),
         _pair_table(scene),
-        _table("Parameters of the scenario", None, _flat("", parameters)),
+        _table("Parameters of the scenario", None, list(flatten(parameters, lists=True).items())),
         _stage_table(scene),
     ]
     return [table for table in result if table["rows"]]
@@ -265,17 +266,6 @@ def _stage_table(scene: Scene) -> Table:
         ("ends at the latest after", f"{scene.ending.max_frames} frames"),
     ]
     return _table("Camera, room, ending", None, rows)
-
-
-def _flat(path: str, value: Any) -> list[tuple[str, object]]:
-    """Return nested parameters as rows of path and value; lists of plain values stay in one row."""
-    if isinstance(value, Mapping):
-        rows = [_flat(f"{path}.{key}" if path else str(key), v) for key, v in value.items()]
-        return [row for part in rows for row in part]
-    if isinstance(value, list) and any(isinstance(v, Mapping | list) for v in value):
-        rows = [_flat(f"{path}[{i}]", v) for i, v in enumerate(value)]
-        return [row for part in rows for row in part]
-    return [(path, value)]
 
 
 def text(value: object) -> str:

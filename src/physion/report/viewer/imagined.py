@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from physion.clips.imagined import PICTURES, SHOWABLE, Arrays, ImaginedTrial
+from physion.clips.batch import PICTURES, SHOWABLE, Arrays, ImaginedTrial
 from physion.core.errors import BadInputError
 from physion.report.viewer.movies import AGENT, OTHERS, PATIENT
 from physion.scenes.scene import OBSERVED_FRAMES, Scene

@@ -7,7 +7,6 @@ the decorator `scenario`.
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, TypeVar
@@ -17,6 +16,7 @@ import numpy as np
 from physion.core.names import SCENARIOS
 from physion.core.registry import Registry
 from physion.core.seeds import child_generator, stable_hash
+from physion.core.settings import as_json
 from physion.scenes.looks import pick_material, random_color
 from physion.scenes.sampling.placement import CameraRule, SceneryRule, place_camera, place_scenery
 from physion.scenes.scene import FLOORS, Body, Cloth, Ending, Joint, Look, Push, Roles, Scene, Vec3
@@ -66,7 +66,7 @@ def scene_name(scenario: str, seed: np.random.SeedSequence) -> str:
 
 def as_record(params: Any) -> dict[str, Any]:
     """Convert parameters to plain JSON values, for `Scene.parameters`."""
-    record: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(params)))
+    record: dict[str, Any] = as_json(dataclasses.asdict(params))
     return record
 
 

@@ -26,7 +26,7 @@ from physion.core.files import (
     write_atomic,
 )
 from physion.core.seeds import stable_hash
-from physion.core.settings import read_json
+from physion.core.settings import as_json, read_json
 from physion.physics.engine import make_engine
 from physion.scenes.sampling.build import as_record, scenarios
 from physion.scenes.sampling.sample import get_preset
@@ -276,8 +276,7 @@ def _fix_settings(
 
     path = folder / SETTINGS
     made_by = {"engine": make_engine(settings.engine).name, "renderer": RENDERER}
-    plain = {"dataset": dataset, "settings": settings.stored(), "made_by": made_by}
-    wanted = json.loads(json.dumps(plain))
+    wanted = as_json({"dataset": dataset, "settings": settings.stored(), "made_by": made_by})
     presets = _presets_in_use(tasks)
     if path.is_file():
         known = read_json(path, dict[str, Any])

@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.seeds import generator, stable_hash
-from physion.core.settings import read_settings
+from physion.core.settings import as_json, read_settings
 from physion.numerics.linear_algebra import norm
 from physion.numerics.rotations import rotate_vectors
 from physion.physics.engine import Engine, make_engine
@@ -307,7 +307,7 @@ def four_scenes(group: Quadruple, base: str, frames: int, engine: Engine) -> lis
                 events=tuple(sorted(events, key=lambda event: event.frame)),
                 parameters={
                     **scene.parameters,
-                    PAIR: json.loads(json.dumps(pair)),
+                    PAIR: as_json(pair),
                     COLORS_OF: group.worlds[0].physics_digest(),
                 },
             )
