@@ -51,7 +51,7 @@ from physion.core.names import SCENARIOS
 from physion.data.official import PACKAGED, humans_folder
 from physion.models.build import build_untrained
 from physion.pipeline import plan_official
-from physion.readout.evaluate import Evaluation
+from physion.readout.evaluation import Evaluation
 from physion.readout.tables import read_table
 from physion.readout.train import Trainings
 from physion.trials.making.generate import make_trials

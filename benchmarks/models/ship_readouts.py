@@ -315,7 +315,7 @@ def ship(features: Features, dataset: Dataset, name: str) -> None:
     text = [
         f"# Readouts of {name}",
         "",
-        f"Used by `{use}`, where trials are red and yellow; `--readout fit` fits others.",
+        f"Used by `{use}`, where trials are red and yellow; `--readout-from fit` fits others.",
         "",
         "| | |",
         "|---|---|",

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from physion.core.version import __version__
 
 if TYPE_CHECKING:
+    from physion.checking import check
     from physion.clips.clips import clips
     from physion.data.official import official
     from physion.judging.judge import judge
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from physion.physics.engine import simulate
     from physion.physics.labels import label_contact
     from physion.pipeline import run
-    from physion.readout.check import check
     from physion.readout.evaluate import evaluate
     from physion.readout.train import train
     from physion.rendering.renderer import Renderer
@@ -58,7 +58,7 @@ _MODULES = {
     "Dataset": "physion.trials.dataset",
     "Renderer": "physion.rendering.renderer",
     "build_model": "physion.models.build",
-    "check": "physion.readout.check",
+    "check": "physion.checking",
     "clips": "physion.clips.clips",
     "compare": "physion.report.compare",
     "evaluate": "physion.readout.evaluate",

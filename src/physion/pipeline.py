@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pandas as pd
 
@@ -21,10 +21,11 @@ from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import is_whole, write_with_digest
 from physion.core.names import canonical_name
 from physion.core.seeds import stable_hash
-from physion.core.settings import split_names
+from physion.core.settings import OPTION_ONLY, split_names
 from physion.data.official import PACKAGED, find_official, humans_folder, read_official_trials
 from physion.models.interface import Model, ask, can
-from physion.readout.evaluate import EvaluatedModel, Evaluation, evaluate
+from physion.readout.evaluate import evaluate
+from physion.readout.evaluation import EvaluatedModel, Evaluation
 from physion.readout.logistic import LogisticSettings
 from physion.readout.predictor import build_decision
 from physion.readout.settings import EvaluationSettings, choose_models
@@ -96,7 +97,7 @@ class RunSettings:
     can use it; default: the model's own."""
     engine: str = "physion"
     """Engine of the trials and of noisy-simulation (physion ls engines); mujoco has no cloth."""
-    encoder_batch: int = 4
+    encoder_batch: Annotated[int, OPTION_ONLY] = 4
     """Clips that a network encodes at a time; lower it when memory runs out."""
     workers: int = os.cpu_count() or 1
     """Number of processes."""

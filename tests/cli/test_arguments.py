@@ -30,8 +30,8 @@ from physion.readout.settings import EvaluationSettings
         ),
         ("train gns", "train needs DATASET (physion train --help explains it)"),
         ("verify x y", "verify does not take 'y' (physion verify --help explains it)"),
-        ("bench --count", "--count needs a value: INTEGER (physion bench --help explains it)"),
-        ("bench --count x", "--count takes INTEGER, not 'x' (physion bench --help explains it)"),
+        ("doctor --count", "--count needs a value: INTEGER (physion doctor --help explains it)"),
+        ("doctor --count x", "--count takes INTEGER, not 'x' (physion doctor --help explains it)"),
         ("run --limit two", "--limit takes INTEGER, not 'two' (physion run --help explains it)"),
         (
             "generate x --split tesing",

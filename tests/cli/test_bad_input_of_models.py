@@ -40,7 +40,7 @@ class HugeWeights(NextBrightness):
     def _apply(self, function, recurse=True):
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB")
 """
-ENCODE = ["--untrained", "--accelerator", "cpu"]
+ENCODE = ["--accelerator", "cpu", "--option", "untrained=true"]
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +110,7 @@ def test_a_movie_that_does_not_fit_is_named(
         write_index(dots.folder, dots.index)
     out = ["--out", str(dots.folder.parent / "out"), "--accelerator", "cpu"]
     if verb == "evaluate":
-        error = refused(capsys, verb, MODEL, str(dots.folder), *out, "--untrained")
+        error = refused(capsys, verb, MODEL, str(dots.folder), *out, "--option", "untrained=true")
     else:
         error = refused(capsys, verb, MODEL, str(dots.folder), *out)
     assert str(path) in error
@@ -133,8 +133,8 @@ def test_memory_that_is_used_up_names_what_to_lower(
         train[1] = f"{file}:{name}"
         assert message in refused(capsys, *train, "--option", "batch=4")
     evaluate = ["evaluate", f"{file}:HugeFeatures", str(made.folder), "--out", str(tmp_path)]
-    assert "lower --encoder-batch, now 4" in refused(capsys, *evaluate, *ENCODE)
-    one = [*ENCODE, "--encoder-batch", "1"]
+    assert "lower the option encoder_batch, now 4" in refused(capsys, *evaluate, *ENCODE)
+    one = [*ENCODE, "encoder_batch=1"]
     assert "use a smaller image_size or size of the model" in refused(capsys, *evaluate, *one)
 
 
@@ -146,7 +146,7 @@ def test_memory_that_numpy_lacks_is_one_line(
         return 0
 
     monkeypatch.setattr("physion.cli.main._run_verb", exhausted)
-    assert "lower --encoder-batch" in refused(capsys, "ls")
+    assert "lower the options encoder_batch" in refused(capsys, "ls")
 
 
 def test_weights_of_another_network_name_the_tensors(

@@ -1,4 +1,4 @@
-"""`physion bench` measures simulation, rendering and trials of a scenario."""
+"""`physion doctor --bench` measures simulation, rendering and trials of a scenario."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from physion.core.version import MADE_WITH
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_every_quantity_of_a_scenario_is_measured(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "--scenario", "drop", "--count", "1", "--json"]) == 0
+    assert main(["doctor", "--bench", "--scenario", "drop", "--count", "1", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["package"] == MADE_WITH and found["count"] == 1
     (row,) = found["scenarios"]
@@ -33,6 +33,6 @@ def test_every_quantity_of_a_scenario_is_measured(capsys: pytest.CaptureFixture[
 def test_bad_options_are_one_line(
     options: list[str], word: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["bench", *options]) == 2
+    assert main(["doctor", "--bench", *options]) == 2
     message = capsys.readouterr().err
     assert message.count("\n") == 1 and word in message

@@ -62,12 +62,10 @@ def test_a_second_run_does_nothing_and_says_so(
     assert main(arguments) == 0
     (folder,) = (tmp_path / "training").iterdir()
     shown = capsys.readouterr().out
-    assert "all, seed 0 trained for 40 steps, loss " in shown and shown.rstrip().endswith(
-        str(folder)
-    )
+    assert "trained for 40 steps" in shown and shown.rstrip().endswith(str(folder))
     before = files_of(tmp_path)
     assert main(arguments) == 0
-    assert "all, seed 0 was trained before, loss " in capsys.readouterr().out
+    assert "was trained before" in capsys.readouterr().out
     assert main([*arguments, "--json"]) == 0
     (result,) = json.loads(capsys.readouterr().out)["trained"]
     assert result["loaded"] and result["folder"] == str(folder) and result["steps"] == 40

@@ -6,7 +6,6 @@ import errno
 import json
 import os
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +15,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from physion.checking import check
 from physion.cli.main import main
 from physion.clips.batch import Batch
 from physion.core.errors import BadInputError, PhysionError
 from physion.models import models
 from physion.models.build import OutOfMemoryError
 from physion.readout.changes import CHANGES, ChangedTrials, take_trials
-from physion.readout.check import REFUSED, SHOWN, CheckedModel, _is_of_the_machine, check
-from physion.readout.evaluate import Evaluation, evaluate
+from physion.readout.check import REFUSED, SHOWN, CheckedModel, _is_of_the_machine
+from physion.readout.evaluation import Evaluation, run_evaluations
 from physion.readout.settings import choose_models
 from physion.readout.tables import read_table
 from physion.trials.dataset import Dataset
@@ -502,14 +502,14 @@ def test_others_may_fail_and_a_twin_decides_as_the_model(
     dots = make_dots(tmp_path / "dots", {"readout": 4, "testing": 4}, ("drop",))
     asked: dict[str, str] = {}
 
-    def noted(model: Any, *arguments: Any, **options: Any) -> Evaluation:
-        settings = replace(arguments[2], **{k: v for k, v in options.items() if k == "decision"})
-        asked[model.provenance().init] = settings.decision
-        if model.provenance().init == "random":
+    def noted(chosen: Any, *arguments: Any, **options: Any) -> Evaluation:
+        init = chosen[0].model.provenance().init
+        asked[init] = arguments[2].decision
+        if init == "random":
             raise BadInputError("no twin")
-        return evaluate(model, *arguments, **options)
+        return run_evaluations(chosen, *arguments, **options)
 
-    monkeypatch.setattr("physion.readout.check.evaluate", noted)
+    monkeypatch.setattr("physion.readout.check.run_evaluations", noted)
     done = check("cswm", dots, tmp_path, trials=8, accelerator="cpu", decision="trees")
     assert asked["random"] == "trees"
     assert set(done.table["change"]) == {"labels"} and done.passed

@@ -24,7 +24,8 @@ from physion.core.errors import BadInputError, UnknownNameError
 from physion.models import build_model, models
 from physion.models.interface import TrainingSettings
 from physion.readout.decisions import Decided
-from physion.readout.evaluate import EvaluatedModel, Evaluation, evaluate
+from physion.readout.evaluate import evaluate
+from physion.readout.evaluation import EvaluatedModel, Evaluation
 from physion.readout.logistic import LogisticSettings
 from physion.readout.settings import ChosenModel, EvaluationSettings, choose_models, plan_cells
 from physion.readout.tables import (

@@ -519,7 +519,7 @@ def exhausted(what: str, tmp_path: Path, batch: int) -> None:
 
 @pytest.mark.parametrize("what", ["numpy", "torch", "device", "reading", "imagining"])
 def test_memory_used_up_names_the_setting_to_lower(what: str, tmp_path: Path) -> None:
-    with pytest.raises(OutOfMemoryError, match=r"3 clips .*lower --encoder-batch, now 3"):
+    with pytest.raises(OutOfMemoryError, match=r"3 clips .*lower the option encoder_batch, now 3"):
         exhausted(what, tmp_path, 3)
     advice = "use a smaller image_size or size of the model, or fewer"
     with pytest.raises(OutOfMemoryError, match=advice):

@@ -10,7 +10,6 @@ from sklearn.ensemble import ExtraTreesClassifier
 from sklearn.linear_model import LogisticRegression
 from sklearn.preprocessing import StandardScaler
 
-import physion.readout.evaluate
 from physion.core.errors import BadInputError
 from physion.core.names import SCENARIOS
 from physion.models.build import build_model
@@ -185,7 +184,8 @@ def test_own_trials_are_fitted_where_there_are_as_many(
     known = ShippedReadout(fit_weights([features], labels), 8, 6, fit_trials, "")
     path = tmp_path / "own.safetensors"
     write_readouts(path, "0" * 64, "set 0123", {(Readout.OBSERVED, "drop"): known})
-    monkeypatch.setattr(physion.readout.evaluate, "find_readouts", lambda _: ShippedReadouts(path))
+    known_to = "physion.readout.evaluation.find_readouts"
+    monkeypatch.setattr(known_to, lambda _: ShippedReadouts(path))
     done = evaluate("blob-centroids", tmp_path / "dots", tmp_path / "out", readouts=("observed",))
     assert set(done.predictions["fit_on"]) == {fit_on}
     assert set(done.predictions["fit_trials"]) == {fit_trials}

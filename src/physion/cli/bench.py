@@ -1,7 +1,7 @@
-"""Measure this machine: simulation, rendering and making of trials, one row for each scenario.
+"""Measurement of this machine (``physion doctor --bench``), one row for each scenario.
 
-Times are of the processor, on one core. On a machine that does other work at the same time they are
-longer.
+Times are of the processor, on one core, for simulation, rendering and the making of trials. On a
+machine that does other work at the same time they are longer.
 """
 
 from __future__ import annotations
@@ -49,41 +49,28 @@ COLUMNS = {
 """Columns of the table by the field of `BenchRow`."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """Options of ``physion bench``."""
-
-    scenario: str = "all"
-    """Name of a scenario, or all."""
-    count: int = 2
-    """Official scenes and trials of each scenario."""
-    json: bool = False
-    """Print one JSON object."""
-
-
-def main(options: Options) -> int:
-    """Measure and print the table."""
-    if options.count < 1:
-        raise BadInputError(f"--count must be 1 or more, not {options.count}")
-    names = scenarios.names() if options.scenario == "all" else [options.scenario]
+def print_bench(scenario: str, count: int, as_json: bool) -> None:
+    """Measure a scenario, or ``all``, with ``count`` scenes and trials of each; print the table."""
+    if count < 1:
+        raise BadInputError(f"--count must be 1 or more, not {count}")
+    names = scenarios.names() if scenario == "all" else [scenario]
     for name in names:
         scenarios.get(name)
     rows = []
     with Stages() as stages:
         stages("measuring", 0, len(names))
         for done, name in enumerate(names, start=1):
-            rows.append(measure(name, options.count))
+            rows.append(measure(name, count))
             stages("measuring", done, len(names))
     machine = processor()
-    if options.json:
+    if as_json:
         values = {"package": MADE_WITH, "machine": machine, "cores": os.cpu_count()}
         found = [dataclasses.asdict(row) for row in rows]
-        print(json_module.dumps(values | {"count": options.count, "scenarios": found}, indent=1))
-        return 0
+        print(json_module.dumps(values | {"count": count, "scenarios": found}, indent=1))
+        return
     table = pd.DataFrame(map(dataclasses.asdict, rows)).rename(columns=COLUMNS)
     title = f"{MADE_WITH}, {machine}, one of {os.cpu_count()} cores"
     print_line(text_table(table, title))
-    return 0
 
 
 @dataclass(frozen=True)

@@ -16,14 +16,13 @@ from typing import Annotated
 import tyro
 
 from physion.analysis.tables import records
-from physion.cli.output import Stages, print_line, print_warnings, text_table, write_text
+from physion.checking import CheckResult, check, described
+from physion.cli.arguments import take_options
+from physion.cli.output import Stages, print_line, print_warnings, text_table
 from physion.compute.local import LocalExecutor
 from physion.compute.run_tasks import ExecutorSettings
 from physion.core.settings import split_names
-from physion.readout.check import CheckedModel, check
 from physion.readout.settings import EvaluationSettings, options_by_model
-from physion.readout.tables import file_name
-from physion.report.check import check_page, described
 from physion.trials.dataset import Dataset
 
 
@@ -43,14 +42,13 @@ class Options:
     changes: tuple[str, ...] = ()
     """Names of the changes to make; default: all, and evaluations of two other models."""
     option: tuple[str, ...] = ()
-    """Settings of the model as NAME=VALUE, such as weights=random."""
+    """Settings of the model as NAME=VALUE, such as weights=random. Of the check: encoder_batch=1,
+    clips that a network encodes at a time (default: 4); lower it when memory runs out."""
     readouts: tuple[str, ...] = EvaluationSettings.readouts
     """Readouts: observed, observed+simulated, full. Default: all but full, which is checked if the
     model has no other."""
     decision: str = EvaluationSettings.decision
     """What turns features or rollouts into P(contact); default: the model's own."""
-    encoder_batch: int = EvaluationSettings.encoder_batch
-    """Clips that a network encodes at a time; lower it when memory runs out."""
     rendered: bool = EvaluationSettings.rendered
     """Render the pictures from the stored motions instead of reading the movies."""
     accelerator: str = EvaluationSettings.accelerator
@@ -64,30 +62,32 @@ class Options:
 
 def main(options: Options) -> int:
     """Print the table of changes and write the page; return 1 unless the model passed."""
+    asked = EvaluationSettings(
+        readouts=options.readouts,
+        decision=options.decision,
+        rendered=options.rendered,
+        accelerator=options.accelerator,
+    )
+    settings, of_model = take_options(asked, options.option)
     with Stages() as stages:
         done = check(
             options.model,
             None if options.dataset is None else Dataset(options.dataset),
             options.out,
-            options=options_by_model([options.model], options.option)[options.model],
+            settings,
+            options=options_by_model([options.model], of_model)[options.model],
             trials=options.trials,
             changes=split_names(options.changes, "change") if options.changes else (),
             executor=LocalExecutor(options.workers),
             progress=stages,
-            readouts=options.readouts,
-            decision=options.decision,
-            encoder_batch=options.encoder_batch,
-            rendered=options.rendered,
-            accelerator=options.accelerator,
         )
-    page = options.out / f"{file_name(done.model)}.html"
-    write_text(page, check_page(done.model, done.verdict, done.table))
+    page = done.report(options.out)
     print_warnings(done.warnings)
     _print(done, page, options)
     return 0 if done.passed else 1
 
 
-def _print(done: CheckedModel, page: Path, options: Options) -> None:
+def _print(done: CheckResult, page: Path, options: Options) -> None:
     if options.json:
         rows = records(done.table)
         values = {"model": done.model, "passed": done.passed, "refused": done.refused}

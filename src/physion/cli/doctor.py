@@ -1,4 +1,8 @@
-"""Check this machine: versions, cores, memory, GPU, codecs, write access; print what to install."""
+"""Check this machine: versions, cores, memory, GPU, codecs, write access; print what to install.
+
+With --bench, measure it instead: simulation, rendering and making of trials of each scenario, in
+time of the processor, on one core.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from physion.cli.output import print_line
+from physion.core.errors import BadInputError
 from physion.core.version import __version__
 
 DISTRIBUTION = "physion-benchmark"
@@ -26,6 +31,12 @@ class Options:
     """Folder whose write access is checked."""
     reproduce: bool = False
     """Also generate a known trial of each scenario and compare it with its known digests."""
+    bench: bool = False
+    """Measure the machine in place of the checks; takes some minutes."""
+    scenario: str = "all"
+    """With --bench: name of a scenario, or all."""
+    count: int = 2
+    """With --bench: official scenes and trials of each scenario."""
     json: bool = False
     """Print one JSON object instead of lines."""
 
@@ -43,6 +54,16 @@ class Check:
 
 def main(options: Options) -> int:
     """Print the checks; return 1 if a requirement of the core is missing."""
+    if options.bench:
+        if options.reproduce:
+            raise BadInputError("--bench and --reproduce are two things: give one of them")
+        # Imported late: loading the compiled renderer takes time.
+        from physion.cli.bench import print_bench
+
+        print_bench(options.scenario, options.count, options.json)
+        return 0
+    if (options.scenario, options.count) != (Options.scenario, Options.count):
+        raise BadInputError("--scenario and --count belong to --bench: add it")
     checks = [*machine(), *packages(), gpu(), codec(), writable(options.folder)]
     if options.reproduce:
         checks += reproduction()

@@ -28,12 +28,13 @@ from physion.compute.run_tasks import ExecutorSettings
 from physion.core.errors import BadInputError
 from physion.core.settings import split_names
 from physion.models.build import FEATURE_FILES
-from physion.readout.check import check_models
-from physion.readout.evaluate import EvaluatedModel, Evaluation, evaluate
+from physion.readout.evaluate import evaluate
+from physion.readout.evaluation import EvaluatedModel, Evaluation
 from physion.readout.settings import EvaluationSettings, options_by_model
 from physion.readout.surprise import MEASURES as SURPRISES
-from physion.readout.surprise import pixel_statistics, surprise, surprise_scores
+from physion.readout.surprise import surprise
 from physion.readout.whatif import MEASURES, whatif_scores
+from physion.report.compare import compare
 from physion.trials.dataset import Dataset
 
 if TYPE_CHECKING:
@@ -61,9 +62,12 @@ class Options:
     """Settings of all models or of their training, such as encoder=resnet50 weights=random
     steps=500; of one of several models as MODEL:NAME=VALUE. Of the evaluation: folds=3, parts into
     which trials are divided where a dataset without a readout split is cross-validated (default:
-    5); rollout_errors=true: also write how far the motion that particle models imagine is from the
-    true one. Of the logistic regression: logistic.folds=3 (for the choice of its penalty),
-    logistic.grid, logistic.seed, logistic.balance, logistic.released."""
+    5); encoder_batch=1, clips that a network encodes at a time (default: 4; lower it when memory
+    runs out); untrained=true: train no model, and take its weights as they are; benchmark=v1.5: the
+    rules of physion_evaluator in place of the paper's; rollout_errors=true: also write how far the
+    motion that particle models imagine is from the true one. Of the logistic regression:
+    logistic.folds=3 (for the choice of its penalty), logistic.grid, logistic.seed,
+    logistic.balance, logistic.released."""
     settings: Annotated[EvaluationSettings, tyro.conf.arg(name="")] = field(
         default_factory=EvaluationSettings
     )
@@ -87,16 +91,32 @@ class Options:
 
 def main(options: Options) -> int:
     """Write the tables of predictions; return 1 if some trials, or evaluations, have none."""
-    if options.surprise:
-        given = {"--fit": options.fit, "--check": options.check, "--dry-run": options.dry_run}
-        for name, value in given.items():
-            if value:
-                raise BadInputError(f"{name} does not apply to --surprise: leave it out")
     settings, of_models = take_options(options.settings, options.option)
-    if options.surprise and len(of_models) < len(options.option):
-        raise BadInputError("--surprise takes options of models only: leave the others out")
+    models, dataset = _models_and_dataset(options)
+    chosen = options_by_model(models, of_models)
+    if options.surprise:
+        return _surprise(chosen, dataset, settings, options, taken=len(of_models))
+    with Stages() as stages:
+        done = evaluate(
+            chosen,
+            Dataset(dataset),
+            options.out,
+            settings,
+            fit=None if options.fit is None else Dataset(options.fit),
+            check=options.check,
+            executor=options.compute.open(),
+            progress=stages,
+            dry_run=options.dry_run,
+            on_evaluated=stages.note_evaluated,
+        )
+    _print(done, options)
+    return 1 if done.failed or done.problems else 0
+
+
+def _models_and_dataset(options: Options) -> tuple[list[str], Path]:
+    """Return the models, with the file of features, and the dataset, which may be the only word."""
     models, dataset = split_names(options.models, "model"), options.dataset
-    if dataset is None:  # the only word is the dataset
+    if dataset is None:
         if options.features is None:
             raise BadInputError(f"no dataset: write physion evaluate {options.models} FOLDER")
         models, dataset = [], Path(options.models)
@@ -106,47 +126,29 @@ def main(options: Options) -> int:
                 f"a file of features ends with {', '.join(FEATURE_FILES)}, not {options.features}"
             )
         models = [*models, str(options.features)]
-    chosen = options_by_model(models, of_models)
-    trials = Dataset(dataset)
-    if options.surprise:
-        with Stages() as stages:
-            found = surprise(
-                chosen,
-                trials,
-                options.out,
-                settings,
-                progress=stages,
-            )
-            pixels = pixel_statistics(
-                trials, options.out, rendered=settings.rendered, progress=stages
-            )
-        _print_surprise(surprise_scores([pixels, found.table]), found.failed, options)
-        return 1 if found.failed else 0
+    return models, dataset
+
+
+def _surprise(
+    chosen: Mapping[str, Mapping[str, Any]],
+    dataset: Path,
+    settings: EvaluationSettings,
+    options: Options,
+    taken: int,
+) -> int:
+    """Print how much movies surprise the models; ``taken``: number of options of models."""
+    given = {"--fit": options.fit, "--check": options.check, "--dry-run": options.dry_run}
+    for name, value in given.items():
+        if value:
+            raise BadInputError(f"{name} does not apply to --surprise: leave it out")
+    if taken < len(options.option):
+        raise BadInputError("--surprise takes options of models only: leave the others out")
     with Stages() as stages:
-        verdicts = {}
-        if options.check and not options.dry_run:
-            verdicts = check_models(
-                chosen,
-                trials,
-                options.out / "check",
-                settings,
-                executor=options.compute.open(),
-                progress=stages,
-            )
-        done = evaluate(
-            chosen,
-            trials,
-            options.out,
-            settings,
-            fit=None if options.fit is None else Dataset(options.fit),
-            verdicts=verdicts,
-            executor=options.compute.open(),
-            progress=stages,
-            dry_run=options.dry_run,
-            on_evaluated=stages.note_evaluated,
+        found = surprise(
+            chosen, Dataset(dataset), options.out, settings, pixels=True, progress=stages
         )
-    _print(done, options)
-    return 1 if done.failed or done.problems else 0
+    _print_surprise(found.scores, found.failed, options)
+    return 1 if found.failed else 0
 
 
 def _print(done: Evaluation, options: Options) -> None:
@@ -180,13 +182,8 @@ def _print(done: Evaluation, options: Options) -> None:
 
 def _print_scores(done: Evaluation) -> None:
     """Print the table of results, with the people of the study if they saw the stimuli."""
-    import physion
-    from physion.core.names import canonical_name
-    from physion.data.official import official
-
-    seen = set(map(canonical_name, done.predictions["stimulus"])) & set(official().labels)
     try:
-        print_scores(physion.compare(done.paths, humans="official" if seen else None))
+        print_scores(compare(done.paths))
     except BadInputError as error:
         print_warnings([f"no comparison: {error}"])
 

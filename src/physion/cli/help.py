@@ -24,8 +24,7 @@ VERBS = {
     "import": "convert official HDF5 files, movies, or a checkout of the original study",
     "verify": "check every byte, label and motion of a dataset",
     "ls": "list scenarios, presets, shapes, props, materials, models, decisions, rooms, engines",
-    "doctor": "check this machine and print what to install",
-    "bench": "measure this machine: simulation, rendering, trials",
+    "doctor": "check this machine and print what to install, or measure it",
 }
 
 MODULES = {
@@ -101,8 +100,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "physion verify trials --against trials-of-another-machine",
     ),
     "ls": ("physion ls models", "physion ls presets"),
-    "doctor": ("physion doctor --reproduce",),
-    "bench": ("physion bench", "physion bench --scenario drop --count 10 --json"),
+    "doctor": (
+        "physion doctor --reproduce",
+        "physion doctor --bench --scenario drop --count 10 --json",
+    ),
 }
 """Command lines that ``--help`` prints, by verb, or verb and sub-verb; tests parse each."""
 

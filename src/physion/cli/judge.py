@@ -21,12 +21,10 @@ from physion.cli.output import (
     print_scores,
     print_warnings,
     text_table,
-    write_text,
 )
 from physion.compute.run_tasks import ExecutorSettings
 from physion.judging.judge import judge
-from physion.report.compare import compare
-from physion.report.judge import described, judge_page, verdict
+from physion.judging.page import described, verdict
 
 SHOWN = 5
 
@@ -59,11 +57,9 @@ def main(options: Options) -> int:
             scenario=options.scenario, progress=stages,
             executor=ExecutorSettings(workers=options.workers).open(),
         )  # fmt: skip
-    page, missing = options.out / "judge.html", done.missing
-    write_text(page, judge_page(done, options.folder))
-    result = compare(done.paths["predictions"])
-    report = result.report(options.out / "report")
-    print_warnings(result.warnings)
+    page, missing = done.report(options.out), done.missing
+    report = page.parent / "report" / "report.html"
+    print_warnings(done.compared.warnings)
     if options.json:
         values = {"complete": done.complete, "page": str(page), "report": str(report)}
         values |= {
@@ -76,7 +72,7 @@ def main(options: Options) -> int:
     if len(missing) > SHOWN:
         print_line(f"... and {len(missing) - SHOWN} more ({done.paths['movies']})")
     print_line(text_table(described(done)))
-    print_scores(result, report)
+    print_scores(done.compared, report)
     print_line(verdict(done))
     print_line(f"page: {page}")
     return 1 if len(missing) else 0

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from physion.compute.run_tasks import RunReport
-    from physion.readout.evaluate import EvaluatedModel
+    from physion.readout.evaluation import EvaluatedModel
     from physion.report.compare import CompareResult
 
 

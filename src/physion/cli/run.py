@@ -15,6 +15,7 @@ from typing import Annotated
 import tyro
 
 from physion.analysis.tables import records
+from physion.cli.arguments import take_options
 from physion.cli.output import Stages, print_line, print_scores, print_warnings
 from physion.pipeline import RunSettings, chosen_models, run
 from physion.readout.settings import options_by_model
@@ -28,7 +29,8 @@ class Options:
     """Scenes, models, folder and sizes."""
     option: tuple[str, ...] = ()
     """Settings of the models or of their training as NAME=VALUE, such as steps=1000; of one model
-    as MODEL:NAME=VALUE, such as noisy-simulation:samples=50."""
+    as MODEL:NAME=VALUE, such as noisy-simulation:samples=50. Of the run: encoder_batch=1, clips
+    that a network encodes at a time (default: 4); lower it when memory runs out."""
     json: bool = False
     """Print one JSON object instead of a table."""
 
@@ -36,11 +38,10 @@ class Options:
 def main(options: Options) -> int:
     """Run the whole pipeline, or what is missing of it; return 1 if something failed."""
     started = time.monotonic()
-    given = options_by_model(chosen_models(options.settings), options.option)
+    settings, of_models = take_options(options.settings, options.option)
+    given = options_by_model(chosen_models(settings), of_models)
     with Stages(at_once=True) as stages:
-        done = run(
-            options.settings, options=given, progress=stages, on_evaluated=stages.note_evaluated
-        )
+        done = run(settings, options=given, progress=stages, on_evaluated=stages.note_evaluated)
     print_warnings(done.warnings)
     if options.json:
         rows = records(done.result.scores)

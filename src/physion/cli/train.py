@@ -14,10 +14,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+import pandas as pd
 import tyro
 
 from physion.cli.arguments import take_options
-from physion.cli.output import Stages, print_line, print_plan
+from physion.cli.output import Stages, print_line, print_plan, text_table
 from physion.compute.run_tasks import ExecutorSettings
 from physion.core.settings import split_names
 from physion.readout.settings import TrainSettings, options_by_model
@@ -39,7 +40,8 @@ class Options:
     """Settings of the models or of their training as NAME=VALUE, such as size=paper steps=500
     batch=16 learning_rate=1e-3; of one of several models as MODEL:NAME=VALUE. Of all trainings:
     folds=3, parts into which trials are divided where a dataset without a readout split is
-    cross-validated (default: 5)."""
+    cross-validated (default: 5); encoder_batch=1, clips that a network encodes at a time (default: 4;
+    lower it when memory runs out)."""
     settings: Annotated[TrainSettings, tyro.conf.arg(name="")] = field(
         default_factory=TrainSettings
     )
@@ -82,25 +84,33 @@ def _print(done: Trainings, options: Options) -> None:
     if options.dry_run:
         print_plan(done.planned, ["model", "name", "seed", "folder", "done"], "trainings")
         return
-    for trained in done.trained:
-        for note in trained.notes:
-            print_line(note)
-        losses = [
-            f"{what} {value:.4g}"
-            for what, value in (
-                ("loss", trained.loss),
-                ("held-out trials", trained.validation),
-                ("trivial predictor", trained.baseline),
-            )
-            if not math.isnan(value)
-        ]
-        how = "was trained before" if trained.loaded else f"trained for {trained.steps} steps"
-        print_line(
-            f"{trained.model}, {trained.name}, seed {trained.seed} {how}, {', '.join(losses)}: "
-            f"{trained.folder}"
-        )
+    for note in (note for trained in done.trained for note in trained.notes):
+        print_line(note)
+    if done.trained:
+        print_line(text_table(_described(done)))
     for label, reason in done.failed.items():
         print_line(f"failed: {label}: {reason}")
+
+
+def _described(done: Trainings) -> pd.DataFrame:
+    """Return the trainings as a table for the terminal, with the losses where they are known."""
+    rows = [
+        {
+            "model": one.model,
+            "training": one.name,
+            "seed": one.seed,
+            "how": "was trained before" if one.loaded else f"trained for {one.steps} steps",
+            "loss": one.loss,
+            "held-out trials": one.validation,
+            "trivial predictor": one.baseline,
+            "folder": str(one.folder),
+        }
+        for one in done.trained
+    ]
+    table = pd.DataFrame(rows)
+    for name in ("loss", "held-out trials", "trivial predictor"):
+        table[name] = ["-" if math.isnan(value) else f"{value:.4g}" for value in table[name]]
+    return table
 
 
 def _values(done: Trainings) -> dict[str, Any]:

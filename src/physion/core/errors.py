@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
-MEMORY_SETTINGS = "lower --encoder-batch, the option batch, --workers or the size of the pictures"
+MEMORY_SETTINGS = "lower the options encoder_batch and batch, --workers or the size of the pictures"
 """What to do when memory is used up where no model is at work."""
 
 

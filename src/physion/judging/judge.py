@@ -11,8 +11,9 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -34,6 +35,9 @@ from physion.trials.files import MAX_FRAMES, MAX_SIDE
 from physion.trials.share.conditioning import PROTOCOL, SEEDS
 from physion.trials.share.items import items_of, true_movie
 from physion.trials.video import open_movie, read_frames
+
+if TYPE_CHECKING:
+    from physion.report.compare import CompareResult
 
 CARD = "card.json"
 SHAPES = 0.02
@@ -76,7 +80,7 @@ class Judged:
     - ``complete``: all movies of at least `SEEDS` seeds were judged.
     - ``paths``: tables by name: movies, seeds, tracks (agent's centre and distance by frame, and
       the true ones), predictions (P(contact) of each trial over its seeds, for `physion.compare`).
-    - ``true``: true movies by trial.
+    - ``true``: true movies by trial. ``generated``: folder of the generated ones.
     """
 
     card: MovieCard
@@ -85,6 +89,30 @@ class Judged:
     complete: bool
     paths: Mapping[str, Path]
     true: Mapping[str, Path]
+    generated: Path
+
+    @cached_property
+    def compared(self) -> CompareResult:
+        """The comparison of the predictions with true outcomes and answers of people."""
+        from physion.report.compare import compare
+
+        return compare(self.paths["predictions"])
+
+    def report(self, folder: Path | str) -> Path:
+        """Write ``judge.html``, and the page of the comparison into ``report/``; return the first.
+
+        Parameters
+        ----------
+        folder
+            Folder of both.
+        """
+        from physion.judging.page import judge_page
+
+        path = Path(folder) / "judge.html"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, judge_page(self).encode())
+        self.compared.report(path.parent / "report")
+        return path
 
     @property
     def missing(self) -> pd.DataFrame:
@@ -178,7 +206,7 @@ def judge(
             write_with_digest(paths[name], table.to_csv(index=False).encode())
     complete = len(card.seeds) >= SEEDS and bool((movies["status"] == JUDGED).all())
     true = {trial: true_movie(known, trial, job.true) for trial, job in jobs.items() if job.movies}
-    return Judged(card, movies, tables["seeds"], complete, paths, true)
+    return Judged(card, movies, tables["seeds"], complete, paths, true, folder)
 
 
 def _card(folder: Path) -> MovieCard:

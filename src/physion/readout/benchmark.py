@@ -95,12 +95,12 @@ class Benchmark:
         if own not in ("", self.name):
             raise BadInputError(
                 f"{model_name(model)} has features by the rules of {own}, not {self.name}; leave "
-                "out --benchmark, or encode the movies of the other one"
+                "out the option benchmark, or encode the movies of the other one"
             )
         if self.last and "state" in model.spec.inputs:
             raise BadInputError(
                 f"{model_name(model)} reads states, which {self.name} does not give: it is about "
-                "models that see movies; leave out --benchmark"
+                "models that see movies; leave out the option benchmark"
             )
 
     def select(self, index: pd.DataFrame) -> pd.DataFrame:

@@ -12,7 +12,7 @@ import dataclasses
 import functools
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ from physion.models.interface import Model, can
 from physion.readout.benchmark import benchmark_of
 from physion.readout.changes import CHANGES, Change, ChangedTrials, take_trials
 from physion.readout.decisions import Readout
-from physion.readout.evaluate import evaluate
+from physion.readout.evaluation import run_evaluations
 from physion.readout.folds import READOUT
 from physion.readout.model_calls import check_identity
 from physion.readout.predictor import ways
@@ -77,7 +77,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class CheckedModel:
-    """What `check` found.
+    """What the check of a model found.
 
     - ``model``: its name. ``table``: a row for every change and readout, with `COLUMNS`.
     - ``warnings``: why the check could say less than it should, in sentences.
@@ -129,71 +129,27 @@ class CheckedModel:
         return f"{self.table.drop(columns=['what', 'note']).to_string(index=False)}\n{self.verdict}"
 
 
-def check(
-    model: str | Path | Model,
-    dataset: Dataset | Path | str | None = None,
-    out: Path | str = "runs/check",
-    settings: EvaluationSettings | None = None,
+def check_model(
+    chosen: ChosenModel,
+    dataset: Dataset | Path | str | None,
+    out: Path,
+    settings: EvaluationSettings,
     *,
-    options: dict[str, Any] | None = None,
     trials: int = 80,
     changes: Sequence[str] = (),
     executor: Executor | None = None,
     progress: Progress | None = None,
-    **fields: Any,
 ) -> CheckedModel:
-    """Test whether predictions of a model depend on what they must not depend on.
-
-    The model is evaluated on some trials and on changed copies of them; it is not trained.
-
-    Parameters
-    ----------
-    model
-        Name of a model (``physion ls models``), ``FILE.py:Class``, or a model.
-    dataset
-        Labelled trials, or the path of their folder. Without it, trials of Collide and Drop are
-        made in ``out/trials``.
-    out
-        Folder for these trials and for the copies, which are deleted.
-    settings
-        Settings of the evaluations, as of `physion.evaluate`. Without readouts, all that the model
-        supports are checked but *full*, which is checked if there is no other.
-    options
-        Options of the model.
-    trials
-        About how many trials are taken, half of them to fit the readout: rounded down for each
-        scenario, but at least 2 of either half.
-    changes
-        Names of the changes to make (`physion.readout.changes.CHANGES`); by default all, and
-        evaluations of two other models.
-    executor, progress
-        As of `physion.evaluate`.
-    **fields
-        Fields of `EvaluationSettings` to replace in ``settings``.
-
-    Returns
-    -------
-    CheckedModel
-        A table with a verdict for every change, and whether the model passed.
-
-    Raises
-    ------
-    UnknownNameError
-        For an unknown model, option or change.
-    BadInputError
-        If the model cannot be built or evaluated, or there are too few trials.
-    """
+    """Check one model, with arguments as of `physion.check`."""
     for name in changes:
         if name not in CHANGES:
             raise UnknownNameError("change", name, CHANGES)
     if trials < 1:
         raise BadInputError(f"trials must be at least 1 (--trials), not {trials}")
-    settings = dataclasses.replace(settings or EvaluationSettings(), **fields)
-    settings = dataclasses.replace(settings, untrained=True, seeds=1)
-    chosen = choose_models(model, options)
-    if len(chosen) != 1:
-        raise BadInputError("one model is checked at a time")
-    built = chosen[0].build(settings.seed)
+    settings = dataclasses.replace(
+        settings, untrained=True, seeds=1, twin=False, rollout_errors=False
+    )
+    built = chosen.build(settings.seed)
     name = check_identity(built).model
     if isinstance(built, FeatureTable):
         raise BadInputError(
@@ -205,7 +161,6 @@ def check(
         possible = [readout.value for readout in ways(built, settings.decision, rules)]
         predicting = tuple(readout for readout in possible if readout != Readout.FULL.value)
         settings = dataclasses.replace(settings, readouts=predicting)
-    out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     if dataset is None:
         opened: Dataset = _made(out / "trials", trials, executor, progress)
@@ -219,43 +174,34 @@ def check(
         for change in tracked(wanted, "changes", len(wanted), progress):
             rows += work.rows(change)
         if not changes:
-            rows += work.rows_of_others(chosen[0].random_twin(built))
+            rows += work.rows_of_others(chosen.random_twin(built))
         table = pd.DataFrame(rows, columns=list(COLUMNS))
         return CheckedModel(name, table, work.warnings())
 
 
 def check_models(
-    models: Mapping[str, Mapping[str, Any]],
+    models: Sequence[ChosenModel],
     dataset: Dataset | Path | str,
-    out: Path | str,
-    settings: EvaluationSettings | None = None,
+    out: Path,
+    settings: EvaluationSettings,
     *,
-    trials: int = 80,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> dict[str, str]:
-    """Return the outcome of a check of each model, as `physion.evaluate` takes ``verdicts``.
+    """Return the outcome of a check of each model by its name, as `physion.evaluate` writes it.
 
     Only the changes that must not move a prediction are made. A table of features is not checked.
-
-    Parameters
-    ----------
-    models
-        Options of each model by its name.
-    dataset, out, settings, trials, executor, progress
-        As of `check`.
     """
     changes = [change.name for change in CHANGES.values() if change.must_hold]
     found = {}
-    for name, options in models.items():
-        if Path(name).suffix.lower() in FEATURE_FILES:
-            found[name] = NOT_CHECKED
+    for chosen in models:
+        if isinstance(chosen.model, str) and Path(chosen.model).suffix.lower() in FEATURE_FILES:
+            found[chosen.name] = NOT_CHECKED
             continue
-        done = check(
-            name, dataset, out, settings, options=dict(options), trials=trials, changes=changes,
-            executor=executor, progress=progress,
-        )  # fmt: skip
-        found[name] = done.outcome
+        done = check_model(
+            chosen, dataset, out, settings, changes=changes, executor=executor, progress=progress
+        )
+        found[chosen.name] = done.outcome
     return found
 
 
@@ -400,10 +346,14 @@ class _Check:
         near = self._first.folder.parent
         kept = dict.fromkeys(self._first.trials(READOUT), near / "kept")
         with tempfile.TemporaryDirectory(dir=near) as folder:
-            return evaluate(
-                model, dataset, folder, self._settings, executor=self._executor, stored=kept,
-                **changes,
-            ).predictions  # fmt: skip
+            return run_evaluations(
+                choose_models(model),
+                dataset,
+                Path(folder),
+                dataclasses.replace(self._settings, **changes),
+                stored=kept,
+                executor=self._executor,
+            ).predictions
 
     def warnings(self) -> list[str]:
         """Return why the check could say less than it should."""

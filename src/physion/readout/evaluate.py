@@ -1,158 +1,17 @@
-"""Evaluation of models on a dataset: predictions of every testing trial.
-
-What is done is known from the name of the table, which holds a hash of all its inputs.
-"""
+"""Predict the trials of a dataset with models: the function behind ``physion evaluate``."""
 
 from __future__ import annotations
 
 import dataclasses
-import functools
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
-from physion.clips.batch import Provenance
-from physion.compute.tasks import Executor, Progress, tracked
-from physion.core.errors import BadInputError
-from physion.core.files import digest_path, is_whole, json_digest
-from physion.core.version import __version__
-from physion.models.interface import Model, TrainingSettings, ask, can
-from physion.readout.benchmark import Benchmark, benchmark_of
-from physion.readout.decisions import Readout, decisions
-from physion.readout.folds import (
-    TESTING,
-    Protocol,
-    check_labels,
-    check_pictures,
-    describe_fit,
-    join_for_fit,
-    plan_folds,
-)
-from physion.readout.logistic import LogisticSettings
-from physion.readout.model_calls import check_identity, is_network
-from physion.readout.predictor import Predictor, Way, choose_readouts, decision_name
-from physion.readout.settings import (
-    Cell,
-    EvaluationSettings,
-    Models,
-    choose_models,
-    open_dataset,
-    plan_cells,
-    run_cells,
-    runner_of_cells,
-)
-from physion.readout.shipped import ShippedReadouts, find_readouts
-from physion.readout.tables import (
-    ScenarioPredictions,
-    file_name,
-    make_table,
-    read_table,
-    summarise_accuracy,
-    write_table,
-)
-from physion.trials.dataset import Dataset, JoinedDataset
-
-NOTHING_TO_FIT = "no trial to fit|one answer only"
-"""Notes of `physion.readout.logistic.fit_readout` where it predicts the base rate."""
-_VERSION = 11
-"""To be increased with every change that can alter the table of an evaluation."""
-_NOT_HASHED = (
-    "protocols", "seeds", "encoder_batch", "accelerator", "rollout_errors", "twin", "benchmark",
-)  # fmt: skip
-"""Settings of where and how an evaluation runs, or of others than this one, or hashed by name."""
-_HASHED_COLUMNS = [
-    "trial", "scenario", "split", "contact", "digest", "movie_sha256", "observed_movie_sha256",
-    "recorded_contact", "observed_contact",
-]  # fmt: skip
-"""Columns of the index that a table depends on."""
-
-
-@dataclass(frozen=True)
-class EvaluatedModel:
-    """A model under one training protocol with one seed.
-
-    - ``model``, ``protocol``, ``seed``: which; ``protocol`` is empty if it was not trained.
-    - ``path``: table of predictions. ``rollout_errors``: errors of imagined motion, if asked for.
-    - ``done``: whether the table was there before.
-    - ``problems``: reasons of trials without a prediction, by name.
-    """
-
-    model: str
-    protocol: str
-    seed: int
-    path: Path
-    rollout_errors: Path | None
-    done: bool
-    problems: Mapping[str, str]
-
-    def accuracies(self) -> dict[str, float]:
-        """Return the mean accuracy over scenarios by name and readout of the model.
-
-        The outcome is the recorded one, where it is known.
-        """
-        table = read_table(self.path)
-        known = table["recorded_outcome"].astype(str)
-        label = (known.where(known != "", table["outcome"].astype(str))) == "True"
-        right = table.assign(right=(table["p_contact"] > 0.5) == label)
-        keys = ["model", "init", "readout"]
-        means = right.groupby([*keys, "scenario"])["right"].mean().groupby(keys).mean()
-        return {
-            " · ".join(name for name in (model, readout) if name): float(mean)
-            for (model, _, readout), mean in means.items()
-        }
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """What `evaluate` did.
-
-    - ``evaluated``: one entry for every model, training protocol and seed.
-    - ``failed``: reasons of those that failed, by model, protocol and seed.
-    """
-
-    evaluated: Sequence[EvaluatedModel]
-    failed: Mapping[str, str]
-
-    @property
-    def paths(self) -> list[Path]:
-        """Tables of predictions."""
-        return [one.path for one in self.evaluated]
-
-    @cached_property
-    def predictions(self) -> pd.DataFrame:
-        """All predictions, with the columns `physion.readout.tables.COLUMNS`."""
-        tables = [read_table(path) for path in self.paths]
-        return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
-
-    @property
-    def scores(self) -> pd.DataFrame:
-        """Accuracies, as mean and spread over seeds (`summarise_accuracy`)."""
-        return summarise_accuracy(self.predictions)
-
-    @property
-    def warnings(self) -> list[str]:
-        """What predictions are not, in sentences: those without a trial to fit a readout on."""
-        if self.predictions.empty:
-            return []
-        unfit = self.predictions[self.predictions["note"].str.contains(NOTHING_TO_FIT)]
-        return [
-            f"{model}, readout {readout}: {len(rows)} predictions are the same number, since "
-            f"the readout had {reason}; add trials of the split readout with both outcomes"
-            for (model, readout, reason), rows in unfit.groupby(["model", "readout", "note"])
-        ]
-
-    @property
-    def problems(self) -> dict[str, str]:
-        """Reasons of the trials without a prediction, by model and trial."""
-        return {
-            f"{one.model}: {trial}": reason
-            for one in self.evaluated
-            for trial, reason in one.problems.items()
-        }
+from physion.compute.tasks import Executor, Progress
+from physion.readout.check import check_models
+from physion.readout.evaluation import EvaluatedModel, Evaluation, run_evaluations
+from physion.readout.settings import EvaluationSettings, Models, choose_models
+from physion.trials.dataset import Dataset
 
 
 def evaluate(
@@ -162,8 +21,7 @@ def evaluate(
     settings: EvaluationSettings | None = None,
     *,
     fit: Dataset | Path | str | None = None,
-    verdicts: Mapping[str, str] | None = None,
-    stored: Mapping[str, Path] | None = None,
+    check: bool = False,
     options: Mapping[str, Any] | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
@@ -188,17 +46,14 @@ def evaluate(
         whose inputs are the same is not made again.
     settings
         Protocols, seeds, readouts, decision, cross-validation and device. Readouts that ship for a
-        model (`physion.readout.shipped`) are used where they fit, unless ``readout="fit"``.
+        model (`physion.readout.shipped`) are used where they fit, unless ``readout_from="fit"``.
     fit
         Another dataset, whose trials of the splits training and readout take the place of the
         dataset's own, as in the paper. No motion may be in both, and look, frame rate and size of
         the movies must agree; a set without movies needs ``rendered``.
-    verdicts
-        By name of a model, as in ``models``, the verdict of its check, for the column ``check``
-        (`physion.readout.check.check_models`).
-    stored
-        By trial the folder of what models compute of it, for trials that several evaluations with
-        different ``out`` share.
+    check
+        Whether each model is first checked on about 80 trials, with the changes that must not move
+        a prediction (`physion.check`); the verdict stands in the column ``check`` of the table.
     options
         Fields of the settings of the models, or of their training (`TrainingSettings`).
     executor
@@ -227,195 +82,20 @@ def evaluate(
         the model raises or returns something wrong, or no trial could be predicted.
     """
     settings = dataclasses.replace(settings or EvaluationSettings(), **changes)
-    for name in settings.readouts:
-        Readout.named(name)
-    if settings.decision:
-        decisions.get(settings.decision)
-    chosen = choose_models(models, options)
-    cells = plan_cells(
+    chosen, verdicts = choose_models(models, options), {}
+    if check and not dry_run:
+        verdicts = check_models(
+            chosen, dataset, Path(out) / "check", settings, executor=executor, progress=progress
+        )
+    return run_evaluations(
         chosen,
+        dataset,
+        Path(out),
         settings,
-        functools.partial(_is_trained, settings=settings),
-        every_seed=settings.untrained,
-        twins=settings.twin,
+        fit=fit,
+        verdicts=verdicts,
+        executor=executor,
+        progress=progress,
+        dry_run=dry_run,
+        on_evaluated=on_evaluated,
     )
-    finished = None if dry_run else on_evaluated
-    elsewhere = None if dry_run else runner_of_cells(executor)
-    trials, fit_on = open_dataset(dataset, elsewhere), ""
-    if fit is not None:
-        other = open_dataset(fit, elsewhere)
-        trials = join_for_fit(trials, other)
-    index, scenario = trials.index, settings.scenario
-    check_labels(index[index["scenario"] == scenario] if scenario else index)
-    if fit is not None:
-        fit_on = describe_fit(other)
-    if elsewhere is None:
-        work = _Evaluate(trials, Path(out), settings, fit_on, verdicts or {}, stored or {})
-        here = functools.partial(work, executor=executor, progress=progress, dry_run=dry_run)
-        done = run_cells(cells, here, Path(out), "evaluations", None, progress, finished)
-        return Evaluation(*done)
-    # Its processes may have another working directory.
-    there = _Evaluate(trials, Path(out).absolute(), settings, fit_on, verdicts or {}, stored or {})
-    done = run_cells(cells, there, Path(out), "evaluations", elsewhere, progress, finished)
-    return Evaluation(*done)
-
-
-def _is_trained(model: Any, settings: EvaluationSettings) -> bool:
-    """Return whether an evaluation trains a model, so that protocol and seed matter."""
-    rules = benchmark_of(model, settings.benchmark)
-    if settings.untrained or not (is_network(model) and can(model, "loss")):
-        return False
-    if ask(model, "trained"):
-        return False
-    # What is trained on features predicts features, which the other readouts do not need.
-    needed = Readout.OBSERVED_SIMULATED.value in (settings.readouts or rules.readouts)
-    return ask(model, "learns_from") != "features" or ask(model, "learns_outcomes") or needed
-
-
-@dataclass(frozen=True)
-class _Evaluate:
-    """Function that evaluates a cell, with all that a process needs for it."""
-
-    dataset: Dataset
-    out: Path
-    settings: EvaluationSettings
-    fit_on: str = ""
-    verdicts: Mapping[str, str] = field(default_factory=dict)
-    stored: Mapping[str, Path] = field(default_factory=dict)
-
-    def __call__(
-        self,
-        cell: Cell,
-        executor: Executor | None = None,
-        progress: Progress | None = None,
-        *,
-        dry_run: bool = False,
-    ) -> EvaluatedModel:
-        """Predict every testing trial, unless that is done."""
-        model, settings = cell.take_model(), self.settings
-        rules = benchmark_of(model, settings.benchmark)
-        index = rules.select(self.dataset.index)
-        settings = dataclasses.replace(settings, logistic=rules.logistic(settings.logistic))
-        if cell.chosen.stays_random(model):
-            settings = dataclasses.replace(settings, untrained=True)
-        training = cell.chosen.settings_of(model) if cell.protocol is not None else None
-        provenance = check_identity(model)
-        if isinstance(self.dataset, JoinedDataset):
-            check_pictures(index, model.spec, rendered=settings.rendered)
-        ways = choose_readouts(model, settings.readouts, settings.decision, rules)
-        if Way.ROLLOUTS in ways.values():
-            # Another decision on the same rollouts is another row.
-            asked, own = decision_name(model, settings.decision), decision_name(model)
-            name = provenance.model if asked == own else f"{provenance.model}-{asked}"
-            provenance = dataclasses.replace(provenance, model=name)
-        if not provenance.inputs:
-            provenance = dataclasses.replace(provenance, inputs=", ".join(model.spec.inputs))
-        shipped = None if rules.together else self._shipped(model)
-        path = self._table(cell, model, training, provenance, ways, shipped, rules)
-        errors_path = self.out / "rollout-errors" / path.name if settings.rollout_errors else None
-        if errors_path is not None:
-            from physion.readout.rollout_error import check_moves_objects, rollout_error
-
-            check_moves_objects(model)
-            if cell.protocol is Protocol.ONE:
-                raise BadInputError("rollout errors need another protocol than one: one per trial")
-        done = is_whole(path) and (errors_path is None or is_whole(errors_path))
-        protocol = cell.protocol.value if cell.protocol is not None else ""
-        evaluated = EvaluatedModel(
-            provenance.model, protocol, cell.seed, path, errors_path, done, {}
-        )
-        if done or dry_run:
-            return evaluated
-        protocol_of_folds = cell.protocol or Protocol.ALL
-        planned = plan_folds(index, protocol_of_folds, settings.folds, cell.seed)
-        folds = rules.arrange(planned, settings.scenario)
-        splits = [split for fold in folds for split in fold.scenarios]
-        needed = {trial for split in splits for trial in (*split.fit, *split.test)}
-        ask(model, "check_trials")(needed, self.dataset.known_trials())
-        predictor = Predictor(
-            self.dataset,
-            model,
-            ways,
-            settings,
-            training=training,
-            protocol=cell.protocol,
-            seed=cell.seed,
-            folder=self.out,
-            shipped=shipped,
-            fit_on=self.fit_on,
-            rules=rules,
-            stored=self.stored,
-            executor=executor,
-            progress=progress,
-        )
-        predictions: list[ScenarioPredictions] = []
-        errors: list[pd.DataFrame] = []
-        try:
-            for fold in tracked(folds, "folds", len(folds), progress):
-                predictions += predictor.predict(fold)
-                if errors_path is not None:
-                    # Now, since the model has the weights that were trained for this fold.
-                    tested = [t for split in fold.scenarios for t in split.test]
-                    known = [t for t in tested if t not in predictor.problems]
-                    errors.append(rollout_error(self.dataset, model, known, progress=progress))
-        finally:
-            predictor.restore()
-        row = index.iloc[0]
-        rate = round(float(row["frames"] / row["playback_seconds"]), 3)
-        frames = functools.partial(rules.describe_frames, model.spec, rate=rate)
-        verdict = self.verdicts.get(cell.chosen.name, "")
-        table = make_table(predictions, provenance, index, rules.name, frames, verdict)
-        if table.empty:
-            reason = next(iter(predictor.problems.values()), "there is no trial to predict")
-            raise BadInputError(f"{provenance.model} predicts no trial: {reason}")
-        # Another name than a complete table has, so that the next run retries these trials.
-        partial = path.with_suffix(".partial.csv")
-        if predictor.problems:
-            path = partial
-        write_table(table, path)
-        if errors_path is not None:
-            errors_path = errors_path.with_name(path.name)
-            write_table(pd.concat(errors, ignore_index=True).round(6), errors_path)
-        if not predictor.problems:
-            for old in (partial, self.out / "rollout-errors" / partial.name):
-                old.unlink(missing_ok=True)
-                digest_path(old).unlink(missing_ok=True)
-        problems = dict(predictor.problems)
-        return dataclasses.replace(
-            evaluated, path=path, rollout_errors=errors_path, problems=problems
-        )
-
-    def _shipped(self, model: Model) -> ShippedReadouts | None:
-        """Return the readouts that ship for a model and may be used; None to fit them."""
-        settings = self.settings
-        anew = settings.readout == "fit" or settings.logistic != LogisticSettings()
-        if anew or self.fit_on or settings.decision not in ("", decision_name(model)):
-            return None
-        index = self.dataset.index
-        looks = set(index["look"][index["split"] == TESTING])
-        return find_readouts(model) if looks == {"redyellow"} else None
-
-    def _table(
-        self,
-        cell: Cell,
-        model: Model,
-        training: TrainingSettings | None,
-        provenance: Provenance,
-        ways: Mapping[Readout, Way],
-        shipped: ShippedReadouts | None,
-        rules: Benchmark,
-    ) -> Path:
-        """Return the table, named by a hash of trials, labels, model, settings and code."""
-        settings = dataclasses.asdict(self.settings) | {"readouts": [r.value for r in ways]}
-        settings |= {"protocol": cell.protocol and cell.protocol.value, "seed": cell.seed}
-        settings |= {"rules": [rules.name, rules.last, rules.window, rules.together, rules.grid]}
-        kept = {name: value for name, value in settings.items() if name not in _NOT_HASHED}
-        options = dataclasses.asdict(chosen) if (chosen := ask(model, "settings")) else {}
-        of_training = dataclasses.asdict(training) if training is not None else {}
-        facts = dataclasses.asdict(provenance)
-        inputs = [_VERSION, __version__, kept, facts, options, of_training, model.digest()]
-        inputs.append(shipped.sha256 if shipped is not None else self.fit_on)
-        inputs += filter(None, [self.verdicts.get(cell.chosen.name)])
-        trials = self.dataset.index[_HASHED_COLUMNS].to_csv(index=False).encode()
-        name = f"{file_name(provenance.model)}-{json_digest(inputs, [trials])[:12]}.csv"
-        return self.out / "predictions" / name

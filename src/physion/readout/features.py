@@ -694,7 +694,7 @@ def _read_clips(read: Callable[[tuple[str, ...]], Batch], group: tuple[str, ...]
         return read(group)
     except MemoryError as error:
         count = len(group)
-        advice = MEMORY_ADVICE if count == 1 else f"lower --encoder-batch, now {count}"
+        advice = MEMORY_ADVICE if count == 1 else f"lower the option encoder_batch, now {count}"
         raise OutOfMemoryError(
             f"reading {count} clips at a time ran out of memory; {advice}"
         ) from error

@@ -208,7 +208,7 @@ def _explain(error: Exception, model: Model, method: str, batch: Batch) -> Physi
     name = model_name(model)
     clips, steps = batch.frames.shape[:2]
     if is_out_of_memory(error):
-        advice = MEMORY_ADVICE if clips == 1 else f"lower --encoder-batch, now {clips}"
+        advice = MEMORY_ADVICE if clips == 1 else f"lower the option encoder_batch, now {clips}"
         return OutOfMemoryError(
             f"model {name!r}: {method} ran out of memory with {clips} clips of {steps} frames at a "
             f"time; {advice}"

@@ -103,7 +103,7 @@ def ways(model: Model, decision: str = "", rules: Benchmark = V1) -> dict[Readou
     if not kept:
         raise BadInputError(
             f"{model_name(model)} has the readouts {', '.join(r.value for r in possible)}, but "
-            f"{rules.name} needs one of {', '.join(rules.readouts)}; leave out --benchmark"
+            f"{rules.name} needs one of {', '.join(rules.readouts)}; leave out the option benchmark"
         )
     return {readout: found[readout] for readout in kept}
 

@@ -48,7 +48,7 @@ class HarnessSettings:
     """First seed: of initial weights, folds and training."""
     folds: Annotated[int, OPTION_ONLY] = 5
     """Folds of the cross-validation of a dataset without a readout split."""
-    encoder_batch: int = 4
+    encoder_batch: Annotated[int, OPTION_ONLY] = 4
     """Clips that a network encodes at a time; lower it when memory runs out."""
     rendered: bool = False
     """Render the pictures from the stored motions instead of reading the movies."""
@@ -81,7 +81,7 @@ class TrainSettings(HarnessSettings):
 class EvaluationSettings(HarnessSettings):
     """Settings of evaluations."""
 
-    benchmark: str = ""
+    benchmark: Annotated[str, OPTION_ONLY] = ""
     """Rules of the evaluation: v1, of the paper, or v1.5, of physion_evaluator (seven scenarios,
     Collide cut at frame 15, one readout of all scenarios, detection around the contact). Default:
     v1, but v1.5 for files of features that physion_evaluator wrote."""
@@ -90,10 +90,10 @@ class EvaluationSettings(HarnessSettings):
     decision: str = ""
     """What turns features or rollouts into P(contact) (physion ls decisions); default: the model's
     own."""
-    readout: Literal["shipped", "fit"] = "shipped"
+    readout_from: Literal["shipped", "fit"] = "shipped"
     """shipped: take a readout of the package where it has one for the model, if trials are red and
     yellow and the dataset has fewer trials to fit one. fit: fit all readouts on the dataset."""
-    untrained: bool = False
+    untrained: Annotated[bool, OPTION_ONLY] = False
     """Train no model, and take its weights as they are; the table says untrained."""
     twin: bool = False
     """Also evaluate a random twin of each model that has weights: the same network with
@@ -264,7 +264,7 @@ class Cell:
     chosen: ChosenModel
     protocol: Protocol | None
     seed: int
-    untrained: bool = False
+    untrained: Annotated[bool, OPTION_ONLY] = False
     built: Any = field(default=None, repr=False)
 
     @property

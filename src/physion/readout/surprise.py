@@ -80,10 +80,17 @@ class Surprises:
 
     - ``table``: `COLUMNS`, one row for each model and movie.
     - ``failed``: reasons of the models that failed, by name.
+    - ``pixels``: a table of the same kind of `pixel_statistics`; None if not asked for.
     """
 
     table: pd.DataFrame
     failed: Mapping[str, str]
+    pixels: pd.DataFrame | None = None
+
+    @property
+    def scores(self) -> pd.DataFrame:
+        """How often the impossible movie of a pair surprises more (`surprise_scores`)."""
+        return surprise_scores([self.table] if self.pixels is None else [self.pixels, self.table])
 
 
 def surprise(
@@ -93,6 +100,7 @@ def surprise(
     settings: EvaluationSettings | None = None,
     *,
     options: Mapping[str, Any] | None = None,
+    pixels: bool = False,
     progress: Progress | None = None,
     **changes: Any,
 ) -> Surprises:
@@ -109,6 +117,8 @@ def surprise(
         Folder of the tables, ``surprise/MODEL-DIGEST.csv``. What is there is not computed again.
     settings
         Of these ``seed``, ``rendered`` and ``accelerator`` count.
+    pixels
+        Whether also the table of `pixel_statistics` is made.
     progress
         Called after every trial.
     **changes
@@ -141,7 +151,11 @@ def surprise(
 
     tables, failed = run_cells(cells, run, Path(out), "models", None, None)
     known = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=list(COLUMNS))
-    return Surprises(known, {label.rpartition(",")[0]: why for label, why in failed.items()})
+    reasons = {label.rpartition(",")[0]: why for label, why in failed.items()}
+    single = None
+    if pixels:
+        single = pixel_statistics(trials, out, rendered=settings.rendered, progress=progress)
+    return Surprises(known, reasons, single)
 
 
 def _pairs(dataset: Dataset) -> dict[str, Pair]:

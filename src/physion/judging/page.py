@@ -60,11 +60,8 @@ def described(judged: Judged) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def judge_page(judged: Judged, generated: Path) -> str:
-    """Return the page: the verdict, measures, what is missing, movies of some trials.
-
-    ``generated``: folder of the movies.
-    """
+def judge_page(judged: Judged) -> str:
+    """Return the page: the verdict, measures, what is missing, movies of some trials."""
     card, table, missing = judged.card, described(judged), judged.missing
     facts = {
         "conditioning": card.conditioning,
@@ -91,7 +88,7 @@ def judge_page(judged: Judged, generated: Path) -> str:
         for row in order.drop_duplicates("trial").head(MOST_SHOWN).itertuples():
             trial, seed = str(row.trial), str(row.seed)
             movie, left = _side_by_side(
-                generated / seed / f"{trial}.mp4", judged.true[trial], card.first_frame, left
+                judged.generated / seed / f"{trial}.mp4", judged.true[trial], card.first_frame, left
             )
             words = ["contact" if yes else "no contact" for yes in (row.contact, row.true_contact)]
             kind = "right" if row.right else "wrong"
