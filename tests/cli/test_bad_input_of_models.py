@@ -157,7 +157,7 @@ def test_weights_of_another_network_name_the_tensors(
         save_file(timm.create_model("test_resnet", pretrained=False).state_dict(), path)
     options = ["--option", "encoder=test_vit", "image_size=64", "hidden=4", f"weights={path}"]
     out = ["--out", str(tmp_path / "out")]
-    command = ["evaluate", "frozen-encoder", str(made.folder), *out, *options, *ENCODE]
+    command = ["evaluate", "frozen-encoder", str(made.folder), *out, *ENCODE, *options[1:]]
     error = refused(capsys, *command)
     assert "does not fit encoder 'test_vit'" in error
     assert "patch_embed.proj.weight is missing" in error

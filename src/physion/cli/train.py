@@ -40,8 +40,8 @@ class Options:
     """Settings of the models or of their training as NAME=VALUE, such as size=paper steps=500
     batch=16 learning_rate=1e-3; of one of several models as MODEL:NAME=VALUE. Of all trainings:
     folds=3, parts into which trials are divided where a dataset without a readout split is
-    cross-validated (default: 5); encoder_batch=1, clips that a network encodes at a time (default: 4;
-    lower it when memory runs out)."""
+    cross-validated (default: 5); encoder_batch=1, clips that a network encodes at a time (default:
+    4; lower it when memory runs out)."""
     settings: Annotated[TrainSettings, tyro.conf.arg(name="")] = field(
         default_factory=TrainSettings
     )
