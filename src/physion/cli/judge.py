@@ -24,7 +24,7 @@ from physion.cli.output import (
 )
 from physion.compute.run_tasks import ExecutorSettings
 from physion.judging.judge import judge
-from physion.judging.page import described, verdict
+from physion.judging.result import described, verdict
 
 SHOWN = 5
 

@@ -11,9 +11,8 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -30,94 +29,19 @@ from physion.core.files import (
 )
 from physion.core.settings import read_json
 from physion.judging.measure import COLUMNS, KnownMovie, measure, reference_of
+from physion.judging.result import CARD, JUDGED, Judged, MovieCard
 from physion.trials.dataset import Dataset
 from physion.trials.files import MAX_FRAMES, MAX_SIDE
 from physion.trials.share.conditioning import PROTOCOL, SEEDS
 from physion.trials.share.items import items_of, true_movie
 from physion.trials.video import open_movie, read_frames
 
-if TYPE_CHECKING:
-    from physion.report.compare import CompareResult
-
-CARD = "card.json"
 SHAPES = 0.02
 """Largest difference of width by height from the trial's, as a fraction."""
 RATES = (4.0, 240.0)
 """Smallest and largest rate of a movie, frames a second."""
-JUDGED = "judged"
 _VERSION = 3
 """To be increased with every change that can alter a measure."""
-
-
-@dataclass(frozen=True)
-class MovieCard:
-    """What a user says of the movies.
-
-    - ``protocol``: name of the rules, `PROTOCOL`. ``model``: name of the row of results.
-    - ``conditioning``, ``prompt``: what the model was given, as text.
-    - ``first_frame``: the frame of the trial that the first frame of each movie shows.
-    - ``seeds``: folders of the movies.
-    """
-
-    protocol: str
-    model: str
-    conditioning: str
-    prompt: str
-    first_frame: int
-    seeds: list[str]
-
-
-@dataclass(frozen=True)
-class Judged:
-    """Result of `judge`.
-
-    - ``card``: what the user says of the movies.
-    - ``movies``: one row per trial and seed: ``trial``, ``scenario``, ``seed``, ``status``
-      (*judged*, or why not), ``true_contact``, ``true_frame``, and the measures of `COLUMNS`.
-    - ``seeds``: one row per seed, then *mean* and *sd* over them: ``movies``, ``right`` (fraction
-      of all movies asked for that show the true outcome; missing ones do not), and the means of
-      all measures.
-    - ``complete``: all movies of at least `SEEDS` seeds were judged.
-    - ``paths``: tables by name: movies, seeds, tracks (agent's centre and distance by frame, and
-      the true ones), predictions (P(contact) of each trial over its seeds, for `physion.compare`).
-    - ``true``: true movies by trial. ``generated``: folder of the generated ones.
-    """
-
-    card: MovieCard
-    movies: pd.DataFrame
-    seeds: pd.DataFrame
-    complete: bool
-    paths: Mapping[str, Path]
-    true: Mapping[str, Path]
-    generated: Path
-
-    @cached_property
-    def compared(self) -> CompareResult:
-        """The comparison of the predictions with true outcomes and answers of people."""
-        from physion.report.compare import compare
-
-        return compare(self.paths["predictions"])
-
-    def report(self, folder: Path | str) -> Path:
-        """Write ``judge.html``, and the page of the comparison into ``report/``; return the first.
-
-        Parameters
-        ----------
-        folder
-            Folder of both.
-        """
-        from physion.judging.page import judge_page
-
-        path = Path(folder) / "judge.html"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, judge_page(self).encode())
-        self.compared.report(path.parent / "report")
-        return path
-
-    @property
-    def missing(self) -> pd.DataFrame:
-        """Rows of the movies that were not judged."""
-        return self.movies[self.movies["status"] != JUDGED]
 
 
 @dataclass(frozen=True)

@@ -414,7 +414,7 @@ def test_a_missing_extra_is_said_in_one_line(
     tutorial = (ROOT / "docs" / "tutorials" / "study.md").read_text(encoding="utf-8")
     found = re.search(r"(\S*pip install) -q (-e '\.\[)[a-z,]+(\]' -c \S+)", tutorial)
     assert found is not None
-    assert said.endswith(f": {found[1]} {found[2]}experiment{found[3]}\n")
+    assert said.endswith(f" {found[1]} {found[2]}experiment{found[3]}\n")
 
 
 @pytest.mark.nightly

@@ -1,15 +1,19 @@
-"""Page of judged movies: measures by seed, and generated movies next to the true ones."""
+"""What judging gives: tables, their comparison with people, and a page of movies by scenario."""
 
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
+from physion.core.files import write_atomic
 from physion.core.html import Markup, joined, macros_of
-from physion.judging.judge import CARD, JUDGED, Judged
 from physion.judging.measure import COLUMNS
 from physion.report.html import (
     MACROS,
@@ -22,11 +26,86 @@ from physion.report.html import (
 )
 from physion.trials.video import encode_movie, open_movie, read_frames
 
+if TYPE_CHECKING:
+    from physion.report.compare import CompareResult
+
+CARD = "card.json"
+JUDGED = "judged"
 PAGE_BYTES = 15_000_000
 """Largest size of a page with its movies."""
 MOST_SHOWN = 6
 """Trials of a scenario whose movies are shown: those with a wrong outcome first."""
 _TRIALS = macros_of("physion.report", "trials.html")
+
+
+@dataclass(frozen=True)
+class MovieCard:
+    """What a user says of the movies.
+
+    - ``protocol``: name of the rules, `PROTOCOL`. ``model``: name of the row of results.
+    - ``conditioning``, ``prompt``: what the model was given, as text.
+    - ``first_frame``: the frame of the trial that the first frame of each movie shows.
+    - ``seeds``: folders of the movies.
+    """
+
+    protocol: str
+    model: str
+    conditioning: str
+    prompt: str
+    first_frame: int
+    seeds: list[str]
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Result of `judge`.
+
+    - ``card``: what the user says of the movies.
+    - ``movies``: one row per trial and seed: ``trial``, ``scenario``, ``seed``, ``status``
+      (*judged*, or why not), ``true_contact``, ``true_frame``, and the measures of `COLUMNS`.
+    - ``seeds``: one row per seed, then *mean* and *sd* over them: ``movies``, ``right`` (fraction
+      of all movies asked for that show the true outcome; missing ones do not), and the means of
+      all measures.
+    - ``complete``: all movies of at least `SEEDS` seeds were judged.
+    - ``paths``: tables by name: movies, seeds, tracks (agent's centre and distance by frame, and
+      the true ones), predictions (P(contact) of each trial over its seeds, for `physion.compare`).
+    - ``true``: true movies by trial. ``generated``: folder of the generated ones.
+    """
+
+    card: MovieCard
+    movies: pd.DataFrame
+    seeds: pd.DataFrame
+    complete: bool
+    paths: Mapping[str, Path]
+    true: Mapping[str, Path]
+    generated: Path
+
+    @cached_property
+    def compared(self) -> CompareResult:
+        """The comparison of the predictions with true outcomes and answers of people."""
+        # Imported late: the processes that measure movies need no statistics.
+        from physion.report.compare import compare
+
+        return compare(self.paths["predictions"])
+
+    def report(self, folder: Path | str) -> Path:
+        """Write ``judge.html``, and the page of the comparison into ``report/``; return the first.
+
+        Parameters
+        ----------
+        folder
+            Folder of both.
+        """
+        path = Path(folder) / "judge.html"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, _page(self).encode())
+        self.compared.report(path.parent / "report")
+        return path
+
+    @property
+    def missing(self) -> pd.DataFrame:
+        """Rows of the movies that were not judged."""
+        return self.movies[self.movies["status"] != JUDGED]
 
 
 def verdict(judged: Judged) -> str:
@@ -60,7 +139,7 @@ def described(judged: Judged) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def judge_page(judged: Judged) -> str:
+def _page(judged: Judged) -> str:
     """Return the page: the verdict, measures, what is missing, movies of some trials."""
     card, table, missing = judged.card, described(judged), judged.missing
     facts = {
