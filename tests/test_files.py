@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from physion.analysis.tables import read_csv
 from physion.cli import main as main_module
 from physion.core import files as atomic
 from physion.core import files as digests
@@ -24,6 +23,7 @@ from physion.core.files import (
     write_atomic,
     write_with_digest,
 )
+from physion.core.tables import read_csv
 
 
 def test_a_file_has_its_digest_next_to_it(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS, Responses, clean
-from physion.analysis.tables import check_table
+from physion.core.tables import check_table
 
 PRACTICE = 10
 

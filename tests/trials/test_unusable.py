@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.trials.dataset import Dataset
-from physion.trials.unusable import UNUSABLE, mark_unusable, read_unusable
+from physion.trials.dataset import UNUSABLE, Dataset, mark_unusable, read_unusable
 from support.viewer_dataset import make_dataset
 
 
@@ -36,9 +35,9 @@ def test_a_file_of_a_spreadsheet_with_more_columns_is_read(dataset: Dataset) -> 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("trial\ndrop_0\n", "must have the columns trial and reason"),
-        ("", "must have the columns"),
-        ("trial,reason\ndrop_0,\n", "row 1: why is drop_0 unusable"),
+        ("trial\ndrop_0\n", "lacks the column.s. reason"),
+        ("", "is not a CSV table"),
+        ("trial,reason\ndrop_0,\n", "row 1 of column 'reason' holds ''"),
         ("trial,reason\ndrop_0,a\ndrop_9,b\n", "row 2: the dataset has no trial 'drop_9'"),
     ],
 )

@@ -24,18 +24,10 @@ from physion.analysis.people.exclusions import (
 )
 from physion.analysis.people.responses import Responses, check_labels, missing_times
 from physion.analysis.people.results import read_any_responses
-from physion.analysis.tables import (
-    DATASETS,
-    DISTINGUISHING,
-    PREDICTIONS,
-    READOUTS,
-    Column,
-    inspect_table,
-    read_csv,
-    read_table,
-)
+from physion.analysis.tables import DATASETS, DISTINGUISHING, PREDICTIONS, READOUTS
 from physion.core.errors import BadInputError
 from physion.core.names import canonical_name, is_ledge, scenario_of
+from physion.core.tables import Column, inspect_table, read_csv, read_table
 
 SHOWN = 20
 """Faults of one kind that are listed one by one; more are counted in one line."""

@@ -29,7 +29,7 @@ from physion.analysis.people.results import PeopleResults
 from physion.analysis.population import PopulationResults, compare_populations
 from physion.analysis.scores import TWO_PEOPLE, against_people, with_kind
 from physion.analysis.statistics.regression import calibration_table
-from physion.analysis.tables import DETECTION, check_excluded_names, name_models, require_columns
+from physion.analysis.tables import DETECTION, check_excluded_names, name_models
 from physion.analysis.with_participants import (
     add_baselines,
     human_zones,
@@ -41,6 +41,7 @@ from physion.analysis.with_participants import (
     released_r_zone,
 )
 from physion.core.errors import BadInputError
+from physion.core.tables import require_columns
 
 # All models compared with all participants: every scenario, their mean, and what was excluded.
 

@@ -14,8 +14,9 @@ import numpy.typing as npt
 import pandas as pd
 
 from physion.analysis.intervals import Variance, mean_of, variance_of_mean
-from physion.analysis.tables import MEAN, Column, check_table, in_order, must, read_csv
+from physion.analysis.tables import MEAN, in_order
 from physion.core.errors import BadInputError
+from physion.core.tables import Column, check_table, must, read_csv
 
 CONSTANT_VELOCITY = "constant velocity"
 """Name of the baseline: objects keep moving as they did in the last observed step."""

@@ -15,8 +15,7 @@ from physion.clips.batch import Imagine
 from physion.core.errors import BadInputError
 from physion.core.settings import parse_pairs
 from physion.report.viewer.build import ViewerOptions, build_viewer
-from physion.trials.dataset import Dataset
-from physion.trials.unusable import mark_unusable
+from physion.trials.dataset import Dataset, mark_unusable
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ Next to each is its digest file (`physion.core.files`).
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import gzip
 import io
@@ -71,8 +70,12 @@ class OfficialData:
     @cached_property
     def labels(self) -> dict[str, bool]:
         """Official label of every stimulus that people saw, by canonical name."""
-        rows = csv.DictReader(io.StringIO(self.read(LABELS).decode()))
-        return {row["stimulus"]: row["contact"] == "1" for row in rows}
+        from physion.core.tables import check_table, must, parse_csv
+
+        columns = (must("stimulus", "text", "Canonical name"), must("contact", "flag", "Outcome"))
+        where = str(self.folder / LABELS)
+        rows = check_table(parse_csv(self.read(LABELS), where), columns, where)
+        return dict(zip(rows["stimulus"], rows["contact"].tolist(), strict=True))
 
     @property
     def humans(self) -> Path:

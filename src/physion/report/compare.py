@@ -48,17 +48,14 @@ from physion.analysis.tables import (
     find_next_to,
     in_order,
     join_predictions,
-    read_csv,
     read_human_zone,
     read_humans,
     read_labels,
     read_stimulus_list,
-    read_table,
-    refuse_duplicates,
-    require_columns,
 )
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.names import SCENARIOS
+from physion.core.tables import read_csv, read_table, refuse_duplicates, require_columns
 from physion.data.official import PACKAGED, find_official, official
 from physion.report.build import build_people_report, build_report
 from physion.report.html import plural

@@ -1,10 +1,12 @@
-"""Reading of a dataset: a folder of trials with its index.
+"""Reading of a dataset: a folder of trials with its index, and marks of unusable trials.
 
 What reads trial files and movies is imported when it is used: an index is known without it.
 """
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +17,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.files import read_plain, write_atomic
+from physion.core.tables import check_table, must, parse_csv
 from physion.trials.files import IndexedFile, TrialPaths
 from physion.trials.index import read_index
 
@@ -224,3 +228,58 @@ def _checked(file: IndexedFile | None, trial: str) -> Path:
         raise BadInputError(f"trial {trial!r} has no such movie; Trial.render makes its pictures")
     file.check()
     return file.path
+
+
+# Trials that someone has looked at and found unusable, with the reason, in a file of the dataset's
+# folder. A study that is made from the dataset leaves these trials out; the trials themselves stay.
+
+UNUSABLE = "unusable.csv"
+UNUSABLE_COLUMNS = (
+    must("trial", "text", "Name of the trial"),
+    must("reason", "text", "Why it is unusable"),
+)
+"""Columns of `UNUSABLE`."""
+_MAX_BYTES = 10_000_000
+
+
+def read_unusable(dataset: Dataset) -> dict[str, str]:
+    """Return the reasons by trial; none without a file.
+
+    Raises `BadInputError` for a file without the two columns, and for a trial without a reason or
+    that the dataset does not have.
+    """
+    path = dataset.folder / UNUSABLE
+    if not path.exists():
+        return {}
+    rows = check_table(
+        parse_csv(read_plain(path, _MAX_BYTES), str(path)), UNUSABLE_COLUMNS, str(path)
+    )
+    unknown = rows["trial"][~rows["trial"].isin(dataset.index["trial"])]
+    if len(unknown):
+        trial = unknown.iloc[0][:100]
+        raise BadInputError(
+            f"{path}, row {unknown.index[0] + 1}: the dataset has no trial {trial!r}"
+        )
+    return dict(zip(rows["trial"], rows["reason"], strict=True))
+
+
+def mark_unusable(dataset: Dataset, reasons: Mapping[str, str]) -> dict[str, str]:
+    """Add trials with their reasons to the file of a dataset; return all of its marks.
+
+    An empty reason takes the mark back. Raises `UnknownNameError` for a trial that the dataset does
+    not have.
+    """
+    marks = read_unusable(dataset)
+    known = set(dataset.index["trial"])
+    for trial, reason in reasons.items():
+        if trial not in known:
+            raise UnknownNameError(f"trial of {dataset.folder}:", trial, known)
+        words = " ".join(reason.split())
+        if words:
+            marks[trial] = words
+        else:
+            marks.pop(trial, None)
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerows([["trial", "reason"], *sorted(marks.items())])
+    write_atomic(dataset.folder / UNUSABLE, buffer.getvalue().encode())
+    return marks

@@ -29,9 +29,9 @@ from physion.analysis.people.responses import (
     scenarios_in,
 )
 from physion.analysis.people.results import analyse_people, read_any_responses
-from physion.analysis.tables import check_table, data_dictionary
 from physion.cli.main import main
 from physion.core.errors import BadInputError
+from physion.core.tables import check_table, data_dictionary
 from support.simulated_people import as_responses, simulate_study, study
 
 SMALL = {"people": 3, "stimuli": 6, "scenarios": ("collide",)}

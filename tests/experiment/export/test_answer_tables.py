@@ -11,8 +11,8 @@ import sqlalchemy as sa
 from pandas.testing import assert_frame_equal
 
 from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS
-from physion.analysis.tables import check_table
 from physion.core.errors import PhysionError, UnknownNameError
+from physion.core.tables import check_table
 from physion.experiment.experimenter.progress import StudyProgress
 from physion.experiment.export import tables as trial_rows
 from physion.experiment.export.tables import (

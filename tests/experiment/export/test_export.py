@@ -13,11 +13,11 @@ from pandas.testing import assert_frame_equal
 
 from physion.analysis.people.exclusions import flag_sessions, read_expected
 from physion.analysis.people.responses import read_responses
-from physion.analysis.tables import check_table, read_table
 from physion.cli.experiment import export as experiment_export
 from physion.cli.help import EXAMPLES
 from physion.cli.main import main
 from physion.core.errors import BadInputError, PhysionError
+from physion.core.tables import check_table, read_table
 from physion.experiment.export import export_study as export
 from physion.experiment.export.descriptions import restore_cell
 from physion.experiment.export.export_study import GONE, TABLES, export_study

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from physion.analysis.tables import Column, read_csv
+from physion.core.tables import Column, read_csv
 from physion.experiment.export.descriptions import guard_cell, restore_cell
 from physion.experiment.export.export_study import TableWriter
 from physion.experiment.study.stimuli import LOOKS, NAME

@@ -29,8 +29,9 @@ from physion.analysis.people.responses import is_number
 from physion.analysis.statistics.agreement import correlate_rows, pearson, z_rates
 from physion.analysis.statistics.paired import corrected_p
 from physion.analysis.statistics.regression import clustered_logit
-from physion.analysis.tables import RESERVED, attribute_names, in_order, require_columns
+from physion.analysis.tables import RESERVED, attribute_names, in_order
 from physion.core.errors import BadInputError
+from physion.core.tables import require_columns
 
 Array = npt.NDArray[np.float64]
 

@@ -21,9 +21,10 @@ import pandas as pd
 
 from physion.analysis.people.responses import Responses, scenarios_in
 from physion.analysis.statistics.regression import clustered_logit
-from physion.analysis.tables import in_order, read_table
+from physion.analysis.tables import in_order
 from physion.core.errors import BadInputError, ExclusionError, UnknownNameError
 from physion.core.names import OFFICIAL_SCENARIOS, canonical_name
+from physion.core.tables import read_table
 
 # Completeness of sessions: the stimuli that a session must have answered, and answers to others.
 #

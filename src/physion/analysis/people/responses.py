@@ -17,17 +17,10 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.tables import (
-    Column,
-    check_table,
-    in_order,
-    must,
-    read_csv,
-    read_table,
-    refuse_duplicates,
-)
+from physion.analysis.tables import in_order
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.names import OFFICIAL_SCENARIOS, canonical_name, is_ledge, scenario_of
+from physion.core.tables import Column, check_table, must, read_csv, read_table, refuse_duplicates
 
 # Schema of participant-level data, shared by the experiment's export and the analysis.
 #

@@ -60,14 +60,13 @@ from physion.analysis.tables import (
     attributes_from_names,
     attributes_from_table,
     better_attributes,
-    read_csv,
-    read_table,
 )
 from physion.analysis.tables import COLUMNS as ATTRIBUTE_COLUMNS
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import read_plain
 from physion.core.names import scenario_of
 from physion.core.settings import parse_json
+from physion.core.tables import read_csv, read_table
 
 _MAX_BYTES = 100_000_000
 

@@ -29,20 +29,11 @@ from physion.analysis.intervals import Bootstrap, wilson
 from physion.analysis.people.effects import below_chance_level
 from physion.analysis.people.measures import spearman_brown
 from physion.analysis.statistics.agreement import correlation_from_sums
-from physion.analysis.tables import (
-    MEAN,
-    READOUTS,
-    SCENARIO,
-    Column,
-    check_table,
-    must,
-    read_csv,
-    read_humans,
-    refuse_duplicates,
-)
+from physion.analysis.tables import MEAN, READOUTS, SCENARIO, read_humans
 from physion.analysis.with_participants import released_zone
 from physion.core.errors import BadInputError
 from physion.core.names import OFFICIAL_SCENARIOS, SCENARIOS, is_ledge
+from physion.core.tables import Column, check_table, must, read_csv, refuse_duplicates
 
 MODELS = {
     "SVG": "SVG",

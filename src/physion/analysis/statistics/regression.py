@@ -15,8 +15,8 @@ import pandas as pd
 from scipy import special, stats
 
 from physion.analysis.intervals import wilson
-from physion.analysis.tables import require_columns
 from physion.core.errors import BadInputError
+from physion.core.tables import require_columns
 
 Array = npt.NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from physion.core.version import __version__
 from physion.experiment.study.study import Study
 
 if TYPE_CHECKING:
-    from physion.analysis.tables import Column
+    from physion.core.tables import Column
 
 # --- labels of files and columns ---
 

@@ -41,9 +41,9 @@ from pyarrow import csv as arrow_csv
 from sqlalchemy import Connection, Engine, select
 
 from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS
-from physion.analysis.tables import Column, data_dictionary
 from physion.core.errors import BadInputError
 from physion.core.files import new_folder
+from physion.core.tables import Column, data_dictionary
 from physion.experiment.export.descriptions import (
     RULE,
     guard_cell,

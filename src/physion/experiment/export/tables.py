@@ -23,9 +23,9 @@ import pyarrow.compute as pc
 from sqlalchemy import Connection, Engine, select
 
 from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS
-from physion.analysis.tables import Column
 from physion.core.errors import PhysionError, UnknownNameError
 from physion.core.names import canonical_name
+from physion.core.tables import Column
 from physion.experiment.store.database import ANSWERS, EVENTS, PRACTICE_REPEATS, SESSIONS, STUDIES
 from physion.experiment.store.sessions import end_of
 from physion.experiment.study.orders import (

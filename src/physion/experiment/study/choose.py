@@ -17,7 +17,6 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from physion.analysis.tables import Column, check_table, must, read_csv
 from physion.compute.tasks import Executor, Progress
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import read_plain
@@ -31,6 +30,7 @@ from physion.core.names import (
 )
 from physion.core.seeds import generator, stable_hash
 from physion.core.settings import parse_json
+from physion.core.tables import Column, check_table, must, read_csv
 from physion.experiment.study.make import StimulusSource
 from physion.experiment.study.stimuli import MAX_FRAMES, is_name
 from physion.physics.engine import simulate
@@ -38,11 +38,10 @@ from physion.physics.labels import label_contact
 from physion.rendering.renderer import Renderer
 from physion.scenes.scene import OBSERVED_FRAMES
 from physion.scenes.tdw.read_logs import ImportedTrial
-from physion.trials.dataset import Dataset
+from physion.trials.dataset import Dataset, read_unusable
 from physion.trials.files import TrialPaths
 from physion.trials.making.plan import TrialTask, check_names, plan_scenes
 from physion.trials.state import outside_picture
-from physion.trials.unusable import read_unusable
 
 Look = Literal["free", "redyellow"]
 SPLITS = {"familiarization": "familiarization", "test": "testing"}

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pandas as pd
 
-from physion.analysis.tables import Column, check_table, must, read_csv
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import write_atomic
 from physion.core.names import canonical_name
+from physion.core.tables import Column, check_table, must, read_csv
 
 STIMULI_FILE = "stimuli.csv"
 MEDIA_FOLDER = "media"

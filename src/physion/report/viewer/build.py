@@ -29,10 +29,9 @@ from physion.report.html import style
 from physion.report.viewer import facts as viewer_facts
 from physion.report.viewer import movies as viewer_movies
 from physion.report.viewer.imagined import pack_imagined
-from physion.trials.dataset import Dataset
+from physion.trials.dataset import Dataset, read_unusable
 from physion.trials.share.gltf import motion_gltf
 from physion.trials.trial_file import Trial
-from physion.trials.unusable import read_unusable
 
 SCRIPTS = ("scene", "pictures", "detail", "page")
 """Parts of the script; the last one starts it."""

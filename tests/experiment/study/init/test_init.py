@@ -26,8 +26,8 @@ from physion.experiment.study.identity import Secrets, check_password
 from physion.experiment.study.make import StimulusSource, import_stimulus, make_study
 from physion.experiment.study.preset import MENTAL_ROTATION
 from physion.experiment.study.study import Study, load_study
+from physion.trials.dataset import mark_unusable
 from physion.trials.index import read_index, write_index
-from physion.trials.unusable import mark_unusable
 from physion.trials.video import read_frames
 from support.experiment.tiny_dataset import is_marked, make_tiny_dataset
 from support.experiment.tiny_study import CONTACT, OBSERVED, make_tiny_study, read_number
