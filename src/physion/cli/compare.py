@@ -12,20 +12,14 @@ PREDICTIONS are tables with at least two columns, stimulus and p_contact. What i
 from __future__ import annotations
 
 import json as json_module
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 if TYPE_CHECKING:
-    import pandas as pd
-
-    from physion.analysis.check import Checked, Reference
-    from physion.analysis.population import PopulationResults
-    from physion.analysis.published.claims import PublishedResults
-    from physion.report.compare import CompareResult
+    from physion.analysis.check import Checked
 
 
 @dataclass(frozen=True)
@@ -105,8 +99,8 @@ def main(options: Options) -> int:
 
 
 def _compare(options: Options) -> int:
-    from physion.cli.output import print_scores, print_warnings
-    from physion.report.compare import compare
+    from physion.cli.output import print_line, print_scores, print_warnings, text_table
+    from physion.report.compare import compare, population_tables
     from physion.report.html import movies_of
 
     movies = {} if options.dataset is None else movies_of(options.dataset)
@@ -140,97 +134,31 @@ def _compare(options: Options) -> int:
         scores = records(result.scores)
         print(json_module.dumps({"report": str(page), "scores": scores, **numbers}))
     else:
-        _print_left_out(result)
-        _print_changed(result)
+        for note in result.notes:
+            print_line(f"note: {note}")
         print_scores(result, page)
         if result.population is not None:
-            _print_population(result.population)
+            print_line("")
+            for title, table in population_tables(result.population).items():
+                print_line(text_table(table, title) + "\n")
     return 0
-
-
-def _print_population(results: PopulationResults) -> None:
-    """Print consensus and agreement in the mean over scenarios, and differences by scenario."""
-    from physion.analysis.tables import MEAN
-
-    consensus, agreement = (
-        t[t["scenario"] == MEAN] for t in (results.consensus, results.agreement)
-    )
-    _print("")
-    first = consensus[["population", "members", "ties", "stimuli"]].assign(
-        **_texts(consensus, {"accuracy of the consensus": "consensus", "of a member": "member"}),
-        **{"SD of members": consensus["member_sd"]},
-    )
-    _show("Populations: mean over scenarios; 95 % intervals over stimuli", first)
-    kappas = {"kappa of members": "kappa_members", "kappa of majorities": "kappa_majorities"}
-    apart = {"members disagree": "disagreement_members",
-             "majorities disagree": "disagreement_majorities"}  # fmt: skip
-    second = agreement[["first", "second"]].assign(**_texts(agreement, kappas | apart))
-    _show("Two members, and two majorities (of one population: of its halves)", second)
-    if len(results.differences):
-        names = {"of the consensus": "consensus", "of a member": "member"}
-        third = results.differences[["population", "scenario", "stimuli"]].assign(
-            **_texts(results.differences, names)
-        )
-        _show("Accuracy less people's", third)
-
-
-def _texts(table: pd.DataFrame, columns: Mapping[str, str]) -> dict[str, list[str]]:
-    """Return columns of a table with their intervals as texts, by heading."""
-    from physion.report.compare import with_interval
-
-    return {
-        heading: [with_interval(row, name) for _, row in table.iterrows()]
-        for heading, name in columns.items()
-    }
-
-
-def _print_left_out(result: CompareResult) -> None:
-    """Say how many stimuli of the predictions are left out, and why."""
-    from physion.analysis.comparison import NOT_PREDICTED
-    from physion.report.inputs import ReportInputs
-
-    if isinstance(result.inputs, ReportInputs):
-        dropped = result.inputs.comparison.dropped
-        given = dropped[(dropped["model"] != "") & (dropped["reason"] != NOT_PREDICTED)]
-        counts = given.groupby("reason", sort=False)["stimuli"].max()
-        for reason, count in counts.items():
-            _print(f"note: {count} stimuli left out: {reason}")
-
-
-def _print_changed(result: CompareResult) -> None:
-    """Name the stimuli whose simulated outcome is not the recorded one."""
-    from physion.report.inputs import ReportInputs
-
-    if not isinstance(result.inputs, ReportInputs) or result.inputs.comparison.changed.empty:
-        return
-    comparison = result.inputs.comparison
-    names, shown = list(comparison.changed["stimulus"]), 5
-    more = f" and {len(names) - shown} more" if len(names) > shown else ""
-    _print(
-        f"note: {len(names)} of {comparison.stimuli['stimulus'].nunique()} stimuli ended otherwise "
-        f"in a simulation than recorded; the recorded outcome counts: {', '.join(names[:shown])}"
-        f"{more} (tables/changed_outcomes.csv)"
-    )
-
-
-# --- check ---------------------------------------------------------------------------------------
 
 
 def _check(options: Options) -> int:
     """Print the faults; return 1 if one of them is an error."""
-    from physion.analysis.check import check_predictions_file
-    from physion.core.errors import BadInputError
+    from physion.report.compare import check_files
 
-    if not options.predictions and not options.responses:
-        raise BadInputError("nothing to check: give files of predictions, or --responses")
-    reference = _reference(options)
-    found = []
-    if options.responses:
-        checked, outcomes = _check_responses(options, reference.labels)
-        found.append(checked)
-        if reference.labels is None and outcomes:
-            reference = replace(reference, labels=outcomes)
-    found += [check_predictions_file(path, reference) for path in options.predictions]
+    found = check_files(
+        options.predictions,
+        humans=options.humans,
+        responses=options.responses,
+        labels=options.labels,
+        sessions=options.sessions,
+        rules=options.rules,
+        expected=options.expected,
+        dataset=options.dataset,
+        fitted=options.fitted,
+    )
     if options.json:
         print(json_module.dumps([{**asdict(each), "errors": each.errors} for each in found]))
     else:
@@ -239,53 +167,13 @@ def _check(options: Options) -> int:
     return 1 if any(each.errors for each in found) else 0
 
 
-def _reference(options: Options) -> Reference:
-    from physion.analysis.check import Reference, read_index
-    from physion.analysis.tables import LABELS_FILE, read_stimulus_list
-    from physion.core.errors import BadInputError
-    from physion.report.compare import read_averages, read_outcomes
-
-    labels = read_outcomes(options.labels)
-    if labels is None and options.humans is not None:
-        _, labels, _, _ = read_averages(options.humans)
-        if labels is None:
-            raise BadInputError(f"no {LABELS_FILE} lies near {options.humans}; give --labels")
-    return Reference(
-        labels=labels,
-        index=None if options.dataset is None else read_index(options.dataset),
-        fitted=None if options.fitted is None else read_stimulus_list(options.fitted),
-    )
-
-
-def _check_responses(
-    options: Options, labels: Mapping[str, bool] | None
-) -> tuple[Checked, dict[str, bool]]:
-    """Check the responses, and return the outcomes of the stimuli that people answered."""
-    from physion.analysis.check import check_responses
-    from physion.analysis.people.exclusions import find_expected, read_expected
-    from physion.analysis.people.results import rules_called
-
-    path = options.expected or find_expected(options.responses)
-    checked, responses = check_responses(
-        options.responses,
-        options.sessions,
-        labels,
-        None if path is None else read_expected(path),
-        rules_called(options.rules, options.responses),
-    )
-    if responses is None:
-        return checked, {}
-    rows = responses.test.drop_duplicates("stimulus")
-    return checked, dict(zip(rows["stimulus"], rows["label"].astype(bool), strict=True))
-
-
 def _print_checked(checked: Checked) -> None:
-    from physion.cli.output import counted
+    from physion.cli.output import counted, print_line
 
     for fault in checked.faults:
-        _print(f"{checked.file}: {fault}")
+        print_line(f"{checked.file}: {fault}")
     for words in checked.not_checked:
-        _print(f"{checked.file}: not checked: {words}")
+        print_line(f"{checked.file}: not checked: {words}")
     errors, warnings = checked.errors, len(checked.faults) - checked.errors
     what = counted(len(checked.models), "model")
     if checked.people:
@@ -293,110 +181,30 @@ def _print_checked(checked: Checked) -> None:
             f"{scenario}: {counted(n, 'person', 'people')}"
             for scenario, n in checked.people.items()
         )
-    _print(
+    print_line(
         f"{checked.file}: {counted(checked.rows, 'row')}, {what}, {counted(errors, 'error')}, "
         f"{counted(warnings, 'warning')}"
     )
 
 
-# --- published numbers ---------------------------------------------------------------------------
-
-
 def _published(options: Options) -> int:
     """Print the published numbers next to ours; write a page if asked."""
-    from physion.analysis.published.claims import published_results
-    from physion.data.official import PACKAGED, find_official
-    from physion.report.published import build_published_report, published_numbers
+    from physion.cli.output import print_line, text_table
+    from physion.data.official import PACKAGED
+    from physion.report.published import (
+        build_published_report,
+        published_numbers,
+        published_parts,
+        recompute_published,
+    )
 
-    folder = options.humans or Path(PACKAGED)
-    data = find_official(folder)
-    results = published_results(folder if data is None else data.results.parent)
+    results = recompute_published(options.humans or PACKAGED)
     page = None if options.out is None else build_published_report(results, options.out)
     if options.json:
         print(json_module.dumps(published_numbers(results), indent=1))
         return 0
-    _print_published(results)
+    for words, table in published_parts(results):
+        print_line((words if table is None else text_table(table, words)) + "\n")
     if page is not None:
-        _print(f"report: {page}")
+        print_line(f"report: {page}")
     return 0
-
-
-def _print_published(results: PublishedResults) -> None:
-    from physion.analysis.published.claims import TITLES
-    from physion.analysis.published.tables import grid
-
-    tables, words = results.tables, results.descriptions
-    accuracies = tables["accuracies"]
-    _show("Accuracy as published (means of all released rows)", grid(accuracies, "published"))
-    _show("Accuracy, trained on all, observed+simulated", grid(accuracies, "expected"))
-    _say(words["accuracies"])
-    for name, measure in (("panel_a", "accuracy"), ("panel_c", "kappa")):
-        table = tables[name]
-        mean = table[table["scenario"] == "mean"]
-        ends = ["low", "high", "people", "zone_low", "zone_high", "in_zone"]
-        _show(TITLES[name], mean[["model", measure, *ends]])
-    for name, column in (("panel_d", "readout"), ("panel_e", "training")):
-        _show(TITLES[name], _wide(tables[name], column))
-    _say(words["panels"])
-    _show(TITLES["accuracy_kappa"], tables["accuracy_kappa"])
-    _say(words["accuracy_kappa"])
-    for name in ("figure_s3", "not_made"):
-        _show(TITLES[name], tables[name])
-    _print_regressions(tables["regressions"])
-    _say(words["regressions"])
-    people = ["scenario", "accuracy", "accuracy_low", "accuracy_high", "printed", "zone_low"]
-    people += ["zone_high", "kappa", "half_r", "half_r_full"]
-    counts = ["participants", "stimuli", "below_chance"]
-    _show(TITLES["people"], tables["people"][[*people, *counts]])
-    _show(TITLES["people_claims"], tables["people_claims"])
-    _say(words["people"])
-    if len(tables["left_out"]):
-        _show(TITLES["left_out"], tables["left_out"])
-
-
-def _wide(table: pd.DataFrame, column: str) -> pd.DataFrame:
-    names = list(dict.fromkeys(table["model"])), list(dict.fromkeys(table[column]))
-    wide = table.pivot(index="model", columns=column, values="accuracy")
-    return wide.reindex(index=names[0], columns=names[1]).reset_index()
-
-
-def _print_regressions(table: pd.DataFrame) -> None:
-    import pandas as pd
-
-    from physion.analysis.published.claims import TITLES
-
-    rows = []
-    for row in table.to_dict("records"):
-        printed = [f"{key} {row[f'printed_{key}']}" for key in "btp" if row[f"printed_{key}"]]
-        rows.append(
-            {
-                "claim": row["claim"],
-                "printed": ", ".join(printed),
-                **{fit: _estimate(row, fit) for fit in ("run", "once", "asked")},
-                "figures": row["met"],
-            }
-        )
-    _show(TITLES["regressions"], pd.DataFrame(rows))
-    for row in table.to_dict("records"):
-        _print(f"{row['claim']}: compares {row['compared']}. {row['differs']}")
-
-
-def _estimate(row: Mapping[Any, Any], fit: str) -> str:
-    b, t, df, p = (float(str(row[f"{fit}_{name}"])) for name in ("b", "t", "df", "p"))
-    return f"b {b:.3f}, t({df:.0f}) {t:.1f}, p {p:.1g}"
-
-
-def _show(title: str, table: pd.DataFrame) -> None:
-    from physion.cli.output import text_table
-
-    _say(text_table(table, title))
-
-
-def _say(text: str) -> None:
-    _print(text + "\n")
-
-
-def _print(text: str) -> None:
-    from physion.cli.output import console
-
-    console.print(text, markup=False, soft_wrap=True)

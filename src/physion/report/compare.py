@@ -14,8 +14,15 @@ from typing import Any, TypeAlias
 
 import pandas as pd
 
+from physion.analysis.check import (
+    Checked,
+    Reference,
+    check_predictions_file,
+    check_responses,
+    read_index,
+)
 from physion.analysis.compare import all_results, tidy_scores
-from physion.analysis.comparison import check_coverage
+from physion.analysis.comparison import NOT_PREDICTED, check_coverage
 from physion.analysis.intervals import Bootstrap
 from physion.analysis.model_tests import fits_of_people
 from physion.analysis.people.exclusions import Expected, find_expected, read_expected
@@ -58,7 +65,7 @@ from physion.core.names import SCENARIOS
 from physion.core.tables import read_csv, read_table, refuse_duplicates, require_columns
 from physion.data.official import PACKAGED, find_official, official
 from physion.report.build import build_people_report, build_report
-from physion.report.html import plural
+from physion.report.html import MACROS, plural
 from physion.report.inputs import PeopleReport, ReportInputs
 from physion.report.people import describe_attributes
 from physion.tasks.logs import is_log, read_answers
@@ -105,6 +112,26 @@ class CompareResult:
     def population(self) -> PopulationResults | None:
         """Consensus, agreement and differences of populations; None if not asked for."""
         return None if isinstance(self.inputs, PeopleReport) else self.inputs.population
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """How many stimuli are left out, and which ended otherwise when simulated than recorded."""
+        if isinstance(self.inputs, PeopleReport):
+            return ()
+        comparison = self.inputs.comparison
+        dropped = comparison.dropped
+        given = dropped[(dropped["model"] != "") & (dropped["reason"] != NOT_PREDICTED)]
+        counts = given.groupby("reason", sort=False)["stimuli"].max()
+        notes = [f"{count} stimuli left out: {reason}" for reason, count in counts.items()]
+        if len(comparison.changed):
+            names, shown = list(comparison.changed["stimulus"]), 5
+            more = f" and {len(names) - shown} more" if len(names) > shown else ""
+            notes.append(
+                f"{len(names)} of {comparison.stimuli['stimulus'].nunique()} stimuli ended "
+                "otherwise in a simulation than recorded; the recorded outcome counts: "
+                f"{', '.join(names[:shown])}{more} (tables/changed_outcomes.csv)"
+            )
+        return tuple(notes)
 
     @property
     def results(self) -> pd.DataFrame:
@@ -155,7 +182,10 @@ class CompareResult:
         return f"{self.heading}\n{self._own().to_string(index=False)}"
 
     def _repr_html_(self) -> str:
-        return f"<p>{self.heading}</p>{self._own().to_html(index=False)}"
+        own = self._own()
+        return str(
+            MACROS.table(list(own), [("", own.astype(str).to_numpy().tolist())], self.heading)
+        )
 
     def _own(self) -> pd.DataFrame:
         """Return `summary` without what others published."""
@@ -201,6 +231,102 @@ def with_interval(row: pd.Series, name: str) -> str:
     if pd.isna(value):
         return ""
     return f"{value:.3f}" + ("" if pd.isna(low) else f" [{low:.3f}, {high:.3f}]")
+
+
+def population_tables(results: PopulationResults) -> dict[str, pd.DataFrame]:
+    """Return consensus and agreement in the mean over scenarios, and differences by scenario.
+
+    Numbers are texts with their intervals; the keys are titles.
+    """
+    consensus, agreement = (
+        t[t["scenario"] == MEAN] for t in (results.consensus, results.agreement)
+    )
+    first = consensus[["population", "members", "ties", "stimuli"]].assign(
+        **_texts(consensus, {"accuracy of the consensus": "consensus", "of a member": "member"}),
+        **{"SD of members": consensus["member_sd"]},
+    )
+    kappas = {"kappa of members": "kappa_members", "kappa of majorities": "kappa_majorities"}
+    apart = {"members disagree": "disagreement_members",
+             "majorities disagree": "disagreement_majorities"}  # fmt: skip
+    second = agreement[["first", "second"]].assign(**_texts(agreement, kappas | apart))
+    tables = {
+        "Populations: mean over scenarios; 95 % intervals over stimuli": first,
+        "Two members, and two majorities (of one population: of its halves)": second,
+    }
+    if len(results.differences):
+        names = {"of the consensus": "consensus", "of a member": "member"}
+        tables["Accuracy less people's"] = results.differences[
+            ["population", "scenario", "stimuli"]
+        ].assign(**_texts(results.differences, names))
+    return tables
+
+
+def _texts(table: pd.DataFrame, columns: Mapping[str, str]) -> dict[str, list[str]]:
+    """Return columns of a table with their intervals as texts, by heading."""
+    return {
+        heading: [with_interval(row, name) for _, row in table.iterrows()]
+        for heading, name in columns.items()
+    }
+
+
+def check_files(
+    predictions: Sequence[Path] = (),
+    *,
+    humans: Path | None = None,
+    responses: Sequence[Path] = (),
+    labels: Path | None = None,
+    sessions: Path | None = None,
+    rules: str | None = None,
+    expected: Path | None = None,
+    dataset: Path | None = None,
+    fitted: Path | None = None,
+) -> list[Checked]:
+    """Check files before a comparison: the responses, then each file of predictions.
+
+    Parameters
+    ----------
+    predictions, humans, responses, labels, sessions, rules, expected
+        As in `compare`. Outcomes of the responses serve where no others are given.
+    dataset
+        Dataset of the trials: no predicted one may be in another split.
+    fitted
+        List of the stimuli on which the readout was fitted.
+
+    Returns
+    -------
+    checked
+        Every fault with its row, by file.
+
+    Raises
+    ------
+    BadInputError
+        If there is nothing to check, or a file is no table.
+    """
+    if not predictions and not responses:
+        raise BadInputError("nothing to check: give files of predictions, or --responses")
+    outcomes = read_outcomes(labels)
+    if outcomes is None and humans is not None:
+        _, outcomes, _, _ = read_averages(humans)
+        if outcomes is None:
+            raise BadInputError(f"no {LABELS_FILE} lies near {humans}; give --labels")
+    found = []
+    index = None if dataset is None else read_index(dataset)
+    known = None if fitted is None else read_stimulus_list(fitted)
+    if responses:
+        path = expected or find_expected(responses)
+        checked, read = check_responses(
+            responses,
+            sessions,
+            outcomes,
+            None if path is None else read_expected(path),
+            rules_called(rules, responses),
+        )
+        found.append(checked)
+        if outcomes is None and read is not None and len(read.test):
+            rows = read.test.drop_duplicates("stimulus")
+            outcomes = dict(zip(rows["stimulus"], rows["label"].astype(bool), strict=True))
+    reference = Reference(outcomes, index, known)
+    return [*found, *(check_predictions_file(path, reference) for path in predictions)]
 
 
 def compare(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,13 @@ from physion.analysis.figure_tables import (
     PARTICIPANTS,
     SCENARIO_ZONE,
 )
-from physion.analysis.published.claims import TITLES, PublishedResults
+from physion.analysis.published.claims import TITLES, PublishedResults, published_results
 from physion.analysis.published.tables import grid
 from physion.analysis.tables import MEAN, records
 from physion.core.files import write_atomic
 from physion.core.html import Markup, joined
 from physion.core.version import MADE_WITH
+from physion.data.official import PACKAGED, find_official
 from physion.report.build import prepare_folder, write_csv, write_plot
 from physion.report.figures.by_scenario import measure_figure, model_and_people_figure
 from physion.report.figures.by_stimulus import difficulty_figure
@@ -46,6 +47,12 @@ from physion.report.html import (
 TITLE = "The published results of the original study, recomputed from its released tables"
 
 
+def recompute_published(humans: Path | str = PACKAGED) -> PublishedResults:
+    """Recompute the published numbers from the released tables: the package's, or of a folder."""
+    data = find_official(humans)
+    return published_results(Path(humans) if data is None else data.results.parent)
+
+
 def build_published_report(results: PublishedResults, folder: Path) -> Path:
     """Write ``report.html``, ``published.json``, ``tables/*.csv``, ``figures/*``; return the page's
     path.
@@ -67,6 +74,67 @@ def published_numbers(results: PublishedResults) -> dict[str, Any]:
     """Return every table, as a list of rows, and its description for JSON; NaN becomes null."""
     tables = {name: records(rows) for name, rows in results.tables.items()}
     return {"package": MADE_WITH, "tables": tables, "words": dict(results.descriptions)}
+
+
+# --- text ---------------------------------------------------------------------------------------
+
+
+def published_parts(results: PublishedResults) -> Iterator[tuple[str, pd.DataFrame | None]]:
+    """Yield what a terminal shows: titles with their tables, and paragraphs without one."""
+    tables, words = results.tables, results.descriptions
+    accuracies = tables["accuracies"]
+    yield "Accuracy as published (means of all released rows)", grid(accuracies, "published")
+    yield "Accuracy, trained on all, observed+simulated", grid(accuracies, "expected")
+    yield words["accuracies"], None
+    for name, measure in (("panel_a", "accuracy"), ("panel_c", "kappa")):
+        table = tables[name]
+        ends = ["low", "high", "people", "zone_low", "zone_high", "in_zone"]
+        yield TITLES[name], table[table["scenario"] == MEAN][["model", measure, *ends]]
+    for name, column in (("panel_d", "readout"), ("panel_e", "training")):
+        yield TITLES[name], _wide(tables[name], column)
+    yield words["panels"], None
+    yield TITLES["accuracy_kappa"], tables["accuracy_kappa"]
+    yield words["accuracy_kappa"], None
+    for name in ("figure_s3", "not_made"):
+        yield TITLES[name], tables[name]
+    yield TITLES["regressions"], _regression_rows(tables["regressions"])
+    claims = tables["regressions"].to_dict("records")
+    compares = [f"{row['claim']}: compares {row['compared']}. {row['differs']}" for row in claims]
+    yield "\n".join([*compares, words["regressions"]]), None
+    people = ["scenario", "accuracy", "accuracy_low", "accuracy_high", "printed", "zone_low"]
+    people += ["zone_high", "kappa", "half_r", "half_r_full"]
+    counts = ["participants", "stimuli", "below_chance"]
+    yield TITLES["people"], tables["people"][[*people, *counts]]
+    yield TITLES["people_claims"], tables["people_claims"]
+    yield words["people"], None
+    if len(tables["left_out"]):
+        yield TITLES["left_out"], tables["left_out"]
+
+
+def _wide(table: pd.DataFrame, column: str) -> pd.DataFrame:
+    names = list(dict.fromkeys(table["model"])), list(dict.fromkeys(table[column]))
+    wide = table.pivot(index="model", columns=column, values="accuracy")
+    return wide.reindex(index=names[0], columns=names[1]).reset_index()
+
+
+def _regression_rows(table: pd.DataFrame) -> pd.DataFrame:
+    rows = []
+    for row in table.to_dict("records"):
+        printed = [f"{key} {row[f'printed_{key}']}" for key in "btp" if row[f"printed_{key}"]]
+        rows.append(
+            {
+                "claim": row["claim"],
+                "printed": ", ".join(printed),
+                **{fit: _estimate(row, fit) for fit in ("run", "once", "asked")},
+                "figures": row["met"],
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _estimate(row: Mapping[Any, Any], fit: str) -> str:
+    b, t, df, p = (float(str(row[f"{fit}_{name}"])) for name in ("b", "t", "df", "p"))
+    return f"b {b:.3f}, t({df:.0f}) {t:.1f}, p {p:.1g}"
 
 
 # --- figures ------------------------------------------------------------------------------------
