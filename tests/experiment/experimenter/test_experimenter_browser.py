@@ -77,7 +77,7 @@ def test_all_pages_are_whole(chromium: Any, site: tuple[Study, str], scheme: str
         page.goto(url + place)
         assert page.evaluate("document.documentElement.scrollWidth") <= 1024, place
         cut = page.evaluate(
-            "[...document.querySelectorAll('.scroll')].filter(e => e.scrollWidth > e.clientWidth)"
+            "[...document.querySelectorAll('.wide')].filter(e => e.scrollWidth > e.clientWidth)"
             ".map(e => e.innerText.slice(0, 80))"
         )
         assert cut == [], f"{place}: a table is wider than the window"
