@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import sys
 
-from physion.cli.help import VERBS, describe, find_module
+from physion.cli.help import VERBS, describe, find_module, module_of
 
 OUTPUT_CLOSED = 141
 """Exit code that shells show for programs that write to a closed pipe: 128 + SIGPIPE."""
@@ -77,6 +77,8 @@ def _run_verb(args: list[str]) -> int:
         " ".join(["physion", *args[:taken]]),
         describe(module.__doc__, args[:taken]),
     )
+    if taken == 2:
+        module_of(args[0]).require_extra(args[1])
     return int(module.main(options))
 
 

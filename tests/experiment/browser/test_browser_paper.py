@@ -12,8 +12,7 @@ import pytest
 
 from physion.cli.main import main
 from physion.experiment.server_process import ServerProcess
-from physion.experiment.study.preset import MENTAL_ROTATION, PAPER
-from physion.experiment.study.settings import Recruitment
+from physion.experiment.study.settings import MENTAL_ROTATION, PAPER, Recruitment
 from physion.experiment.study.study import Study
 from physion.experiment.study.texts import TEXTS_FOLDER, shipped_question
 from support.experiment.browser import FAST, SHORT, Visit, rows_of

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from physion.experiment.study.preset import MENTAL_ROTATION
+from physion.experiment.study.settings import MENTAL_ROTATION
 from physion.experiment.study.texts import shipped_languages, shipped_question
 from support.paths import ROOT
 

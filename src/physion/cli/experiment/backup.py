@@ -31,9 +31,6 @@ class Options:
 
 def main(options: Options) -> int:
     """Back up; print the path of the new folder."""
-    from physion.cli.experiment.experiment import require_extra
-
-    require_extra()
     from physion.experiment.store.lab import back_up
 
     made = back_up(

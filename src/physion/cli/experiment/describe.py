@@ -25,9 +25,6 @@ class Options:
 
 def main(options: Options) -> int:
     """Write the documents; print their paths."""
-    from physion.cli.experiment.experiment import require_extra
-
-    require_extra()
     from physion.cli.output import print_line
     from physion.experiment.export.documents import write_documents
     from physion.experiment.study.study import load_study

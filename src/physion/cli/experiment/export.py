@@ -31,9 +31,6 @@ class Options:
 
 def main(options: Options) -> int:
     """Export; print the number of sessions and what was left out."""
-    from physion.cli.experiment.experiment import require_extra
-
-    require_extra()
     from physion.experiment.export.descriptions import count_lines
     from physion.experiment.export.export_study import export_study
     from physion.experiment.store.database import open_database

@@ -33,14 +33,12 @@ class Options:
 
 def main(options: Options) -> int:
     """Delete; print the number of ids or sessions."""
-    from physion.cli.experiment.experiment import require_extra
     from physion.core.errors import BadInputError
 
     if [bool(options.participant), options.all, bool(options.session)].count(True) != 1:
         raise BadInputError(
             "give the ids to delete, --participant HASH or --all, or a session, --session REFERENCE"
         )
-    require_extra()
     from physion.experiment.store.lab import forget, forget_sessions
 
     if options.session:

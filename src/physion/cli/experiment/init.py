@@ -82,9 +82,6 @@ class Options:
 
 def main(options: Options) -> int:
     """Create the study; print its password once, and the next steps."""
-    from physion.cli.experiment.experiment import require_extra
-
-    require_extra()
     from physion.cli.output import Stages
     from physion.experiment.export.documents import write_documents
     from physion.experiment.study.identity import read_password
@@ -206,7 +203,7 @@ def _choose_listed(options: Options) -> StimulusSelection:
 
 def _study(options: Options, scenarios: tuple[str, ...]) -> Study:
     """Return the settings of the new study."""
-    from physion.experiment.study.preset import MENTAL_ROTATION, PAPER
+    from physion.experiment.study.settings import MENTAL_ROTATION, PAPER
     from physion.experiment.study.study import Study
 
     chosen = dict(PAPER) if options.preset == "paper" else {}

@@ -35,9 +35,6 @@ class Options:
 
 def main(options: Options) -> int:
     """Print the links."""
-    from physion.cli.experiment.experiment import require_extra
-
-    require_extra()
     from physion.experiment.study.identity import Secrets
     from physion.experiment.study.recruitment import links
     from physion.experiment.study.study import load_study

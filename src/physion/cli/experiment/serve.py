@@ -43,9 +43,6 @@ class Options:
 
 def main(options: Options) -> int:
     """Serve until stopped; return exit status 0."""
-    from physion.cli.experiment.experiment import require_extra
-
-    require_extra()
     from physion.experiment.server import Address, serve
     from physion.experiment.study.identity import read_password, set_password
 

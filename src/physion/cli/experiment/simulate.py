@@ -48,9 +48,6 @@ class Options:
 
 def main(options: Options) -> int:
     """Simulate; return exit status 1 if any participant was refused or failed."""
-    from physion.cli.experiment.experiment import require_extra
-
-    require_extra()
     from physion.experiment.simulated import SimulationPlan, simulate
     from physion.experiment.study.identity import Secrets
     from physion.experiment.study.study import load_study

@@ -21,8 +21,7 @@ from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError
 from physion.core.files import digest_of, new_folder, read_plain, write_atomic
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.preset import SHIPPED
-from physion.experiment.study.settings import format_settings
+from physion.experiment.study.settings import SHIPPED, format_settings
 from physion.experiment.study.stimuli import (
     MAX_SIDE,
     MEDIA_FOLDER,

@@ -24,7 +24,7 @@ from physion.experiment.study import make as study_folder
 from physion.experiment.study.choose import choose_familiarization, choose_trials
 from physion.experiment.study.identity import Secrets, check_password
 from physion.experiment.study.make import StimulusSource, import_stimulus, make_study
-from physion.experiment.study.preset import MENTAL_ROTATION
+from physion.experiment.study.settings import MENTAL_ROTATION
 from physion.experiment.study.study import Study, load_study
 from physion.trials.dataset import mark_unusable
 from physion.trials.index import read_index, write_index
