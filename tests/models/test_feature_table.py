@@ -277,7 +277,7 @@ def test_a_damaged_file_is_refused_in_one_line(
 def test_text_with_the_ending_npz_is_not_called_pickled(tmp_path: Path) -> None:
     path = tmp_path / "net.npz"
     path.write_text("names, frames, features")
-    with pytest.raises(BadInputError, match=r"cannot be read: it is no npz file"):
+    with pytest.raises(BadInputError, match=r"cannot be read: it is not an npz file"):
         build_model(str(path))
 
 

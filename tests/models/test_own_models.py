@@ -354,7 +354,7 @@ def test_the_digest_of_an_extractor_follows_source_weights_and_gap(
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("(torch.nn.Module)", "", "is no torch Module"),
+        ("(torch.nn.Module)", "", "is not a torch"),
         ("return change, self.gap, self.least", "return change", "expected a transform, the gap"),
         ("self.gap, self.least\n\n", "self.gap, 0\n\n", "expected a transform, the gap"),
         ("change, self.gap", "change, 'slow'", "expected a transform, the gap"),

@@ -169,7 +169,7 @@ def test_changed_trials_link_to_their_movies(make_comparison: Maker, tmp_path: P
 
 def test_bad_movies_are_refused_and_no_page_is_left(make_comparison: Maker, tmp_path: Path) -> None:
     comparison = make_comparison()
-    for name, message in (("none.mp4", "is not there"), ("movie.exe", "no movie")):
+    for name, message in (("none.mp4", "is not there"), ("movie.exe", "cannot be shown")):
         movies = dict.fromkeys(comparison.stimuli["stimulus"], tmp_path / name)
         with pytest.raises(BadInputError, match=message):
             build_report(ReportInputs(comparison, movies=movies), tmp_path / "out")

@@ -239,7 +239,7 @@ EVIL: dict[str, tuple[str, Callable[[h5py.File], None]]] = {
     ),
     "group gone": ("contacts/frame.*is missing", lambda f: f.__delitem__("contacts")),
     "group for array": ("scene.*is not an array", group_for_array),
-    "array for group": ("contacts/frame.*no group", array_for_group),
+    "array for group": ("contacts/frame.*not a group", array_for_group),
     "external link": ("scene.*is a ExternalLink", external_link),
     "soft link": ("contacts/point.*is a SoftLink", soft_link),
     "external storage": ("contacts/impulse.*not stored in chunks", external_storage),

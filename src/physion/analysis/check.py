@@ -323,7 +323,7 @@ def _leaks(rows: pd.DataFrame, against: Reference) -> list[Fault]:
     stimulus = rows["stimulus"]
     split = rows["split"].str.lower()
     reason = pd.Series("", index=rows.index, dtype=object)
-    reason = reason.mask(~split.isin(["", *TESTING]), "column split says it is no test trial")
+    reason = reason.mask(~split.isin(["", *TESTING]), "column split says it is not a test trial")
     if against.fitted is not None:
         on = stimulus.isin({canonical_name(name) for name in against.fitted})
         reason = reason.mask(on, "the readout was fitted on it")

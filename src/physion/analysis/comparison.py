@@ -309,7 +309,7 @@ class Comparison:
 
     @property
     def models(self) -> list[str]:
-        """Names of the models that are no baselines; if all are, of all."""
+        """Names of the models that are not baselines; if all are, of all."""
         return [name for name in self.names if kind_of(name) == "model"] or self.names
 
     @property

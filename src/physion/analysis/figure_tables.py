@@ -218,13 +218,12 @@ def calibration_table(comparison: Comparison) -> pd.DataFrame:
 
 
 def thirds_table(comparison: Comparison, answers: pd.DataFrame | None = None) -> pd.DataFrame:
-    """Return r with the average person within the stimuli that are hard, chance and easy for
-    people.
+    """Return Pearson's r with the average person for hard, at-chance and easy stimuli.
 
-    `MEASURE_COLUMNS` and ``stimuli``, their number; a panel a third. r is computed in each scenario
-    and averaged; intervals draw the scenarios, from three on, as in the paper. With the ``answers``
-    of participants (``test`` of `Responses`) the dashed line is the r of halves of them with each
-    other, likewise averaged, and so are the bounds of its zone.
+    `MEASURE_COLUMNS` and ``stimuli``, their number; one panel per third. r is computed in each
+    scenario and averaged; intervals draw the scenarios, from three on, as in the paper. With the
+    ``answers`` of participants (``test`` of `Responses`) the dashed line is the r of halves of them
+    with each other, likewise averaged, and so are the bounds of its zone.
     """
     people = _halves_by_third(comparison, answers)
     stimuli = pd.concat([comparison.stimuli, baseline_stimuli(comparison.stimuli)])

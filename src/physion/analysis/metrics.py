@@ -400,8 +400,8 @@ def _correlation(sums: Sums) -> Array:
 
 # Metrics of likeness to people beyond what both owe to the outcome.
 #
-# Whoever predicts outcomes well resembles people, since people predict them well too: the recorded
-# outcome itself, a perfect simulator, correlates with P(yes). These metrics take out that part.
+# Accurate models correlate with people simply because people are accurate: even the recorded
+# outcome, a perfect simulator, correlates with P(yes). These metrics remove that part.
 
 BEYOND_OUTCOME = ("r_beyond_outcome", "kappa_beyond_outcome", "kappa_within_outcomes")
 """Names of the metrics of this module."""

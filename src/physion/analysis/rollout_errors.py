@@ -44,7 +44,7 @@ def read_rollout_errors(paths: Sequence[Path]) -> pd.DataFrame:
     ``baseline``.
 
     A model that is in several files is named with each file. Raises `BadInputError` for a file that
-    is no such table.
+    is not such a table.
     """
     tables = {path: check_table(read_csv(path), ERRORS, str(path)) for path in paths}
     count = Counter(name for table in tables.values() for name in set(table["model"]))

@@ -524,7 +524,9 @@ def attributes_from_names(stimuli: Iterable[str]) -> pd.DataFrame:
 def _from_name(stimulus: str) -> dict[str, Any]:
     scenario = scenario_of(stimulus)
     if scenario is None:
-        raise BadInputError(f"{stimulus!r} is no official name; give a table of attributes instead")
+        raise BadInputError(
+            f"{stimulus!r} is not an official name; give a table of attributes instead"
+        )
     configuration = _NUMBERED.sub("", stimulus)
     result = {name: _first(patterns, configuration) for name, patterns in _PATTERNS.items()}
     if scenario in _ALWAYS_ONE_EACH:

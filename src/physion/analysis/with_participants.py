@@ -575,7 +575,7 @@ def released_zone(
     """Return the grey band of the published panels for accuracy and kappa: mean, low, high.
 
     It is a bootstrap over the values of the eight scenarios. It shows how far their mean would vary
-    with other scenarios, and not how participants differ, so it is no human zone, although the
+    with other scenarios, and not how participants differ, so it is not a human zone, although the
     paper names it so. The released code drew without a seed.
     """
     values = np.asarray(scenario_values, dtype=np.float64)

@@ -181,7 +181,7 @@ def _described(options: Any) -> tuple[str, ...]:
     """Return all options of a dataclass, and write into its annotations how the help shows them.
 
     Values get names, defaults that say nothing (None, no text, no names, False) are left out, and
-    a switch that is off has no ``--no-`` form. A field with `OPTION_ONLY` is no option.
+    a switch that is off has no ``--no-`` form. A field with `OPTION_ONLY` is not an option.
     """
     names = ["-h", "--help"]
     hints, texts = get_type_hints(options, include_extras=True), _texts(options)

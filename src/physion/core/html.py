@@ -37,5 +37,5 @@ def macros_of(package: str, template: str = "macros.html") -> Any:
 
 
 def joined(parts: Iterable[str]) -> Markup:
-    """Return parts of a page below each other; parts that are no `Markup` are escaped."""
+    """Return parts of a page below each other; parts that are not `Markup` are escaped."""
     return Markup("\n").join(part for part in parts if part)

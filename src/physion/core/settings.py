@@ -259,7 +259,7 @@ def _plain(value: Any) -> Any:
     to_list: Callable[[], Any] | None = getattr(value, "tolist", None)  # numbers of numpy
     if to_list is not None:
         return to_list()
-    raise TypeError(f"{shown(value)} is no text, number, list or object")
+    raise TypeError(f"{shown(value)} is not a text, number, list or object")
 
 
 def _text(path: Path) -> str:

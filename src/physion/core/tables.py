@@ -247,6 +247,21 @@ def require_columns(table: pd.DataFrame, columns: Iterable[str], where: str) -> 
         raise BadInputError(f"{where} lacks the column(s) {', '.join(missing)}; it has: {result}")
 
 
+def markdown_table(
+    head: Sequence[object], rows: Iterable[Sequence[object]], *, tight: bool = False
+) -> str:
+    """Return a Markdown table; a vertical bar in a cell is escaped.
+
+    ``tight``: without spaces in the rule below the head, and around empty names of columns.
+    """
+    cells = [[str(cell).replace("|", "\\|") for cell in row] for row in (head, *rows)]
+    first, *others = (f"| {' | '.join(row)} |" for row in cells)
+    rule = f"| {' | '.join(['---'] * len(head))} |"
+    if tight:
+        first, rule = first.replace("|  ", "| "), rule.replace(" ", "")
+    return "\n".join([first, rule, *others])
+
+
 def refuse_duplicates(names: pd.Series, where: str) -> None:
     """Raise `BadInputError` with the first name that occurs twice."""
     twice = names[names.duplicated()]

@@ -85,7 +85,7 @@ def make_official(checkout: Path, folder: Path) -> MadeData:
     people = {path.name: path for path in _distinct(found(_PEOPLE), checkout)}
     if not people:
         raise BadInputError(
-            f"{checkout} holds no {_PEOPLE}: it is no checkout of the original study; "
+            f"{checkout} holds no {_PEOPLE}: it is not a checkout of the original study; "
             "only command logs are read with: physion run --scenes DIR"
         )
     trials, notes = _trials(checkout)

@@ -160,7 +160,10 @@ Keys = dict[tuple[str, str], str]
 
 
 def _what_is_there(folder: Path, card: MovieCard, trials: list[str]) -> tuple[Keys, Keys]:
-    """Return status and digest of each movie by trial and seed; equal movies are no two seeds."""
+    """Return status and digest of each movie by trial and seed.
+
+    Equal movies do not count as two seeds.
+    """
     status, digests = {}, {}
     for trial in trials:
         seen: dict[str, str] = {}

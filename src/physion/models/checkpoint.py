@@ -223,7 +223,7 @@ def _shown(values: Mapping[str, Any], key: str) -> str:
 FOLDER = "physion.data.weights"
 """Name of the folder with the weights that are installed with the package."""
 BUILT_AS = "built_as"
-"""Metadata of weights: what the method of this name said of the model that was trained."""
+"""Metadata key of weights: the return value of the model's ``built_as()``."""
 
 
 def shipped_digests() -> dict[str, str]:

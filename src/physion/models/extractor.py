@@ -44,8 +44,8 @@ class ExtractorModel(TorchModel):
         self._name = type(extractor).__name__
         if not isinstance(extractor, nn.Module):
             raise BadInputError(
-                f"model {self._name!r} has transform and extract_features, but is no torch Module, "
-                "so that its weights cannot be identified; derive it from torch.nn.Module"
+                f"model {self._name!r} has transform and extract_features, but is not a torch "
+                "Module, so that its weights cannot be identified; derive it from torch.nn.Module"
             )
         self.extractor: Any = extractor
         transform, gap, self._least = _settings(extractor, self._name)

@@ -149,7 +149,9 @@ class FeatureTable(Model):
         try:
             if path.suffix.lower() == ".npz":
                 if not zipfile.is_zipfile(path):  # numpy would speak of pickled data
-                    raise ValueError("it is no npz file, or damaged; write it with numpy.savez")
+                    raise ValueError(
+                        "it is not an npz file, or is damaged; write it with numpy.savez"
+                    )
                 with np.load(path, allow_pickle=False) as arrays:
                     yield arrays
             else:

@@ -129,7 +129,8 @@ def settings_of_size(model: str, sizes: Sizes, size: str) -> Mapping[str, Any]:
 
 
 RANDOM, SHIPPED = "random", "shipped"
-"""Weights that are no path of a file: initial ones, to be trained, and weights of the package."""
+"""Weights that are not the path of a file: initial ones, to be trained, and weights of the
+package."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -309,7 +310,7 @@ class Model:
     def trials_together(self) -> int:
         """Trials that a process imagines at a time, of a network that is sent to all processes.
 
-        0: the main process imagines all, as on a GPU. Models that are no networks always imagine
+        0: the main process imagines all, as on a GPU. Models that are not networks always imagine
         in all processes.
         """
         return 0

@@ -406,7 +406,7 @@ class Intuition(TorchModel):
     spec
         What the model asks for.
     training
-        Optimiser and schedule, which are no part of the digest.
+        Optimiser and schedule, which are not part of the digest.
     """
 
     answers = "observed"

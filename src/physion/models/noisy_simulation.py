@@ -573,7 +573,7 @@ class NoisySimulation(Model):
         return found
 
     def digest(self) -> str:
-        """Return the SHA-256 of engine and noise; scales and number of samples are no part."""
+        """Return the SHA-256 of engine and noise; without scales and number of samples."""
         settings = dataclasses.asdict(self.settings)
         levels = {field.name: settings[field.name] for field in dataclasses.fields(NoiseLevels)}
         parts: list[Any] = [NOISE_VERSION, self.engine.name, levels]

@@ -54,7 +54,7 @@ class VisionModel(TorchModel):
     settings
         What the user chose.
     training
-        Optimiser and schedule, which are no part of the digest.
+        Optimiser and schedule, which are not part of the digest.
     spec
         What the model asks for.
     """

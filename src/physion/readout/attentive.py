@@ -93,7 +93,7 @@ def _read(parts: Sequence[Any], tokens: int) -> Iterator[Array]:
             pieces.append(of.reshape(len(rows), of.shape[1] * tokens, -1))
         if len({piece.shape[2] for piece in pieces}) > 1:
             raise BadInputError(
-                "observed and imagined features differ in size, so that they are no tokens of one "
+                "observed and imagined features differ in size, so they cannot be tokens of one "
                 "kind; use the decision logistic"
             )
         yield np.concatenate(pieces, axis=1).astype(np.float64)

@@ -389,7 +389,7 @@ def _files(trials: ChangedTrials) -> None:
                 trials.write(paths.map, encode_png(picture))
             for column in FILES:
                 path = getattr(paths, column)
-                if path.is_file():  # which is no link any more: the first file keeps its time
+                if path.is_file():  # which is not a link any more: the first file keeps its time
                     os.utime(path, (then := int(trials.rng.integers(10**9, 17 * 10**8)), then))
 
 

@@ -145,7 +145,7 @@ def to_array(
     Raises
     ------
     BadInputError
-        If the value is no array, or has another shape or data type; the message says what was
+        If the value is not an array, or has another shape or data type; the message says what was
         expected and what was given.
     """
     actual = getattr(value, "shape", None)

@@ -224,7 +224,7 @@ def options_by_model(models: Sequence[str], pairs: Sequence[str]) -> dict[str, d
     """Return the options of every model from pairs of the command line.
 
     A pair is ``NAME=VALUE`` for all models, or ``MODEL:NAME=VALUE`` for one. Raises `BadInputError`
-    for what is no pair, or given twice.
+    for what is not a pair, or is given twice.
     """
     own: dict[str, list[str]] = {name: [] for name in models}
     for pair in pairs:

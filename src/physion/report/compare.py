@@ -300,7 +300,7 @@ def check_files(
     Raises
     ------
     BadInputError
-        If there is nothing to check, or a file is no table.
+        If there is nothing to check, or a file is not a table.
     """
     if not predictions and not responses:
         raise BadInputError("nothing to check: give files of predictions, or --responses")

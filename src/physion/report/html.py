@@ -300,8 +300,8 @@ _POSTER_SIDE = 256
 def movies_of(folder: Path) -> dict[str, Path]:
     """Return the movies of a dataset's testing trials, by canonical stimulus, for `ReportInputs`.
 
-    Raises `BadInputError` if ``folder`` is no dataset or has no testing trial, or if a movie does
-    not have its SHA-256 in the index.
+    Raises `BadInputError` if ``folder`` is not a dataset or has no testing trial, or if a movie
+    does not have its SHA-256 in the index.
     """
     from physion.trials.dataset import Dataset
 
@@ -341,7 +341,7 @@ class PageMovies:
         ``description``: for readers who do not see it. It plays without sound while it is in
         view; for people who ask for reduced motion it plays when they mark a box. Returns nothing
         if no movie of any stimulus was given. Raises `BadInputError` if its file cannot be read or
-        is no movie.
+        is not a movie.
         """
         if not self.files:
             return Markup()
@@ -380,8 +380,8 @@ def _still(poster: bytes, description: str) -> Markup:
 def make_poster(path: Path) -> bytes:
     """Return the last observed picture of a movie as JPEG: what people saw when they answered.
 
-    A shorter movie gives its last picture; a file that is no movie, or one that cannot be decoded
-    here (a browser may still play it), gives b"".
+    A shorter movie gives its last picture; a file that is not a movie, or one that cannot be
+    decoded here (a browser may still play it), gives b"".
     """
     from physion.trials.video import count_frames, read_chosen
 
@@ -401,5 +401,5 @@ def make_poster(path: Path) -> bytes:
 def _mime(path: Path) -> str:
     mime = _MIME.get(path.suffix.lower())
     if mime is None:
-        raise BadInputError(f"{path} is no movie for a page; use one of {', '.join(_MIME)}")
+        raise BadInputError(f"{path} cannot be shown as a movie; use one of {', '.join(_MIME)}")
     return mime

@@ -135,8 +135,8 @@ _BASELINES = (
 )
 
 _BEYOND = (
-    "Whoever predicts outcomes well resembles people, because people predict them well too. These "
-    "numbers take out that part: a model that resembles people only by the outcome has 0. Kappa "
+    "Accurate models correlate with people simply because people are accurate. These "
+    "numbers remove that part: a model that resembles people only by the outcome has 0. Kappa "
     "beyond the outcome supposes that half of the answers are yes, and is too low where most "
     "outcomes are alike; kappa within outcomes is right there too."
 )

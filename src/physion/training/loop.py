@@ -90,7 +90,7 @@ def call(model: Any, method: str, batch: Batch) -> Any:
 
 
 def losses_of(model: Any, batch: Batch) -> dict[str, Tensor]:
-    """Return loss and parts of a batch; raise `BadInputError` if they are no scalars."""
+    """Return loss and parts of a batch; raise `BadInputError` if they are not scalars."""
     name = model.provenance().model
     losses = call(model, "loss", batch)
     if not isinstance(losses, Mapping) or LOSS not in losses:

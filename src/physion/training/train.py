@@ -22,6 +22,7 @@ from physion.compute.tasks import Progress
 from physion.core.errors import BadInputError
 from physion.core.files import digest_of, folder_lock, json_digest, remove_leftovers
 from physion.core.seeds import generator, stable_hash
+from physion.core.tables import markdown_table
 from physion.models.build import OutOfMemoryError, is_out_of_memory
 from physion.models.checkpoint import (
     BUILT_AS,
@@ -116,8 +117,8 @@ def model_card(
 
 
 def _table(values: Mapping[str, Any]) -> str:
-    rows = [f"| {name} | {_text(value)} |" for name, value in values.items()]
-    return "\n".join(["| | |", "|---|---|", *rows])
+    rows = [(name, _text(value)) for name, value in values.items()]
+    return markdown_table(["", ""], rows, tight=True)
 
 
 def _text(value: Any) -> str:

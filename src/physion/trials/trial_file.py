@@ -336,7 +336,9 @@ class FieldReader(GuardedHdf5):
         if dataset is None:
             parent = self.find(path.rpartition("/")[0]) if "/" in path else None
             inside = isinstance(parent, h5py.Dataset)
-            raise self.bad(path, "lies in something that is no group" if inside else "is missing")
+            raise self.bad(
+                path, "lies in something that is not a group" if inside else "is missing"
+            )
         if not isinstance(dataset, h5py.Dataset):
             raise self.bad(path, "is not an array")
         self.guard(path, lambda: self._check_layout(path, dataset))

@@ -342,7 +342,7 @@ def test_the_effect_of_a_flag_is_found_and_its_interval_allows_for_people() -> N
     assert single["reason"].tolist() == ["a single participant determines it"]
     other = flag_effect(responses, flags.assign(low_accuracy=False, flagged=worse), "flagged")
     assert other["reason"].tolist() == [""]
-    with pytest.raises(BadInputError, match="no rule"):
+    with pytest.raises(BadInputError, match="not a rule"):
         flag_effect(responses, flags, "tired")
 
 

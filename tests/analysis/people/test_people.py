@@ -436,7 +436,7 @@ def test_attributes_from_tables_and_bad_names() -> None:
         attributes_from_table(table.assign(occluders=["1", "x"]))
     with pytest.raises(BadInputError, match="has no column"):
         attributes_from_table(table[["stimulus", "scenario"]])
-    with pytest.raises(BadInputError, match="no official name"):
+    with pytest.raises(BadInputError, match="not an official name"):
         attributes_from_names(["collide_0001"])
     with pytest.raises(BadInputError, match="stands in two rows"):
         attributes_from_names(["test13_0011", "test13_0011_img"])

@@ -424,7 +424,7 @@ def test_own_questions_come_in_place_of_demographics(asking_store: Store) -> Non
 
 def test_a_study_without_questions_has_no_such_page(store: Store) -> None:
     token = walk(store, enter(store, "Ada", scenario="drop"), "demographics")
-    assert "no question" in str(refusal(store.page(token, PageDone(page="questions",
+    assert "not a question" in str(refusal(store.page(token, PageDone(page="questions",
                                                                    data=OWN_ANSWERS))))  # fmt: skip
     assert page(store, token, "demographics").stage == "feedback"
 

@@ -92,7 +92,7 @@ def test_a_damaged_database_leaves_no_backup(served: Study, tmp_path: Path) -> N
 
 
 def test_what_is_no_study_or_was_never_served_is_named(served: Study, tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="no study folder"):
+    with pytest.raises(BadInputError, match="not a study folder"):
         back_up(tmp_path, tmp_path / "safe")
     with pytest.raises(BadInputError, match="has the study been served"):
         back_up(served.folder, tmp_path / "safe")

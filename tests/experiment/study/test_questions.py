@@ -58,10 +58,10 @@ def test_questions_are_written_and_read_back(tmp_path: Path) -> None:
         ({"name": "games", "kind": "choice", "options": ["one"]}, "games needs options"),
         ({"name": "games", "kind": "scale", "options": ["a", "b"]}, "games has options"),
         ({"name": "games", "kind": "scale", "steps": 1}, "greater than or equal to 2"),
-        ({"name": "games", "kind": "text", "right": "a"}, "no option of it as a choice"),
+        ({"name": "games", "kind": "text", "right": "a"}, "not an option of it as a choice"),
         (
             {"name": "games", "kind": "choice", "options": ["a", "b"], "right": "c"},
-            "right answer c, which is no option",
+            "right answer c, which is not an option",
         ),
         ({"name": "games", "kind": "text", "picture": "../a.png"}, "the name of a PNG"),
         ({"name": "session", "kind": "text"}, "a second column session"),
@@ -138,7 +138,7 @@ def test_each_question_is_answered_and_no_other() -> None:
     for name in OWN_ANSWERS:
         with pytest.raises(ValueError, match=f"{name} is missing"):
             check_answers(OWN_QUESTIONS, {k: v for k, v in OWN_ANSWERS.items() if k != name})
-    with pytest.raises(ValueError, match="'other' is no question"):
+    with pytest.raises(ValueError, match="'other' is not a question"):
         check_answers(OWN_QUESTIONS, OWN_ANSWERS | {"other": "x"})
     needed = replace(OWN_QUESTIONS[2], required=True)
     with pytest.raises(ValueError, match="an answer is required"):
@@ -162,7 +162,7 @@ def test_the_check_is_read_back_and_needs_its_texts(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changed", "told"),
     [
-        ({"right": "blue"}, "right answer blue, which is no option"),
+        ({"right": "blue"}, "right answer blue, which is not an option"),
         ({"options": ["red"]}, "must hold 2 values"),
         ({"name": "task"}, "task exists twice"),
         ({"correct": "red"}, "unknown key"),
@@ -183,5 +183,5 @@ def test_an_attempt_answers_every_question() -> None:
     for bad in ({"task": "touch"}, RIGHT | {"colour": "blue"}, RIGHT | {"colour": None}):
         with pytest.raises(ValueError, match="colour: one of red, green, yellow"):
             check_attempt(COMPREHENSION, bad)
-    with pytest.raises(ValueError, match="'other' is no question"):
+    with pytest.raises(ValueError, match="'other' is not a question"):
         check_attempt(COMPREHENSION, RIGHT | {"other": "red"})

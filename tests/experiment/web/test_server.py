@@ -256,7 +256,7 @@ def test_a_folder_without_a_study_is_refused(
 ) -> None:
     assert main(["experiment", "serve", str(tmp_path)]) == 2
     said = capsys.readouterr().err
-    assert "this is no study folder; create one with physion experiment init" in said
+    assert "this is not a study folder; create one with physion experiment init" in said
     assert said.count("\n") == 1
 
 

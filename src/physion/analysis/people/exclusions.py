@@ -484,7 +484,7 @@ def check_excluded(
 
     A rule that flags so many is more likely wrong for these data than the sessions are.
     ``accept_rules``: rules that may; ``expected``: the list of stimuli, if one was given. Raises
-    `ExclusionError`, and `UnknownNameError` for a name in ``accept_rules`` that is no rule.
+    `ExclusionError`, and `UnknownNameError` for a name in ``accept_rules`` that is not a rule.
     """
     for name in accept_rules:
         if name not in RULES:
@@ -588,7 +588,9 @@ def flag_effect(
     the ``reason`` then states it.
     """
     if column not in (*RULES, "flagged"):
-        raise BadInputError(f"{column!r} is no rule; choose one of {', '.join(RULES)} or flagged")
+        raise BadInputError(
+            f"{column!r} is not a rule; choose one of {', '.join(RULES)} or flagged"
+        )
     test = responses.test
     value = test["session"].map(flags.set_index("session")[column]).astype(np.float64)
     table = test.assign(**{column: value})

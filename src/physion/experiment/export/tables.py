@@ -447,7 +447,7 @@ def detail_table(trials: TrialBatch) -> pa.Table:
     return pa.table([*keys, trials.details], schema=arrow_schema(DETAIL_COLUMNS))
 
 
-# --- answers that are no trials of the analysis ---
+# --- answers that are not trials of the analysis ---
 #
 # Attention checks, and practice trials that were repeated afterwards.
 

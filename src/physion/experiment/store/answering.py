@@ -374,7 +374,7 @@ def check_page(study: Study, done: PageDone) -> dict[str, Any]:
     except ValueError as error:
         raise Refused("bad_request", f"data.{error}") from None
     if done.page not in FIELDS:
-        raise Refused("bad_request", f"page: {done.page} is no page that is submitted")
+        raise Refused("bad_request", f"page: {done.page} is not a page that is submitted")
     try:
         values = FIELDS[done.page].model_validate(done.data)
     except ValidationError as error:

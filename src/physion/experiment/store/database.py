@@ -137,7 +137,7 @@ the session, separated by commas; NULL without any.
 ``next_from``: earliest time at which the next trial can have begun. ``fast_answers``,
 ``unfetched``, ``replayed``: number of answers that were too fast, whose media were not fetched, and
 whose movie was shown too often. ``implausible``: reasons, separated by commas, for which the
-session is no person's (`judging.REASONS`); NULL without any."""
+session is not a person's (`judging.REASONS`); NULL without any."""
 
 PAUSES = Table(
     "pauses",
@@ -250,7 +250,7 @@ def open_database(folder: Path) -> Engine:
     BadInputError
         The study has no database yet, or it has tables of another version.
     PhysionError
-        The file cannot be read, or is no database.
+        The file cannot be read, or is not a database.
     """
     path = folder / DATABASE_FILE
     if not path.exists():

@@ -110,7 +110,7 @@ def judged(study: Study, session: Session, answer: Answer, shown: Presentation) 
 
 
 def reasons(study: Study, session: Session, finished_at: float | None = None) -> str | None:
-    """Return why a session is no person's, as stored in ``implausible``; None for a preview.
+    """Return why a session is not a person's, as stored in ``implausible``; None for a preview.
 
     ``finished_at``: when it ended, to judge its duration; None while it continues.
     """

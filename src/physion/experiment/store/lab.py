@@ -112,7 +112,7 @@ def back_up(study: Path, out: Path, *, media: bool = False, secret: bool = False
         The database cannot be read, or the copy is damaged.
     """
     if not (study / STUDY_FILE).is_file():
-        raise BadInputError(f"{study} is no study folder: it has no {STUDY_FILE}")
+        raise BadInputError(f"{study} is not a study folder: it has no {STUDY_FILE}")
     target = out / datetime.now(UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
     if target.exists():
         raise BadInputError(f"{target} is there already; wait a second and try again")

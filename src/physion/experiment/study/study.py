@@ -107,7 +107,8 @@ def load_study(folder: Path | str) -> Study:
     path = folder / STUDY_FILE
     if not os.path.lexists(path):
         raise BadInputError(
-            f"{path} is missing: this is no study folder; create one with physion experiment init"
+            f"{path} is missing: this is not a study folder; create one with physion experiment "
+            "init"
         )
     content = read_plain(path, MAX_BYTES)
     settings = parse_settings(parse_bytes(path, content), path)

@@ -70,7 +70,7 @@ def observed_motion(motion: Motion, trial: str) -> Motion:
 
 
 def bodies_present(scene: Scene, *frames: int) -> NDArray[np.bool_]:
-    """Return which bodies (N,) are there in all ``frames`` and are no scenery."""
+    """Return which bodies (N,) are there in all ``frames`` and are not scenery."""
     there = np.all([scene.present(frame) for frame in frames], axis=0)[: len(scene.bodies)]
     return np.asarray(there & np.array([not body.scenery for body in scene.bodies]))
 

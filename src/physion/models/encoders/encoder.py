@@ -552,7 +552,7 @@ class FineTunedEncoder(EncoderModel):
 
 
 class FrozenEncoder(EncoderModel):
-    """Frozen encoder with dynamics. The encoder is no parameter and is loaded at first use."""
+    """Frozen encoder with dynamics. The encoder is not a parameter and is loaded at first use."""
 
     learns_from: LearnsFrom = "features"
 

@@ -89,7 +89,7 @@ class GridFeatures(nn.Module):
     """Encoder whose features are a map of it, averaged in a grid of `CELLS` x `CELLS` cells.
 
     It maps (B, 3, H, W) to (B, rows * columns * channels), ordered by row, then column, then
-    channel. Where the sides of the map are no multiples of `CELLS`, neighbouring cells overlap by
+    channel. Where the sides of the map are not multiples of `CELLS`, neighbouring cells overlap by
     a row or column; a map with fewer rows or columns is not enlarged. The map of a transformer
     consists of its patch tokens, without class and register tokens.
 
@@ -170,7 +170,7 @@ def read_state_dict(path: Path) -> dict[str, Tensor]:
     except pickle.UnpicklingError as error:
         # The error of torch advises to switch off `weights_only`, which would execute the file.
         raise BadInputError(
-            f"{path} is refused: it holds more than plain tensors, or is no file of torch; save "
+            f"{path} is refused: it holds more than plain tensors, or is not a file of torch; save "
             "only the state dict, best as .safetensors"
         ) from error
     except SafetensorError as error:
@@ -485,7 +485,7 @@ class EncoderWeights:
 
     @property
     def package(self) -> WeightsPackage | None:
-        """The package that holds the weights, or None if they are no package."""
+        """The package that holds the weights, or None if they are not a package."""
         if not self.source.startswith(PACKAGE):
             return None
         return weights_package(self.source.removeprefix(PACKAGE))

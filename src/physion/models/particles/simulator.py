@@ -463,7 +463,7 @@ class ParticleSimulator(TorchModel):
         return VERSIONS[self.settings.network] + (self.settings.stride == 1)
 
     def digest(self) -> str:
-        """Return the SHA-256 of settings and weights; the number of futures is no part."""
+        """Return the SHA-256 of settings and weights; without the number of futures."""
         settings = asdict(self.settings)
         for name in ("weights", "seed", "samples", "calibrated"):
             settings.pop(name)

@@ -385,7 +385,7 @@ def misleading_plot(difficulty: pd.DataFrame, movies: Mapping[str, Path]) -> Plo
 
 
 def read_two_frames(path: Path) -> npt.NDArray[np.uint8] | None:
-    """Return the last observed and the last frame of a movie; None if it is no movie."""
+    """Return the last observed and the last frame of a movie; None if it is not a movie."""
     from physion.trials.video import count_frames, read_chosen
 
     try:

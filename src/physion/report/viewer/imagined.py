@@ -358,7 +358,7 @@ def _changes(
 
 
 def _slot_colors() -> list[tuple[int, int, int]]:
-    """Return the colours of the slots, which are no roles."""
+    """Return the colours of the slots, which are not colours of roles."""
     return [OTHERS[slot % len(OTHERS)] for slot in range(SLOTS)]
 
 

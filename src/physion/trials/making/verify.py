@@ -33,7 +33,7 @@ class Verification:
 
     ``faults`` is empty if the dataset is intact. ``other_versions`` lists what cannot be reproduced
     because another version of engine, renderer or encoder made it, which is not a fault.
-    ``notes`` lists what is no fault either: pictures that are only compressed differently, and
+    ``notes`` lists what is not a fault either: pictures that are only compressed differently, and
     trials whose scene was not drawn again because their preset is unknown. ``damaged`` names the
     trials with faults.
     """

@@ -238,8 +238,8 @@ def _plan(
     sources = list(_sources(folder))
     if not sources:
         raise BadInputError(
-            f"{folder} has no official HDF5 file and no official movie, and is no checkout of the "
-            "original study (with human_accuracy-*.csv)"
+            f"{folder} has no official HDF5 file and no official movie, and is not a checkout "
+            "of the original study (with human_accuracy-*.csv)"
         )
     lists = _FolderLists()
     jobs: dict[str, ImportJob] = {}

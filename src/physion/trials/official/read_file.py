@@ -612,7 +612,7 @@ MAX_RESOLUTION = 101
 _NEAR = 50.0
 """Depth in metres from which pixels say nothing about the rows of a picture."""
 _DEPTH_ERROR = 0.1
-"""Median relative error above which a picture is no depth of the scene."""
+"""Median relative error above which a picture is not the depth of the scene."""
 _UNKNOWN = np.full(3, np.nan)
 
 
@@ -693,7 +693,7 @@ class MotionReader:
         return stored
 
     def _stored_depth(self, path: str) -> Floats | None:
-        """Return depth (H, W) in metres as stored; None if the array is no depth."""
+        """Return depth (H, W) in metres as stored; None if the array is not a depth."""
         try:
             return decode_depth(self.reader.file.numbers(path, (None, None, 3)))
         except BadInputError:
