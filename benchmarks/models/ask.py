@@ -22,6 +22,7 @@ import pandas as pd
 from inspect_ai import eval as run_tasks
 from inspect_ai.model import ModelOutput, ModelUsage, get_model
 
+from physion.core.tables import markdown_table
 from physion.trials.dataset import Dataset
 from physion.trials.files import TrialPaths
 from physion.trials.index import write_index
@@ -101,11 +102,10 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         dataset = enlarged(options.dataset, Path(folder) / "trials", options.stimuli)
-        cells = [list(HEADINGS), ["---"] * len(HEADINGS)]
-        cells += [row(dataset, *run, f"{folder}/logs") for run in RUNS]
+        rows = [row(dataset, *run, f"{folder}/logs") for run in RUNS]
     head = f"# Answers of the mock model\n`python benchmarks/models/ask.py` with {options.stimuli} "
-    lines = [f"| {' | '.join(line)} |" for line in cells]
-    text = f"{head}stimuli, {date.today().isoformat()}\n\n" + "\n".join(lines) + "\n"
+    table = markdown_table(list(HEADINGS), rows)
+    text = f"{head}stimuli, {date.today().isoformat()}\n\n{table}\n"
     print(text)
     if options.write:
         RESULT.write_text(text, encoding="utf-8")

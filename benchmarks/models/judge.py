@@ -37,6 +37,7 @@ from scipy import ndimage
 
 import physion
 from physion.compute.local import LocalExecutor
+from physion.core.tables import markdown_table
 from physion.judging.measure import KnownMovie, measure, reference_of
 from physion.judging.track import AGENT, PATIENT, Tracker, with_hue
 from physion.trials.dataset import Dataset
@@ -218,8 +219,7 @@ def main() -> None:
     for table in tables(rows):
         cells = [[f"{v:.3f}" if isinstance(v, float) else str(v) for v in row]
                  for row in [table.columns, *table.to_numpy().tolist()]]  # fmt: skip
-        cells.insert(1, ["---"] * len(table.columns))
-        lines += ["", *(f"| {' | '.join(row)} |" for row in cells)]
+        lines += ["", markdown_table(cells[0], cells[1:])]
     seconds = np.mean([row["seconds"] for row in rows])
     wrong = [f"{row['trial']} ({', '.join(bad)})" for row in rows if (bad := mistakes(row))]
     lines += ["", f"Processor seconds for a movie of 150 frames: {seconds:.2f}.", "",

@@ -34,6 +34,7 @@ import physion
 from physion.clips.clips import observed_source
 from physion.compute.local import SerialExecutor
 from physion.core.names import canonical_name
+from physion.core.tables import markdown_table
 from physion.data.official import official
 from physion.judging.judge import judge
 from physion.models.build import build_model
@@ -191,7 +192,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         [f"{v:.3f}" if isinstance(v, float) else str(v) for v in row]
         for row in [table.columns, *table.to_numpy().tolist()]
     ]
-    cells.insert(1, ["---"] * len(table.columns))
     index = dataset.index.set_index("trial")
     contacts = int(index.loc[unanswered(dataset), "contact"].sum())
     lines = [
@@ -205,7 +205,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         f"{contacts} have one later. Not judged "
         "are movies that equal one of another seed; they count as wrong.",
         "",
-        *(f"| {' | '.join(row)} |" for row in cells),
+        markdown_table(cells[0], cells[1:]),
     ]
     print("\n".join(lines))
     if options.write:

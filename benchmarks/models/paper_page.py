@@ -57,6 +57,7 @@ from physion.analysis.published.tables import (
 from physion.analysis.tables import ALL_BUT, MEAN, ONLY
 from physion.compute.tasks import processor
 from physion.core.names import SCENARIOS
+from physion.core.tables import markdown_table
 from physion.data.official import official
 from physion.report.build import prepare_folder, write_csv, write_plot
 from physion.report.figures.by_scenario import measure_figure
@@ -242,9 +243,7 @@ def accuracies(tested: Mapping[str, Tested]) -> pd.DataFrame:
 
 def markdown(table: pd.DataFrame) -> str:
     """Return a table as Markdown."""
-    head = [str(name) for name in table.columns]
-    lines = [head, ["---"] * len(head), *table.astype(str).to_numpy().tolist()]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return markdown_table(list(table.columns), table.astype(str).to_numpy().tolist())
 
 
 CAPTIONS = {

@@ -56,6 +56,7 @@ from physion.clips.batch import LAST_OBSERVED, Batch, Motion, cut_to_observed
 from physion.clips.clips import observed_source, whole_source
 from physion.compute.tasks import processor
 from physion.core.names import RIGID, canonical_name
+from physion.core.tables import markdown_table
 from physion.data.official import PACKAGED, humans_folder, official
 from physion.models.build import build_untrained
 from physion.models.particles.bodies import poses_of, rotation_from_vector, scene_particles
@@ -500,9 +501,8 @@ def step_of_drape(name: str, size: str) -> list[str]:
 
 
 def table(head: list[str], rows: Rows) -> str:
-    """Return a Markdown table."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+    """Return a Markdown table that ends with a new line."""
+    return markdown_table(head, rows) + "\n"
 
 
 def report(section: str, command: str, text: str, write: bool) -> None:

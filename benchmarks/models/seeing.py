@@ -50,6 +50,7 @@ from physion.clips.batch import LAST_OBSERVED, Batch, Motion
 from physion.clips.rendered import MotionRenderer, object_ids
 from physion.core.names import RIGID, canonical_name
 from physion.core.seeds import stable_hash
+from physion.core.tables import markdown_table
 from physion.data.official import official
 from physion.models.baselines.motion import gap_in_constant_motion
 from physion.models.build import build_model
@@ -419,8 +420,7 @@ def _quantiles(values: pd.Series) -> str:
 
 def _markdown(rows: Sequence[ROW]) -> str:
     names = list(rows[0])
-    lines = [names, ["---"] * len(names), *([str(row[name]) for name in names] for row in rows)]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return markdown_table(names, [[row[name] for name in names] for row in rows])
 
 
 def priors() -> str:

@@ -62,6 +62,7 @@ from physion.clips.batch import Batch, Spec
 from physion.clips.clips import whole_source
 from physion.compute.tasks import processor
 from physion.core.seeds import generator, stable_hash
+from physion.core.tables import markdown_table
 from physion.models.build import build_untrained
 from physion.models.cswm import ranking
 from physion.models.vision import empty_scene_error
@@ -327,11 +328,11 @@ def moving_errors(model: Any, batch: Batch) -> tuple[float, float, float]:
 
 def table(head: list[str], rows: Rows) -> str:
     """Return a Markdown table; print its rows as they come."""
-    lines = [head, ["---"] * len(head)]
+    lines = []
     for row in rows:
         print(*row, flush=True)
         lines.append(row)
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return markdown_table(head, lines)
 
 
 def write_section(title: str, text: str) -> None:

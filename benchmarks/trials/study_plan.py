@@ -39,6 +39,7 @@ import torch
 
 import physion
 from physion.compute.tasks import processor
+from physion.core.tables import markdown_table
 from physion.readout.folds import Protocol, TrainingSet, training_sets
 from physion.training.windows import VALIDATION_CLIPS
 from physion.trials.making.plan import FULL_COUNTS
@@ -197,12 +198,6 @@ def plan(study: Study, machine: Machine, prices: tuple[float, float]) -> dict[st
     }
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a Markdown table."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
 def models_table(study: Study) -> str:
     """Return steps, seconds of a step and hours of all trainings and evaluations by model."""
     rows = []
@@ -220,7 +215,7 @@ def models_table(study: Study) -> str:
         "model", "steps", "batch", "measured with", "step, s", "its reading, s",
         "longest training, h", "17 trainings, h", "features, rollouts, readouts, h",
     ]  # fmt: skip
-    return table(head, rows)
+    return markdown_table(head, rows)
 
 
 def stages_table(plans: Sequence[Mapping[str, Any]], heads: Sequence[str]) -> str:
@@ -240,7 +235,7 @@ def stages_table(plans: Sequence[Mapping[str, Any]], heads: Sequence[str]) -> st
     rows.append(["**length of the schedule, hours**", *(f"**{p['hours']:,.0f}**" for p in plans)])
     rows.append(["the same in days", *(f"{p['hours'] / 24:,.0f}" for p in plans)])
     rows.append(["cost", *(f"{p['cost']:,.0f}" for p in plans)])
-    return table(["", *heads], rows)
+    return markdown_table(["", *heads], rows)
 
 
 def hours(value: float) -> str:

@@ -28,6 +28,7 @@ from pydantic import AfterValidator, Field, StringConstraints
 
 from physion.core.errors import BadInputError
 from physion.core.settings import read_settings
+from physion.core.tables import markdown_table
 from physion.experiment.study.stimuli import NAME
 
 ALL_SCENARIOS = "all scenarios"
@@ -565,8 +566,8 @@ def _faults(settings: StudySettings) -> Iterator[str]:
             yield (f"the question {name} needs options, at least two, as it is of the kind "
                    f"{question.kind}")  # fmt: skip
         if question.right and (question.kind != "choice" or question.right not in question.options):
-            yield (f"the question {name} has the right answer {question.right}, which is no option "
-                   "of it as a choice")  # fmt: skip
+            yield (f"the question {name} has the right answer {question.right}, which is not "
+                   "an option of it as a choice")  # fmt: skip
         if not chosen and question.options:
             yield (f"the question {name} has options; only choice and choices have some, not "
                    f"{question.kind}")  # fmt: skip
@@ -581,7 +582,7 @@ def _faults(settings: StudySettings) -> Iterator[str]:
     for checked in settings.comprehension_questions:
         where = f"the comprehension question {checked.name}"
         if checked.right not in checked.options:
-            yield f"{where} has the right answer {checked.right}, which is no option of it"
+            yield f"{where} has the right answer {checked.right}, which is not an option of it"
         if names.count(checked.name) > 1:
             yield f"{where} exists twice; give one of them another name"
     names = [condition.name for condition in settings.conditions]
@@ -726,12 +727,13 @@ def _toml(value: Any) -> str:
 
 def settings_table() -> str:
     """Return the Markdown table of all keys for the documentation."""
-    rows = ["| key | default | meaning |", "|---|---|---|"]
+    rows = []
     for key in all_keys():
         name = f"{key.table}.{key.name}" if key.table else key.name
         default = "" if key.default is None else f"`{_toml(key.default)}`"
-        rows.append(f"| `{name}` | {default} | {key.about} |".replace(" |  | ", " | | "))
-    return "\n".join(rows) + "\n"
+        rows.append((f"`{name}`", default, key.about))
+    table = markdown_table(["key", "default", "meaning"], rows, tight=True)
+    return table.replace(" |  | ", " | | ") + "\n"
 
 
 # --- answers to questions ------------------------------------------------------------------------
@@ -759,7 +761,7 @@ def check_answers(questions: Sequence[Question], given: Mapping[str, Any]) -> di
     names = {question.name for question in questions}
     for name in given:
         if name not in names:
-            raise ValueError(f"{name[:40]!a} is no question")
+            raise ValueError(f"{name[:40]!a} is not a question")
     answers: dict[str, Answer] = {}
     for question in questions:
         if question.name not in given:
@@ -819,7 +821,7 @@ def check_attempt(
     """
     for name in given:
         if name not in {question.name for question in questions}:
-            raise ValueError(f"{name[:40]!a} is no question")
+            raise ValueError(f"{name[:40]!a} is not a question")
     for question in questions:
         if given.get(question.name) not in question.options:
             raise ValueError(f"{question.name}: one of {', '.join(question.options)}")

@@ -22,6 +22,7 @@ import pyarrow.parquet as pq
 
 from physion.core.errors import BadInputError
 from physion.core.files import folder_for_writing, write_atomic
+from physion.core.tables import markdown_table
 from physion.trials.dataset import indexed_file
 from physion.trials.files import INDEX
 from physion.trials.index import INDEX_COLUMNS
@@ -214,8 +215,7 @@ def _meanings(column: str, meanings: dict[str, str], facts: DatasetFacts) -> str
 
 def _table(table: pd.DataFrame) -> str:
     """Return a Markdown table."""
-    rows = [list(table.columns), ["---"] * len(table.columns), *table.astype(str).values.tolist()]
-    return "\n".join("| " + " | ".join(c.replace("|", "\\|") for c in row) + " |" for row in rows)
+    return markdown_table(list(table.columns), table.astype(str).values.tolist())
 
 
 def _list(title: str, items: list[str]) -> str:

@@ -309,7 +309,7 @@ def _write_meta(out: Path, episodes: _Episodes, splits: list[str]) -> Path:
     tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([WORDINGS[0]], name="task"))
     write_atomic(meta / "tasks.parquet", _parquet(pa.Table.from_pandas(tasks)))
     write_atomic(meta / "stats.json", _json(stats))
-    # Last: a folder without it is no dataset.
+    # Last: a folder without it is not a dataset.
     write_atomic(meta / "info.json", _json(info))
     return meta / "info.json"
 

@@ -88,7 +88,7 @@ def export_result_tables(folder: Path, out: Path) -> list[Path]:
 
 
 def _official_text(path: Path) -> str | None:
-    """Return a table in the official form; None if it is no table of predictions."""
+    """Return a table in the official form; None if it is not a table of predictions."""
     try:
         content = path.read_bytes()
         if NEEDED - set(pd.read_csv(io.BytesIO(content), nrows=0).columns):
