@@ -75,7 +75,7 @@ class RunSettings:
 
     scenes: Path = Path(PACKAGED)
     """Official scenes: official (shipped with the package), a folder made by import, or one with
-    command logs."""
+    command logs, which are looked for in all folders in it."""
     humans: Path | None = None
     """Answers of people to these scenes: official, or a folder with human_accuracy-*.csv. Default:
     official with the scenes of the package, else none."""

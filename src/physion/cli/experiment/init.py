@@ -32,7 +32,8 @@ class Options:
     """Dataset from which testing and familiarization trials are drawn."""
     scenes: Path | None = None
     """Instead of --trials: official scenes, which are rendered first: the package's own
-    (official), a folder made by physion import, or one with command logs."""
+    (official), a folder made by physion import, or one with command logs, which are looked for
+    in all folders in it."""
     rendered: Path | None = None
     """Folder of the trials that --scenes makes; existing ones are kept. Default: next to the study,
     with -trials after its name."""

@@ -63,7 +63,7 @@ class CommandLog:
 
 
 def find_logs(root: Path) -> list[Path]:
-    """Return all command logs in the folder ``root``, sorted by path."""
+    """Return all command logs in the folder ``root`` and in all folders in it, sorted by path."""
     if not root.exists():
         raise BadInputError(
             f"{root} does not exist; give official (the packaged scenes), a folder that "
