@@ -1,8 +1,10 @@
 """Draw docs/picture.jpg: one trial of each scenario, and every pass of one of them.
 
     python docs/picture.py [OFFICIAL_FRAME.png]
+    python docs/picture.py --gallery
 
-If the published picture of the eight official scenarios is given, it is put on the right.
+If the published picture of the eight official scenarios is given, it is put on the right. With
+--gallery, draw docs/gallery/SCENARIO.jpg instead: three frames of each trial in red and yellow.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from physion.physics.engine import simulate
 from physion.rendering.renderer import Frame, Renderer, role_map
 from physion.scenes.looks import with_role_colors
 from physion.scenes.sampling.sample import get_preset, sample_scene
+from physion.scenes.scene import OBSERVED_FRAMES
 
 TRIALS = {
     "dominoes": ("2mid_J020R15_d3chairs_o1plants_tdwroom", 0, 60),
@@ -33,6 +36,11 @@ TRIALS = {
     "drape": ("test15", 0, 60),
 }
 """Preset, index and frame of each scenario, in the order of the official picture."""
+LATER = {
+    "dominoes": 160, "support": 300, "collide": 150, "contain": 340, "drop": 150, "link": 440,
+    "roll": 150, "drape": 150,
+}  # fmt: skip
+"""Last frame of each scenario in the gallery."""
 PASSES = ("contain", ("color", "depth", "normals", "ids", "flow"))
 SIZE, GAP = 256, 6
 
@@ -69,11 +77,27 @@ def grid(tiles: list[NDArray[np.uint8]], columns: int) -> NDArray[np.uint8]:
     return sheet
 
 
+def draw_gallery() -> None:
+    """Write the first, the last observed and a later frame of each trial, side by side."""
+    folder = Path(__file__).with_name("gallery")
+    folder.mkdir(exist_ok=True)
+    for name, later in LATER.items():
+        renderer = renderer_of(name, cues=True)
+        frames = [renderer.render(at).color for at in (0, OBSERVED_FRAMES - 1, later)]
+        sheet = grid([frame for frame in frames if frame is not None], 3)
+        Image.fromarray(sheet).save(folder / f"{name}.jpg", quality=85)
+
+
 def main() -> None:
     """Sample, simulate and render the trials, and write the picture."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("official", nargs="?", type=Path)
-    official = parser.parse_args().official
+    parser.add_argument("--gallery", action="store_true", help="draw docs/gallery/ instead")
+    args = parser.parse_args()
+    if args.gallery:
+        draw_gallery()
+        return
+    official = args.official
     frames = [renderer_of(name).render(at).color for name, (_, _, at) in TRIALS.items()]
     ours = grid([frame for frame in frames if frame is not None], 4)
     name, passes = PASSES
