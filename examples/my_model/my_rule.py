@@ -11,7 +11,7 @@ from physion.models import Batch, Provenance, Spec
 class MyRule:
     """The nearer agent and patient are in the last observed picture, the likelier is a contact."""
 
-    answers = "observed"  # the readout protocol under which it answers
+    answers = "observed"  # the readout under which it answers
     spec = Spec(inputs=("boxes",), image_size=64, context=1, future=0, context_at="end", objects=2)
 
     def __init__(self, scale: float = 0.2) -> None:

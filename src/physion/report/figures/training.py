@@ -104,7 +104,7 @@ def effects(inputs: ReportInputs) -> Plot | None:
     if table.empty:
         return None
     caption = (
-        "Accuracy by readout protocol and by training protocol, mean over scenarios, seeds of "
+        "Accuracy by readout and by training protocol, mean over scenarios, seeds of "
         "one model averaged; intervals draw stimuli. Readout full sees the whole movie. "
         f"{PROTOCOLS}"
     )
