@@ -333,7 +333,7 @@ def test_a_scenario_can_be_taken_out(tmp_path: Path) -> None:
 
 
 def test_no_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="not a study folder"):
+    with pytest.raises(BadInputError, match="no study folder"):
         load_study(tmp_path / "none")
 
 
