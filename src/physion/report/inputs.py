@@ -105,7 +105,7 @@ class ReportInputs(ComparisonResults):
                 "measures": self.with_people.scores,
                 "zones": self.with_people.zones,
                 "model_pairs": self.with_people.pairs,
-                "left_out_beside_people": self.with_people.dropped,
+                "left_out_with_people": self.with_people.dropped,
             }
         if self.population is not None:
             found |= {f"population_{one.name}": getattr(self.population, one.name)
