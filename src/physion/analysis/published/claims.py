@@ -367,7 +367,7 @@ def _record(claim: Claim, tables: PublishedTables) -> dict[str, Any]:
 
 
 def contrast_rows(contrast: Contrast, tables: PublishedTables, rows: Rows) -> pd.DataFrame:
-    """Return the rows that a contrast compares, with ``x`` and one column ``other_…`` a further
+    """Return the rows that a contrast compares, with ``x`` and one column ``further_…`` a further
     term.
     """
     people = tables.people[["scenario", "accuracy"]].assign(model=PEOPLE)
@@ -378,7 +378,7 @@ def contrast_rows(contrast: Contrast, tables: PublishedTables, rows: Rows) -> pd
             table = table[table[column].isin(wanted)]
     table = table.assign(x=table[contrast.column].isin(contrast.high).astype(np.float64))
     for at, value in enumerate(contrast.further):
-        table[f"beside_{at}"] = (table[contrast.column] == value).astype(np.float64)
+        table[f"further_{at}"] = (table[contrast.column] == value).astype(np.float64)
     if table.empty or (contrast.high and table["x"].nunique() < 2):
         raise BadInputError(f"the released tables hold nothing to compare: {contrast.text}")
     return table.reset_index(drop=True)
@@ -389,7 +389,7 @@ def fit_contrast(contrast: Contrast, tables: PublishedTables, rows: Rows) -> dic
     table = contrast_rows(contrast, tables, rows)
     if not contrast.groups:
         return _test_against_half(table["accuracy"])
-    terms = ["x", *(name for name in table.columns if str(name).startswith("other_"))]
+    terms = ["x", *(name for name in table.columns if str(name).startswith("further_"))]
     groups = [f"(1|{name})" for name in contrast.groups]
     fit = fit_linear(" ".join(["accuracy ~", " + ".join([*terms, *groups])]), table)
     row = fit.table.set_index("term").loc["Intercept" if contrast.intercept else "x"]
