@@ -56,7 +56,6 @@ def test_help_imports_nothing_heavy() -> None:
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.nightly
 @pytest.mark.slow
 def test_two_columns_are_enough_and_the_terminal_shows_the_results(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -66,6 +65,7 @@ def test_two_columns_are_enough_and_the_terminal_shows_the_results(
     p = [0.9 if labels[name] else 0.2 for name in names]
     for name, columns in (("good", ["stimulus", "p_contact"]), ("same", ["stimulus", "p"])):
         table = pd.DataFrame({columns[0]: names, columns[1]: p})
+        table["fit_on"] = "mine 1b2c" if name == "good" else ""
         table.to_csv(tmp_path / f"{name}.csv", index=False)
     files = [str(tmp_path / f"{name}.csv") for name in ("good", "same")]
     command = ["compare", *files, "--out", str(tmp_path / "out")]
@@ -75,14 +75,16 @@ def test_two_columns_are_enough_and_the_terminal_shows_the_results(
     lines = out.splitlines()
     assert len(lines) <= 26, "25 lines, then the path"
     assert lines[1].split() == ["model", "given", "accuracy", "r", "with", "people", "kappa"]
-    rows = [re.split(r"\s{2,}", line) for line in lines[2:-2]]
+    rows = [re.split(r"\s{2,}", line) for line in lines[2:-3]]
     names = [row[0] for row in rows]
     assert names[:3] == ["one person with another", "majority of people", "people of the study *"]
     assert set(names[3:6]) == {"good", "same", "recorded outcome"}
     own = {row[0]: row[-3:] for row in rows}
     assert own["good"][0] == "1.000 [1.000, 1.000]" and own["good"] == own["same"]
     assert {"DPI-Net *", "pDeIT-lstm *"} < set(names[6:]) and "V-JEPA 2 ViT-L *" not in names
-    assert lines[-2].startswith("* published, not run here")
+    assert lines[-3].startswith("* published, not run here")
+    assert lines[-2] == "Readouts fitted on mine 1b2c: good"
+    assert "Readouts fitted on mine 1b2c: good." in (tmp_path / "out/report.html").read_text()
     assert lines[-1] == f"report: {tmp_path / 'out' / 'report.html'}"
 
 

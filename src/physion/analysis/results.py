@@ -21,18 +21,19 @@ MARKED = (
     "stimuli"
 )
 RESULTS = (
-    "row", "group", "readout", "given", "frames", "benchmark", "check", "stimuli", "accuracy",
-    "accuracy_low", "accuracy_high", "r", "r_low", "r_high", "kappa", "kappa_low", "kappa_high",
-    "beyond", "beyond_low", "beyond_high", "source",
+    "row", "group", "readout", "given", "frames", "benchmark", "check", "fit_on", "stimuli",
+    "accuracy", "accuracy_low", "accuracy_high", "r", "r_low", "r_high", "kappa", "kappa_low",
+    "kappa_high", "beyond", "beyond_low", "beyond_high", "source",
 )  # fmt: skip
 """Columns of the table of results. ``beyond``: r with people beyond the outcome.
 
 - ``group``: people, model, baseline or published. ``given``: what a row was given of a trial.
 - ``frames``: first and last frame that it saw, and how many a second, if its predictions say so.
-- ``benchmark``: rules of the evaluation, v1 or v1.5, and ``check``: verdict of a check, likewise.
+- ``benchmark``: rules of the evaluation, v1 or v1.5; ``check``: verdict of a check; ``fit_on``:
+  another set, with its digest, that fitted the readout; likewise.
 """
 
-SEEN = ("frames", "benchmark", "check")
+SEEN = ("frames", "benchmark", "check", "fit_on")
 """Columns that predictions may have, too."""
 
 GIVEN = {
@@ -166,6 +167,15 @@ def frames_with_benchmark(results: pd.DataFrame) -> list[str]:
     """Return benchmark and frames of the rows of a table of results, such as v1: 2 to 44, 5/s."""
     pairs = zip(results["benchmark"], results["frames"], strict=True)
     return [": ".join(filter(None, pair)) for pair in pairs]
+
+
+def fitted_elsewhere(results: pd.DataFrame) -> list[str]:
+    """Return a sentence for each other set on which readouts of the rows were fitted."""
+    known = results[results["fit_on"].fillna("") != ""]
+    return [
+        f"Readouts fitted on {name}: {', '.join(dict.fromkeys(rows))}"
+        for name, rows in known.groupby("fit_on", sort=False)["row"]
+    ]
 
 
 def _given(name: str, inputs: str) -> str:

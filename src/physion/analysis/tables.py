@@ -119,6 +119,8 @@ PREDICTIONS: tuple[Column, ...] = (
     Column("frames", "text", "Frames that the model saw of a trial, and how many a second"),
     Column("benchmark", "text", "Rules of the evaluation: v1 or v1.5"),
     Column("check", "text", "Verdict of physion check: passed, refused, ..."),
+    Column("fit_on", "text", "Set whose trials fitted the readout, with the start of its digest; "
+           "empty: trials of the tested set, or no fit"),
     Column("init", "text", "Weights that the model started from", also=("Init",)),
     Column("protocol", "text", "Scenarios of the training: all, all-but, only, one",
            also=("Dynamics Training Dataset",)),

@@ -174,7 +174,7 @@ MOST_ROWS = 20
 
 def print_scores(result: CompareResult, page: Path | None = None, made: str = "") -> None:
     """Print the table of results, in at most 25 lines, then the path of the report."""
-    from physion.analysis.results import MARKED, fewest_rows
+    from physion.analysis.results import MARKED, fewest_rows, fitted_elsewhere
     from physion.report.compare import as_text
 
     rows = result.results
@@ -182,6 +182,8 @@ def print_scores(result: CompareResult, page: Path | None = None, made: str = ""
     print_line(text_table(as_text(shown), f"People and models: {result.heading}"))
     if (shown["source"] != "").any():
         print_line(MARKED)
+    for line in fitted_elsewhere(shown):
+        print_line(line)
     if len(rows) > len(shown):
         where = "" if page is None else f": {page.parent / 'tables' / 'results.csv'}"
         print_line(f"{len(rows) - len(shown)} more rows{where}")

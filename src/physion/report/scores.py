@@ -12,7 +12,7 @@ from physion.analysis.comparison import SETTING, Comparison
 from physion.analysis.metrics import BEYOND_OUTCOME, Metric, score_metrics
 from physion.analysis.mixed.result import effect_name
 from physion.analysis.model_tests import MixedTable, permutations_of
-from physion.analysis.results import MARKED, frames_with_benchmark
+from physion.analysis.results import MARKED, fitted_elsewhere, frames_with_benchmark
 from physion.analysis.scores import AVERAGES, TWO_PEOPLE, runs_table, shown_average
 from physion.analysis.tables import MEAN, POOLED, in_order
 from physion.core.html import Markup, joined
@@ -110,7 +110,9 @@ def results(inputs: ReportInputs) -> Markup:
     caption = AVERAGES[shown_average(inputs.comparison.all_scores)].capitalize()
     columns = ["", "given", *known, *chosen]
     listing = table(columns, cells, f"{caption}, by accuracy")
-    return listing + (paragraph(f"{MARKED} ({sources}).", "note") if published else Markup())
+    notes = [f"{MARKED} ({sources})."] if published else []
+    notes += [f"{line}." for line in fitted_elsewhere(rows)]
+    return listing + Markup().join(paragraph(note, "note") for note in notes)
 
 
 def _result(row: pd.Series, key: str) -> str:
