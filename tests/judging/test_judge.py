@@ -71,6 +71,7 @@ def generated(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 
 def write_card(folder: Path, **values: Any) -> None:
+    folder.mkdir(exist_ok=True)
     card = {
         "protocol": "physion-judge-1",
         "model": "the truth",
@@ -134,6 +135,29 @@ def test_bad_cards_are_refused(
         judge(tmp_path, dataset.folder, tmp_path / "out")
 
 
+def test_movies_that_nobody_asked_for_are_named(dataset: Dataset, tmp_path: Path) -> None:
+    (trial,) = dataset.trials(scenario="collide")
+    folder = tmp_path / "movies"
+    write_card(folder, seeds=["0", "1"])
+    others = [f"0/{trial}.webm", "0/collide_testing_0001.mp4", "2/any.mp4", "3/a.mov", "whole.mp4"]
+    for name in [f"0/{trial}.mp4", "0/notes.txt", "notes/readme.txt", ".cache/old.mp4", *others]:
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(b"no movie")
+    done = judge(folder, dataset.folder, folder / "out", scenario="collide")
+    assert done.unknown == (
+        f"0/{trial}.webm", "0/collide_testing_0001.mp4", "2/", "3/", "whole.mp4"
+    )  # fmt: skip
+    (line,) = done.warnings
+    assert line.endswith(f"(5): {', '.join(done.unknown)}")
+    (folder / "2" / "any.mp4").unlink()
+    (folder / "6").mkdir()
+    (folder / "6" / "any.mp4").touch()
+    (folder / "4.mp4").touch()
+    (folder / "5.mp4").touch()
+    (line,) = judge(folder, dataset.folder, folder / "out", scenario="collide").warnings
+    assert "(7): " in line and line.endswith("4.mp4, 5.mp4, ...")
+
+
 def test_the_request_tells_no_outcome(dataset: Dataset, tmp_path: Path) -> None:
     readme, listing, card = export_conditioning(dataset.folder, tmp_path)
     table = pd.read_csv(listing)
@@ -156,8 +180,12 @@ def test_the_verb_writes_page_and_comparison(
 ) -> None:
     arguments = ["judge", str(generated), str(dataset.folder), "--out", str(tmp_path / "out")]
     arguments += ["--workers", "1"]
+    other = generated / "0" / "other.mp4"
+    other.touch()
     assert cli(arguments) == 1
-    printed = capsys.readouterr().out
+    caught = capsys.readouterr()
+    printed = caught.out
+    assert "no such trial (1): 0/other.mp4" in caught.err
     assert "the truth: not complete, 6 of 12 movies judged by physion-judge-1" in printed
     assert "missing: drop_testing_0000, seed 0" in printed and "and 1 more" in printed
     page = (tmp_path / "out" / "judge.html").read_text()
@@ -165,6 +193,8 @@ def test_the_verb_writes_page_and_comparison(
     assert cli([*arguments, "--scenario", "collide", "--json"]) == 0
     values = json.loads(capsys.readouterr().out)
     assert values["complete"] and len(values["movies"]) == SEEDS
+    assert values["unknown"] == ["0/other.mp4"]
+    other.unlink()
 
 
 def turned(frames: U8, part: float) -> U8:

@@ -59,9 +59,10 @@ def main(options: Options) -> int:
         )  # fmt: skip
     page, missing = done.report(options.out), done.missing
     report = page.parent / "report" / "report.html"
-    print_warnings(done.compared.warnings)
+    print_warnings([*done.warnings, *done.compared.warnings])
     if options.json:
         values = {"complete": done.complete, "page": str(page), "report": str(report)}
+        values |= {"unknown": list(done.unknown)}
         values |= {
             name: records(table) for name, table in (("movies", done.movies), ("seeds", done.seeds))
         }

@@ -40,6 +40,8 @@ SHAPES = 0.02
 """Largest difference of width by height from the trial's, as a fraction."""
 RATES = (4.0, 240.0)
 """Smallest and largest rate of a movie, frames a second."""
+_MOVIES = {".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif"}
+"""Endings of files that may be movies."""
 _VERSION = 3
 """To be increased with every change that can alter a measure."""
 
@@ -130,7 +132,8 @@ def judge(
             write_with_digest(paths[name], table.to_csv(index=False).encode())
     complete = len(card.seeds) >= SEEDS and bool((movies["status"] == JUDGED).all())
     true = {trial: true_movie(known, trial, job.true) for trial, job in jobs.items() if job.movies}
-    return Judged(card, movies, tables["seeds"], complete, paths, true, folder)
+    unknown = _unknown(folder, card, set(known.index["trial"]), aside={out, out / "true"})
+    return Judged(card, movies, tables["seeds"], complete, paths, true, folder, unknown)
 
 
 def _card(folder: Path) -> MovieCard:
@@ -181,6 +184,25 @@ def _what_is_there(folder: Path, card: MovieCard, trials: list[str]) -> tuple[Ke
             f"{folder / card.seeds[0] / trials[0]}.mp4"
         )
     return status, digests
+
+
+def _unknown(folder: Path, card: MovieCard, trials: set[str], aside: set[Path]) -> tuple[str, ...]:
+    """Return movies of unknown trials and seeds in a folder, but for the own output ``aside``."""
+    found = []
+    own = {path.resolve() for path in aside}
+    for path in sorted(folder.iterdir()):
+        if path.name.startswith(".") or path.resolve() in own:
+            continue
+        if path.is_dir():
+            movies = sorted(one for one in path.iterdir() if one.suffix.lower() in _MOVIES)
+            if path.name in card.seeds:
+                named = {f"{trial}.mp4" for trial in trials}
+                found += [f"{path.name}/{one.name}" for one in movies if one.name not in named]
+            elif movies:
+                found.append(f"{path.name}/")
+        elif path.suffix.lower() in _MOVIES:
+            found.append(path.name)
+    return tuple(found)
 
 
 def _judge_trial(job: _Job) -> None:

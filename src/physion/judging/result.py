@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 CARD = "card.json"
 JUDGED = "judged"
+_NAMED = 5
+"""Names in a warning."""
 PAGE_BYTES = 15_000_000
 """Largest size of a page with its movies."""
 MOST_SHOWN = 6
@@ -70,6 +72,8 @@ class Judged:
     - ``paths``: tables by name: movies, seeds, tracks (agent's centre and distance by frame, and
       the true ones), predictions (P(contact) of each trial over its seeds, for `physion.compare`).
     - ``true``: true movies by trial. ``generated``: folder of the generated ones.
+    - ``unknown``: what lies in that folder but is not judged, as paths in it: folders of movies that
+      the card does not name, and movies of trials that the dataset does not have.
     """
 
     card: MovieCard
@@ -79,6 +83,7 @@ class Judged:
     paths: Mapping[str, Path]
     true: Mapping[str, Path]
     generated: Path
+    unknown: tuple[str, ...] = ()
 
     @cached_property
     def compared(self) -> CompareResult:
@@ -106,6 +111,17 @@ class Judged:
     def missing(self) -> pd.DataFrame:
         """Rows of the movies that were not judged."""
         return self.movies[self.movies["status"] != JUDGED]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What lies in the folder but is not judged, as at most one line."""
+        if not self.unknown:
+            return []
+        names = ", ".join(self.unknown[:_NAMED]) + (", ..." if len(self.unknown) > _NAMED else "")
+        return [
+            f"not judged, because the card does not name the seed or the dataset has no such trial "
+            f"({len(self.unknown)}): {names}"
+        ]
 
 
 def verdict(judged: Judged) -> str:
