@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.readout.whatif import whatif_scores
+from physion.readout.whatif import causes, causes_line, whatif_scores
 
 P = {
     # name: P(contact), outcome, contact in the observed part
@@ -49,6 +49,28 @@ def test_every_measure_is_counted_by_hand() -> None:
     assert np.isnan(scores.loc["mass", "unmoved_se"]) and np.isnan(removed["unmoved"])
     # Two trials, a and b, with residual sums 1 and -1 of `moved` - .625 = .75: 2 / 1 * 2 * .75^2.
     assert removed["moved_se"] == pytest.approx(np.sqrt(2 * 2 * 0.75**2) / 4)
+
+
+def test_a_body_without_which_the_outcome_is_another_is_a_cause() -> None:
+    more = pd.DataFrame(
+        [{"model": "m", "readout": "observed", "protocol": "", "seed": "", "stimulus": name,
+          "p_contact": 0.5, "outcome": outcome, "observed_contact": False}
+         for name, outcome in [("e", False), ("e+remove.x", True), ("e+remove.ramp.2", False)]]
+    )  # fmt: skip
+    found = causes(pd.concat([table(), table("other"), more]))
+    assert [tuple(row) for row in found.itertuples(index=False)] == [
+        ("a", "x", True, False, True),
+        ("a", "y", True, False, True),
+        ("b", "x", True, False, True),
+        ("b", "y", True, False, True),
+        ("e", "ramp.2", False, False, False),
+        ("e", "x", False, True, True),
+    ]
+    assert list(found) == ["trial", "removed", "before", "after", "changed"]
+    assert causes_line(found) == (
+        "5 of 6 removals change the outcome: x 3 of 3, y 2 of 2, ramp.2 0 of 1"
+    )
+    assert causes(table().iloc[:0]).empty and list(causes(table().iloc[:0])) == list(found)
 
 
 def test_trials_of_a_test_with_two_cues_are_a_pair() -> None:

@@ -23,6 +23,7 @@ from physion.cli.output import (
     print_scores,
     print_warnings,
     text_table,
+    write_text,
 )
 from physion.compute.run_tasks import ExecutorSettings
 from physion.core.errors import BadInputError
@@ -33,7 +34,7 @@ from physion.readout.evaluation import EvaluatedModel, Evaluation
 from physion.readout.settings import EvaluationSettings, options_by_model
 from physion.readout.surprise import MEASURES as SURPRISES
 from physion.readout.surprise import surprise
-from physion.readout.whatif import MEASURES, whatif_scores
+from physion.readout.whatif import MEASURES, causes, causes_line, whatif_scores
 from physion.report.compare import compare
 from physion.trials.dataset import Dataset
 
@@ -161,6 +162,7 @@ def _print(done: Evaluation, options: Options) -> None:
             values["scores"] = records(done.scores)
             changes = whatif_scores(done.predictions)
             values["whatif"] = records(changes)
+            values["causes"] = records(causes(done.predictions))
         print(json_module.dumps(values))
         return
     if options.dry_run:
@@ -173,7 +175,7 @@ def _print(done: Evaluation, options: Options) -> None:
     if done.evaluated:
         print_warnings(done.warnings)
         _print_scores(done)
-        _print_whatif(whatif_scores(done.predictions))
+        _print_whatif(done.predictions, options.out)
     for one in done.evaluated:
         print_line(f"predictions: {one.path}{' (done before)' if one.done else ''}")
         if one.rollout_errors is not None:
@@ -194,14 +196,22 @@ def with_errors(scores: pd.DataFrame, name: str) -> list[str]:
     return ["-" if m != m else f"{m:.3f}" if se != se else f"{m:.3f} ({se:.3f})" for m, se in pairs]
 
 
-def _print_whatif(scores: pd.DataFrame) -> None:
-    """Print how predictions change with the scene, if the dataset holds variants of trials."""
+def _print_whatif(predictions: pd.DataFrame, out: Path) -> None:
+    """Print how predictions change with the scene, if the dataset holds variants of trials.
+
+    Which removals change the outcome is written into ``out``.
+    """
+    scores = whatif_scores(predictions)
     if scores.empty:
         return
     shown = scores[["model", "readout", "change", "pairs", "changed"]].copy()
     for name in MEASURES:
         shown[name] = with_errors(scores, name)
     print_line(text_table(shown, "One thing changed: mean and standard error over trials"))
+    removals = causes(predictions)
+    if len(removals):
+        write_text(out / "causes.csv", removals.to_csv(index=False))
+        print_line(f"{causes_line(removals)} ({out / 'causes.csv'})")
 
 
 def _print_surprise(scores: pd.DataFrame, failed: Mapping[str, str], options: Options) -> None:

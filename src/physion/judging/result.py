@@ -72,8 +72,8 @@ class Judged:
     - ``paths``: tables by name: movies, seeds, tracks (agent's centre and distance by frame, and
       the true ones), predictions (P(contact) of each trial over its seeds, for `physion.compare`).
     - ``true``: true movies by trial. ``generated``: folder of the generated ones.
-    - ``unknown``: what lies in that folder but is not judged, as paths in it: folders of movies that
-      the card does not name, and movies of trials that the dataset does not have.
+    - ``unknown``: what lies in that folder but is not judged, as paths in it: folders of movies
+      that the card does not name, and movies of trials that the dataset does not have.
     """
 
     card: MovieCard

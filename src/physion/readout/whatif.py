@@ -22,6 +22,8 @@ from physion.trials.making.whatif import CUES, pair_of, parts_of
 
 MEASURES = ("accuracy", "paired", "moved", "unmoved")
 ALL = "all"
+_NAMED = 6
+"""Bodies in a line about removals."""
 
 
 def whatif_scores(predictions: pd.DataFrame) -> pd.DataFrame:
@@ -55,6 +57,39 @@ def whatif_scores(predictions: pd.DataFrame) -> pd.DataFrame:
                 row[measure], row[f"{measure}_se"] = mean_over_trials(part, measure)
             rows.append(row)
     return pd.DataFrame(rows, columns=columns)
+
+
+def causes(predictions: pd.DataFrame) -> pd.DataFrame:
+    """Return what each removal of a body does to the outcome: a contact that it ends had that cause.
+
+    Returns
+    -------
+    causes
+        One row per trial and removed body, of the pairs that `whatif_scores` counts: ``trial``,
+        ``removed``, ``before`` and ``after`` (whether agent and patient touch with the body and
+        without it), ``changed``. Outcomes are the same for all models.
+    """
+    rows = _pairs(predictions)
+    rows = rows[rows["change"] == "remove"]
+    removed = [parts_of(name)[1].partition(".")[2] for name in rows["stimulus"]]
+    before, after = (rows[name].astype(bool) for name in ("outcome_base", "outcome"))
+    table = pd.DataFrame(
+        {"trial": rows["base"], "removed": removed, "before": before, "after": after}
+    )
+    table = table.assign(changed=before != after).drop_duplicates()
+    return table.sort_values(["trial", "removed"], ignore_index=True)
+
+
+def causes_line(table: pd.DataFrame) -> str:
+    """Return how many removals of `causes` change the outcome, and of which bodies, in one line."""
+    of_body = table.groupby("removed")["changed"].agg(["sum", "size"])
+    of_body = of_body.sort_values("sum", ascending=False, kind="stable")
+    named = [f"{name} {row['sum']} of {row['size']}" for name, row in of_body.iterrows()]
+    more = ", ..." if len(named) > _NAMED else ""
+    return (
+        f"{int(table['changed'].sum())} of {len(table)} removals change the outcome: "
+        f"{', '.join(named[:_NAMED])}{more}"
+    )
 
 
 def _pairs(predictions: pd.DataFrame) -> pd.DataFrame:

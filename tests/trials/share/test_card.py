@@ -19,9 +19,10 @@ import pytest
 
 from physion.cli.main import main as cli
 from physion.core.errors import BadInputError
+from physion.physics.replay import RECORDED_OUTCOMES
 from physion.trials.files import TrialPaths, encode_png, find_trials, write_files
 from physion.trials.index import COLUMNS, INDEX_COLUMNS, build_index, read_index, write_index
-from physion.trials.share.card import write_card
+from physion.trials.share.card import about_states, write_card
 from support.hand_made import SIZE, make_parts
 from support.programs import find_program
 
@@ -87,6 +88,26 @@ def _front_matter(text: str) -> dict[str, Any]:
     yaml = pytest.importorskip("yaml")
     _, front, _ = text.split("---\n", 2)
     return dict(yaml.safe_load(front))
+
+
+def test_the_card_says_whose_states_these_are_and_how_good(dataset: Path, tmp_path: Path) -> None:
+    text = write_card(dataset, tmp_path).readme.read_text()
+    assert about_states(["by hand 1"]) in text
+    ours = about_states(["physion-3.97b", "physion-3.97b"])
+    assert ours.startswith("States, contacts and labels are computed by the engine physion-3.97b,")
+    results = Path(__file__).parents[3] / "benchmarks" / "results" / "replay.json"
+    for engine, known in RECORDED_OUTCOMES.items():
+        table = pd.DataFrame(json.loads(results.read_text())["scenarios"])
+        found = table[table["engine"] == engine].set_index("scenario")["agreement"]
+        assert found.drop("drape", errors="ignore").size == 7
+        assert known["rigid"] == round(found.drop("drape", errors="ignore").mean(), 3)
+        assert known.get("drape") == (round(found["drape"], 3) if "drape" in found else None)
+        said = about_states([f"{engine}-1"])
+        assert all(f"{number:.3f}" in said for number in known.values())
+    assert "was not measured" in about_states(["own-1"])
+    assert about_states(["imported: TDW"]) == (
+        "States, contacts and labels of some trials are imported (TDW)."
+    )
 
 
 def test_the_front_matter_is_what_the_hub_reads(dataset: Path, tmp_path: Path) -> None:

@@ -220,10 +220,16 @@ def test_export_writes_one_file_for_each_trial(
     assert main([*command, "--scenario", "drape"]) == 0
     (path,) = (tmp_path / "out").rglob("*.glb")
     assert path == tmp_path / "out" / "testing" / "drape" / "drape_0.glb"
-    assert capsys.readouterr().out.split() == [str(path)]
+    readme = tmp_path / "out" / "README.md"
+    assert capsys.readouterr().out.split() == [str(path), str(readme)]
+    assert "computed by the engine" in readme.read_text()
     assert path.read_bytes() == trial_gltf(Dataset(folder).trial("drape_0"))
     with pytest.raises(BadInputError, match="no trial of split readout"):
         export_gltf(folder, tmp_path / "none", split="readout")
+    readme.write_text("my own")
+    with pytest.raises(BadInputError, match="would be lost"):
+        export_gltf(folder, tmp_path / "out")
+    assert readme.read_text() == "my own"
 
 
 def test_a_cloth_without_all_vertices_is_refused() -> None:

@@ -14,6 +14,7 @@ import pytest
 from physion.cli.main import main
 from physion.core.errors import BadInputError
 from physion.trials.dataset import Dataset
+from physion.trials.share.card import about_states
 from physion.trials.share.lerobot import CAMERA, export_lerobot
 from support.viewer_dataset import FRAMES, PLANS, make_dataset
 
@@ -58,6 +59,12 @@ def test_episodes_are_trials_in_the_order_of_splits(source: Path, made: Path) ->
             file_index=row[f"videos/{CAMERA}/file_index"],
         )
         assert movie.read_bytes() == Dataset(source).paths(row["trial"]).movie.read_bytes()
+
+
+def test_the_readme_says_where_states_come_from(source: Path, made: Path) -> None:
+    text = (made / "README.md").read_text()
+    assert text.startswith("# Physion trials as a LeRobot dataset\n")
+    assert text.endswith(f"\n{about_states(Dataset(source).index['engine'])}\n")
 
 
 def test_frames_hold_states_pushes_and_the_outcome(source: Path, made: Path) -> None:

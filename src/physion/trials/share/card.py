@@ -11,7 +11,7 @@ from __future__ import annotations
 import datetime
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ import pyarrow.parquet as pq
 from physion.core.errors import BadInputError
 from physion.core.files import folder_for_writing, write_atomic
 from physion.core.tables import markdown_table
+from physion.physics.replay import RECORDED_OUTCOMES
 from physion.trials.dataset import indexed_file
 from physion.trials.files import INDEX
 from physion.trials.index import INDEX_COLUMNS
@@ -134,6 +135,7 @@ def card_text(facts: DatasetFacts, terms: PublicationTerms) -> str:
         _front_matter(facts, terms),
         f"# {facts.name}\n{description(facts)}",
         f"## How it was made\n{facts.collection()}\n\n"
+        f"{about_states(facts.index['engine'])}\n\n"
         f"Creator: {name}. Version {terms.version}, {terms.published}. "
         f"Licence: {terms.license}.",
         f"## Splits\n{_table(_counts(facts.index))}\n\n{_meanings('split', SPLIT_MEANINGS, facts)}",
@@ -150,6 +152,49 @@ def card_text(facts: DatasetFacts, terms: PublicationTerms) -> str:
         f"## Citation\n```bibtex\n{CITATION}\n```",
     ]
     return "\n\n".join(sections) + "\n"
+
+
+def about_states(engines: Iterable[str]) -> str:
+    """Return where states come from, and how often their outcome is the recorded one.
+
+    ``engines``: names of the engines as trials have them.
+    """
+    sentences = []
+    for engine in sorted(set(engines)):
+        name = engine.partition("-")[0]
+        if engine.startswith("imported: "):
+            source = engine.removeprefix("imported: ")
+            sentences.append(f"States, contacts and labels of some trials are imported ({source}).")
+            continue
+        sentences.append(
+            f"States, contacts and labels are computed by the engine {engine}, also where a scene "
+            "comes from the original study; they are not recorded from the simulator of that study."
+        )
+        known = RECORDED_OUTCOMES.get(name)
+        if known is None:
+            found = "How often its outcome is the recorded one was not measured."
+        else:
+            drape = f"; {known['drape']:.3f} in Drape" if "drape" in known else ""
+            found = (
+                f"On the official scenes its outcome is the recorded one in {known['rigid']:.3f} "
+                f"of the trials (mean over the seven rigid scenarios{drape})."
+            )
+        sentences.append(found)
+    return " ".join(sentences)
+
+
+def check_readme(out: Path, title: str) -> None:
+    """Raise `BadInputError` if `write_readme` would replace a file of others."""
+    path = out / CARD
+    if path.exists() and not (path.is_file() and path.read_bytes().startswith(title.encode())):
+        raise BadInputError(f"{path} is there and would be lost: give another folder")
+
+
+def write_readme(out: Path, title: str, text: str, engines: Iterable[str]) -> Path:
+    """Write a short README with the title, a text and `about_states`; return its path."""
+    check_readme(out, title)
+    write_atomic(out / CARD, f"{title}\n{text}\n\n{about_states(engines)}\n".encode())
+    return out / CARD
 
 
 def _front_matter(facts: DatasetFacts, terms: PublicationTerms) -> str:

@@ -39,10 +39,13 @@ from physion.physics.trajectory import Trajectory
 from physion.rendering.triangles import solid, surface_of
 from physion.scenes.scene import FRAME_TIME, GRAVITY, Camera, Look, Scene
 from physion.trials.dataset import Dataset
+from physion.trials.share.card import check_readme, write_readme
 from physion.trials.trial_file import Trial
 
 CLOTH_KEYS = 60
 """Largest number of key frames of a cloth."""
+TITLE = "# Physion trials as glTF files"
+README = "One GLB file for each trial; `extras` of its scene hold the contacts, their units and more."
 UNITS = "metres, kilograms, seconds; below the node world z points upwards"
 
 _Array = NDArray[Any]
@@ -81,13 +84,16 @@ def export_gltf(
     verify: bool = True,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Write trials of a dataset as ``SPLIT/SCENARIO/TRIAL.glb`` below ``out``, and return them.
+    """Write trials of a dataset as ``SPLIT/SCENARIO/TRIAL.glb`` below ``out``, and a README.
+
+    Return the paths of all files.
 
     ``split``, ``scenario``: only these. ``verify``: whether trial files are compared with the
     index. Raises `BadInputError` if no trial is chosen or one is damaged.
     """
     dataset = Dataset(folder, verify=verify)
     trials = dataset.chosen(split, scenario)
+    check_readme(out, TITLE)
     made = []
     for name in tracked(trials, "glTF files", len(trials), progress):
         trial = dataset.trial(name)
@@ -95,7 +101,8 @@ def export_gltf(
         place.mkdir(parents=True, exist_ok=True)
         write_atomic(place / f"{name}.glb", trial_gltf(trial))
         made.append(place / f"{name}.glb")
-    return made
+    engines = dataset.index.set_index("trial").loc[trials, "engine"]
+    return [*made, write_readme(out, TITLE, README, engines)]
 
 
 def motion_gltf(

@@ -2,6 +2,7 @@
 
 Layout of the folder:
 
+- ``README.md``: where the states come from;
 - ``meta/info.json``: features, frame rate, number of episodes, splits as ranges of episodes;
 - ``meta/tasks.parquet``: the question of every trial; ``meta/stats.json``: statistics for scaling,
   of pictures from the first one of each episode;
@@ -48,6 +49,7 @@ from physion.physics.trajectory import Trajectory
 from physion.scenes.scene import FRAME_TIME, Scene
 from physion.trials.dataset import Dataset
 from physion.trials.making.pairs import without_pairs
+from physion.trials.share.card import check_readme, write_readme
 from physion.trials.share.questions import WORDINGS
 from physion.trials.video import open_movie
 
@@ -61,6 +63,11 @@ NAMES = (
 )
 ACTION = ("impulse_x", "impulse_y", "impulse_z", "point_x", "point_y", "point_z", "object")
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+TITLE = "# Physion trials as a LeRobot dataset"
+README = (
+    "Each trial is an episode; `meta/info.json` names the columns. `LeRobotDataset` of LeRobot "
+    "opens the folder."
+)
 QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
 
 
@@ -88,8 +95,10 @@ def export_lerobot(
     names = [str(name) for name in index.index if name in chosen]
     if unlabelled := [name for name in names if pd.isna(index.loc[name, "contact"])]:
         raise BadInputError(f"trial {unlabelled[0]!r} has no label: choose a split with labels")
+    check_readme(out, TITLE)
     with folder_for_writing(out):
         remove_leftovers(out)
+        write_readme(out, TITLE, README, index.loc[names, "engine"])
         episodes = _write_episodes(dataset, names, out, progress)
         return [_write_meta(out, episodes, index.loc[names, "split"].tolist())]
 
