@@ -35,6 +35,7 @@ class Options:
         "webdataset",
         "gltf",
         "lerobot",
+        "lance",
         "features-request",
         "lmms-eval",
         "conditioning",
@@ -48,6 +49,7 @@ class Options:
     files; webdataset: tar shards;
     gltf: one GLB file for each trial, with its motion, for Blender and other 3D programs;
     lerobot: a LeRobot dataset (v3.0) of full movies, states and pushes, for world models;
+    lance: the same as tables of Lance, for stable-worldmodel (extra lance);
     features-request: movies to be encoded elsewhere, their names, and a script that needs only
     torch; physion evaluate --features takes its result;
     lmms-eval: questions for language models with movies, as tasks of this harness;
@@ -146,6 +148,11 @@ def _trials(options: Options, out: Path, stages: Stages) -> int:
         from physion.trials.share.lerobot import export_lerobot
 
         made = export_lerobot(options.folder, out, verify=options.verify, progress=stages, **chosen)
+        return _print_paths(made, options.json)
+    if options.layout == "lance":
+        from physion.trials.share.lance import export_lance
+
+        made = export_lance(options.folder, out, verify=options.verify, progress=stages, **chosen)
         return _print_paths(made, options.json)
     if options.layout == "features-request":
         from physion.trials.share.features_request import export_features_request

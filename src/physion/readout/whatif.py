@@ -60,7 +60,7 @@ def whatif_scores(predictions: pd.DataFrame) -> pd.DataFrame:
 
 
 def causes(predictions: pd.DataFrame) -> pd.DataFrame:
-    """Return what each removal of a body does to the outcome: a contact that it ends had that cause.
+    """Return what each removal of a body does to the outcome: what ends a contact, was a cause of it.
 
     Returns
     -------

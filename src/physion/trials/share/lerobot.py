@@ -89,18 +89,27 @@ def export_lerobot(
     BadInputError
         If no trial is chosen, one has no label or no movie, or movies differ in size or rate.
     """
-    dataset = without_pairs(Dataset(folder, verify=verify))
-    index = dataset.index.sort_values("split", kind="stable").set_index("trial")
-    chosen = set(dataset.chosen(split, scenario))
-    names = [str(name) for name in index.index if name in chosen]
-    if unlabelled := [name for name in names if pd.isna(index.loc[name, "contact"])]:
-        raise BadInputError(f"trial {unlabelled[0]!r} has no label: choose a split with labels")
+    dataset, names = labelled(folder, split, scenario, verify=verify)
+    index = dataset.index.set_index("trial")
     check_readme(out, TITLE)
     with folder_for_writing(out):
         remove_leftovers(out)
         write_readme(out, TITLE, README, index.loc[names, "engine"])
         episodes = _write_episodes(dataset, names, out, progress)
         return [_write_meta(out, episodes, index.loc[names, "split"].tolist())]
+
+
+def labelled(
+    folder: Path, split: str | None, scenario: str | None, *, verify: bool
+) -> tuple[Dataset, list[str]]:
+    """Return a dataset without pairs and its chosen trials, by split; all must have labels."""
+    dataset = without_pairs(Dataset(folder, verify=verify))
+    index = dataset.index.sort_values("split", kind="stable").set_index("trial")
+    chosen = set(dataset.chosen(split, scenario))
+    names = [str(name) for name in index.index if name in chosen]
+    if unlabelled := [name for name in names if pd.isna(index.loc[name, "contact"])]:
+        raise BadInputError(f"trial {unlabelled[0]!r} has no label: choose a split with labels")
+    return dataset, names
 
 
 @dataclass
