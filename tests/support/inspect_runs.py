@@ -18,7 +18,10 @@ from inspect_ai.log import read_eval_log, write_eval_log
 from inspect_ai.model import ModelOutput, ModelUsage, get_model
 
 from physion.core.errors import PhysionError
+from physion.tasks.inspect import _data_uri as data_uri
 from physion.tasks.logs import read_answers
+from physion.trials.dataset import Dataset
+from physion.trials.share.items import items_of, movie_of
 
 SLOW = "slow"
 """Answer that comes after a minute."""
@@ -45,6 +48,27 @@ def mock(answer: Callable[[str, int], str]) -> Any:
     return get_model("mockllm/model", custom_outputs=outputs)
 
 
+def truths(dataset: str) -> dict[str, str]:
+    """The right answer by the movie that is shown, as Inspect hands it to a model."""
+    known = Dataset(dataset)
+    return {
+        data_uri("video/mp4", movie_of(known, item)): item.truth for item in items_of(known)
+    }
+
+
+def knows(by_movie: dict[str, str]) -> Any:
+    """A model that finds the outcome by the movie before the question."""
+
+    async def outputs(messages: Any, *_: Any) -> ModelOutput:
+        movie, text = messages[-1].content
+        said = option(text.text, by_movie[movie.video])
+        output = ModelOutput.from_content("mockllm", f"I think so. Answer: {said}")
+        output.usage = ModelUsage(input_tokens=1, output_tokens=1, total_tokens=2)
+        return output
+
+    return get_model("mockllm/model", custom_outputs=outputs)
+
+
 def results(log: Any) -> dict[str, Any]:
     """All metrics of a log by name, and its status."""
     found = {name: one.value for score in log.results.scores for name, one in score.metrics.items()}
@@ -65,10 +89,11 @@ def main(dataset: str, folder: str) -> None:
     """Run the mock models and print what came out."""
     logs, found = Path(folder), dict[str, Any]()
 
-    def run(name: str, answer: Callable[[str, int], str], **options: Any) -> Any:
+    def run(name: str, answer: Any, **options: Any) -> Any:
         task = options.pop("task", "physion/contact")
         arguments = {"dataset": dataset, **options.pop("arguments", {})}
-        log = run_tasks(task, mock(answer), task_args=arguments, log_dir=str(logs / name),
+        model = answer if name == "truth" else mock(answer)
+        log = run_tasks(task, model, task_args=arguments, log_dir=str(logs / name),
                         display="none", **options)[0]  # fmt: skip
         if log.results:
             found[name] = results(log)
@@ -76,6 +101,7 @@ def main(dataset: str, folder: str) -> None:
 
     run("yes", lambda text, _: option(text, "yes"))
     run("no", lambda text, _: f"The answer is {option(text, 'no')}) no.")
+    run("truth", knows(truths(dataset)), arguments={"media": "movie"})
     run("first", lambda *_: "A", arguments={"media": "movie", "wording": 3})
     run("nonsense", lambda *_: "I cannot answer yes or no to this.")
     run("pictures", lambda text, count: "A" if count == 3 and "These 3 pictures" in text else "",
@@ -100,6 +126,7 @@ def main(dataset: str, folder: str) -> None:
     found["retried"] = {"task": retried.eval.task, "kept": len(kept)}
     whole = next((logs / "yes").glob("*.eval"))
     found["read"] = predictions(whole)
+    found["true"] = predictions(next((logs / "truth").glob("*.eval")))
     found["order"] = predictions(next((logs / "first").glob("*.eval")))
     found["other question"] = predictions(next((logs / "seen").glob("*.eval")))
     cut = logs / "cut.eval"

@@ -16,16 +16,19 @@ from support.hand_made import FRAMES, make_parts
 SIZE, OBSERVED = 64, 45
 
 
-def picture(red: int, yellow: int) -> NDArray[np.uint8]:
+def picture(red: int, yellow: int, grey: int = 90) -> NDArray[np.uint8]:
     """A picture with squares whose left edges are in these columns, on grey."""
-    frame = np.full((SIZE, SIZE, 3), 90, np.uint8)
+    frame = np.full((SIZE, SIZE, 3), grey, np.uint8)
     frame[20:32, red : red + 12] = (200, 20, 20)
     frame[40:52, yellow : yellow + 12] = (220, 210, 30)
     return frame
 
 
 def make_dataset(folder: Path, count: int = 4, look: str = "redyellow") -> Path:
-    """Trials ``squares_0``, ...: the first half touches, in even ones red is on the left."""
+    """Trials ``squares_0``, ...: the first half touches, in even ones red is on the left.
+
+    Each has a grey of its own, so that no two movies are equal.
+    """
     for place in range(count):
         name, left = f"squares_{place}", place % 2 == 0
         parts = make_parts(name, cloth=False, contact_frame=50 if place < count / 2 else None)
@@ -34,7 +37,7 @@ def make_dataset(folder: Path, count: int = 4, look: str = "redyellow") -> Path:
         )
         starts = (4, 46) if left else (46, 4)
         steps = np.linspace(0, 14, FRAMES).astype(int) * (1 if left else -1)
-        movie = np.stack([picture(starts[0] + int(step), starts[1]) for step in steps])
+        movie = np.stack([picture(starts[0] + int(step), starts[1], 90 + place) for step in steps])
         role_map = np.zeros((SIZE, SIZE, 4), np.uint8)
         role_map[20:32, starts[0] : starts[0] + 12] = (255, 0, 0, 255)
         role_map[40:52, starts[1] : starts[1] + 12] = (255, 255, 0, 255)

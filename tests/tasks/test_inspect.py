@@ -12,6 +12,7 @@ import math
 import os
 import subprocess
 import sys
+from statistics import NormalDist
 from typing import Any
 
 import pytest
@@ -56,6 +57,17 @@ def test_answers_are_counted_by_outcome_and_order(
     assert got["status"] == "success" and got["unreadable"] == 0
     assert (got["accuracy"], got["yes_bias"], got["flips"]) == (accuracy, bias, flips)
     assert got["d_prime"] == pytest.approx(0)
+
+
+def test_the_truth_is_right_in_both_orders(found: dict[str, Any]) -> None:
+    got = found["truth"]
+    assert got["status"] == "success" and got["unreadable"] == 0
+    assert (got["accuracy"], got["stderr"], got["yes_bias"], got["flips"]) == (1, 0, 0, 0)
+    # Four of four contacts and none of four others: (k + 1/2) / (n + 1), z of .9 twice.
+    assert got["d_prime"] == pytest.approx(2 * NormalDist().inv_cdf(0.9))
+    rows = found["true"]["rows"]
+    assert not found["true"]["warnings"] and len(rows) == 4
+    assert all(row["p_contact"] == row["predicted"] == row["outcome"] for row in rows.values())
 
 
 def test_the_standard_error_is_clustered_by_stimulus(found: dict[str, Any]) -> None:

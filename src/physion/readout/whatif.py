@@ -60,7 +60,7 @@ def whatif_scores(predictions: pd.DataFrame) -> pd.DataFrame:
 
 
 def causes(predictions: pd.DataFrame) -> pd.DataFrame:
-    """Return what each removal of a body does to the outcome: what ends a contact, was a cause of it.
+    """Return what each removal of a body does: one that ends a contact took a cause of it.
 
     Returns
     -------
