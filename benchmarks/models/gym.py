@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from physion.core.tables import markdown_table
 from physion.tasks.push import SCENARIOS, PushEnv
 
 RESULT = Path(__file__).parents[1] / "results" / "gym.md"
@@ -48,17 +49,16 @@ def main() -> None:
     n, started = options.episodes, time.perf_counter()
     counts = {scenario: successes(scenario, n, options.tries) for scenario in SCENARIOS}
     headings = ["scenario", "no push", "random push", f"best of {options.tries} simulated pushes"]
-    cells = [headings, ["---"] * len(headings)]
+    cells = []
     for scenario, found in counts.items():
         cells.append([scenario, *(f"{count / n:.2f} ({count} of {n})" for count in found)])
     means = np.mean(list(counts.values()), axis=0) / n
     cells.append(["mean", *(f"{mean:.3f}" for mean in means)])
     command = f"python benchmarks/models/gym.py --episodes {n} --tries {options.tries}"
     seconds = time.perf_counter() - started
-    lines = [f"| {' | '.join(line)} |" for line in cells]
     text = (
         f"# One push: episodes in which red touches yellow\n`{command}`, "
-        f"{date.today().isoformat()}, {seconds:.0f} s\n\n" + "\n".join(lines) + "\n"
+        f"{date.today().isoformat()}, {seconds:.0f} s\n\n{markdown_table(headings, cells)}\n"
     )
     print(text)
     if options.write:
