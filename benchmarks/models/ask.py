@@ -188,7 +188,8 @@ def _cells(name: str, row: pd.Series) -> list[str]:
     """A row of the table: measures with their 95 % intervals, over all stimuli."""
     cells = [name, str(int(row["stimuli"]))]
     for measure in MEASURES:
-        value, low, high = (row[f"{measure}{end}"] for end in ("", "_low", "_high"))
+        ends = ("", "_low", "_high")
+        value, low, high = (round(row[f"{measure}{end}"], 3) + 0.0 for end in ends)  # no -0
         interval = "" if low != low else f" [{low:.3f}, {high:.3f}]"
         cells.append("-" if value != value else f"{value:.3f}{interval}")
     return cells

@@ -1,6 +1,6 @@
 """How often simple policies make red touch yellow with one push, in the environment of Gymnasium.
 
-    python benchmarks/models/gym.py [--episodes 100] [--tries 20] [--write]
+    python benchmarks/models/gym.py [--episodes 50] [--tries 20] [--write]
 
 Policies: no push; a push drawn uniformly from all actions; and the first of 20 such pushes with
 which red touches yellow in a simulation of the same scene, which is exact.
@@ -42,7 +42,7 @@ def successes(scenario: str, episodes: int, tries: int) -> list[int]:
 def main() -> None:
     """Print one row for each scenario."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--tries", type=int, default=20)
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()

@@ -15,7 +15,14 @@ from physion.core.errors import BadInputError
 from physion.core.files import write_atomic
 from physion.core.html import Markup, joined
 from physion.models.interface import Model
-from physion.readout.check import CheckedModel, check_model
+from physion.readout.check import (
+    NOT_CHECKED,
+    PASSED,
+    REFUSED,
+    SHOWN,
+    CheckedModel,
+    check_model,
+)
 from physion.readout.settings import EvaluationSettings, choose_models
 from physion.readout.tables import file_name
 from physion.report.html import MACROS, notes, paragraph, render_document
@@ -113,11 +120,14 @@ def check(
 def described(table: pd.DataFrame) -> pd.DataFrame:
     """Return the table of a check (`physion.readout.check.COLUMNS`) as texts."""
     shown = pd.DataFrame({"change": table["change"], "readout": table["readout"]})
-    shown["moved"] = [f"{m} of {n}" for m, n in zip(table["moved"], table["trials"], strict=True)]
+    counts = zip(table["moved"], table["trials"], strict=True)
+    shown["moved"] = ["" if pd.isna(moved) else f"{moved:.0f} of {of}" for moved, of in counts]
+    none = table["accuracy"].isna()  # nothing was predicted anew
     for name, title in (("largest", "by at most"), ("mean", "on average")):
         shown[title] = [f"{value:.2g}" for value in table[name]]
     both = zip(table["accuracy"], table["accuracy_changed"], strict=True)
     shown["accuracy"] = [f"{before:.3f} -> {after:.3f}" for before, after in both]
+    shown.loc[none, ["by at most", "on average", "accuracy"]] = ""
     shown["verdict"] = table["verdict"]
     return shown
 
@@ -130,10 +140,15 @@ def _page(done: CheckedModel) -> str:
         [str(what), *(str(cell) for cell in cells)]
         for what, cells in zip(table["what"], shown.to_numpy(), strict=True)
     ]
-    judged = table["verdict"].isin(["passed", "refused"])
+    kinds = {
+        "must not move a prediction": table["verdict"].isin([PASSED, REFUSED]),
+        "may move predictions": table["verdict"] == SHOWN,
+        "not possible for a table of features": table["verdict"] == NOT_CHECKED,
+    }
     groups = [
-        ("must not move a prediction", [row for row, yes in zip(rows, judged, strict=True) if yes]),
-        ("may move predictions", [row for row, yes in zip(rows, judged, strict=True) if not yes]),
+        (name, [row for row, yes in zip(rows, chosen, strict=True) if yes])
+        for name, chosen in kinds.items()
+        if chosen.any()
     ]
     changes = Markup(MACROS.table(["what was changed", *shown.columns], groups))
     explained = paragraph(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import json
+import math
 import os
 import re
 import subprocess
@@ -19,11 +21,14 @@ from numpy.typing import NDArray
 from physion.cli.main import main
 from physion.clips.batch import Batch, Provenance, Spec
 from physion.core.errors import BadInputError
+from physion.checking import check
 from physion.models import build_model
+from physion.models.feature_table import FeatureTable
 from physion.models.interface import Model
+from physion.readout.check import check_models
 from physion.readout.evaluate import evaluate
 from physion.readout.logistic import LogisticSettings
-from physion.readout.settings import EvaluationSettings
+from physion.readout.settings import EvaluationSettings, choose_models
 from physion.trials.dataset import Dataset
 from physion.trials.share.features_request import export_features_request
 from physion.trials.video import count_frames
@@ -272,6 +277,59 @@ def test_a_damaged_file_is_refused_in_one_line(
     path.unlink()
     assert main(["evaluate", str(path), str(dots.folder), "--out", str(tmp_path)]) == 2
     assert "there is no file of features" in capsys.readouterr().err
+
+
+def weak(dots: Dataset) -> dict[str, Any]:
+    """Features with less of the outcome: no number of them tells all outcomes."""
+    given = arrays(dots)
+    contact = dots.index.set_index("trial")["contact"].loc[given["names"]].to_numpy(float)
+    given["features"][:, :, 0] -= np.float32(2) * contact[:, None].astype(np.float32)
+    return given
+
+
+def test_a_number_that_tells_all_outcomes_is_found(dots: Dataset, tmp_path: Path) -> None:
+    given = weak(dots)
+    known = dots.index.set_index("trial")["contact"].loc[named(dots)].astype(bool).to_dict()
+    np.savez(tmp_path / "net.npz", **given)
+    table = FeatureTable(tmp_path / "net.npz")
+    place, chance = table.telling(known)
+    # 24 trials, half of them with contact, and 40 numbers.
+    assert sum(known.values()) == 12 and chance == 2 * 40 / math.comb(24, 12)
+    assert place == ""
+    given["features"][:, 3, 2] = [-1e-3 * contact for contact in known.values()]
+    np.savez(tmp_path / "leak.npz", **given)
+    assert FeatureTable(tmp_path / "leak.npz").telling(known)[0] == "time step 3, feature 2"
+    assert table.telling(dict.fromkeys(known, True)) == ("", float("inf"))
+    twin = table.random_twin(np.random.default_rng(0))
+    assert twin.digest() != table.digest() and twin.features.shape == table.features.shape
+    assert list(table.of_trials(named(dots)[:2]).rows) == named(dots)[:2]
+
+
+@pytest.mark.slow
+def test_a_table_is_checked_as_far_as_it_can_be(
+    dots: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given, labels = weak(dots), dots.index.set_index("trial")["contact"]
+    np.savez(tmp_path / "net.npz", **given)
+    given["features"][:, 3, 2] = 1e-3 * labels.loc[given["names"]].to_numpy(float)
+    np.savez(tmp_path / "leak.npz", **given)
+    command = ["check", str(tmp_path / "net.npz"), str(dots.folder), "--out", str(tmp_path / "out")]
+    assert main([*command, "--trials", "40", "--json"]) == 0
+    values = json.loads(capsys.readouterr().out)
+    found = {row["change"]: row["verdict"] for row in values["changes"]}
+    assert {name for name, verdict in found.items() if verdict == "passed"} == {
+        "again", "labels", "outcome"
+    }  # fmt: skip
+    assert found["random twin"] == "shown" and found["future"] == "not possible: a table"
+    assert values["verdict"].endswith("; 10 changes are not possible for a table of features")
+    page = (tmp_path / "out" / "net.html").read_text()
+    assert "not possible for a table of features" in page and "nan" not in page.split("<table")[1]
+    both = choose_models([str(tmp_path / name) for name in ("net.npz", "leak.npz")])
+    outcomes = check_models(both, dots.folder, tmp_path / "both", QUICK)
+    assert list(outcomes.values()) == ["passed, as a table", "refused: outcome"]
+    few = check(str(tmp_path / "leak.npz"), dots, tmp_path / "few", QUICK, trials=4)
+    (row,) = few.table[few.table["change"] == "outcome"].itertuples()
+    assert (row.verdict, row.note) == ("shown", "too few trials to tell that from chance")
 
 
 def test_text_with_the_ending_npz_is_not_called_pickled(tmp_path: Path) -> None:

@@ -51,9 +51,7 @@ def mock(answer: Callable[[str, int], str]) -> Any:
 def truths(dataset: str) -> dict[str, str]:
     """The right answer by the movie that is shown, as Inspect hands it to a model."""
     known = Dataset(dataset)
-    return {
-        data_uri("video/mp4", movie_of(known, item)): item.truth for item in items_of(known)
-    }
+    return {data_uri("video/mp4", movie_of(known, item)): item.truth for item in items_of(known)}
 
 
 def knows(by_movie: dict[str, str]) -> Any:

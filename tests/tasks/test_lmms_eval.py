@@ -21,7 +21,6 @@ from physion.trials.share.lmms_eval import export_lmms_eval
 from support.programs import find_program
 from support.red_and_yellow import make_dataset
 
-
 RESPONSES = {
     # what the mock model always says: accuracy, yes bias, flips, unreadable, P(contact)
     "A": (0.5, 0, 1, 0, {0.5}),

@@ -21,8 +21,10 @@ Nothing in a file is executed: pickled arrays are refused.
 from __future__ import annotations
 
 import contextlib
+import copy
+import math
 import zipfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -201,6 +203,45 @@ class FeatureTable(Model):
                 f"{len(unknown)} of {len(self.rows)} names are unknown to the dataset, such as "
                 f"{unknown[0]!r}; leave them out, or choose the dataset that was encoded"
             )
+
+    def of_trials(self, trials: Collection[str]) -> FeatureTable:
+        """Return the table of these trials only, as far as it has them."""
+        part, wanted = copy.copy(self), {self._key(trial) for trial in trials}
+        part.rows = {name: row for name, row in self.rows.items() if name in wanted}
+        return part
+
+    def random_twin(self, rng: np.random.Generator) -> FeatureTable:
+        """Return a table of the same trials with random numbers in place of all features."""
+        twin = copy.copy(self)
+        twin.features = rng.normal(size=self.features.shape).astype(np.float32)
+        twin._sha256 = digest_of(twin.features.tobytes())
+        return twin
+
+    def telling(self, outcomes: Mapping[str, bool]) -> tuple[str, float]:
+        """Return a number of the features that tells all outcomes of trials, and the chance of it.
+
+        Parameters
+        ----------
+        outcomes
+            Outcomes by trial.
+
+        Returns
+        -------
+        place, chance
+            ``time step T, feature D`` of a number that is larger in all trials of one outcome than
+            in all of the other, or an empty text; and how many of the numbers would be so if none
+            had to do with the outcome.
+        """
+        values = self.features[[self.rows[self._key(trial)] for trial in outcomes]]
+        contact = np.array(list(outcomes.values()), np.bool_)
+        yes, no = values[contact], values[~contact]
+        if not (len(yes) and len(no)):
+            return "", float("inf")
+        chance = 2 * values[0].size / math.comb(len(values), len(yes))
+        apart = (yes.min(0) > no.max(0)) | (yes.max(0) < no.min(0))
+        places = np.argwhere(apart)
+        place = "time step {}, feature {}".format(*places[0]) if len(places) else ""
+        return place, chance
 
     def encode(self, batch: Batch) -> NDArray[np.float32]:
         """Return the features (B, T, D) of the trials of a batch."""

@@ -26,7 +26,7 @@ from physion.compute.run_tasks import FATAL_ERRNOS
 from physion.compute.tasks import Executor, Progress, tracked
 from physion.core.errors import BadInputError, PhysionError, UnknownNameError, one_line
 from physion.core.seeds import generator
-from physion.models.build import FEATURE_FILES, OutOfMemoryError, build_model
+from physion.models.build import OutOfMemoryError, build_model
 from physion.models.feature_table import FeatureTable
 from physion.models.interface import Model, can
 from physion.readout.benchmark import benchmark_of
@@ -46,7 +46,12 @@ PASSED, REFUSED, SHOWN = "passed", "refused", "shown"
 UNDECIDED = "not decided"
 """Verdict of a model of which no change was judged."""
 NOT_CHECKED = "not possible: a table"
-"""Verdict of a table of features, which knows trials by their names only."""
+"""Verdict of a change that cannot be made to a table of features, which knows trials by their names
+only."""
+OF_TABLES, TELLS = ("again", "labels"), "outcome"
+"""Changes that are made to a table of features, and the test that is only for tables."""
+AS_TABLE = f"{PASSED}, as a table"
+"""Outcome of a table of features, of which few changes can be judged."""
 ROUNDING = 1e-3
 """Largest change of P(contact), of the range of all predictions, where trials are in other batches,
 in which sums are rounded differently."""
@@ -56,9 +61,10 @@ SCENARIOS, SIZE = ("collide", "drop"), 64
 """Scenarios of the trials that are made if no dataset is given, and pixels per side."""
 BLOBS, TWIN = "blob-centroids", "random twin"
 _OTHERS = {
-    TWIN: "The same architecture with random weights",
+    TWIN: "The same architecture with random weights, or random numbers in place of features",
     BLOBS: "Centroids and areas of red and yellow pixels, in place of the model",
 }
+_TELLS = "Nothing: no single number of the features may tell all outcomes"
 
 COLUMNS = (
     "change", "what", "readout", "trials", "moved", "largest", "mean", "accuracy",
@@ -106,13 +112,19 @@ class CheckedModel:
         if not self.passed:
             return f"{self.model} {UNDECIDED}: {self._undecided()}"
         held = self.table["change"][self.table["verdict"] == PASSED].nunique()
-        return f"{self.model} passed: none of {held} changes moved a prediction that must stay"
+        no = int((self.table["verdict"] == NOT_CHECKED).sum())
+        more = f"; {no} changes are not possible for a table of features" if no else ""
+        return (
+            f"{self.model} passed: none of {held} changes moved a prediction that must stay{more}"
+        )
 
     @property
     def outcome(self) -> str:
         """The result for a table: passed, not decided, or refused with the changes."""
         if self.refused:
             return f"{REFUSED}: {', '.join(self.refused)}"
+        if self.passed and (self.table["verdict"] == NOT_CHECKED).any():
+            return AS_TABLE
         return PASSED if self.passed else UNDECIDED
 
     def _undecided(self) -> str:
@@ -120,6 +132,8 @@ class CheckedModel:
         rows = self.table[
             self.table["change"].isin([c.name for c in CHANGES.values() if c.must_hold])
         ]
+        if (rows["verdict"] == NOT_CHECKED).any():
+            return "none of these changes is possible for a table of features"
         if rows.empty:
             return "no change was made that must not move a prediction"
         notes = [note for note in rows["note"] if note]
@@ -151,11 +165,6 @@ def check_model(
     )
     built = chosen.build(settings.seed)
     name = check_identity(built).model
-    if isinstance(built, FeatureTable):
-        raise BadInputError(
-            f"{name} is a table of features, which knows trials by their names only; its frames "
-            "and names are checked when it is evaluated. Check the network that made it, as a model"
-        )
     if not settings.readouts:
         rules = benchmark_of(built, settings.benchmark)
         possible = [readout.value for readout in ways(built, settings.decision, rules)]
@@ -169,12 +178,20 @@ def check_model(
     wanted = [CHANGES[name] for name in changes or CHANGES]
     with tempfile.TemporaryDirectory(dir=out, prefix="copies-") as folder:
         first = take_trials(opened, Path(folder) / "first", trials)
+        features = built if isinstance(built, FeatureTable) else None
+        if features is not None:
+            features.check_trials(first.trials(), opened.known_trials())
+            built = features = features.of_trials(first.trials())
         work = _Check(built, first, settings, executor)
         rows = []
         for change in tracked(wanted, "changes", len(wanted), progress):
-            rows += work.rows(change)
+            made = features is None or change.name in OF_TABLES
+            rows += work.rows(change) if made else work.left(change)
+        if features is not None:
+            rows += work.rows_of_outcome(features)
         if not changes:
-            rows += work.rows_of_others(chosen.random_twin(built))
+            twin = chosen.random_twin(built) if features is None else None
+            rows += work.rows_of_others(twin)
         table = pd.DataFrame(rows, columns=list(COLUMNS))
         return CheckedModel(name, table, work.warnings())
 
@@ -190,14 +207,11 @@ def check_models(
 ) -> dict[str, str]:
     """Return the outcome of a check of each model by its name, as `physion.evaluate` writes it.
 
-    Only the changes that must not move a prediction are made. A table of features is not checked.
+    Only the changes that must not move a prediction are made.
     """
     changes = [change.name for change in CHANGES.values() if change.must_hold]
     found = {}
     for chosen in models:
-        if isinstance(chosen.model, str) and Path(chosen.model).suffix.lower() in FEATURE_FILES:
-            found[chosen.name] = NOT_CHECKED
-            continue
         done = check_model(
             chosen, dataset, out, settings, changes=changes, executor=executor, progress=progress
         )
@@ -303,10 +317,38 @@ class _Check:
     def _imagines(self, readout: str) -> bool:
         return readout == Readout.OBSERVED_SIMULATED.value and can(self._model, "imagine")
 
+    def left(self, change: Change) -> list[dict[str, Any]]:
+        """Return the rows of a change that is not possible for a table of features."""
+        return [
+            {"change": change.name, "what": change.what, "readout": readout}
+            | {"trials": len(rows), "verdict": NOT_CHECKED, "note": ""}
+            for readout, rows in self._before.groupby("readout")
+        ]
+
+    def rows_of_outcome(self, table: FeatureTable) -> list[dict[str, Any]]:
+        """Return the row that says whether a number of a table of features is the outcome."""
+        known = self._first.index[self._first.index["contact"].notna()]
+        outcomes = dict(zip(known["trial"], known["contact"].astype(bool), strict=True))
+        place, chance = table.telling(outcomes)
+        rows = []
+        for readout in self._readouts:
+            verdict, note = PASSED, ""
+            if place:
+                verdict, note = REFUSED, f"{place} tells all {len(outcomes)} outcomes"
+            if readout == Readout.FULL.value or chance > CHANCE:
+                verdict = SHOWN
+                note = note if chance <= CHANCE else "too few trials to tell that from chance"
+            rows.append({"change": TELLS, "what": _TELLS, "readout": readout})
+            rows[-1] |= {"trials": len(outcomes), "verdict": verdict, "note": note}
+        return rows
+
     def rows_of_others(self, twin: ChosenModel | None) -> list[dict[str, Any]]:
         """Return rows that compare the model with its random twin, and with blobs."""
         others: dict[str, Callable[[], Model]] = {}
-        if twin is not None:
+        model = self._model
+        if isinstance(model, FeatureTable):
+            others[TWIN] = lambda: model.random_twin(generator("check", TWIN))
+        elif twin is not None:
             others[TWIN] = functools.partial(twin.build, self._settings.seed)
         if self._has_pictures():
             others[BLOBS] = functools.partial(build_model, BLOBS)

@@ -45,9 +45,7 @@ from physion.trials.trial_file import Trial
 CLOTH_KEYS = 60
 """Largest number of key frames of a cloth."""
 TITLE = "# Physion trials as glTF files"
-README = (
-    "One GLB file for each trial; `extras` of its scene hold the contacts and more."
-)
+README = "One GLB file for each trial; `extras` of its scene hold the contacts and more."
 UNITS = "metres, kilograms, seconds; below the node world z points upwards"
 
 _Array = NDArray[Any]
