@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 import physion
 from physion import sample_scene
+from physion.cli.main import main
 from physion.compute.local import SerialExecutor
 from physion.core.errors import UnknownNameError
 from physion.physics.engine import simulate
@@ -75,7 +77,9 @@ def test_an_unknown_change_is_refused() -> None:
 
 
 @pytest.mark.slow
-def test_variants_are_made_with_the_trials(tmp_path: Path) -> None:
+def test_variants_are_made_with_the_trials(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     settings = GenerateSettings(width=64, height=64, jitters=0, movies=False)
 
     def make(count: int) -> physion.Dataset:
@@ -102,6 +106,16 @@ def test_variants_are_made_with_the_trials(tmp_path: Path) -> None:
             assert known["base_contact"] == dataset.trial(base).known_labels().contact
             assert trial.metadata.split == "testing"
     assert verify_dataset(tmp_path / "trials", again=4).faults == []
+    out = tmp_path / "out"
+    assert main(["evaluate", "constant-motion", str(dataset.folder), "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    table = pd.read_csv(out / "causes.csv")
+    assert len(table) and f"of {len(table)} removals change the outcome: " in printed
+    labels = dataset.index.set_index("trial")["contact"]
+    for row in table.itertuples():
+        without = labels[f"{row.trial}+remove.{row.removed}"]
+        assert (row.before, row.after) == (labels[row.trial], without)
+        assert row.changed == (row.before != row.after)
     digests = dict(zip(dataset.index["trial"], dataset.index["trial_file_sha256"], strict=True))
     again = make(3)
     more = dict(zip(again.index["trial"], again.index["trial_file_sha256"], strict=True))
