@@ -18,10 +18,10 @@ import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
+from physion.checking import check
 from physion.cli.main import main
 from physion.clips.batch import Batch, Provenance, Spec
 from physion.core.errors import BadInputError
-from physion.checking import check
 from physion.models import build_model
 from physion.models.feature_table import FeatureTable
 from physion.models.interface import Model
