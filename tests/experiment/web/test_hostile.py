@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import gzip
 import json
 import socket
 import time
@@ -90,40 +89,23 @@ def changed(**values: Any) -> bytes:
 
 
 BODIES = {
-    "nothing": b"",
     "no JSON": b"response=yes",
-    "null": b"null",
     "invalid UTF-8": changed().replace(b"yes", b"y\xffs"),
-    "packed": gzip.compress(changed()),
     "deep": DEEP.encode(),
-    "deep in details": changed().replace(b'"details": {', b'"details": {"x": ' + b"[" * 5000),
     "NaN": changed(rt_ms=float("nan")),
-    "Infinity": changed(rt_ms=float("inf")),
-    "beyond a double": changed().replace(b"812.5", b"1e999"),
-    "NaN in details": changed(details={"x": float("nan")}),
     "beyond a double in details": changed(details={"x": 12321}).replace(b"12321", b"1e999"),
-    "a huge number": changed(rt_ms=10**400),
     "digits beyond reading": changed().replace(b"812.5", b"1" * 10_000),
     "NUL": changed(details={"x": "a\x00b"}),
     "half a character": changed(details={"x": "\ud800"}),
 }
 VALUES: dict[str, dict[str, Any]] = {
-    "negative time": {"rt_ms": -1},
     "time beyond a day": {"rt_ms": 86_400_001},
     "time as text": {"rt_ms": "812.5"},
-    "time as bool": {"rt_ms": True},
-    "huge cue": {"cue_ms": 1e300},
-    "negative trial": {"trial": -1},
-    "unknown phase": {"phase": "demo"},
-    "unknown response": {"response": "maybe"},
     "unknown input": {"input": "<script>"},
     "key with an end of line": {"key": "abcdefgh\n"},
-    "long key": {"key": "a" * 65},
-    "huge window": {"window_width": 10**9},
     "too many details": {"details": {str(number): 0 for number in range(31)}},
     "too long details": {"details": {"x": "y" * 17_000}},
     "a long name in details": {"details": {"n" * 201: 1}},
-    "a stimulus": {"stimulus": "collide_tiny_tes_0000"},
     "correct": {"correct": True},
 }
 
@@ -143,10 +125,7 @@ class TestAnswers:
         assert field[:4].strip("<") in message, "the refusal says where"
         assert counts(site) == before and tester.state()["trial"] == 0
 
-    @pytest.mark.parametrize("kind", [
-        None, "", "text/plain", "application/x-www-form-urlencoded", "multipart/form-data",
-        "application/jsonx", "text/html; application/json", "application/octet-stream",
-    ])  # fmt: skip
+    @pytest.mark.parametrize("kind", [None, "text/plain", "text/html; application/json"])
     def test_other_content_types(self, tester: Person, kind: str | None) -> None:
         """This also blocks forms of other sites, which can only send these content types."""
         assert_refused(post(tester, "/api/answers", changed(), kind))
@@ -160,20 +139,15 @@ class TestAnswers:
 
 
 class TestEverythingElse:
-    @pytest.mark.parametrize("name", [name for name in BODIES if "details" not in name])
     @pytest.mark.parametrize("path", ["/api/enter", "/api/page", "/api/events"])
-    def test_bodies_of_other_endpoints(
-        self, site: Served, tester: Person, path: str, name: str
-    ) -> None:
+    def test_bodies_of_other_endpoints(self, site: Served, tester: Person, path: str) -> None:
         before = counts(site)
-        assert_refused(post(tester, path, BODIES[name]))
+        assert_refused(post(tester, path, BODIES["deep"]))
         assert counts(site) == before
 
     @pytest.mark.parametrize("body", [
-        {"id": "x" * 201}, {"id": " "}, {"id": 5}, {"source": "facebook"}, {"language": "x" * 21},
-        {"recruiter": {"a": "x" * 501}}, {"recruiter": {str(i): "" for i in range(11)}},
-        {"recruiter": {"a": {"b": 1}}}, {"device": {"refresh_hz": -60}}, {"kind": "simulated"},
-        {"device": {"user_agent": "x" * 1001}}, {"device": {"screen_width": 1e9}},
+        {"id": " "}, {"source": "facebook"}, {"recruiter": {str(i): "" for i in range(11)}},
+        {"device": {"refresh_hz": -60}}, {"kind": "simulated"},
     ])  # fmt: skip
     def test_entering(self, site: Served, body: Any) -> None:
         before = counts(site)
@@ -181,9 +155,8 @@ class TestEverythingElse:
         assert counts(site) == before
 
     @pytest.mark.parametrize("event", [
-        {"kind": "<script>", "at_ms": 1}, {"kind": "ok", "at_ms": -1}, {"kind": "ok", "at_ms": "1"},
-        {"kind": "x" * 41, "at_ms": 1}, {"kind": "ok", "at_ms": 1, "data": {"a": {"b": 1}}},
-        {"kind": "ok", "at_ms": 1, "data": {"a": "x" * 5001}}, {"kind": "ok"}, "hidden", None,
+        {"kind": "<script>", "at_ms": 1}, {"kind": "ok", "at_ms": -1}, {"kind": "ok"}, None,
+        {"kind": "ok", "at_ms": 1, "data": {"a": {"b": 1}}},
     ])  # fmt: skip
     def test_events(self, site: Served, tester: Person, event: Any) -> None:
         before = counts(site)
@@ -192,9 +165,7 @@ class TestEverythingElse:
         assert_refused(post(tester, "/api/events", json.dumps({"events": [good] * 51}).encode()))
         assert counts(site) == before
 
-    @pytest.mark.parametrize("query", [
-        "load=true&load=false", "load=1", "load=%00", "load[]=true", "x=" + "y" * 3000, "%ff=%fe",
-    ])  # fmt: skip
+    @pytest.mark.parametrize("query", ["load=true&load=false", "%ff=%fe"])
     def test_queries(self, tester: Person, query: str) -> None:
         assert tester.ask("GET", f"/api/session?{query}")["stage"] == "test"
 
@@ -269,13 +240,10 @@ class TestSignatures:
 
 
 TRAVERSALS = (
-    "/static/../../study.py", "/static/%2e%2e/%2e%2e/study.py", "/static/..%2f..%2fstudy.py",
-    "/static/..%5c..%5cstudy.py", "/static/....//....//study.py", "/static//etc/passwd",
-    "/static/%2fetc%2fpasswd", "/static/./main.js", "/static/main.js/", "/static/main.js%00",
-    "/static/main.js%00.css", "/static/%252e%252e/study.py", "/static/\\..\\study.py",
-    "/media/../study.toml", "/media/%2e%2e%2fsecret.json", "/media/%2fetc%2fpasswd",
-    "/static/vendor/../../wire.py", "//etc/passwd", "/..%2f..%2fetc/passwd", "/%ff%fe",
-    "/api/../secret.json", "/%2e%2e/secret.json", "/experimenter/static/..%2f..%2fgate.py",
+    "/static/../../study.py", "/static/%2e%2e/%2e%2e/study.py", "/static/..%5c..%5cstudy.py",
+    "/static/%2fetc%2fpasswd", "/static/main.js%00.css", "/static/%252e%252e/study.py",
+    "/media/%2e%2e%2fsecret.json", "/media/%2fetc%2fpasswd", "//etc/passwd", "/%ff%fe",
+    "/experimenter/static/..%2f..%2fgate.py",
 )  # fmt: skip
 
 
@@ -338,11 +306,6 @@ class TestRawRequests:
         answer = exchange(port, b"GET " + path.encode() + rest)
         assert answer.startswith((b"HTTP/1.1 404", b"HTTP/1.1 400", b"HTTP/1.1 303"))
         assert b"root:" not in answer and b"import" not in answer and b"hash_key" not in answer
-
-    def test_a_name_cannot_inject_a_header(self, port: int) -> None:
-        start = b"GET /api/texts/x%0d%0aSet-Cookie:%20a=b HTTP/1.1\r\nHost: x\r\n"
-        answer = exchange(port, start + b"Connection: close\r\n\r\n")
-        assert answer.startswith(b"HTTP/1.1 404") and b"a=b" not in answer
 
     def test_a_forged_host_appears_nowhere(self, port: int) -> None:
         for path in (b"/", b"/api/session/", b"/static", b"/experimenter"):
