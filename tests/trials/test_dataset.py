@@ -272,6 +272,6 @@ def test_the_verbs_can_skip_the_check(
     assert cli(view) == 2
     assert "was changed since it was made" in capsys.readouterr().err
     assert cli([*view, "--no-verify"]) == 0
-    shards = ["export", str(folder), str(tmp_path / "s"), "--layout", "webdataset", "--no-verify"]
-    assert cli(shards) == 2
-    assert "--no-verify does not apply to webdataset" in capsys.readouterr().err
+    tables = ["export", str(folder), str(tmp_path / "s"), "--layout", "result-tables"]
+    assert cli([*tables, "--no-verify"]) == 2
+    assert "--no-verify does not apply to result-tables" in capsys.readouterr().err

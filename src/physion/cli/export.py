@@ -1,5 +1,5 @@
-"""Export a dataset to layouts that published code reads, to tar shards, or to a dataset card, as
-movies that a network elsewhere is to encode, or as questions for language models."""
+"""Export a dataset to layouts that published code reads, as a dataset card, as movies that a
+network elsewhere is to encode, or as questions for language models."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from physion.cli.output import Stages, counted, print_line, print_report
+from physion.cli.output import Stages, print_line, print_report
 from physion.compute.local import LocalExecutor
 from physion.core.errors import BadInputError
 
@@ -32,7 +32,6 @@ class Options:
         "physion-evaluator",
         "mp4s",
         "hdf5s",
-        "webdataset",
         "gltf",
         "lerobot",
         "lance",
@@ -46,7 +45,7 @@ class Options:
     physopt, physion-evaluator: folders that this published code reads (of physion_evaluator,
     extract_features.py needs one edit: remove its check of the number of movies, after which it
     would download others); mp4s, hdf5s: the study's downloads of movies (SlotFormer) and of HDF5
-    files; webdataset: tar shards;
+    files;
     gltf: one GLB file for each trial, with its motion, for Blender and other 3D programs;
     lerobot: a LeRobot dataset (v3.0) of full movies, states and pushes, for world models;
     lance: the same as tables of Lance, for stable-worldmodel (extra lance);
@@ -64,8 +63,6 @@ class Options:
     """Write pictures into HDF5 files; without, the export is 20 times as fast."""
     verify: bool = True
     """Compare files with their SHA-256 in the index before they are used."""
-    parts: Literal["all", "seen"] = "all"
-    """For webdataset: all parts of a sample, or only those that do not reveal the outcome."""
     readout: Literal["observed", "full"] = "observed"
     """For a features-request: movies that end with the observed part, or whole ones."""
     license: str | None = None
@@ -118,8 +115,6 @@ def _check(options: Options) -> None:
     terms = [name for name in CARD_TERMS if getattr(options, name) is not None]
     if terms and layout != "card":
         raise BadInputError(f"--{terms[0]} applies only to a card: use it with --layout card")
-    if options.parts != "all" and layout != "webdataset":
-        raise BadInputError("--parts applies only to shards: use it with --layout webdataset")
     if options.readout != "observed" and layout != "features-request":
         raise BadInputError(
             "--readout applies only to a request: use it with --layout features-request"
@@ -128,7 +123,7 @@ def _check(options: Options) -> None:
         raise BadInputError(
             f"--no-images applies to HDF5 files: use it with --layout {', '.join(HDF5_LAYOUTS)}"
         )
-    if not options.verify and layout in ("webdataset", "result-tables"):
+    if not options.verify and layout == "result-tables":
         raise BadInputError(f"--no-verify does not apply to {layout}: leave it out")
     if layout in WHOLE and (options.split or options.scenario):
         raise BadInputError(
@@ -177,19 +172,6 @@ def _trials(options: Options, out: Path, stages: Stages) -> int:
         )
         return _print_paths(paths, options.json)
     chosen |= {"executor": LocalExecutor(workers=options.workers), "progress": stages}
-    if options.layout == "webdataset":
-        from physion.trials.share.shards import MANIFEST, PARTS, SEEN_PARTS, export_shards
-
-        parts = SEEN_PARTS if options.parts == "seen" else PARTS
-        shards = export_shards(options.folder, out, parts=parts, **chosen)
-        samples = sum(shard.samples for shard in shards)
-        if options.json:
-            values: dict[str, Any] = {"made": [shard.name for shard in shards]}
-            values |= {"samples": samples, "bytes": sum(shard.bytes for shard in shards)}
-            print(json_module.dumps(values | {"index": str(out / MANIFEST)}))
-        else:
-            print_line(f"{samples} trials in {counted(len(shards), 'shard')}: {out / MANIFEST}")
-        return 0
     from physion.trials.official.export_folder import export_official
 
     report = export_official(

@@ -1,7 +1,6 @@
 """Run many tasks that write files: a failed task does not stop the others, a full disk stops all.
 
-Generation of trials, export as shards, and export to and import from the official layout work in
-this way.
+Generation of trials, and export to and import from the official layout work in this way.
 """
 
 from __future__ import annotations

@@ -211,7 +211,7 @@ def _is_same_file(path: Path, descriptor: int) -> bool:
 # SHA-256 of files: how it is computed, stored in a digest file, and checked.
 #
 # A digest file ``NAME.sha256`` lies next to what people exchange or keep: the index, predictions,
-# weights, official data, shards. Its one line is what ``sha256sum --check`` reads. Trial files hold
+# weights, official data. Its one line is what ``sha256sum --check`` reads. Trial files hold
 # their SHA-256 in their own header (`physion.trials.trial_file`).
 
 SUFFIX = ".sha256"

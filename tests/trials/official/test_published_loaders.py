@@ -442,6 +442,6 @@ def test_trials_without_a_place_are_named(dataset: Path, tmp_path: Path) -> None
 
 
 def test_pictures_are_refused_where_there_are_none(dataset: Path, tmp_path: Path) -> None:
-    options = export_verb.Options(dataset, tmp_path / "x", layout="webdataset", images=False)
+    options = export_verb.Options(dataset, tmp_path / "x", layout="gltf", images=False)
     with pytest.raises(BadInputError, match="--no-images"):
         export_verb.main(options)

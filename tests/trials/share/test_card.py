@@ -422,5 +422,3 @@ def test_the_verb_refuses_terms_of_another_layout(
 ) -> None:
     assert cli(["export", str(dataset), str(tmp_path / "out"), "--creator", "me"]) == 2
     assert "--layout card" in capsys.readouterr().err
-    assert cli(["export", str(dataset), "--layout", "card", "--parts", "seen"]) == 2
-    assert "--layout webdataset" in capsys.readouterr().err

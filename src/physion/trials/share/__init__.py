@@ -1,1 +1,1 @@
-"""Datasets in the formats of others: cards, shards and tables."""
+"""Datasets in the formats of others: cards, scenes and tables."""
