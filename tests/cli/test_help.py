@@ -31,7 +31,7 @@ def test_examples_are_parsed(name: str, line: str) -> None:
     tyro.cli(module.Options, args=words[1 + taken :])
 
 
-@pytest.mark.parametrize("words", [["verify"], ["experiment", "power"]])
+@pytest.mark.parametrize("words", [["verify"], ["experiment", "simulate"]])
 def test_help_ends_with_options_and_shows_examples(
     words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -20,7 +20,7 @@ VERBS = {
     "judge": "judge generated movies: contact, paths, permanence, against truth and people",
     "experiment": "run the experiment with people: init, serve, export",
     "view": "write a page that shows a dataset: movies, passes, motion in 3D",
-    "export": "write the official layout, webdataset shards, or a dataset card",
+    "export": "write the official layout, formats of others, or a dataset card",
     "import": "convert official HDF5 files, movies, or a checkout of the original study",
     "verify": "check every byte, label and motion of a dataset",
     "ls": "list scenarios, presets, shapes, props, materials, models, decisions, rooms, engines",
@@ -80,7 +80,6 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "experiment export": ("physion experiment export study --no-simulated",),
     "experiment describe": ("physion experiment describe study",),
     "experiment backup": ("physion experiment backup study --out backups",),
-    "experiment power": ("physion experiment power --effect 0.1 --people 20 40 --stimuli 60 100",),
     "experiment forget": ("physion experiment forget study --participant 5f0c1e",),
     "view": (
         "physion view trials --scenario collide",

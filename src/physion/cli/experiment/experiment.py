@@ -9,7 +9,6 @@ STUDY is the folder of the study. Sub-verbs, whose options --help lists after ea
   describe STUDY   write the preregistration of the study and a figure of its trials
   backup STUDY     copy the database, settings and texts while the study is served
   forget STUDY     delete the ids of recruiters, or all data of a session
-  power            how many people and stimuli a study needs
 """
 
 from __future__ import annotations
@@ -31,7 +30,6 @@ SUBVERBS = {
     "describe": "physion.cli.experiment.describe",
     "backup": "physion.cli.experiment.backup",
     "forget": "physion.cli.experiment.forget",
-    "power": "physion.cli.experiment.power",
 }
 """Sub-verbs of ``physion experiment``, and the module of each."""
 NEEDED = ("fastapi", "uvicorn", "sqlalchemy", "argon2", "jinja2", "pydantic")
@@ -43,7 +41,7 @@ class Options:
     """Options of ``physion experiment`` without a sub-verb."""
 
     sub_verb: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """One of init, serve, links, simulate, export, describe, backup, forget, power."""
+    """One of init, serve, links, simulate, export, describe, backup, forget."""
 
 
 def main(options: Options) -> int:
