@@ -101,8 +101,6 @@ class RunSettings:
     """Clips that a network encodes at a time; lower it when memory runs out."""
     workers: int = os.cpu_count() or 1
     """Number of processes."""
-    trial_pages: bool = False
-    """Also write a page for each stimulus, to trials/ in the folder of the report."""
 
 
 @dataclass(frozen=True)
@@ -219,7 +217,6 @@ def run(
         methods=methods(settings, dataset.index, options or {}, built, models, decided),
         movies=page_movies(settings, dataset, result, out / "movies", executor, progress),
         question="Will the red object touch the yellow one?",
-        trial_pages=settings.trial_pages,
     )
     return Run(page, result, done, failures)
 
@@ -303,7 +300,7 @@ def page_movies(
     assert isinstance(result.inputs, ReportInputs)
     names = {canonical_name(trial): trial for trial in dataset.trials("testing")}
     tested = {stimulus: folder / f"{trial}.mp4" for stimulus, trial in names.items()}
-    inputs = replace(result.inputs, movies=tested, trial_pages=settings.trial_pages)
+    inputs = replace(result.inputs, movies=tested)
     wanted = [*shown_stimuli(inputs), *inputs.comparison.changed["stimulus"]]
     movies = {stimulus: tested[stimulus] for stimulus in dict.fromkeys(wanted)}
     tasks = {

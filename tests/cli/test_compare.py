@@ -262,7 +262,6 @@ def test_every_option_of_a_comparison_reaches_the_report(
     command += ["--resamples", "60", "--out", str(tmp_path / "report")]
     command += ["--expected", str(own.expected), "--attributes", str(own.dataset)]
     command += ["--dataset", str(own.dataset), "--rules", "official-code", "--seed", "5"]
-    command += ["--trial-pages"]
     assert main(command) == 0
     found = json.loads(capsys.readouterr().out)
     assert not any(row["incomplete"] for row in found["people_flags"])
@@ -279,8 +278,6 @@ def test_every_option_of_a_comparison_reaches_the_report(
     assert {row["elements"] for row in found["people_attributes"]} == {1, 2, 3}
     page = Path(found["report"]).read_text(encoding="utf-8")
     assert "<video" in page
-    pages = {path.name for path in (Path(found["report"]).parent / "trials").iterdir()}
-    assert len(pages) == 1 + 32 and "index.html" in pages
     assert "32 by the table that was given" in page
 
 

@@ -67,7 +67,7 @@ def test_the_first_command_compares_models_with_people(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     few = ["--models", "noisy-simulation,state-trees,chance"]
-    command = ["run", "--out", str(tmp_path), *SMALL, *FEW, *few, "--trial-pages", "--json"]
+    command = ["run", "--out", str(tmp_path), *SMALL, *FEW, *few, "--json"]
     assert main(command) == 0
     answer = json.loads(capsys.readouterr().out)
     scores = pd.DataFrame(answer["scores"])
@@ -80,8 +80,6 @@ def test_the_first_command_compares_models_with_people(
     assert page.count("<video") >= 8 and "Will the red object touch the yellow one?" in page
     assert "noisy-simulation and state-trees: the true state of the scene" in page
     assert "chance: nothing of the trial" in page
-    pages = list((tmp_path / "report" / "trials").iterdir())
-    assert len(pages) == stimuli["stimulus"].nunique() + 1
     index = pd.read_parquet(tmp_path / "trials" / "index.parquet").set_index("trial")
     for row in stimuli.itertuples():
         assert row.label == index.loc[row.stimulus, "recorded_contact"]

@@ -1,4 +1,4 @@
-"""The report and the pages of its trials in a real browser, wide and narrow, light and dark."""
+"""The report in a real browser, wide and narrow, light and dark."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import pytest
 
 from physion.analysis import Comparison
 from physion.report import ReportInputs, build_report
-from physion.report.trials import opening_trials, page_name
 from physion.trials.video import encode_movie
 from support.browser import Browser
 
@@ -28,14 +27,14 @@ MODEL = "a model with a name that is far too long for one line of a card of the 
 
 @pytest.fixture(scope="module")
 def page(make_comparison: Maker, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A report with trial pages; its movies become brighter from picture to picture."""
+    """A report whose movies become brighter from picture to picture."""
     grey = np.arange(60, dtype=np.uint8)[:, None, None, None]
     folder = tmp_path_factory.mktemp("report")
     movie = folder / "movie.mp4"
     movie.write_bytes(encode_movie(np.broadcast_to(40 + 3 * grey, (60, 64, 64, 3)).copy()))
     comparison = make_comparison(model=MODEL)
     movies = dict.fromkeys(comparison.stimuli["stimulus"], movie)
-    inputs = ReportInputs(comparison, movies=movies, trial_pages=True)
+    inputs = ReportInputs(comparison, movies=movies)
     return build_report(inputs, folder / "report")
 
 
@@ -70,19 +69,14 @@ def test_with_reduced_motion_a_movie_plays_only_on_request(browser: Browser, pag
 
 
 @pytest.mark.nightly
-def test_no_page_is_wider_than_the_screen(
-    browser: Browser, page: Path, make_comparison: Maker
-) -> None:
-    stimulus = opening_trials(make_comparison())[0]
-    trials = page.parent / "trials"
-    for path in (page, trials / "index.html", trials / page_name(stimulus)):
-        for size in SIZES:
-            for dark in (False, True):
-                browser.open(path, size=size, dark=dark)
-                assert browser.ask("document.documentElement.scrollWidth") <= size[0], path
-                assert browser.ask(CUT) == [], "only tables may be wider, in boxes that scroll"
-                assert (browser.picture()[5, 5].mean() < 128) == dark
-                assert browser.complaints() == []
+def test_the_page_is_not_wider_than_the_screen(browser: Browser, page: Path) -> None:
+    for size in SIZES:
+        for dark in (False, True):
+            browser.open(page, size=size, dark=dark)
+            assert browser.ask("document.documentElement.scrollWidth") <= size[0]
+            assert browser.ask(CUT) == [], "only tables may be wider, in boxes that scroll"
+            assert (browser.picture()[5, 5].mean() < 128) == dark
+            assert browser.complaints() == []
 
 
 def test_bars_have_the_length_of_the_answers(browser: Browser, page: Path) -> None:
@@ -95,14 +89,3 @@ def test_bars_have_the_length_of_the_answers(browser: Browser, page: Path) -> No
     )
     assert len(lengths) == 2
     assert all(length == pytest.approx(said, abs=0.01) for said, length in lengths)
-
-
-@pytest.mark.nightly
-def test_a_name_leads_to_the_page_of_its_trial_and_back(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    name = browser.ask("document.querySelector('.name a').textContent")
-    browser.ask("document.querySelector('.name a').click()")
-    browser.until(f"document.querySelector('h1')?.textContent === {name!r}")
-    browser.until("document.querySelector('video')?.currentTime > 0.1")
-    browser.ask("document.querySelector('.ways a').click()")
-    browser.until("document.querySelectorAll('video').length === 10")

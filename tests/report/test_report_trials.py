@@ -27,9 +27,7 @@ from physion.report.trials import (
     card,
     opening_trials,
     outcome,
-    page_name,
     pick_readouts,
-    trial_pages,
     who_was_right,
     widest_gaps,
 )
@@ -285,41 +283,3 @@ def test_one_sentence_says_which_weights_each_model_started_from(
     table = inputs.tables()["comparison"].set_index("base_model")["init"]
     assert set(table["encoder"]) == {"imagenet"} and set(table["simulation"]) == {"none"}
     assert set(table.drop(["encoder", "simulation"])) == {""}, "baselines that were computed"
-
-
-# --- a page for each stimulus ---------------------------------------------------------------------
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_trial_pages_are_linked_both_ways(make_comparison: Maker, movie: Path) -> None:
-    comparison = make_comparison()
-    names = list(dict.fromkeys(comparison.stimuli["stimulus"]))
-    movies = dict.fromkeys(names, movie)
-    inputs = ReportInputs(comparison, movies=movies, trial_pages=True)
-    pages = dict(trial_pages(inputs))
-    assert set(pages) == {"index.html", *map(page_name, names)}
-    report = render_page(inputs, [])
-    assert 'href="trials/index.html"' in report
-    for position, name in enumerate(names):
-        text = pages[page_name(name)]
-        assert 'href="../report.html"' in text
-        for other, at in (("previous", position - 1), ("next", position + 1)):
-            link = f'href="{page_name(names[at])}">{other}' if 0 <= at < len(names) else ""
-            assert link in text and (bool(link) or f">{other}<" not in text)
-        assert text.count("<video") == 1 and "default-src 'none'" in text
-        rows = comparison.stimuli[comparison.stimuli["stimulus"] == name]
-        assert f"{100 * rows['p_yes'].iloc[0]:.0f} %" in text
-    assert "trials/index.html" not in render_page(ReportInputs(comparison), [])
-
-
-def test_foreign_names_of_stimuli_stay_in_the_folder(make_comparison: Maker) -> None:
-    names = ["../../evil", "a/b", "a b", "index", "<b>", "x" * 400, "pilot-drop_1"]
-    files = [page_name(name) for name in names]
-    assert len(set(files)) == len(files) and "index.html" not in files
-    assert all("/" not in name and len(name) < 130 for name in files)
-    assert files[-1] == "pilot-drop_1.html"
-    rows = some_rows(stimulus=names)
-    made = dict(trial_pages(ReportInputs(with_stimuli(make_comparison(), rows))))
-    assert set(made) == {*files, "index.html"}
-    assert "<b>" not in made[page_name("<b>")].partition("<h1>")[2].partition("</h1>")[0]

@@ -71,8 +71,6 @@ class Options:
     """File of stimuli to exclude, one per line."""
     fitted: Path | None = None
     """With --check: the stimuli on which the readout was fitted, one per line."""
-    trial_pages: bool = False
-    """Also write a page for each stimulus, to trials/ in the folder of the report."""
     resamples: int = 1000
     """Draws of people for their accuracy, agreement and biases."""
     seed: int = 0
@@ -123,9 +121,7 @@ def _compare(options: Options) -> int:
         resamples=options.resamples,
         seed=options.seed,
     )
-    page = result.report(
-        options.out or Path("runs/report"), movies=movies, trial_pages=options.trial_pages
-    )
+    page = result.report(options.out or Path("runs/report"), movies=movies)
     print_warnings(result.warnings)
     if options.json:
         from physion.analysis.tables import records

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ from physion.report.html import (
 )
 from physion.report.inputs import PeopleReport, ReportInputs
 from physion.report.page import people_methods, render_page, render_people_page
-from physion.report.trials import FOLDER, shown_stimuli, trial_pages
+from physion.report.trials import shown_stimuli
 
 
 def prepare_folder(folder: Path) -> Path:
@@ -103,15 +103,13 @@ def people_plots(people: PeopleResults, movies: Mapping[str, Path]) -> list[Plot
 def build_report(inputs: ReportInputs, folder: Path) -> Path:
     """Write ``report.html``, ``report.json``, ``tables/*.csv`` and ``figures/*.{svg,pdf,png,csv}``.
 
-    With ``inputs.trial_pages`` also ``trials/*.html``, a page for each stimulus and their list.
     Returns the path of the page, which needs none of the other files. Every file is complete or
     absent, the page is written last, and the same inputs give the same bytes. Raises
     `BadInputError`, before anything is written, if ``folder`` is a file or a movie is not readable.
     """
     check_movies(inputs.movies, shown_stimuli(inputs))
     shown = _write_parts(folder, inputs.tables(), make_plots(inputs), bool(inputs.mark))
-    pages = trial_pages(inputs) if inputs.trial_pages else ()
-    return _write_pages(folder, report_numbers(inputs), pages, render_page(inputs, shown, folder))
+    return _write_pages(folder, report_numbers(inputs), render_page(inputs, shown, folder))
 
 
 def report_numbers(inputs: ReportInputs) -> dict[str, Any]:
@@ -139,15 +137,10 @@ def _write_parts(
     return [write_plot(plot, figures, rehearsal) for plot in plots]
 
 
-def _write_pages(
-    folder: Path, numbers: Mapping[str, Any], trials: Iterable[tuple[str, str]], page: str
-) -> Path:
-    """Write the numbers for machines, the pages of trials and, last, the page; return its path."""
+def _write_pages(folder: Path, numbers: Mapping[str, Any], page: str) -> Path:
+    """Write the numbers for machines and, last, the page; return its path."""
     text = json.dumps(numbers, indent=1, ensure_ascii=False, allow_nan=False)
     write_atomic(folder / "report.json", f"{text}\n".encode())
-    for name, content in trials:
-        (folder / FOLDER).mkdir(exist_ok=True)
-        write_atomic(folder / FOLDER / name, content.encode())
     path = folder / "report.html"
     write_atomic(path, page.encode())
     return path

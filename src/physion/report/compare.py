@@ -162,7 +162,7 @@ class CompareResult:
         folder
             Folder for ``report.html``, ``report.json``, ``tables/`` and ``figures/``.
         **page
-            Fields of `physion.report.ReportInputs` such as ``movies``, ``trial_pages``, ``title``
+            Fields of `physion.report.ReportInputs` such as ``movies``, ``title``
             and ``methods``, which are added to the comparison's.
 
         Raises

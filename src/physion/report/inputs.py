@@ -36,7 +36,6 @@ class ReportInputs(ComparisonResults):
     - ``rollout_errors``: from `rollout_error_table`, or None.
     - ``movie_count``: largest number of disagreements that are shown as movies.
     - ``page_bytes``: size of the page up to which movies are added; what does not fit is left out.
-    - ``trial_pages``: whether a page for each stimulus is written, to ``trials/``.
     - ``scatter_limit``: largest number of models in the scatter figure; the caption names the rest.
     """
 
@@ -52,7 +51,6 @@ class ReportInputs(ComparisonResults):
     rollout_errors: pd.DataFrame | None = None
     movie_count: int = 8
     page_bytes: int = 15_000_000
-    trial_pages: bool = False
     scatter_limit: int = 12
 
     @classmethod

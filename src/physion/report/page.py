@@ -35,7 +35,7 @@ from physion.report.html import (
 )
 from physion.report.inputs import EXPECTED_METHODS, PeopleReport, ReportInputs
 from physion.report.scores import inputs_sentence, weights_sentence
-from physion.report.trials import FOLDER, gaps, opening, page_name
+from physion.report.trials import gaps, opening
 
 
 def render_page(
@@ -92,10 +92,7 @@ def _with_trials(
 
 
 def _links(inputs: ReportInputs, folder: Path | None) -> Mapping[str, str]:
-    """Return the addresses by stimulus, relative to the page: of its own page, or its movie."""
-    if inputs.trial_pages:
-        names = inputs.comparison.stimuli["stimulus"].unique()
-        return {name: f"{FOLDER}/{page_name(name)}" for name in names}
+    """Return the addresses of movies by stimulus, relative to the page."""
     return {} if folder is None else html.relative_links(inputs.movies, folder)
 
 

@@ -1,9 +1,8 @@
-"""Trials on a page: choice of those to show, cards, answers, a page for each stimulus."""
+"""Trials on a page: choice of those to show, cards, answers."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,17 +10,14 @@ import pandas as pd
 
 from physion.analysis.comparison import Comparison
 from physion.analysis.tables import in_order
-from physion.core.files import digest_of
 from physion.core.html import Markup, joined, macros_of
 from physion.report.html import (
-    MACROS,
     PageMovies,
     listed,
     number,
     paragraph,
     percent,
     plural,
-    render_document,
     stimulus_link,
     table,
 )
@@ -272,14 +268,9 @@ def probability(p: float) -> str:
 
 # --- sections: one trial of each scenario, and the largest disagreements ------------------------
 
-INDEX = "trials/index.html"
-"""Address of the list of trial pages, relative to the report."""
-
 
 def shown_stimuli(inputs: ReportInputs) -> list[str]:
-    """Return the stimuli whose movies the page or the trial pages show."""
-    if inputs.trial_pages:
-        return list(dict.fromkeys(inputs.comparison.stimuli["stimulus"]))
+    """Return the stimuli whose movies the page shows."""
     found = opening_trials(inputs.comparison, inputs.movies)
     if inputs.comparison.has_people:
         found += list(widest_gaps(inputs.comparison, inputs.movie_count)["stimulus"])
@@ -295,13 +286,7 @@ def opening(inputs: ReportInputs, movies: PageMovies, links: Mapping[str, str]) 
         cards.append(card(rows, movies.show(stimulus, describe(rows)), links))
     people = inputs.comparison.has_people
     note = [OPENING_RULE if people else OPENING_RULE_ALONE, KEY, READOUT_KEY]
-    listing = MACROS.link(INDEX, "A page for every stimulus") if inputs.trial_pages else ""
-    return joined([
-        paragraph(_question(inputs)),
-        _grid(cards),
-        paragraph(" ".join(note), "note"),
-        *([paragraph(listing)] if listing else []),
-    ])  # fmt: skip
+    return joined([paragraph(_question(inputs)), _grid(cards), paragraph(" ".join(note), "note")])
 
 
 def _question(inputs: ReportInputs) -> str:
@@ -368,102 +353,3 @@ def _counts(inputs: ReportInputs) -> Markup:
 
 def _grid(cards: list[Markup]) -> Markup:
     return Markup(_MACROS.cards(cards))
-
-
-# --- a page for each stimulus, and their list, on demand ----------------------------------------
-
-FOLDER = "trials"
-"""Name of the folder that holds one page for each stimulus; it lies next to ``report.html``."""
-
-
-def page_name(stimulus: str) -> str:
-    """Return the file name of a stimulus' page; characters that are unsafe in names are replaced.
-
-    A hash of the name keeps two stimuli apart that would be called alike.
-    """
-    safe = re.sub(r"[^A-Za-z0-9_-]+", "-", stimulus)[:100]
-    if safe == stimulus and stimulus != "index":
-        return f"{stimulus}.html"
-    return f"{safe}-{digest_of(stimulus)[:12]}.html"
-
-
-def trial_pages(inputs: ReportInputs) -> Iterator[tuple[str, str]]:
-    """Yield file name and text of every page: one for each stimulus, then the list.
-
-    Each page contains its movie and needs no other file. Raises `BadInputError` for a movie that
-    cannot be read.
-    """
-    groups = dict(list(inputs.comparison.stimuli.groupby("stimulus", sort=False)))
-    names = _ordered(inputs)
-    for position, stimulus in enumerate(names):
-        before = names[position - 1] if position else None
-        after = names[position + 1] if position + 1 < len(names) else None
-        page = _page(inputs, groups[stimulus], before, after)
-        yield page_name(stimulus), page
-    yield "index.html", _index(inputs, [groups[name] for name in names])
-
-
-def _ordered(inputs: ReportInputs) -> list[str]:
-    """Return the stimuli by scenario, then by name."""
-    rows = inputs.comparison.stimuli.drop_duplicates("stimulus")
-    return [
-        str(name)
-        for scenario in in_order(rows["scenario"])
-        for name in sorted(rows.loc[rows["scenario"] == scenario, "stimulus"])
-    ]
-
-
-def _page(inputs: ReportInputs, rows: pd.DataFrame, before: str | None, after: str | None) -> str:
-    first = rows.iloc[0]
-    movies = PageMovies(inputs.movies, inputs.page_bytes)
-    movie = movies.show(first["stimulus"], describe(rows))
-    links = [("the report", "../report.html"), ("all stimuli", "index.html")]
-    links += [("previous", page_name(before))] if before is not None else []
-    links += [("next", page_name(after))] if after is not None else []
-    asked = outcome(first)
-    body = _MACROS.trial(_facts(first), movie, inputs.question, asked, answers(rows), KEY)
-    lead = joined([Markup(_MACROS.ways(links)), Markup(body), _answers(rows)])
-    return render_document(first["stimulus"], lead, [], inputs.mark)
-
-
-def _facts(first: pd.Series) -> str:
-    """Return scenario, outcomes and people's answers as one sentence."""
-    words = {True: "contact", False: "no contact"}
-    official, simulated = words[bool(first["label"])], words[bool(first["simulated"])]
-    outcomes = f"official outcome {official}, simulated {simulated}"
-    if pd.isna(first["p_yes"]):
-        return f"Scenario {first['scenario']}; {outcomes}."
-    return (
-        f"Scenario {first['scenario']}; {outcomes}; {first['count']:.0f} people, of whom "
-        f"{percent(first['p_yes'])} say yes and {percent(first['human_accuracy'])} are right."
-    )
-
-
-def _answers(rows: pd.DataFrame) -> Markup:
-    """Return the table of the models' answers."""
-    people = rows["p_yes"].notna().all()
-    cells = []
-    for _, row in rows.iterrows():
-        line = [str(row["base_model"]), str(row["readout"]), number(row["p_contact"], 3)]
-        line.append("contact" if row["predicted"] else "no contact")
-        line.append("yes" if bool(row["predicted"]) == bool(row["label"]) else "no")
-        cells.append([*line, number(row["gap"])] if people else line)
-    header = ["model", "readout", "P(contact)", "answer", "right"]
-    return table([*header, "P less people"] if people else header, cells)
-
-
-def _index(inputs: ReportInputs, groups: list[pd.DataFrame]) -> str:
-    people = inputs.comparison.has_people
-    cells = []
-    for rows in groups:
-        first = rows.iloc[0]
-        right = (rows["predicted"].astype(bool) == rows["label"].astype(bool)).sum()
-        name = str(first["stimulus"])
-        line: list[str] = [stimulus_link(name, {name: page_name(name)})]
-        line += [str(first["scenario"]), outcome(first)]
-        line += [percent(first["human_accuracy"])] if people else []
-        cells.append([*line, f"{right} of {len(rows)}"])
-    header = ["stimulus", "scenario", "outcome", *(["people right"] if people else [])]
-    body = table([*header, "models right"], cells)
-    lead = joined([Markup(_MACROS.ways([("the report", "../report.html")])), body])
-    return render_document("Every stimulus", lead, [], inputs.mark)
