@@ -34,7 +34,7 @@ A refused request is answered with a `Refusal`; codes and HTTP statuses are in `
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, get_args
 
@@ -57,7 +57,6 @@ Stage = Literal[
     "familiarization",
     "ready",
     "test",
-    "block",
     "demographics",
     "questions",
     "feedback",
@@ -66,16 +65,11 @@ Stage = Literal[
     "withdrawn",
     "screened_out",
 ]
-"""Stages of a session, in this order; the `ENDED` ones can follow any other but ``done``. After
-``block``, the page between blocks, the next block begins with ``familiarization`` or ``test``."""
+"""Stages of a session, in this order; the `ENDED` ones can follow any other but ``done``."""
 STAGES: tuple[Stage, ...] = get_args(Stage)
 ENDED: tuple[Stage, ...] = ("declined", "withdrawn", "screened_out")
 """Stages of sessions that ended before they were complete: no consent, stopped, or ended by the
 study since the participant failed the comprehension check."""
-
-
-OF_BLOCK: tuple[Stage, ...] = ("familiarization", "ready", "test", "block")
-"""Stages that each block of a session has."""
 
 
 @dataclass(frozen=True)
@@ -91,51 +85,11 @@ PAGES: Mapping[Stage, Page] = {
     "instructions": Page("instructed_at", "Instructions"),
     "comprehension": Page("comprehended_at", "Comprehension check"),
     "ready": Page("ready_at", "Start page"),
-    "block": Page("block_at", "Page between blocks"),
     "demographics": Page("demographics_at", "Demographics"),
     "questions": Page("questions_at", "Own questions"),
     "feedback": Page("finished_at", "Feedback"),
 }
 """The pages by stage; the last one finishes the session."""
-
-
-@dataclass(frozen=True)
-class Block:
-    """A block of a session.
-
-    Attributes
-    ----------
-    scenario
-        The scenario of its trials.
-    familiarization, test
-        Indices of its trials in each phase, counted over the whole session.
-    """
-
-    scenario: str
-    familiarization: range
-    test: range
-
-    def of(self, phase: str) -> range:
-        """Return the indices of the trials of a phase."""
-        return self.test if phase == "test" else self.familiarization
-
-
-@dataclass(frozen=True)
-class SessionTrials(Mapping[str, int]):
-    """Numbers of trials of a session by phase, and its blocks."""
-
-    blocks: tuple[Block, ...]
-
-    def __getitem__(self, phase: str) -> int:
-        if phase not in get_args(Phase):
-            raise KeyError(phase)
-        return self.blocks[-1].of(phase).stop
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(get_args(Phase))
-
-    def __len__(self) -> int:
-        return len(get_args(Phase))
 
 
 @dataclass(frozen=True)
@@ -147,27 +101,22 @@ class Course:
     stages
         Its pages and phases in order, ``done`` last.
     trials
-        Number of trials in each phase, and blocks.
+        Number of trials in each phase.
     settings
         Settings of the study that may differ between sessions: the fields of
         `SessionSettings`.
     """
 
     stages: tuple[Stage, ...]
-    trials: SessionTrials
+    trials: Mapping[str, int]
     settings: Mapping[str, float] = field(default_factory=dict)
 
 
 def label(stage: str) -> str:
-    """Return the name of a stage on the experimenter's pages.
-
-    The stage may be followed by the number of a block: ``test 2``.
-    """
-    name, _, number = stage.partition(" ")
+    """Return the name of a stage on the experimenter's pages."""
     known: dict[str, str] = {page: about.label for page, about in PAGES.items()}
     known["done"] = "Finished"
-    words = known.get(name, name.capitalize())
-    return f"{words}, block {number}" if number else words
+    return known.get(stage, stage.capitalize())
 
 
 Kind = Literal["person", "simulated", "preview"]
@@ -274,14 +223,6 @@ class Enter(Message):
     device: Device = Device()
 
 
-class BlockTrials(Message):
-    """A block of a session: its scenario, and the first trial and the end (exclusive) by phase."""
-
-    scenario: str
-    familiarization: tuple[int, int]
-    test: tuple[int, int]
-
-
 class SessionSettings(Message):
     """Settings of the study in the session's condition, instead of `PublicStudy`."""
 
@@ -294,9 +235,8 @@ class SessionSettings(Message):
 class SessionState(Message):
     """State of a session.
 
-    ``trial`` is the next trial of the phase, None outside a phase. Trials are counted over the
-    whole session. ``block``: index of the current block, whose scenario is ``scenario``; a session
-    with one scenario has one block. ``condition``: empty if the study has no conditions.
+    ``trial`` is the next trial of the phase, None outside a phase. ``condition``: empty if the
+    study has no conditions.
     """
 
     stage: Stage
@@ -307,11 +247,9 @@ class SessionState(Message):
     comprehension_attempts: int
     """How often the comprehension check was answered."""
     practice_repeats: int
-    """How often the practice of the current block was repeated."""
+    """How often the practice was repeated."""
     answered: bool
     """Whether a trial was answered, after which stopping is final."""
-    block: int
-    blocks: list[BlockTrials]
     condition: str
     settings: SessionSettings
     scenario: str
@@ -357,8 +295,8 @@ class PageDone(Message):
     Fields of ``data`` by page: ``consent`` {agreed: bool, language: optional, in which it was
     read}; ``comprehension`` {NAME: option, for each of `PublicStudy.comprehension_questions`};
     ``demographics`` {age, gender, education}; ``questions`` {NAME: answer, for each of
-    `PublicStudy.questions`}; ``feedback`` {difficulty, technical_problems, text}; ``ready`` and
-    ``block`` {block: optional, index of the current block}; ``instructions`` and ``withdraw`` {}.
+    `PublicStudy.questions`}; ``feedback`` {difficulty, technical_problems, text}; ``ready``,
+    ``instructions`` and ``withdraw`` {}.
     """
 
     page: Literal[Stage, "withdraw"]

@@ -27,7 +27,7 @@ from physion.experiment.study.identity import Secrets
 from physion.experiment.study.media import read_media_path
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.recruitment import make_pass
-from physion.experiment.study.settings import ALL_SCENARIOS, Answer, Question
+from physion.experiment.study.settings import Answer, Question
 from physion.experiment.study.stimuli import ATTENTION, PHASES, STIMULUS_PHASES, Stimulus
 from physion.experiment.study.study import Study
 
@@ -348,7 +348,7 @@ class Participation:
         """Enter by the pilot link and return the state of the session."""
         who = {
             "id": f"simulated-{self._plan.seed}-{self._visit.number}",
-            "scenario": None if self._visit.scenario == ALL_SCENARIOS else self._visit.scenario,
+            "scenario": self._visit.scenario,
             "language": language,
             "pass": make_pass(self._secrets, "simulated"),
             "device": DEVICE,
@@ -436,8 +436,7 @@ class Participation:
         # Instructed attention checks show movies of the practice.
         phases = STIMULUS_PHASES if media.instructed else (phase, ATTENTION)
         for stimulus in self._study.stimuli:
-            several = self._visit.scenario in (ALL_SCENARIOS, stimulus.scenario)
-            fits = several and stimulus.phase in phases
+            fits = self._visit.scenario == stimulus.scenario and stimulus.phase in phases
             if fits and self._study.folder / stimulus.movie == path:
                 return stimulus
         raise PhysionError(
@@ -542,9 +541,9 @@ async def simulate(
     UnknownNameError
         The study has no such scenario.
     """
-    if plan.scenario is not None and plan.scenario not in study.offered:
-        raise UnknownNameError("scenario", plan.scenario, study.offered)
-    scenarios = study.offered if plan.scenario is None else (plan.scenario,)
+    if plan.scenario is not None and plan.scenario not in study.scenarios:
+        raise UnknownNameError("scenario", plan.scenario, study.scenarios)
+    scenarios = study.scenarios if plan.scenario is None else (plan.scenario,)
     visits = [SimulatedVisit(n, scenarios[n % len(scenarios)]) for n in range(plan.participants)]
     slots = asyncio.Semaphore(AT_ONCE)
     limits = httpx2.Limits(max_connections=AT_ONCE, max_keepalive_connections=AT_ONCE)

@@ -1,4 +1,4 @@
-"""Optional parts of a session: boxes, checks, blocks, breaks, conditions, questions."""
+"""Optional parts of a session: boxes, checks, breaks, conditions, questions."""
 
 from __future__ import annotations
 
@@ -11,11 +11,9 @@ import pytest
 
 from physion.experiment.server_process import ServerProcess
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.orders import block_scenarios
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.settings import (
     Attention,
-    Blocks,
     Comprehension,
     Condition,
     EarlyEnd,
@@ -53,8 +51,6 @@ high = "Yes"
 answer = "First {practice}, then {trials} movies."
 [condition.plain.ready]
 text = "{trials} movies follow."
-[condition.plain.block]
-practice = "{practice}, {trials}"
 [condition.plain.trial]
 prompt = "Do they meet?"
 """
@@ -62,11 +58,11 @@ prompt = "Do they meet?"
 
 @pytest.fixture(scope="module")
 def rich(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Study, str]]:
-    """A study with all optional parts: two blocks of a practice trial, two trials, a check."""
+    """A study with all optional parts: a practice trial, four trials, a check."""
     study = make_tiny_study(
         tmp_path_factory.mktemp("study"), test=4, familiarization=1,
-        scenarios=("collide", "drop"), languages=("en",), plausibility=FAST,
-        timing=replace(SHORT, break_every=2), blocks=Blocks(all_scenarios=True, trials=2),
+        scenarios=("drop",), languages=("en",), plausibility=FAST,
+        timing=replace(SHORT, break_every=2),
         attention=Attention(instructed=1), practice=Practice(min_correct=1, repeats=1),
         comprehension_questions=COMPREHENSION, comprehension=Comprehension(attempts=2),
         questions=(*OWN_QUESTIONS, Question("fun", "scale", steps=5)), demographics=False,
@@ -150,7 +146,7 @@ def test_a_session_with_all_optional_parts(chromium: Any, rich: tuple[Study, str
         page = visit.page
         visit.go(query_of(study, "Ada", "usual"))
         visit.heading("Taking part in this study")
-        assert "8 short movies" in page.inner_text("main")
+        assert "6 short movies" in page.inner_text("main")
         agree(visit, query_of(study, "Ada", "usual"))
         # One wrong answer to the questions about the instructions, which are shown again.
         visit.heading("Before you begin")
@@ -169,30 +165,26 @@ def test_a_session_with_all_optional_parts(chromium: Any, rich: tuple[Study, str
         page.reload()
         visit.heading("The practice once more")
         visit.main_button().click()
-        page.get_by_text("Part 1 of 2 · Practice 1 of 2").wait_for()
+        page.get_by_text("Practice 1 of 1").wait_for()
         visit.answer("yes")
         assert visit.see_feedback() == "Correct!"
         prompts = []
-        for block in range(2):
-            visit.heading("You are ready")
-            assert "3 movies follow" in page.inner_text("main")
-            assert "After every 2 movies you can take a break" in page.inner_text("main")
-            visit.begin_test()
-            for trial in range(3 * block, 3 * block + 3):
-                if trial in (2, 4):
-                    take_a_break(visit, trial)
-                page.get_by_text(f"Part {block + 1} of 2 · Trial {trial + 1} of 6").wait_for()
-                prompts.append(page.inner_text("#prompt"))
-                visit.wait_for_answer()
-                asked = page.inner_text("#prompt")
-                if asked.startswith("A check of your attention"):
-                    visit.picture("check")
-                    # Right in the second block only.
-                    visit.answer("yes" if ("YES" in asked) == (block == 1) else "no")
-                else:
-                    visit.answer("yes")
-            if block == 0:
-                rest_between_blocks(visit)
+        visit.heading("You are ready")
+        assert "5 movies follow" in page.inner_text("main")
+        assert "After every 2 movies you can take a break" in page.inner_text("main")
+        visit.begin_test()
+        for trial in range(5):
+            if trial in (2, 4):
+                take_a_break(visit, trial)
+            page.get_by_text(f"Trial {trial + 1} of 5").wait_for()
+            prompts.append(page.inner_text("#prompt"))
+            visit.wait_for_answer()
+            asked = page.inner_text("#prompt")
+            if asked.startswith("A check of your attention"):
+                visit.picture("check")
+                visit.answer("no" if "YES" in asked else "yes")
+            else:
+                visit.answer("yes")
         answer_own_questions(visit)
         page.check("#difficulty-4")
         page.check("#technical-no")
@@ -200,18 +192,11 @@ def test_a_session_with_all_optional_parts(chromium: Any, rich: tuple[Study, str
         page.locator("#code").wait_for()
         assert "of 4 movies" in page.inner_text("main")
         assert visit.unexpected() == []
-    assert len(set(prompts)) == 2 and prompts[:3] == prompts[:1] * 3, "one question per scenario"
+    assert set(prompts) == {"Will the falling object be hit?"}
     session, answers, events = rows_of(study, "Ada")
-    order = block_scenarios(study, session.scenario, session.order_seed)
-    shown = [
-        (row.phase, row.trial, row.stimulus.split("_")[0])
-        for row in answers
-        if row.phase != "attention"
-    ]
-    assert [row[:2] for row in shown[:2]] == [("familiarization", 0), ("familiarization", 1)]
-    assert [row[2] for row in shown] == [*order, order[0], order[0], order[1], order[1]]
-    checks = [row.trial for row in answers if row.phase == "attention"]
-    assert len(checks) == 2 and 1 <= checks[0] <= 2 and 4 <= checks[1] <= 5
+    shown = [(row.phase, row.trial) for row in answers]
+    (check,) = [trial for phase, trial in shown if phase == "attention"]
+    assert shown.count(("familiarization", 0)) == 1 and 1 <= check <= 4
     assert (session.attention_failed, session.failed_checks) == (1, "attention")
     assert session.comprehension_attempts == 2 and session.condition == "usual"
     rests = {row.trial: row.break_ms for row in answers if row.phase != "familiarization"}
@@ -225,27 +210,11 @@ def test_a_session_with_all_optional_parts(chromium: Any, rich: tuple[Study, str
 def take_a_break(visit: Visit, trial: int) -> None:
     for again in range(2):  # a reload shows the break again
         visit.heading("Time for a break")
-        assert f"You have answered {trial} of 6 movies" in visit.page.inner_text("main")
+        assert f"You have answered {trial} of 5 movies" in visit.page.inner_text("main")
         if again == 0:
             visit.page.reload()
     visit.page.wait_for_timeout(700)
     visit.page.get_by_role("button", name="Continue").click()
-
-
-def rest_between_blocks(visit: Visit) -> None:
-    """See the page between the blocks, also after a reload, and the second practice."""
-    for again in range(2):
-        visit.heading("Part 2 of 2")
-        said = visit.page.inner_text("main")
-        assert "You have answered 3 of 6 movies" in said and "1 practice movies" in said
-        assert "From now on the question is: Will" in said
-        if again == 0:
-            visit.page.reload()
-    visit.page.get_by_role("button", name="Continue").click()
-    visit.page.get_by_text("Part 2 of 2 · Practice 2 of 2").wait_for()
-    assert visit.page.locator("#bar").evaluate("bar => [bar.value, bar.max]") == [4, 8]
-    visit.answer("yes")
-    visit.see_feedback()
 
 
 def answer_own_questions(visit: Visit) -> None:
@@ -306,15 +275,15 @@ def test_a_condition_has_its_own_settings_and_texts(
         visit.answer("no")
         visit.heading("The practice once more")  # no feedback before
         visit.main_button().click()
-        visit.page.get_by_text("Practice 1 of 2").wait_for()
+        visit.page.get_by_text("Practice 1 of 1").wait_for()
         visit.answer("yes" if passes else "no")
         if passes:
             visit.heading("You are ready")
-            assert "3 movies follow." in visit.page.inner_text("main")
+            assert "5 movies follow." in visit.page.inner_text("main")
             visit.begin_test()
             assert visit.page.inner_text("#prompt") == "Do they meet?"
             visit.answer("yes")
-            visit.page.get_by_text("Trial 2 of 6").wait_for()
+            visit.page.get_by_text("Trial 2 of 5").wait_for()
             visit.wait_for_answer()
         else:
             visit.heading("The study ends here for you")

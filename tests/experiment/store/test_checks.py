@@ -26,7 +26,6 @@ from physion.experiment.study.identity import Secrets
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.settings import (
     Attention,
-    Blocks,
     Comprehension,
     EarlyEnd,
     Practice,
@@ -341,29 +340,6 @@ def test_a_failed_practice_can_be_flagged(practising: Study, tmp_path: Path, rep
     walk(store, token, "done")
     (session,) = rows(store, SESSIONS)
     assert session.failed_checks == "practice" and session.finished_at is not None
-    store.close()
-
-
-def test_each_block_has_its_practice(practising: Study, tmp_path: Path) -> None:
-    study = replace(practising, blocks=Blocks(all_scenarios=True))
-    store = open_store(study, Secrets.load(study.folder), tmp_path / "a")
-    token = enter(store, "Ada")
-    for block, name in enumerate("ab"):
-        walk(store, token, PHASE)
-        practise(store, token, f"{name}-first", "no", "no", "no")
-        state = run(store.state(token))
-        first = state.blocks[block].familiarization[0]
-        assert (state.stage, state.trial, state.practice_repeats) == (PHASE, first, 1)
-        (session,) = rows(store, SESSIONS)
-        order = trial_order(study, session.scenario, session.order_seed)[PHASE]
-        right = ["yes" if order[first + step].label else "no" for step in range(3)]
-        assert practise(store, token, f"{name}-second", *right).stage == "ready"
-        walk(store, token, "block" if block == 0 else "done")
-        if block == 0:
-            page(store, token, "block")
-    assert [(row.trial, row.repeat) for row in rows(store, PRACTICE_REPEATS)] == [
-        (trial, 0) for trial in range(6)
-    ]
     store.close()
 
 

@@ -32,7 +32,6 @@ PAGES: dict[str, dict[str, Any]] = {
 OPTIONAL_PAGES: dict[str, dict[str, Any]] = {
     "comprehension": RIGHT,
     "questions": OWN_ANSWERS,
-    "block": {},
 }
 """Pages that a study has by its settings alone."""
 ORDER = tuple(stage for stage in stages.STAGES if stage not in stages.ENDED)
@@ -86,8 +85,7 @@ def walk(store: Store, token: str, stage: str) -> str:
         state = run(store.state(token))
         if state.stage == stage:
             return token
-        in_blocks = state.stage == "block" or state.block > 0
-        assert in_blocks or ORDER.index(state.stage) < ORDER.index(stage)
+        assert ORDER.index(state.stage) < ORDER.index(stage)
         if state.trial is None:
             page(store, token, state.stage)
         else:

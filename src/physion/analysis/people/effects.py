@@ -208,10 +208,8 @@ def accuracy_by_background(
     by_person["relative"] = by_person["accuracy"] - by_person.groupby("scenario")[
         "accuracy"
     ].transform("mean")
-    # A session of several scenarios counts once.
-    by_person = by_person.groupby("session", as_index=False, sort=False)["relative"].mean()
-    joined = by_person.merge(sessions.drop(columns=["participant", "scenario"], errors="ignore"),
-                       on="session", how="left")  # fmt: skip
+    about = sessions.drop(columns=["participant", "scenario"], errors="ignore")
+    joined = by_person[["session", "relative"]].merge(about, on="session", how="left")
     return pd.DataFrame([_association(joined, column) for column in _asked(joined, own)])
 
 

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.people.responses import Responses, scenarios_in
+from physion.analysis.people.responses import Responses
 from physion.analysis.statistics.regression import clustered_logit
 from physion.analysis.tables import in_order
 from physion.core.errors import BadInputError, ExclusionError, UnknownNameError
@@ -33,7 +33,7 @@ from physion.core.tables import read_table
 # stimulus does not make every other session incomplete.
 
 Expected = Mapping[str, frozenset[str]]
-"""Canonical names of the test stimuli by session or, for all sessions of it, by scenario."""
+"""Canonical names of the test stimuli by scenario."""
 
 EXPECTED_FILE = "expected.csv"
 """File with the study's list of stimuli, in the folder of the exported responses."""
@@ -44,18 +44,12 @@ NOT_EXPECTED = "stimulus is not on the study's list"
 def read_expected(path: Path) -> dict[str, frozenset[str]]:
     """Read the stimuli that a session must have from a list of them (CSV or parquet).
 
-    Columns: ``stimulus``, and ``session`` (if each has a list of its own) or ``scenario``, whose
-    values are the keys of the result. Raises `BadInputError`.
+    Columns: ``stimulus`` and ``scenario``. Raises `BadInputError`.
     """
-    table = read_table(path, ("stimulus",))
-    if "session" not in table and "scenario" not in table:
-        raise BadInputError(f"{path} must say whose stimuli these are: column session or scenario")
+    table = read_table(path, ("stimulus", "scenario"))
     names = table["stimulus"].astype(str).map(canonical_name)
-    if "session" in table:
-        whose = table["session"].astype(str)
-    else:
-        lower = table["scenario"].astype(str).str.strip().str.lower()
-        whose = lower.replace(OFFICIAL_SCENARIOS)
+    lower = table["scenario"].astype(str).str.strip().str.lower()
+    whose = lower.replace(OFFICIAL_SCENARIOS)
     return {str(key): frozenset(group) for key, group in names.groupby(whose)}
 
 
@@ -66,12 +60,11 @@ def find_expected(responses: Sequence[Path]) -> Path | None:
 
 
 def check_expected(responses: Responses, expected: Expected | None) -> None:
-    """Raise `BadInputError` for a list that names none of these sessions and scenarios."""
-    known = {*responses.sessions["session"], *_each(responses.sessions["scenario"])}
-    if expected is not None and not known & set(expected):
+    """Raise `BadInputError` for a list that names none of these scenarios."""
+    if expected is not None and not set(responses.sessions["scenario"]) & set(expected):
         raise BadInputError(
             f"the list of expected stimuli names {next(iter(expected), 'nothing')!r}, which is "
-            "neither a session nor a scenario of the responses"
+            "no scenario of the responses"
         )
 
 
@@ -92,16 +85,11 @@ def expected_by_session(
 ) -> dict[str, frozenset[str]]:
     """Return the stimuli that each session must have answered.
 
-    The list of the session, else of its scenarios, else `stimuli_of_most`; none for a
-    scenario without either.
+    The list of its scenario, else `stimuli_of_most`; none for a scenario without either.
     """
-    given = dict(expected or {})
-    of_scenario = {**stimuli_of_most(responses.test), **given}
-    found = {}
-    for session, scenarios in responses.sessions[["session", "scenario"]].to_numpy():
-        parts = [of_scenario.get(name, frozenset()) for name in scenarios_in(scenarios)]
-        found[str(session)] = given.get(session, frozenset().union(*parts))
-    return found
+    of_scenario = {**stimuli_of_most(responses.test), **(expected or {})}
+    pairs = responses.sessions[["session", "scenario"]].to_numpy()
+    return {str(session): of_scenario.get(name, frozenset()) for session, name in pairs}
 
 
 def drop_unexpected(responses: Responses, expected: Expected | None) -> Responses:
@@ -155,16 +143,9 @@ def completeness_warnings(responses: Responses, expected: Expected | None) -> li
 
 
 def _listed(responses: Responses, expected: Expected) -> set[str]:
-    """Return the sessions for which the list names stimuli, by session or by scenario."""
+    """Return the sessions for whose scenario the list names stimuli."""
     rows = responses.sessions
-    of_scenario = [any(name in expected for name in scenarios_in(s)) for s in rows["scenario"]]
-    given = rows["session"].isin(set(expected)) | np.array(of_scenario, dtype=bool)
-    return set(rows.loc[given, "session"])
-
-
-def _each(sets: pd.Series) -> set[str]:
-    """Return each scenario of some `scenario_set`."""
-    return {name for scenarios in sets.unique() for name in scenarios_in(scenarios)}
+    return set(rows.loc[rows["scenario"].isin(set(expected)), "session"])
 
 
 def _not_expected(responses: Responses, expected: Expected | None) -> pd.Series:
@@ -210,9 +191,7 @@ def _longest_run(same: npt.NDArray[np.bool_]) -> int:
 def session_measures(responses: Responses, expected: Expected | None = None) -> pd.DataFrame:
     """Return the measures for the rules, one row per session, in order of ``sessions``.
 
-    A session of several blocks is measured as a whole, over the answers in the order given.
-
-    ``expected``: the test stimuli by scenario, or by session if people see subsets; by default
+    ``expected``: the test stimuli by scenario; by default
     those that at least half of the scenario's sessions answered (`completeness`). Columns:
     ``session``, ``participant``, ``scenario``, ``expected`` (number of stimuli), ``missing``
     (stimuli without an answer), ``trials``, ``accuracy``, ``yes``, ``mean_log_rt``,

@@ -7,7 +7,6 @@ Intervals draw participants with replacement (`Bootstrap`, 1000 draws, seeded), 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -194,43 +193,24 @@ def accuracy_by_scenario(test: pd.DataFrame, bootstrap: Bootstrap | None = None)
     accuracy) with ``_low``, ``_high`` (interval of that mean), ``sd`` over people, ``t``, ``df``,
     ``p`` (two-sided, of people's accuracies against 0.5), ``zone_low``, ``zone_high`` (2.5th and
     97.5th percentile of single people), ``consistency`` (mean over stimuli), ``reason``. In row
-    `MEAN` the scenarios' people are drawn independently, unless sessions have several scenarios:
-    then a session is drawn with all of them.
+    `MEAN` the scenarios' people are drawn independently.
     """
     draws = bootstrap or Bootstrap()
-    records, resampled, accuracies = [], [], []
+    records, resampled = [], []
     for answers in all_answers(test):
         by_person = np.nanmean(answers.correct, axis=1)
-        accuracies.append(pd.Series(by_person, index=list(answers.sessions)))
         resampled.append(draws_of_people(answers, draws) @ by_person / len(by_person))
         records.append(_scenario_record(answers, by_person, resampled[-1], draws))
     table = pd.DataFrame(records)
-    people = len(set().union(*(by_session.index for by_session in accuracies)))
-    joint = people < table["people"].sum()
-    of_mean = _means_of_sessions(accuracies, draws) if joint else np.mean(resampled, axis=0)
-    low, high = draws.interval(of_mean)
+    low, high = draws.interval(np.mean(resampled, axis=0))
     mean: dict[str, Any] = {
-        "scenario": MEAN, "people": people,
+        "scenario": MEAN, "people": int(table["people"].sum()),
         "stimuli": int(table["stimuli"].sum()), "accuracy": table["accuracy"].mean(),
         "accuracy_low": low, "accuracy_high": high,
         "consistency": table["consistency"].mean(),
-        "reason": "zone, sd and t: within each scenario" if joint
-        else "zone, sd and t: people of different scenarios are not one sample",
+        "reason": "zone, sd and t: people of different scenarios are not one sample",
     }  # fmt: skip
     return pd.concat([table, pd.DataFrame([mean])], ignore_index=True)
-
-
-def _means_of_sessions(accuracies: Sequence[pd.Series], draws: Bootstrap) -> Array:
-    """Return the mean over scenarios in each draw of whole sessions, (resamples,).
-
-    ``accuracies``: of each scenario, by session. With the weight w of session i in a draw, the mean
-    of a scenario is ``sum(w_i a_i) / sum(w_i)`` over its sessions.
-    """
-    table = pd.concat(accuracies, axis=1).sort_index()
-    values = table.to_numpy(dtype=np.float64)
-    weights = draws.weights("people of all scenarios", len(values))
-    means: Array = np.mean(mean_over_people(values, weights), axis=1)
-    return means
 
 
 def accuracy_by_condition(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataFrame:

@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.tables import in_order
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.names import OFFICIAL_SCENARIOS, canonical_name, is_ledge, scenario_of
 from physion.core.tables import Column, check_table, must, read_csv, read_table, refuse_duplicates
@@ -69,8 +68,6 @@ TRIAL_COLUMNS: tuple[Column, ...] = (
            "page was hidden, a dialog open, or the window too small; empty: nothing",
            choices=("hidden", "dialog", "window")),
     Column("answered_at", "time", "When the server stored the answer"),
-    Column("block", "integer", "Index of the block in a session of several scenarios, from 0; "
-           "empty: a session of one", low=0),
     Column("condition", "text", "Between-subject condition of the session; empty: there is none"),
 )  # fmt: skip
 """One row per participant and trial."""
@@ -78,8 +75,7 @@ TRIAL_COLUMNS: tuple[Column, ...] = (
 SESSION_COLUMNS: tuple[Column, ...] = (
     must("participant", "text", "As in the trials"),
     must("session", "text", "As in the trials; unique here"),
-    must("scenario", "text", "Scenario of the session; several, one block each, in the order "
-          "shown and separated by spaces"),
+    must("scenario", "text", "Scenario of the session"),
     must("simulated", "flag", "As in the trials"),
     Column("study", "text", "Name and version of the study"),
     Column("recruited_by", "text", "Where the participant came from"),
@@ -92,8 +88,7 @@ SESSION_COLUMNS: tuple[Column, ...] = (
            "How often the questions about the instructions were answered", low=0),
     Column("screened_out", "choice", "Which check ended the session early; empty: none did",
            choices=("comprehension", "practice")),
-    Column("ready_at", "time", "When the page between practice and test was sent; of the last "
-           "block begun, if there are several"),
+    Column("ready_at", "time", "When the page between practice and test was sent"),
     Column("buttons", "choice", "The buttons from left to right", choices=("yes-no", "no-yes")),
     Column("language", "text", "Language of the pages"),
     Column("order_number", "integer", "Prepared order of trials, from 1; 0: an order of its own",
@@ -102,9 +97,7 @@ SESSION_COLUMNS: tuple[Column, ...] = (
     Column("replayed", "integer", "Trials shown more often than the study allows", low=0),
     Column("implausible", "text", "Why no person can have made the session, as the server judged: "
            "fast answers, no media, short; empty: nothing is wrong"),
-    Column("practice_repeats", "integer",
-           "How often the practice was repeated; in the last block begun, if there are several",
-           low=0),
+    Column("practice_repeats", "integer", "How often the practice was repeated", low=0),
     Column("attention_failed", "integer", "Number of failed attention checks", low=0),
     Column("failed_checks", "text", "Checks of the lab that the session failed: practice, "
            "attention; empty: none"),
@@ -138,8 +131,6 @@ REHEARSAL = "Rehearsal: participants are simulated, so no number here is about p
 EXCLUDED = "on the list of stimuli to leave out"
 LEDGE = "Roll stimulus with a ledge"
 VOID = "the movie was interrupted"
-SEVERAL = " + "
-"""Between the scenarios of a session that has several."""
 NO_TIME = "no response time above 0: the answer counts, its time does not"
 
 DROPPED_COLUMNS = ("step", "scenario", "reason", "sessions", "rows")
@@ -155,7 +146,7 @@ class Responses:
       (bool), ``rt_ms`` (from the moment of the buttons; NaN where not known), ``log_rt`` (natural
       logarithm of it; NaN where not above 0), and whatever else of `TRIAL_COLUMNS` was given.
     - ``sessions``: one row per session (`SESSION_COLUMNS`, as far as given), in the order in which
-      they began, or else in which they stand in the file. ``scenario`` is a `scenario_set`.
+      they began, or else in which they stand in the file.
     - ``dropped``: what was left out: ``step``, ``scenario``, ``reason``, ``sessions`` (with at
       least one such row) and ``rows``.
     - ``own``: columns of ``sessions`` with answers to the lab's own questions.
@@ -311,9 +302,9 @@ def clean(
 ) -> Responses:
     """Return the responses of a table that `check_table` has typed; see `read_responses`.
 
-    Raises `BadInputError` for a session of two participants; a session with two scenarios in one
-    block, or without blocks; a stimulus with two labels or in two scenarios; a ``correct`` that
-    contradicts response and label; and a trial whose session is not in ``sessions``.
+    Raises `BadInputError` for a session of two participants or scenarios; a stimulus with two
+    labels or in two scenarios; a ``correct`` that contradicts response and label; and a trial whose
+    session is not in ``sessions``.
     """
     if trials.empty:
         raise BadInputError(f"{where} has no row")
@@ -341,31 +332,22 @@ def _ours(name: str) -> str:
 
 
 def _sessions(trials: pd.DataFrame, given: pd.DataFrame | None, where: str) -> pd.DataFrame:
-    """Return the table of sessions, checked against the trials.
-
-    The scenario of a session of several blocks is the `scenario_set` of its scenarios.
-    """
+    """Return the table of sessions, checked against the trials."""
     keys = ["session", "participant", "scenario"]
-    pairs = trials[keys[:2]].drop_duplicates()
-    twice = pd.concat([pairs[pairs["session"].duplicated()], _unexplained_scenarios(trials)])
-    if len(twice):
+    cleaned = trials[keys].drop_duplicates().reset_index(drop=True)
+    twice = cleaned["session"].duplicated()
+    if twice.any():
         raise BadInputError(
-            f"{where}: session {twice['session'].iloc[0]!r} belongs to two participants or, "
-            "without blocks, to two scenarios"
+            f"{where}: session {cleaned.loc[twice, 'session'].iloc[0]!r} belongs to two "
+            "participants or scenarios"
         )
-    answered = trials.groupby("session", sort=False)["scenario"].unique()
-    cleaned = pairs.assign(scenario=pairs["session"].map(answered.map(scenario_set)))
-    cleaned = cleaned.reset_index(drop=True)
     if given is None:
         return cleaned
     refuse_duplicates(given["session"], "table of sessions")
-    listed = given["scenario"].str.split().map(lambda names: scenario_set(map(_ours, names)))
-    given = given.assign(scenario=listed)
+    given = given.assign(scenario=_scenarios(given["scenario"]))
     joined = cleaned.merge(given[keys], on="session", how="left", suffixes=("", "_given"))
-    # An unfinished session lacks the scenarios of its last blocks.
-    both = zip(joined["scenario"], joined["scenario_given"].fillna(""), strict=True)
-    absent = [not set(scenarios_in(here)) <= set(scenarios_in(there)) for here, there in both]
-    wrong = (joined["participant"] != joined["participant_given"]) | np.array(absent, dtype=bool)
+    wrong = joined["participant"] != joined["participant_given"]
+    wrong |= joined["scenario"] != joined["scenario_given"]
     if wrong.any():
         raise BadInputError(
             f"{where}: session {joined.loc[wrong, 'session'].iloc[0]!r} is missing from the "
@@ -375,25 +357,6 @@ def _sessions(trials: pd.DataFrame, given: pd.DataFrame | None, where: str) -> p
         began = pd.to_datetime(given["started_at"], errors="coerce", utc=True, format="ISO8601")
         given = given.loc[began.sort_values(kind="stable", na_position="last").index]
     return given.reset_index(drop=True)
-
-
-def _unexplained_scenarios(trials: pd.DataFrame) -> pd.DataFrame:
-    """Return rows of sessions with two scenarios whose blocks do not have one scenario each."""
-    pairs = trials.assign(block=trials.get("block", pd.NA))
-    pairs = pairs[["session", "block", "scenario"]].drop_duplicates()
-    several = pairs[pairs.groupby("session")["scenario"].transform("nunique") > 1]
-    own = several.groupby(["session", "block"], dropna=False)["scenario"].transform("nunique")
-    return several[several["block"].isna() | (own > 1)]
-
-
-def scenario_set(scenarios: Iterable[str]) -> str:
-    """Return the scenarios of a session as one text, the same for all orders of its blocks."""
-    return SEVERAL.join(in_order(pd.Series(list(scenarios), dtype=str)))
-
-
-def scenarios_in(name: str) -> list[str]:
-    """Return the scenarios of a `scenario_set`."""
-    return name.split(SEVERAL)
 
 
 def _refuse_two_answers(trials: pd.DataFrame, where: str) -> None:

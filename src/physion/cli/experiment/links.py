@@ -46,7 +46,7 @@ def main(options: Options) -> int:
     if options.json:
         print(json_module.dumps({"links": [asdict(link) for link in all_links]}, indent=1))
         return 0
-    for scenario in study.offered:
+    for scenario in study.scenarios:
         print(scenario)
         for link in all_links:
             if link.scenario == scenario:

@@ -74,7 +74,7 @@ def _tell_duration(study: Study, options: Options) -> None:
     from physion.cli.output import console
     from physion.experiment.simulated import minutes_each
 
-    minutes = max(minutes_each(study, scenario) for scenario in study.offered)
+    minutes = max(minutes_each(study, scenario) for scenario in study.scenarios)
     if minutes > 1 and not options.json:
         console.print(
             f"each participant takes about {minutes:.0f} minutes, as people do; simulated_speed in "

@@ -43,7 +43,7 @@ from physion.experiment.store.entry import is_paused
 from physion.experiment.store.lab import forget_raw_ids, forget_session, set_paused, set_voided
 from physion.experiment.store.sessions import ACTIVE_WITHIN
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.orders import instructed_response, stimuli_by_session
+from physion.experiment.study.orders import instructed_response
 from physion.experiment.study.stimuli import is_right
 from physion.experiment.study.study import Study
 from physion.experiment.web.files import read_page_files
@@ -243,7 +243,7 @@ class _Pages:
         if not lines:
             return self._problem(NO_SESSION, 404)
         line = lines[0]
-        labels = {key: each.label for key, each in stimuli_by_session(self._study).items()}
+        labels = self._study.labels
         columns = [column for column in ANSWERS.c if column.name != "details"]
         own = ANSWERS.c.session == name
         with self._engine.connect() as connection:

@@ -19,7 +19,8 @@ from typing import Any
 from sqlalchemy import Engine, select, text
 
 from physion.core.errors import PhysionError
-from physion.experiment.protocol import OF_BLOCK, Block, Course, SessionTrials, label
+from physion.core.names import canonical_name
+from physion.experiment.protocol import Course, label
 from physion.experiment.store.database import SESSIONS
 from physion.experiment.store.sessions import (
     ACTIVE_WITHIN,
@@ -30,7 +31,7 @@ from physion.experiment.store.sessions import (
     stage_of,
     stages_of,
 )
-from physion.experiment.study.orders import stimuli_by_session
+from physion.experiment.study.stimuli import PHASES
 from physion.experiment.study.study import Study
 
 KINDS = {"person": "People", "simulated": "Simulated", "preview": "Previews"}
@@ -58,7 +59,7 @@ FROM answers JOIN sessions ON sessions.session = answers.session
 GROUP BY answers.session, answers.phase
 """)
 """Answers of each session by phase; ``contacts`` are the stimuli whose outcome is a contact."""
-_UNKNOWN = SessionTrials((Block("", range(1_000_000), range(1_000_000)),))
+_UNKNOWN = dict.fromkeys(PHASES, 1_000_000)
 """Trials of previews of scenarios that the study no longer has."""
 
 
@@ -161,9 +162,8 @@ class StudyProgress:
         self._study, self._engine = study, engine
         self._courses, self._stages = Courses(study), stages_of(study)
         self._contacts = json.dumps(
-            [f"{scenario}/{name}" for (scenario, name), each in stimuli_by_session(study).items()
-             if each.label]
-        )  # fmt: skip
+            [f"{scenario}/{name}" for (scenario, name), label in study.labels.items() if label]
+        )
         self._flags: Mapping[str, Flags] = {}
         self._flags_of: object = None
         self._flags_due = 0.0
@@ -214,7 +214,7 @@ class StudyProgress:
         wanted = self._study.participants
         by_scenario = [
             _row(name, wanted, [s for s in lines if s.row.scenario == name])
-            for name in self._study.offered
+            for name in self._study.scenarios
         ]
         if len(by_scenario) > 1:
             total = _row("All", wanted * len(by_scenario), lines)
@@ -249,9 +249,7 @@ class StudyProgress:
         session = Session(**columns | {"withdrawn_at": None, "screened_out_at": None})
         known = self._courses.has(session)
         course = self._courses.of(session) if known else Course(self._stages, _UNKNOWN)
-        stage = stage_of(session, course)
-        several = len(course.trials.blocks) > 1 and stage in OF_BLOCK
-        return label(f"{stage} {session.block + 1}" if several else stage)
+        return label(stage_of(session, course))
 
 
 def session_state(row: Any, now: float) -> str:
@@ -285,11 +283,13 @@ def _find_flags(study: Study, engine: Engine) -> Mapping[str, Flags]:
     """Compute which sessions the study's exclusion rules flag, separately for each kind."""
     from physion.analysis.people.exclusions import RULE_SETS, RULES, flag_sessions
     from physion.analysis.people.responses import clean
-    from physion.experiment.export.tables import expected_names, read_tables
+    from physion.experiment.export.tables import read_tables
 
     trials, sessions = read_tables(engine, study)
-    with engine.connect() as connection:
-        expected = expected_names(connection, study)
+    expected = {
+        name.lower(): frozenset(canonical_name(s.stimulus) for s in study.phase(name, "test"))
+        for name in study.scenarios
+    }
     found = {}
     for kind in ("person", "simulated"):
         now = time.time()

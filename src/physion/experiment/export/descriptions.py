@@ -158,18 +158,8 @@ _TASK = """\
 Participants saw the first part of a movie, in whose first frame the agent was marked in red and the
 patient in yellow, and predicted whether the agent would touch the patient."""
 
-_ONE_SCENARIO = """ A session is one
+_SESSION = """ A session is one
 participant in one scenario: familiarization with feedback, then the test without feedback."""
-
-_BLOCKS = """ A session has
-all scenarios of the study, one block each, in an order of its own: the column `scenario` of the
-sessions names them in this order, and the column `block` of the trials counts them from 0. Trials
-are counted over the whole session. {practice}, with feedback; a test has no
-feedback."""
-_PRACTICE = {
-    "each": "Each block begins with a familiarization",
-    "first": "The first block begins with a familiarization",
-}
 
 _PEOPLE = """\
 `participant` is a keyed hash: the same for all sessions of a person in this study, and of no use
@@ -217,15 +207,12 @@ def readme(
 
     ``facts``, if given, are the counts of `ExportReport.facts`, which are appended.
     """
-    files = _FILES
-    if study.blocks.all_scenarios:
-        files = files.replace("the test stimuli by scenario", "the test stimuli of each session")
-    special = files if layout == "export" else _PSYCH_DS
+    special = _FILES if layout == "export" else _PSYCH_DS
     parts = [
         f"# {study.title}",
         f"Study {study.name}, version {study.version}. Contact: {study.contact}",
         f"Written by physion {__version__}.",
-        _TASK + _structure(study),
+        _TASK + _SESSION,
         special,
         _PEOPLE,
         fill(RULE, 100),
@@ -233,13 +220,6 @@ def readme(
     if facts is not None:
         parts.append("## Counts\n\n" + "\n".join(count_lines(facts, "- ")))
     return "\n\n".join(parts) + "\n"
-
-
-def _structure(study: Study) -> str:
-    """Return the description of a session."""
-    if not study.blocks.all_scenarios:
-        return _ONE_SCENARIO
-    return _BLOCKS.format(practice=_PRACTICE[study.blocks.familiarization])
 
 
 def count_lines(facts: Mapping[str, Any], bullet: str = "") -> list[str]:

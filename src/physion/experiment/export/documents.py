@@ -52,15 +52,13 @@ def preregistration(study: Study) -> str:
         for scenario in study.scenarios
     }
     rules = RULE_SETS[study.exclusions]
-    tests = {_session_trials(study, len(labels)) for labels in counts.values()}
-    total = sum(tests) if study.blocks.all_scenarios else max(tests)
+    total = max(len(labels) for labels in counts.values())
     plain = environment("physion.experiment.export").overlay(autoescape=False)
     return plain.get_template(PREREGISTRATION).render(
         study=study,
         texts=texts,
         counts=[(name, len(labels), sum(labels)) for name, labels in counts.items()],
         practice=max(len(study.phase(name, "familiarization")) for name in study.scenarios),
-        tests=max(tests),
         total=total,
         rate=_common([s.rate for s in study.stimuli]),
         seconds=_common([s.frames / s.rate for s in study.stimuli]),
@@ -74,12 +72,6 @@ def preregistration(study: Study) -> str:
         ],
         made_with=MADE_WITH,
     )
-
-
-def _session_trials(study: Study, available: int) -> int:
-    """Return the number of test trials that a session has of a scenario."""
-    wanted = study.blocks.trials if study.blocks.all_scenarios else 0
-    return min(wanted or available, available)
 
 
 def _common(values: Sequence[float]) -> str:
@@ -136,7 +128,7 @@ def trial_figure(study: Study) -> str:
     practice += [cue, movie, prompt]
     practice += [feedback] if study.familiarization_feedback else []
     number = len(study.phase(study.scenarios[0], "familiarization"))
-    tests = _session_trials(study, len(study.phase(study.scenarios[0], "test")))
+    tests = len(study.phase(study.scenarios[0], "test"))
     rows = [
         (f"Practice trial, {number} in a session", practice),
         (f"Test trial, {tests} in a session", [cross, cue, movie, prompt]),

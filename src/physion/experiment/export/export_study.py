@@ -11,7 +11,7 @@
       attention_checks.csv, .parquet  answers to attention checks, if there are any
       events.csv, .parquet   other events in the browser
       trial_details.parquet  times of frames and cues within each trial
-      stimuli.csv, expected.csv   the stimuli; the test stimuli of each scenario or session
+      stimuli.csv, expected.csv   the stimuli; the test stimuli of each scenario
       data_dictionary.json   description of every column of every table
       study.json             settings and texts of the study, without codes and keys
       psych-ds/              the same data as a Psych-DS dataset
@@ -62,7 +62,6 @@ from physion.experiment.export.tables import (
     SessionTable,
     arrow_schema,
     detail_table,
-    expected_stimuli,
     iso_times,
     question_columns,
     read_attention,
@@ -383,9 +382,8 @@ def export_study(
             sessions = read_sessions(connection, study, SessionSelection(kinds, scenario))
             written = write_tables(folder, connection, study, sessions)
             states = _states(connection, sessions)
-            expected = expected_stimuli(connection, study, sessions)
         report = _report(out, sessions, written)
-        _write_stimuli(folder, study, expected)
+        _write_stimuli(folder, study)
         _write_json(folder / "study.json", {"states": states})
         dictionary: dict[str, Any] = {
             name: data_dictionary(columns) for name, columns in written.described.items()
@@ -441,12 +439,13 @@ def _states(connection: Connection, sessions: SessionTable) -> list[dict[str, An
     return states
 
 
-def _write_stimuli(folder: Path, study: Study, expected: Sequence[Sequence[str]]) -> None:
-    """Write ``stimuli.csv`` and ``expected.csv``, whose rows are ``expected``."""
+def _write_stimuli(folder: Path, study: Study) -> None:
+    """Write ``stimuli.csv`` and ``expected.csv``, the test stimuli of each scenario."""
     names = [column.name for column in STIMULI_COLUMNS]
     shown = [[getattr(stimulus, name) for name in names] for stimulus in study.stimuli]
     _write_csv(folder / "stimuli.csv", names, shown)
-    _write_csv(folder / "expected.csv", expected[0], expected[1:])
+    expected = [(s.stimulus, s.scenario) for s in study.stimuli if s.phase == "test"]
+    _write_csv(folder / "expected.csv", ("stimulus", "scenario"), expected)
 
 
 def _write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

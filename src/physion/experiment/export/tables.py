@@ -24,20 +24,14 @@ from sqlalchemy import Connection, Engine, select
 
 from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS
 from physion.core.errors import PhysionError, UnknownNameError
-from physion.core.names import canonical_name
 from physion.core.tables import Column
 from physion.experiment.store.database import ANSWERS, EVENTS, PRACTICE_REPEATS, SESSIONS, STUDIES
 from physion.experiment.store.sessions import end_of
-from physion.experiment.study.orders import (
-    block_scenarios,
-    instructed_response,
-    stimuli_by_session,
-    trial_order,
-)
-from physion.experiment.study.settings import ALL_SCENARIOS, Question, columns_of
-from physion.experiment.study.stimuli import ATTENTION, PHASES, Stimulus, is_right
+from physion.experiment.study.orders import instructed_response
+from physion.experiment.study.settings import Question, columns_of
+from physion.experiment.study.stimuli import ATTENTION, PHASES, is_right
 from physion.experiment.study.stimuli import COLUMNS as ALL_STIMULI_COLUMNS
-from physion.experiment.study.study import Study, under
+from physion.experiment.study.study import Study
 
 # --- columns as Arrow types and data frames ---
 
@@ -233,8 +227,8 @@ def read_sessions(
     for kind in wanted.kinds:
         if kind not in EXPORTED_KINDS:
             raise UnknownNameError("kind of session", kind, EXPORTED_KINDS)
-    if wanted.scenario is not None and wanted.scenario not in study.offered:
-        raise UnknownNameError("scenario", wanted.scenario, study.offered)
+    if wanted.scenario is not None and wanted.scenario not in study.scenarios:
+        raise UnknownNameError("scenario", wanted.scenario, study.scenarios)
     query = select(*SESSIONS.c, STUDIES.c.name, STUDIES.c.version).join(
         STUDIES, STUDIES.c.digest == SESSIONS.c.study
     )
@@ -252,7 +246,7 @@ def read_sessions(
     kept.sort(key=lambda row: (row.started_at, row.session))
     digests = tuple(dict.fromkeys(row.study for row in kept))
     cells = [
-        {column.name: _session_value(row, column.name, study) for column in SESSION_COLUMNS}
+        {column.name: _session_value(row, column.name) for column in SESSION_COLUMNS}
         for row in kept
     ]
     return SessionTable(_as_table(cells, SESSION_COLUMNS), states, left_out, digests)
@@ -271,19 +265,16 @@ def _why_not(row: _Row, wanted: SessionSelection, study: Study) -> str | None:
         return VOID
     if end == "withdrawn":
         return WITHDRAWN
-    if row.scenario not in study.offered:
+    if row.scenario not in study.scenarios:
         return GONE_SCENARIO.format(scenario=row.scenario)
     if wanted.finished_only and end != "finished":
         return UNFINISHED
     return None
 
 
-def _session_value(row: _Row, name: str, study: Study) -> Any:
+def _session_value(row: _Row, name: str) -> Any:
     """Return the value of one exported column; None for an empty cell."""
     match name:
-        case "scenario":
-            variant = under(study, row.condition)
-            return " ".join(block_scenarios(variant, row.scenario, row.order_seed))
         case "simulated":
             return row.kind == "simulated"
         case "study":
@@ -348,23 +339,18 @@ def read_trials(connection: Connection, study: Study, sessions: pa.Table) -> Ite
         unknown: list[str] = []
         for row in connection.execute(select(ANSWERS).where(*wanted)).mappings():
             session = chosen[row["session"]]
-            blocks = session["scenario"].split(" ")
-            known = [n for n, each in enumerate(blocks) if (each, row["stimulus"]) in stimuli]
-            if not known:
+            stimulus = stimuli.get((session["scenario"], row["stimulus"]))
+            if stimulus is None:
                 unknown.append(row["stimulus"])
                 continue
-            block, scenario = known[0], blocks[known[0]]
-            stimulus = stimuli[scenario, row["stimulus"]]
             cells = {
                 **row,
                 **session,
-                "scenario": scenario,
-                "block": block if len(blocks) > 1 else None,
                 "label": stimulus.label,
                 "correct": is_right(row["response"], stimulus.label),
                 "look": stimulus.look,
             }
-            place = ranks[row["session"]], block, PHASES.index(row["phase"]), row["trial"]
+            place = ranks[row["session"]], PHASES.index(row["phase"]), row["trial"]
             kept.append((place, cells))
         kept.sort(key=lambda entry: entry[0])
         rows = [cells for _, cells in kept]
@@ -460,7 +446,7 @@ _AS_TRIALS = tuple(
 )
 REPEAT_COLUMNS: tuple[Column, ...] = (
     *_AS_TRIALS,
-    Column("repeat", "integer", "How often the practice of this block had been repeated before",
+    Column("repeat", "integer", "How often the practice had been repeated before",
            low=0, required=True, may_be_empty=False),
 )  # fmt: skip
 """One row per answer to a practice trial that was repeated afterwards."""
@@ -493,12 +479,10 @@ def _table(
     """
     names = ("session", "participant", "scenario")
     keys = zip(*(sessions.column(name).to_pylist() for name in names), strict=True)
-    several = study.blocks.all_scenarios
     places = {
-        session: (at, person, ALL_SCENARIOS if several else scenario)
-        for at, (session, person, scenario) in enumerate(keys)
+        session: (at, person, scenario) for at, (session, person, scenario) in enumerate(keys)
     }
-    labels = {key: each.label for key, each in stimuli_by_session(study).items()}
+    labels = study.labels
     kept: list[tuple[tuple[int, int, int], dict[str, Any]]] = []
     for row in rows:
         if row.session not in places:
@@ -518,51 +502,6 @@ def _table(
         kept.append(((at, repeat, row.trial), cells))
     kept.sort(key=lambda entry: entry[0])
     return _as_table([cells for _, cells in kept], columns)
-
-
-# --- the test stimuli that a complete session has answered: of its scenario or its blocks ---
-
-
-def expected_stimuli(
-    connection: Connection, study: Study, sessions: SessionTable
-) -> list[tuple[str, ...]]:
-    """Return the rows of ``expected.csv`` with their header: stimulus and scenario.
-
-    If sessions have several scenarios, each has rows of its own, with the column ``session``.
-    """
-    if not study.blocks.all_scenarios:
-        rows = [(s.stimulus, s.scenario) for s in study.stimuli if s.phase == "test"]
-        return [("stimulus", "scenario"), *rows]
-    seeds = _seeds(connection)
-    found: list[tuple[str, ...]] = [("stimulus", "scenario", "session")]
-    for session in sessions.table.column("session").to_pylist():
-        seed, condition = seeds[session]
-        order = trial_order(under(study, condition), ALL_SCENARIOS, seed)["test"]
-        found += [(s.stimulus, s.scenario, session) for s in order if s.phase == "test"]
-    return found
-
-
-def expected_names(connection: Connection, study: Study) -> dict[str, frozenset[str]]:
-    """Return the expected stimuli as the analysis takes them, by scenario or by session."""
-    if not study.blocks.all_scenarios:
-        return {name.lower(): _names(study.phase(name, "test")) for name in study.scenarios}
-    return {
-        session: _names(trial_order(under(study, condition), ALL_SCENARIOS, seed)["test"])
-        for session, (seed, condition) in _seeds(connection).items()
-    }
-
-
-def _names(stimuli: Sequence[Stimulus]) -> frozenset[str]:
-    """Return the names of test stimuli, without the attention checks among them."""
-    return frozenset(canonical_name(s.stimulus) for s in stimuli if s.phase == "test")
-
-
-def _seeds(connection: Connection) -> dict[str, tuple[int, str | None]]:
-    """Return seed and condition of the sessions that have several scenarios."""
-    columns = SESSIONS.c
-    chosen = select(columns.session, columns.order_seed, columns.condition)
-    rows = connection.execute(chosen.where(columns.scenario == ALL_SCENARIOS))
-    return {session: (seed, condition) for session, seed, condition in rows}
 
 
 # --- the data of a study as two data frames ---

@@ -3,7 +3,6 @@
  * @module frame
  */
 
-import { hasBlocks, sessionProgress } from "./blocks.js";
 import { button, el } from "./dom.js";
 
 /** Stages in which there is nothing to stop: not begun yet, or finished. */
@@ -77,12 +76,9 @@ export class Frame {
     const trials = state.trials[phase];
     const key = phase === "test" ? "common.progress" : "common.practice_progress";
     const text = texts.t(key, { trial: trial + 1, trials });
-    const several = hasBlocks(state);
-    const part = { block: state.block + 1, blocks: state.blocks.length };
-    const { before, all } = sessionProgress(state, phase, trial);
     byId("progress").replaceChildren(
-      el("label", { for: "bar" }, several ? `${texts.t("block.progress", part)} · ${text}` : text),
-      el("progress", { id: "bar", max: several ? all : trials, value: several ? before : trial }),
+      el("label", { for: "bar" }, text),
+      el("progress", { id: "bar", max: trials, value: trial }),
     );
   }
 

@@ -26,12 +26,6 @@ export interface Enter {
   device?: Device;
 }
 
-export interface BlockTrials {
-  scenario: string;
-  familiarization: [number, number];
-  test: [number, number];
-}
-
 export interface SessionSettings {
   cue_ms: number;
   flash_hz: number;
@@ -47,8 +41,6 @@ export interface SessionState {
   comprehension_attempts: number;
   practice_repeats: number;
   answered: boolean;
-  block: number;
-  blocks: BlockTrials[];
   condition: string;
   settings: SessionSettings;
   scenario: string;

@@ -3,7 +3,6 @@
  * @module pages
  */
 
-import { currentBlock, hasBlocks, size } from "./blocks.js";
 import { button, el, paragraphs, sleep } from "./dom.js";
 import { showExample } from "./example.js";
 import { wrongAttempt } from "./forms.js";
@@ -39,9 +38,7 @@ export function instructionsPages(context) {
   const { texts, state } = context;
   const { t } = bound(texts);
   const prompt = t("trial.prompt");
-  const block = currentBlock(state);
-  const practice = size(block, "familiarization");
-  const several = { blocks: state.blocks.length, trials: state.trials.test };
+  const counts = { practice: state.trials.familiarization, trials: state.trials.test };
   const checked = context.study.comprehension_questions.length > 0;
   const parts = [
     () => [
@@ -57,8 +54,7 @@ export function instructionsPages(context) {
     ],
     () => [
       el("h1", {}, t("instructions.title_answer")),
-      ...paragraphs(t("instructions.answer", { practice, trials: size(block, "test") })),
-      ...(hasBlocks(state) ? paragraphs(t("instructions.blocks", several)) : []),
+      ...paragraphs(t("instructions.answer", counts)),
     ],
   ];
   return (page, done, signal) => {
@@ -89,7 +85,7 @@ export function instructionsPages(context) {
 /** Render the page between practice and test. @param {Context} context @returns {Render} */
 export function readyPage(context) {
   const { t } = bound(context.texts);
-  const test = size(currentBlock(context.state), "test");
+  const test = context.state.trials.test;
   const every = context.study.break_every;
   const values = { trials: test, minutes: minutes(context.study, 0, test) };
   const breaks = every > 0 && every < test ? paragraphs(t("ready.breaks", { every })) : [];
@@ -105,7 +101,7 @@ export function readyPage(context) {
 /** Render the page before a practice that is repeated. @param {Context} context @returns {Render} */
 export function repeatPage({ texts, study, state }) {
   const { t } = bound(texts);
-  const trials = size(currentBlock(state), "familiarization");
+  const trials = state.trials.familiarization;
   const needed = Math.min(study.practice_min_correct, trials);
   return (page, done) =>
     page.append(

@@ -4,7 +4,6 @@
  * @module remembered
  */
 
-import { currentBlock } from "./blocks.js";
 import { keep, newKey, outlivesPage, recall } from "./storage.js";
 
 /**
@@ -64,8 +63,7 @@ export function forgetFeedback() {
 export function dueFeedback(state) {
   const due = recall("feedback");
   if (due?.session !== state.reference || !due.answer) return null;
-  const [, end] = currentBlock(state).familiarization;
-  const answered = state.stage === "ready" ? end : state.trial;
+  const answered = state.stage === "ready" ? state.trials.familiarization : state.trial;
   const practises = state.stage === "familiarization" || state.stage === "ready";
   const repeats = state.practice_repeats > 0 && due.answer.trial >= answered;
   return practises && (repeats || answered === due.answer.trial + 1) ? due.answer : null;

@@ -7,7 +7,6 @@
 
 import { announce, newShowing } from "./answer_queue.js";
 import { Refused } from "./api.js";
-import { blockPage, currentBlock } from "./blocks.js";
 import { consentPage } from "./consent_page.js";
 import { endedPage, resultPage, stopQuestion } from "./ending_pages.js";
 import { hideAddress } from "./entering.js";
@@ -26,7 +25,6 @@ const PAGES = {
   instructions: pages.instructionsPages,
   comprehension: comprehensionPage,
   ready: pages.readyPage,
-  block: blockPage,
   demographics: demographicsPage,
   questions: questionPage,
   feedback: feedbackPage,
@@ -215,7 +213,7 @@ export class Session {
     const due = dueFeedback(this.state);
     if (due) await this.#showFeedback(due);
     if (stage === "familiarization" || stage === "test") return this.#phase(stage);
-    if (stage !== "ready" && stage !== "block") leaveFullscreen();
+    if (stage !== "ready") leaveFullscreen();
     return this.#page(stage, PAGES[stage](this.context));
   }
 
@@ -225,7 +223,6 @@ export class Session {
     let outcome = null;
     const store = async (data) => {
       if (page === "consent") data.language = this.basis.texts.language;
-      if (page === "ready" || page === "block") data.block = this.state.block;
       const post = this.basis.api.post("/api/page", { page, data }, { signal });
       // Refusals are handled by `run`; the page has ended in any case.
       outcome = await post.catch((error) => ({ error }));
@@ -255,17 +252,13 @@ export class Session {
   }
 
   /**
-   * Run the remaining trials of a phase in the current block.
+   * Run the remaining trials of a phase.
    * @returns {Promise<SessionState>} The state after them.
    */
   async #phase(phase) {
     const { api } = this.basis;
     const { signal } = this.#part;
-    const end = currentBlock(this.state)[phase][1];
-    const list = async () => {
-      const { trials } = await api.get(`/api/trials/${phase}`, { signal });
-      return trials.filter((media) => media.trial < end);
-    };
+    const list = async () => (await api.get(`/api/trials/${phase}`, { signal })).trials;
     const trials = await this.#patiently(list());
     this.media.start(trials, this.state.trial, list);
     const remaining = trials.filter((trial) => trial.trial >= this.state.trial);

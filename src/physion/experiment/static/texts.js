@@ -35,14 +35,6 @@ export class Texts {
     );
   }
 
-  /** Return these texts in another scenario. @param {string} scenario @returns {Texts} */
-  inScenario(scenario) {
-    const texts = new Texts(this.language, this.words);
-    texts.scenario = scenario;
-    texts.condition = this.condition;
-    return texts;
-  }
-
   /** Return whether there is a text for a key. @param {string} key @returns {boolean} */
   has(key) {
     return this.#place(key) in this.words;

@@ -5,7 +5,6 @@
  */
 
 import { Refused } from "./api.js";
-import { currentBlock } from "./blocks.js";
 import { FeedbackTrial } from "./feedback_trial.js";
 import { fullscreenPage, offersFullscreen } from "./fullscreen.js";
 import { windowFits } from "./gate.js";
@@ -64,7 +63,7 @@ export function trialPieces(context, phase, media, session) {
  */
 export function repeatBefore(context, phase) {
   const { state } = context;
-  const first = phase === "familiarization" && state.trial === currentBlock(state).familiarization[0];
+  const first = phase === "familiarization" && state.trial === 0;
   if (!first || state.practice_repeats === 0) return [];
   return [{ type: PageTrial, render: pages.repeatPage(context) }];
 }
@@ -90,9 +89,7 @@ export function feedbackPieces(context, media, given) {
  */
 function breakBefore(context, phase, number, rested) {
   const every = context.study.break_every;
-  // The page between blocks is a break too.
-  const [first] = currentBlock(context.state).test;
-  if (phase !== "test" || every === 0 || number === first || number % every !== 0) return [];
+  if (phase !== "test" || every === 0 || number === 0 || number % every !== 0) return [];
   let start = 0;
   return [
     {

@@ -316,7 +316,6 @@ _Label = Annotated[
     StringConstraints(max_length=MAX_LABEL, strip_whitespace=True),
     AfterValidator(lambda text: text or None),
 ]
-_Block = Annotated[int, Field(ge=0, le=100_000)]
 
 
 class _Page(BaseModel):
@@ -328,10 +327,6 @@ class _Page(BaseModel):
 class _Consent(_Page):
     agreed: bool
     language: _Label | None = None
-
-
-class _OfBlock(_Page):
-    block: _Block | None = None
 
 
 class _Demographics(_Page):
@@ -349,8 +344,7 @@ class _Feedback(_Page):
 FIELDS: Mapping[str, type[_Page]] = {
     "consent": _Consent,
     "instructions": _Page,
-    "ready": _OfBlock,
-    "block": _OfBlock,
+    "ready": _Page,
     "demographics": _Demographics,
     "feedback": _Feedback,
     "withdraw": _Page,
@@ -399,8 +393,6 @@ def submit_page(step: Step, page: str, values: Mapping[str, Any]) -> SessionStat
         if stage not in ENDED:
             step.change(withdrawn_at=step.now, last_seen=step.now)
         return step.state
-    if "block" in values and values["block"] < step.session.block and stage not in ENDED:
-        return step.state  # a page of an earlier block, sent again
     if stage in ENDED or STAGES.index(stage) < STAGES.index(page):  # type: ignore[arg-type]
         raise step.refused("wrong_stage", "This page is not next.")
     if stage == page:
@@ -416,8 +408,6 @@ def submit_page(step: Step, page: str, values: Mapping[str, Any]) -> SessionStat
 def _columns(step: Step, page: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the columns of SESSIONS that a page sets, besides the time at which it was sent."""
     match page:
-        case "block":
-            return {"block": step.session.block + 1, "ready_at": None, "practice_repeats": 0}
         case "demographics":
             return dict(values)
         case "questions":

@@ -97,11 +97,11 @@ SESSIONS = Table(
     Column("order_seed", BigInteger, nullable=False),
     Column("order_number", Integer, nullable=False),
     *_columns(Float, "started_at", "last_seen", nullable=False),
-    *_columns(Float, "consented_at", "instructed_at", "comprehended_at", "ready_at", "block_at",
+    *_columns(Float, "consented_at", "instructed_at", "comprehended_at", "ready_at",
               "demographics_at", "questions_at", "finished_at", "withdrawn_at", "closed_at",
               "voided_at", "screened_out_at", "progressed_at", "next_from"),
     *_columns(Integer, "comprehension_attempts", "practice_repeats", "attention_failed",
-              "answered_familiarization", "answered_test", "block", "fast_answers", "unfetched",
+              "answered_familiarization", "answered_test", "fast_answers", "unfetched",
               "replayed", "loads", nullable=False, default=0),
     *_columns(String(200), "consent_version", "questions_study", "screened_out_by", "browser",
               "failed_checks", "condition", "implausible", "loaded_at_phase", "gender",
@@ -118,9 +118,7 @@ SESSIONS = Table(
 )  # fmt: skip
 """Sessions. ``kind`` is written when the session begins and never changed. ``order_number`` is the
 number of the prepared order, 0 if the study has none; ``order_seed`` and the stimuli determine the
-order of the trials. ``scenario`` is `study.ALL_SCENARIOS` in sessions of several scenarios, and
-``block`` the index of the current block, to which ``ready_at`` belongs; ``block_at``: when the page
-before it was sent. ``condition``: name of the between-subject condition; NULL without conditions.
+order of the trials. ``condition``: name of the between-subject condition; NULL without conditions.
 ``loaded_at_*``: the trial that was next when the page was last reloaded.
 ``own_answers``: answers to the lab's own questions, by name; ``questions_study``: digest of the
 version of the study that asked them.
@@ -130,7 +128,7 @@ decided that the session does not count.
 ``screened_out_at``: when the session ended because the participant failed the check
 ``screened_out_by``; ``comprehension_attempts``: how often the comprehension check was answered.
 ``attention_failed``: number of failed attention checks. ``practice_repeats``: how often the
-practice of the current block was repeated; ``failed_checks``: names of the lab's checks that flag
+practice was repeated; ``failed_checks``: names of the lab's checks that flag
 the session, separated by commas; NULL without any.
 ``browser``: keyed hash of the key of the browser that began the session, empty if it sent none.
 ``progressed_at``: time of the last page or answer.
@@ -228,7 +226,7 @@ EVENTS = Table(
 several events together."""
 
 DATABASE_FILE = "responses.sqlite"
-SCHEMA = 1
+SCHEMA = 2
 """Version of the tables above; raise it with every change of them."""
 BUSY_MS = 10_000
 """Time in milliseconds that SQLite waits for a lock of another process, such as a backup."""

@@ -13,7 +13,6 @@ through the practice and continues.
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from secrets import token_hex
@@ -51,7 +50,6 @@ from physion.experiment.study.identity import (
     participant_hash,
 )
 from physion.experiment.study.orders import (
-    block_orders,
     draw_buttons,
     individual_order_seed,
     prepared_order_seed,
@@ -62,7 +60,6 @@ from physion.experiment.study.recruitment import (
     is_unfilled,
     read_pass,
 )
-from physion.experiment.study.settings import ALL_SCENARIOS
 from physion.experiment.study.study import Study, under, variants
 
 
@@ -115,7 +112,7 @@ def identify_visitor(study: Study, secrets: Secrets, enter: Enter, token: str = 
         raise Refused("id_needed", "This link lacks your id; open the link that you were given.")
     if raw_id is not None and kind == "person" and not is_id_allowed(study, enter.source, raw_id):
         raise Refused("id_refused", "This study does not know the id of this link.")
-    if enter.scenario is not None and enter.scenario not in study.offered:
+    if enter.scenario is not None and enter.scenario not in study.scenarios:
         raise Refused("bad_link", "This link names a scenario that no session of the study is of.")
     if enter.condition is not None and (
         key is None or enter.condition not in [each.name for each in study.conditions]
@@ -194,7 +191,7 @@ def enter_session(
     done = {each.scenario for each in sessions}
     places = _Places(connection, study, visitor, others)
     chosen, scenario = _choose_course(study, places, visitor, done, own)
-    number, seed = _assign_order(connection, chosen, secrets, scenario, places)
+    number, seed = _assign_order(chosen, secrets, scenario, places)
     values = {
         "session": visitor.session,
         "participant": visitor.participant,
@@ -356,7 +353,7 @@ def _find_ended(study: Study, sessions: list[Session], scenario: str | None) -> 
         return max(screened_out, key=lambda session: session.started_at)
     known = {session.scenario for session in sessions}
     wanted = [session for session in sessions if scenario in (None, session.scenario)]
-    if not wanted or (scenario is None and not set(study.offered) <= known):
+    if not wanted or (scenario is None and not set(study.scenarios) <= known):
         return None
     last = max(wanted, key=lambda session: session.started_at)
     by_lab = last.closed_at is not None or last.voided_at is not None
@@ -509,7 +506,7 @@ def in_use(study: Study, now: float) -> tuple[ColumnElement[bool], ...]:
     ``hold_minutes``: a script that only sends the first pages takes no place from people.
     """
     columns = SESSIONS.c
-    practised = or_(columns.ready_at.is_not(None), columns.block > 0, columns.answered_test > 0)
+    practised = or_(columns.ready_at.is_not(None), columns.answered_test > 0)
     held_since = now - 60 * study.recruitment.hold_minutes
     return (
         columns.finished_at.is_not(None),
@@ -554,7 +551,7 @@ def _choose_course(
         ranked = sorted(variants(study), key=rank)
     refused: Refused | None = None
     for variant in ranked:
-        if wanted not in (None, *variant.offered):
+        if wanted not in (None, *variant.scenarios):
             continue
         try:
             return variant, _choose_scenario(variant, places, wanted, done)
@@ -568,7 +565,7 @@ def _choose_scenario(study: Study, places: _Places, wanted: str | None, done: se
 
     Scenarios in ``done`` are excluded, and for people also those that have enough participants.
     """
-    available = [each for each in study.offered if each not in done and wanted in (None, each)]
+    available = [each for each in study.scenarios if each not in done and wanted in (None, each)]
     if not available:
         raise Refused("already_took_part", "You have taken part already. Thank you!")
     free = places.require(study, available)
@@ -576,13 +573,12 @@ def _choose_scenario(study: Study, places: _Places, wanted: str | None, done: se
 
 
 def _assign_order(
-    connection: Connection, study: Study, secrets: Secrets, scenario: str, places: _Places
+    study: Study, secrets: Secrets, scenario: str, places: _Places
 ) -> tuple[int, int]:
     """Return the number of the prepared order of a new session, 0 if there is none, and its seed.
 
-    The seed also determines the order of the blocks; the least used order is taken.
+    The least used prepared order is taken.
     """
-    visitor = places.visitor
     if study.orders:
         own = {"scenario": scenario, "condition": study.condition or None}
         number = min(
@@ -590,39 +586,4 @@ def _assign_order(
             key=lambda order: (places.count("total", order=order, **own), order),
         )
         return number, prepared_order_seed(study, secrets, scenario, number)
-    blocks = 0
-    if scenario == ALL_SCENARIOS:
-        blocks = _least_used_blocks(connection, study, places)
-    return 0, individual_order_seed(study, scenario, visitor.participant, blocks)
-
-
-def _least_used_blocks(connection: Connection, study: Study, places: _Places) -> int:
-    """Return the index of the order of blocks with the fewest sessions; equal ones by seed.
-
-    Sessions that ended early, or that nobody continues, give their place back.
-    """
-    count, columns, visitor = len(block_orders(len(study.scenarios))), SESSIONS.c, places.visitor
-    index = columns.order_seed % count
-    statement = (
-        select(index, func.count())
-        .where(
-            columns.scenario == ALL_SCENARIOS,
-            func.coalesce(columns.condition, "") == study.condition,
-            columns.implausible.is_(None),
-            or_(*in_use(study, visitor.now)),
-            *live(visitor.kind),
-        )
-        .group_by(index)
-    )
-    used: Counter[int] = Counter(dict(connection.execute(statement).all()))
-    used.update(
-        each.session.order_seed % count
-        for each in places.reading
-        if (each.session.condition or "") == study.condition
-    )
-
-    def rank(number: int) -> tuple[int, int]:
-        tie = stable_hash("order of blocks", study.seed, visitor.participant, number)
-        return used[number], tie
-
-    return min(range(count), key=rank)
+    return 0, individual_order_seed(study, scenario, places.visitor.participant)

@@ -23,8 +23,8 @@ from sqlalchemy import Connection, bindparam, delete, func, insert, literal, or_
 
 from physion.experiment.protocol import Answer
 from physion.experiment.store.database import ANSWERS, PRACTICE_REPEATS, SESSIONS, SHOWINGS, STUDIES
-from physion.experiment.store.sessions import Session, Step, block_of, with_check
-from physion.experiment.study.orders import fixation, stimuli_by_session, trial_order
+from physion.experiment.store.sessions import Session, Step, with_check
+from physion.experiment.study.orders import fixation, trial_order
 from physion.experiment.study.stimuli import PHASES, Stimulus, is_right
 from physion.experiment.study.study import Study
 
@@ -143,61 +143,54 @@ def repeated_response(connection: Connection, session: Session, answer: Answer) 
 
 
 def judge_practice(step: Step) -> None:
-    """Judge the practice of the current block when its last trial has been answered.
+    """Judge the practice when its last trial has been answered.
 
     With fewer right answers than ``practice.min_correct`` it is repeated ``practice.repeats``
     times; afterwards the session ends or is flagged.
     """
     session, rules = step.session, step.study.practice
-    trials = block_of(session, step.course).familiarization
-    if session.answered_familiarization < trials.stop or not trials:
+    trials = step.course.trials[PHASES[0]]
+    if session.answered_familiarization < trials:
         return
-    if _count_right(step, trials) >= min(rules.min_correct, len(trials)):
+    if _count_right(step) >= min(rules.min_correct, trials):
         return
     if session.practice_repeats < rules.repeats:
-        step.change(**_repeat(step.connection, session, trials))
+        step.change(**_repeat(step.connection, session))
     elif rules.failed == "end":
         step.change(screened_out_at=step.now, screened_out_by=PRACTICE)
     else:
         step.change(**with_check(session, PRACTICE))
 
 
-def _count_right(step: Step, trials: range) -> int:
-    """Count the right answers to these practice trials."""
+def _count_right(step: Step) -> int:
+    """Count the right answers to the practice trials."""
     session = step.session
     order = trial_order(step.study, session.scenario, session.order_seed)[PHASES[0]]
     rows = step.connection.execute(
-        select(ANSWERS.c.trial, ANSWERS.c.response).where(*_of(ANSWERS, session, trials))
+        select(ANSWERS.c.trial, ANSWERS.c.response).where(*_of(ANSWERS, session))
     )
     return sum(is_right(response, order[trial].label) for trial, response in rows)
 
 
-def _repeat(connection: Connection, session: Session, trials: range) -> dict[str, Any]:
-    """Move the answers to these practice trials away; return the changed columns of the session."""
+def _repeat(connection: Connection, session: Session) -> dict[str, Any]:
+    """Move the answers to the practice away; return the changed columns of the session."""
     columns = list(ANSWERS.c)
-    moved = select(literal(session.practice_repeats), *columns).where(
-        *_of(ANSWERS, session, trials)
-    )
+    moved = select(literal(session.practice_repeats), *columns).where(*_of(ANSWERS, session))
     names = ["repeat", *(column.name for column in columns)]
     connection.execute(insert(PRACTICE_REPEATS).from_select(names, moved))
     for table in (ANSWERS, SHOWINGS):
-        connection.execute(delete(table).where(*_of(table, session, trials)))
+        connection.execute(delete(table).where(*_of(table, session)))
     return {
-        "answered_familiarization": trials.start,
+        "answered_familiarization": 0,
         "practice_repeats": session.practice_repeats + 1,
         "loaded_at_phase": None,
         "loaded_at_trial": None,
     }
 
 
-def _of(table: Any, session: Session, trials: range) -> tuple[Any, ...]:
-    """Return the conditions for the rows of these practice trials of a session."""
-    return (
-        table.c.session == session.session,
-        table.c.phase == PHASES[0],
-        table.c.trial >= trials.start,
-        table.c.trial < trials.stop,
-    )
+def _of(table: Any, session: Session) -> tuple[Any, ...]:
+    """Return the conditions for the rows of the practice trials of a session."""
+    return table.c.session == session.session, table.c.phase == PHASES[0]
 
 
 _CHUNK = 500
@@ -225,7 +218,7 @@ class Scores:
     """Cache of the numbers of correct test answers of finished sessions, which are final."""
 
     def __init__(self, study: Study) -> None:
-        self._labels = {key: each.label for key, each in stimuli_by_session(study).items()}
+        self._labels = study.labels
         self._stimuli = study.stimuli_digest
         self._correct: dict[str, int] = {}
         self._lock = threading.Lock()

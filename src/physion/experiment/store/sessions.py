@@ -13,8 +13,6 @@ from physion.experiment.protocol import (
     ENDED,
     PAGES,
     STAGES,
-    Block,
-    BlockTrials,
     Course,
     Refused,
     SessionSettings,
@@ -68,8 +66,6 @@ class Session:
     implausible: str | None
     answered_familiarization: int
     answered_test: int
-    block: int
-    block_at: float | None
     condition: str | None
     loads: int
     loaded_at_phase: str | None
@@ -87,7 +83,6 @@ _BY_TOKEN = (
 def stages_of(study: Study) -> tuple[Stage, ...]:
     """Return the stages of a study's sessions in order, ``done`` last."""
     absent = {
-        "block": not study.blocks.all_scenarios,
         "comprehension": not study.comprehension_questions,
         "demographics": not study.demographics,
         "questions": not study.questions,
@@ -116,7 +111,7 @@ class Courses:
                 "The study no longer has this scenario; open your link again.",
             )
         study = under(self._study, session.condition)
-        trials = session_trials(study, session.scenario, session.order_seed)
+        trials = session_trials(study, session.scenario)
         settings = {
             "cue_ms": study.timing.cue_ms,
             "flash_hz": study.timing.flash_hz,
@@ -127,7 +122,7 @@ class Courses:
 
     def has(self, session: Session) -> bool:
         """Return whether the study currently has the scenario of a session."""
-        return session.scenario in under(self._study, session.condition).offered
+        return session.scenario in under(self._study, session.condition).scenarios
 
 
 def new_session_of(values: Mapping[str, Any]) -> Session:
@@ -170,10 +165,7 @@ def end_of(session: Any) -> Literal["void", "finished", "withdrawn", "screened_o
 
 
 def stage_of(session: Session, course: Course) -> Stage:
-    """Return the current stage of a session: the first one that is not complete.
-
-    A block without familiarization has no page between practice and test.
-    """
+    """Return the current stage of a session: the first one that is not complete."""
     end = end_of(session)
     if session.finished_at is not None:  # also of a void session
         return "done"
@@ -181,25 +173,14 @@ def stage_of(session: Session, course: Course) -> Stage:
         return end
     if end is not None:
         return "declined" if session.consented_at is None else "withdrawn"
-    block = block_of(session, course)
     for stage in course.stages:
         if stage in PHASES:
-            complete = answered(session, stage) >= block.of(stage).stop
-        elif stage == "block":
-            complete = block is course.trials.blocks[-1]
-        elif stage == "ready" and not block.familiarization:
-            complete = True
+            complete = answered(session, stage) >= course.trials[stage]
         else:
             complete = stage in PAGES and getattr(session, PAGES[stage].column) is not None
         if not complete:
             return stage
     raise AssertionError("a session whose last page was sent is finished")
-
-
-def block_of(session: Session, course: Course) -> Block:
-    """Return the current block of a session."""
-    blocks = course.trials.blocks
-    return blocks[min(session.block, len(blocks) - 1)]
 
 
 def answered(session: Session, phase: str) -> int:
@@ -209,7 +190,7 @@ def answered(session: Session, phase: str) -> int:
 
 def state_of(session: Session, course: Course) -> SessionState:
     """Return the state of a session as sent to the client."""
-    stage, block = stage_of(session, course), block_of(session, course)
+    stage = stage_of(session, course)
     return SessionState(
         stage=stage,
         ended=stage in ENDED,
@@ -218,27 +199,14 @@ def state_of(session: Session, course: Course) -> SessionState:
         comprehension_attempts=session.comprehension_attempts,
         practice_repeats=session.practice_repeats,
         answered=any(answered(session, phase) for phase in PHASES),
-        block=course.trials.blocks.index(block),
-        blocks=[
-            BlockTrials(
-                scenario=each.scenario,
-                familiarization=_ends(each.familiarization),
-                test=_ends(each.test),
-            )
-            for each in course.trials.blocks
-        ],
         condition=session.condition or "",
         settings=SessionSettings.model_validate(course.settings),
-        scenario=block.scenario,
+        scenario=session.scenario,
         language=session.language,
         kind=cast("Any", session.kind),
         buttons=cast("Any", session.buttons),
         reference=session.reference,
     )
-
-
-def _ends(indices: range) -> tuple[int, int]:
-    return indices.start, indices.stop
 
 
 @dataclass

@@ -401,11 +401,11 @@ def register(connection: Connection, study: Study, now: float) -> None:
         .join(STUDIES, STUDIES.c.digest == SESSIONS.c.study)
         .where(STUDIES.c.stimuli_digest != study.stimuli_digest)
     )
-    gone = SESSIONS.c.scenario.not_in(study.offered)
+    gone = SESSIONS.c.scenario.not_in(study.scenarios)
     count = sum(_by_scenario(connection, other).values())
     if count:
         raise BadInputError(
-            f"{count} sessions were made with another stimuli.csv, other media or other blocks; "
+            f"{count} sessions were made with another stimuli.csv or other media; "
             "their orders of trials would change. Restore the old stimuli and settings, or create "
             "a new study folder for the new ones"
         )

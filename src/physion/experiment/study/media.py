@@ -115,7 +115,7 @@ def read_media(study: Study, secrets: Secrets, path: str) -> SignedMedia:
 def _courses(study: Study) -> Iterator[tuple[Study, str]]:
     """Yield the conditions of a study, and the study itself, with the scenarios of sessions."""
     for variant in dict.fromkeys(map(StudyKey, (*variants(study), study))):
-        for scenario in dict.fromkeys((*variant.study.offered, *variant.study.scenarios)):
+        for scenario in variant.study.scenarios:
             yield variant.study, scenario
 
 

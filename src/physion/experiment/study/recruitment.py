@@ -17,7 +17,6 @@ from urllib.parse import parse_qsl, quote, unquote, urlencode, urlsplit, urlunsp
 from physion.core.errors import BadInputError
 from physion.experiment.protocol import Completion, Enter, Recruiter, Source
 from physion.experiment.study.identity import REFERENCE_LETTERS, check_signature, sign
-from physion.experiment.study.settings import ALL_SCENARIOS
 from physion.experiment.study.study import under
 
 if TYPE_CHECKING:
@@ -181,7 +180,7 @@ class Link:
     name
         Recruiter, ``link``, ``preview`` or ``simulated``.
     scenario
-        Scenario that the link leads to, or `study.ALL_SCENARIOS`.
+        Scenario that the link leads to.
     condition
         The condition that the link fixes; empty: the one with the fewest sessions.
     address
@@ -230,7 +229,7 @@ def links(study: Study, secrets: Secrets, base_url: str) -> tuple[Link, ...]:
     root = _root(base_url)
     result = []
     for condition in ("", *(each.name for each in study.conditions)):
-        for scenario in under(study, condition).offered:
+        for scenario in under(study, condition).scenarios:
             for name in GOES_TO:
                 query = _query(study, secrets, scenario, name, condition)
                 address = f"{root}/?{'&'.join(query)}" if query else f"{root}/"
@@ -241,7 +240,7 @@ def links(study: Study, secrets: Secrets, base_url: str) -> tuple[Link, ...]:
 
 def _query(study: Study, secrets: Secrets, scenario: str, name: str, condition: str) -> list[str]:
     """Return the parts of the query of an entry link."""
-    query = [] if scenario == ALL_SCENARIOS else [f"scenario={quote(scenario, safe='')}"]
+    query = [f"scenario={quote(scenario, safe='')}"]
     fixed = ("condition", condition) if condition else ()
     if condition:
         query.append(f"condition={quote(condition, safe='')}")
@@ -274,11 +273,11 @@ def signed_links(
             )
     return tuple(
         (scenario, raw_id, f"{root}/?{urlencode(query)}")
-        for scenario in study.offered
+        for scenario in study.scenarios
         for raw_id in ids
         for query in (
             {
-                **({} if scenario == ALL_SCENARIOS else {"scenario": scenario}),
+                "scenario": scenario,
                 "pass": make_pass(secrets, "person", source, raw_id),
                 name: raw_id,
             },

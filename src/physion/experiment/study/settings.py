@@ -31,8 +31,6 @@ from physion.core.settings import read_settings
 from physion.core.tables import markdown_table
 from physion.experiment.study.stimuli import NAME
 
-ALL_SCENARIOS = "all scenarios"
-"""In place of a scenario: a session of all scenarios. No scenario can have this name."""
 HEAD = """\
 # Settings of this study. Texts are in texts/, stimuli in stimuli.csv (which is never served).
 # To run it: physion experiment serve FOLDER
@@ -162,21 +160,6 @@ class Timing:
 
 
 @dataclass(frozen=True)
-class Blocks:
-    """Several scenarios in one session."""
-
-    all_scenarios: bool = False
-    """Whether a session runs through all scenarios, one block each, in an order of its own; all
-    orders are used about equally often. false: a session has one scenario."""
-    familiarization: Literal["each", "first"] = "each"
-    """Whether "each" block begins with the familiarization trials of its scenario, or only the
-    "first" one."""
-    trials: Count = 0
-    """Test trials of a block, drawn for each session, half of them with contact where possible; 0:
-    all."""
-
-
-@dataclass(frozen=True)
 class Comprehension:
     """Comprehension check after the instructions."""
 
@@ -190,7 +173,7 @@ class Practice:
     """Criterion of the practice."""
 
     min_correct: Annotated[int, Field(ge=0, le=1000)] = 0
-    """Right answers needed in the familiarization (of each block); 0: no criterion."""
+    """Right answers needed in the familiarization; 0: no criterion."""
     repeats: Annotated[int, Field(ge=0, le=20)] = 1
     """How often the practice is repeated with fewer right answers."""
     failed: Literal["end", "flag"] = "end"
@@ -202,8 +185,8 @@ class Attention:
     """Attention checks among the test trials."""
 
     instructed: Annotated[int, Field(ge=0, le=100)] = 0
-    """Attention checks in the test (of each block) that say which button to press. Stimuli of the
-    phase attention in stimuli.csv, with an obvious outcome, are checks too."""
+    """Attention checks in the test that say which button to press. Stimuli of the phase attention
+    in stimuli.csv, with an obvious outcome, are checks too."""
     max_failed: Annotated[int, Field(ge=0, le=1000)] = 0
     """Sessions with more failed checks than this are flagged."""
 
@@ -467,7 +450,6 @@ class StudySettings:
     embed_from: Annotated[tuple[Site, ...], Field(max_length=100), AfterValidator(_distinct)] = ()
     """Sites that may show the pages in a frame (MTurk: https://www.mturk.com); usually none."""
     timing: Timing = Timing()
-    blocks: Blocks = Blocks()
     comprehension: Comprehension = Comprehension()
     practice: Practice = Practice()
     attention: Attention = Attention()
@@ -832,12 +814,11 @@ WITHOUT_FEEDBACK = ("instructions.answer", "ready.text")
 """Texts that speak of feedback, which a condition without it must replace."""
 
 
-def condition_text_keys(conditions: Sequence[Condition], *, blocks: bool) -> tuple[str, ...]:
+def condition_text_keys(conditions: Sequence[Condition]) -> tuple[str, ...]:
     """Return the keys of texts that conditions need: of those without feedback, about practice."""
-    wanted = (*WITHOUT_FEEDBACK, *(("block.practice",) if blocks else ()))
     return tuple(
         f"condition.{condition.name}.{key}"
         for condition in conditions
         if condition.familiarization_feedback is False
-        for key in wanted
+        for key in WITHOUT_FEEDBACK
     )

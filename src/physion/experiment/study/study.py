@@ -16,7 +16,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -24,9 +23,7 @@ from pathlib import Path
 
 from physion.core.errors import BadInputError
 from physion.core.files import check_plain, digest_of, read_ids, read_plain, write_atomic
-from physion.core.names import canonical_name
 from physion.experiment.study.settings import (
-    ALL_SCENARIOS,
     StudySettings,
     condition_text_keys,
     format_settings,
@@ -66,8 +63,7 @@ class Study(StudySettings):
     digest
         SHA-256 of study.toml, texts, consent forms and stimuli.csv.
     stimuli_digest
-        SHA-256 of stimuli.csv; with blocks or instructed checks, also of the settings that choose
-        trials from it.
+        SHA-256 of stimuli.csv; with instructed checks, also of their number.
     """
 
     folder: Path
@@ -80,9 +76,9 @@ class Study(StudySettings):
     stimuli_digest: str = ""
 
     @property
-    def offered(self) -> tuple[str, ...]:
-        """What a session can be of: one of the scenarios, or `ALL_SCENARIOS`."""
-        return (ALL_SCENARIOS,) if self.blocks.all_scenarios else self.scenarios
+    def labels(self) -> dict[tuple[str, str], bool]:
+        """Outcomes by scenario and name of the stimulus."""
+        return {(each.scenario, each.stimulus): each.label for each in self.stimuli}
 
     def phase(self, scenario: str, phase: str) -> tuple[Stimulus, ...]:
         """Return the stimuli of one phase of a scenario, sorted by place."""
@@ -135,7 +131,6 @@ def load_study(folder: Path | str) -> Study:
     rows = listed.read_bytes()
     stimuli = tuple(s for s in read_stimuli(listed) if s.scenario in study.scenarios)
     _check_stimuli(study, stimuli, listed)
-    _check_blocks(study, stimuli, listed)
     return replace(
         study,
         stimuli=stimuli,
@@ -143,7 +138,7 @@ def load_study(folder: Path | str) -> Study:
         texts=texts,
         consent_files=files,
         digest=_digest(content, *written, rows),
-        stimuli_digest=_digest(rows, *_block_settings(study), *_check_settings(study)),
+        stimuli_digest=_digest(rows, *_check_settings(study)),
     )
 
 
@@ -151,8 +146,7 @@ def own_text_keys(study: Study) -> tuple[str, ...]:
     """Return the keys of the texts that a study needs for its own questions and conditions."""
     asked = [key for question in study.comprehension_questions for key in question.text_keys]
     asked += [key for question in study.questions for key in question.text_keys]
-    several = study.blocks.all_scenarios
-    return (*asked, *condition_text_keys(study.conditions, blocks=several))
+    return (*asked, *condition_text_keys(study.conditions))
 
 
 def write_settings(study: Study) -> Path:
@@ -175,40 +169,6 @@ def _check_stimuli(study: Study, stimuli: tuple[Stimulus, ...], path: Path) -> N
     for stimulus in stimuli:
         for name in filter(None, (stimulus.movie, stimulus.map, stimulus.full)):
             check_plain(study.folder / name)
-
-
-def _check_blocks(study: Study, stimuli: tuple[Stimulus, ...], path: Path) -> None:
-    """Check that the blocks of a session have the trials that they need, and distinct stimuli."""
-    wanted, settings = study.blocks.trials, study.folder / STUDY_FILE
-    if not study.blocks.all_scenarios:
-        return
-    for scenarios in (study.scenarios, *(each.scenarios for each in study.conditions)):
-        if scenarios is not None and len(scenarios) < 2:
-            raise BadInputError(f"{settings}: blocks.all_scenarios needs at least two scenarios")
-    counts = Counter(s.scenario for s in stimuli if s.phase == "test")
-    for scenario in study.scenarios:
-        if wanted > counts[scenario]:
-            raise BadInputError(
-                f"{settings}: blocks.trials is {wanted}, but {scenario} has {counts[scenario]} "
-                "test stimuli"
-            )
-    seen: dict[str, str] = {}
-    for stimulus in stimuli:
-        first = seen.setdefault(canonical_name(stimulus.stimulus), stimulus.scenario)
-        if first != stimulus.scenario:
-            raise BadInputError(
-                f"{path}: {stimulus.stimulus} is a stimulus of {first} and of {stimulus.scenario}; "
-                "with blocks.all_scenarios a session has both, so give them different names"
-            )
-
-
-def _block_settings(study: Study) -> tuple[bytes, ...]:
-    """Return the settings that choose the trials of blocks, as JSON; nothing without blocks."""
-    if not study.blocks.all_scenarios:
-        return ()
-    own = [[each.name, each.scenarios] for each in study.conditions if each.scenarios]
-    chosen = [study.scenarios, vars(study.blocks), *([own] if own else [])]
-    return (json.dumps(chosen).encode(),)
 
 
 def _check_settings(study: Study) -> tuple[bytes, ...]:
