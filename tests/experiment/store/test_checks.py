@@ -15,7 +15,6 @@ from physion.analysis.people.exclusions import flag_sessions, read_expected
 from physion.analysis.people.responses import read_responses
 from physion.core.errors import BadInputError
 from physion.experiment.experimenter.progress import StudyProgress
-from physion.experiment.export.descriptions import restore_cell
 from physion.experiment.export.export_study import export_study
 from physion.experiment.protocol import Completion, PageDone, SessionState
 from physion.experiment.store.answering import ATTEMPT
@@ -416,7 +415,7 @@ def test_answers_are_exported_with_their_words(asking_store: Store, tmp_path: Pa
                "confidence"]  # fmt: skip
     assert list(table.columns) == ["participant", "session", *columns] and len(table) == 2
     first = table.iloc[0]
-    assert restore_cell(first["strategy"]) == OWN_ANSWERS["strategy"] != first["strategy"]
+    assert first["strategy"] == OWN_ANSWERS["strategy"]
     assert [first[name] for name in columns[1:]] == ["often", True, True, False, 4]
     assert set(table["session"]) <= set(pd.read_csv(out / "sessions.csv")["session"])
     described = json.loads((out / "data_dictionary.json").read_text())["questions"]

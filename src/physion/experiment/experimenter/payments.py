@@ -13,7 +13,6 @@ from statistics import median
 from sqlalchemy import Engine, func, select
 
 from physion.experiment.experimenter.progress import SessionLine
-from physion.experiment.export.descriptions import guard_cell
 from physion.experiment.store.database import RAW_IDS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import completion
@@ -133,5 +132,7 @@ def payment_csv(payments: Sequence[Payment]) -> bytes:
             payment.code or "",
             json.dumps(dict(payment.recruiter), ensure_ascii=False) if payment.recruiter else "",
         )
-        writer.writerow([guard_cell(text) for text in texts])
+        # An apostrophe before what a spreadsheet would take for a formula.
+        risky = ("=", "+", "-", "@", "\t", "\r", "'")
+        writer.writerow([f"'{text}" if text.startswith(risky) else text for text in texts])
     return lines.getvalue().encode()

@@ -21,7 +21,6 @@ The same data and package version give byte-identical files, whatever the databa
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import io
 import json
@@ -30,7 +29,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -44,12 +42,7 @@ from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS
 from physion.core.errors import BadInputError
 from physion.core.files import new_folder
 from physion.core.tables import Column, data_dictionary
-from physion.experiment.export.descriptions import (
-    RULE,
-    guard_cell,
-    readme,
-    write_psych_ds,
-)
+from physion.experiment.export.descriptions import readme, write_psych_ds
 from physion.experiment.export.tables import (
     ATTENTION_COLUMNS,
     DETAIL_COLUMNS,
@@ -107,18 +100,16 @@ def _refuse_others(out: Path) -> None:
 # --- one table as CSV and parquet; the same rows give the same bytes ---
 
 NAMES = frozenset({"participant", "session", "scenario", "condition", "stimulus", "kind"})
-"""Text columns that need no protection against formulas: their values are hashes or consist of
-letters, digits and ._+- and start with a letter or digit."""
+"""Text columns whose values are names or hashes; other texts are free, and hardly ever repeat."""
 
 
 class TableWriter:
-    """Context manager that writes ``NAME.csv`` and ``NAME.parquet`` in a folder.
-
-    CSV: UTF-8 with a header and LF line ends; free text is protected by `guard_cell` and quoted
-    where needed. Parquet: Zstandard compression; empty cells are null.
+    """Writes ``NAME.csv`` (UTF-8, LF line ends) and ``NAME.parquet`` (Zstandard) in a folder.
 
     Parameters
     ----------
+    opened
+        Closes the files.
     folder, name
         Folder, and name of the files without ending.
     columns
@@ -131,6 +122,7 @@ class TableWriter:
 
     def __init__(
         self,
+        opened: ExitStack,
         folder: Path,
         name: str,
         columns: Sequence[Column],
@@ -138,59 +130,27 @@ class TableWriter:
         with_csv: bool = True,
         level: int = 3,
     ) -> None:
-        self.csv = folder / f"{name}.csv"
         self.rows = 0
-        self._texts = [c.name for c in columns if c.kind == "text" and c.name not in NAMES]
-        self._stack = contextlib.ExitStack()
         schema = arrow_schema(columns)
-        with contextlib.ExitStack() as opened:
-            self._parquet = opened.enter_context(
-                pq.ParquetWriter(
-                    folder / f"{name}.parquet",
-                    schema,
-                    compression="zstd",
-                    compression_level=level,
-                    # No dictionary for free texts, which hardly ever repeat.
-                    use_dictionary=[c.name for c in columns if c.name not in self._texts],
-                )
-            )
-            self._csv = None
-            if with_csv:
-                file = opened.enter_context(self.csv.open("wb"))
-                file.write(",".join(column.name for column in columns).encode() + b"\n")
-                options = arrow_csv.WriteOptions(
-                    include_header=False, quoting_style="needed" if self._texts else "none"
-                )
-                writer = arrow_csv.CSVWriter(file, schema, write_options=options)
-                self._csv = opened.enter_context(writer)
-            self._stack = opened.pop_all()
+        names = [c.name for c in columns if c.kind != "text" or c.name in NAMES]
+        parquet = pq.ParquetWriter(
+            folder / f"{name}.parquet", schema, compression="zstd", compression_level=level,
+            use_dictionary=names,
+        )  # fmt: skip
+        self._files = [opened.enter_context(parquet)]
+        if with_csv:
+            file = opened.enter_context((folder / f"{name}.csv").open("wb"))
+            file.write(",".join(column.name for column in columns).encode() + b"\n")
+            quoting = "none" if len(names) == len(columns) else "needed"
+            options = arrow_csv.WriteOptions(include_header=False, quoting_style=quoting)
+            csv_file = arrow_csv.CSVWriter(file, schema, write_options=options)
+            self._files.append(opened.enter_context(csv_file))
 
     def write(self, table: pa.Table) -> None:
         """Append rows."""
         self.rows += table.num_rows
-        self._parquet.write_table(table)
-        if self._csv is not None:
-            self._csv.write_table(self._guarded(table))
-
-    def _guarded(self, table: pa.Table) -> pa.Table:
-        """Return the table with its free texts protected by `guard_cell`."""
-        for name in self._texts:
-            cells = table.column(name).to_pylist()
-            guarded = [None if cell is None else guard_cell(cell) for cell in cells]
-            index = table.schema.get_field_index(name)
-            table = table.set_column(index, name, pa.array(guarded, pa.string()))
-        return table
-
-    def __enter__(self) -> TableWriter:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        at: TracebackType | None,
-    ) -> None:
-        self._stack.close()
+        for file in self._files:
+            file.write_table(table)
 
 
 # --- all tables, in batches of sessions ---
@@ -252,13 +212,12 @@ def write_tables(
     latest = [_latest(sessions.table, column) for column in ("started_at", "finished_at")]
     with ExitStack() as stack:
         files = {
-            name: stack.enter_context(TableWriter(folder, name, TABLES[name]))
+            name: TableWriter(stack, folder, name, TABLES[name])
             for name in ("trials", "sessions", "events")
         }
-        details = stack.enter_context(
-            TableWriter(folder, "trial_details", DETAIL_COLUMNS, with_csv=False, level=1)
+        details = TableWriter(
+            stack, folder, "trial_details", DETAIL_COLUMNS, with_csv=False, level=1
         )
-
         files["sessions"].write(sessions.table)
         own = _write_own_answers(folder, connection, study, sessions)
         for events in read_events(connection, sessions.table):
@@ -279,8 +238,8 @@ def write_tables(
     for name, (read, columns) in further.items():
         table = read(connection, study, sessions.table)
         if table.num_rows:
-            with TableWriter(folder, name, columns) as file:
-                file.write(table)
+            with ExitStack() as stack:
+                TableWriter(stack, folder, name, columns).write(table)
             rows[name], described[name] = table.num_rows, columns
     return WrittenTables(rows, gone, max(latest) or None, own, described)
 
@@ -294,8 +253,8 @@ def _write_own_answers(
         return None
     columns = (*KEYS, *question_columns(questions))
     table = read_own_answers(connection, questions, sessions.table)
-    with TableWriter(folder, "questions", columns) as file:
-        file.write(table)
+    with ExitStack() as stack:
+        TableWriter(stack, folder, "questions", columns).write(table)
     return table, columns
 
 
@@ -388,7 +347,7 @@ def export_study(
         dictionary: dict[str, Any] = {
             name: data_dictionary(columns) for name, columns in written.described.items()
         }
-        _write_json(folder / "data_dictionary.json", dictionary | {"spreadsheet_safety": RULE})
+        _write_json(folder / "data_dictionary.json", dictionary)
         chosen = {
             name: (folder / f"{name}.csv", columns)
             for name, columns in written.described.items()
