@@ -82,7 +82,7 @@ def build_people_report(report: PeopleReport, folder: Path) -> Path:
     plots = people_plots(report.people, report.movies)
     shown = _write_parts(folder, tables, plots, bool(report.people.mark))
     numbers = _numbers(people_methods(report), report.people.warnings, tables)
-    return _write_pages(folder, numbers, (), render_people_page(report, shown, folder))
+    return _write_pages(folder, numbers, render_people_page(report, shown, folder))
 
 
 def people_plots(people: PeopleResults, movies: Mapping[str, Path]) -> list[Plot]:
