@@ -315,7 +315,7 @@ def test_options_that_do_not_fit_are_one_line(
     other = tmp_path / "other.csv"
     other.write_text("stimulus,scenario,elements\nelsewhere,drop,3\n")
     strangers = tmp_path / "strangers.csv"
-    strangers.write_text("stimulus,session\ndrop_000,nobody\n")
+    strangers.write_text("stimulus,scenario\ndrop_000,nobody\n")
     for words, told in (
         (["--attributes", str(other)], "about responses"),
         ([*people, "--attributes", str(other)], "elsewhere"),

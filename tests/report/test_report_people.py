@@ -331,7 +331,7 @@ def test_a_rehearsal_with_only_people_is_marked(
 def test_only_people_have_no_results_of_models(tmp_path: Path) -> None:
     responses().to_csv(tmp_path / "responses.csv", index=False)
     with pytest.raises(BadInputError, match="about predictions"):
-        compare(responses=tmp_path / "responses.csv").report(tmp_path / "out")
+        compare(responses=tmp_path / "responses.csv").report(tmp_path / "out", movie_count=3)
     with pytest.raises(BadInputError, match="no predictions"):
         compare()
     assert not (tmp_path / "out").exists()

@@ -172,9 +172,8 @@ class CompareResult:
         """
         methods = {**self.inputs.methods, **page.pop("methods", {})}
         if isinstance(self.inputs, PeopleReport):
-            page = {name: value for name, value in page.items() if value}
-            if set(page) - {"movies", "title"}:
-                raise BadInputError("pages of stimuli are about predictions: give some")
+            for name in set(page) - {"movies", "title"}:
+                raise BadInputError(f"{name} is about predictions: give some")
             return build_people_report(replace(self.inputs, methods=methods, **page), Path(folder))
         return build_report(replace(self.inputs, methods=methods, **page), Path(folder))
 
