@@ -214,7 +214,8 @@ def own_study(folder: Path) -> Own:
     ]  # fmt: skip
     answers = pd.DataFrame(rows)
     answers.to_csv(folder / "trials.csv", index=False)
-    answers[["session", "stimulus"]].to_csv(folder / "lists.csv", index=False)
+    expected = answers[["scenario", "stimulus"]].drop_duplicates()
+    expected.to_csv(folder / "lists.csv", index=False)
     p = generator.random(32).round(3)
     pd.DataFrame(
         {
@@ -264,10 +265,9 @@ def test_every_option_of_a_comparison_reaches_the_report(
     command += ["--dataset", str(own.dataset), "--rules", "official-code", "--seed", "5"]
     assert main(command) == 0
     found = json.loads(capsys.readouterr().out)
-    assert not any(row["incomplete"] for row in found["people_flags"])
-    assert (
-        "study's list: collide 16, drop 12 to 16" in (found["methods"]["Trials of a whole session"])
-    )
+    flagged = [row["session"] for row in found["people_flags"] if row["incomplete"]]
+    assert flagged == ["drop-p0"]
+    assert "study's list: collide 16, drop 16" in found["methods"]["Trials of a whole session"]
     assert "official-code" in found["methods"]["People"]
     intervals = found["methods"]["Intervals of people's accuracy and agreement"]
     assert "60 resamples, seed 5" in intervals
