@@ -7,7 +7,7 @@ import pandas as pd
 
 from coverage_studies import Coverage, Size, Study, logistic
 from physion.analysis.intervals import Bootstrap
-from physion.analysis.mixed.fit import fit_linear, fit_logistic
+from physion.analysis.mixed import fit_linear, fit_logistic
 from physion.analysis.people.effects import (
     HYPOTHESES,
     learning,

@@ -299,7 +299,7 @@ def test_only_people(report: Path, tmp_path: Path) -> None:
         for path in (report.parent / "tables").iterdir()
         if path.stem.startswith(("people_", "mixed_")) and path.stem not in OF_MODELS
     ]
-    names = {"scenarios", "h1", "h2", "h3", "h4", "h1_slopes", "response_times", "flagged"}
+    names = {"scenarios", "h1", "h2", "h3", "h4", "response_times", "flagged"}
     assert {f"mixed_{name}" for name in names} <= {path.stem for path in of_people}
     for table in of_people:
         assert (tmp_path / "one" / "tables" / table.name).read_bytes() == table.read_bytes()

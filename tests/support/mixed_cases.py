@@ -77,29 +77,6 @@ def models() -> pd.DataFrame:
     )
 
 
-def sloped() -> pd.DataFrame:
-    """40 participants of 30 stimuli, whose slopes of distance and practice differ."""
-    draw = np.random.default_rng(7)
-    participant, stimulus = np.indices((40, 30)).reshape(2, -1)
-    distance = draw.normal(0, 1, 30).round(3)[stimulus]
-    practice = draw.permuted(np.tile(np.arange(30) / 10, (40, 1)), axis=1).ravel()
-    intercept, slope = draw.multivariate_normal([1.0, -0.6], [[0.5, 0.2], [0.2, 0.3]], 40).T
-    learning = draw.normal(0.1, 0.15, 40)
-    easy = draw.normal(0, 0.6, 30)[stimulus]
-    logit = intercept[participant] + slope[participant] * distance + easy
-    logit += learning[participant] * practice
-    return pd.DataFrame(
-        {
-            "participant": np.char.add("p", participant.astype(str)),
-            "stimulus": np.char.add("s", stimulus.astype(str)),
-            "distance": distance,
-            "practice": practice,
-            "correct": (draw.random(len(logit)) < 1 / (1 + np.exp(-logit))).astype(int),
-            "log_rt": 6.5 - 0.3 * logit + draw.normal(0, 0.4, len(logit)),
-        }
-    )
-
-
 def published() -> pd.DataFrame:
     """The published table of models' accuracies, where the official data is."""
     folder = official_folder()
@@ -137,20 +114,6 @@ CASES = {
         "linear",
         "model_correct ~ model + (1|scenario) + (1|readout) + (1|training)",
         published,
-    ),
-    "slopes": Case(
-        "logistic", "correct ~ distance + (1 + distance|participant) + (1|stimulus)", sloped
-    ),
-    "slopes apart": Case(
-        "logistic",
-        "correct ~ distance + practice + (1 + distance||participant) + (1|stimulus)",
-        sloped,
-    ),
-    "times slopes": Case(
-        "linear", "log_rt ~ distance + practice + (distance|participant) + (1|stimulus)", sloped
-    ),
-    "times slopes apart": Case(
-        "linear", "log_rt ~ distance + (1 + practice||participant) + (practice|stimulus)", sloped
     ),
     "times big": Case("linear", f"log_rt ~ scenario + elements + {PEOPLE}", big),
 }

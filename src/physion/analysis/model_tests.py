@@ -19,8 +19,7 @@ import pandas as pd
 
 from physion.analysis.comparison import Comparison, with_training
 from physion.analysis.intervals import Bootstrap
-from physion.analysis.mixed.fit import fit_linear, fit_logistic
-from physion.analysis.mixed.result import MixedFit, effect_name
+from physion.analysis.mixed import MixedFit, fit_linear, fit_logistic
 from physion.analysis.people.effects import HYPOTHESES, answer_rows, with_attributes
 from physion.analysis.people.results import PeopleResults
 from physion.analysis.statistics.paired import (
@@ -239,22 +238,11 @@ class MixedTable:
     term: str = ""
 
     def table(self) -> pd.DataFrame:
-        """Return fixed effects, then standard deviations and correlations of the random ones."""
+        """Return fixed effects, then standard deviations of the random ones."""
         if self.fit is None:
             return pd.DataFrame({"term": ["(none)"], "reason": [self.reason]})
-        random, pairs = self.fit.random, self.fit.correlations
-        names = [
-            effect_name(group, effect)
-            for group, effect in zip(random["group"], random["effect"], strict=True)
-        ]
-        parts = [
-            self.fit.table,
-            random.assign(term=["sd of " + name for name in names])[["term", "levels", "sd"]],
-        ]
-        if len(pairs):
-            words = "r of " + pairs["group"] + ": " + pairs["first"] + ", " + pairs["second"]
-            parts.append(pd.DataFrame({"term": words, "r": pairs["r"]}))
-        return pd.concat(parts, ignore_index=True)
+        spreads = self.fit.random.assign(term="sd of " + self.fit.random["group"])
+        return pd.concat([self.fit.table, spreads[["term", "levels", "sd"]]], ignore_index=True)
 
 
 Fitter = Callable[[str, pd.DataFrame], MixedFit]
@@ -271,8 +259,8 @@ def _fitted(
 
 
 def fits_of_people(people: PeopleResults) -> list[MixedTable]:
-    """Fit the preregistered models of single answers, also with random slopes of people, response
-    times, and the effect of flags on all complete sessions.
+    """Fit the preregistered models of single answers, response times, and the effect of flags (on
+    all complete sessions).
     """
     stimuli = with_attributes(people.tables["by_stimulus"], people.tables["attributes"])
     rows = answer_rows(people.kept.test, stimuli)
@@ -292,9 +280,6 @@ def fits_of_people(people: PeopleResults) -> list[MixedTable]:
         formula = hypothesis.formula if scenario else hypothesis.formula.replace("scenario + ", "")
         about = f"{key}, preregistered: {hypothesis.about} ({hypothesis.family})"
         fits.append(_fitted(key.lower(), about, formula, fitter, rows))
-        own = formula.replace("(1|participant)", f"(1 + {hypothesis.predictor}|participant)")
-        about = f"{key} with a slope of {hypothesis.predictor} for each participant"
-        fits.append(_fitted(f"{key.lower()}_slopes", about, own, fitter, rows))
     fits.append(_attributes(people, rows, scenario))
     fits.append(_response_times(people, scenario))
     flagged = people.tables["flags"].set_index("session")["flagged"]

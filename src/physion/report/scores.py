@@ -10,7 +10,6 @@ import pandas as pd
 from physion.analysis.compare import tidy_scores
 from physion.analysis.comparison import SETTING, Comparison
 from physion.analysis.metrics import BEYOND_OUTCOME, Metric, score_metrics
-from physion.analysis.mixed.result import effect_name
 from physion.analysis.model_tests import MixedTable, permutations_of
 from physion.analysis.results import MARKED, fitted_elsewhere, frames_with_benchmark
 from physion.analysis.scores import AVERAGES, TWO_PEOPLE, runs_table, shown_average
@@ -464,7 +463,7 @@ def _contrasts(rows: pd.DataFrame) -> Markup:
 
 
 _MIXED = (
-    "Random intercepts and slopes as the formula says. Logistic models: maximum likelihood by "
+    "Random intercepts as the formula says. Logistic models: maximum likelihood by "
     "Laplace approximation, Wald z. Linear models: restricted maximum likelihood, t with degrees "
     "of freedom by Satterthwaite. b of a logistic model is in log odds."
 )
@@ -575,13 +574,10 @@ def _mixed(model: MixedTable) -> Markup:
     logistic = "z" in rows
     known = [c for c in columns if c.key in rows and not (logistic and c.key == "df")]
     spreads = ", ".join(
-        f"{effect_name(row['group'], row['effect'])} {number(row['sd'], 3)} ({int(row['levels'])})"
+        f"{row['group']} {number(row['sd'], 3)} ({int(row['levels'])})"
         for _, row in fit.random.iterrows()
     )
     note = f"{fit.rows} rows, {fit.left_out} left out; standard deviations (levels): {spreads}"
-    for _, row in fit.correlations.iterrows():
-        note += f"; correlation of {row['first']} and {row['second']} by {row['group']}: "
-        note += number(row["r"])
     note = ". ".join([note, *fit.warnings]) + "."
     listing = rows_table(rows, known) + paragraph(note, "note")
     return details(f"{model.about}{_together(model)}", formula + listing)

@@ -1,4 +1,4 @@
-"""Mixed models of a report: known parameters are found again; slopes; groups of models."""
+"""Mixed models of a report: known parameters are found again; groups of models."""
 
 from __future__ import annotations
 
@@ -68,17 +68,6 @@ def test_the_parameters_of_log_normal_response_times_are_found_again(
     assert dict(sd) == pytest.approx(SPREAD, rel=0.2)
     # exp(b) is the factor of the median response time.
     assert np.exp(rows.loc["scenario[T.roll]", "b"]) == pytest.approx(np.exp(0.25), rel=0.25)
-
-
-def test_each_hypothesis_has_a_model_with_slopes_of_people(fits: dict[str, MixedTable]) -> None:
-    own = fits["h4_slopes"]
-    assert "(1 + accuracy|participant)" in own.formula
-    assert own.fit is not None and len(own.fit.correlations) == 1
-    terms = list(own.table()["term"])
-    assert {"sd of participant", "sd of participant: accuracy"} <= set(terms)
-    assert "r of participant: Intercept, accuracy" in terms
-    # The number of elements of these stimuli is not known: the reason stands in its place.
-    assert fits["h1_slopes"].fit is None and "elements" in fits["h1_slopes"].reason
 
 
 @pytest.mark.slow

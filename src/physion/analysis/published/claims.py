@@ -22,7 +22,7 @@ import pandas as pd
 from scipy import stats
 
 from physion.analysis.intervals import Bootstrap
-from physion.analysis.mixed.fit import fit_linear
+from physion.analysis.mixed import fit_linear
 from physion.analysis.published.tables import (
     END_TO_END,
     NOT_MADE,

@@ -1,1 +1,0 @@
-"""Linear and logistic mixed models with crossed random intercepts."""
