@@ -6,7 +6,7 @@ Side by side in one run: Cohen's kappa of every pair of 100 people who answered 
 scikit-learn pair by pair and by `physion.analysis.statistics.agreement` at once, with the largest
 difference of the two; then 1000 bootstraps of the mean pairwise kappa, drawing people, stimuli or
 both; then 20 models beside the 100 people with every interval in each of eight scenarios, from
-tables, with the tests of all pairs of models, zones and calibration. Times are the best of
+tables, with the tests of all pairs of models, and zones. Times are the best of
 several runs, but for the loop and the eight scenarios, which run once. ``--write`` puts them into
 benchmarks/results/agreement.json.
 """

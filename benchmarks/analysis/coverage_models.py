@@ -15,7 +15,6 @@ from physion.analysis.rollout_errors import CONSTANT_VELOCITY, rollout_error_tab
 from physion.analysis.sample import Resampled, Sample
 from physion.analysis.scores import score_table
 from physion.analysis.statistics.agreement import correlate_resampled
-from physion.analysis.statistics.regression import reliability_curve
 from physion.analysis.tables import MEAN, POOLED
 from physion.analysis.with_participants import sample_of_models, sampling_variances
 from physion.core.seeds import generator
@@ -74,12 +73,11 @@ def measures(coverage: Coverage, drawn: Resampled, size: Size, repeats: int) -> 
 
 
 def of_stimuli(coverage: Coverage, size: Size, repeats: int) -> None:
-    """Differences between models, r in a third of the stimuli, and calibration."""
+    """Differences between models, and r in a third of the stimuli."""
     pairs = [f"{a} less {b}: {measure}" for a in MODELS for b in MODELS
              for measure in ("r", "rmsd", "kappa_from_averages")]  # fmt: skip
     easy = [f"{name}: r, easy stimuli" for name in MODELS]
-    bin_name = "good: calibration, P 0.8 to 0.9"
-    wanted = [coverage.wants(*names) for names in (pairs, easy, [bin_name])]
+    wanted = [coverage.wants(*names) for names in (pairs, easy)]
     if not any(wanted):
         return
     for study in coverage.studies("stimuli", size, repeats):
@@ -87,8 +85,6 @@ def of_stimuli(coverage: Coverage, size: Size, repeats: int) -> None:
             _differences(coverage, size, study)
         if wanted[1]:
             _easy(coverage, size, study)
-        bin_ = reliability_curve(study.p_contact[1], study.label).iloc[8]
-        coverage.add(bin_name, "stimuli", size, bin_["fraction"], bin_["low"], bin_["high"])
 
 
 def _differences(coverage: Coverage, size: Size, study: Study) -> None:

@@ -132,7 +132,7 @@ def distinct(table: pd.DataFrame) -> pd.DataFrame:
 def rendered(inputs: ReportInputs) -> str:
     """Return the page with empty figures, below which some tables stand."""
     blank = {"svg": b"<svg/>", "png": b""}
-    names = ("accuracy", "r", "kappa", "calibration", "difficulty")
+    names = ("accuracy", "r", "kappa", "difficulty")
     return render_page(inputs, [Picture(name, blank, blank) for name in names])
 
 
@@ -157,7 +157,6 @@ def filled(inputs: ReportInputs) -> tuple[ReportInputs, str]:
     """Inputs whose tables hold a different number in every cell, and their page."""
     assert inputs.people is not None and inputs.with_people is not None
     assert inputs.paired is not None and inputs.paired_measures is not None
-    assert inputs.calibration is not None
     kept = ("by_stimulus", "items", "flags", "flag_counts", "attributes", "left_out")
     tables = {
         name: table if name in kept or not len(table.columns) else distinct(table)
@@ -181,7 +180,6 @@ def filled(inputs: ReportInputs) -> tuple[ReportInputs, str]:
         with_people=with_people,
         paired=distinct(inputs.paired),
         paired_measures=distinct(inputs.paired_measures),
-        calibration=distinct(inputs.calibration),
     )
     return changed, rendered(changed)
 
@@ -323,18 +321,6 @@ def test_counts_of_differing_pairs(filled: tuple[ReportInputs, str]) -> None:
         f"Of 3 pairs, {counts[0]} differ in accuracy by Holm and {counts[1]} by Benjamini and "
         f"Hochberg (5 %); of 3, {counts[2]} and {counts[3]} in r." in text_of(page)
     )
-
-
-def test_calibration(filled: tuple[ReportInputs, str]) -> None:
-    inputs, page = filled
-    assert inputs.calibration is not None
-    names = ("brier", "reliability", "resolution", "uncertainty", "within", "skill",
-             "calibration_error")  # fmt: skip
-    headings = ("Brier", "reliability", "resolution", "uncertainty", "within bins", "skill",
-                "calibration error")  # fmt: skip
-    columns = {h: (n, fixed(3)) for h, n in zip(headings, names, strict=True)}
-    check(find(page, "Brier score and its parts"), inputs.calibration,
-          {"model": "model", "stimuli": ("stimuli", count)} | columns)  # fmt: skip
 
 
 def test_measures_with_single_people(filled: tuple[ReportInputs, str]) -> None:

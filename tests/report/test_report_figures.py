@@ -37,7 +37,6 @@ from physion.report.figures import theme
 from physion.report.figures.by_scenario import measure_figure, model_and_people_figure
 from physion.report.figures.by_stimulus import (
     SQUARE,
-    calibration_figure,
     difficulty_figure,
     misleading_plot,
     response_time_figure,
@@ -97,7 +96,6 @@ def test_baselines_stand_below_the_models_lighter_and_hollow(make_comparison: Ma
 def test_figures_of_single_answers_show_only_models(make_comparison: Maker) -> None:
     comparison = make_comparison(model="constant-motion")
     model = ["encoder · observed+simulated"]
-    assert list(figure_tables.calibration_table(comparison)["model"].unique()) == model
     assert ReportInputs(comparison).scatter_models() == model
 
 
@@ -181,16 +179,6 @@ def test_bars_hold_every_stimulus_and_mark_the_tail() -> None:
     assert sum(bars.values()) == 6
     tail = {x for (x, hatch) in bars if hatch}
     assert tail == {0.0, 0.1, 0.4}
-
-
-def test_calibration_is_the_fraction_of_contact_in_each_bin(make_comparison: Maker) -> None:
-    comparison = make_comparison()
-    table = figure_tables.calibration_table(comparison)
-    own = comparison.stimuli[comparison.stimuli["model"] == comparison.names[0]]
-    first = table[(table["model"] == comparison.names[0]) & (table["from"] == 0.5)].iloc[0]
-    inside = own[(own["p_contact"] >= 0.5) & (own["p_contact"] < 0.6)]
-    assert first["stimuli"] == len(inside) and first["fraction"] == inside["label"].mean()
-    assert first["brier"] == pytest.approx(((own["p_contact"] - own["label"]) ** 2).mean())
 
 
 def test_thirds_are_of_the_stimuli_that_bear_their_name(make_comparison: Maker) -> None:
@@ -370,20 +358,6 @@ def test_intervals_zones_and_written_values_belong_to_their_row(make_comparison:
             np.testing.assert_allclose(ends, rows.iloc[0][["zone_low", "zone_high"]].astype(float))
 
 
-def test_points_of_the_calibration_are_bins_of_their_model(make_comparison: Maker) -> None:
-    table = figure_tables.calibration_table(make_comparison())
-    figure = calibration_figure(table)
-    for axis, model in zip(figure.axes, table["model"].unique(), strict=False):
-        rows = table[(table["model"] == model) & (table["stimuli"] > 0)]
-        bars, points = axis.collections
-        np.testing.assert_allclose(points.get_offsets(), rows[["mean_p", "fraction"]])
-        ends = [np.asarray(bar) for bar in bars.get_segments()]  # type: ignore[attr-defined]
-        np.testing.assert_allclose([bar[:, 1] for bar in ends], rows[["low", "high"]])
-        areas = np.asarray(points.get_sizes()) - 8  # type: ignore[attr-defined]
-        np.testing.assert_allclose(areas / areas.sum(), rows["stimuli"] / rows["stimuli"].sum())
-        assert axis.get_title(loc="left") == f"{model}\nBrier {rows['brier'].iloc[0]:.3f}"
-
-
 def test_marks_of_conditions_stand_in_the_row_of_their_model() -> None:
     rows = [
         ("readout", model, group, value, value - 0.02, value + 0.05, 0.7, 9.0, "")
@@ -505,7 +479,7 @@ def test_one_condition_makes_no_figure(make_comparison: Maker) -> None:
     assert figure_tables.generalization_table(comparison, predictions).empty
     names = {plot.name for plot in make_plots(ReportInputs(comparison, predictions=predictions))}
     assert names == {"overview", "accuracy", "r", "people_and_models", "scatter", "right_answers",
-                     "thirds", "calibration", "difficulty"}  # fmt: skip
+                     "thirds", "difficulty"}  # fmt: skip
 
 
 def test_a_figure_without_a_value_is_left_out(

@@ -70,13 +70,13 @@ def movie(tmp_path: Path) -> Path:
     return path
 
 
-FIGURES = ("accuracy", "r", "scatter", "thirds", "calibration", "difficulty")
+FIGURES = ("accuracy", "r", "scatter", "thirds", "difficulty")
 BLANK = {"svg": b"<svg/>", "png": b""}
 
 
 def render(inputs: ReportInputs) -> Page:
     """The page with blank figures, which are slow to draw and tested elsewhere."""
-    names = ["accuracy", "calibration"]
+    names = ["accuracy"]
     names += ["r", "scatter", "thirds", "difficulty"] if inputs.comparison.has_people else []
     return Page(render_page(inputs, [Picture(name, BLANK, BLANK) for name in names]))
 
@@ -128,7 +128,7 @@ def test_without_people_there_is_a_page_too(make_comparison: Maker) -> None:
     assert "No answers of people were given" in text
     assert "Pearson r by scenario" not in text
     assert "Everything that compares with people" in text
-    assert {plot.name for plot in make_plots(inputs)} == {"accuracy", "calibration"}
+    assert {plot.name for plot in make_plots(inputs)} == {"accuracy"}
 
 
 def test_numbers_for_machines_say_null_where_undefined(make_comparison: Maker) -> None:

@@ -65,7 +65,7 @@ def test_every_figure_has_its_files(report: Path) -> None:
     stems = {path.stem for path in (report.parent / "figures").iterdir()}
     assert stems == {
         *("overview", "accuracy", "r", "kappa", "effects", "people_and_models", "scatter"),
-        *("right_answers", "thirds", "calibration", "difficulty", "response_time"),
+        *("right_answers", "thirds", "difficulty", "response_time"),
     }
     for stem in stems:
         for kind in ("svg", "pdf", "png", "csv"):

@@ -1,7 +1,7 @@
 """All results of a comparison, computed here so that the report only draws.
 
 `all_results` is what `physion.compare` calls: scores of models by stimulus (`comparison`), models
-with single participants (`compare_everywhere`), tests, calibration and mixed models.
+with single participants (`compare_everywhere`), tests and mixed models.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from physion.analysis.people.measures import HALVES, accuracy_by_stimulus, all_a
 from physion.analysis.people.results import PeopleResults
 from physion.analysis.population import PopulationResults, compare_populations
 from physion.analysis.scores import TWO_PEOPLE, against_people, with_kind
-from physion.analysis.statistics.regression import calibration_table
 from physion.analysis.tables import DETECTION, check_excluded_names, name_models
 from physion.analysis.with_participants import (
     add_baselines,
@@ -144,7 +143,6 @@ class ComparisonResults:
     - ``comparison_all``: the comparison with all complete sessions, including flagged ones.
     - ``paired``: from `paired_tests`, all scenarios pooled; None for one model.
     - ``paired_measures``: from `paired_measures`; None for one model or no people.
-    - ``calibration``: from `calibration_table`.
     - ``mixed``: from `fits_of_people` and `fits_of_models`.
     - ``contrasts``: from `group_contrasts`; None if no grouping was given.
     - ``population``: from `compare_populations`; None if not asked for.
@@ -158,7 +156,6 @@ class ComparisonResults:
     comparison_all: Comparison | None = None
     paired: pd.DataFrame | None = None
     paired_measures: pd.DataFrame | None = None
-    calibration: pd.DataFrame | None = None
     mixed: tuple[MixedTable, ...] = ()
     contrasts: pd.DataFrame | None = None
     population: PopulationResults | None = None
@@ -199,7 +196,7 @@ def all_results(
     Returns
     -------
     results
-        Scores by model and scenario with intervals, differences of models, calibration, mixed
+        Scores by model and scenario with intervals, differences of models, mixed
         models, and, with ``people``, models next to single participants.
 
     Raises
@@ -253,7 +250,6 @@ def all_results(
         comparison_all=whole,
         paired=paired_tests(pooled, draws) if several else None,
         paired_measures=paired_measures(pooled, draws) if several and main.has_people else None,
-        calibration=calibration_table(list(pooled.names), pooled.p_contact, pooled.label),
         mixed=(*about_people, *fits_of_models(main, predictions)),
         contrasts=group_contrasts(main, predictions, groups) if groups else None,
         population=compare_populations(main, predictions, draws.level) if population else None,

@@ -18,7 +18,6 @@ from physion.analysis.intervals import mean_of, variance_of_mean
 from physion.analysis.people.effects import THIRDS, below_chance_level, difficulty_third, r_by_third
 from physion.analysis.scores import COMPUTED, baseline_stimuli, kind_of
 from physion.analysis.statistics.agreement import pearson
-from physion.analysis.statistics.regression import brier, reliability_curve
 from physion.analysis.tables import ALL_BUT, DETECTION, MEAN, ONLY, POOLED, READOUTS, in_order
 from physion.analysis.with_participants import released_zone
 from physion.core.names import SCENARIOS
@@ -200,21 +199,6 @@ def difficulty_table(comparison: Comparison, by_stimulus: pd.DataFrame | None) -
 def response_time_table(by_stimulus: pd.DataFrame) -> pd.DataFrame:
     """Return ``scenario``, ``stimulus``, ``count``, ``accuracy``, ``mean_log_rt``."""
     return by_stimulus[["scenario", "stimulus", "count", "accuracy", "mean_log_rt"]]
-
-
-def calibration_table(comparison: Comparison) -> pd.DataFrame:
-    """Return the reliability curve of each model on all its stimuli, with its ``brier`` score.
-
-    The outcome is the official one.
-    """
-    parts = []
-    chosen = comparison.stimuli[comparison.stimuli["model"].isin(comparison.models)]
-    for model, rows in chosen.groupby("model", sort=False):
-        truth = rows["label"].to_numpy(dtype=np.float64)
-        curve = reliability_curve(rows["p_contact"], truth)
-        curve.insert(0, "model", model)
-        parts.append(curve.assign(brier=brier(rows["p_contact"], truth)))
-    return pd.concat(parts, ignore_index=True)
 
 
 def thirds_table(comparison: Comparison, answers: pd.DataFrame | None = None) -> pd.DataFrame:

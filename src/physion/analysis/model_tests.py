@@ -1,4 +1,4 @@
-"""Tests of models against each other, calibration, and mixed models of answers and accuracies.
+"""Tests of models against each other, and mixed models of answers and accuracies.
 
 Pairs of models are compared on the stimuli of all scenarios together: McNemar's test of accuracy
 and permutations of r (`paired_tests`), differences of every measure with intervals

@@ -93,7 +93,6 @@ class ReportInputs(ComparisonResults):
             "paired_tests": self.paired,
             "paired_measures": self.paired_measures,
             "group_contrasts": self.contrasts,
-            "calibration_scores": self.calibration,
             "comparison_with_flagged": None
             if self.comparison_all is None
             else self._with_init(self.comparison_all.all_scores),

@@ -226,7 +226,7 @@ def _by_scenario(inputs: ReportInputs, shown: Mapping[str, Markup]) -> Markup:
 
 
 def _stimuli(inputs: ReportInputs, shown: Mapping[str, Markup], links: Mapping[str, str]) -> Markup:
-    below = {"calibration": scores.calibration(inputs)}
+    below: dict[str, Markup] = {}
     if inputs.comparison.has_people:
         below["difficulty"] = people_parts.fooled(inputs, links)
     return _figures(BY_STIMULUS, shown, below)

@@ -418,7 +418,7 @@ def populations(inputs: ReportInputs) -> Markup:
     return joined([*parts, rows_table(found.differences, differences, caption)])
 
 
-# --- tests: models against each other, mixed models, calibration --------------------------------
+# --- tests: models against each other, mixed models -------------------------------------------
 
 
 def tests(inputs: ReportInputs) -> Markup:
@@ -592,30 +592,6 @@ def _together(model: MixedTable) -> str:
     if np.isinf(test.df2):
         return f". All together: χ²({test.df1}) = {number(test.statistic * test.df1, 1)}, {p}"
     return f". All together: F({test.df1}, {number(test.df2, 1)}) = {number(test.statistic)}, {p}"
-
-
-def calibration(inputs: ReportInputs) -> Markup:
-    """Return the Brier score and its parts, one row per model."""
-    rows = inputs.calibration
-    if rows is None:
-        return Markup()
-    columns = [
-        PageColumn("model", "model", "text"),
-        PageColumn("stimuli", "stimuli", "count"),
-        PageColumn("Brier", "brier", digits=3),
-        PageColumn("reliability", "reliability", digits=3),
-        PageColumn("resolution", "resolution", digits=3),
-        PageColumn("uncertainty", "uncertainty", digits=3),
-        PageColumn("within bins", "within", digits=3),
-        PageColumn("skill", "skill", digits=3),
-        PageColumn("calibration error", "calibration_error", digits=3),
-    ]
-    words = (
-        "Brier score = reliability − resolution + uncertainty + within bins (ten of equal width); "
-        "skill is 1 − Brier / uncertainty, above 0 where a model beats the base rate"
-    )
-    known = rows.replace([np.inf, -np.inf], np.nan)
-    return details("Brier score and its parts", rows_table(known, columns, words))
 
 
 # --- outcomes that differ, and what was left out --------------------------------------------------

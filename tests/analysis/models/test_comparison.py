@@ -571,7 +571,6 @@ def test_compare_computes_all_that_a_report_draws() -> None:
     direct = compare_scores(both, people, labels(people), bootstrap=QUICK)
     pd.testing.assert_frame_equal(found.comparison.scores, direct.scores)
     assert found.paired is not None and len(found.paired) == 1
-    assert found.calibration is not None and len(found.calibration) == 2
     assert found.people is None and found.predictions is not None
     alone = all_results(predictions(people), None, bootstrap=QUICK)
     assert alone.paired is None and alone.comparison.people.empty

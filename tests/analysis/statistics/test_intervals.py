@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from scipy.stats import binomtest
 
 from physion.analysis.intervals import (
     Bootstrap,
@@ -17,6 +18,7 @@ from physion.analysis.intervals import (
     mean_of,
     second_order,
     variance_of_mean,
+    wilson,
 )
 from physion.core.errors import BadInputError
 
@@ -190,3 +192,10 @@ def test_undefined_draws_are_left_out_until_they_are_most() -> None:
 def test_senseless_settings_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(BadInputError, match="bootstrap needs"):
         Bootstrap(**wrong)  # type: ignore[arg-type]
+
+
+def test_intervals_of_fractions_match_wilson() -> None:
+    for k, n in ((0, 10), (7, 10), (120, 199), (10, 10)):
+        known = binomtest(k, n).proportion_ci(method="wilson")
+        assert wilson(k / n, n) == pytest.approx((known.low, known.high), abs=1e-12)
+    assert np.isnan(wilson(float("nan"), 10)).all() and np.isnan(wilson(0.5, 0)).all()

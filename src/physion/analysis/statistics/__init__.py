@@ -1,1 +1,1 @@
-"""Statistics of arrays: agreement, correlation, kappa, calibration, bootstrap, paired tests."""
+"""Statistics of arrays: agreement, correlation, kappa, bootstrap, paired tests."""

@@ -1,4 +1,4 @@
-"""Figures by stimulus: models against people, thirds, calibration, difficulty, response times."""
+"""Figures by stimulus: models against people, thirds, difficulty, response times."""
 
 from __future__ import annotations
 
@@ -192,57 +192,6 @@ def thirds(inputs: ReportInputs) -> Plot | None:
     table = tables.thirds_table(inputs.comparison, answers)
     draw = partial(measure_figure, measure="r")
     return Plot("thirds", f"{caption} Dotted: chance.", table, draw)
-
-
-# --- calibration of P(contact) ------------------------------------------------------------------
-
-
-@register_figure("calibration", section=BY_STIMULUS, heading="Calibration of P(contact)", order=80)
-def calibration(inputs: ReportInputs) -> Plot:
-    """Return the reliability curves."""
-    caption = (
-        "Reliability: of the stimuli to which a model gives about this P(contact), the fraction "
-        "that ends in contact, in ten bins with Wilson's 95 % intervals; the area of a point is "
-        "proportional to its stimuli. The outcome is the official one. Dotted: calibrated. The "
-        "Brier score is the mean squared difference of P(contact) and outcome: 0 is perfect, 0.25 "
-        "the score of P = 0.5."
-    )
-    table = tables.calibration_table(inputs.comparison)
-    return Plot("calibration", caption, table, calibration_figure)
-
-
-def calibration_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
-    """Draw reliability curves: the fraction of contact by P(contact), one panel per model.
-
-    ``table``: see `figure_tables.calibration_table`. The area of a point is proportional to its
-    stimuli.
-    """
-    models = list(table["model"].unique())
-    columns = 3 if len(models) <= 6 else 5
-    with matplotlib.rc_context(style(theme)):
-        width = 11 / columns
-        figure, axes = panels(len(models), columns, (width, width + 0.2), above=0.5,
-                              sharex=True, sharey=True)  # fmt: skip
-        for axis, model in zip(axes, models, strict=True):
-            rows = table[(table["model"] == model) & (table["stimuli"] > 0)]
-            axis.plot([0, 1], [0, 1], color=theme.faint, linewidth=1, linestyle=":")
-            axis.vlines(rows["mean_p"], rows["low"], rows["high"], color=theme.palette[0],
-                        linewidth=1.1)  # fmt: skip
-            axis.plot(rows["mean_p"], rows["fraction"], color=theme.palette[0], linewidth=0.8)
-            fraction = rows["stimuli"] / rows["stimuli"].sum()
-            axis.scatter(rows["mean_p"], rows["fraction"], s=8 + 160 * fraction, zorder=3,
-                         color=theme.palette[0], edgecolors=theme.ink, linewidths=0.6)  # fmt: skip
-            words = label(model, 30 if columns == 5 else 44)
-            brier = table.loc[table["model"] == model, "brier"].iloc[0]
-            axis.set_title(f"{words}\nBrier {brier:.3f}", fontsize=8, loc="left")
-            axis.set_xlim(-0.03, 1.03)
-            axis.set_ylim(-0.03, 1.03)
-            axis.set_aspect("equal")
-            axis.set_xticks([0, 0.5, 1])
-            axis.set_yticks([0, 0.5, 1])
-        figure.supxlabel("P(contact) of the model", fontsize=10)
-        figure.supylabel("fraction of stimuli with contact", fontsize=10)
-    return figure
 
 
 # --- accuracy of people, with the stimuli that mislead them -------------------------------------
