@@ -10,21 +10,18 @@ from physion.analysis.intervals import Bootstrap
 from physion.analysis.mixed import fit_linear, fit_logistic
 from physion.analysis.people.effects import (
     HYPOTHESES,
-    learning,
     regress_hypotheses,
     side_bias,
     yes_bias,
 )
-from physion.analysis.people.exclusions import flag_effect
 from physion.analysis.people.measures import accuracy_by_scenario, agreement_by_scenario
-from physion.analysis.people.responses import Responses
 from physion.core.seeds import generator
 
 
 def of_people(coverage: Coverage, size: Size, repeats: int) -> None:
-    """Accuracy, agreement, biases and practice."""
+    """Accuracy, agreement and biases."""
     named = ("accuracy", "kappa of pairs", "correlation of pairs", "bias", "d_prime", "criterion",
-             "left presses", "practice")  # fmt: skip
+             "left presses")  # fmt: skip
     if not coverage.wants(*(f"people: {name}" for name in named)):
         return
     draws = Bootstrap()
@@ -40,7 +37,6 @@ def of_people(coverage: Coverage, size: Size, repeats: int) -> None:
         tables += [(bias, f"people: {name}", _bounds(name))
                    for name in ("bias", "d_prime", "criterion")]  # fmt: skip
         tables.append((side_bias(test, draws), "people: left presses", _bounds("left")))
-        tables.append((learning(test), "people: practice", ("b", "low", "high")))
         for rows, what, columns in tables:
             value, low, high = rows.iloc[0][list(columns)].astype(float)
             coverage.add(what, "people", size, value, low, high)
@@ -48,21 +44,6 @@ def of_people(coverage: Coverage, size: Size, repeats: int) -> None:
 
 def _bounds(name: str) -> tuple[str, str, str]:
     return name, f"{name}_low", f"{name}_high"
-
-
-def flags(coverage: Coverage, size: Size, repeats: int) -> None:
-    """Effects of a flag that a seventh of the sessions have by chance."""
-    what = "effect of flags"
-    if not coverage.wants(what):
-        return
-    rng = generator("flags", *size)
-    for study in coverage.studies("people", size, repeats):
-        test = study.test(rng)
-        sessions = test[["session", "participant", "scenario"]].drop_duplicates()
-        given = sessions.assign(low_accuracy=False, slow=rng.random(len(sessions)) < 1 / 7)
-        responses = Responses(test, sessions, pd.DataFrame())
-        row = flag_effect(responses, given, "slow").iloc[0]
-        coverage.add(what, "people", size, row["b"], row["low"], row["high"])
 
 
 def hypotheses(coverage: Coverage, size: Size, repeats: int) -> None:

@@ -5,13 +5,13 @@
 
 Studies are simulated again and again (`coverage_studies`), and intervals are computed by the
 package's own functions: scores of models, and differences between them
-(`coverage_models`); people, effects of flags, hypotheses and mixed models (`coverage_people`). Not
+(`coverage_models`); people, hypotheses and mixed models (`coverage_people`). Not
 simulated are those of the published tables. An interval is about the expected value of the number
 with other people, other stimuli, or both, of the same number; that value is the mean over all
 repeats. Coverage is the fraction of repeats whose interval
 contains it. Its standard error is 0.6 % with 1200 repeats; for means over eight scenarios, which
 are groups of repeats drawn at random, up to 1.8 %. What takes long has fewer repeats (column
-``repeats``): numbers about people, flags, hypotheses, mixed models and pooled scenarios.
+``repeats``): numbers about people, hypotheses, mixed models and pooled scenarios.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pathlib import Path
 import pandas as pd
 
 from coverage_models import measures, of_stimuli, pooled, rollout_errors
-from coverage_people import flags, hypotheses, mixed_models, of_people
+from coverage_people import hypotheses, mixed_models, of_people
 from coverage_studies import MODELS, POPULATIONS, Coverage
 from physion.analysis.sample import RESAMPLED
 from physion.compute.tasks import processor
@@ -110,9 +110,8 @@ def main() -> None:
             done(f"measures, {drawn} drawn, {size}")
         of_stimuli(coverage, size, repeats)
         done(f"differences, {size}")
-        for part in (of_people, flags):
-            part(coverage, size, repeats // 2)
-            done(f"{part.__name__}, {size}")
+        of_people(coverage, size, repeats // 2)
+        done(f"of_people, {size}")
         for slow in (rollout_errors, hypotheses):
             slow(coverage, size, repeats // 4)
             done(f"{slow.__name__}, {size}")

@@ -387,7 +387,7 @@ def test_agreement_among_people(filled: tuple[ReportInputs, str]) -> None:
             assert table.column("interval of the mean", number)[at] == ends
 
 
-def test_inclinations_and_practice(filled: tuple[ReportInputs, str]) -> None:
+def test_inclinations(filled: tuple[ReportInputs, str]) -> None:
     inputs, page = filled
     assert inputs.people is not None
     tables = inputs.people.tables
@@ -400,12 +400,6 @@ def test_inclinations_and_practice(filled: tuple[ReportInputs, str]) -> None:
         "scenario": "scenario", "yes on the left": ("yes_left", count),
         "yes on the right": ("yes_right", count), "order unknown": ("unknown", count),
         "left presses": own("left", 3), "p": ("p", p),
-    })  # fmt: skip
-    check(find(page, "Practice: being right"), tables["learning"], {
-        "scenario": "scenario", "answers": ("rows", lambda x: str(round(x))),
-        "first half": ("first_half", fixed(3)), "second half": ("second_half", fixed(3)),
-        "log odds per 100 trials": spread("b", "low", "high", 3), "t": ("t", fixed(2)),
-        "p": ("p", p),
     })  # fmt: skip
     check(find(page, "Accuracy by who people are"), tables["background_tests"], {
         "question": "question", "sessions": ("sessions", count), "test": "test",

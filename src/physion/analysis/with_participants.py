@@ -36,7 +36,6 @@ from physion.analysis.sample import RESAMPLED, Resampled, Sample
 from physion.analysis.scores import MAJORITY, OUTCOME, not_given
 from physion.analysis.statistics import agreement
 from physion.analysis.statistics.agreement import correctness, correlate_rows, cross_kappa, rmsd
-from physion.analysis.statistics.regression import check_probabilities
 from physion.analysis.tables import MEAN
 from physion.core.errors import BadInputError
 from physion.core.seeds import generator
@@ -63,7 +62,8 @@ class Models:
             raise BadInputError("P(contact) and predicted outcomes differ in shape")
         if len(self.names) != len(self.p_contact) or len(set(self.names)) != len(self.names):
             raise BadInputError("each model needs one name of its own and one row")
-        check_probabilities(self.p_contact, gaps=True)
+        if ((self.p_contact < 0) | (self.p_contact > 1)).any():
+            raise BadInputError("a P(contact) does not lie in 0..1")
         if not (np.isnan(self.predicted) | np.isin(self.predicted, (0, 1))).all():
             raise BadInputError("predicted outcomes must be 0, 1 or NaN")
         if (np.isnan(self.predicted) != np.isnan(self.p_contact)).any():

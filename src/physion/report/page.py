@@ -260,7 +260,7 @@ def _unanswered(inputs: ReportInputs) -> list[str]:
     if inputs.people is None:
         words.append(
             "Cohen's kappa with participants, their zones of r and kappa, split halves, response "
-            "times, biases, learning, exclusions and their effect, intervals that draw people, "
+            "times, biases, exclusions and their effect, intervals that draw people, "
             "mixed models of answers: they need the answers of single participants (--responses)."
         )
     elif inputs.people.tables["by_stimulus"]["mean_log_rt"].isna().all():

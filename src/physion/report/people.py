@@ -246,15 +246,6 @@ def _biases(tables: Mapping[str, pd.DataFrame]) -> Markup:
         PageColumn("left presses", "left", "interval", 3),
         PageColumn("p", "p", "p"),
     ]
-    practice = [
-        PageColumn("scenario", "scenario", "text"),
-        PageColumn("answers", "rows", "count"),
-        PageColumn("first half", "first_half", digits=3),
-        PageColumn("second half", "second_half", digits=3),
-        PageColumn("log odds per 100 trials", "b", "interval", 3, "low", "high"),
-        PageColumn("t", "t"),
-        PageColumn("p", "p", "p"),
-    ]
     questions = [
         PageColumn("question", "question", "text"),
         PageColumn("sessions", "sessions", "count"),
@@ -271,7 +262,6 @@ def _biases(tables: Mapping[str, pd.DataFrame]) -> Markup:
     return (
         rows_table(tables["yes_bias"], yes, "Saying yes; a criterion below 0 leans to it")
         + rows_table(tables["side_bias"], side, "Pressing the left button")
-        + rows_table(tables["learning"], practice, "Practice: being right, over the test trials")
         + rows_table(
             tables["background_tests"],
             questions,
@@ -472,22 +462,6 @@ def sessions_only(people: PeopleResults, models: str = "") -> Markup:
         parts.append(paragraph(f"Rules {people.confirmed}."))
     parts.append(_flag_counts(result["flag_counts"]))
     parts.append(_with_and_without(people) + models)
-    if len(result["flag_effects"]):
-        columns = [
-            PageColumn("rule", "term", "text"),
-            PageColumn("log odds of being right", "b", "interval", 3, "low", "high"),
-            PageColumn("t", "t"),
-            PageColumn("p", "p", "p"),
-            PageColumn("answers", "rows", "count"),
-            PageColumn("participants", "clusters", "count"),
-        ]
-        words = (
-            "Effect of a flag on being right, over all sessions: logistic regression with an "
-            "intercept for each scenario, standard errors clustered by participant. Low accuracy "
-            "is itself a reason to be flagged, so its effect and the effect of “flagged” are there "
-            "by construction"
-        )
-        parts.append(rows_table(result["flag_effects"], columns, words))
     return joined(parts)
 
 

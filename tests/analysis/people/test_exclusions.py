@@ -13,11 +13,9 @@ import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import stats
 
 from physion.analysis import Bootstrap
 from physion.analysis.people.exclusions import (
-    BY_CONSTRUCTION,
     NOT_EXPECTED,
     OFFICIAL_CODE,
     PREREGISTERED,
@@ -29,7 +27,6 @@ from physion.analysis.people.exclusions import (
     count_flags,
     drop_unexpected,
     find_expected,
-    flag_effect,
     flag_from_server,
     flag_sessions,
     longest_alternation,
@@ -41,7 +38,6 @@ from physion.analysis.people.exclusions import (
 from physion.analysis.people.measures import accuracy_by_scenario
 from physion.analysis.people.responses import DROPPED_COLUMNS, VOID, Responses, missing_times
 from physion.analysis.people.results import analyse_people, rules_called
-from physion.analysis.statistics.regression import clustered_logit
 from physion.core.errors import BadInputError, ExclusionError, UnknownNameError
 from support.simulated_people import as_responses, simulate_study, study
 
@@ -310,113 +306,6 @@ def test_analyses_are_done_with_and_without_the_flagged() -> None:
     assert people["unflagged"] == 25 and people["complete"] == 30
     with pytest.raises(BadInputError, match="no session is unflagged"):
         with_and_without(responses, flags.assign(flagged=True), lambda kept: kept.test)
-
-
-def test_the_effect_of_a_flag_is_found_and_its_interval_allows_for_people() -> None:
-    responses = study(people=60, stimuli=50, scenarios=("drop", "roll"), seed=6, ability_sd=0.0)
-    flags = flag_sessions(responses)
-    worse = flags["session"].isin(flags["session"].iloc[::3])
-    generator = np.random.default_rng(0)
-    trials = responses.trials.copy()
-    rows = trials["session"].isin(flags.loc[worse, "session"]) & (
-        generator.random(len(trials)) < 0.3
-    )
-    trials.loc[rows, "yes"] = ~trials.loc[rows, "yes"]
-    trials["correct"] = trials["yes"] == trials["label"]
-    found = flag_effect(replace(responses, trials=trials), flags.assign(slow=worse), "slow")
-    assert found["term"].tolist() == ["slow"]
-    assert found["high"].iloc[0] < 0 and found["p"].iloc[0] < 1e-4
-    test = replace(responses, trials=trials).test
-    right = test["correct"].groupby(test["session"].isin(flags.loc[worse, "session"])).mean()
-    odds = np.log(right / (1 - right))
-    assert found["b"].iloc[0] == pytest.approx(odds[True] - odds[False], abs=0.03)
-    nobody = flag_effect(responses, flags.assign(slow=False), "slow")
-    assert np.isnan(nobody["b"].iloc[0]) and "same in all rows" in nobody["reason"].iloc[0]
-    poor = flags.assign(low_accuracy=worse, flagged=worse)
-    for column in ("low_accuracy", "flagged"):
-        assert flag_effect(responses, poor, column)["reason"].tolist() == [BY_CONSTRUCTION]
-    assert flag_effect(responses, poor.assign(slow=worse), "slow")["reason"].tolist() == [""]
-    one = flags["session"] == flags["session"].iloc[0]
-    single = flag_effect(responses, flags.assign(slow=one), "slow")
-    assert np.isfinite(single["b"].iloc[0]) and np.isnan(single["low"].iloc[0])
-    assert single["reason"].tolist() == ["a single participant determines it"]
-    other = flag_effect(responses, flags.assign(low_accuracy=False, flagged=worse), "flagged")
-    assert other["reason"].tolist() == [""]
-    with pytest.raises(BadInputError, match="not a rule"):
-        flag_effect(responses, flags, "tired")
-
-
-def test_clustered_errors_are_wider_where_people_differ_and_cover_the_truth() -> None:
-    """100 studies without an effect: about 95 intervals hold 0, though people differ much."""
-    held = 0
-    for seed in range(100):
-        generator = np.random.default_rng(seed)
-        person = np.repeat(np.arange(40), 20)
-        ability = generator.normal(0, 1.0, 40)[person]
-        rows = pd.DataFrame(
-            {
-                "participant": person,
-                "group": (person % 2).astype(float),
-                "right": generator.random(800) < 1 / (1 + np.exp(-ability)),
-            }
-        )
-        found = clustered_logit(rows, "right", ["group"]).set_index("term").loc["group"]
-        held += bool(found["low"] <= 0 <= found["high"])
-    assert 88 <= held <= 100
-
-
-def test_clustered_errors_of_two_groups_match_the_means_of_people() -> None:
-    """Two groups of people with equally many answers each: Welch's test of their means."""
-    generator = np.random.default_rng(3)
-    sizes, answers = (5, 12), 30
-    person = np.repeat(np.arange(sum(sizes)), answers)
-    group = (person < sizes[0]).astype(float)
-    ability = generator.normal(0, 0.7, sum(sizes))[person]
-    right = generator.random(len(person)) < 1 / (1 + np.exp(-ability - 0.5))
-    rows = pd.DataFrame({"participant": person, "group": group, "right": right})
-    found = clustered_logit(rows, "right", ["group"]).set_index("term").loc["group"]
-    squared, parts, of_df = 0.0, 0.0, 0.0
-    for flag, n in ((1.0, sizes[0]), (0.0, sizes[1])):
-        means = rows[rows["group"] == flag].groupby("participant")["right"].mean()
-        slope = 1 / (means.mean() * (1 - means.mean()))
-        squared += slope**2 * means.var(ddof=1) / n
-        parts += slope / n
-        of_df += (slope / n) ** 2 / (n - 1)
-    assert found["se"] == pytest.approx(np.sqrt(squared))
-    assert found["df"] == pytest.approx(parts**2 / of_df)
-    assert (found["high"] - found["low"]) / 2 / found["se"] == pytest.approx(
-        stats.t.ppf(0.975, found["df"])
-    )
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_few_participants_with_a_property_have_wide_intervals() -> None:
-    """6 of 40 differ in nothing: the normal distribution would hold 0 in 88 % of the studies."""
-    held = 0
-    for seed in range(300):
-        generator = np.random.default_rng(seed)
-        person = np.repeat(np.arange(40), 30)
-        ability = generator.normal(0, 0.6, 40)[person]
-        right = generator.random(1200) < 1 / (1 + np.exp(-ability - 1))
-        rows = pd.DataFrame({"participant": person, "few": (person < 6) * 1.0, "right": right})
-        found = clustered_logit(rows, "right", ["few"]).set_index("term").loc["few"]
-        held += bool(found["low"] <= 0 <= found["high"])
-    assert 0.93 <= held / 300 <= 0.985
-
-
-@pytest.mark.parametrize(
-    ("rows", "words"),
-    [
-        ({"x": [0.0, 1, 0, 1], "y": [True] * 4}, "alike"),
-        ({"x": [0.0, np.nan, 0, 1], "y": [True, False] * 2}, "missing"),
-        ({"x": [0.0, 1, 0, 1], "y": [True, False] * 2}, "separates"),
-    ],
-)
-def test_regressions_that_cannot_be_say_why(rows: dict[str, list[float]], words: str) -> None:
-    table = pd.DataFrame(rows).assign(participant=["a", "a", "b", "b"])
-    found = clustered_logit(table, "y", ["x"])
-    assert found["b"].isna().all() and words in found["reason"].iloc[0]
 
 
 # --- completeness --------------------------------------------------------------------------------

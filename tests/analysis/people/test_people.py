@@ -25,7 +25,6 @@ from physion.analysis.people.effects import (
     below_chance_level,
     below_chance_level_p,
     difficulty_third,
-    learning,
     regress_attributes,
     regress_hypotheses,
     side_bias,
@@ -304,15 +303,6 @@ def test_biases_are_means_over_people_by_hand(made: Responses) -> None:
     assert side["p"] == pytest.approx(stats.ttest_ind(left, right, equal_var=False).pvalue)
 
 
-def test_halves_of_the_trials_part_in_the_middle(made: Responses) -> None:
-    """30 trials: numbers 0 to 14, and 15 to 29."""
-    rows = made.test[made.test["scenario"] == "roll"]
-    found = learning(rows).iloc[0]
-    assert rows["trial"].max() == 29
-    assert found["first_half"] == pytest.approx(rows[rows["trial"] < 15]["correct"].mean())
-    assert found["second_half"] == pytest.approx(rows[rows["trial"] >= 15]["correct"].mean())
-
-
 def test_biases_that_cannot_be_known_say_why(made: Responses) -> None:
     one_outcome = made.test[made.test["label"]]
     found = yes_bias(one_outcome, FEW)
@@ -320,16 +310,6 @@ def test_biases_that_cannot_be_known_say_why(made: Responses) -> None:
     blind = side_bias(made.test.drop(columns="buttons"), FEW)
     assert blind["left"].isna().all() and (blind["unknown"] == 24).all()
     assert blind["reason"].str.contains("fewer than two").all()
-
-
-def test_learning_is_found_where_there_is_some() -> None:
-    flat = learning(study(people=60, stimuli=100, scenarios=("drop",), seed=3).test)
-    assert flat["low"].iloc[0] < 0 < flat["high"].iloc[0]
-    steep = study(people=60, stimuli=100, scenarios=("drop", "roll"), seed=3, learning=1.0).test
-    found = learning(steep).set_index("scenario")
-    assert (found["low"] > 0).all() and (found["second_half"] > found["first_half"]).all()
-    # Stimuli differ, so that the slope over all is flatter than the one within stimuli: 1.
-    assert 0.6 < found.loc["all", "b"] < 1.0
 
 
 def test_background_is_counted_and_related_to_accuracy(made: Responses) -> None:

@@ -1,6 +1,6 @@
 """What moves the answers of people: biases, practice, background, difficulty, the hypotheses.
 
-- response bias and side bias, learning over the trials, accuracy by background;
+- response bias and side bias, accuracy by background;
 - difficulty of stimuli: below chance, hard, at chance, easy;
 - `regress_hypotheses`: the four preregistered hypotheses about attributes of stimuli, and
   `regress_attributes`: accuracy by any attributes.
@@ -28,7 +28,6 @@ from physion.analysis.people.measures import (
 from physion.analysis.people.responses import is_number
 from physion.analysis.statistics.agreement import correlate_rows, pearson, z_rates
 from physion.analysis.statistics.paired import corrected_p
-from physion.analysis.statistics.regression import clustered_logit
 from physion.analysis.tables import RESERVED, attribute_names, in_order
 from physion.core.errors import BadInputError
 from physion.core.tables import require_columns
@@ -132,38 +131,7 @@ def _side_record(groups: dict[str, Array], scenario: str, draws: Bootstrap) -> d
             "reason": "p: nobody differs within the groups" if constant else ""}  # fmt: skip
 
 
-# --- practice and people ------------------------------------------------------------------------
-
-
-def learning(test: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
-    """Test whether people improve over the test trials, without feedback; one row per scenario,
-    then all.
-
-    Logistic regression of correctness on the position in the order, in units of 100 trials, with
-    standard errors clustered by participant (`clustered_logit`); for all scenarios together with an
-    intercept for each. Columns: ``scenario``, ``b`` (log odds per 100 trials), ``se``, ``t``,
-    ``df``, ``p``, ``low``, ``high``, ``rows``, ``clusters``, ``reason``, ``first_half`` and
-    ``second_half`` (accuracy in either half of the trials). Orders are random, so stimuli need no
-    adjustment.
-    """
-    table = test.assign(hundred=test["trial"].to_numpy(dtype=np.float64) / 100)
-    parts = [(name, table[table["scenario"] == name]) for name in in_order(table["scenario"])]
-    if len(parts) > 1:
-        parts.append(("all", table))
-    fits = []
-    for name, rows in parts:
-        fixed = "scenario" if name == "all" else None
-        fit = clustered_logit(rows, "correct", ["hundred"], fixed=fixed, level=level)
-        fit = fit[fit["term"] == "hundred"].drop(columns="term")
-        late = rows["trial"] >= (rows["trial"].max() + 1) / 2
-        fit.insert(0, "scenario", name)
-        fits.append(
-            fit.assign(
-                first_half=float(rows.loc[~late, "correct"].mean()),
-                second_half=float(rows.loc[late, "correct"].mean()),
-            )
-        )
-    return pd.concat(fits, ignore_index=True)
+# --- people -------------------------------------------------------------------------------------
 
 
 def background(sessions: pd.DataFrame, own: Sequence[str] = ()) -> pd.DataFrame:

@@ -20,7 +20,6 @@ import numpy.typing as npt
 import pandas as pd
 
 from physion.analysis.people.responses import Responses
-from physion.analysis.statistics.regression import clustered_logit
 from physion.analysis.tables import in_order
 from physion.core.errors import BadInputError, ExclusionError, UnknownNameError
 from physion.core.names import OFFICIAL_SCENARIOS, canonical_name
@@ -275,8 +274,6 @@ FROM_SERVER = RULES[-3:]
 
 MOST_EXCLUDED = 1 / 3
 """Largest fraction of a scenario's sessions that a rule may leave out unless this is confirmed."""
-
-BY_CONSTRUCTION = "by construction: sessions are flagged for their low accuracy"
 
 
 @dataclass(frozen=True)
@@ -553,29 +550,3 @@ def with_and_without(
 def whole_sessions(flags: pd.DataFrame) -> pd.Series:
     """Return which sessions are complete and the first of their participant."""
     return ~flags["incomplete"] & ~flags["repeated"]
-
-
-def flag_effect(
-    responses: Responses, flags: pd.DataFrame, column: str = "flagged", level: float = 0.95
-) -> pd.DataFrame:
-    """Estimate the effect of a session's flag on correctness, over all sessions.
-
-    Logistic regression of every test answer on the flag and the scenario, with standard errors
-    clustered by participant. Columns as in `clustered_logit`, for the term ``column`` only;
-    NaN with a ``reason`` if all or no sessions are flagged. Low accuracy is itself a rule, so the
-    effects of ``low_accuracy``, and of ``flagged`` if it flags any session, hold by construction;
-    the ``reason`` then states it.
-    """
-    if column not in (*RULES, "flagged"):
-        raise BadInputError(
-            f"{column!r} is not a rule; choose one of {', '.join(RULES)} or flagged"
-        )
-    test = responses.test
-    value = test["session"].map(flags.set_index("session")[column]).astype(np.float64)
-    table = test.assign(**{column: value})
-    fit = clustered_logit(table, "correct", [column], fixed="scenario", level=level)
-    result = fit[fit["term"] == column].reset_index(drop=True)
-    if column in ("low_accuracy", "flagged") and flags["low_accuracy"].any():
-        known = result["reason"] != ""
-        result["reason"] = (result["reason"] + "; ").where(known, "") + BY_CONSTRUCTION
-    return result

@@ -12,7 +12,6 @@ from physion.analysis.intervals import Bootstrap
 from physion.analysis.people.effects import (
     accuracy_by_background,
     background,
-    learning,
     regress_attributes,
     regress_hypotheses,
     side_bias,
@@ -22,7 +21,6 @@ from physion.analysis.people.effects import (
 from physion.analysis.people.exclusions import (
     PREREGISTERED,
     RULE_SETS,
-    RULES,
     ExclusionRules,
     Expected,
     check_excluded,
@@ -31,7 +29,6 @@ from physion.analysis.people.exclusions import (
     count_flags,
     describe_confirmed,
     drop_unexpected,
-    flag_effect,
     flag_sessions,
     whole_sessions,
     with_and_without,
@@ -79,12 +76,12 @@ class PeopleResults:
     ``whole``: the responses of all complete first sessions; ``rules``: the exclusion rules;
     ``tables``: by name, with the columns of the function in parentheses:
 
-    - ``flags`` (`flag_sessions`), ``flag_counts``, ``flag_effects``;
+    - ``flags`` (`flag_sessions`), ``flag_counts``;
     - ``with_and_without``: `accuracy_by_scenario` without and with flagged sessions;
     - ``participants``, ``by_scenario``, ``by_condition``, ``by_stimulus``
       (`people.accuracy_by_...`), ``items`` (`item_statistics`);
     - ``agreement``: agreement among people (`agreement_by_scenario`);
-    - ``yes_bias``, ``side_bias``, ``learning``, ``background``, ``background_tests``;
+    - ``yes_bias``, ``side_bias``, ``background``, ``background_tests``;
     - ``attributes`` of the stimuli that people answered, ``hypotheses`` (`regress_hypotheses`) and
       ``attribute_effects`` (`regress_attributes`);
     - ``left_out``: dropped answers, with their reasons.
@@ -235,7 +232,6 @@ def analyse_people(
         set(flags.loc[whole_sessions(flags), "session"]), "session is incomplete or repeated"
     )
     tables = {"flags": flags, "flag_counts": count_flags(flags)}
-    tables["flag_effects"] = _flag_effects(shown, flags)
     tables["with_and_without"] = with_and_without(
         shown, flags, lambda some: accuracy_by_scenario(some.test, draws)
     )
@@ -247,7 +243,6 @@ def analyse_people(
     tables["agreement"] = agreement_by_scenario(kept.test, draws)
     tables["yes_bias"] = yes_bias(kept.test, draws)
     tables["side_bias"] = side_bias(kept.test, draws)
-    tables["learning"] = learning(kept.test)
     tables["background"] = background(kept.sessions, kept.own)
     tables["background_tests"] = accuracy_by_background(kept.test, kept.sessions, kept.own)
     tables["attributes"] = _attributes(tables["by_stimulus"]["stimulus"], attributes)
@@ -262,12 +257,6 @@ def analyse_people(
     stimuli = frozenset(responses.trials["stimulus"])
     confirmed = describe_confirmed(flags, accept_rules)
     return PeopleResults(kept, whole, rules, tables, warnings, stimuli, confirmed)
-
-
-def _flag_effects(responses: Responses, flags: pd.DataFrame) -> pd.DataFrame:
-    rules_asked = [rule for rule in (*RULES, "flagged") if 0 < flags[rule].sum() < len(flags)]
-    parts = [flag_effect(responses, flags, rule) for rule in rules_asked]
-    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
 
 
 def _attributes(stimuli: pd.Series, given: pd.DataFrame | None) -> pd.DataFrame:
