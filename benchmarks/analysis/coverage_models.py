@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
@@ -10,7 +10,7 @@ import pandas as pd
 from coverage_studies import F64, MODELS, SCENARIOS, Coverage, Size, Study
 from physion.analysis.intervals import Variance, jackknife
 from physion.analysis.metrics import all_metrics, metrics
-from physion.analysis.model_tests import PooledStimuli, paired_measures
+from physion.analysis.model_tests import PooledStimuli, paired_tests
 from physion.analysis.rollout_errors import CONSTANT_VELOCITY, rollout_error_table
 from physion.analysis.sample import Resampled, Sample
 from physion.analysis.scores import score_table
@@ -74,8 +74,7 @@ def measures(coverage: Coverage, drawn: Resampled, size: Size, repeats: int) -> 
 
 def of_stimuli(coverage: Coverage, size: Size, repeats: int) -> None:
     """Differences between models, and r in a third of the stimuli."""
-    pairs = [f"{a} less {b}: {measure}" for a in MODELS for b in MODELS
-             for measure in ("r", "rmsd", "kappa_from_averages")]  # fmt: skip
+    pairs = [f"{a} less {b}: r" for a in MODELS for b in MODELS]
     easy = [f"{name}: r, easy stimuli" for name in MODELS]
     wanted = [coverage.wants(*names) for names in (pairs, easy)]
     if not any(wanted):
@@ -88,38 +87,19 @@ def of_stimuli(coverage: Coverage, size: Size, repeats: int) -> None:
 
 
 def _differences(coverage: Coverage, size: Size, study: Study) -> None:
-    _paired(coverage, "", size, _pool({"drop": study}), ("r", "rmsd", "kappa_from_averages"))
-
-
-def _pool(studies: Mapping[str, Study]) -> PooledStimuli:
-    """Return the models on the stimuli of studies by scenario."""
-    each = studies.values()
-    p_contact = np.concatenate([study.p_contact for study in each], axis=1)
-    label = np.concatenate([study.label for study in each])
-    return PooledStimuli(
+    """Add differences of two models in r on all stimuli."""
+    pooled = PooledStimuli(
         names=MODELS,
-        p_contact=p_contact,
-        correct=((p_contact > 0.5) == label).astype(np.float64),
-        label=label,
-        p_yes=np.concatenate([study.p_yes for study in each]),
-        scenario=tuple(name for name, study in studies.items() for _ in study.label),
+        p_contact=study.p_contact,
+        correct=((study.p_contact > 0.5) == study.label).astype(np.float64),
+        label=study.label,
+        p_yes=study.p_yes,
+        scenario=("drop",) * len(study.label),
     )
-
-
-def _paired(
-    coverage: Coverage,
-    prefix: str,
-    size: Size | str,
-    pooled: PooledStimuli,
-    measures: Sequence[str] = ("rmsd", "kappa_from_averages"),
-) -> None:
-    """Add differences of two models on all stimuli."""
-    table = paired_measures(pooled, permutations=1)
-    last = table["scenario"].iloc[-1]
-    table = table[(table["scenario"] == last) & table["measure"].isin(measures)]
-    for row in table.to_dict("records"):
-        what = f"{prefix}{row['first']} less {row['second']}: {row['measure']}"
-        coverage.add(what, "stimuli", size, row["difference"], row["low"], row["high"])
+    for row in paired_tests(pooled, permutations=1).to_dict("records"):
+        what = f"{row['first']} less {row['second']}: r"
+        coverage.add(what, "stimuli", size, row["r_difference"], row["r_difference_low"],
+                     row["r_difference_high"])  # fmt: skip
 
 
 def _easy(coverage: Coverage, size: Size, study: Study) -> None:
@@ -157,13 +137,11 @@ def rollout_errors(coverage: Coverage, size: Size, repeats: int) -> None:
 
 
 def pooled(coverage: Coverage, size: Size, repeats: int) -> None:
-    """The rows of all stimuli pooled and of the mean of the table of scores, and differences."""
+    """The rows of all stimuli pooled and of the mean of the table of scores."""
     named = f"8 x {size[0]} x {size[1]}"
     shown = ("accuracy", "r", "kappa_from_averages", "rmsd", "r_beyond_outcome")
     scores = [f"good, {where}: {name}" for where in (MEAN, POOLED) for name in shown]
-    pairs = [f"pooled: {a} less {b}: {measure}" for a in MODELS for b in MODELS
-             for measure in ("rmsd", "kappa_from_averages")]  # fmt: skip
-    if not coverage.wants(*scores, *pairs):
+    if not coverage.wants(*scores):
         return
     drawn = coverage.studies("stimuli", size, SCENARIOS * repeats)
     for _ in range(repeats):
@@ -175,8 +153,6 @@ def pooled(coverage: Coverage, size: Size, repeats: int) -> None:
                 row = table.loc[where]
                 coverage.add(f"good, {where}: {name}", "stimuli", named, row[name],
                              row[f"{name}_low"], row[f"{name}_high"])  # fmt: skip
-        if coverage.wants(*pairs):
-            _paired(coverage, "pooled: ", named, _pool(parts))
 
 
 def _good(scenario: str, study: Study, people: int) -> pd.DataFrame:

@@ -156,7 +156,7 @@ def page(inputs: ReportInputs) -> str:
 def filled(inputs: ReportInputs) -> tuple[ReportInputs, str]:
     """Inputs whose tables hold a different number in every cell, and their page."""
     assert inputs.people is not None and inputs.with_people is not None
-    assert inputs.paired is not None and inputs.paired_measures is not None
+    assert inputs.paired is not None
     kept = ("by_stimulus", "items", "flags", "flag_counts", "attributes", "left_out")
     tables = {
         name: table if name in kept or not len(table.columns) else distinct(table)
@@ -179,7 +179,6 @@ def filled(inputs: ReportInputs) -> tuple[ReportInputs, str]:
         people=dataclasses.replace(inputs.people, tables=tables),
         with_people=with_people,
         paired=distinct(inputs.paired),
-        paired_measures=distinct(inputs.paired_measures),
     )
     return changed, rendered(changed)
 
@@ -291,7 +290,7 @@ def test_people_on_predicted_stimuli(inputs: ReportInputs, page: str) -> None:
 
 def test_paired_tests(filled: tuple[ReportInputs, str]) -> None:
     inputs, page = filled
-    assert inputs.paired is not None and inputs.paired_measures is not None
+    assert inputs.paired is not None
     check(find(page, "Models against each other"), inputs.paired, {
         "first": "first", "second": "second", "stimuli": ("stimuli", count),
         "accuracy, first less second": ("accuracy_difference", fixed(3)),
@@ -299,14 +298,6 @@ def test_paired_tests(filled: tuple[ReportInputs, str]) -> None:
         "p": ("p_accuracy", p), "Holm": ("p_accuracy_holm", p), "B-H": ("p_accuracy_bh", p),
         "r, first less second": own("r_difference"),
         "p#": ("p_r", p), "Holm#": ("p_r_holm", p), "B-H#": ("p_r_bh", p),
-    })  # fmt: skip
-    rows = inputs.paired_measures
-    names = {"rmsd": "RMSD", "kappa_from_averages": "kappa, from averages", "r": "r"}
-    last = rows[rows["scenario"] == POOLED].assign(measure=lambda t: t["measure"].map(names))
-    check(find(page, "Every pair: pooled"), last, {
-        "first": "first", "second": "second", "measure": "measure", "stimuli": ("stimuli", count),
-        "first less second": spread("difference", "low", "high", 3),
-        "p": ("p", p), "Holm": ("p_holm", p), "B-H": ("p_bh", p),
     })  # fmt: skip
 
 

@@ -20,7 +20,6 @@ from physion.analysis.model_tests import (
     fits_of_models,
     fits_of_people,
     group_contrasts,
-    paired_measures,
     paired_tests,
     pool_comparison,
 )
@@ -142,7 +141,6 @@ class ComparisonResults:
       `DETECTION`.
     - ``comparison_all``: the comparison with all complete sessions, including flagged ones.
     - ``paired``: from `paired_tests`, all scenarios pooled; None for one model.
-    - ``paired_measures``: from `paired_measures`; None for one model or no people.
     - ``mixed``: from `fits_of_people` and `fits_of_models`.
     - ``contrasts``: from `group_contrasts`; None if no grouping was given.
     - ``population``: from `compare_populations`; None if not asked for.
@@ -155,7 +153,6 @@ class ComparisonResults:
     with_people: PeopleComparison | None = None
     comparison_all: Comparison | None = None
     paired: pd.DataFrame | None = None
-    paired_measures: pd.DataFrame | None = None
     mixed: tuple[MixedTable, ...] = ()
     contrasts: pd.DataFrame | None = None
     population: PopulationResults | None = None
@@ -249,7 +246,6 @@ def all_results(
         with_people=with_people,
         comparison_all=whole,
         paired=paired_tests(pooled, draws) if several else None,
-        paired_measures=paired_measures(pooled, draws) if several and main.has_people else None,
         mixed=(*about_people, *fits_of_models(main, predictions)),
         contrasts=group_contrasts(main, predictions, groups) if groups else None,
         population=compare_populations(main, predictions, draws.level) if population else None,

@@ -1,9 +1,8 @@
 """Tests of models against each other, and mixed models of answers and accuracies.
 
 Pairs of models are compared on the stimuli of all scenarios together: McNemar's test of accuracy
-and permutations of r (`paired_tests`), differences of every measure with intervals
-(`paired_measures`). `fits_of_people` and `fits_of_models` are the mixed models of the report;
-`group_contrasts` compares groups of models by such models.
+and permutations of r (`paired_tests`). `fits_of_people` and `fits_of_models` are the mixed models
+of the report; `group_contrasts` compares groups of models by such models.
 """
 
 from __future__ import annotations
@@ -23,13 +22,12 @@ from physion.analysis.mixed import MixedFit, fit_linear, fit_logistic
 from physion.analysis.people.effects import HYPOTHESES, answer_rows, with_attributes
 from physion.analysis.people.results import PeopleResults
 from physion.analysis.statistics.paired import (
-    MEASURES,
     Difference,
     corrected_p,
     mcnemar_exact,
     paired_difference,
 )
-from physion.analysis.tables import DETECTION, MEAN, POOLED, in_order
+from physion.analysis.tables import DETECTION, MEAN, POOLED
 from physion.core.errors import BadInputError, PhysionError
 
 Array = npt.NDArray[np.float64]
@@ -115,7 +113,7 @@ def paired_tests(
         first, second = pooled.correct[i], pooled.correct[j]
         shared = np.isfinite(first) & np.isfinite(second)
         counts = mcnemar_exact(first, second)
-        r = _difference(pooled, (i, j), shared & np.isfinite(pooled.p_yes), "r", draws, count)
+        r = _difference(pooled, (i, j), shared & np.isfinite(pooled.p_yes), draws, count)
         why = "" if np.isfinite(r.value) else "r: undefined for one of the two"
         records.append(
             {
@@ -144,72 +142,17 @@ def paired_tests(
     return table
 
 
-COLUMNS = ("scenario", "measure", "first", "second", "stimuli", "difference", "low", "high", "p",
-           "p_holm", "p_bh")  # fmt: skip
-
-
-def paired_measures(
-    pooled: PooledStimuli, bootstrap: Bootstrap | None = None, permutations: int | None = None
-) -> pd.DataFrame:
-    """Test the differences of every two models in `MEASURES`, by scenario and over all of them.
-
-    Parameters
-    ----------
-    pooled
-        Models and people on the stimuli of all scenarios.
-    bootstrap
-        Level of the intervals, and the seed of the permutations.
-    permutations
-        As in `paired_tests`.
-
-    Returns
-    -------
-    table
-        `COLUMNS`: one row per scenario (and `POOLED`), measure and pair on the stimuli that both
-        predict: `paired_difference`, and ``p`` corrected over the pairs of the same scenario and
-        measure. Empty without people or with one model.
-    """
-    draws = bootstrap or Bootstrap()
-    pairs = list(combinations(range(len(pooled.names)), 2))
-    count = permutations_of(len(pairs)) if permutations is None else permutations
-    scenarios = in_order(set(pooled.scenario))
-    groups = [*scenarios, POOLED] if len(scenarios) > 1 else scenarios
-    known = np.isfinite(pooled.p_contact)
-    parts = []
-    for group in groups:
-        members = np.isin(pooled.scenario, scenarios if group == POOLED else [group])
-        members &= np.isfinite(pooled.p_yes)
-        for measure in MEASURES:
-            rows = []
-            for i, j in pairs:
-                shared = members & known[i] & known[j]
-                found = _difference(pooled, (i, j), shared, measure, draws, count)
-                rows.append((pooled.names[i], pooled.names[j], int(shared.sum()), *found))
-            table = pd.DataFrame(rows, columns=list(COLUMNS[2:9]))
-            table = table.assign(
-                p_holm=corrected_p(table["p"], "holm"), p_bh=corrected_p(table["p"], "fdr_bh")
-            )
-            parts.append(table.assign(scenario=group, measure=measure))
-    table = pd.concat(parts, ignore_index=True)[list(COLUMNS)]
-    return table[table["difference"].notna()].reset_index(drop=True)
-
-
 def _difference(
     pooled: PooledStimuli,
     pair: tuple[int, int],
     shared: npt.NDArray[np.bool_],
-    measure: str,
     draws: Bootstrap,
     permutations: int,
 ) -> Difference:
     both = list(pair)
     shared = shared & (not pooled.detecting & {pooled.names[one] for one in both})
-    label = pooled.label[shared]
-    right = pooled.correct[both][:, shared] == 1
     return paired_difference(
-        measure,
         pooled.p_contact[both][:, shared],
-        np.where(right, label, 1 - label),
         pooled.p_yes[shared],
         np.unique(pooled.scenario, return_inverse=True)[1][shared],
         level=draws.level,

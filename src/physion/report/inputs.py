@@ -91,7 +91,6 @@ class ReportInputs(ComparisonResults):
             "left_out": comparison.dropped,
             "accuracy_over_runs": runs if len(runs := runs_table(comparison.scores)) else None,
             "paired_tests": self.paired,
-            "paired_measures": self.paired_measures,
             "group_contrasts": self.contrasts,
             "comparison_with_flagged": None
             if self.comparison_all is None

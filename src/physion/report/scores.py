@@ -426,8 +426,6 @@ def tests(inputs: ReportInputs) -> Markup:
     parts = []
     if inputs.paired is not None:
         parts += [heading("Models against each other"), _paired(inputs.paired)]
-    if inputs.paired_measures is not None and len(inputs.paired_measures):
-        parts.append(_paired_measures(inputs.paired_measures))
     if inputs.contrasts is not None and len(inputs.contrasts):
         parts += [heading("Groups of models"), _contrasts(inputs.contrasts)]
     if inputs.mixed:
@@ -516,42 +514,6 @@ def _paired(rows: pd.DataFrame) -> Markup:
     if len(rows) > 10:
         listing = details(f"All {len(rows)} pairs", listing)
     return paragraph(words) + listing
-
-
-def _paired_measures(rows: pd.DataFrame) -> Markup:
-    """Return a summary by scenario and measure, and the table of all pairs over all scenarios."""
-    counts = rows.assign(
-        holm=rows["p_holm"] < 0.05, pairs=1, measure=rows["measure"].map(_MEASURES)
-    )
-    summary = counts.groupby(["scenario", "measure"], sort=False)[["pairs", "holm"]].sum()
-    columns = [
-        PageColumn("scenario", "scenario", "text"),
-        PageColumn("measure", "measure", "text"),
-        PageColumn("pairs", "pairs", "count"),
-        PageColumn("differ (Holm, 5 %)", "holm", "count"),
-    ]
-    words = (
-        "Permutation tests that swap two models stimulus by stimulus, in each scenario and over "
-        "all of them; every pair with its interval is in tables/paired_measures.csv"
-    )
-    last = counts[counts["scenario"] == counts["scenario"].iloc[-1]]
-    pair = [
-        PageColumn("first", "first", "text"),
-        PageColumn("second", "second", "text"),
-        PageColumn("measure", "measure", "text"),
-        PageColumn("stimuli", "stimuli", "count"),
-        PageColumn("first less second", "difference", "interval", 3, "low", "high"),
-        PageColumn("p", "p", "p"),
-        PageColumn("Holm", "p_holm", "p"),
-        PageColumn("B-H", "p_bh", "p"),
-    ]
-    name = str(last["scenario"].iloc[0])
-    return details("RMSD, kappa and r by scenario", rows_table(
-        summary.reset_index(), columns, words
-    ) + rows_table(last, pair, f"Every pair: {name}"))  # fmt: skip
-
-
-_MEASURES = {"rmsd": "RMSD", "kappa_from_averages": "kappa, from averages", "r": "r"}
 
 
 def _mixed(model: MixedTable) -> Markup:

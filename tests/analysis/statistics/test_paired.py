@@ -18,13 +18,11 @@ from statsmodels.stats.multitest import multipletests
 
 from physion.analysis.intervals import Bootstrap
 from physion.analysis.model_tests import (
-    COLUMNS,
     PooledStimuli,
-    paired_measures,
     paired_tests,
     permutations_of,
 )
-from physion.analysis.statistics.agreement import pearson, rmsd
+from physion.analysis.statistics.agreement import pearson
 from physion.analysis.statistics.paired import (
     corrected_p,
     mcnemar_exact,
@@ -40,9 +38,7 @@ def r_test(a: Array, b: Array, y: Array, permutations: int = 200, seed: int = 0)
     """Return p of the difference of two models' r with people."""
     pair = np.stack([a, b])
     strata = np.zeros(len(y), dtype=np.int_)
-    return paired_difference(
-        "r", pair, pair > 0.5, y, strata, permutations=permutations, seed=seed
-    ).p
+    return paired_difference(pair, y, strata, permutations=permutations, seed=seed).p
 
 
 def pooled(p: Array, seed: int = 0, scenarios: int = 2) -> PooledStimuli:
@@ -141,56 +137,19 @@ def test_the_interval_matches_leaving_out_stimuli_of_both_models_at_once() -> No
     y, strata = rng.random(50), np.repeat([0, 1], 25)
     shared = rng.normal(0, 0.5, 50)
     pair = np.stack([y + shared + rng.normal(0, 0.02, 50) for _ in range(2)])
-    found = paired_difference("rmsd", pair, pair > 0.5, y, strata, permutations=5)
-    without = np.array([rmsd(*(np.delete(v, k) for v in (pair[0], y)))
-                        - rmsd(*(np.delete(v, k) for v in (pair[1], y)))
+    found = paired_difference(pair, y, strata, permutations=5)
+    without = np.array([pearson(*(np.delete(v, k) for v in (pair[0], y)))
+                        - pearson(*(np.delete(v, k) for v in (pair[1], y)))
                         for k in range(50)])  # fmt: skip
     parts = [np.sum((own - own.mean()) ** 2) * 24 / 25 for own in np.split(without, 2)]
     assert (found.high + found.low) / 2 == pytest.approx(found.value)
     half = (found.high - found.low) / 2 / np.sqrt(sum(parts))
     assert stats.norm.ppf(0.975) < half < stats.t.ppf(0.975, 15)
-    alone = [np.var([rmsd(np.delete(p, k), np.delete(y, k)) for k in range(50)]) for p in pair]
+    alone = [np.var([pearson(np.delete(p, k), np.delete(y, k)) for k in range(50)]) for p in pair]
     assert sum(parts) < sum(alone) * 50 / 10
 
 
 # --- tables of all pairs -------------------------------------------------------------------------
-
-
-def test_differences_match_the_measures_and_corrected_over_the_pairs() -> None:
-    rng = np.random.default_rng(1)
-    p = rng.random((4, 60))
-    p[2, :5] = np.nan
-    given = pooled(p)
-    p[0] = given.p_yes + rng.normal(0, 0.2, 60)
-    table = paired_measures(given, permutations=200)
-    assert tuple(table.columns) == COLUMNS and len(table) == 3 * 3 * 6
-    rows = table.set_index(["scenario", "measure", "first", "second"])
-    drop = np.array(given.scenario) == "drop"
-    for where, members in (("pooled", np.ones(60, bool)), ("drop", drop)):
-        known = members & np.isfinite(p[2])
-        y = given.p_yes[known]
-        expected = {
-            "rmsd": rmsd(p[0, known], y) - rmsd(p[2, known], y),
-            "r": pearson(p[0, known], y) - pearson(p[2, known], y),
-        }
-        kappas = []
-        for k in (0, 2):
-            said = np.where(given.correct[k, known] == 1, given.label[known],
-                            1 - given.label[known])  # fmt: skip
-            agree = np.mean(np.where(said, y, 1 - y))
-            by_guess = said.mean() * y.mean() + (1 - said.mean()) * (1 - y.mean())
-            kappas.append((agree - by_guess) / (1 - by_guess))
-        expected["kappa_from_averages"] = kappas[0] - kappas[1]
-        for measure, value in expected.items():
-            row = rows.loc[(where, measure, "a", "c")]
-            assert row["difference"] == pytest.approx(value), (where, measure)
-            assert row["low"] < value < row["high"] and row["stimuli"] == known.sum()
-    # Each scenario and measure is a family of its own: six pairs.
-    for _, family in table.groupby(["scenario", "measure"]):
-        raw = family["p"].to_numpy()
-        np.testing.assert_allclose(family["p_holm"], step_down(raw))
-        np.testing.assert_allclose(family["p_bh"], step_up(raw))
-    assert (table["p_holm"] > table["p"]).sum() > 20
 
 
 def step_up(p: Array) -> Array:
@@ -200,25 +159,6 @@ def step_up(p: Array) -> Array:
         least = min(least, p[order[rank - 1]] * len(p) / rank)
         found[order[rank - 1]] = least
     return found
-
-
-def test_equal_models_rarely_differ_and_a_better_one_does() -> None:
-    rng = np.random.default_rng(2)
-    small = 0
-    for seed in range(40):
-        noise = rng.random((2, 40))
-        table = paired_measures(pooled(noise, seed, 1), permutations=199)
-        assert set(table["scenario"]) == {"collide"}
-        small += int((table["p"] < 0.05).sum())
-    assert small <= 18  # of 120 tests; 6 are expected
-    given = pooled(rng.random((2, 80)), 5, 1)
-    close = np.clip(given.p_yes + rng.normal(0, 0.05, 80), 0, 1)
-    better = replace(given, p_contact=np.stack([close, given.p_contact[1]]))
-    table = paired_measures(better, permutations=199).set_index("measure")
-    assert table.loc["rmsd", "difference"] < 0 and table.loc["rmsd", "p"] == pytest.approx(1 / 200)
-    assert table.loc["r", "difference"] > 0 and table.loc["r", "low"] > 0
-    nobody = replace(given, p_yes=np.full(80, np.nan))
-    assert paired_measures(nobody, permutations=5).empty
 
 
 def test_pairs_of_models_are_tested_on_what_both_answered() -> None:

@@ -1,12 +1,11 @@
 """Paired tests of differences between two models, and corrections for many tests.
 
-`mcnemar_exact` compares correct answers; `paired_difference` any measure of `MEASURES`, which is a
-function of sums over stimuli, so that leaving stimuli out and swapping models need sums only.
+`mcnemar_exact` compares correct answers; `paired_difference` r with people, which is a function of
+sums over stimuli, so that leaving stimuli out and swapping models need sums only.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal, NamedTuple
@@ -16,12 +15,7 @@ import numpy.typing as npt
 from scipy import stats
 
 from physion.analysis.intervals import jackknife
-from physion.analysis.statistics.agreement import (
-    CONSTANT,
-    FEWEST,
-    correlation_from_sums,
-    kappa_from_fractions,
-)
+from physion.analysis.statistics.agreement import CONSTANT, FEWEST, correlation_from_sums
 from physion.core.errors import BadInputError
 from physion.core.seeds import generator
 
@@ -55,36 +49,7 @@ def mcnemar_exact(first: npt.ArrayLike, second: npt.ArrayLike) -> McNemar:
     return McNemar(only_a, only_b, p)
 
 
-@dataclass(frozen=True)
-class SumMeasure:
-    """A measure that is a function of sums over stimuli.
-
-    - ``columns``: from P(contact), answers (1 or 0) and P(yes), each (n,), to what is summed
-      (n, k);
-    - ``value``: from sums (..., k) to the measure (...).
-    """
-
-    columns: Callable[[Array, Array, Array], Array]
-    value: Callable[[Array], Array]
-
-
-def _squares(p: Array, answer: Array, people: Array) -> Array:
-    return np.stack([np.ones_like(p), (p - people) ** 2], axis=-1)
-
-
-def _root_mean(sums: Array) -> Array:
-    return np.asarray(np.sqrt(np.maximum(sums[..., 1], 0.0) / sums[..., 0]))
-
-
-def _agreements(p: Array, answer: Array, people: Array) -> Array:
-    return np.stack([np.ones_like(p), answer, people, answer * people], axis=-1)
-
-
-def _kappa(sums: Array) -> Array:
-    return kappa_from_fractions(*(sums[..., k] / sums[..., 0] for k in (1, 2, 3)))
-
-
-def _products(p: Array, answer: Array, people: Array) -> Array:
+def _products(p: Array, people: Array) -> Array:
     # Standardised, so that two models whose values spread differently can be swapped.
     x = (p - p.mean()) / (p.std() if p.std() >= CONSTANT else np.nan)
     y = people - people.mean()
@@ -93,14 +58,6 @@ def _products(p: Array, answer: Array, people: Array) -> Array:
 
 def _pearson(sums: Array) -> Array:
     return correlation_from_sums(*(sums[..., k] for k in range(6)))
-
-
-MEASURES: Mapping[str, SumMeasure] = {
-    "rmsd": SumMeasure(_squares, _root_mean),
-    "kappa_from_averages": SumMeasure(_agreements, _kappa),
-    "r": SumMeasure(_products, _pearson),
-}
-"""What is compared, by the name of its metric."""
 
 
 class Difference(NamedTuple):
@@ -113,9 +70,7 @@ class Difference(NamedTuple):
 
 
 def paired_difference(
-    measure: str,
     p_contact: Array,
-    answers: Array,
     people: Array,
     strata: npt.NDArray[np.int_],
     *,
@@ -123,14 +78,12 @@ def paired_difference(
     permutations: int = 2000,
     seed: int = 0,
 ) -> Difference:
-    """Test the difference of two models in one of `MEASURES` on n stimuli.
+    """Test the difference of two models in r with people on n stimuli.
 
     Parameters
     ----------
-    measure
-        Name in `MEASURES`.
-    p_contact, answers
-        (2, n): P(contact) and answers (1 or 0) of the two models.
+    p_contact
+        (2, n): P(contact) of the two models.
     people
         (n,): fraction of people who say yes.
     strata
@@ -143,30 +96,26 @@ def paired_difference(
     Returns
     -------
     difference
-        NaN if the measure is undefined for one of the two, or for fewer than three stimuli.
+        NaN if r is undefined for one of the two, or for fewer than three stimuli.
 
     Notes
     -----
-    Under the null hypothesis the two models are exchangeable (for r: their standardised values,
-    since r does not depend on shift and scale), so for every stimulus they are swapped with
-    probability 1/2. p = (1 + count of |difference| as large) / (1 + permutations).
+    Under the null hypothesis the standardised values of the two models are exchangeable (r does not
+    depend on shift and scale), so for every stimulus they are swapped with probability 1/2. p = (1
+    + count of |difference| as large) / (1 + permutations).
     """
     n = len(people)
     if n < FEWEST:
         return Difference()
-    value = MEASURES[measure].value
-    first, second = (
-        MEASURES[measure].columns(p, said, people)
-        for p, said in zip(p_contact, answers, strict=True)
-    )
+    first, second = (_products(p, people) for p in p_contact)
     totals = first.sum(axis=0), second.sum(axis=0)
-    difference = float(value(totals[0]) - value(totals[1]))
+    difference = float(_pearson(totals[0]) - _pearson(totals[1]))
     if not np.isfinite(difference):
         return Difference()
-    without = value(totals[0] - first) - value(totals[1] - second)
+    without = _pearson(totals[0] - first) - _pearson(totals[1] - second)
     low, high = jackknife(without, strata).interval(difference, level)
     change = swap_coins(permutations, n, seed) @ (second - first)
-    swapped = value(totals[0] + change) - value(totals[1] - change)
+    swapped = _pearson(totals[0] + change) - _pearson(totals[1] - change)
     as_large = np.sum(np.abs(swapped) >= abs(difference) - 1e-12)
     return Difference(difference, low, high, float((1 + as_large) / (1 + permutations)))
 
