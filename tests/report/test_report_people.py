@@ -17,7 +17,7 @@ from physion.analysis.people.responses import PERSON, REHEARSAL
 from physion.analysis.statistics.agreement import cross_kappa
 from physion.analysis.tables import attributes_from_table
 from physion.cli.main import main
-from physion.core.errors import BadInputError, ExclusionError, UnknownNameError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.report import ReportInputs
 from physion.report.build import report_numbers
 from physion.report.compare import compare
@@ -196,26 +196,20 @@ def test_labels_that_contradict_are_refused(tmp_path: Path) -> None:
 
 def test_no_session_left_is_refused(tmp_path: Path) -> None:
     answers = responses().assign(response="yes")
-    with pytest.raises(ExclusionError, match="'streak' leaves out 8 of 8 sessions of collide"):
-        compare_small(tmp_path, answers)
     with pytest.raises(BadInputError, match="all 16 sessions are flagged"):
-        compare_small(tmp_path, answers, accept_rules=["streak"])
+        compare_small(tmp_path, answers)
 
 
 @pytest.mark.nightly
-def test_confirmed_rules_are_listed(report: Path, tmp_path: Path) -> None:
+def test_rules_that_leave_out_many_are_warned_of(report: Path, tmp_path: Path) -> None:
     answers = responses()
     lazy = (answers["scenario"] == "drop") & answers["participant"].isin(
         answers.loc[answers["scenario"] == "drop", "participant"].unique()[:4]
     )
     answers.loc[lazy, "response"] = "yes"
-    with pytest.raises(ExclusionError, match="'streak' leaves out 4 of 8 sessions of drop"):
-        compare_small(tmp_path, answers)
-    words = "confirmed by --accept-rules"
+    words = "'streak' leaves out 4 of 8 sessions of drop"
     assert words not in text_of(report)
-    text = page_text(tmp_path, answers=answers, accept_rules=["streak", "slow"])
-    assert text.count(words) == 2  # under the sessions left out, and how the page was made
-    assert "streak (drop 4 of 8); slow (no scenario needed it)" in text
+    assert words in page_text(tmp_path, answers=answers)
 
 
 @pytest.mark.nightly

@@ -44,9 +44,6 @@ class Options:
     """Table of the stimuli (stimulus) that each session, or each scenario, must have; if not given,
     expected.csv next to the responses, else the stimuli that half of the scenario's sessions
     answered."""
-    accept_rules: tuple[str, ...] = ()
-    """Exclusion rules that may leave out more than a third of a scenario's sessions: streak,
-    alternation, familiarization, low_accuracy, slow, incomplete, repeated."""
     simulated: bool = False
     """Rehearse with the simulated participants of --responses; every page is marked."""
     where: tuple[str, ...] = ()
@@ -110,7 +107,6 @@ def _compare(options: Options) -> int:
         sessions=options.sessions,
         rules=options.rules,
         expected=options.expected,
-        accept_rules=options.accept_rules,
         simulated=options.simulated,
         where=options.where,
         attributes=options.attributes,

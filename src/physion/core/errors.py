@@ -50,33 +50,6 @@ class BadSceneError(BadInputError):
     """Error for an inconsistent scene, for example two bodies of one name or an unfilled role."""
 
 
-class ExclusionError(BadInputError):
-    """Error for an exclusion rule that leaves out more than a third of a scenario's sessions.
-
-    Parameters
-    ----------
-    rule, scenario
-        Names of the rule and of the scenario.
-    flagged, sessions
-        Number of sessions that the rule leaves out, and of all sessions of the scenario.
-    listed
-        Whether the study's list of stimuli was given.
-    """
-
-    def __init__(
-        self, rule: str, scenario: str, flagged: int, sessions: int, listed: bool = False
-    ) -> None:
-        advice = ""
-        if rule == "incomplete" and not listed:
-            advice = "give the study's list of stimuli (--expected), or "
-        super().__init__(
-            f"the exclusion rule {rule!r} leaves out {flagged} of {sessions} sessions of "
-            f"{scenario}, more than a third: look at these sessions; {advice}confirm with "
-            f"--accept-rules {rule} if this is right"
-        )
-        self.rule, self.scenario, self.flagged, self.sessions = rule, scenario, flagged, sessions
-
-
 OWN_ENVIRONMENT = ("inspect",)
 """Extras whose dependencies exclude versions of requirements.lock."""
 

@@ -6,7 +6,7 @@ a result can write its own report.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -337,7 +337,6 @@ def compare(
     sessions: Path | None = None,
     rules: str | None = None,
     expected: Path | Expected | None = None,
-    accept_rules: Collection[str] = (),
     simulated: bool = False,
     where: Sequence[str] = (),
     attributes: Path | pd.DataFrame | None = None,
@@ -381,8 +380,6 @@ def compare(
         Stimuli that a session must have, by scenario or by session, or their table. None:
         ``expected.csv`` next to the responses, else the stimuli that half of the scenario's
         sessions answered.
-    accept_rules
-        Exclusion rules that may leave out more than a third of a scenario's sessions.
     simulated
         Whether to rehearse with the simulated participants of ``responses``, who are left out
         otherwise.
@@ -452,7 +449,7 @@ def compare(
         if humans is not None:
             raise BadInputError("give averages of people (humans) or their responses, not both")
         people, methods = _participants(
-            files, sessions, rules, labels, expected, accept_rules, simulated, where, attributes,
+            files, sessions, rules, labels, expected, simulated, where, attributes,
             settings,
         )  # fmt: skip
         if rows is None:
@@ -465,9 +462,9 @@ def compare(
     else:
         assert rows is not None
         about = (sessions, expected, attributes)
-        if any(one is not None for one in about) or accept_rules or simulated or where:
+        if any(one is not None for one in about) or simulated or where:
             raise BadInputError(
-                "sessions, expected, attributes, accepted rules, chosen values (where) and "
+                "sessions, expected, attributes, chosen values (where) and "
                 "simulated participants are about responses: give those"
             )
         if humans is None and labels is None:
@@ -673,7 +670,6 @@ def _participants(
     rules: str | None,
     labels: str | Path | Mapping[str, bool] | None,
     expected: Path | Expected | None,
-    accept_rules: Collection[str],
     simulated: bool,
     where: Sequence[str],
     attributes: Path | pd.DataFrame | None,
@@ -685,7 +681,6 @@ def _participants(
         files, sessions, rules, read_outcomes(labels), settings["exclude"],
         settings["exclude_ledge"], settings["bootstrap"],
         expected=read_expected(expected) if isinstance(expected, Path) else expected,
-        accept_rules=accept_rules,
         participants="simulated" if simulated else "people",
         attributes=read_attributes(attributes) if isinstance(attributes, Path) else attributes,
         where=where,
@@ -729,7 +724,6 @@ def _read_people(
     draws: Bootstrap,
     *,
     expected: Expected | None = None,
-    accept_rules: Collection[str] = (),
     participants: Participants = "people",
     attributes: pd.DataFrame | None = None,
     where: Sequence[str] = (),
@@ -743,7 +737,6 @@ def _read_people(
         read,
         rules=chosen,
         expected=expected,
-        accept_rules=accept_rules,
         attributes=attributes,
         exclude=excluded,
         exclude_ledge=exclude_ledge,

@@ -458,8 +458,6 @@ def sessions_only(people: PeopleResults, models: str = "") -> Markup:
     """Return the same without models; ``models``: their scores without and with these sessions."""
     result = people.tables
     parts = [paragraph(describe_rules(people.rules))]
-    if people.confirmed:
-        parts.append(paragraph(f"Rules {people.confirmed}."))
     parts.append(_flag_counts(result["flag_counts"]))
     parts.append(_with_and_without(people) + models)
     return joined(parts)
@@ -581,8 +579,7 @@ def dropped(result: PeopleResults) -> Markup:
 
 def rules_text(people: PeopleResults) -> dict[str, str]:
     """Return the exclusion rules as text."""
-    words = {
+    return {
         "Exclusions": describe_rules(people.rules),
         "Rules applied": ", ".join(name.replace("_", " ") for name in RULES),
     }
-    return words | ({"Rules confirmed": people.confirmed} if people.confirmed else {})

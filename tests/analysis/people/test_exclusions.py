@@ -22,13 +22,13 @@ from physion.analysis.people.exclusions import (
     RULE_SETS,
     RULES,
     ExclusionRules,
-    check_excluded,
     completeness_warnings,
     count_flags,
     drop_unexpected,
     find_expected,
     flag_from_server,
     flag_sessions,
+    large_exclusions,
     longest_alternation,
     longest_streak,
     read_expected,
@@ -38,7 +38,7 @@ from physion.analysis.people.exclusions import (
 from physion.analysis.people.measures import accuracy_by_scenario
 from physion.analysis.people.responses import DROPPED_COLUMNS, VOID, Responses, missing_times
 from physion.analysis.people.results import analyse_people, rules_called
-from physion.core.errors import BadInputError, ExclusionError, UnknownNameError
+from physion.core.errors import BadInputError
 from support.simulated_people import as_responses, simulate_study, study
 
 answers = st.lists(st.booleans(), max_size=60)
@@ -374,47 +374,24 @@ def test_a_session_without_answers_is_incomplete_whatever_was_expected() -> None
     assert flags.loc[flags["incomplete"], "session"].tolist() == ["drop-s001"]
 
 
-def test_a_rule_that_leaves_out_more_than_a_third_stops() -> None:
+def test_a_rule_that_leaves_out_more_than_a_third_is_warned_of() -> None:
     found = study(people=12, stimuli=10, scenarios=("drop", "roll"), slow_by_error=0.0)
     calm = flag_sessions(found).assign(**dict.fromkeys(RULES, False))
     drop = calm[calm["scenario"] == "drop"].index
-    check_excluded(calm.assign(slow=calm.index.isin(drop[:4])))
-    many = calm.assign(slow=calm.index.isin(drop[:5]))
-    with pytest.raises(ExclusionError, match="'slow' leaves out 5 of 12 sessions of drop") as error:
-        check_excluded(many)
-    assert (error.value.rule, error.value.scenario) == ("slow", "drop")
-    assert "--accept-rules slow" in str(error.value) and isinstance(error.value, BadInputError)
-    check_excluded(many, ["slow"])
-    with pytest.raises(ExclusionError):
-        check_excluded(many, ["streak"])
-    with pytest.raises(UnknownNameError, match="slow"):
-        check_excluded(calm, ["slaw"])
-
-
-def test_analysis_stops_unless_confirmed() -> None:
-    found = study(people=6, stimuli=10, scenarios=("drop",))
-    half = found.test.loc[found.test["session"].isin(["drop-s000", "drop-s001", "drop-s002"])]
-    cut = found.trials.drop(index=half.index[half["stimulus"] == "drop_003"]).reset_index(drop=True)
-    some = replace(found, trials=cut)
-    with pytest.raises(ExclusionError, match=r"'incomplete' leaves out 3 of 6 .*--expected"):
-        analyse_people(some, bootstrap=QUICK)
-    listed = {"drop": frozenset(found.test["stimulus"])}
-    with pytest.raises(ExclusionError, match="'incomplete' leaves out 3 of 6") as error:
-        analyse_people(some, expected=listed, bootstrap=QUICK)
-    assert "--expected" not in str(error.value), "the list was given"
-    results = analyse_people(some, accept_rules=["incomplete"], bootstrap=QUICK)
-    assert results.tables["flags"]["incomplete"].sum() == 3
-
-
-def test_sessions_that_never_answered_do_not_count_in_the_third() -> None:
-    found = study(people=12, stimuli=10, scenarios=("drop",), slow_by_error=0.0)
-    calm = flag_sessions(found).assign(**dict.fromkeys(RULES, False))
-    silent = calm.index[:6]
-    calm.loc[silent, ["trials", "incomplete"]] = [0, True]
-    check_excluded(calm)
-    calm.loc[calm.index[6:9], "incomplete"] = True
-    with pytest.raises(ExclusionError, match="'incomplete' leaves out 3 of 6"):
-        check_excluded(calm)
+    assert large_exclusions(calm.assign(slow=calm.index.isin(drop[:4]))) == []
+    (words,) = large_exclusions(calm.assign(slow=calm.index.isin(drop[:5])))
+    assert "'slow' leaves out 5 of 12 sessions of drop" in words
+    # Sessions that never answered do not count.
+    silent = calm.assign(trials=np.where(calm.index.isin(drop[:6]), 0, calm["trials"]))
+    silent["incomplete"] = silent["trials"].eq(0)
+    assert large_exclusions(silent) == []
+    silent.loc[drop[6:9], "incomplete"] = True
+    assert "'incomplete' leaves out 3 of 6" in large_exclusions(silent)[0]
+    short = found.trials["session"].isin(calm.loc[drop[:5], "session"])
+    short &= found.trials["stimulus"].eq("drop_003")
+    cut = found.trials[~short].reset_index(drop=True)
+    warned = analyse_people(replace(found, trials=cut), bootstrap=QUICK).warnings
+    assert any("'incomplete' leaves out 5 of 12" in warning for warning in warned)
 
 
 def test_the_list_is_found_next_to_the_responses(tmp_path: Path) -> None:

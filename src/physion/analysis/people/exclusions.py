@@ -8,7 +8,7 @@ released code, which differs from it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
@@ -21,7 +21,7 @@ import pandas as pd
 
 from physion.analysis.people.responses import Responses
 from physion.analysis.tables import in_order
-from physion.core.errors import BadInputError, ExclusionError, UnknownNameError
+from physion.core.errors import BadInputError
 from physion.core.names import OFFICIAL_SCENARIOS, canonical_name
 from physion.core.tables import read_table
 
@@ -272,10 +272,6 @@ FROM_SERVER = RULES[-3:]
 """Rules that are not of the preregistration."""
 
 
-MOST_EXCLUDED = 1 / 3
-"""Largest fraction of a scenario's sessions that a rule may leave out unless this is confirmed."""
-
-
 @dataclass(frozen=True)
 class ExclusionRules:
     """Thresholds of the rules; None turns a rule off.
@@ -434,57 +430,20 @@ def flag_sessions(
     return table.assign(flagged=table[list(RULES)].any(axis=1))
 
 
-def large_exclusions(flags: pd.DataFrame) -> pd.DataFrame:
-    """Return the rules that flag more than `MOST_EXCLUDED` of the sessions of a scenario.
+def large_exclusions(flags: pd.DataFrame) -> list[str]:
+    """Return a warning for each rule that flags more than a third of a scenario's sessions.
 
-    Sessions without a single test answer (they consented and left) do not count: there is nothing
-    to leave out of them. Columns: ``scenario``, ``rule``, ``flagged``, ``sessions``.
+    Such a rule is more likely wrong for these data than the sessions are. Sessions without a single
+    test answer (they consented and left) do not count: there is nothing to leave out of them.
     """
-    rows = []
-    answered = flags[flags["trials"] > 0]
-    for scenario in in_order(answered["scenario"]):
-        part = answered[answered["scenario"] == scenario]
-        counts = {rule: int(part[rule].sum()) for rule in RULES}
-        rows += [
-            (scenario, rule, count, len(part))
-            for rule, count in counts.items()
-            if count > MOST_EXCLUDED * len(part)
-        ]
-    return pd.DataFrame(rows, columns=["scenario", "rule", "flagged", "sessions"])
-
-
-def check_excluded(
-    flags: pd.DataFrame, accept_rules: Collection[str] = (), expected: Expected | None = None
-) -> None:
-    """Refuse a rule that leaves out more than `MOST_EXCLUDED` of the sessions of a scenario.
-
-    A rule that flags so many is more likely wrong for these data than the sessions are.
-    ``accept_rules``: rules that may; ``expected``: the list of stimuli, if one was given. Raises
-    `ExclusionError`, and `UnknownNameError` for a name in ``accept_rules`` that is not a rule.
-    """
-    for name in accept_rules:
-        if name not in RULES:
-            raise UnknownNameError("exclusion rule", name, RULES)
-    for row in large_exclusions(flags).itertuples():
-        if row.rule not in accept_rules:
-            given = expected is not None
-            raise ExclusionError(row.rule, row.scenario, row.flagged, row.sessions, given)
-
-
-def describe_confirmed(flags: pd.DataFrame, accept_rules: Collection[str]) -> str:
-    """Describe what the rules in ``accept_rules`` leave out; empty without any."""
-    large = large_exclusions(flags)
-    words = []
-    for rule in dict.fromkeys(accept_rules):
-        own = large[large["rule"] == rule]
-        counts = ", ".join(f"{r.scenario} {r.flagged} of {r.sessions}" for r in own.itertuples())
-        words.append(f"{rule.replace('_', ' ')} ({counts or 'no scenario needed it'})")
-    if not words:
-        return ""
-    return (
-        "confirmed by --accept-rules, although more than a third of a scenario's sessions are left "
-        f"out: {'; '.join(words)}"
-    )
+    answered = flags[flags["trials"] > 0].groupby("scenario", sort=False)
+    return [
+        f"the exclusion rule {rule!r} leaves out {int(rows[rule].sum())} of {len(rows)} sessions "
+        f"of {scenario}: look at these sessions"
+        for scenario, rows in answered
+        for rule in RULES
+        if 3 * rows[rule].sum() > len(rows)
+    ]
 
 
 def without_flagged(responses: Responses, flags: pd.DataFrame) -> Responses:

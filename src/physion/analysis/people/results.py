@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,13 +23,12 @@ from physion.analysis.people.exclusions import (
     RULE_SETS,
     ExclusionRules,
     Expected,
-    check_excluded,
     check_expected,
     completeness_warnings,
     count_flags,
-    describe_confirmed,
     drop_unexpected,
     flag_sessions,
+    large_exclusions,
     whole_sessions,
     with_and_without,
     without_flagged,
@@ -87,8 +86,7 @@ class PeopleResults:
     - ``left_out``: dropped answers, with their reasons.
 
     ``warnings``: what may make the results wrong, one sentence each; ``stimuli``: names of all
-    stimuli of the responses, also of excluded ones; ``confirmed``: rules that may leave out more
-    than a third of a scenario's sessions, as text.
+    stimuli of the responses, also of excluded ones.
     """
 
     kept: Responses
@@ -97,7 +95,6 @@ class PeopleResults:
     tables: dict[str, pd.DataFrame]
     warnings: tuple[str, ...] = ()
     stimuli: frozenset[str] = frozenset()
-    confirmed: str = ""
 
     @property
     def mark(self) -> str:
@@ -187,7 +184,6 @@ def analyse_people(
     *,
     rules: ExclusionRules = PREREGISTERED,
     expected: Expected | None = None,
-    accept_rules: Collection[str] = (),
     attributes: pd.DataFrame | None = None,
     exclude: Iterable[str] = (),
     exclude_ledge: bool = True,
@@ -204,8 +200,6 @@ def analyse_people(
     expected
         Test stimuli that a session must have, by scenario or by session; by default those that at
         least half of the scenario's sessions answered. Answers to other stimuli are dropped.
-    accept_rules
-        Rules that may leave out more than a third of a scenario's sessions.
     attributes
         Attributes of one's own stimuli, from `attributes_from_table`; attributes of other stimuli
         come from official names.
@@ -218,13 +212,10 @@ def analyse_people(
     ------
     BadInputError
         If no session remains, or ``expected`` names none.
-    ExclusionError
-        If a rule leaves out more than a third of a scenario's sessions.
     """
     draws = bootstrap or Bootstrap()
     check_expected(responses, expected)
     flags = flag_sessions(responses, rules, expected=expected)
-    check_excluded(flags, accept_rules, expected)
     shown = drop_unexpected(responses, expected).drop_void()
     shown = shown.drop_stimuli(exclude, exclude_ledge)
     kept = without_flagged(shown, flags)
@@ -253,10 +244,9 @@ def analyse_people(
     )
     tables["left_out"] = pd.concat([kept.dropped, missing_times(kept)], ignore_index=True)
     mark = (REHEARSAL,) if responses.simulated_sessions else ()
-    warnings = (*mark, *completeness_warnings(responses, expected))
+    warnings = (*mark, *completeness_warnings(responses, expected), *large_exclusions(flags))
     stimuli = frozenset(responses.trials["stimulus"])
-    confirmed = describe_confirmed(flags, accept_rules)
-    return PeopleResults(kept, whole, rules, tables, warnings, stimuli, confirmed)
+    return PeopleResults(kept, whole, rules, tables, warnings, stimuli)
 
 
 def _attributes(stimuli: pd.Series, given: pd.DataFrame | None) -> pd.DataFrame:
