@@ -14,7 +14,7 @@ figure, statements about people, and the supplementary figures.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import lcm
@@ -32,7 +32,7 @@ from physion.analysis.statistics.agreement import correlation_from_sums
 from physion.analysis.tables import MEAN, READOUTS, SCENARIO, read_humans
 from physion.analysis.with_participants import released_zone
 from physion.core.errors import BadInputError
-from physion.core.names import OFFICIAL_SCENARIOS, SCENARIOS, is_ledge
+from physion.core.names import OFFICIAL_SCENARIOS, SCENARIOS
 from physion.core.tables import Column, check_table, must, read_csv, refuse_duplicates
 
 MODELS = {
@@ -65,23 +65,15 @@ READOUT_NAMES = {**READOUTS, "D": OBSERVED_AGAIN}
 TRAININGS = {"all": "all", "all_but_this": "all-but", "same": "only"}
 """The words of the released tables for the training protocols, and the words of the paper."""
 
-STIMULI, LEDGES = 150, 56
-"""Stimuli per scenario that people saw; stimuli of Roll with a ledge (not released)."""
-
-
-def _one_of(name: str, header: str, about: str, names: Mapping[str, str]) -> Column:
-    return must(name, "choice", about, choices=tuple(map(str.lower, names)), also=(header,))
-
-
 _RUN_COLUMNS = (
     SCENARIO,
     must("run", "text", "Model, protocol, readout and file", also=("ModelID",)),
-    _one_of("model", "Model", "Name of the model", MODELS),
+    must("model", "text", "Name of the model", also=("Model",)),
 )
 ACCURACIES: tuple[Column, ...] = (
     *_RUN_COLUMNS,
-    _one_of("readout", "Readout Type", "What the readout saw", READOUT_NAMES),
-    _one_of("training", "Dynamics Training Dataset Type", "Scenarios of the training", TRAININGS),
+    must("readout", "text", "What the readout saw", also=("Readout Type",)),
+    must("training", "text", "Scenarios of the training", also=("Dynamics Training Dataset Type",)),
     Column("seed", "integer", "Seed of the encoder; empty: it was not trained", required=True,
            low=0, also=("Encoder Training Seed",)),
     Column("dynamics_seed", "integer", "Seed of the dynamics", required=True, low=0,
@@ -154,40 +146,14 @@ class PublishedTables:
 def read_published(folder: Path) -> PublishedTables:
     """Read the released tables in ``folder``, which contains ``results/`` and ``humans/``.
 
-    Raises `BadInputError` for what is missing, out of range or occurs twice, and for a table that
-    was cut.
+    Raises `BadInputError` for what is missing, out of range or occurs twice.
     """
     results = folder / "results"
     if not results.is_dir():
         raise BadInputError(f"{folder} has no folder results; give the folder of the official data")
     runs, dropped = _read_runs(results)
     stimuli = read_humans(folder / "humans")
-    _check_sizes(stimuli, folder / "humans")
     return PublishedTables(runs, _read_people(results), stimuli, dropped)
-
-
-def _check_whole(models: pd.Series, scenarios: pd.Series, path: Path) -> None:
-    """Refuse a table in which a model has more runs in one scenario than in another."""
-    counts = pd.crosstab(models, scenarios).reindex(columns=list(SCENARIOS), fill_value=0)
-    for model, runs in counts.iterrows():
-        few, most = runs.idxmin(), int(runs.max())
-        if runs[few] < most:
-            raise BadInputError(
-                f"{path}: {model} has {runs[few]} rows of {few} and {most} of {runs.idxmax()}: the "
-                "table is cut, copy it again"
-            )
-
-
-def _check_sizes(stimuli: pd.DataFrame, folder: Path) -> None:
-    """Refuse tables of people that have other numbers of stimuli than the released ones."""
-    counts = stimuli[~stimuli["stimulus"].map(is_ledge)]["scenario"].value_counts()
-    for scenario in SCENARIOS:
-        released = STIMULI - (LEDGES if scenario == "roll" else 0)
-        if counts.get(scenario, 0) != released:
-            raise BadInputError(
-                f"{folder}: the table of {scenario} has {counts.get(scenario, 0)} stimuli, the "
-                f"released one {released}; it may be cut: copy it again"
-            )
 
 
 def in_paper_order(table: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:
@@ -211,7 +177,6 @@ def _read_runs(results: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     )
     for table, path in ((left, paths[0]), (right, paths[1])):
         refuse_duplicates(table["scenario"] + " / " + table["run"], str(path))
-        _check_whole(table["model"], table["scenario"], path)
     seeds = left["seed"].where(left["seed"].notna(), left["dynamics_seed"])
     if seeds.isna().any():
         row = int(np.flatnonzero(seeds.isna())[0])
@@ -244,7 +209,7 @@ def _read_released(path: Path, columns: Sequence[Column]) -> pd.DataFrame:
     table = check_table(read_csv(path), columns, str(path))
     for name, names in (("model", MODELS), ("readout", READOUT_NAMES), ("training", TRAININGS)):
         if name in table:
-            table[name] = table[name].map({word.lower(): ours for word, ours in names.items()})
+            table[name] = table[name].str.strip().map(names)
     return table.assign(scenario=table["scenario"].replace(OFFICIAL_SCENARIOS))
 
 
