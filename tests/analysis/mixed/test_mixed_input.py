@@ -98,10 +98,10 @@ def test_missing_rows_are_counted_and_said(table: pd.DataFrame) -> None:
 def test_perfect_separation_is_said_and_names_the_effect(table: pd.DataFrame) -> None:
     sure = table["scenario"] == "support"
     quasi = table.assign(correct=np.where(sure, 1, table["correct"]))
-    with pytest.raises(BadInputError, match=r"\[T.support\] cannot be told .perfect separation"):
+    with pytest.raises(BadInputError, match=r"\[T.support\] is not determined .perfect separation"):
         fit_logistic(f"correct ~ scenario + {CROSSED}", quasi)
     complete = table.assign(correct=(table["elements"] > 5).astype(int))
-    with pytest.raises(BadInputError, match="elements cannot be told"):
+    with pytest.raises(BadInputError, match="elements is not determined"):
         fit_logistic(f"correct ~ elements + {CROSSED}", complete)
 
 
