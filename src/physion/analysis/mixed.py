@@ -268,8 +268,8 @@ def _curvature_covariance(model: Any, names: list[str]) -> Array:
     spread = np.sqrt(np.diag(own)) * np.ptp(model.matrices.X, axis=0)
     if not model.converged or spread.max() > UNKNOWN:
         raise BadInputError(
-            f"the effect of {names[int(np.argmax(spread))]} is not determined (perfect separation: it "
-            "predicts all answers of a part of the data?); leave it out or join its levels"
+            f"the effect of {names[int(np.argmax(spread))]} is not determined (perfect separation: "
+            "it predicts all answers of a part of the data?); leave it out or join its levels"
         )
     free, scale, value = model.theta > ZERO, np.linalg.cholesky(own), model.as_function("deviance")
     k, theta = int(free.sum()), np.where(free, model.theta, 0.0)
