@@ -146,6 +146,9 @@ _FILES = """\
 - `study.json`: settings and texts of each version of the study under which sessions ran.
 - `psych-ds/`: the same tables as a Psych-DS dataset.
 
+In CSV files an apostrophe stands before a text that a spreadsheet would take for a formula, because
+it begins with =, +, -, @ or an apostrophe; Parquet files hold the text as it was written.
+
 A row of `trials` is identified by `session`, `phase` and `trial`. To compare them with models:
 
     physion compare PREDICTIONS --responses trials.csv --sessions sessions.csv \\

@@ -103,8 +103,14 @@ NAMES = frozenset({"participant", "session", "scenario", "condition", "stimulus"
 """Text columns whose values are names or hashes; other texts are free, and hardly ever repeat."""
 
 
+FORMULA = r"\A([=+\-@\t\r'])"
+"""Begin of a text that a spreadsheet would take for a formula."""
+
+
 class TableWriter:
     """Writes ``NAME.csv`` (UTF-8, LF line ends) and ``NAME.parquet`` (Zstandard) in a folder.
+
+    In the CSV file an apostrophe stands before a free text that begins like a formula.
 
     Parameters
     ----------
@@ -133,24 +139,31 @@ class TableWriter:
         self.rows = 0
         schema = arrow_schema(columns)
         names = [c.name for c in columns if c.kind != "text" or c.name in NAMES]
+        self._texts = [c.name for c in columns if c.name not in names]
         parquet = pq.ParquetWriter(
             folder / f"{name}.parquet", schema, compression="zstd", compression_level=level,
             use_dictionary=names,
         )  # fmt: skip
-        self._files = [opened.enter_context(parquet)]
+        self._parquet, self._csv = opened.enter_context(parquet), None
         if with_csv:
             file = opened.enter_context((folder / f"{name}.csv").open("wb"))
             file.write(",".join(column.name for column in columns).encode() + b"\n")
             quoting = "none" if len(names) == len(columns) else "needed"
             options = arrow_csv.WriteOptions(include_header=False, quoting_style=quoting)
             csv_file = arrow_csv.CSVWriter(file, schema, write_options=options)
-            self._files.append(opened.enter_context(csv_file))
+            self._csv = opened.enter_context(csv_file)
 
     def write(self, table: pa.Table) -> None:
         """Append rows."""
         self.rows += table.num_rows
-        for file in self._files:
-            file.write_table(table)
+        self._parquet.write_table(table)
+        if self._csv is None:
+            return
+        for name in self._texts:
+            place = table.schema.get_field_index(name)
+            safe = pc.replace_substring_regex(table[name], FORMULA, r"'\1")
+            table = table.set_column(place, table.schema.field(place), safe)
+        self._csv.write_table(table)
 
 
 # --- all tables, in batches of sessions ---
