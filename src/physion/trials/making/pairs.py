@@ -392,6 +392,17 @@ def _teleport(scene: Scene, path: Trajectory, engine: Engine, rng: np.random.Gen
 
 
 def _swap(scene: Scene, path: Trajectory, engine: Engine, rng: np.random.Generator) -> Found:
+    # Bodies first change places at random. Else each would have its usual place, as red has in
+    # Dominoes, and the place alone would tell which world a part of a movie shows.
+    free = _movable(scene)
+    places = [free[number].position for number in rng.permutation(len(free)).tolist()]
+    scene = _shifted(
+        scene,
+        {
+            body.name: tuple(b - a for a, b in zip(body.position, place, strict=True))
+            for body, place in zip(free, places, strict=True)
+        },
+    )
     for one, other in itertools.combinations(_movable(scene), 2):
         step = tuple(b - a for a, b in zip(one.position, other.position, strict=True))
         back = tuple(-part for part in step)
