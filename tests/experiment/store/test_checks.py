@@ -415,7 +415,7 @@ def test_answers_are_exported_with_their_words(asking_store: Store, tmp_path: Pa
                "confidence"]  # fmt: skip
     assert list(table.columns) == ["participant", "session", *columns] and len(table) == 2
     first = table.iloc[0]
-    assert first["strategy"] == OWN_ANSWERS["strategy"]
+    assert first["strategy"] == f"'{OWN_ANSWERS['strategy']}", "no formula for a spreadsheet"
     assert [first[name] for name in columns[1:]] == ["often", True, True, False, 4]
     assert set(table["session"]) <= set(pd.read_csv(out / "sessions.csv")["session"])
     described = json.loads((out / "data_dictionary.json").read_text())["questions"]

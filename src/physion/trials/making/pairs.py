@@ -393,7 +393,7 @@ def _teleport(scene: Scene, path: Trajectory, engine: Engine, rng: np.random.Gen
 
 def _swap(scene: Scene, path: Trajectory, engine: Engine, rng: np.random.Generator) -> Found:
     # Bodies first change places at random. Else each would have its usual place, as red has in
-    # Dominoes, and the place alone would tell which world a part of a movie shows.
+    # Dominoes, and its place would tell which world a part of a movie shows.
     free = _movable(scene)
     places = [free[number].position for number in rng.permutation(len(free)).tolist()]
     scene = _shifted(
