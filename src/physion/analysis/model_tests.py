@@ -201,14 +201,28 @@ def _fitted(
         return MixedTable(name, about, formula, None, str(error))
 
 
-def fits_of_people(people: PeopleResults) -> list[MixedTable]:
+def fits_of_people(
+    people: PeopleResults, progress: Callable[[str, int, int], None] | None = None
+) -> list[MixedTable]:
     """Fit the preregistered models of single answers, response times, and the effect of flags (on
     all complete sessions).
+
+    A logistic model of 15,000 answers takes some ten seconds; ``progress`` learns of each.
     """
+    fits: list[MixedTable] = []
+    count = len(HYPOTHESES) + 4
+
+    def add(fit: MixedTable) -> None:
+        fits.append(fit)
+        if progress is not None:
+            progress("fitting mixed models", len(fits), count)
+
+    if progress is not None:
+        progress("fitting mixed models", 0, count)
     stimuli = with_attributes(people.tables["by_stimulus"], people.tables["attributes"])
     rows = answer_rows(people.kept.test, stimuli)
     scenario = "scenario + " if rows["scenario"].nunique() > 1 else ""
-    fits = [
+    add(
         _fitted(
             "scenarios",
             "Do people differ between scenarios? Log odds of being right, logistic",
@@ -217,21 +231,19 @@ def fits_of_people(people: PeopleResults) -> list[MixedTable]:
             rows,
             "scenario" if scenario else "",
         )
-    ]
+    )
     for key, hypothesis in HYPOTHESES.items():
         fitter = fit_logistic if hypothesis.family == "logistic" else fit_linear
         formula = hypothesis.formula if scenario else hypothesis.formula.replace("scenario + ", "")
         about = f"{key}, preregistered: {hypothesis.about} ({hypothesis.family})"
-        fits.append(_fitted(key.lower(), about, formula, fitter, rows))
-    fits.append(_attributes(people, rows, scenario))
-    fits.append(_response_times(people, scenario))
+        add(_fitted(key.lower(), about, formula, fitter, rows))
+    add(_attributes(people, rows, scenario))
+    add(_response_times(people, scenario))
     flagged = people.tables["flags"].set_index("session")["flagged"]
     whole = people.whole.test
     whole = whole.assign(flagged=whole["session"].map(flagged).astype(float))
     about = "Effect of a session's flag on being right, all complete sessions, logistic"
-    fits.append(
-        _fitted("flagged", about, f"correct ~ flagged + {scenario}{CROSSED}", fit_logistic, whole)
-    )
+    add(_fitted("flagged", about, f"correct ~ flagged + {scenario}{CROSSED}", fit_logistic, whole))
     return fits
 
 

@@ -94,29 +94,31 @@ def main(options: Options) -> int:
 
 
 def _compare(options: Options) -> int:
-    from physion.cli.output import print_line, print_scores, print_warnings, text_table
+    from physion.cli.output import Stages, print_line, print_scores, print_warnings, text_table
     from physion.report.compare import compare, population_tables
     from physion.report.html import movies_of
 
     movies = {} if options.dataset is None else movies_of(options.dataset)
-    result = compare(
-        options.predictions,
-        humans=options.humans,
-        responses=options.responses,
-        labels=options.labels,
-        sessions=options.sessions,
-        rules=options.rules,
-        expected=options.expected,
-        simulated=options.simulated,
-        where=options.where,
-        attributes=options.attributes,
-        groups=options.groups,
-        population=options.population,
-        exclude=options.exclude or (),
-        rollout_errors=options.rollout_errors,
-        resamples=options.resamples,
-        seed=options.seed,
-    )
+    with Stages() as stages:
+        result = compare(
+            options.predictions,
+            humans=options.humans,
+            responses=options.responses,
+            labels=options.labels,
+            sessions=options.sessions,
+            rules=options.rules,
+            expected=options.expected,
+            simulated=options.simulated,
+            where=options.where,
+            attributes=options.attributes,
+            groups=options.groups,
+            population=options.population,
+            exclude=options.exclude or (),
+            rollout_errors=options.rollout_errors,
+            resamples=options.resamples,
+            seed=options.seed,
+            progress=stages,
+        )
     page = result.report(options.out or Path("runs/report"), movies=movies)
     print_warnings(result.warnings)
     if options.json:

@@ -60,6 +60,7 @@ from physion.analysis.tables import (
     read_labels,
     read_stimulus_list,
 )
+from physion.compute.tasks import Progress
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.names import SCENARIOS
 from physion.core.tables import read_csv, read_table, refuse_duplicates, require_columns
@@ -349,6 +350,7 @@ def compare(
     rollout_errors: Sequence[Path] = (),
     resamples: int = 1000,
     seed: int = 0,
+    progress: Progress | None = None,
 ) -> CompareResult:
     """Compare models with people: accuracy, correlation, kappa, each with its interval.
 
@@ -405,6 +407,8 @@ def compare(
         Files of ``physion evaluate --option rollout_errors=true``, for a figure of them.
     resamples, seed
         Draws of people for their accuracy and agreement, of halves, and of permutations.
+    progress
+        Shows the progress of the mixed models of people, which take minutes for a large study.
 
     Returns
     -------
@@ -455,7 +459,7 @@ def compare(
         if rows is None:
             check_excluded_names(excluded, people.stimuli)
             methods |= {"Intervals": _describe_intervals(draws)}
-            fits = tuple(fits_of_people(people))
+            fits = tuple(fits_of_people(people, progress))
             page = PeopleReport(people, fits, methods)
             return CompareResult(_scores_of_people(people), people, page)
         results = all_results(rows, people=people, **asked, **settings)

@@ -50,7 +50,10 @@ def timed_study(people: int, stimuli: int) -> PeopleResults:
 
 @pytest.fixture(scope="module")
 def fits() -> dict[str, MixedTable]:
-    return {one.name: one for one in fits_of_people(timed_study(30, 60))}
+    seen: list[tuple[int, int]] = []
+    fits = fits_of_people(timed_study(30, 60), lambda _, done, total: seen.append((done, total)))
+    assert seen == [(done, len(fits)) for done in range(len(fits) + 1)]
+    return {one.name: one for one in fits}
 
 
 @pytest.mark.nightly
