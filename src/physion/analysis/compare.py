@@ -6,7 +6,7 @@ with single participants (`compare_everywhere`), tests and mixed models.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -172,6 +172,7 @@ def all_results(
     exclude: Iterable[str] = (),
     exclude_ledge: bool = True,
     bootstrap: Bootstrap | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
 ) -> ComparisonResults:
     """Compare models with people, and compute all that a report shows.
 
@@ -236,7 +237,7 @@ def all_results(
         whole = compare_scores(predictions, everybody, known, **settings)
         predicting = main.stimuli[main.stimuli["readout"] != DETECTION]
         with_people = compare_everywhere(predicting, test, draws)
-        about_people = fits_of_people(people)
+        about_people = fits_of_people(people, progress)
     pooled = pool_comparison(main)
     several = len(main.names) > 1
     return ComparisonResults(

@@ -182,6 +182,8 @@ def _fit(formula: str, data: pd.DataFrame, level: float, logistic: bool) -> Mixe
     found = _warnings(random, model, len(data) - len(rows), logistic)
     if not logistic:
         random.loc[len(random)] = ["residual", len(rows), model.sigma]
+    if not (np.isfinite(covariance).all() and (np.diag(covariance) > 0).all()):
+        raise BadInputError(UNDETERMINED)
     return MixedFit(
         formula=formula,
         table=table,
@@ -197,6 +199,9 @@ def _fit(formula: str, data: pd.DataFrame, level: float, logistic: bool) -> Mixe
         level=level,
         _linear=None if logistic else model,
     )
+
+
+UNDETERMINED = "the data do not determine the effects: leave one out, or rescale large numbers"
 
 
 def _read(formula: str, data: pd.DataFrame) -> tuple[Any, pd.DataFrame]:
@@ -216,6 +221,7 @@ def _read(formula: str, data: pd.DataFrame) -> tuple[Any, pd.DataFrame]:
         raise BadInputError(f"{formula!r} needs random intercepts, (1|group), and takes only these")
     if not parsed.fixed.has_intercept:
         raise BadInputError(f"{formula!r} has no intercept: leave out the 0")
+    _refuse_terms(formula, parsed)
     rows = data[used].dropna().reset_index(drop=True)
     if rows.empty:
         raise BadInputError(f"no row of the table has all of {', '.join(used)}")
@@ -242,6 +248,25 @@ def _read(formula: str, data: pd.DataFrame) -> tuple[Any, pd.DataFrame]:
     return parsed, rows
 
 
+def _refuse_terms(formula: str, parsed: Any) -> None:
+    """Refuse functions of columns, and interactions without their main effects: lme4 would fit
+    another model.
+    """
+    known: set[frozenset[str]] = set()
+    for term in parsed.fixed.terms:
+        if type(term).__name__ not in ("VariableTerm", "InteractionTerm", "InterceptTerm"):
+            raise BadInputError(
+                f"{formula!r} cannot be read: functions of columns are not taken, add a column"
+            )
+        known.add(frozenset(getattr(term, "variables", None) or [getattr(term, "name", "")]))
+    for parts in known:
+        if any(parts - {name} not in known for name in parts if len(parts) > 1):
+            raise BadInputError(
+                f"{formula!r} has an interaction without its parts: write "
+                f"{' * '.join(sorted(parts))}"
+            )
+
+
 def _terms(parsed: Any, levels: Mapping[str, list[Any]]) -> dict[str, list[str]]:
     """Return the names of the columns of each term; ``levels``: of the categories."""
 
@@ -266,11 +291,15 @@ def _curvature_covariance(model: Any, names: list[str]) -> Array:
 
     own = model.vcov()
     spread = np.sqrt(np.diag(own)) * np.ptp(model.matrices.X, axis=0)
-    if not model.converged or spread.max() > UNKNOWN:
+    if not np.isfinite(own).all() or (np.linalg.eigvalsh(own) <= 0).any():
+        raise BadInputError(UNDETERMINED)
+    if spread.max() > UNKNOWN:
         raise BadInputError(
             f"the effect of {names[int(np.argmax(spread))]} is not determined (perfect separation: "
             "it predicts all answers of a part of the data?); leave it out or join its levels"
         )
+    if not model.converged:
+        raise BadInputError(f"the search did not converge: {UNDETERMINED}")
     free, scale, value = model.theta > ZERO, np.linalg.cholesky(own), model.as_function("deviance")
     k, theta = int(free.sum()), np.where(free, model.theta, 0.0)
 
@@ -281,7 +310,7 @@ def _curvature_covariance(model: Any, names: list[str]) -> Array:
     at = np.concatenate([model.theta[free], np.zeros(len(names))])
     steps = 0.01 * np.concatenate([np.maximum(at[:k], 0.1), np.full(len(names), 3.0)])
     curvature = approx_hess3(at, deviance, epsilon=steps) / 2
-    if not np.isfinite(curvature).all():
+    if not np.isfinite(curvature).all() or (np.linalg.eigvalsh(curvature) <= 0).any():
         raise BadInputError("the likelihood has no maximum: do all levels of a group answer alike?")
     block = np.linalg.inv(curvature)[k:, k:]
     return np.asarray(scale @ block @ scale.T, dtype=np.float64)

@@ -242,7 +242,10 @@ def fits_of_people(
     flagged = people.tables["flags"].set_index("session")["flagged"]
     whole = people.whole.test
     whole = whole.assign(flagged=whole["session"].map(flagged).astype(float))
-    about = "Effect of a session's flag on being right, all complete sessions, logistic"
+    about = (
+        "Effect of a session's flag on being right, all complete sessions, logistic; low accuracy "
+        "is one of the flags, so a part of the effect holds by construction"
+    )
     add(_fitted("flagged", about, f"correct ~ flagged + {scenario}{CROSSED}", fit_logistic, whole))
     return fits
 

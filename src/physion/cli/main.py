@@ -78,7 +78,7 @@ def _run_verb(args: list[str]) -> int:
         describe(module.__doc__, args[:taken]),
     )
     if taken == 2:
-        module_of(args[0]).require_extra(args[1])
+        module_of(args[0]).require_extra()
     return int(module.main(options))
 
 

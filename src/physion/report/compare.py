@@ -462,7 +462,7 @@ def compare(
             fits = tuple(fits_of_people(people, progress))
             page = PeopleReport(people, fits, methods)
             return CompareResult(_scores_of_people(people), people, page)
-        results = all_results(rows, people=people, **asked, **settings)
+        results = all_results(rows, people=people, progress=progress, **asked, **settings)
     else:
         assert rows is not None
         about = (sessions, expected, attributes)

@@ -55,7 +55,7 @@ def main(options: Options) -> int:
     return 2
 
 
-def require_extra(sub_verb: str) -> None:
-    """Raise `MissingExtraError` unless the extra ``experiment``, if needed, is installed."""
-    if sub_verb != "power" and any(find_spec(name) is None for name in NEEDED):
+def require_extra() -> None:
+    """Raise `MissingExtraError` unless the extra ``experiment`` is installed."""
+    if any(find_spec(name) is None for name in NEEDED):
         raise MissingExtraError("the experiment", "experiment")
