@@ -14,7 +14,7 @@ from physion.analysis.model_tests import PooledStimuli, paired_tests
 from physion.analysis.rollout_errors import CONSTANT_VELOCITY, rollout_error_table
 from physion.analysis.sample import Resampled, Sample
 from physion.analysis.scores import score_table
-from physion.analysis.statistics.agreement import correlate_resampled
+from physion.analysis.statistics.agreement import correlate_rows
 from physion.analysis.tables import MEAN, POOLED
 from physion.analysis.with_participants import sample_of_models, sampling_variances
 from physion.core.seeds import generator
@@ -105,11 +105,12 @@ def _differences(coverage: Coverage, size: Size, study: Study) -> None:
 def _easy(coverage: Coverage, size: Size, study: Study) -> None:
     easy = study.right >= 2 / 3
     p_yes, without = study.p_yes[easy], 1 - np.eye(int(easy.sum()))
-    y, ones = np.broadcast_to(p_yes, without.shape), np.ones((1, len(p_yes)))
+    y = np.broadcast_to(p_yes, without.shape)
     for k, name in enumerate(MODELS):
         x = study.p_contact[k : k + 1, easy]
-        r = float(correlate_resampled(x, p_yes[None], ones)[0, 0])
-        variance = jackknife(correlate_resampled(x, y, without)).of(0)
+        r = float(correlate_rows(x, p_yes[None])[0])
+        left = correlate_rows(np.where(without > 0, x, np.nan), y)
+        variance = jackknife(left[:, None]).of(0)
         coverage.add(f"{name}: r, easy stimuli", "stimuli", size, r,
                      *variance.interval(r, 0.95, "correlation"))  # fmt: skip
 

@@ -59,9 +59,17 @@ def lance(folder: Path) -> dict[str, Any]:
     from stable_worldmodel.data.formats.lance import LanceDataset
 
     from physion.cli.main import main as physion
+    from physion.trials.dataset import Dataset
 
     out = folder.parent / "lance"
     arguments = ["export", str(folder), str(out), "--layout", "lance", "--json"]
+    file = Dataset(folder).file("drop_2", "movie")
+    assert file is not None
+    movie = file.path
+    kept = movie.read_bytes()
+    movie.write_bytes(kept[:100])
+    broken = [physion(arguments), len(list(out.glob("*.lance")))]
+    movie.write_bytes(kept)
     again = [physion(arguments), physion(arguments)]
     known = data.load_dataset(str(out / "trials.lance"), num_steps=4)
     assert isinstance(known, LanceDataset)
@@ -69,6 +77,7 @@ def lance(folder: Path) -> dict[str, Any]:
     clips = [known[place] for place in (0, 57 + 6, len(known) - 1)]
     return {
         "again": again,
+        "broken": broken,
         "lengths": [int(length) for length in known.lengths],
         "clips": len(known),
         "names": sorted(known.column_names),

@@ -1,7 +1,7 @@
 """Mixed models with crossed random intercepts: `fit_linear` and `fit_logistic`.
 
 The package mixedlm fits them, as lme4 does in R. This module checks the input and adds what mixedlm
-has not: standard errors of logistic models from the curvature of the likelihood, as lme4 and
+lacks: standard errors of logistic models from the curvature of the likelihood, as lme4 and
 glmmTMB have them (mixedlm takes the variances as known, for errors up to 2 % too small), and
 Satterthwaite's degrees of freedom of contrasts and joint tests, as in lmerTest.
 
@@ -12,6 +12,7 @@ quoted with backticks.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -64,7 +65,7 @@ class MixedFit:
     - ``log_likelihood``: restricted for linear models, so that it compares only models of the same
       fixed effects;
     - ``rows``: used; ``left_out``: left out for a missing value;
-    - ``singular``: a variance was estimated as zero; ``converged``: the optimum is one;
+    - ``singular``: a variance was estimated as zero; ``converged``: the search ended at an optimum;
     - ``warnings``: in words, what a reader should know;
     - ``covariance``: of the fixed effects, in the order of the table; ``terms``: rows of the table
       by term of the formula.
@@ -154,18 +155,25 @@ def _fit(formula: str, data: pd.DataFrame, level: float, logistic: bool) -> Mixe
     checks = {f"check_{name}": action for name, action in checks.items()}
     model: Any
     try:
-        if logistic:
-            control = mixedlm.GlmerControl(**checks, pirls_maxiter=500)
-            model = mixedlm.glmer(parsed, rows, mixedlm.families.Binomial(), control=control)
-        else:
-            model = mixedlm.lmer(parsed, rows, control=mixedlm.LmerControl(**checks))
+        # What mixedlm warns of is judged below: rank, convergence, finite covariances.
+        with warnings.catch_warnings(action="ignore"):
+            if logistic:
+                control = mixedlm.GlmerControl(**checks, pirls_maxiter=500)
+                model = mixedlm.glmer(parsed, rows, mixedlm.families.Binomial(), control=control)
+            else:
+                model = mixedlm.lmer(parsed, rows, control=mixedlm.LmerControl(**checks))
     except (ModelCheckError, RuntimeError, ValueError) as error:
-        raise BadInputError(f"{formula!r} cannot be fitted: {error}") from error
+        hint = ": a column is constant or follows from others, leave it out"
+        hint = hint if "rank deficient" in str(error) else ""
+        raise BadInputError(f"{formula!r} cannot be fitted: {error}{hint}") from error
     if not logistic and model.sigma < 1e-8 * y.std():
         raise BadInputError(f"the effects explain {parsed.response!r} exactly: nothing to test")
     terms = _terms(parsed, model.matrices.category_levels)
     names = [name for columns in terms.values() for name in columns]
-    covariance = _curvature_covariance(model, names) if logistic else model.vcov()
+    with warnings.catch_warnings(action="ignore"):
+        covariance = _curvature_covariance(model, names) if logistic else model.vcov()
+    if not (np.isfinite(covariance).all() and (np.diag(covariance) > 0).all()):
+        raise BadInputError(UNDETERMINED)
     starts = np.cumsum([0, *map(len, terms.values())])
     places = zip(terms, starts[:-1], starts[1:], strict=True)
     table = _estimates(
@@ -182,8 +190,6 @@ def _fit(formula: str, data: pd.DataFrame, level: float, logistic: bool) -> Mixe
     found = _warnings(random, model, len(data) - len(rows), logistic)
     if not logistic:
         random.loc[len(random)] = ["residual", len(rows), model.sigma]
-    if not (np.isfinite(covariance).all() and (np.diag(covariance) > 0).all()):
-        raise BadInputError(UNDETERMINED)
     return MixedFit(
         formula=formula,
         table=table,

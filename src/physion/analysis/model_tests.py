@@ -207,7 +207,7 @@ def fits_of_people(
     """Fit the preregistered models of single answers, response times, and the effect of flags (on
     all complete sessions).
 
-    A logistic model of 15,000 answers takes some ten seconds; ``progress`` learns of each.
+    A logistic model of 15,000 answers takes about 14 s; ``progress`` is called after each model.
     """
     fits: list[MixedTable] = []
     count = len(HYPOTHESES) + 4

@@ -41,7 +41,7 @@ class Options:
     """Exclusion rules: preregistered, preregistered-only (without what the experiment's server
     found) or official-code; if not given, as in the exported study, else preregistered."""
     expected: Path | None = None
-    """Table of the stimuli (stimulus) that each session, or each scenario, must have; if not given,
+    """Table of the test stimuli of each scenario (stimulus, scenario); if not given,
     expected.csv next to the responses, else the stimuli that half of the scenario's sessions
     answered."""
     simulated: bool = False

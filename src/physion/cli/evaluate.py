@@ -162,7 +162,7 @@ def _print(done: Evaluation, options: Options) -> None:
             values["scores"] = records(done.scores)
             changes = whatif_scores(done.predictions)
             values["whatif"] = records(changes)
-            values["causes"] = records(causes(done.predictions))
+            values["causes"] = records(_write_causes(done.predictions, options.out))
         print(json_module.dumps(values))
         return
     if options.dry_run:
@@ -197,10 +197,7 @@ def with_errors(scores: pd.DataFrame, name: str) -> list[str]:
 
 
 def _print_whatif(predictions: pd.DataFrame, out: Path) -> None:
-    """Print how predictions change with the scene, if the dataset holds variants of trials.
-
-    Which removals change the outcome is written into ``out``.
-    """
+    """Print how predictions change with the scene, if the dataset holds variants of trials."""
     scores = whatif_scores(predictions)
     if scores.empty:
         return
@@ -208,10 +205,17 @@ def _print_whatif(predictions: pd.DataFrame, out: Path) -> None:
     for name in MEASURES:
         shown[name] = with_errors(scores, name)
     print_line(text_table(shown, "One thing changed: mean and standard error over trials"))
+    removals = _write_causes(predictions, out)
+    if len(removals):
+        print_line(f"{causes_line(removals)} ({out / 'causes.csv'})")
+
+
+def _write_causes(predictions: pd.DataFrame, out: Path) -> pd.DataFrame:
+    """Return which removals change the outcome; write them into ``out`` if there are any."""
     removals = causes(predictions)
     if len(removals):
         write_text(out / "causes.csv", removals.to_csv(index=False))
-        print_line(f"{causes_line(removals)} ({out / 'causes.csv'})")
+    return removals
 
 
 def _print_surprise(scores: pd.DataFrame, failed: Mapping[str, str], options: Options) -> None:

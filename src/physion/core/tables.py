@@ -20,6 +20,9 @@ import pandas as pd
 from physion.core.errors import BadInputError
 from physion.core.files import check_digest, digest_path
 
+FORMULA = r"\A([=+\-@\t\r\n'])"
+"""Begin of a text that a spreadsheet would take for a formula: an apostrophe is put before it."""
+
 
 def read_csv(path: Path, columns: Iterable[str] = ()) -> pd.DataFrame:
     """Read the CSV file at ``path`` as text; it must have ``columns`` and at least one row.

@@ -7,7 +7,7 @@ a result can write its own report.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -171,6 +171,10 @@ class CompareResult:
         BadInputError
             Before anything is written, if ``folder`` is a file or a movie cannot be read.
         """
+        known = [one.name for one in fields(ReportInputs)]
+        for name in page:
+            if name not in known:
+                raise UnknownNameError("field of the report", name, known)
         methods = {**self.inputs.methods, **page.pop("methods", {})}
         if isinstance(self.inputs, PeopleReport):
             for name in set(page) - {"movies", "title"}:
@@ -379,7 +383,7 @@ def compare(
         experiment's server found) or ``official-code``. None: those in ``study.json`` next to the
         responses, else ``preregistered``.
     expected
-        Stimuli that a session must have, by scenario or by session, or their table. None:
+        Stimuli that a session must have, by scenario, or their table. None:
         ``expected.csv`` next to the responses, else the stimuli that half of the scenario's
         sessions answered.
     simulated
@@ -762,11 +766,8 @@ def _describe_people(responses: Sequence[Path], people: PeopleResults) -> str:
 def _describe_expected(people: PeopleResults, given: bool) -> str:
     """Describe how many stimuli a session must have, and how many sessions lack some."""
     flags = people.tables["flags"]
-    counts = flags.groupby("scenario")["expected"].agg(["min", "max"])
-    each = ", ".join(
-        f"{name} {row['min']}" + (f" to {row['max']}" if row["max"] > row["min"] else "")
-        for name, row in counts.iterrows()
-    )
+    counts = flags.groupby("scenario")["expected"].first()
+    each = ", ".join(f"{name} {count}" for name, count in counts.items())
     by = (
         "by the study's list"
         if given

@@ -73,6 +73,7 @@ def test_stable_worldmodel_reads_what_was_exported(tmp_path: Path) -> None:
     python = find_program(variable="PHYSION_STABLE_WORLDMODEL", what="stable-worldmodel")
     source = make_dataset(tmp_path / "trials")
     found = read_back(python, "lance", source, tmp_path / "home")
+    assert found["broken"] == [2, 0], "a damaged movie is refused, and leaves no table"
     assert found["again"] == [0, 2], "tables that are there are not replaced"
     assert found["lengths"] == [FRAMES] * 4 and found["clips"] == 4 * (FRAMES - 3)
     assert found["names"] == ["action", "done", "pixels", "state", "success"]

@@ -1,4 +1,4 @@
-"""What moves the answers of people: biases, practice, background, difficulty, the hypotheses.
+"""What moves the answers of people: biases, background, difficulty, the hypotheses.
 
 - response bias and side bias, accuracy by background;
 - difficulty of stimuli: below chance, hard, at chance, easy;

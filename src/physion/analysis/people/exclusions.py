@@ -63,7 +63,7 @@ def check_expected(responses: Responses, expected: Expected | None) -> None:
     if expected is not None and not set(responses.sessions["scenario"]) & set(expected):
         raise BadInputError(
             f"the list of expected stimuli names {next(iter(expected), 'nothing')!r}, which is "
-            "no scenario of the responses"
+            "not a scenario of the responses"
         )
 
 

@@ -198,8 +198,8 @@ def analyse_people(
     rules
         Exclusion rules.
     expected
-        Test stimuli that a session must have, by scenario or by session; by default those that at
-        least half of the scenario's sessions answered. Answers to other stimuli are dropped.
+        Test stimuli that a session must have, by scenario; by default those that at least half of
+        the scenario's sessions answered. Answers to other stimuli are dropped.
     attributes
         Attributes of one's own stimuli, from `attributes_from_table`; attributes of other stimuli
         come from official names.

@@ -147,22 +147,6 @@ def correlate_rows(x: npt.ArrayLike, y: npt.ArrayLike) -> Array:
     )  # fmt: skip
 
 
-def correlate_resampled(x: npt.ArrayLike, y: npt.ArrayLike, weights: npt.ArrayLike) -> Array:
-    """Return r of each row of ``x`` (m, stimuli) with each row of ``y`` (resamples, stimuli).
-
-    ``weights`` (resamples, stimuli) is how often a stimulus is drawn. Shape (resamples, m). Gaps
-    (NaN) are left out pair by pair.
-    """
-    a, b = np.asarray(x, dtype=np.float64) - 0.5, np.asarray(y, dtype=np.float64) - 0.5
-    has_a, has_b = np.isfinite(a).astype(np.float64), np.isfinite(b)
-    a, b = np.where(has_a > 0, a, 0.0), np.where(has_b, b, 0.0)
-    w = np.where(has_b, np.asarray(weights, dtype=np.float64), 0.0)
-    return correlation_from_sums(
-        w @ has_a.T, w @ a.T, (w * b) @ has_a.T,
-        w @ (a * a).T, (w * b * b) @ has_a.T, (w * b) @ a.T,
-    )  # fmt: skip
-
-
 def correlation_from_sums(
     n: npt.ArrayLike,
     x: npt.ArrayLike,

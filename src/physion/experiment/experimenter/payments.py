@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -12,6 +13,7 @@ from statistics import median
 
 from sqlalchemy import Engine, func, select
 
+from physion.core.tables import FORMULA
 from physion.experiment.experimenter.progress import SessionLine
 from physion.experiment.store.database import RAW_IDS
 from physion.experiment.study.identity import Secrets
@@ -132,7 +134,5 @@ def payment_csv(payments: Sequence[Payment]) -> bytes:
             payment.code or "",
             json.dumps(dict(payment.recruiter), ensure_ascii=False) if payment.recruiter else "",
         )
-        # An apostrophe before what a spreadsheet would take for a formula.
-        risky = ("=", "+", "-", "@", "\t", "\r", "'")
-        writer.writerow([f"'{text}" if text.startswith(risky) else text for text in texts])
+        writer.writerow([re.sub(FORMULA, r"'\1", text) for text in texts])
     return lines.getvalue().encode()

@@ -147,7 +147,8 @@ _FILES = """\
 - `psych-ds/`: the same tables as a Psych-DS dataset.
 
 In CSV files an apostrophe stands before a text that a spreadsheet would take for a formula, because
-it begins with =, +, -, @ or an apostrophe; Parquet files hold the text as it was written.
+it begins with =, +, -, @, a tab, a line end or an apostrophe. Parquet files hold the text as it was
+written.
 
 A row of `trials` is identified by `session`, `phase` and `trial`. To compare them with models:
 

@@ -41,7 +41,7 @@ from sqlalchemy import Connection, Engine, select
 from physion.analysis.people.responses import SESSION_COLUMNS, TRIAL_COLUMNS
 from physion.core.errors import BadInputError
 from physion.core.files import new_folder
-from physion.core.tables import Column, data_dictionary
+from physion.core.tables import FORMULA, Column, data_dictionary
 from physion.experiment.export.descriptions import readme, write_psych_ds
 from physion.experiment.export.tables import (
     ATTENTION_COLUMNS,
@@ -101,10 +101,6 @@ def _refuse_others(out: Path) -> None:
 
 NAMES = frozenset({"participant", "session", "scenario", "condition", "stimulus", "kind"})
 """Text columns whose values are names or hashes; other texts are free, and hardly ever repeat."""
-
-
-FORMULA = r"\A([=+\-@\t\r'])"
-"""Begin of a text that a spreadsheet would take for a formula."""
 
 
 class TableWriter:

@@ -28,7 +28,7 @@ from PIL import Image
 
 from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError, MissingExtraError
-from physion.core.files import folder_for_writing
+from physion.core.files import folder_for_writing, new_folder
 from physion.trials.dataset import Dataset
 from physion.trials.share.card import check_readme, write_readme
 from physion.trials.share.lerobot import ACTION, NAMES, actions_of, labelled, states_of
@@ -59,7 +59,8 @@ def export_lance(
     Raises
     ------
     BadInputError
-        If no trial is chosen, one has no label or no movie, or the tables are there already.
+        If no trial is chosen, one has no label or no movie, its movie has another number of frames
+        than its motion, or the tables are there already. No table is written then.
     MissingExtraError
         If pylance is not installed.
     """
@@ -80,6 +81,15 @@ def export_lance(
             | {name: pa.list_(pa.float32(), size) for name, size in sizes.items()}
         )
         rows: list[dict[str, Any]] = []
+        wrong: list[BadInputError] = []
+
+        def episodes() -> Iterator[pa.RecordBatch]:
+            # Lance would report an error of its reader as one of its own.
+            try:
+                yield from batches()
+            except BadInputError as error:
+                wrong.append(error)
+                raise
 
         def batches() -> Iterator[pa.RecordBatch]:
             for number, name in enumerate(tracked(names, "episodes", len(names), progress)):
@@ -90,15 +100,30 @@ def export_lance(
                 rows.append({"episode_idx": number, **row})
                 yield pa.record_batch([pa.array(columns[f.name], f.type) for f in schema], schema)
 
-        lance.write_dataset(
-            pa.RecordBatchReader.from_batches(schema, batches()), out / TABLE, schema=schema
-        )
+        reader = pa.RecordBatchReader.from_batches(schema, episodes())
+        with new_folder(out / TABLE) as part:
+            try:
+                lance.write_dataset(reader, part / "table", schema=schema)
+            except Exception:
+                if wrong:
+                    raise wrong[0] from None
+                raise
+            _lift(part)
         table = pa.Table.from_pylist(rows)
         index = table.schema.get_field_index("episode_idx")
         table = table.set_column(index, "episode_idx", table["episode_idx"].cast(pa.int32()))
-        lance.write_dataset(table, out / EPISODES)
+        with new_folder(out / EPISODES) as part:
+            lance.write_dataset(table, part / "table")
+            _lift(part)
         write_readme(out, TITLE, README, dataset.index.set_index("trial").loc[names, "engine"])
     return [out / TABLE, out / EPISODES]
+
+
+def _lift(folder: Path) -> None:
+    """Move what is in the sub-folder ``table``, which Lance makes itself, into ``folder``."""
+    for path in (folder / "table").iterdir():
+        path.rename(folder / path.name)
+    (folder / "table").rmdir()
 
 
 def _episode(dataset: Dataset, name: str, slots: int) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -109,10 +134,12 @@ def _episode(dataset: Dataset, name: str, slots: int) -> tuple[dict[str, Any], d
     labels, meta = trial.known_labels(), trial.metadata
     states = states_of(trial.scene, trial.trajectory, slots)
     frames = len(states)
+    if len(pictures) != frames:
+        raise BadInputError(f"trial {name!r}: the movie has {len(pictures)} frames, not {frames}")
     first = frames if labels.first_frame is None else labels.first_frame
     place = np.arange(frames)[:, None]
     columns = {
-        "pixels": [_jpeg(picture) for picture in pictures[:frames]],
+        "pixels": [_jpeg(picture) for picture in pictures],
         "state": list(states),
         "action": list(actions_of(trial.scene, trial.trajectory)),
         "success": list((place >= first).astype(np.float32)),
