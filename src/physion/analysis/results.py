@@ -38,7 +38,7 @@ SEEN = ("frames", "benchmark", "check", "fit_on")
 
 GIVEN = {
     "rgb": "pixels",
-    "ids": "objects of pixels",
+    "ids": "true masks",
     "state": "true state",
     "outcomes": "outcome",
 }

@@ -25,7 +25,7 @@ ZONE = ["zone_low", "zone_high", "zone_kappa_low", "zone_kappa_high"]
 GROUPS = {
     "people": "people",
     "pixels": "models from pixels",
-    "state": "models from the true state",
+    "state": "models from true states or masks",
     "unknown": "models, inputs not stated",
     "baseline": "baselines",
 }
@@ -100,7 +100,7 @@ def _kind(group: str, given: str) -> str:
         return group
     if not given:
         return "unknown"
-    return "state" if "state" in given else "pixels"
+    return "state" if "state" in given or "masks" in given else "pixels"
 
 
 def _known(values: Any) -> list[float]:
