@@ -1,6 +1,7 @@
 """Check a model, and the page of a check: how much predictions moved when trials were changed.
 
-`physion.readout.check` does the work; the page stands here, since `readout` may not import `report`.
+`physion.readout.check` does the work.
+The page stands here, since `readout` may not import `report`.
 """
 
 from __future__ import annotations
