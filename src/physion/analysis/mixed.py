@@ -333,7 +333,10 @@ def _satterthwaite(model: Any, contrasts: Array) -> Array:
     turn = np.vstack([contrasts, null_space(contrasts).T])
     matrices = replace(model.matrices, X=model.matrices.X @ np.linalg.inv(turn))
     turned = replace(model, matrices=matrices, beta=turn @ model.beta)
-    return np.asarray(satterthwaite_df(turned).df[: len(contrasts)], dtype=np.float64)
+    # At a boundary fit it solves with the variance that is zero, and warns.
+    with warnings.catch_warnings(action="ignore"):
+        found = satterthwaite_df(turned).df[: len(contrasts)]
+    return np.asarray(found, dtype=np.float64)
 
 
 def _combine(df: Array) -> float:
