@@ -1,9 +1,14 @@
-"""Entering: refused visitors and devices, recruiters, previews, computers of several people."""
+"""Entering and ending: refusals, recruiters, several people; declining, stopping, the result."""
 
 from __future__ import annotations
 
+import json
+import sqlite3
+import time
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
+from urllib.parse import parse_qs
 
 import pytest
 import sqlalchemy as sa
@@ -13,17 +18,33 @@ from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.settings import EarlyEnd, Recruitment
 from physion.experiment.study.study import Study
-from support.experiment.browser import Visit, rows_of, served
+from support.experiment.browser import (
+    FAST,
+    MTURK,
+    Visit,
+    answers_to_test,
+    rows_of,
+    served,
+    signed_query,
+)
 
 pytestmark = pytest.mark.slow
+
+
 SMALL = {"width": 900, "height": 560}
+
+
 PHONE = {
     "viewport": {"width": 1100, "height": 700},
     "screen": {"width": 1100, "height": 700},
     "has_touch": True,
     "is_mobile": True,
 }
+
+
 TABLET = {"viewport": SMALL, "screen": SMALL, "has_touch": True}
+
+
 NEXT = "Another person takes part on this computer"
 
 
@@ -275,3 +296,307 @@ def test_the_next_person_at_this_computer(chromium: Any, site: tuple[Study, str]
         visit.page.get_by_text("You have already taken part").wait_for()
         visit.page.get_by_text(NEXT).click()
         visit.heading("Taking part in this study")
+
+
+# --- the end of a session -------------------------------------------------------------------------
+
+
+SCREEN = """
+Object.defineProperty(screen, "width", {value: 1280});
+Object.defineProperty(screen, "height", {value: 800});
+"""
+
+
+"""What Playwright tells pages of the screen does not reach frames of other sites."""
+
+
+COUNT_PLAYS = """
+window.plays = 0;
+const original = HTMLVideoElement.prototype.play;
+HTMLVideoElement.prototype.play = function () { window.plays += 1; return original.call(this); };
+"""
+
+
+@pytest.fixture(scope="module")
+def strict(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Study, str]]:
+    """A study whose sessions are implausible unless they take an hour; declining has a code."""
+    rules = replace(FAST, reading_s=3600.0)
+    declined = EarlyEnd("NOCONSENT", "no-consent", "https://lab.example/declined")
+    folder = tmp_path_factory.mktemp("study")
+    with served(folder, test=2, plausibility=rules, declined=declined) as (study, server):
+        yield study, server.url
+
+
+def count_rows(study: Study) -> dict[str, int]:
+    """Return the number of rows in those tables that know of persons."""
+    with sqlite3.connect(study.folder / "responses.sqlite") as database:
+        return {
+            name: database.execute(f"SELECT count(*) FROM {name}").fetchone()[0]
+            for name in ("sessions", "raw_ids", "events", "participants")
+        }
+
+
+def decline(visit: Visit) -> None:
+    visit.page.get_by_text("I do not want to take part").click()
+    visit.heading("Do you really not want to take part?")
+    visit.page.get_by_role("button", name="I do not take part").click()
+    visit.heading("You do not take part")
+
+
+def test_declining_is_asked_once_more_and_leaves_nothing(
+    chromium: Any, strict: tuple[Study, str]
+) -> None:
+    study, url = strict
+    before = count_rows(study)
+    with Visit(chromium, url, "decline") as visit:
+        visit.go("?participant=Ada")
+        visit.page.get_by_text("I do not want to take part").click()
+        visit.page.get_by_role("button", name="Back to the consent form").click()
+        visit.page.locator("dialog").wait_for(state="detached")
+        assert visit.heading() == "Taking part in this study"
+        decline(visit)
+        visit.picture("declined")
+        assert visit.page.inner_text("#code") == "no-consent"
+        assert visit.page.get_attribute("#go", "href") == "https://lab.example/declined"
+        assert count_rows(study) == before
+        visit.page.reload()
+        visit.heading("Taking part in this study")
+        decline(visit)
+        visit.page.get_by_text("Take part after all").click()
+        visit.heading("Taking part in this study")
+        assert "participant=Ada" in visit.page.url
+        visit.main_button().click()
+        visit.heading("What you will do")
+        assert "participant" not in visit.page.url
+        visit.page.get_by_text("Stop taking part").click()
+        visit.page.get_by_text("Stop for good").click()
+        visit.heading("You have stopped")
+        visit.page.get_by_text("please return the task there").wait_for()
+        assert visit.page.get_by_text("Take part after all").count() == 0
+        assert visit.unexpected() == []
+    session, _, _ = rows_of(study, "Ada")
+    assert (
+        session.withdrawn_at is not None and count_rows(study)["sessions"] == before["sessions"] + 1
+    )
+
+
+@pytest.mark.nightly
+def test_an_implausible_session_gets_neither_code_nor_link(
+    chromium: Any, strict: tuple[Study, str]
+) -> None:
+    """The page says whom to ask instead, also when the participant comes back to it."""
+    study, url = strict
+    with Visit(chromium, url, "withheld") as visit:
+        visit.to_the_test("?participant=Bo&language=en")
+        visit.answer("yes")
+        visit.answer("yes")
+        visit.heading("About you")
+        visit.send_forms()
+        secrets = (study.recruitment.link_code, study.recruitment.link_address)
+
+        def check_page() -> None:
+            said_why = visit.page.locator("#withheld").inner_text()
+            assert "before your participation is credited" in said_why
+            assert study.contact in said_why
+            said = visit.page.inner_text("main")
+            assert "You were right in 1 of 2 movies" in said
+            assert rows_of(study, "Bo")[0].reference in said
+            assert visit.page.locator("#code, #go, main form, main a").count() == 0
+            assert not [secret for secret in secrets if secret in visit.page.content()]
+
+        check_page()
+        visit.page.reload()
+        check_page()
+        visit.go("?participant=Bo&language=en")
+        check_page()
+        assert visit.unexpected() == []
+        with Visit(chromium, url) as elsewhere:
+            elsewhere.go(f"{signed_query(study, 'Bo')}&language=en")
+            elsewhere.page.get_by_text("You have already taken part").wait_for()
+            assert elsewhere.page.locator("#code, #go, main form, main a").count() == 0
+            assert not [secret for secret in secrets if secret in elsewhere.page.content()]
+    assert all(secrets)
+    assert rows_of(study, "Bo")[0].implausible == "short"
+
+
+# --- stopping ------------------------------------------------------------------------------------
+
+
+@pytest.mark.nightly
+def test_the_trial_continues_behind_the_question(chromium: Any, site: tuple[Study, str]) -> None:
+    study, url = site
+    with Visit(chromium, url, "question") as visit:
+        visit.context.add_init_script(COUNT_PLAYS)
+        visit.to_the_test("?participant=Question")
+        visit.wait_for_answer()
+        plays = visit.page.evaluate("plays")
+        for close in ("button", "Escape"):
+            visit.page.get_by_text("Stop taking part").click()
+            visit.heading("Do you want to stop?")
+            visit.page.wait_for_timeout(400)
+            visit.picture("asked")
+            # Keys are not answers while the question is open.
+            visit.press("f", "j")
+            if close == "Escape":
+                visit.press("Escape")
+            else:
+                visit.page.get_by_text("Continue with the study").click()
+            visit.page.locator("dialog").wait_for(state="detached")
+            assert visit.page.locator(".answer:enabled").count() == 2
+        visit.answer("no", by="keyboard")
+        assert visit.page.evaluate("plays") == plays
+        visit.answer("yes")
+        visit.answer("yes")
+        visit.heading("About you")
+        visit.page.wait_for_timeout(100)
+        visit.page.reload()  # sends the events
+        visit.heading("About you")
+        assert visit.unexpected() == []
+    asked, other, _ = answers_to_test(study, "Question")
+    assert (asked.response, asked.resumed, asked.input) == ("no", False, "keyboard")
+    details = json.loads(asked.details)
+    assert (details["attempts"], details["stop_asked"]) == (1, 2)
+    assert asked.rt_ms > 800
+    assert json.loads(other.details)["stop_asked"] == 0
+    events = rows_of(study, "Question")[2]
+    noted = [(event.kind, event.data) for event in events if event.kind.startswith("stop_")]
+    place = {"stage": "test", "phase": "test", "trial": 0}
+    assert noted == [("stop_asked", place), ("stop_answered", {**place, "stop": False})] * 2
+
+
+def test_stopping_sends_what_was_answered_and_is_final(
+    chromium: Any, site: tuple[Study, str]
+) -> None:
+    study, url = site
+    with Visit(chromium, url, "stop") as visit:
+        visit.to_the_test("?participant=Leaving")
+        visit.wait_for_answer()
+        visit.context.set_offline(True)
+        visit.answer("no")
+        visit.page.get_by_text("Trial 2 of 3").wait_for()
+        visit.page.get_by_text("Stop taking part").click()
+        visit.page.get_by_text("Stop for good").click()
+        visit.heading("One moment")
+        # What was noted is stored before the session ends, also by a slow network.
+        visit.page.route("**/api/events", lambda route: (time.sleep(0.5), route.continue_())[1])
+        visit.context.set_offline(False)
+        visit.heading("You have stopped")
+        session, _, events = rows_of(study, "Leaving")
+        visit.picture("stopped")
+        assert session.reference in visit.page.inner_text("main")
+        visit.page.reload()
+        visit.heading("You have stopped")
+        assert visit.unexpected() == []
+    assert session.withdrawn_at is not None and session.finished_at is None
+    assert [row.response for row in answers_to_test(study, "Leaving")] == ["no"]
+    (stopped,) = [event.data for event in events if event.kind == "stop_answered"]
+    assert stopped == {"stage": "test", "phase": "test", "trial": 1, "stop": True}
+
+
+# --- the result ----------------------------------------------------------------------------------
+
+
+def correct(study: Study, name: str) -> int:
+    labels = {stimulus.stimulus: stimulus.label for stimulus in study.stimuli}
+    test = answers_to_test(study, name)
+    return sum((row.response == "yes") == labels[row.stimulus] for row in test)
+
+
+@pytest.mark.nightly
+def test_accuracy_and_percentile_of_the_result(chromium: Any, site: tuple[Study, str]) -> None:
+    """As computed from the stored answers: others with fewer right ones, and half of the equal."""
+    study, url = site
+    with Visit(chromium, url) as visit:
+        visit.take_part("?participant=First", "yes", "yes", "yes")
+    with Visit(chromium, url) as visit:
+        said = visit.take_part("?participant=Second", "yes", "yes", "yes")
+    labels = {stimulus.stimulus: stimulus.label for stimulus in study.stimuli}
+    with sqlite3.connect(study.folder / "responses.sqlite") as database:
+        finished = database.execute(
+            f"SELECT session FROM {SESSIONS.name} WHERE finished_at IS NOT NULL AND kind = 'person'"
+        ).fetchall()
+        rows = database.execute(
+            "SELECT session, stimulus, response FROM answers WHERE phase = 'test'"
+        ).fetchall()
+    scores = {session: 0 for (session,) in finished}
+    for session, stimulus, response in rows:
+        if session in scores:
+            scores[session] += (response == "yes") == labels[stimulus]
+    own = scores.pop(rows_of(study, "Second")[0].session)
+    assert own == correct(study, "Second") == 2
+    below = sum(score < own for score in scores.values())
+    equal = sum(score == own for score in scores.values())
+    percentile = 100 * (below + equal / 2) / len(scores)
+    assert "You were right in 2 of 3 movies" in said
+    assert f"you are at percentile {round(percentile)}" in said
+
+
+@pytest.mark.nightly
+def test_the_form_of_mturk_stays_in_its_frame(chromium: Any, site: tuple[Study, str]) -> None:
+    """The whole session runs in a frame of MTurk's page, and is submitted there."""
+    _, url = site
+    task = f"{MTURK}/projects/task"
+    submit = f"{MTURK}/mturk/externalSubmit"
+    handed_in: list[tuple[dict[str, list[str]], bool]] = []
+
+    def amazon(route: Any) -> None:
+        request = route.request
+        if request.url == task:
+            page = '<title>Tasks</title><iframe id="task" width="1240" height="760"></iframe>'
+            route.fulfill(content_type="text/html", body=page)
+        elif request.url == submit:
+            handed_in.append((parse_qs(request.post_data), request.frame != top.main_frame))
+            route.fulfill(content_type="text/html", body="<p>Thank you, worker</p>")
+        else:
+            route.abort()
+
+    with Visit(chromium, url) as visit:
+        visit.context.route(f"{MTURK}/**", amazon)
+        visit.context.add_init_script(SCREEN)
+        top = visit.page
+        top.goto(task)
+        # All steps happen within the frame.
+        visit.page = top.main_frame.child_frames[0]
+        query = f"?workerId=W1&assignmentId=A1&hitId=H1&turkSubmitTo={MTURK}"
+        visit.take_part(query, "yes", "yes", "yes")
+        form = visit.page.locator("form")
+        assert (form.get_attribute("action"), form.get_attribute("target")) == (submit, None)
+        visit.page.locator("#go").click()
+        visit.page.get_by_text("Thank you, worker").wait_for()
+        assert top.url == task and top.title() == "Tasks"
+    assert handed_in == [({"assignmentId": ["A1"], "code": ["TURK-CODE"]}, True)]
+
+
+def test_forms_go_to_no_other_host(chromium: Any, site: tuple[Study, str]) -> None:
+    """Forms are not sent to other hosts, even if the server's result names one."""
+    _, url = site
+    with Visit(chromium, url) as visit:
+        visit.go()  # without an id: a session belongs to the browser in which it began
+        visit.heading("Taking part in this study")
+
+        def finished(route: Any) -> None:
+            state = route.fetch().json()
+            route.fulfill(json={**state, "stage": "done", "trial": None})
+
+        address = ""
+
+        def result(route: Any) -> None:
+            completion = {"code": "C", "url": address, "post": {"assignmentId": "A"}}
+            scores = {"correct": 1, "trials": 2, "accuracy": 0.5, "percentile": None}
+            route.fulfill(json={**scores, "completion": completion})
+
+        visit.context.route("**/api/session**", finished)
+        visit.context.route("**/api/result", result)
+        for address in (
+            "https://www.mturk.com.example.org/mturk/externalSubmit",
+            "http://www.mturk.com/mturk/externalSubmit",
+            "https://www.mturk.com@example.org/mturk/externalSubmit",
+            "https://www.mturk.com/other",
+            f"{MTURK}/mturk/externalSubmit",
+        ):
+            visit.go()
+            visit.page.locator("#code").wait_for()
+            allowed = address.startswith(MTURK)
+            assert visit.page.locator("form").count() == int(allowed)
+            if not allowed:
+                visit.page.get_by_text("You can close this window now.").wait_for()

@@ -33,6 +33,8 @@ from support.experiment.store_walk import (
 )
 
 MOVIE_S = 44 / 30
+
+
 """From the first to the last of the 45 frames of a movie."""
 
 

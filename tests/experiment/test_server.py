@@ -21,9 +21,6 @@ from typing import Any, get_args, get_type_hints
 
 import pytest
 
-pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
-
-
 from physion.analysis.people.exclusions import RULE_SETS
 from physion.cli.experiment import serve
 from physion.cli.main import main
@@ -34,6 +31,7 @@ from physion.experiment.study.study import Study
 from support.experiment.app_walk import answer_body, served
 from support.experiment.live_app import HOST, read_all, running
 from support.experiment.tiny_study import PASSWORD, make_tiny_study
+from support.paths import ROOT
 from support.programs import find_program
 
 
@@ -283,8 +281,9 @@ def test_serving_imports_nothing_slow() -> None:
     assert done.stdout.strip() == "[]"
 
 
-ROOT = Path(__file__).parents[3]
 SERVER = ROOT / "examples" / "server"
+
+
 DEFAULTS = {field.name: field.default for field in fields(serve.Options)}
 
 

@@ -17,16 +17,29 @@ from typing import Any
 import numpy as np
 import pytest
 
+from physion.analysis.tables import read_humans
 from physion.cli.experiment.experiment import SUBVERBS
 from physion.cli.main import main
+from physion.compute.local import SerialExecutor
 from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.names import canonical_name
+from physion.data.official import official
 from physion.experiment.study import make as study_folder
-from physion.experiment.study.choose import choose_familiarization, choose_trials
+from physion.experiment.study.choose import (
+    HIDDEN,
+    OfficialSelection,
+    choose_familiarization,
+    choose_official,
+    choose_trials,
+    find_fault,
+)
 from physion.experiment.study.identity import Secrets, check_password
 from physion.experiment.study.make import StimulusSource, import_stimulus, make_study
 from physion.experiment.study.settings import MENTAL_ROTATION
 from physion.experiment.study.study import Study, load_study
-from physion.trials.dataset import mark_unusable
+from physion.physics.replay import ReplayTask, replay_trial
+from physion.scenes.tdw.read_logs import ImportedTrial
+from physion.trials.dataset import Dataset, mark_unusable
 from physion.trials.index import read_index, write_index
 from physion.trials.video import read_frames
 from support.experiment.tiny_dataset import is_marked, make_tiny_dataset
@@ -81,7 +94,7 @@ def test_another_seed_chooses_otherwise(dataset: Path) -> None:
     assert len(set(all_of_them)) == 10 and len({frozenset(names) for names in all_of_them}) == 1
 
 
-def _draw_of_roll(folder: Path, test: int) -> list[str]:
+def draw_of_roll(folder: Path, test: int) -> list[str]:
     chosen = choose_trials(folder, scenarios=["roll"], test=test, practice=2)
     return [source.stimulus for source in chosen.sources if source.phase == "test"]
 
@@ -95,7 +108,7 @@ def test_presets_alternate_in_the_draw(tmp_path: Path) -> None:
     preset = {name: "aaaaaaaabbbc"[int(name[-2:]) // 2] for name in table["trial"]}
     table["preset"] = table["trial"].map(preset)
     write_index(tmp_path, table)
-    drawn = _draw_of_roll(tmp_path, 12)
+    drawn = draw_of_roll(tmp_path, 12)
     for outcome in (0, 1):
         found = Counter(preset[name] for name in drawn if int(name[-2:]) % 2 == outcome)
         assert found["c"] == 1 and {found["a"], found["b"]} == {2, 3}
@@ -111,14 +124,14 @@ def test_an_unusable_trial_is_replaced_by_the_next_of_its_preset_and_outcome(
 ) -> None:
     """Of twelve trials, of which even numbers have contact, two of one kind share a preset."""
     dataset = make_tiny_dataset(tmp_path, scenarios=("roll",), test=12)
-    before = _draw_of_roll(tmp_path, 4)
+    before = draw_of_roll(tmp_path, 4)
     bad = next(name for name in before if int(name[-2:]) % 2 == 0)
     others = [f"roll_testing_{number:04d}" for number in range(10, -1, -2)]
     wanted = next(name for name in others if name not in before)
     table = read_index(tmp_path)
     table.loc[table["trial"].isin([bad, wanted]), "preset"] = "other"
     write_index(tmp_path, table)
-    before = _draw_of_roll(tmp_path, 4)
+    before = draw_of_roll(tmp_path, 4)
     assert bad in before and wanted not in before
     mark_unusable(dataset, {bad: "a block flickers"})
     chosen = choose_trials(tmp_path, scenarios=["roll"], test=4, practice=2)
@@ -131,7 +144,7 @@ def test_an_unusable_trial_is_replaced_by_the_next_of_its_preset_and_outcome(
 def test_without_another_of_the_preset_any_replaces_it_and_it_is_said(tmp_path: Path) -> None:
     dataset = make_tiny_dataset(tmp_path, scenarios=("roll",), test=6)
     table = read_index(tmp_path)
-    before = _draw_of_roll(tmp_path, 4)
+    before = draw_of_roll(tmp_path, 4)
     bad = next(name for name in before if int(name[-2:]) % 2 == 0)
     table.loc[table["trial"] == bad, "preset"] = "rare"
     write_index(tmp_path, table)
@@ -157,14 +170,14 @@ def test_where_fewer_are_there_it_says_so(dataset: Path) -> None:
 
 
 def test_fewer_of_one_kind_means_fewer_of_both(dataset: Path, tmp_path: Path) -> None:
-    _changed(dataset, tmp_path, lambda t: t["trial"] != "roll_testing_0002")
+    copy_with_rows(dataset, tmp_path, lambda t: t["trial"] != "roll_testing_0002")
     chosen = choose_trials(tmp_path, scenarios=["roll"])
     test = [source for source in chosen.sources if source.phase == "test"]
     assert Counter(s.label for s in test) == {True: 2, False: 2}
 
 
 def test_a_scenario_without_one_kind_is_refused(dataset: Path, tmp_path: Path) -> None:
-    _changed(dataset, tmp_path, lambda t: t["contact"] | (t["split"] != "familiarization"))
+    copy_with_rows(dataset, tmp_path, lambda t: t["contact"] | (t["split"] != "familiarization"))
     with pytest.raises(BadInputError, match="no familiarization trial of collide without") as e:
         choose_trials(tmp_path)
     assert "physion generate" in str(e.value) and "--split familiarization" in str(e.value)
@@ -173,7 +186,7 @@ def test_a_scenario_without_one_kind_is_refused(dataset: Path, tmp_path: Path) -
 def test_imported_trials_without_familiarization_name_the_official_scenes(
     dataset: Path, tmp_path: Path
 ) -> None:
-    _changed(dataset, tmp_path, lambda t: t["split"] != "familiarization")
+    copy_with_rows(dataset, tmp_path, lambda t: t["split"] != "familiarization")
     table = read_index(tmp_path)
     table["recorded_contact"] = table["contact"]
     write_index(tmp_path, table)
@@ -182,7 +195,7 @@ def test_imported_trials_without_familiarization_name_the_official_scenes(
 
 
 def test_datasets_without_testing_trials_are_refused(dataset: Path, tmp_path: Path) -> None:
-    _changed(dataset, tmp_path, lambda t: t["split"] == "familiarization")
+    copy_with_rows(dataset, tmp_path, lambda t: t["split"] == "familiarization")
     with pytest.raises(BadInputError, match="no testing trials"):
         choose_trials(tmp_path)
     assert len(choose_familiarization(tmp_path, "roll").sources) == 4
@@ -203,7 +216,7 @@ def test_unknown_scenarios_get_the_closest(dataset: Path) -> None:
 def test_looks_are_free_unless_asked_otherwise(dataset: Path, tmp_path: Path) -> None:
     for look in ("free", "redyellow"):
         chosen = choose_trials(dataset, test=2, practice=2, scenarios=["roll"], look=look)
-        study = make_study(_study(tmp_path / look, ("roll",)), chosen.sources, "a password")
+        study = make_study(empty_study(tmp_path / look, ("roll",)), chosen.sources, "a password")
         for stimulus in study.stimuli:
             assert stimulus.look == look
             frame = read_frames(study.folder / stimulus.movie, count=1)[0]
@@ -218,7 +231,7 @@ def test_a_look_that_was_not_made_is_refused(tmp_path: Path) -> None:
 
 
 def test_trials_without_movies_are_refused(dataset: Path, tmp_path: Path) -> None:
-    table = _changed(dataset, tmp_path, lambda t: t["split"] != "")
+    table = copy_with_rows(dataset, tmp_path, lambda t: t["split"] != "")
     table.loc[:, ["map", "map_sha256"]] = None
     write_index(tmp_path, table)
     with pytest.raises(BadInputError, match="no map file"):
@@ -231,7 +244,7 @@ def test_trials_without_movies_are_refused(dataset: Path, tmp_path: Path) -> Non
 @pytest.mark.slow
 def test_a_study_shows_what_the_trials_show(dataset: Path, tmp_path: Path) -> None:
     chosen = choose_trials(dataset)
-    study = make_study(_study(tmp_path / "study"), chosen.sources, "a password")
+    study = make_study(empty_study(tmp_path / "study"), chosen.sources, "a password")
     assert study == load_study(tmp_path / "study")
     assert {(s.stimulus, s.label, s.place) for s in study.stimuli} == {
         (s.stimulus, s.label, s.place) for s in chosen.sources
@@ -256,7 +269,7 @@ def test_missing_files_are_named_all_at_once(dataset: Path, tmp_path: Path) -> N
     for number in (0, 3):
         sources[number] = dataclasses.replace(sources[number], observed=tmp_path / f"{number}.mp4")
     with pytest.raises(BadInputError, match="2 of 48 files are missing") as raised:
-        make_study(_study(tmp_path / "study"), sources, "a password")
+        make_study(empty_study(tmp_path / "study"), sources, "a password")
     assert "0.mp4" in str(raised.value) and "3.mp4" in str(raised.value)
     assert not (tmp_path / "study").exists()
 
@@ -275,7 +288,7 @@ def test_an_interrupted_making_leaves_nothing(
     monkeypatch.setattr(study_folder, "import_stimulus", take)
     sources = choose_trials(dataset).sources
     with pytest.raises(KeyboardInterrupt):
-        make_study(_study(tmp_path / "study"), sources, "a password")
+        make_study(empty_study(tmp_path / "study"), sources, "a password")
     assert not list(tmp_path.iterdir())
 
 
@@ -287,14 +300,14 @@ def test_folders_with_something_in_them_are_refused(
     folder.mkdir()
     (folder / name).write_text("mine")
     with pytest.raises(BadInputError, match=r"already|not empty"):
-        make_study(_study(folder), choose_trials(dataset).sources, "a password")
+        make_study(empty_study(folder), choose_trials(dataset).sources, "a password")
     assert [path.name for path in folder.iterdir()] == [name]
 
 
 def test_a_finished_study_is_never_replaced(dataset: Path, tmp_path: Path) -> None:
     study = make_tiny_study(tmp_path)
     with pytest.raises(BadInputError, match=r"study in .* already"):
-        make_study(_study(tmp_path), choose_trials(dataset).sources, "a password")
+        make_study(empty_study(tmp_path), choose_trials(dataset).sources, "a password")
     assert load_study(tmp_path) == study
 
 
@@ -442,7 +455,7 @@ def test_a_killed_command_can_be_repeated(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"dataset", "study"}
 
 
-def _changed(dataset: Path, folder: Path, keep: Any) -> Any:
+def copy_with_rows(dataset: Path, folder: Path, keep: Any) -> Any:
     """Copy a dataset with only these rows of its index; return the rows."""
     shutil.copytree(dataset, folder, dirs_exist_ok=True)
     from physion.trials.index import read_index
@@ -453,7 +466,7 @@ def _changed(dataset: Path, folder: Path, keep: Any) -> Any:
     return kept
 
 
-def _study(folder: Path, scenarios: tuple[str, ...] = ("collide", "roll")) -> Study:
+def empty_study(folder: Path, scenarios: tuple[str, ...] = ("collide", "roll")) -> Study:
     return Study(
         folder=folder,
         name="tiny",
@@ -462,3 +475,121 @@ def _study(folder: Path, scenarios: tuple[str, ...] = ("collide", "roll")) -> St
         contact="Ada, ada@example.org",
         scenarios=scenarios,
     )
+
+
+# --- official scenes, rendered for a study --------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def seen() -> set[str]:
+    """Names of the stimuli that people saw."""
+    return set(read_humans(official().humans)["stimulus"])
+
+
+def choose(trials: list[ImportedTrial], seen: set[str] | None, test: int = 4) -> OfficialSelection:
+    return choose_official(trials, seen, test=test, practice=2, executor=SerialExecutor())
+
+
+def collide() -> list[ImportedTrial]:
+    return [trial for trial in official().trials if trial.scene.scenario == "collide"]
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_test_trials_were_seen_by_people_and_familiarization_is_apart(seen: set[str]) -> None:
+    tasks = choose(collide(), seen).tasks
+    assert tasks == choose(collide(), seen).tasks
+    assert Counter((task.split, task.recorded_contact) for task in tasks) == {
+        ("testing", True): 2, ("testing", False): 2,
+        ("familiarization", True): 1, ("familiarization", False): 1,
+    }  # fmt: skip
+    assert all((canonical_name(task.trial) in seen) == (task.split == "testing") for task in tasks)
+    scenes = [task.scene for task in tasks if task.scene is not None]
+    assert len({scene.physics_digest() for scene in scenes}) == len(tasks) == 6
+
+
+def test_a_larger_study_adds_trials_to_a_smaller_one(seen: set[str]) -> None:
+    few, many = choose(collide(), seen, test=2), choose(collide(), seen, test=6)
+    assert {task.trial for task in few.tasks} < {task.trial for task in many.tasks}
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_scenes_whose_simulation_ends_otherwise_are_left_out_and_counted(seen: set[str]) -> None:
+    trials = collide()
+    chosen = choose(trials, seen, test=100)
+    differ = {
+        trial.scene.name
+        for trial in trials
+        if canonical_name(trial.scene.name) in seen and not replay_trial(ReplayTask(trial)).agrees
+    }
+    assert differ, "the test needs a scene that the engine predicts wrongly"
+    assert not differ & {task.trial for task in chosen.tasks}
+    assert f"recorded outcome: {len(differ)}" in chosen.notes[0]
+
+
+def test_scenes_with_a_hidden_agent_or_patient_are_left_out(seen: set[str]) -> None:
+    hidden = "pilot_it2_collision_simple_box_2_dis_2_occ_0008"
+    faults = {
+        t.scene.name: find_fault(t) for t in collide() if t.scene.name.startswith(hidden[:-1])
+    }
+    assert faults[hidden] == HIDDEN and "" in faults.values()
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_familiarization_trials_of_the_study_come_first(seen: set[str]) -> None:
+    drape = [trial for trial in official().trials if trial.scene.scenario == "drape"]
+    chosen = choose(drape, seen, test=2).tasks
+    practice = [task.trial for task in chosen if task.split == "familiarization"]
+    assert practice and all("familiarization" in name for name in practice)
+
+
+def test_a_scenario_without_scenes_of_one_kind_is_refused(seen: set[str]) -> None:
+    never = [trial for trial in collide() if not trial.outcome.contact]
+    with pytest.raises(BadInputError, match="no official scene of collide with contact for"):
+        choose(never, seen)
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_the_command_renders_official_scenes_and_makes_a_study(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], seen: set[str]
+) -> None:
+    folder, made = tmp_path / "study", tmp_path / "study-trials"
+    words = ["--scenes", "official", "--scenario", "collide", "--test", "2", "--practice", "2"]
+    assert main(["experiment", "init", *CONTACT, str(folder), *words, "--workers", "1"]) == 0
+    assert "collide: 2 test and 2 familiarization trials" in capsys.readouterr().out
+    recorded = {trial.scene.name: trial.outcome.contact for trial in official().trials}
+    stimuli = load_study(folder).stimuli
+    assert Counter((s.phase, s.label) for s in stimuli) == {
+        (phase, label): 1 for phase in ("test", "familiarization") for label in (True, False)
+    }
+    assert all(stimulus.label == recorded[stimulus.stimulus] for stimulus in stimuli)
+    assert all((canonical_name(s.stimulus) in seen) == (s.phase == "test") for s in stimuli)
+    before = {path: path.stat().st_mtime_ns for path in made.rglob("*.h5")}
+    assert len(before) == len(Dataset(made).index) == 4
+    words += ["--rendered", str(made), "--workers", "1"]
+    assert main(["experiment", "init", *CONTACT, str(tmp_path / "again"), *words]) == 0
+    assert {path: path.stat().st_mtime_ns for path in made.rglob("*.h5")} == before
+    assert load_study(tmp_path / "again").stimuli == stimuli
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--scenes", "official", "--trials", "."], "give either --trials DATASET, --scenes"),
+        (["--scenes", "official", "--movies", "."], "--movies needs --stimuli"),
+        (["--trials", ".", "--rendered", "x"], "--rendered goes with --scenes"),
+        (["--scenes", "official", "--test", "3"], "--test must be even"),
+        (["--scenes", "official", "--scenario", "colide"], "'colide'"),
+        (["--scenes", "nowhere"], "nowhere"),
+    ],
+)
+def test_bad_commands_with_scenes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+) -> None:
+    assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert not list(tmp_path.iterdir())

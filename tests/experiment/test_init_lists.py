@@ -20,14 +20,16 @@ from support.experiment.tiny_dataset import make_tiny_dataset
 from support.experiment.tiny_study import CONTACT, FULL, OBSERVED, draw, draw_map, read_number
 
 LIST = "human-physics-benchmarking-collision-pilot_production_2_experimental_stims.json"
+
+
 SIZE = 64
 
 
-def _ids(count: int, config: str = "pilot_it2_collision_yeet_box") -> list[str]:
+def ids_of(count: int, config: str = "pilot_it2_collision_yeet_box") -> list[str]:
     return [f"{config}_{number:04d}_img" for number in range(count)]
 
 
-def _columns(ids: list[str]) -> dict[str, dict[str, Any]]:
+def columns_of(ids: list[str]) -> dict[str, dict[str, Any]]:
     """Write a list as published: one object per column, keyed by row."""
     base = "https://bucket.s3.amazonaws.com"
     columns = {
@@ -39,12 +41,12 @@ def _columns(ids: list[str]) -> dict[str, dict[str, Any]]:
     return {name: {str(i): v for i, v in enumerate(values)} for name, values in columns.items()}
 
 
-def _write_list(path: Path, ids: list[str]) -> Path:
-    path.write_text(json.dumps(_columns(ids)))
+def write_list(path: Path, ids: list[str]) -> Path:
+    path.write_text(json.dumps(columns_of(ids)))
     return path
 
 
-def _write_media(folder: Path, ids: list[str], maps: Path | None = None) -> None:
+def write_media(folder: Path, ids: list[str], maps: Path | None = None) -> None:
     for place in (folder, maps or folder):
         place.mkdir(parents=True, exist_ok=True)
     for number, name in enumerate(ids):
@@ -56,10 +58,10 @@ def _write_media(folder: Path, ids: list[str], maps: Path | None = None) -> None
 def test_the_command_makes_a_study_of_lists(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ids, practice = _ids(6), _ids(4, "pilot_it2_collision_simple_box")
-    stimuli = _write_list(tmp_path / LIST, ids)
-    fam = _write_list(tmp_path / "collision_familiarization.json", practice)
-    _write_media(tmp_path / "mp4s", ids + practice, tmp_path / "maps")
+    ids, practice = ids_of(6), ids_of(4, "pilot_it2_collision_simple_box")
+    stimuli = write_list(tmp_path / LIST, ids)
+    fam = write_list(tmp_path / "collision_familiarization.json", practice)
+    write_media(tmp_path / "mp4s", ids + practice, tmp_path / "maps")
     words = ["--stimuli", str(stimuli), "--familiarization", str(fam), "--movies"]
     words += [str(tmp_path / "mp4s"), "--json"]
     assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 0
@@ -80,9 +82,9 @@ def test_the_command_makes_a_study_of_lists(
 
 
 def test_familiarization_may_come_from_a_dataset(tmp_path: Path) -> None:
-    ids = _ids(4)
-    stimuli = _write_list(tmp_path / LIST, ids)
-    _write_media(tmp_path / "movies", ids)
+    ids = ids_of(4)
+    stimuli = write_list(tmp_path / LIST, ids)
+    write_media(tmp_path / "movies", ids)
     make_tiny_dataset(tmp_path / "dataset", test=0, familiarization=4)
     words = ["--stimuli", str(stimuli), "--movies", str(tmp_path / "movies"), "--practice", "4"]
     words += ["--familiarization-trials", str(tmp_path / "dataset")]
@@ -94,9 +96,9 @@ def test_familiarization_may_come_from_a_dataset(tmp_path: Path) -> None:
 def test_missing_movies_are_named_all_at_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ids = _ids(6)
-    stimuli = _write_list(tmp_path / LIST, ids)
-    _write_media(tmp_path / "movies", ids)
+    ids = ids_of(6)
+    stimuli = write_list(tmp_path / LIST, ids)
+    write_media(tmp_path / "movies", ids)
     for name in ids[1:4]:
         (tmp_path / "movies" / f"{name}.mp4").unlink()
     words = ["--stimuli", str(stimuli), "--familiarization", str(stimuli)]
@@ -110,8 +112,8 @@ def test_missing_movies_are_named_all_at_once(
 def test_many_missing_movies_are_three_and_a_count(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ids = _ids(8)
-    stimuli = _write_list(tmp_path / LIST, ids)
+    ids = ids_of(8)
+    stimuli = write_list(tmp_path / LIST, ids)
     (tmp_path / "movies").mkdir()
     words = ["--stimuli", str(stimuli), "--familiarization", str(stimuli)]
     words += ["--movies", str(tmp_path / "movies")]
@@ -124,10 +126,10 @@ def test_many_missing_movies_are_three_and_a_count(
 def test_names_that_are_one_to_the_analysis_are_refused_before_movies_are_cut(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ids = _ids(2)
+    ids = ids_of(2)
     looks = [name.replace("_0", "-redyellow_0", 1) for name in ids]
-    lists = [_write_list(tmp_path / LIST, ids), _write_list(tmp_path / f"looks_{LIST}", looks)]
-    _write_media(tmp_path / "movies", ids + looks)
+    lists = [write_list(tmp_path / LIST, ids), write_list(tmp_path / f"looks_{LIST}", looks)]
+    write_media(tmp_path / "movies", ids + looks)
     words = ["--stimuli", str(lists[0]), "--familiarization", str(lists[1])]
     words += ["--movies", str(tmp_path / "movies")]
     assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 2
@@ -139,9 +141,9 @@ def test_names_that_are_one_to_the_analysis_are_refused_before_movies_are_cut(
 def test_a_stimulus_in_both_lists_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ids = _ids(4)
-    stimuli = _write_list(tmp_path / LIST, ids)
-    _write_media(tmp_path / "movies", ids)
+    ids = ids_of(4)
+    stimuli = write_list(tmp_path / LIST, ids)
+    write_media(tmp_path / "movies", ids)
     words = ["--stimuli", str(stimuli), "--familiarization", str(stimuli)]
     words += ["--movies", str(tmp_path / "movies")]
     assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 2
@@ -150,26 +152,26 @@ def test_a_stimulus_in_both_lists_is_refused(
 
 @pytest.mark.parametrize("layout", ["flat", "core", "core of a scenario", "maps apart"])
 def test_movies_and_maps_are_found_in_the_usual_places(tmp_path: Path, layout: str) -> None:
-    ids, apart = _ids(2), None
-    stimuli = _write_list(tmp_path / LIST, ids)
+    ids, apart = ids_of(2), None
+    stimuli = write_list(tmp_path / LIST, ids)
     root = tmp_path / "files"
     if layout == "flat":
-        _write_media(root, ids)
+        write_media(root, ids)
     elif layout == "core":
-        _write_media(root / "mp4s", ids, root / "maps")
+        write_media(root / "mp4s", ids, root / "maps")
     elif layout == "core of a scenario":
-        _write_media(root / "Collide" / "mp4s", ids, root / "Collide" / "maps")
+        write_media(root / "Collide" / "mp4s", ids, root / "Collide" / "maps")
     else:
         apart = tmp_path / "elsewhere"
-        _write_media(root, ids, apart)
+        write_media(root, ids, apart)
     chosen = choose_listed([stimuli], [], root, apart)
     assert all(source.movie.is_file() and source.map.is_file() for source in chosen.sources)
 
 
 def test_both_looks_share_their_map(tmp_path: Path) -> None:
     ids = ["pilot_dominoes_4mid_boxroom-redyellow_0001_img"]
-    stimuli = _write_list(tmp_path / "dominoes.json", ids)
-    _write_media(tmp_path / "mp4s-redyellow", ids)
+    stimuli = write_list(tmp_path / "dominoes.json", ids)
+    write_media(tmp_path / "mp4s-redyellow", ids)
     maps = tmp_path / "maps"
     maps.mkdir()
     (tmp_path / "mp4s-redyellow" / "pilot_dominoes_4mid_boxroom-redyellow_0001_map.png").rename(
@@ -182,12 +184,12 @@ def test_both_looks_share_their_map(tmp_path: Path) -> None:
 
 
 def test_addresses_in_a_list_lead_nowhere(tmp_path: Path) -> None:
-    columns = _columns(_ids(1))
+    columns = columns_of(ids_of(1))
     (tmp_path / "secret.png").write_bytes(draw_map(0, SIZE))
     columns["map_url"]["0"] = "https://x/../../secret.png/.."
     path = tmp_path / "collide.json"
     path.write_text(json.dumps(columns))
-    _write_media(tmp_path / "movies", _ids(1))
+    write_media(tmp_path / "movies", ids_of(1))
     (source,) = choose_listed([path], [], tmp_path / "movies").sources
     assert source.map.parent == tmp_path / "movies"
 
@@ -205,7 +207,7 @@ def test_lists_may_be_csv(tmp_path: Path) -> None:
 
 
 def test_fewer_may_be_taken_and_are_balanced(tmp_path: Path) -> None:
-    stimuli = _write_list(tmp_path / LIST, _ids(20))
+    stimuli = write_list(tmp_path / LIST, ids_of(20))
     (tmp_path / "m").mkdir()
     chosen = choose_listed([stimuli], [], tmp_path / "m", test=8)
     assert Counter(source.label for source in chosen.sources) == {True: 4, False: 4}
@@ -246,16 +248,16 @@ def test_bad_lists_are_refused(tmp_path: Path, case: str) -> None:
 
 
 def test_lists_of_one_scenario_come_once(tmp_path: Path) -> None:
-    lists = [_write_list(tmp_path / f"{name}.json", _ids(2)) for name in "ab"]
+    lists = [write_list(tmp_path / f"{name}.json", ids_of(2)) for name in "ab"]
     with pytest.raises(BadInputError, match="both lists of collide"):
         choose_listed(lists, [], tmp_path)
 
 
 def test_a_list_that_betrays_no_scenario_is_asked_for_it(tmp_path: Path) -> None:
-    path = _write_list(tmp_path / "mine.json", _ids(2, "own"))
+    path = write_list(tmp_path / "mine.json", ids_of(2, "own"))
     with pytest.raises(BadInputError, match="which scenario is it"):
         choose_listed([path], [], tmp_path)
-    path = _write_list(tmp_path / "my-drop_list.json", _ids(2, "own"))
+    path = write_list(tmp_path / "my-drop_list.json", ids_of(2, "own"))
     assert choose_listed([path], [], tmp_path).scenarios == ("drop",)
 
 
@@ -280,7 +282,7 @@ def test_the_published_lists_are_read(official: Path) -> None:
     assert all(outcomes[name] == listed[name] for name in shared)
 
 
-def _write_own(path: Path, names: list[str], **columns: Any) -> Path:
+def write_own(path: Path, names: list[str], **columns: Any) -> Path:
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, ["stim_ID", "target_hit_zone_label", *columns])
         writer.writeheader()
@@ -293,9 +295,9 @@ def _write_own(path: Path, names: list[str], **columns: Any) -> Path:
 def test_own_movies_have_any_scenario_and_length(tmp_path: Path) -> None:
     names, practice = [f"ball-{i}" for i in range(3)], ["try-0", "try-1"]
     own = {"scenario": ["billiards"] * 3, "observed_frames": [20, "", 50]}
-    listed = _write_own(tmp_path / "mine.csv", names, **own)
-    fam = _write_own(tmp_path / "first.csv", practice, scenario=["billiards"] * 2)
-    _write_media(tmp_path / "movies", names + practice)
+    listed = write_own(tmp_path / "mine.csv", names, **own)
+    fam = write_own(tmp_path / "first.csv", practice, scenario=["billiards"] * 2)
+    write_media(tmp_path / "movies", names + practice)
     words = ["--stimuli", str(listed), "--familiarization", str(fam)]
     words += ["--movies", str(tmp_path / "movies")]
     assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 0
@@ -327,6 +329,6 @@ def test_own_movies_have_any_scenario_and_length(tmp_path: Path) -> None:
 def test_bad_columns_of_own_movies_are_named(
     tmp_path: Path, columns: dict[str, Any], told: str
 ) -> None:
-    path = _write_own(tmp_path / "list.csv", ["a", "b"], **columns)
+    path = write_own(tmp_path / "list.csv", ["a", "b"], **columns)
     with pytest.raises(BadInputError, match=told):
         list_scenario(path, read_list(path))

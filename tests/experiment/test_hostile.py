@@ -13,9 +13,6 @@ from typing import Any
 from urllib.parse import quote
 
 import pytest
-
-pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
-
 import sqlalchemy as sa
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -42,6 +39,8 @@ NASTY = (
     "\u202eright to left\u0085\ufeff",
     "\U0001f41b" * 20,
 )
+
+
 DEEP = "[" * 30_000 + "]" * 30_000
 
 
@@ -98,6 +97,8 @@ BODIES = {
     "NUL": changed(details={"x": "a\x00b"}),
     "half a character": changed(details={"x": "\ud800"}),
 }
+
+
 VALUES: dict[str, dict[str, Any]] = {
     "time beyond a day": {"rt_ms": 86_400_001},
     "time as text": {"rt_ms": "812.5"},

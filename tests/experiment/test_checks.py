@@ -23,13 +23,7 @@ from physion.experiment.store.lab import forget_sessions
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.orders import trial_order
-from physion.experiment.study.settings import (
-    Attention,
-    Comprehension,
-    EarlyEnd,
-    Practice,
-    Question,
-)
+from physion.experiment.study.settings import Attention, Comprehension, EarlyEnd, Practice, Question
 from physion.experiment.study.stimuli import ATTENTION, Stimulus
 from physion.experiment.study.study import Study, load_study, write_settings
 from physion.experiment.study.texts import shipped_file
@@ -225,6 +219,8 @@ def test_attempts_and_ends_are_exported(checking_store: Store, tmp_path: Path) -
 
 
 PHASE = "familiarization"
+
+
 # The labels of the three practice trials are contact, none, contact: "yes" is right twice.
 RULES = Practice(min_correct=3, repeats=1, failed="end")
 

@@ -1,10 +1,14 @@
-"""study.toml: round trip, and refusal of invalid values with file, key and allowed values."""
+"""study.toml and its folder, the texts of the pages, and what the documentation says of both."""
 
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import os
+import re
+import shlex
 import tomllib
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +16,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from physion.core.errors import BadInputError
+from physion.cli.experiment.experiment import SUBVERBS
+from physion.core.errors import BadInputError, UnknownNameError
+from physion.experiment.store.database import METADATA
 from physion.experiment.study.settings import (
     Attention,
     Bonus,
@@ -23,31 +29,53 @@ from physion.experiment.study.settings import (
     Practice,
     Recruitment,
     Screen,
+    StudySettings,
     Timing,
     all_keys,
     format_settings,
     keys_of,
     parse_settings,
+    settings_table,
     tables,
 )
 from physion.experiment.study.study import Study, load_study, write_settings
+from physion.experiment.study.texts import (
+    read_consent_file,
+    read_texts,
+    shipped_file,
+    shipped_languages,
+    shipped_texts,
+)
 from support.experiment.own_questions import COMPREHENSION, OWN_QUESTIONS
 from support.experiment.tiny_study import make_tiny_study
+from support.paths import ROOT
 
 NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,40}", fullmatch=True)
+
+
 CODES = st.from_regex(r"[A-Za-z0-9_-]{0,30}", fullmatch=True)
+
+
 LINES = (
     st.text(st.characters(exclude_categories=["Cc", "Cs", "Zl", "Zp"]), min_size=1, max_size=60)
     .map(str.strip)
     .filter(bool)
 )
+
+
 SPANS = st.tuples(st.integers(0, 60_000), st.integers(0, 60_000)).map(
     lambda ends: (min(ends), max(ends))
 )
+
+
 ADDRESSES = st.sampled_from(
     ["", "https://lab.example.org/credit?experiment_id=1&credit_token=a%20b&x=", ]
 )  # fmt: skip
+
+
 EARLY_ENDS = st.builds(EarlyEnd, prolific_code=CODES, code=CODES, address=ADDRESSES)
+
+
 STUDIES = st.builds(
     Study,
     folder=st.just(Path("somewhere")),
@@ -192,7 +220,7 @@ REFUSED: dict[str, tuple[str, Any, str]] = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_a_bad_value_is_named_with_what_is_allowed(case: str) -> None:
     key, value, allowed = REFUSED[case]
-    content = tomllib.loads(format_settings(_study(), Path()))
+    content = tomllib.loads(format_settings(minimal_study(), Path()))
     owner = content
     *above, name = key.split(".")
     for table in above:
@@ -206,7 +234,7 @@ def test_a_bad_value_is_named_with_what_is_allowed(case: str) -> None:
 
 
 def test_a_wage_below_what_the_lab_wants_is_refused() -> None:
-    content = tomllib.loads(format_settings(_study(), Path()))
+    content = tomllib.loads(format_settings(minimal_study(), Path()))
     content["payment"] = {"amount": 4, "currency": "EUR", "minutes": 30, "least_per_hour": 12}
     with pytest.raises(BadInputError) as raised:
         parse_settings(content, Path("study.toml"))
@@ -227,7 +255,7 @@ def test_a_wage_below_what_the_lab_wants_is_refused() -> None:
     ],
 )
 def test_unknown_keys_are_refused_with_the_closest(change: dict[str, Any], closest: str) -> None:
-    content = {**tomllib.loads(format_settings(_study(), Path())), **change}
+    content = {**tomllib.loads(format_settings(minimal_study(), Path())), **change}
     with pytest.raises(BadInputError, match="unknown key") as raised:
         parse_settings(content, Path("study.toml"))
     assert closest in str(raised.value)
@@ -235,20 +263,20 @@ def test_unknown_keys_are_refused_with_the_closest(change: dict[str, Any], close
 
 @pytest.mark.parametrize("name", ["name", "version", "title", "contact", "scenarios"])
 def test_what_a_lab_must_say_may_not_lack(name: str) -> None:
-    content = tomllib.loads(format_settings(_study(), Path()))
+    content = tomllib.loads(format_settings(minimal_study(), Path()))
     del content[name]
     with pytest.raises(BadInputError, match=f"missing '{name}'"):
         parse_settings(content, Path("study.toml"))
 
 
 def test_a_value_for_a_table_is_refused() -> None:
-    content = {**tomllib.loads(format_settings(_study(), Path())), "timing": 3}
+    content = {**tomllib.loads(format_settings(minimal_study(), Path())), "timing": 3}
     with pytest.raises(BadInputError, match="timing must be an object"):
         parse_settings(content, Path("study.toml"))
 
 
 def test_a_study_that_could_not_be_read_back_is_not_written(tmp_path: Path) -> None:
-    study = dataclasses.replace(_study(), folder=tmp_path, participants=0)
+    study = dataclasses.replace(minimal_study(), folder=tmp_path, participants=0)
     with pytest.raises(BadInputError, match="participants"):
         write_settings(study)
     assert not list(tmp_path.iterdir())
@@ -337,7 +365,7 @@ def test_no_folder_is_refused(tmp_path: Path) -> None:
         load_study(tmp_path / "none")
 
 
-def _study() -> Study:
+def minimal_study() -> Study:
     return Study(
         folder=Path("somewhere"),
         name="tiny",
@@ -346,3 +374,184 @@ def _study() -> Study:
         contact="Ada, ada@example.org",
         scenarios=("collide",),
     )
+
+
+# --- texts of the pages ---------------------------------------------------------------------------
+
+
+def test_two_languages_are_shipped() -> None:
+    assert {"en", "de"} <= set(shipped_languages())
+    with pytest.raises(UnknownNameError, match="closest"):
+        shipped_file("tlh")
+
+
+@pytest.mark.parametrize("language", shipped_languages())
+def test_shipped_languages_are_whole(tmp_path: Path, language: str) -> None:
+    (tmp_path / f"{language}.toml").write_bytes(shipped_file(language))
+    texts, content = read_texts(tmp_path, language)
+    assert texts.keys() == shipped_texts().keys() and content == shipped_file(language)
+    for key, original in shipped_texts().items():
+        # A translation that leaves a number out would leave people without it.
+        assert set(words_in_braces(texts[key])) == set(words_in_braces(original)), key
+
+
+def test_a_missing_text_is_named_with_the_original(tmp_path: Path) -> None:
+    path = copy_german(tmp_path)
+    tables = tomllib.loads(path.read_text())
+    path.write_text(path.read_text().replace("\nnext = ", "\nnxt = ", 1))
+    with pytest.raises(BadInputError, match=r"unknown text 'common\.nxt'.*closest: common\.next"):
+        read_texts(tmp_path, "de")
+    path.write_text(re.sub(r"\nnxt = .*", "", path.read_text()))
+    with pytest.raises(BadInputError, match=r"lacks the text common\.next") as raised:
+        read_texts(tmp_path, "de")
+    assert str(path) in str(raised.value) and tables["common"]["next"] not in str(raised.value)
+    assert repr(shipped_texts()["common.next"]) in str(raised.value)
+
+
+@pytest.mark.parametrize("value", ['""', '"  "', "3", '["a"]', "true", '"' + "x" * 20_001 + '"'])
+def test_what_is_no_text_is_refused(tmp_path: Path, value: str) -> None:
+    path = copy_german(tmp_path)
+    path.write_text(re.sub(r"\nnext = .*", f"\nnext = {value}", path.read_text(), count=1))
+    with pytest.raises(BadInputError, match=r"common\.next must be a text in quotes"):
+        read_texts(tmp_path, "de")
+
+
+def test_words_in_braces_must_be_known(tmp_path: Path) -> None:
+    path = copy_german(tmp_path)
+    path.write_text(path.read_text().replace("{reference}", "{refrence}", 1))
+    with pytest.raises(BadInputError, match=r"\{refrence\}; it may have \{reference\}"):
+        read_texts(tmp_path, "de")
+
+
+def test_a_lab_may_change_every_word(tmp_path: Path) -> None:
+    path = copy_german(tmp_path)
+    changed = re.sub(r"\nnext = .*", '\nnext = "Vorwärts <b>&amp;"', path.read_text(), count=1)
+    path.write_text(changed)
+    texts, _ = read_texts(tmp_path, "de")
+    assert texts["common.next"] == "Vorwärts <b>&amp;"
+
+
+SCENARIO_TEXTS = """
+[study]
+title = "Was geschieht?"
+[scenario.drape.trial]
+prompt = "Wird das Tuch den gelben Gegenstand berühren?"
+[scenario."a.b".consent]
+text = "Ein Film dauert {minutes} Minuten."
+"""
+
+
+def test_titles_are_translated_and_texts_differ_by_scenario(tmp_path: Path) -> None:
+    path = copy_german(tmp_path)
+    path.write_text(path.read_text() + SCENARIO_TEXTS)
+    texts, _ = read_texts(tmp_path, "de", ("collide", "drape", "a.b"))
+    assert texts["study.title"] == "Was geschieht?"
+    assert texts["scenario.drape.trial.prompt"].startswith("Wird das Tuch")
+    assert texts["scenario.a.b.consent.text"] == "Ein Film dauert {minutes} Minuten."
+    with pytest.raises(BadInputError, match=r"unknown text 'scenario\.drape\.trial\.prompt'"):
+        read_texts(tmp_path, "de", ("collide", "a.b"))
+    path.write_text(path.read_text().replace('\nprompt = "Wird das', '\npromt = "Wird das'))
+    with pytest.raises(BadInputError, match=r"unknown text 'trial\.promt'.*closest: trial\.prompt"):
+        read_texts(tmp_path, "de", ("drape", "a.b"))
+
+
+def test_words_in_braces_of_a_scenario_must_be_known(tmp_path: Path) -> None:
+    path = copy_german(tmp_path)
+    path.write_text(path.read_text() + '[scenario.drape.study]\ntitle = "{contact}"\n')
+    with pytest.raises(BadInputError, match=r"drape\.study\.title has \{contact\}.*have none"):
+        read_texts(tmp_path, "de", ("drape",))
+
+
+def test_boxes_to_tick_are_optional_and_at_most_nine(tmp_path: Path) -> None:
+    path = copy_german(tmp_path)
+    boxes = '[consent]\ncheck_1 = "Ich bin volljährig."\ncheck_9 = "Ich habe alles gelesen."\n'
+    path.write_text(path.read_text().replace("[consent]\n", boxes))
+    texts, _ = read_texts(tmp_path, "de")
+    assert texts["consent.check_1"] == "Ich bin volljährig."
+    path.write_text(path.read_text().replace("check_9", "check_10"))
+    with pytest.raises(BadInputError, match=r"unknown text 'consent\.check_10'"):
+        read_texts(tmp_path, "de")
+
+
+def test_a_consent_form_is_a_pdf_file(tmp_path: Path) -> None:
+    assert read_consent_file(tmp_path, "en") is None
+    path = tmp_path / "consent-en.pdf"
+    path.write_bytes(b"%PDF-1.7 ...")
+    assert read_consent_file(tmp_path, "en") == b"%PDF-1.7 ..."
+    path.write_bytes(b"<html>")
+    with pytest.raises(BadInputError, match="no PDF file"):
+        read_consent_file(tmp_path, "en")
+    path.unlink()
+    path.symlink_to(tmp_path / "elsewhere.pdf")
+    with pytest.raises(BadInputError, match="link"):
+        read_consent_file(tmp_path, "en")
+
+
+def words_in_braces(text: str) -> list[str]:
+    return re.findall(r"\{([a-z_]+)\}", text)
+
+
+def copy_german(folder: Path) -> Path:
+    path = folder / "de.toml"
+    path.write_bytes(shipped_file("de"))
+    return path
+
+
+# --- the pages of the documentation ---------------------------------------------------------------
+
+
+DOCS = ROOT / "docs"
+
+
+PAGE = "".join(
+    (DOCS / name).read_text()
+    for name in (
+        "tutorials/study.md",
+        "how-to/run-a-study.md",
+        "reference/study.md",
+        "how-to/compare.md",
+    )
+)
+
+
+def _commands() -> list[list[str]]:
+    """Return the words of every `physion experiment` command on the page."""
+    joined = PAGE.replace("\\\n", " ")
+    found = re.findall(r"physion (experiment [a-z]+[^\n`#]*)", joined)
+    return [shlex.split(line) for line in found]
+
+
+def test_every_command_has_its_verb_and_options() -> None:
+    commands = _commands()
+    assert {words[1] for words in commands} >= set(SUBVERBS)
+    for words in commands:
+        options = importlib.import_module(SUBVERBS[words[1]]).Options
+        known = {field.name for field in fields(options)}
+        for word in words[2:]:
+            if word.startswith("--"):
+                name = word.removeprefix("--").removeprefix("no-").replace("-", "_")
+                assert name in known, " ".join(words)
+
+
+def test_every_setting_that_is_given_is_one_that_the_file_may_have() -> None:
+    given = re.findall(r"`([a-z_]+ = [^`]+)`", PAGE)
+    tables = {key.name: key.table for key in reversed(all_keys())}
+    assert len(given) >= 5
+    needed = {"name": "n", "version": "1", "title": "t", "contact": "c", "scenarios": ["collide"]}
+    for line in given:
+        name = line.partition(" ")[0]
+        content = f"[{tables[name]}]\n{line}" if tables[name] else line
+        settings = parse_settings(needed | tomllib.loads(content), Path(line))
+        assert isinstance(settings, StudySettings)
+
+
+def test_the_table_of_settings_is_generated() -> None:
+    """To make it anew, print `settings_table()` into the section Settings."""
+    assert settings_table() in PAGE
+
+
+def test_every_table_is_described() -> None:
+    described = re.findall(
+        r"^\| `([a-z_]+)` \|", PAGE.partition("## Settings")[0], flags=re.MULTILINE
+    )
+    assert set(described) == set(METADATA.tables)

@@ -1,20 +1,40 @@
-"""What a lab does: backups, and deleting without leaving bytes behind."""
+"""The database of a study: tables, lock and writer; backups, and deleting without a trace."""
 
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
+import stat
+import threading
+import traceback
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from sqlalchemy import Connection, Engine, event, insert, inspect, text
+from sqlalchemy.exc import IntegrityError, SQLAlchemyError
 
 from physion.cli.main import main
 from physion.core.errors import BadInputError, PhysionError
 from physion.experiment.protocol import Device, Enter, Event, Events
-from physion.experiment.store.database import ANSWERS, EVENTS, RAW_IDS, SESSIONS, TOKENS
+from physion.experiment.store.database import (
+    ANSWERS,
+    DATABASE_FILE,
+    EVENTS,
+    METADATA,
+    RAW_IDS,
+    SCHEMA,
+    SESSIONS,
+    TOKENS,
+    Writer,
+    create_database,
+    open_database,
+    server_lock,
+)
 from physion.experiment.store.lab import back_up, forget, forget_raw_ids, forget_sessions
-from physion.experiment.store.store import Store
+from physion.experiment.store.store import Refused, Store
 from physion.experiment.study.identity import Secrets, participant_hash
 from physion.experiment.study.study import Study
 from support.experiment.store_walk import (
@@ -29,6 +49,189 @@ from support.experiment.store_walk import (
     walk,
 )
 from support.experiment.tiny_study import make_tiny_study
+
+
+@pytest.fixture
+def engine(tmp_path: Path) -> Iterator[Engine]:
+    created = create_database(tmp_path)
+    with created.begin() as connection:
+        connection.execute(text("CREATE TABLE numbers (number INTEGER PRIMARY KEY)"))
+    yield created
+    created.dispose()
+
+
+def put(number: int) -> Callable[[Connection], int]:
+    def command(connection: Connection) -> int:
+        connection.execute(text("INSERT INTO numbers VALUES (:number)"), {"number": number})
+        return number
+
+    return command
+
+
+def kept(engine: Engine) -> set[int]:
+    with engine.connect() as connection:
+        return set(connection.scalars(text("SELECT number FROM numbers")))
+
+
+def test_a_new_database_has_the_tables_and_keeps_them(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="has the study been served"):
+        open_database(tmp_path)
+    create_database(tmp_path).dispose()
+    for engine in (create_database(tmp_path), open_database(tmp_path)):
+        assert set(inspect(engine).get_table_names()) == set(METADATA.tables)
+        engine.dispose()
+
+
+def test_a_server_that_was_killed_as_it_began_leaves_a_database_that_can_be_made(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / DATABASE_FILE).touch()
+    create_database(tmp_path).dispose()
+    with sqlite3.connect(tmp_path / DATABASE_FILE) as connection:
+        assert connection.execute("PRAGMA user_version").fetchone() == (SCHEMA,)
+
+
+def test_tables_of_another_version_are_refused(engine: Engine, tmp_path: Path) -> None:
+    with engine.begin() as connection:
+        connection.exec_driver_sql("PRAGMA user_version = 9")
+    for ask in (create_database, open_database):
+        with pytest.raises(BadInputError, match=f"version 9, this .* version {SCHEMA}") as caught:
+            ask(tmp_path)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
+    (tmp_path / DATABASE_FILE).write_bytes(b"no database at all" * 100)
+    for ask in (create_database, open_database):
+        with pytest.raises(PhysionError, match="cannot be read: file is not a database"):
+            ask(tmp_path)
+
+
+def test_errors_tell_no_values(engine: Engine) -> None:
+    """Participants' ids must not reach a log through an error message."""
+    row = {"participant": "0" * 32, "source": "sona", "raw_id": "Ada-5f1e", "seen": 1.0}
+    faults = (
+        lambda connection: connection.execute(insert(RAW_IDS), row | {"recruiter": {}}),
+        lambda connection: connection.execute(
+            text("INSERT INTO raw_ids VALUES (:a, :b, :c, NULL, NULL)"),
+            {"a": "1" * 32, "b": "sona", "c": "Ada-5f1e"},
+        ),
+        lambda connection: connection.execute(insert(RAW_IDS), [row | {"raw_id": object()}]),
+    )
+    with engine.begin() as connection:
+        faults[0](connection)
+    for fault in faults:
+        with pytest.raises(SQLAlchemyError) as caught, engine.begin() as connection:
+            fault(connection)
+        said = "".join(traceback.format_exception(caught.value)) + repr(caught.value)
+        assert "raw_ids" in said and "5f1e" not in said
+
+
+def test_a_second_server_is_refused_until_the_first_is_gone(tmp_path: Path) -> None:
+    stop = pytest.raises(PhysionError, match="stop the server")
+    with server_lock(tmp_path), stop, server_lock(tmp_path):
+        pass
+    with server_lock(tmp_path):
+        pass
+
+
+def test_commits_wait_for_the_disk(engine: Engine) -> None:
+    with engine.connect() as connection:
+        found = {
+            name: connection.exec_driver_sql(f"PRAGMA {name}").scalar()
+            for name in ("journal_mode", "synchronous", "foreign_keys", "secure_delete")
+        }
+    assert found == {"journal_mode": "wal", "synchronous": 2, "foreign_keys": 1, "secure_delete": 1}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="no such file modes on this system")
+def test_only_the_owner_reads_the_file_and_its_log(engine: Engine, tmp_path: Path) -> None:
+    with engine.connect() as connection:
+        connection.execute(text("SELECT * FROM sessions"))
+        modes = {
+            path.name: stat.S_IMODE(path.stat().st_mode) for path in tmp_path.glob("*.sqlite*")
+        }
+    names = (DATABASE_FILE, f"{DATABASE_FILE}-wal", f"{DATABASE_FILE}-shm")
+    assert modes == dict.fromkeys(names, 0o600)
+
+
+def test_nothing_is_acknowledged_before_the_commit(engine: Engine) -> None:
+    committing, go_on = threading.Event(), threading.Event()
+
+    @event.listens_for(engine, "commit")
+    def hold(connection: Connection) -> None:
+        committing.set()
+        assert go_on.wait(30)
+
+    writer = Writer(engine)
+    future = writer.submit(put(1))
+    assert committing.wait(30)
+    assert not future.done() and kept(engine) == set()
+    go_on.set()
+    assert future.result(30) == 1
+    assert kept(engine) == {1}
+    writer.close()
+
+
+def test_refusals_and_faults_roll_back_only_their_own_command(engine: Engine) -> None:
+    def refuse(connection: Connection) -> None:
+        put(1000)(connection)
+        raise Refused("not_yet", "no")
+
+    writer = Writer(engine)
+    futures = [writer.submit(command) for command in (put(1), refuse, put(1), put(2))]
+    errors = [type(future.exception(30)) for future in futures]
+    assert errors == [type(None), Refused, IntegrityError, type(None)]
+    assert kept(engine) == {1, 2}
+    writer.close()
+
+
+def test_waiting_commands_share_a_commit(engine: Engine) -> None:
+    commits, reached, go_on = [], threading.Event(), threading.Event()
+    event.listen(engine, "commit", lambda connection: commits.append(1))
+
+    def gate(connection: Connection) -> None:
+        reached.set()
+        assert go_on.wait(30)
+
+    writer = Writer(engine)
+    writer.submit(gate)
+    assert reached.wait(30)
+    futures = [writer.submit(put(number)) for number in range(100)]
+    go_on.set()
+    assert [future.result(30) for future in futures] == list(range(100))
+    assert len(commits) == 2
+    writer.close()
+
+
+def test_waiting_commands_are_written_before_the_writer_closes(engine: Engine) -> None:
+    writer = Writer(engine)
+    futures = [writer.submit(put(number)) for number in range(50)]
+    writer.close()
+    assert all(future.done() for future in futures) and kept(engine) == set(range(50))
+    with pytest.raises(Refused, match="stopping"):
+        writer.submit(put(99))
+
+
+def test_a_lock_of_another_program_is_a_refusal_after_which_all_continues(
+    engine: Engine, tmp_path: Path
+) -> None:
+    writer = Writer(engine)
+    other = sqlite3.connect(tmp_path / DATABASE_FILE, isolation_level=None)
+    other.execute("BEGIN IMMEDIATE")
+    with engine.connect() as connection:  # so that the pool has a connection with the short wait
+        connection.exec_driver_sql("PRAGMA busy_timeout = 50")
+    with pytest.raises(Refused, match="cannot write") as caught:
+        writer.submit(put(1)).result(30)
+    assert caught.value.code == "unavailable"
+    other.execute("ROLLBACK")
+    assert writer.submit(put(2)).result(30) == 2
+    other.close()
+    writer.close()
+    assert kept(engine) == {2}
+
+
+# --- what a lab does: backups and deleting --------------------------------------------------------
 
 
 @pytest.fixture
@@ -121,7 +324,7 @@ def bytes_of(folder: Path) -> bytes:
 
 
 @pytest.fixture
-def database(tmp_path: Path, small_study: Study, small_secrets: Secrets) -> Path:
+def filled(tmp_path: Path, small_study: Study, small_secrets: Secrets) -> Path:
     store = open_store(replace(small_study, participants=1000), small_secrets, tmp_path)
     fill(store)
     store.close()
@@ -131,13 +334,13 @@ def database(tmp_path: Path, small_study: Study, small_secrets: Secrets) -> Path
 
 
 def test_no_byte_of_the_ids_stays(
-    database: Path, tmp_path: Path, small_study: Study, small_secrets: Secrets
+    filled: Path, tmp_path: Path, small_study: Study, small_secrets: Secrets
 ) -> None:
-    assert forget(database, None) == 60
+    assert forget(filled, None) == 60
     found = bytes_of(tmp_path)
     assert b"5f1eada" not in found and b"visit-" not in found
-    assert forget(database, None) == 0
-    store = open_store(small_study, small_secrets, database)
+    assert forget(filled, None) == 0
+    store = open_store(small_study, small_secrets, filled)
     try:
         assert len(rows(store, SESSIONS)) == 60 and rows(store, RAW_IDS) == []
         # People are still recognised by their hash.
@@ -149,14 +352,14 @@ def test_no_byte_of_the_ids_stays(
 
 
 def test_single_participants_are_forgotten(
-    database: Path, tmp_path: Path, small_secrets: Secrets
+    filled: Path, tmp_path: Path, small_secrets: Secrets
 ) -> None:
     names = [participant_hash(small_secrets, "prolific", raw_id(number)) for number in (3, 4)]
     for wrong in ("0" * 32, "x", raw_id(3), "'; --", names[0].upper()):
         with pytest.raises(BadInputError, match="participant"):
-            forget(database, [names[0], wrong])
+            forget(filled, [names[0], wrong])
     assert raw_id(3).encode() in bytes_of(tmp_path)
-    assert forget(database, [*names, names[0]]) == 2
+    assert forget(filled, [*names, names[0]]) == 2
     found = bytes_of(tmp_path)
     assert raw_id(3).encode() not in found and b"-0004" not in found
     assert raw_id(5).encode() in found
@@ -180,12 +383,12 @@ def test_ids_are_forgotten_while_the_study_is_served(
 
 
 def test_a_served_study_and_a_busy_reader_are_named(
-    database: Path, tmp_path: Path, small_study: Study, small_secrets: Secrets,
+    filled: Path, tmp_path: Path, small_study: Study, small_secrets: Secrets,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    store = open_store(small_study, small_secrets, database)
+    store = open_store(small_study, small_secrets, filled)
     with pytest.raises(PhysionError, match="another"):
-        forget(database, None)
+        forget(filled, None)
     assert len(rows(store, RAW_IDS)) == 60
     store.close()
     monkeypatch.setattr("physion.experiment.store.database.BUSY_MS", 200)
@@ -193,9 +396,9 @@ def test_a_served_study_and_a_busy_reader_are_named(
     reader.execute("BEGIN")
     reader.execute("SELECT count(*) FROM raw_ids").fetchone()
     with pytest.raises(PhysionError, match="close that program and run"):
-        forget(database, None)
+        forget(filled, None)
     reader.close()
-    forget(database, None)
+    forget(filled, None)
     assert b"5f1eada" not in bytes_of(tmp_path)
 
 
@@ -247,7 +450,7 @@ def test_all_of_a_session_is_forgotten(
 
 
 def test_the_verb_forgets_a_session(
-    database: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    filled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with sqlite3.connect(tmp_path / "responses.sqlite") as connection:
         (reference,) = connection.execute("SELECT reference FROM sessions LIMIT 1").fetchone()
@@ -260,9 +463,7 @@ def test_the_verb_forgets_a_session(
     assert main(["experiment", "forget", study, "--session", reference, "--all"]) == 2
 
 
-def test_the_verb_forget(
-    database: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_verb_forget(filled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     study = str(tmp_path)
     assert main(["experiment", "forget", study]) == 2
     assert main(["experiment", "forget", study, "--all", "--participant", "0" * 32]) == 2

@@ -9,11 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pytest
-
-pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
-
 import av
+import pytest
 from sqlalchemy import select
 
 from physion.experiment.store.database import SESSIONS
@@ -26,12 +23,20 @@ from support.experiment.app_walk import Person, Served, served
 from support.experiment.tiny_study import FULL, OBSERVED, read_number
 
 TRIALS = {"familiarization": 3, "test": 6}
+
+
 PHASES = ("familiarization", "test")
+
+
 ADDRESS = re.compile(
     r"/media/([tf]-\d+-(?:movie|map))-([0-9a-f]{16})-([0-9a-f]{16})-([0-9a-f]{32})"
 )
+
+
 TELLING = {"contact", "correct", "accuracy", "percentile", "label", "outcome", "score", "stimulus",
            "full", "place", "answer", "feedback"}  # fmt: skip
+
+
 """Names in messages that could reveal an outcome."""
 
 

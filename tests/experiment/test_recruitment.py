@@ -13,8 +13,6 @@ from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
-pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
-
 from physion.cli.main import main
 from physion.core.errors import BadInputError
 from physion.experiment.protocol import Enter

@@ -9,18 +9,14 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
-
 from physion.experiment.server_process import ServerProcess
 from physion.experiment.store.database import open_database
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Study
-from support.experiment.browser import chromium, driver
 from support.experiment.experimenter_client import BASE, TWO
 from support.experiment.experimenter_rows import insert_sessions
 from support.experiment.tiny_study import PASSWORD, make_tiny_study
 
-__all__ = ["chromium", "driver"]
 pytestmark = pytest.mark.slow
 PAGES = ("", "?kind=simulated", "/sessions", "/sessions?flag=any", "/export", "/payments")
 
