@@ -36,8 +36,6 @@ from support.experiment.app_walk import Person, Served, answer_body, served
 from support.experiment.experimenter_client import lab
 
 TRIALS = {"familiarization": 2, "test": 3}
-
-
 WITH_TOKEN = [
     ("GET", "/api/session", None),
     ("GET", "/api/trials/test", None),
@@ -219,8 +217,6 @@ class TestSession:
 
 
 SECRET = "a word of the request that no answer may hold"
-
-
 STUDY = Study(folder=Path(), name="n", version="1", title="t", contact="c", scenarios=("collide",))
 
 
@@ -348,20 +344,10 @@ def test_logins_are_logged_without_addresses(
 
 
 PACKAGE = Path(physion.experiment.__file__).parent
-
-
 STATIC = PACKAGE / "static"
-
-
 VENDOR = STATIC / "vendor"
-
-
 OWN = sorted(STATIC.glob("*.js"))
-
-
 CODE = {path.name: path.read_text(encoding="utf-8") for path in OWN}
-
-
 TEXTS = {
     language: texts.read_texts(PACKAGE / "texts", language)[0]
     for language in texts.shipped_languages()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -39,7 +40,6 @@ from support.experiment.own_questions import (
 )
 from support.experiment.store_walk import (
     answer,
-    begin,
     enter,
     give,
     open_store,
@@ -179,7 +179,9 @@ def test_a_wrong_answer_shows_the_instructions_again(checking_store: Store) -> N
     walk(store, token, "done")
 
 
-def test_after_the_last_attempt_the_session_has_ended(checking_store: Store) -> None:
+def test_after_the_last_attempt_the_session_has_ended(
+    checking_store: Store, tmp_path: Path
+) -> None:
     store = checking_store
     token = walk(store, enter(store, "Ada", scenario="drop"), "comprehension")
     page(store, token, "comprehension", **WRONG)
@@ -195,6 +197,21 @@ def test_after_the_last_attempt_the_session_has_ended(checking_store: Store) -> 
         back = run(store.enter(request("Ada", scenario=scenario)))
         assert back.state.stage == "screened_out"
     walk(store, enter(store, "Bo", scenario="drop"), "done")
+    out = export_study(store.engine, store.study, tmp_path / "out").out
+    table = pd.read_csv(out / "sessions.csv").sort_values("comprehension_attempts")
+    assert table["comprehension_attempts"].tolist() == [1, 2]
+    assert table["screened_out"].fillna("").tolist() == ["", "comprehension"]
+    assert (pd.read_csv(out / "events.csv")["kind"] == ATTEMPT).sum() == 3
+
+
+@contextmanager
+def practice_store(study: Study, folder: Path, rules: Practice) -> Iterator[Store]:
+    """Open a store in which the practice has these rules."""
+    store = open_store(
+        replace(study, practice=rules), Secrets.load(study.folder), folder / "database"
+    )
+    yield store
+    store.close()
 
 
 def test_right_answers_are_not_sent(checking: Study) -> None:
@@ -203,19 +220,6 @@ def test_right_answers_are_not_sent(checking: Study) -> None:
     swapped = tuple(replace(each, right=each.options[0]) for each in COMPREHENSION)
     other = replace(checking, comprehension_questions=swapped)
     assert public_study(other, Secrets.load(checking.folder)).model_dump_json() == sent
-
-
-def test_attempts_and_ends_are_exported(checking_store: Store, tmp_path: Path) -> None:
-    store = checking_store
-    walk(store, enter(store, "Ada", scenario="drop"), "done")
-    token = enter(store, "Bo", scenario="collide")
-    for _ in range(2):
-        page(store, walk(store, token, "comprehension"), "comprehension", **WRONG)
-    out = export_study(store.engine, store.study, tmp_path / "out").out
-    table = pd.read_csv(out / "sessions.csv").sort_values("scenario")
-    assert table["comprehension_attempts"].tolist() == [2, 1]
-    assert table["screened_out"].fillna("").tolist() == ["comprehension", ""]
-    assert (pd.read_csv(out / "events.csv")["kind"] == ATTEMPT).sum() == 3
 
 
 PHASE = "familiarization"
@@ -232,11 +236,6 @@ def practising(tmp_path_factory: pytest.TempPathFactory) -> Study:
         scenarios=("collide", "drop"), practice=RULES,
         screened_out=EarlyEnd("", "out", ""),
     )  # fmt: skip
-
-
-@pytest.fixture
-def practice_store(practising: Study, database: Path) -> Iterator[Store]:
-    yield from opened(practising, database)
 
 
 def practise(store: Store, token: str, name: str, *responses: str) -> SessionState:
@@ -260,82 +259,60 @@ def test_as_many_right_answers_as_needed_pass(
     practising: Study, tmp_path: Path, responses: tuple[str, ...], right: int, needed: int
 ) -> None:
     """The labels are contact, none, contact; more than there are trials means all of them."""
-    study = replace(practising, practice=Practice(needed, 1, "end"))
-    store = open_store(study, Secrets.load(study.folder), tmp_path / "a")
-    token = walk(store, enter(store, "Ada", scenario="drop"), PHASE)
-    state = practise(store, token, "first", *responses)
-    passed = right >= min(needed, 3)
-    assert (state.stage, state.practice_repeats) == (("ready", 0) if passed else (PHASE, 1))
-    assert len(rows(store, PRACTICE_REPEATS)) == (0 if passed else 3)
-    store.close()
+    with practice_store(practising, tmp_path, Practice(needed, 1, "end")) as store:
+        token = walk(store, enter(store, "Ada", scenario="drop"), PHASE)
+        state = practise(store, token, "first", *responses)
+        passed = right >= min(needed, 3)
+        assert (state.stage, state.practice_repeats) == (("ready", 0) if passed else (PHASE, 1))
+        assert len(rows(store, PRACTICE_REPEATS)) == (0 if passed else 3)
 
 
+@pytest.mark.parametrize("failed", ["end", "flag"])
 @pytest.mark.parametrize("repeats", [0, 1, 3])
 def test_a_practice_is_repeated_as_often_as_the_study_says(
-    practising: Study, tmp_path: Path, repeats: int
+    practising: Study, tmp_path: Path, repeats: int, failed: str
 ) -> None:
-    study = replace(practising, practice=Practice(3, repeats, "end"))
-    store = open_store(study, Secrets.load(study.folder), tmp_path / "a")
-    token = walk(store, enter(store, "Ada", scenario="drop"), PHASE)
-    for number in range(repeats):
-        state = practise(store, token, f"repeat{number}", "no", "no", "no")
-        assert (state.stage, state.practice_repeats, state.ended) == (PHASE, number + 1, False)
-    state = practise(store, token, "the-last", "no", "no", "no")
-    assert (state.stage, state.ended) == ("screened_out", True)
-    kept = rows(store, PRACTICE_REPEATS)
-    assert [(row.repeat, row.trial) for row in kept] == [
-        (repeat, trial) for repeat in range(repeats) for trial in range(3)
-    ]
-    store.close()
+    """Then it ends the session, or is passed and flagged."""
+    with practice_store(practising, tmp_path, Practice(3, repeats, failed)) as store:
+        token = walk(store, enter(store, "Ada", scenario="drop"), PHASE)
+        for number in range(repeats):
+            state = practise(store, token, f"repeat{number}", "no", "no", "no")
+            assert (state.stage, state.practice_repeats, state.ended) == (PHASE, number + 1, False)
+        state = practise(store, token, "the-last", "no", "no", "no")
+        assert [(row.repeat, row.trial) for row in rows(store, PRACTICE_REPEATS)] == [
+            (repeat, trial) for repeat in range(repeats) for trial in range(3)
+        ]
+        if failed == "end":
+            assert (state.stage, state.ended) == ("screened_out", True)
+            assert store.ending(token).completion == Completion(code="out", url=None)
+            back = run(store.enter(request("Ada", scenario="collide")))
+            assert back.state.stage == "screened_out"
+        else:
+            assert (state.stage, state.practice_repeats) == ("ready", repeats)
+            walk(store, token, "done")
+        (session,) = rows(store, SESSIONS)
+        assert session.screened_out_by == ("practice" if failed == "end" else None)
+        assert session.failed_checks == ("practice" if failed == "flag" else None)
 
 
-def test_the_practice_is_repeated_and_then_passed(practice_store: Store) -> None:
-    store = practice_store
-    token = walk(store, enter(store, "Ada", scenario="drop"), PHASE)
-    state = practise(store, token, "first", "yes", "yes", "yes")
-    assert (state.stage, state.trial, state.practice_repeats) == (PHASE, 0, 1)
-    # An answer of the first practice, sent once more, gets its feedback and changes nothing.
-    again = give(store, token, 2, PHASE, response="yes", key="first-000002")
-    assert again.duplicate and again.feedback is not None and again.feedback.correct
-    assert run(store.state(token)) == state
-    other = answer(1, PHASE, key="another-key")
-    assert refusal(store.answer(token, other)).code == "out_of_order"
-    state = practise(store, token, "second", "yes", "no", "yes")
-    assert (state.stage, state.practice_repeats) == ("ready", 1)
-    assert [row.response for row in rows(store)] == ["yes", "no", "yes"]
-    kept = rows(store, PRACTICE_REPEATS)
-    assert [(row.trial, row.repeat, row.response) for row in kept] == [
-        (0, 0, "yes"), (1, 0, "yes"), (2, 0, "yes"),
-    ]  # fmt: skip
-    walk(store, token, "done")
-    (session,) = rows(store, SESSIONS)
-    assert (session.failed_checks, session.screened_out_at) == (None, None)
-
-
-def test_after_the_last_repeat_the_session_has_ended(practice_store: Store) -> None:
-    store = practice_store
-    token = walk(store, enter(store, "Ada", scenario="drop"), PHASE)
-    practise(store, token, "first", "no", "no", "no")
-    state = practise(store, token, "second", "no", "no", "no")
-    assert (state.stage, state.ended) == ("screened_out", True)
-    assert store.ending(token).completion == Completion(code="out", url=None)
-    assert run(store.enter(request("Ada", scenario="collide"))).state.stage == "screened_out"
-    (session,) = rows(store, SESSIONS)
-    assert session.screened_out_by == "practice"
-
-
-@pytest.mark.parametrize("repeats", [0, 2])
-def test_a_failed_practice_can_be_flagged(practising: Study, tmp_path: Path, repeats: int) -> None:
-    study = replace(practising, practice=Practice(3, repeats, "flag"))
-    store = open_store(study, Secrets.load(study.folder), tmp_path / "a")
-    token = walk(store, enter(store, "Ada", scenario="drop"), PHASE)
-    for number in range(repeats + 1):
-        state = practise(store, token, f"repeat{number}", "yes", "yes", "yes")
-    assert (state.stage, state.practice_repeats) == ("ready", repeats)
-    walk(store, token, "done")
-    (session,) = rows(store, SESSIONS)
-    assert session.failed_checks == "practice" and session.finished_at is not None
-    store.close()
+def test_the_practice_is_repeated_and_then_passed(practising: Study, tmp_path: Path) -> None:
+    with practice_store(practising, tmp_path, RULES) as store:
+        token = walk(store, enter(store, "Ada", scenario="drop"), PHASE)
+        state = practise(store, token, "first", "yes", "yes", "yes")
+        assert (state.stage, state.trial, state.practice_repeats) == (PHASE, 0, 1)
+        # An answer of the first practice, sent once more, gets its feedback and changes nothing.
+        again = give(store, token, 2, PHASE, response="yes", key="first-000002")
+        assert again.duplicate and again.feedback is not None and again.feedback.correct
+        assert run(store.state(token)) == state
+        other = answer(1, PHASE, key="another-key")
+        assert refusal(store.answer(token, other)).code == "out_of_order"
+        state = practise(store, token, "second", "yes", "no", "yes")
+        assert (state.stage, state.practice_repeats) == ("ready", 1)
+        assert [row.response for row in rows(store)] == ["yes", "no", "yes"]
+        assert [row.response for row in rows(store, PRACTICE_REPEATS)] == ["yes", "yes", "yes"]
+        walk(store, token, "done")
+        (session,) = rows(store, SESSIONS)
+        assert (session.failed_checks, session.screened_out_at) == (None, None)
 
 
 def test_repeats_are_exported_and_forgotten(practising: Study, tmp_path: Path) -> None:
@@ -373,13 +350,8 @@ def asking(tmp_path: Path) -> Study:
     )  # fmt: skip
 
 
-@pytest.fixture
-def asking_store(asking: Study, database: Path) -> Iterator[Store]:
-    yield from opened(asking, database)
-
-
-def test_own_questions_come_in_place_of_demographics(asking_store: Store) -> None:
-    store = asking_store
+def test_own_questions_come_in_place_of_demographics(asking: Study, database: Path) -> None:
+    store = open_store(asking, Secrets.load(asking.folder), database)
     token = walk(store, enter(store, "Ada", scenario="drop"), "questions")
     bad = PageDone(page="questions", data=OWN_ANSWERS | {"confidence": 9})
     assert "confidence" in str(refusal(store.page(token, bad)))
@@ -391,21 +363,24 @@ def test_own_questions_come_in_place_of_demographics(asking_store: Store) -> Non
     assert session.own_answers == OWN_ANSWERS | {"devices": ["phone", "console"]}
     assert session.questions_at is not None and session.demographics_at is None
     assert page(store, token, "feedback").stage == "done"
+    reference = run(store.state(token)).reference
+    store.close()
+    assert b"I looked" in (database / "responses.sqlite").read_bytes()
+    forget_sessions(database, [reference])
+    assert b"I looked" not in (database / "responses.sqlite").read_bytes()
+    store = open_store(asking, Secrets.load(asking.folder), database)
+    (session,) = rows(store, SESSIONS)
+    assert (session.own_answers, session.questions_at) == (None, None)
+    store.close()
 
 
-def test_a_study_without_questions_has_no_such_page(store: Store) -> None:
-    token = walk(store, enter(store, "Ada", scenario="drop"), "demographics")
-    assert "not a question" in str(refusal(store.page(token, PageDone(page="questions",
-                                                                   data=OWN_ANSWERS))))  # fmt: skip
-    assert page(store, token, "demographics").stage == "feedback"
-
-
-def test_answers_are_exported_with_their_words(asking_store: Store, tmp_path: Path) -> None:
-    store = asking_store
+def test_answers_are_exported_with_their_words(asking: Study, tmp_path: Path) -> None:
+    store = open_store(asking, Secrets.load(asking.folder), tmp_path / "database")
     for scenario in ("collide", "drop"):
         walk(store, enter(store, "Ada", scenario=scenario), "done")
     walk(store, enter(store, "Bo", scenario="drop"), "questions")
     out = export_study(store.engine, store.study, tmp_path / "out").out
+    store.close()
     table = pd.read_csv(out / "questions.csv")
     columns = ["strategy", "games", "devices_phone", "devices_console", "devices_computer",
                "confidence"]  # fmt: skip
@@ -421,21 +396,6 @@ def test_answers_are_exported_with_their_words(asking_store: Store, tmp_path: Pa
     psych = json.loads((out / "psych-ds" / "dataset_description.json").read_text())
     assert set(columns) <= {each["name"] for each in psych["variableMeasured"]}
     assert len(list((out / "psych-ds" / "data").glob("*questions_data.csv"))) == 1
-
-
-def test_answers_are_forgotten(asking: Study, tmp_path: Path) -> None:
-    url = tmp_path / "a"
-    store = open_store(asking, Secrets.load(asking.folder), url)
-    token = walk(store, begin(store, "Ada", scenario="drop"), "done")
-    reference = run(store.state(token)).reference
-    store.close()
-    assert b"I looked" in (url / "responses.sqlite").read_bytes()
-    forget_sessions(url, [reference])
-    assert b"I looked" not in (url / "responses.sqlite").read_bytes()
-    store = open_store(asking, Secrets.load(asking.folder), url)
-    (session,) = rows(store, SESSIONS)
-    assert (session.own_answers, session.questions_at) == (None, None)
-    store.close()
 
 
 def test_an_answered_question_keeps_its_form(asking: Study, tmp_path: Path) -> None:

@@ -46,14 +46,8 @@ from support.experiment.store_walk import (
 from support.experiment.tiny_study import make_tiny_study
 
 PLAIN = Condition("plain")
-
-
 BRIEF = Condition("brief", cue_ms=100, flash_hz=1.0, break_every=2, familiarization_feedback=False)
-
-
 OTHER = Condition("other", scenarios=("drop",))
-
-
 OWN_TEXTS = """
 [condition.brief.instructions]
 answer = "{practice} and {trials} movies."
@@ -76,11 +70,6 @@ def groups(tmp_path_factory: pytest.TempPathFactory) -> Study:
         texts.write(OWN_TEXTS)
     write_settings(replace(study, conditions=(PLAIN, BRIEF, OTHER)))
     return load_study(folder)
-
-
-@pytest.fixture
-def groups_store(groups: Study, database: Path) -> Iterator[Store]:
-    yield from opened(groups, database)
 
 
 def conditions_of(store: Store) -> Counter[str]:
@@ -168,7 +157,9 @@ def test_a_signed_link_fixes_the_condition(
     assert "  prolific, condition other: " in capsys.readouterr().out
 
 
-def test_a_session_has_the_settings_of_its_condition(groups_store: Store) -> None:
+def test_a_session_has_the_settings_of_its_condition(
+    groups_store: Store, groups: Study, database: Path
+) -> None:
     store = groups_store
     token = run(store.enter(link_to(store, "brief", scenario="drop"))).token
     state = run(store.state(walk(store, token, "familiarization")))
@@ -184,15 +175,14 @@ def test_a_session_has_the_settings_of_its_condition(groups_store: Store) -> Non
     state = run(store.state(walk(store, usual, "familiarization")))
     assert state.settings.cue_ms == 700
     assert give(store, usual, 0, "familiarization").feedback is not None
-
-
-def test_percentiles_are_among_people_of_the_same_condition(groups_store: Store) -> None:
-    store = groups_store
-    for person, condition in (("ada", "plain"), ("bob", "brief")):
-        token = run(store.enter(link_to(store, condition, person=person, scenario="drop"))).token
-        assert store.result(walk(store, token, "done")).percentile is None
+    # Percentiles are among people of the same condition.
+    for one in (token, usual):
+        assert store.result(walk(store, one, "done")).percentile is None
     token = run(store.enter(link_to(store, "plain", person="cleo", scenario="drop"))).token
     assert store.result(walk(store, token, "done")).percentile == 50.0
+    store.close()
+    with pytest.raises(BadInputError, match="condition brief"):
+        open_store(replace(groups, conditions=(PLAIN, OTHER)), store.secrets, database)
 
 
 @pytest.mark.parametrize(
@@ -212,16 +202,6 @@ def test_conditions_that_cannot_be_served_are_refused(
             load_study(write_settings(replace(groups, conditions=changed)).parent)
     finally:
         write_settings(groups)
-
-
-def test_a_condition_with_sessions_cannot_be_removed(groups: Study, tmp_path: Path) -> None:
-    url = tmp_path / "a"
-    secrets = Secrets.load(groups.folder)
-    store = open_store(groups, secrets, url)
-    page(store, run(store.enter(link_to(store, "brief"))).token, "consent")
-    store.close()
-    with pytest.raises(BadInputError, match="condition brief"):
-        open_store(replace(groups, conditions=(PLAIN, OTHER)), secrets, url)
 
 
 # --- export, overview and analysis ----------------------------------------------------------------
@@ -301,3 +281,8 @@ def test_the_analysis_compares_and_chooses_conditions(exported: tuple[Path, Stor
         keep_where(responses, ["brief"])
     with pytest.raises(BadInputError, match="no column language"):
         keep_where(alone, ["language=en"])
+
+
+@pytest.fixture
+def groups_store(groups: Study, database: Path) -> Iterator[Store]:
+    yield from opened(groups, database)

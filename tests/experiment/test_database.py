@@ -31,7 +31,6 @@ from physion.experiment.store.database import (
     Writer,
     create_database,
     open_database,
-    server_lock,
 )
 from physion.experiment.store.lab import back_up, forget, forget_raw_ids, forget_sessions
 from physion.experiment.store.store import Refused, Store
@@ -100,13 +99,6 @@ def test_tables_of_another_version_are_refused(engine: Engine, tmp_path: Path) -
         assert "\n" not in str(caught.value)
 
 
-def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
-    (tmp_path / DATABASE_FILE).write_bytes(b"no database at all" * 100)
-    for ask in (create_database, open_database):
-        with pytest.raises(PhysionError, match="cannot be read: file is not a database"):
-            ask(tmp_path)
-
-
 def test_errors_tell_no_values(engine: Engine) -> None:
     """Participants' ids must not reach a log through an error message."""
     row = {"participant": "0" * 32, "source": "sona", "raw_id": "Ada-5f1e", "seen": 1.0}
@@ -125,14 +117,6 @@ def test_errors_tell_no_values(engine: Engine) -> None:
             fault(connection)
         said = "".join(traceback.format_exception(caught.value)) + repr(caught.value)
         assert "raw_ids" in said and "5f1e" not in said
-
-
-def test_a_second_server_is_refused_until_the_first_is_gone(tmp_path: Path) -> None:
-    stop = pytest.raises(PhysionError, match="stop the server")
-    with server_lock(tmp_path), stop, server_lock(tmp_path):
-        pass
-    with server_lock(tmp_path):
-        pass
 
 
 def test_commits_wait_for_the_disk(engine: Engine) -> None:
@@ -243,33 +227,25 @@ def test_a_backup_of_a_served_study_is_a_study(
     served: Study, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     store = Store.open(served, Secrets.load(served.folder))
-    try:
-        token = walk(store, enter(store, "Ada"), "test")
-        give(store, token, 0)
-        command = ["experiment", "backup", str(served.folder), "--media", "--secret", "--json"]
-        assert main(command) == 0
-        made = Path(json.loads(capsys.readouterr().out)["backup"])
-        give(store, token, 1)  # not in the backup
-    finally:
-        store.close()
+    token = walk(store, enter(store, "Ada"), "test")
+    give(store, token, 0)
+    command = ["experiment", "backup", str(served.folder), "--media", "--secret", "--json"]
+    assert main(command) == 0
+    made = Path(json.loads(capsys.readouterr().out)["backup"])
+    give(store, token, 1)  # not in the backup
+    store.close()
     assert made.parent == served.folder / "backups"
     assert made.stat().st_mode & 0o077 == 0
     assert (made / "responses.sqlite").stat().st_mode & 0o077 == 0
     again = open_store(served, Secrets.load(made), made)
-    try:
-        assert [(row.phase, row.trial) for row in rows(again, ANSWERS)] == [
-            ("familiarization", 0), ("test", 0),
-        ]  # fmt: skip
-    finally:
-        again.close()
+    found = [(row.phase, row.trial) for row in rows(again, ANSWERS)]
+    assert found == [("familiarization", 0), ("test", 0)]
+    again.close()
     for name in ("study.toml", "stimuli.csv", "secret.json", "texts/de.toml"):
         assert (made / name).read_bytes() == (served.folder / name).read_bytes()
-    kept = {path.name for path in (made / "media").iterdir()}
-    assert kept == {path.name for path in (served.folder / "media").iterdir()}
-
-
-def test_keys_and_movies_are_left_out_unless_wanted(served: Study, tmp_path: Path) -> None:
-    Store.open(served, Secrets.load(served.folder)).close()
+    copied = {path.name for path in (made / "media").iterdir()}
+    assert copied == {path.name for path in (served.folder / "media").iterdir()}
+    # Keys and movies are left out unless wanted.
     made = back_up(served.folder, tmp_path / "safe")
     assert {path.name for path in made.iterdir()} == {
         "responses.sqlite", "study.toml", "stimuli.csv", "texts",
@@ -333,73 +309,73 @@ def filled(tmp_path: Path, small_study: Study, small_secrets: Secrets) -> Path:
     return tmp_path
 
 
-def test_no_byte_of_the_ids_stays(
-    filled: Path, tmp_path: Path, small_study: Study, small_secrets: Secrets
-) -> None:
+def test_no_byte_of_the_ids_stays(filled: Path, small_study: Study, small_secrets: Secrets) -> None:
     assert forget(filled, None) == 60
-    found = bytes_of(tmp_path)
+    found = bytes_of(filled)
     assert b"5f1eada" not in found and b"visit-" not in found
     assert forget(filled, None) == 0
     store = open_store(small_study, small_secrets, filled)
-    try:
-        assert len(rows(store, SESSIONS)) == 60 and rows(store, RAW_IDS) == []
-        # People are still recognised by their hash.
-        entered = enter(store, raw_id(1), source="prolific", scenario="drop")
-        assert len(rows(store, SESSIONS)) == 60
-        assert run(store.state(entered)).stage == "instructions"
-    finally:
-        store.close()
+    assert len(rows(store, SESSIONS)) == 60 and rows(store, RAW_IDS) == []
+    # People are still recognised by their hash.
+    entered = enter(store, raw_id(1), source="prolific", scenario="drop")
+    assert len(rows(store, SESSIONS)) == 60
+    assert run(store.state(entered)).stage == "instructions"
+    store.close()
 
 
-def test_single_participants_are_forgotten(
-    filled: Path, tmp_path: Path, small_secrets: Secrets
-) -> None:
+def test_single_participants_are_forgotten(filled: Path, small_secrets: Secrets) -> None:
     names = [participant_hash(small_secrets, "prolific", raw_id(number)) for number in (3, 4)]
     for wrong in ("0" * 32, "x", raw_id(3), "'; --", names[0].upper()):
         with pytest.raises(BadInputError, match="participant"):
             forget(filled, [names[0], wrong])
-    assert raw_id(3).encode() in bytes_of(tmp_path)
+    assert raw_id(3).encode() in bytes_of(filled)
     assert forget(filled, [*names, names[0]]) == 2
-    found = bytes_of(tmp_path)
+    found = bytes_of(filled)
     assert raw_id(3).encode() not in found and b"-0004" not in found
     assert raw_id(5).encode() in found
 
 
-@pytest.mark.slow
-def test_ids_are_forgotten_while_the_study_is_served(
-    tmp_path: Path, small_study: Study, small_secrets: Secrets
-) -> None:
-    store = open_store(small_study, small_secrets, tmp_path)
-    tokens = [begin(store, raw_id(number), source="sona") for number in range(4)]
-    walk(store, tokens[0], "test")
-    first = participant_hash(small_secrets, "sona", raw_id(0))
-    assert run(forget_raw_ids(store, [first])) == 1
-    assert len(rows(store, RAW_IDS)) == 3
-    assert run(forget_raw_ids(store)) == 3
-    assert rows(store, RAW_IDS) == []
-    assert not give(store, tokens[0], 0).duplicate  # and the session continues
-    assert b"5f1eada" not in bytes_of(tmp_path)
-    store.close()
-
-
 def test_a_served_study_and_a_busy_reader_are_named(
-    filled: Path, tmp_path: Path, small_study: Study, small_secrets: Secrets,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    filled: Path, small_study: Study, small_secrets: Secrets, monkeypatch: pytest.MonkeyPatch
+) -> None:
     store = open_store(small_study, small_secrets, filled)
     with pytest.raises(PhysionError, match="another"):
         forget(filled, None)
-    assert len(rows(store, RAW_IDS)) == 60
+    # While it is served, the store itself forgets ids.
+    first = participant_hash(small_secrets, "prolific", raw_id(0))
+    assert run(forget_raw_ids(store, [first])) == 1
+    assert len(rows(store, RAW_IDS)) == 59
     store.close()
     monkeypatch.setattr("physion.experiment.store.database.BUSY_MS", 200)
-    reader = sqlite3.connect(tmp_path / "responses.sqlite", isolation_level=None)
+    reader = sqlite3.connect(filled / "responses.sqlite", isolation_level=None)
     reader.execute("BEGIN")
     reader.execute("SELECT count(*) FROM raw_ids").fetchone()
     with pytest.raises(PhysionError, match="close that program and run"):
         forget(filled, None)
     reader.close()
     forget(filled, None)
-    assert b"5f1eada" not in bytes_of(tmp_path)
+    assert b"5f1eada" not in bytes_of(filled)
+
+
+def test_the_verb_forgets_a_session_or_all_ids(
+    filled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def forget_by_verb(*words: str, study: Path = filled, code: int = 0) -> tuple[str, str]:
+        assert main(["experiment", "forget", str(study), *words]) == code
+        printed = capsys.readouterr()
+        return printed.out, printed.err
+
+    with sqlite3.connect(filled / "responses.sqlite") as connection:
+        (reference,) = connection.execute("SELECT reference FROM sessions LIMIT 1").fetchone()
+    assert forget_by_verb("--session", reference) == ("forgotten: 1 session\n", "")
+    _, said = forget_by_verb("--session", "'; --", code=2)
+    assert "no sessions have the reference" in said and said.count("\n") == 1
+    forget_by_verb("--session", reference, "--all", code=2)
+    for words in ((), ("--all", "--participant", "0" * 32)):
+        assert "give the ids to delete" in forget_by_verb(*words, code=2)[1]
+    assert json.loads(forget_by_verb("--all", "--json")[0]) == {"forgotten": 59}
+    forget_by_verb("--all", study=tmp_path / "none", code=2)
+    assert not (tmp_path / "none").exists()
 
 
 def test_all_of_a_session_is_forgotten(
@@ -449,26 +425,17 @@ def test_all_of_a_session_is_forgotten(
     assert raw_id(2).encode() in found
 
 
-def test_the_verb_forgets_a_session(
-    filled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_other_files_and_tables_of_another_version_are_refused(
+    engine: Engine, tmp_path: Path
 ) -> None:
-    with sqlite3.connect(tmp_path / "responses.sqlite") as connection:
-        (reference,) = connection.execute("SELECT reference FROM sessions LIMIT 1").fetchone()
-    study = str(tmp_path)
-    assert main(["experiment", "forget", study, "--session", reference]) == 0
-    assert capsys.readouterr().out == "forgotten: 1 session\n"
-    assert main(["experiment", "forget", study, "--session", "'; --"]) == 2
-    said = capsys.readouterr().err
-    assert "no sessions have the reference" in said and said.count("\n") == 1
-    assert main(["experiment", "forget", study, "--session", reference, "--all"]) == 2
-
-
-def test_the_verb_forget(filled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    study = str(tmp_path)
-    assert main(["experiment", "forget", study]) == 2
-    assert main(["experiment", "forget", study, "--all", "--participant", "0" * 32]) == 2
-    assert capsys.readouterr().err.count("give the ids to delete") == 2
-    assert main(["experiment", "forget", study, "--all", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"forgotten": 60}
-    assert main(["experiment", "forget", str(tmp_path / "none"), "--all"]) == 2
-    assert not (tmp_path / "none").exists()
+    with engine.begin() as connection:
+        connection.exec_driver_sql("PRAGMA user_version = 9")
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / DATABASE_FILE).write_bytes(b"no database at all" * 100)
+    for ask in (create_database, open_database):
+        with pytest.raises(BadInputError, match=f"version 9, this .* version {SCHEMA}") as caught:
+            ask(tmp_path)
+        assert "\n" not in str(caught.value)
+        with pytest.raises(PhysionError, match="cannot be read: file is not a database"):
+            ask(other)

@@ -44,11 +44,7 @@ from support.experiment.tiny_study import PASSWORD
 HOSTILE = (
     "<script>alert(1)</script>\"'><img src=x onerror=alert(2)>'; DROP TABLE answers; --{{7*7}}"
 )
-
-
 PEOPLE, SIMULATED, PREVIEWS = 300, 12, 3
-
-
 ONE = {"participants": 1, "scenarios": ("drop",), "test": 2, "familiarization": 1}
 
 
@@ -576,8 +572,6 @@ def test_the_export_matches_the_command(
 
 
 PAGES = ("", "/", "/sessions", "/sessions/abc", "/payments", "/payments.csv", "/export", "?auto=1")
-
-
 ACTIONS = ("/logout", "/recruitment", "/sessions/abc/void", "/sessions/abc/forget",
            "/payments/forget", "/export")  # fmt: skip
 

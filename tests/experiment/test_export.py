@@ -46,14 +46,8 @@ from support.experiment.own_questions import OWN_QUESTIONS, OWN_TEXTS
 from support.experiment.tiny_study import FULL, OBSERVED, RATE, make_tiny_study, read_number
 
 NOW = 1_790_000_000.0
-
-
 NASTY = '=HYPERLINK("http://evil","x")\n-2;@SUM(1)\t+3, "quoted"\rend'
-
-
 CODE = "COMPLETION-CODE-17"
-
-
 SONA = f"https://lab.sona-systems.com/webstudy_credit.aspx?experiment_id=1&credit_token={CODE}"
 
 
@@ -472,8 +466,6 @@ TEMPLATE = [
     *("Analysis plan", "Data exclusion criteria", "Missing data", "Planned analyses"),
     "Exploratory analyses",
 ]
-
-
 """Headings in the order of the template."""
 
 

@@ -296,8 +296,6 @@ def test_answers_to_stimuli_that_are_gone_are_named(engine: sa.Engine, study: St
 
 
 NASTY = '=1+1\t"tab"\n-2;@SUM(1) \\ \r n/a'
-
-
 Exported = tuple[Path, pd.DataFrame, pd.DataFrame]
 
 

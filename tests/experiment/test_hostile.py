@@ -39,8 +39,6 @@ NASTY = (
     "\u202eright to left\u0085\ufeff",
     "\U0001f41b" * 20,
 )
-
-
 DEEP = "[" * 30_000 + "]" * 30_000
 
 
@@ -97,8 +95,6 @@ BODIES = {
     "NUL": changed(details={"x": "a\x00b"}),
     "half a character": changed(details={"x": "\ud800"}),
 }
-
-
 VALUES: dict[str, dict[str, Any]] = {
     "time beyond a day": {"rt_ms": 86_400_001},
     "time as text": {"rt_ms": "812.5"},

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import re
@@ -11,10 +10,12 @@ import signal
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from physion.analysis.tables import read_humans
@@ -43,7 +44,7 @@ from physion.trials.dataset import Dataset, mark_unusable
 from physion.trials.index import read_index, write_index
 from physion.trials.video import read_frames
 from support.experiment.tiny_dataset import is_marked, make_tiny_dataset
-from support.experiment.tiny_study import CONTACT, OBSERVED, make_tiny_study, read_number
+from support.experiment.tiny_study import CONTACT, OBSERVED, read_number
 from support.paths import ROOT
 
 
@@ -92,11 +93,6 @@ def test_another_seed_chooses_otherwise(dataset: Path) -> None:
     }
     assert len(patterns) >= 4
     assert len(set(all_of_them)) == 10 and len({frozenset(names) for names in all_of_them}) == 1
-
-
-def draw_of_roll(folder: Path, test: int) -> list[str]:
-    chosen = choose_trials(folder, scenarios=["roll"], test=test, practice=2)
-    return [source.stimulus for source in chosen.sources if source.phase == "test"]
 
 
 @pytest.mark.nightly
@@ -158,7 +154,7 @@ def test_without_another_of_the_preset_any_replaces_it_and_it_is_said(tmp_path: 
     assert Counter(source.label for source in test) == {True: 2, False: 2}
 
 
-def test_where_fewer_are_there_it_says_so(dataset: Path) -> None:
+def test_where_fewer_are_there_it_says_so(dataset: Path, tmp_path: Path) -> None:
     chosen = choose_trials(dataset, scenarios=["roll"])
     assert Counter(s.phase for s in chosen.sources) == {"test": 6, "familiarization": 4}
     assert chosen.notes == (
@@ -167,49 +163,53 @@ def test_where_fewer_are_there_it_says_so(dataset: Path) -> None:
         "roll: 6 testing trials instead of 150, since half must have contact and no more "
         "are available",
     )
-
-
-def test_fewer_of_one_kind_means_fewer_of_both(dataset: Path, tmp_path: Path) -> None:
-    copy_with_rows(dataset, tmp_path, lambda t: t["trial"] != "roll_testing_0002")
+    # Fewer of one kind means fewer of both.
+    change_index(dataset, tmp_path, lambda table: table[table["trial"] != "roll_testing_0002"])
     chosen = choose_trials(tmp_path, scenarios=["roll"])
     test = [source for source in chosen.sources if source.phase == "test"]
     assert Counter(s.label for s in test) == {True: 2, False: 2}
 
 
-def test_a_scenario_without_one_kind_is_refused(dataset: Path, tmp_path: Path) -> None:
-    copy_with_rows(dataset, tmp_path, lambda t: t["contact"] | (t["split"] != "familiarization"))
-    with pytest.raises(BadInputError, match="no familiarization trial of collide without") as e:
-        choose_trials(tmp_path)
-    assert "physion generate" in str(e.value) and "--split familiarization" in str(e.value)
+def change_index(dataset: Path, folder: Path, change: Callable[[Any], pd.DataFrame]) -> None:
+    """Copy a dataset and change the table of its trials."""
+    shutil.copytree(dataset, folder, dirs_exist_ok=True)
+    write_index(folder, change(read_index(folder)).reset_index(drop=True))
 
 
-def test_imported_trials_without_familiarization_name_the_official_scenes(
-    dataset: Path, tmp_path: Path
+def without_maps(table: pd.DataFrame) -> pd.DataFrame:
+    return table.assign(map=None, map_sha256=None)
+
+
+def imported_without_practice(table: pd.DataFrame) -> pd.DataFrame:
+    kept = table[table["split"] != "familiarization"]
+    return kept.assign(recorded_contact=kept["contact"])
+
+
+@pytest.mark.parametrize(
+    ("changed", "words", "message"),
+    [
+        (lambda t: t[t["contact"] | (t["split"] != "familiarization")], {},
+         r"no familiarization trial of collide without.*physion generate.*--split familiarization"),
+        (imported_without_practice, {}, "give --scenes official in place of --trials"),
+        (lambda t: t[t["split"] == "familiarization"], {}, "no testing trials"),
+        (without_maps, {}, "no map file"),
+        (None, {"test": 3, "practice": 4}, "must be even"),
+        (None, {"test": 0, "practice": 4}, "must be even"),
+        (None, {"test": 4, "practice": 5}, "must be even"),
+        (None, {"scenarios": ["colide"]}, "closest: collide"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_chosen_is_named(
+    dataset: Path, tmp_path: Path, changed: Any, words: dict[str, Any], message: str
 ) -> None:
-    copy_with_rows(dataset, tmp_path, lambda t: t["split"] != "familiarization")
-    table = read_index(tmp_path)
-    table["recorded_contact"] = table["contact"]
-    write_index(tmp_path, table)
-    with pytest.raises(BadInputError, match="give --scenes official in place of --trials"):
-        choose_trials(tmp_path)
+    if changed is not None:
+        change_index(dataset, tmp_path, changed)
+    with pytest.raises((BadInputError, UnknownNameError), match=message):
+        choose_trials(dataset if changed is None else tmp_path, **words)
 
 
-def test_datasets_without_testing_trials_are_refused(dataset: Path, tmp_path: Path) -> None:
-    copy_with_rows(dataset, tmp_path, lambda t: t["split"] == "familiarization")
-    with pytest.raises(BadInputError, match="no testing trials"):
-        choose_trials(tmp_path)
-    assert len(choose_familiarization(tmp_path, "roll").sources) == 4
-
-
-@pytest.mark.parametrize(("test", "practice"), [(3, 4), (0, 4), (4, 5), (-2, 4)])
-def test_counts_must_be_even(dataset: Path, test: int, practice: int) -> None:
-    with pytest.raises(BadInputError, match="must be even"):
-        choose_trials(dataset, test=test, practice=practice)
-
-
-def test_unknown_scenarios_get_the_closest(dataset: Path) -> None:
-    with pytest.raises(UnknownNameError, match="closest: collide"):
-        choose_trials(dataset, scenarios=["colide"])
+def test_familiarization_may_be_chosen_alone(dataset: Path) -> None:
+    assert len(choose_familiarization(dataset, "roll").sources) == 4
 
 
 @pytest.mark.slow
@@ -228,14 +228,6 @@ def test_a_look_that_was_not_made_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="--look redyellow"):
         choose_trials(tmp_path, test=2, practice=2)
     assert choose_trials(tmp_path, test=2, practice=2, look="redyellow").sources
-
-
-def test_trials_without_movies_are_refused(dataset: Path, tmp_path: Path) -> None:
-    table = copy_with_rows(dataset, tmp_path, lambda t: t["split"] != "")
-    table.loc[:, ["map", "map_sha256"]] = None
-    write_index(tmp_path, table)
-    with pytest.raises(BadInputError, match="no map file"):
-        choose_trials(tmp_path)
 
 
 # --- the folder ----------------------------------------------------------------------------------
@@ -264,16 +256,6 @@ def test_a_study_shows_what_the_trials_show(dataset: Path, tmp_path: Path) -> No
     assert {path.name for path in (study.folder / "media").iterdir()} == used
 
 
-def test_missing_files_are_named_all_at_once(dataset: Path, tmp_path: Path) -> None:
-    sources = list(choose_trials(dataset).sources)
-    for number in (0, 3):
-        sources[number] = dataclasses.replace(sources[number], observed=tmp_path / f"{number}.mp4")
-    with pytest.raises(BadInputError, match="2 of 48 files are missing") as raised:
-        make_study(empty_study(tmp_path / "study"), sources, "a password")
-    assert "0.mp4" in str(raised.value) and "3.mp4" in str(raised.value)
-    assert not (tmp_path / "study").exists()
-
-
 def test_an_interrupted_making_leaves_nothing(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -296,19 +278,31 @@ def test_an_interrupted_making_leaves_nothing(
 def test_folders_with_something_in_them_are_refused(
     dataset: Path, tmp_path: Path, name: str
 ) -> None:
-    folder = tmp_path / "study"
-    folder.mkdir()
-    (folder / name).write_text("mine")
+    (tmp_path / name).write_text("mine")
     with pytest.raises(BadInputError, match=r"already|not empty"):
-        make_study(empty_study(folder), choose_trials(dataset).sources, "a password")
-    assert [path.name for path in folder.iterdir()] == [name]
-
-
-def test_a_finished_study_is_never_replaced(dataset: Path, tmp_path: Path) -> None:
-    study = make_tiny_study(tmp_path)
-    with pytest.raises(BadInputError, match=r"study in .* already"):
         make_study(empty_study(tmp_path), choose_trials(dataset).sources, "a password")
-    assert load_study(tmp_path) == study
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+BAD_COMMANDS = {
+    "nothing": "give either --trials DATASET, --scenes official",
+    "--trials DATA --stimuli a.json": "give either",
+    "--scenes official --trials .": "give either --trials DATASET, --scenes",
+    "--trials DATA --movies .": "--movies needs --stimuli",
+    "--scenes official --movies .": "--movies needs --stimuli",
+    "--stimuli a.json": "--stimuli needs --movies",
+    "--stimuli a.json --movies .": "--familiarization LISTS",
+    "--trials . --rendered x": "--rendered goes with --scenes",
+    "--trials nowhere": "does not exist",
+    "--scenes nowhere": "nowhere",
+    "--trials DATA --test 7": "--test must be even",
+    "--scenes official --test 3": "--test must be even",
+    "--scenes official --scenario colide": "'colide'",
+    "--trials DATA --name a/b": "name is 'a/b': must be letters",
+    "--trials DATA --languages en fr": "unknown language 'fr'",
+    "--trials DATA --password-file SHORT": "8 characters or more",
+    "--trials DATA --password-file nowhere": "nowhere is missing",
+}
 
 
 # --- the command ---------------------------------------------------------------------------------
@@ -369,55 +363,27 @@ def test_the_command_takes_a_password_and_prints_json(
     assert check_password(Secrets.load(study.folder), "correct horse battery")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ([], "give either --trials DATASET, --scenes official"),
-        (["--trials", "DATA", "--stimuli", "a.json"], "give either"),
-        (["--trials", "DATA", "--movies", "."], "--movies needs --stimuli"),
-        (["--stimuli", "a.json"], "--stimuli needs --movies"),
-        (["--stimuli", "a.json", "--movies", "."], "--familiarization LISTS"),
-        (["--trials", "nowhere"], "does not exist"),
-        (["--trials", "DATA", "--test", "7"], "--test must be even"),
-        (["--trials", "DATA", "--name", "a/b"], "name is 'a/b': must be letters"),
-        (["--trials", "DATA", "--languages", "en", "fr"], "unknown language 'fr'"),
-        (["--trials", "DATA", "--password-file", "SHORT"], "8 characters or more"),
-        (["--trials", "DATA", "--password-file", "nowhere"], "nowhere is missing"),
-    ],
-)
+@pytest.mark.parametrize("words", BAD_COMMANDS)
 def test_bad_commands_are_one_line_and_leave_nothing(
-    dataset: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    words: list[str],
-    message: str,
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: str
 ) -> None:
-    short = tmp_path / "short"
-    short.write_text("short\n")
-    names = {"DATA": str(dataset), "SHORT": str(short)}
-    given = [names.get(word, word) for word in words]
+    (tmp_path / "short").write_text("short\n")
+    names = {"DATA": str(dataset), "SHORT": str(tmp_path / "short")}
+    given = [names.get(word, word) for word in words.split() if word != "nothing"]
     assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *given]) == 2
     error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1
+    assert BAD_COMMANDS[words] in error and error.count("\n") == 1
     assert not (tmp_path / "study").exists()
 
 
-def test_the_verb_without_words_lists_them(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["experiment"]) == 2
-    out = capsys.readouterr().out
-    assert all(f"\n  {word} " in out for word in SUBVERBS)
-    assert main(["experiment", "srve"]) == 2
-    assert "did you mean serve?" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("word", SUBVERBS)
-def test_a_missing_extra_is_said_in_one_line(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    word: str,
+def test_verbs_are_listed_and_a_missing_extra_is_said_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, word: str
 ) -> None:
+    assert main(["experiment"]) == 2
+    assert f"\n  {word} " in capsys.readouterr().out
+    assert main(["experiment", word[:-1]]) == 2
+    assert f"did you mean {word}?" in capsys.readouterr().err
     monkeypatch.setattr("physion.cli.experiment.experiment.NEEDED", ("no_such_module",))
     more = ["--all"] if word == "forget" else []
     assert main(["experiment", word, str(tmp_path / "s"), *more]) == 2
@@ -453,17 +419,6 @@ def test_a_killed_command_can_be_repeated(tmp_path: Path) -> None:
     used = {Path(n).name for s in study.stimuli for n in (s.movie, s.map, s.full) if n}
     assert {path.name for path in (folder / "media").iterdir()} == used
     assert {path.name for path in tmp_path.iterdir()} == {"dataset", "study"}
-
-
-def copy_with_rows(dataset: Path, folder: Path, keep: Any) -> Any:
-    """Copy a dataset with only these rows of its index; return the rows."""
-    shutil.copytree(dataset, folder, dirs_exist_ok=True)
-    from physion.trials.index import read_index
-
-    table = read_index(folder)
-    kept = table[keep(table)].reset_index(drop=True)
-    write_index(folder, kept)
-    return kept
 
 
 def empty_study(folder: Path, scenarios: tuple[str, ...] = ("collide", "roll")) -> Study:
@@ -506,11 +461,11 @@ def test_test_trials_were_seen_by_people_and_familiarization_is_apart(seen: set[
     assert all((canonical_name(task.trial) in seen) == (task.split == "testing") for task in tasks)
     scenes = [task.scene for task in tasks if task.scene is not None]
     assert len({scene.physics_digest() for scene in scenes}) == len(tasks) == 6
-
-
-def test_a_larger_study_adds_trials_to_a_smaller_one(seen: set[str]) -> None:
-    few, many = choose(collide(), seen, test=2), choose(collide(), seen, test=6)
-    assert {task.trial for task in few.tasks} < {task.trial for task in many.tasks}
+    # Familiarization trials of the original study come first.
+    drape = [trial for trial in official().trials if trial.scene.scenario == "drape"]
+    chosen = choose(drape, seen, test=2).tasks
+    practice = [task.trial for task in chosen if task.split == "familiarization"]
+    assert practice and all("familiarization" in name for name in practice)
 
 
 @pytest.mark.nightly
@@ -528,21 +483,17 @@ def test_scenes_whose_simulation_ends_otherwise_are_left_out_and_counted(seen: s
     assert f"recorded outcome: {len(differ)}" in chosen.notes[0]
 
 
+def test_a_larger_study_adds_trials_to_a_smaller_one(seen: set[str]) -> None:
+    few, many = choose(collide(), seen, test=2), choose(collide(), seen, test=6)
+    assert {task.trial for task in few.tasks} < {task.trial for task in many.tasks}
+
+
 def test_scenes_with_a_hidden_agent_or_patient_are_left_out(seen: set[str]) -> None:
     hidden = "pilot_it2_collision_simple_box_2_dis_2_occ_0008"
     faults = {
         t.scene.name: find_fault(t) for t in collide() if t.scene.name.startswith(hidden[:-1])
     }
     assert faults[hidden] == HIDDEN and "" in faults.values()
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_familiarization_trials_of_the_study_come_first(seen: set[str]) -> None:
-    drape = [trial for trial in official().trials if trial.scene.scenario == "drape"]
-    chosen = choose(drape, seen, test=2).tasks
-    practice = [task.trial for task in chosen if task.split == "familiarization"]
-    assert practice and all("familiarization" in name for name in practice)
 
 
 def test_a_scenario_without_scenes_of_one_kind_is_refused(seen: set[str]) -> None:
@@ -575,21 +526,7 @@ def test_the_command_renders_official_scenes_and_makes_a_study(
     assert load_study(tmp_path / "again").stimuli == stimuli
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--scenes", "official", "--trials", "."], "give either --trials DATASET, --scenes"),
-        (["--scenes", "official", "--movies", "."], "--movies needs --stimuli"),
-        (["--trials", ".", "--rendered", "x"], "--rendered goes with --scenes"),
-        (["--scenes", "official", "--test", "3"], "--test must be even"),
-        (["--scenes", "official", "--scenario", "colide"], "'colide'"),
-        (["--scenes", "nowhere"], "nowhere"),
-    ],
-)
-def test_bad_commands_with_scenes(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
-) -> None:
-    assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1
-    assert not list(tmp_path.iterdir())
+def draw_of_roll(folder: Path, test: int) -> list[str]:
+    """Return the names of the test trials that are chosen, in order."""
+    chosen = choose_trials(folder, scenarios=["roll"], test=test, practice=2)
+    return [source.stimulus for source in chosen.sources if source.phase == "test"]

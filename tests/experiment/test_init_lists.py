@@ -20,8 +20,6 @@ from support.experiment.tiny_dataset import make_tiny_dataset
 from support.experiment.tiny_study import CONTACT, FULL, OBSERVED, draw, draw_map, read_number
 
 LIST = "human-physics-benchmarking-collision-pilot_production_2_experimental_stims.json"
-
-
 SIZE = 64
 
 
@@ -61,12 +59,9 @@ def test_the_command_makes_a_study_of_lists(
     ids, practice = ids_of(6), ids_of(4, "pilot_it2_collision_simple_box")
     stimuli = write_list(tmp_path / LIST, ids)
     fam = write_list(tmp_path / "collision_familiarization.json", practice)
-    write_media(tmp_path / "mp4s", ids + practice, tmp_path / "maps")
-    words = ["--stimuli", str(stimuli), "--familiarization", str(fam), "--movies"]
-    words += [str(tmp_path / "mp4s"), "--json"]
-    assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 0
+    write_media(tmp_path / "movies" / "mp4s", ids + practice, tmp_path / "movies" / "maps")
+    study = load_study(make_listed(tmp_path, stimuli, fam, "--json"))
     assert json.loads(capsys.readouterr().out)["notes"] == []
-    study = load_study(tmp_path / "study")
     assert study.scenarios == ("collide",)
     assert [s.stimulus for s in study.phase("collide", "test")] == [n[:-4] for n in ids]
     # Those to practise on keep the order of their list.
@@ -86,41 +81,28 @@ def test_familiarization_may_come_from_a_dataset(tmp_path: Path) -> None:
     stimuli = write_list(tmp_path / LIST, ids)
     write_media(tmp_path / "movies", ids)
     make_tiny_dataset(tmp_path / "dataset", test=0, familiarization=4)
-    words = ["--stimuli", str(stimuli), "--movies", str(tmp_path / "movies"), "--practice", "4"]
-    words += ["--familiarization-trials", str(tmp_path / "dataset")]
-    assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 0
-    study = load_study(tmp_path / "study")
+    words = ["--practice", "4", "--familiarization-trials", str(tmp_path / "dataset")]
+    study = load_study(make_listed(tmp_path, stimuli, None, *words))
     assert Counter(s.phase for s in study.stimuli) == {"test": 4, "familiarization": 4}
 
 
+@pytest.mark.parametrize("missing", [3, 8])
 def test_missing_movies_are_named_all_at_once(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    ids = ids_of(6)
-    stimuli = write_list(tmp_path / LIST, ids)
-    write_media(tmp_path / "movies", ids)
-    for name in ids[1:4]:
-        (tmp_path / "movies" / f"{name}.mp4").unlink()
-    words = ["--stimuli", str(stimuli), "--familiarization", str(stimuli)]
-    words += ["--movies", str(tmp_path / "movies")]
-    assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 2
-    error = capsys.readouterr().err
-    assert all(f"{name}.mp4" in error for name in ids[1:4]) and error.count("\n") == 1
-    assert "3 of 12 files are missing" in error and f"{ids[0]}.mp4" not in error
-
-
-def test_many_missing_movies_are_three_and_a_count(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], missing: int
 ) -> None:
     ids = ids_of(8)
     stimuli = write_list(tmp_path / LIST, ids)
-    (tmp_path / "movies").mkdir()
-    words = ["--stimuli", str(stimuli), "--familiarization", str(stimuli)]
-    words += ["--movies", str(tmp_path / "movies")]
-    assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 2
+    write_media(tmp_path / "movies", ids)
+    for name in ids[-missing:]:
+        (tmp_path / "movies" / f"{name}.mp4").unlink()
+    make_listed(tmp_path, stimuli, stimuli, code=2)
     error = capsys.readouterr().err
-    assert "16 of 16 files are missing" in error and error.endswith(", and 13 more\n")
-    assert error.count(str(tmp_path / "movies")) == 3
+    assert error.count("\n") == 1 and error.count(str(tmp_path / "movies")) == 3
+    if missing == 3:
+        assert all(f"{name}.mp4" in error for name in ids[-3:])
+        assert "3 of 16 files are missing" in error and f"{ids[0]}.mp4" not in error
+    else:
+        assert "8 of 16 files are missing" in error and error.endswith(", and 5 more\n")
 
 
 def test_names_that_are_one_to_the_analysis_are_refused_before_movies_are_cut(
@@ -130,23 +112,12 @@ def test_names_that_are_one_to_the_analysis_are_refused_before_movies_are_cut(
     looks = [name.replace("_0", "-redyellow_0", 1) for name in ids]
     lists = [write_list(tmp_path / LIST, ids), write_list(tmp_path / f"looks_{LIST}", looks)]
     write_media(tmp_path / "movies", ids + looks)
-    words = ["--stimuli", str(lists[0]), "--familiarization", str(lists[1])]
-    words += ["--movies", str(tmp_path / "movies")]
-    assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 2
+    make_listed(tmp_path, *lists, code=2)
     error = capsys.readouterr().err
     assert "one stimulus to the analysis" in error and error.count("\n") == 1
-    assert looks[0].removesuffix("_img") in error and not (tmp_path / "study").exists()
-
-
-def test_a_stimulus_in_both_lists_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    ids = ids_of(4)
-    stimuli = write_list(tmp_path / LIST, ids)
-    write_media(tmp_path / "movies", ids)
-    words = ["--stimuli", str(stimuli), "--familiarization", str(stimuli)]
-    words += ["--movies", str(tmp_path / "movies")]
-    assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 2
+    assert looks[0].removesuffix("_img") in error
+    # A stimulus in both lists.
+    make_listed(tmp_path, lists[0], lists[0], code=2)
     assert "is already in row" in capsys.readouterr().err
 
 
@@ -247,18 +218,15 @@ def test_bad_lists_are_refused(tmp_path: Path, case: str) -> None:
     assert str(path) in str(raised.value)
 
 
-def test_lists_of_one_scenario_come_once(tmp_path: Path) -> None:
-    lists = [write_list(tmp_path / f"{name}.json", ids_of(2)) for name in "ab"]
-    with pytest.raises(BadInputError, match="both lists of collide"):
-        choose_listed(lists, [], tmp_path)
-
-
 def test_a_list_that_betrays_no_scenario_is_asked_for_it(tmp_path: Path) -> None:
     path = write_list(tmp_path / "mine.json", ids_of(2, "own"))
     with pytest.raises(BadInputError, match="which scenario is it"):
         choose_listed([path], [], tmp_path)
     path = write_list(tmp_path / "my-drop_list.json", ids_of(2, "own"))
     assert choose_listed([path], [], tmp_path).scenarios == ("drop",)
+    lists = [write_list(tmp_path / f"{name}.json", ids_of(2)) for name in "ab"]
+    with pytest.raises(BadInputError, match="both lists of collide"):
+        choose_listed(lists, [], tmp_path)
 
 
 def test_the_published_lists_are_read(official: Path) -> None:
@@ -298,10 +266,7 @@ def test_own_movies_have_any_scenario_and_length(tmp_path: Path) -> None:
     listed = write_own(tmp_path / "mine.csv", names, **own)
     fam = write_own(tmp_path / "first.csv", practice, scenario=["billiards"] * 2)
     write_media(tmp_path / "movies", names + practice)
-    words = ["--stimuli", str(listed), "--familiarization", str(fam)]
-    words += ["--movies", str(tmp_path / "movies")]
-    assert main(["experiment", "init", *CONTACT, str(tmp_path / "study"), *words]) == 0
-    study = load_study(tmp_path / "study")
+    study = load_study(make_listed(tmp_path, listed, fam))
     assert study.scenarios == ("billiards",)
     test = study.phase("billiards", "test")
     assert [stimulus.frames for stimulus in test] == [20, OBSERVED, 50]
@@ -311,24 +276,31 @@ def test_own_movies_have_any_scenario_and_length(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("columns", "told"),
+    ("scenario", "frames", "told"),
     [
-        ({"scenario": ["a b"] * 2}, r"row 1: scenario must be letters"),
-        ({"scenario": ["pool", "snooker"]}, r"of one scenario, not of pool and snooker"),
-        ({"scenario": ["pool", ""]}, r"of one scenario"),
-        (
-            {"scenario": ["pool"] * 2, "observed_frames": [0, 9]},
-            r"row 1 of column .obs.* holds .0.",
-        ),
-        (
-            {"scenario": ["pool"] * 2, "observed_frames": [9, 2.5]},
-            r"row 2 of column .obs.* holds .2\.5.",
-        ),
+        (["a b", "a b"], None, r"row 1: scenario must be letters"),
+        (["pool", "snooker"], None, r"of one scenario, not of pool and snooker"),
+        (["pool", ""], None, r"of one scenario"),
+        (["pool", "pool"], [0, 9], r"row 1 of column .obs.* holds .0."),
+        (["pool", "pool"], [9, 2.5], r"row 2 of column .obs.* holds .2\.5."),
     ],
 )
 def test_bad_columns_of_own_movies_are_named(
-    tmp_path: Path, columns: dict[str, Any], told: str
+    tmp_path: Path, scenario: list[str], frames: list[Any] | None, told: str
 ) -> None:
-    path = write_own(tmp_path / "list.csv", ["a", "b"], **columns)
+    more = {} if frames is None else {"observed_frames": frames}
+    path = write_own(tmp_path / "list.csv", ["a", "b"], scenario=scenario, **more)
     with pytest.raises(BadInputError, match=told):
         list_scenario(path, read_list(path))
+
+
+def make_listed(
+    folder: Path, stimuli: Path, familiarization: Path | None, *more: str, code: int = 0
+) -> Path:
+    """Make a study of two lists with the movies in ``folder``; return its folder."""
+    words = ["--stimuli", str(stimuli), "--movies", str(folder / "movies"), *more]
+    if familiarization is not None:
+        words += ["--familiarization", str(familiarization)]
+    assert main(["experiment", "init", *CONTACT, str(folder / "study"), *words]) == code
+    assert (folder / "study").exists() == (code == 0)
+    return folder / "study"

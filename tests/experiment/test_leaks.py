@@ -23,20 +23,12 @@ from support.experiment.app_walk import Person, Served, served
 from support.experiment.tiny_study import FULL, OBSERVED, read_number
 
 TRIALS = {"familiarization": 3, "test": 6}
-
-
 PHASES = ("familiarization", "test")
-
-
 ADDRESS = re.compile(
     r"/media/([tf]-\d+-(?:movie|map))-([0-9a-f]{16})-([0-9a-f]{16})-([0-9a-f]{32})"
 )
-
-
 TELLING = {"contact", "correct", "accuracy", "percentile", "label", "outcome", "score", "stimulus",
            "full", "place", "answer", "feedback"}  # fmt: skip
-
-
 """Names in messages that could reveal an outcome."""
 
 

@@ -33,8 +33,6 @@ from support.experiment.store_walk import (
 )
 
 MOVIE_S = 44 / 30
-
-
 """From the first to the last of the 45 frames of a movie."""
 
 

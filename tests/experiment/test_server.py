@@ -282,8 +282,6 @@ def test_serving_imports_nothing_slow() -> None:
 
 
 SERVER = ROOT / "examples" / "server"
-
-
 DEFAULTS = {field.name: field.default for field in fields(serve.Options)}
 
 

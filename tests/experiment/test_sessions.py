@@ -58,8 +58,6 @@ from support.experiment.store_walk import (
 )
 
 AGREED = PageDone(page="consent", data={"agreed": True})
-
-
 VISIT_KEY = "3f6c1d2e-0000-4000-8000-abcdefABCDEF"
 
 
@@ -71,11 +69,7 @@ def code_of(ask: Callable[[], object]) -> str:
 
 
 DEVICE = Device(user_agent="TellingBrowser 7", screen_width=1917)
-
-
 TELLING = (b"did-not-agree", b"TellingBrowser", b"1917", b"telling-visit", b"TellingEvent")
-
-
 ENDS = {
     "declined": EarlyEnd("NOCONSENT", "no-consent", "https://lab.example/declined"),
     "stopped": EarlyEnd("STOPPED", "", "https://lab.example/stopped"),

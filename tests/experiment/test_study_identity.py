@@ -121,6 +121,7 @@ def test_orders_depend_only_on_the_seed(small_study: Study) -> None:
     assert trial_order(shuffled, "collide", 11) == order
     # Pinned: an upgrade must not change the order of a session that is under way.
     assert [stimulus.place for stimulus in order["test"]] == [1, 0, 3, 2]
+    assert session_trials(small_study, "drop") == {"familiarization": 3, "test": 4}
 
 
 def test_every_order_is_as_likely(small_study: Study) -> None:
@@ -179,11 +180,6 @@ def test_addresses_of_media_lead_to_the_files(small_study: Study) -> None:
                 expected = small_study.folder / getattr(stimulus, kind)
                 assert read_media_path(small_study, KEYS, path) == expected
                 assert stimulus.stimulus not in path and "drop" not in path
-
-
-def test_no_full_movie_of_a_test_trial(small_study: Study) -> None:
-    with pytest.raises(ValueError, match="full movie of a test trial"):
-        sign_media(small_study, KEYS, "drop", 77, "test", 0, "full")
 
 
 def test_other_addresses_lead_nowhere(small_study: Study) -> None:
@@ -249,14 +245,6 @@ def test_addresses_tell_nothing_of_the_seed(small_study: Study) -> None:
 
 
 # --- orders with attention checks -----------------------------------------------------------------
-
-
-def test_the_seed_determines_the_order_of_the_test(tmp_path: Path) -> None:
-    study = make_tiny_study(tmp_path, test=6, familiarization=2, scenarios=("drop",), size=32)
-    order = trial_order(study, "drop", 11)
-    assert [each.place for each in order["test"]] == [4, 3, 5, 0, 1, 2]
-    assert order["familiarization"] == study.phase("drop", "familiarization")
-    assert session_trials(study, "drop") == {"familiarization": 2, "test": 6}
 
 
 @pytest.fixture(scope="module")

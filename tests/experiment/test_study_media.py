@@ -34,11 +34,7 @@ from support.experiment.tiny_study import (
 )
 
 NAMES_OF_COLUMNS = [column.name for column in COLUMNS]
-
-
 NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,30}", fullmatch=True)
-
-
 FILES = st.from_regex(r"media/[A-Za-z0-9][A-Za-z0-9_-]{0,20}", fullmatch=True)
 
 
@@ -81,17 +77,24 @@ def test_what_is_written_is_read_back(tmp_path: Path, stimuli: list[Stimulus]) -
     assert list(read_stimuli(path)) == stimuli
 
 
+def test_a_spreadsheet_may_save_it_in_any_order_of_columns(tmp_path: Path) -> None:
+    path = written_table(tmp_path)
+    original = path.read_text()
+    text = original.replace("True", "TRUE").replace("\n", "\r\n")
+    path.write_bytes(b"\xef\xbb\xbf" + text.encode() + b",,,,,,,,,,,,,\r\n")
+    assert list(read_stimuli(path)) == four_stimuli()
+    rows = list(csv.reader(original.splitlines()))
+    path.write_text("\n".join(",".join(reversed(row)) for row in rows))
+    assert list(read_stimuli(path)) == four_stimuli()
+    path.write_text(",".join(NAMES_OF_COLUMNS))
+    with pytest.raises(BadInputError, match="no rows"):
+        read_stimuli(path)
+
+
 def test_a_spreadsheet_may_save_it(tmp_path: Path) -> None:
     path = written_table(tmp_path)
     text = path.read_text().replace("True", "TRUE").replace("\n", "\r\n")
     path.write_bytes(b"\xef\xbb\xbf" + text.encode() + b",,,,,,,,,,,,,\r\n")
-    assert list(read_stimuli(path)) == four_stimuli()
-
-
-def test_columns_may_stand_in_any_order(tmp_path: Path) -> None:
-    path = written_table(tmp_path)
-    rows = list(csv.reader(path.read_text().splitlines()))
-    path.write_text("\n".join(",".join(reversed(row)) for row in rows))
     assert list(read_stimuli(path)) == four_stimuli()
 
 
@@ -159,13 +162,6 @@ def test_other_files_are_refused(tmp_path: Path, old: bytes, new: bytes, message
     path = written_table(tmp_path)
     path.write_bytes(path.read_bytes().replace(old, new, 1))
     with pytest.raises(BadInputError, match=message):
-        read_stimuli(path)
-
-
-def test_an_empty_file_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "stimuli.csv"
-    path.write_text(",".join(NAMES_OF_COLUMNS))
-    with pytest.raises(BadInputError, match="no rows"):
         read_stimuli(path)
 
 
@@ -245,22 +241,10 @@ def test_our_movies_are_copied_as_they_are(source: StimulusSource, folder: Path)
     assert (folder / found.full).read_bytes() == source.movie.read_bytes()
     assert (found.frames, found.full_frames, found.rate) == (OBSERVED, FULL, 30.0)
     assert (found.width, found.height, found.label) == (SIZE, SIZE, True)
-
-
-def test_names_match_the_content(source: StimulusSource, folder: Path) -> None:
-    found = import_stimulus(source, folder)
+    # Names match the content.
     for name in (found.movie, found.map, found.full):
         assert Path(name).stem == hashlib.sha256((folder / name).read_bytes()).hexdigest()
     assert len(list((folder / "media").iterdir())) == 3
-
-
-def test_test_stimuli_come_without_their_end(source: StimulusSource, folder: Path) -> None:
-    found = import_stimulus(replace(source, phase="test"), folder)
-    assert (found.full, found.full_frames) == ("", 0)
-    assert {path.name for path in (folder / "media").iterdir()} == {
-        Path(found.movie).name,
-        Path(found.map).name,
-    }
 
 
 def test_a_whole_movie_is_cut_to_exactly_the_observed_frames(
@@ -275,39 +259,39 @@ def test_a_whole_movie_is_cut_to_exactly_the_observed_frames(
     with av.open(str(folder / found.movie)) as container:
         packets = [packet for packet in container.demux(video=0) if packet.size]
     assert len(packets) == OBSERVED
+    # A test stimulus comes without its end.
+    assert (found.full, found.full_frames) == ("", 0)
+    names = {Path(found.movie).name, Path(found.map).name}
+    assert {path.name for path in (folder / "media").iterdir()} == names
 
 
-def test_an_observed_movie_of_more_frames_is_refused(source: StimulusSource, folder: Path) -> None:
-    assert source.observed is not None
-    source.observed.write_bytes(encode_movie(draw(1, True, SIZE)[: OBSERVED + 1]))
-    with pytest.raises(BadInputError, match="46 frames, not the 45") as raised:
-        import_stimulus(source, folder)
-    assert str(source.observed) in str(raised.value)
-    source.observed.write_bytes(encode_movie(draw(1, True, SIZE)[: OBSERVED - 1]))
-    with pytest.raises(BadInputError, match="44 frames, not the 45"):
-        import_stimulus(source, folder)
+def movie_of(frames: int, size: int = SIZE, rate: int = 30) -> bytes:
+    return encode_movie(draw(1, True, size)[:frames], rate=rate)
+
+
+@pytest.mark.parametrize(
+    ("which", "content", "changed", "message"),
+    [
+        ("observed", movie_of(OBSERVED + 1), {}, r"a_observed\.mp4.*46 frames, not the 45"),
+        ("observed", movie_of(OBSERVED - 1), {}, "44 frames, not the 45"),
+        ("movie", movie_of(40), {"observed": None, "phase": "test"}, "40 frames, not 45"),
+        ("movie", movie_of(OBSERVED), {}, "none after the 45"),
+        ("movie", movie_of(FULL, rate=100), {"observed": None}, "--playback slow"),
+        ("movie", movie_of(FULL, 2 * SIZE), {}, r"128 x 128 .* observed part 64 x 64"),
+        ("observed", movie_of(OBSERVED), {"digests": {"observed": "0" * 64}}, "index"),
+        ("observed", b"", {}, r"a_observed\.mp4"),
+        ("observed", b"not a movie", {}, r"a_observed\.mp4"),
+        ("observed", movie_of(OBSERVED)[:-2000], {}, r"a_observed\.mp4"),
+    ],
+    ids=range(10),
+)
+def test_movies_that_do_not_fit_are_refused(
+    source: StimulusSource, folder: Path, which: str, content: bytes, changed: Any, message: str
+) -> None:
+    getattr(source, which).write_bytes(content)
+    with pytest.raises(BadInputError, match=message):
+        import_stimulus(replace(source, **changed), folder)
     assert not list((folder / "media").iterdir())
-
-
-def test_a_movie_that_is_too_short_is_refused(source: StimulusSource, folder: Path) -> None:
-    source.movie.write_bytes(encode_movie(draw(1, True, SIZE)[: OBSERVED - 5]))
-    with pytest.raises(BadInputError, match="40 frames, not 45"):
-        import_stimulus(replace(source, observed=None, phase="test"), folder)
-    source.movie.write_bytes(encode_movie(draw(1, True, SIZE)[:OBSERVED]))
-    with pytest.raises(BadInputError, match="none after the 45"):
-        import_stimulus(source, folder)
-
-
-def test_a_faster_movie_than_screens_is_refused(source: StimulusSource, folder: Path) -> None:
-    source.movie.write_bytes(encode_movie(draw(1, True, SIZE), rate=100))
-    with pytest.raises(BadInputError, match="--playback slow"):
-        import_stimulus(replace(source, observed=None), folder)
-
-
-def test_whole_and_observed_movies_must_fit(source: StimulusSource, folder: Path) -> None:
-    source.movie.write_bytes(encode_movie(draw(1, True, 2 * SIZE)))
-    with pytest.raises(BadInputError, match=r"128 x 128 .* observed part 64 x 64"):
-        import_stimulus(source, folder)
 
 
 @pytest.mark.parametrize("what", ["audio", "yuv444p", "untagged"])
@@ -327,13 +311,6 @@ def test_what_browsers_may_not_play_rightly_is_encoded_again(
     assert numbers == list(range(OBSERVED))
 
 
-def test_files_that_do_not_match_the_index_are_refused(
-    source: StimulusSource, folder: Path
-) -> None:
-    with pytest.raises(BadInputError, match="index"):
-        import_stimulus(replace(source, digests={"observed": "0" * 64}), folder)
-
-
 @pytest.mark.parametrize("name", ["movie", "observed", "map"])
 def test_links_are_not_followed(source: StimulusSource, folder: Path, name: str) -> None:
     path: Path = getattr(source, name)
@@ -351,17 +328,6 @@ def test_a_link_in_the_study_is_replaced_by_the_file(source: StimulusSource, fol
     (folder / found.movie).symlink_to(outside)
     import_stimulus(source, folder)
     assert not (folder / found.movie).is_symlink()
-
-
-@pytest.mark.parametrize("damage", [b"", b"not a movie", None])
-def test_damaged_movies_are_refused(
-    source: StimulusSource, folder: Path, damage: bytes | None
-) -> None:
-    assert source.observed is not None
-    whole = source.observed.read_bytes()
-    source.observed.write_bytes(whole[: len(whole) * 2 // 3] if damage is None else damage)
-    with pytest.raises(BadInputError, match=r"a_observed\.mp4"):
-        import_stimulus(source, folder)
 
 
 # --- maps ----------------------------------------------------------------------------------------
@@ -446,22 +412,29 @@ def study(tmp_path: Path) -> Study:
     return make_tiny_study(tmp_path, test=2, familiarization=2, size=64)
 
 
-def test_a_right_study_passes(study: Study) -> None:
+def test_a_movie_that_continues_is_refused(
+    study: Study, capsys: pytest.CaptureFixture[str]
+) -> None:
     check_media(study)
-
-
-def test_a_movie_that_continues_is_refused(study: Study) -> None:
     path = study.folder / study.stimuli[-1].movie
     path.write_bytes(encode_movie(draw(3, False, 64)[: OBSERVED + 1]))
     with pytest.raises(BadInputError, match=r"46 frames; stimuli\.csv says 45") as raised:
         check_media(load_study(study.folder))
     assert str(path) in str(raised.value)
-
-
-def test_it_is_not_served(study: Study, capsys: pytest.CaptureFixture[str]) -> None:
-    (study.folder / study.stimuli[-1].movie).write_bytes(encode_movie(draw(3, False, 64)))
     assert main(["experiment", "serve", str(study.folder), "--port", "0"]) == 2
-    assert f"{FULL} frames" in capsys.readouterr().err
+    assert "46 frames" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("kind", "content"),
+    [("movie", b""), ("movie", b"no movie"), ("movie", draw_map(0, 64)),
+     ("map", b""), ("map", b"no map"), ("map", draw_map(0, 32))],
+)  # fmt: skip
+def test_what_is_no_movie_or_map_is_refused(study: Study, kind: str, content: bytes) -> None:
+    first = study.stimuli[0]
+    (study.folder / (first.full if kind == "movie" else first.map)).write_bytes(content)
+    with pytest.raises(BadInputError, match=kind):
+        check_media(study)
 
 
 @pytest.mark.parametrize(
@@ -478,17 +451,3 @@ def test_rows_that_say_otherwise_are_refused(
     rows = (*study.stimuli[:-1], dataclasses.replace(study.stimuli[-1], **change))
     with pytest.raises(BadInputError, match=message):
         check_media(dataclasses.replace(study, stimuli=rows))
-
-
-@pytest.mark.parametrize("content", [b"", b"no movie", draw_map(0, 64)])
-def test_what_is_no_movie_is_refused(study: Study, content: bytes) -> None:
-    (study.folder / study.stimuli[0].full).write_bytes(content)
-    with pytest.raises(BadInputError, match="movie"):
-        check_media(study)
-
-
-@pytest.mark.parametrize("content", [b"", b"no map", draw_map(0, 32)])
-def test_what_is_no_map_is_refused(study: Study, content: bytes) -> None:
-    (study.folder / study.stimuli[0].map).write_bytes(content)
-    with pytest.raises(BadInputError, match="map"):
-        check_media(study)

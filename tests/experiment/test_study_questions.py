@@ -21,7 +21,6 @@ from physion.experiment.study.settings import (
     check_answers,
     check_attempt,
     columns_of,
-    format_settings,
     parse_settings,
 )
 from physion.experiment.study.study import load_study
@@ -40,51 +39,75 @@ from support.experiment.own_questions import (
 from support.experiment.tiny_study import make_tiny_study
 from support.paths import ROOT
 
+NEEDED: dict[str, Any] = {
+    "name": "n", "version": "1", "title": "t", "contact": "c", "scenarios": ["collide"],
+}  # fmt: skip
+"""The settings that a study must have."""
+
 
 def test_questions_are_written_and_read_back(tmp_path: Path) -> None:
-    study = make_tiny_study(tmp_path, test=1, familiarization=1, questions=OWN_QUESTIONS,
-                            more_texts=OWN_TEXTS)  # fmt: skip
+    study = make_tiny_study(
+        tmp_path, test=1, familiarization=1, questions=OWN_QUESTIONS,
+        comprehension_questions=COMPREHENSION, more_texts=OWN_TEXTS + COMPREHENSION_TEXTS,
+    )  # fmt: skip
     assert study.questions == OWN_QUESTIONS == load_study(tmp_path).questions
     assert study.texts["de"]["question.games.options.never"] == "Never"
+    assert load_study(tmp_path).comprehension_questions == COMPREHENSION
+    assert study.texts["en"]["comprehension_question.task.text"] == "What do you predict?"
     path = tmp_path / "texts" / "de.toml"
-    path.write_text(path.read_text().replace('high = "Very"\n', ""))
-    with pytest.raises(BadInputError, match=r"de\.toml lacks the text question\.confidence\.high"):
-        load_study(tmp_path)
+    whole = path.read_text()
+    for line, lacking in (
+        ('high = "Very"\n', r"question\.confidence\.high"),
+        ('fall = "What falls"\n', r"comprehension_question\.task.*fall"),
+    ):
+        path.write_text(whole.replace(line, ""))
+        with pytest.raises(BadInputError, match=rf"de\.toml lacks the text {lacking}"):
+            load_study(tmp_path)
 
 
 @pytest.mark.parametrize(
     ("question", "told"),
     [
-        (
-            {"name": "Games", "kind": "text"},
-            "name .* a word of small letters",
-        ),
+        ({"name": "Games", "kind": "text"}, "name .* a word of small letters"),
         ({"name": "games"}, "missing 'kind'"),
         ({"name": "games", "kind": "text", "step": 3}, "unknown key"),
         ({"name": "games", "kind": "choice", "options": ["one"]}, "games needs options"),
         ({"name": "games", "kind": "scale", "options": ["a", "b"]}, "games has options"),
         ({"name": "games", "kind": "scale", "steps": 1}, "greater than or equal to 2"),
         ({"name": "games", "kind": "text", "right": "a"}, "not an option of it as a choice"),
-        (
-            {"name": "games", "kind": "choice", "options": ["a", "b"], "right": "c"},
-            "right answer c, which is not an option",
-        ),
+        ({"name": "games", "kind": "choice", "options": ["a", "b"], "right": "c"},
+         "right answer c, which is not an option"),
         ({"name": "games", "kind": "text", "picture": "../a.png"}, "the name of a PNG"),
         ({"name": "session", "kind": "text"}, "a second column session"),
         ({"name": "a_b", "kind": "text"}, "a second column a_b"),
     ],
-)
-def test_what_is_no_question_is_refused(
-    tmp_path: Path, question: dict[str, Any], told: str
-) -> None:
-    study = make_tiny_study(tmp_path, test=1, familiarization=1)
-    tables = tomllib.loads(format_settings(study, Path()))
+)  # fmt: skip
+def test_what_is_no_question_is_refused(question: dict[str, Any], told: str) -> None:
     first = {"name": "a", "kind": "choices", "options": ["b", "c"]}
     with pytest.raises(BadInputError, match=told):
-        parse_settings(tables | {"questions": [first, question]}, tmp_path / "study.toml")
+        parse_settings(NEEDED | {"questions": [first, question]}, Path("study.toml"))
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"right": "blue"}, "right answer blue, which is not an option"),
+        ({"options": ["red"]}, "must hold 2 values"),
+        ({"name": "task"}, "task exists twice"),
+        ({"correct": "red"}, "unknown key"),
+    ],
+)
+def test_what_is_no_check_is_refused(changed: dict[str, Any], told: str) -> None:
+    first = {"name": "task", "options": ["a", "b"], "right": "a"}
+    second = {"name": "colour", "options": ["red", "green"], "right": "red"} | changed
+    with pytest.raises(BadInputError, match=told):
+        parse_settings(NEEDED | {"comprehension_questions": [first, second]}, Path("study.toml"))
+
+
+def test_a_study_has_at_most_nine_questions() -> None:
     texts = [{"name": f"q{number}", "kind": "text"} for number in range(10)]
     with pytest.raises(BadInputError, match="at most 9"):
-        parse_settings(tables | {"questions": texts}, tmp_path / "study.toml")
+        parse_settings(NEEDED | {"questions": texts}, Path("study.toml"))
 
 
 def test_a_question_may_have_a_picture_and_a_right_answer(tmp_path: Path) -> None:
@@ -150,38 +173,6 @@ def test_each_question_is_answered_and_no_other() -> None:
     with pytest.raises(ValueError, match="an answer is required"):
         check_answers([needed], {"devices": []})
     assert check_answers([Question("a", "scale")], {"a": None}) == {"a": None}
-
-
-def test_the_check_is_read_back_and_needs_its_texts(tmp_path: Path) -> None:
-    study = make_tiny_study(
-        tmp_path, test=1, familiarization=1, comprehension_questions=COMPREHENSION,
-        more_texts=COMPREHENSION_TEXTS,
-    )  # fmt: skip
-    assert load_study(tmp_path).comprehension_questions == COMPREHENSION
-    assert study.texts["en"]["comprehension_question.task.text"] == "What do you predict?"
-    path = tmp_path / "texts" / "en.toml"
-    path.write_text(path.read_text().replace('fall = "What falls"\n', ""))
-    with pytest.raises(BadInputError, match=r"lacks the text comprehension_question\.task.*fall"):
-        load_study(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("changed", "told"),
-    [
-        ({"right": "blue"}, "right answer blue, which is not an option"),
-        ({"options": ["red"]}, "must hold 2 values"),
-        ({"name": "task"}, "task exists twice"),
-        ({"correct": "red"}, "unknown key"),
-    ],
-)
-def test_what_is_no_check_is_refused(tmp_path: Path, changed: dict[str, Any], told: str) -> None:
-    tables = tomllib.loads(
-        format_settings(make_tiny_study(tmp_path, test=1, familiarization=1), Path())
-    )
-    first = {"name": "task", "options": ["a", "b"], "right": "a"}
-    second = {"name": "colour", "options": ["red", "green"], "right": "red"} | changed
-    with pytest.raises(BadInputError, match=told):
-        parse_settings(tables | {"comprehension_questions": [first, second]}, tmp_path / "s.toml")
 
 
 def test_an_attempt_answers_every_question() -> None:

@@ -29,22 +29,14 @@ from support.experiment.browser import (
 )
 
 pytestmark = pytest.mark.slow
-
-
 SMALL = {"width": 900, "height": 560}
-
-
 PHONE = {
     "viewport": {"width": 1100, "height": 700},
     "screen": {"width": 1100, "height": 700},
     "has_touch": True,
     "is_mobile": True,
 }
-
-
 TABLET = {"viewport": SMALL, "screen": SMALL, "has_touch": True}
-
-
 NEXT = "Another person takes part on this computer"
 
 
@@ -305,11 +297,7 @@ SCREEN = """
 Object.defineProperty(screen, "width", {value: 1280});
 Object.defineProperty(screen, "height", {value: 800});
 """
-
-
 """What Playwright tells pages of the screen does not reach frames of other sites."""
-
-
 COUNT_PLAYS = """
 window.plays = 0;
 const original = HTMLVideoElement.prototype.play;

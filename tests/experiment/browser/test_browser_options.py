@@ -40,17 +40,11 @@ from support.experiment.own_questions import (
 from support.experiment.tiny_study import make_tiny_study
 
 pytestmark = pytest.mark.slow
-
-
 BOXES = """[consent]
 check_1 = "I am 18 or older."
 check_2 = "I have read this form."
 """
-
-
 FORM = b"%PDF-1.7 a form"
-
-
 TEXTS = """
 [scenario.drop.trial]
 prompt = "Will the falling object be hit?"
@@ -317,14 +311,10 @@ new MutationObserver((changes) => {
     if (target.matches?.(".has-verdict .screen-map") && !target.hidden) window.flashes += 1;
 }).observe(document, { subtree: true, attributes: true, attributeFilter: ["hidden"] });
 """
-
-
 VERDICTS = (
     "The object that flashed red touches the object that flashed yellow.",
     "The object that flashed red does not touch the object that flashed yellow.",
 )
-
-
 OWN = """
 [study]
 title = "Was geschieht?"
@@ -430,8 +420,6 @@ CONSENTS = {
     "en": ("en-US", "you receive $4.00. At 20 minutes this is $12.00 per hour."),
     "de": ("de-DE", "erhalten Sie 4,00\xa0$. Bei 20 Minuten sind das 12,00\xa0$ in der Stunde."),
 }
-
-
 FUNDERS = {
     "en": "This study is paid for by the Abc Foundation.",
     "de": "Diese Studie wird bezahlt von: the Abc Foundation.",

@@ -104,8 +104,6 @@ WATCH_STATUS = """() => {
   };
   look();
 }"""
-
-
 """Records in which part of a trial the message about the connection can be seen."""
 
 
@@ -511,8 +509,6 @@ WATCH_TROUBLE = """() => {
   new MutationObserver(() => window.troubles.push(status.textContent))
     .observe(status, {childList: true, characterData: true, subtree: true});
 }"""
-
-
 """Function that keeps what the page says about the connection from now on."""
 
 
