@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import sqlalchemy as sa
 from sqlalchemy.exc import OperationalError
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
@@ -34,6 +33,7 @@ from physion.experiment.study.study import Study
 from physion.experiment.web.guards import Guards, content_policy
 from support.experiment.app_walk import Person, Served, answer_body, served
 from support.experiment.experimenter_client import lab
+from support.experiment.store_walk import rows
 
 TRIALS = {"familiarization": 2, "test": 3}
 WITH_TOKEN = [
@@ -164,11 +164,8 @@ class TestSession:
         person.page("demographics")
         person.page("feedback")
         result = wire.Result.model_validate(person.ask("GET", "/api/result"))
-        assert (result.trials, result.correct, result.percentile) == (
-            3,
-            2,
-            None,
-        )  # no other participants
+        assert (result.trials, result.correct) == (3, 2)
+        assert result.percentile is None, "no other participants"
         site.person(id="p-other", scenario="collide").walk("done")
         result = wire.Result.model_validate(person.ask("GET", "/api/result"))
         assert result.percentile == 50
@@ -197,15 +194,12 @@ class TestSession:
         assert first.ask("POST", "/api/enter", who)["state"]["trial"] == 2
 
     def test_mturk_preview_begins_nothing(self, site: Served) -> None:
-        with site.store.engine.connect() as connection:
-            before = connection.scalar(sa.select(sa.func.count()).select_from(SESSIONS))
+        before = rows(site.store, SESSIONS)
         preview = {"assignmentId": "ASSIGNMENT_ID_NOT_AVAILABLE", "hitId": "h"}
         for more in ({}, {"id": "w1"}):
             body = {"source": "mturk", "recruiter": preview, **more}
             refused(site.client.post("/api/enter", json=body), 403, "not_yet")
-        with site.store.engine.connect() as connection:
-            after = connection.scalar(sa.select(sa.func.count()).select_from(SESSIONS))
-        assert before == after
+        assert rows(site.store, SESSIONS) == before
 
     def test_entering_refuses_unknown_fields(self, site: Served) -> None:
         person = Person(site.client)
@@ -220,23 +214,22 @@ SECRET = "a word of the request that no answer may hold"
 STUDY = Study(folder=Path(), name="n", version="1", title="t", contact="c", scenarios=("collide",))
 
 
-async def _echo(request: Request) -> Response:
-    return PlainTextResponse(str(len(await request.body())))
-
-
-async def _fail(request: Request) -> Response:
-    raise RuntimeError(SECRET)
-
-
-async def _own_headers(request: Request) -> Response:
-    return PlainTextResponse("", headers={"cache-control": "private", "x-own": "1"})
-
-
 def client(study: Study = STUDY, **settings: str) -> TestClient:
+    """Return a client of three pages behind the guards."""
+
+    async def echo(request: Request) -> Response:
+        return PlainTextResponse(str(len(await request.body())))
+
+    async def fail(request: Request) -> Response:
+        raise RuntimeError(SECRET)
+
+    async def own_headers(request: Request) -> Response:
+        return PlainTextResponse("", headers={"cache-control": "private", "x-own": "1"})
+
     routes = [
-        Route("/echo", _echo, methods=["POST", "GET"]),
-        Route("/fail", _fail),
-        Route("/own", _own_headers),
+        Route("/echo", echo, methods=["POST", "GET"]),
+        Route("/fail", fail),
+        Route("/own", own_headers),
     ]
     app = Starlette(routes=routes, middleware=[Middleware(Guards, study=study)])
     return TestClient(app, **settings)
@@ -253,8 +246,6 @@ class TestHeaders:
             assert answer.headers["cache-control"] == "no-store"
             assert answer.headers["x-frame-options"] == "DENY"
             assert "strict-transport-security" not in answer.headers
-
-    def test_https_is_kept(self) -> None:
         headers = client(base_url="https://lab.example.org").get("/echo").headers
         assert headers["strict-transport-security"] == "max-age=31536000"
 
@@ -264,32 +255,26 @@ class TestHeaders:
         assert headers["x-own"] == "1"
         assert headers["x-content-type-options"] == "nosniff"
 
-    def test_only_named_sites_may_embed_the_pages(self) -> None:
+    def test_only_named_sites_may_embed_the_pages_and_nothing_inline_runs(self) -> None:
         sites = ("https://www.mturk.com", "https://workersandbox.mturk.com")
         headers = client(replace(STUDY, embed_from=sites)).get("/echo").headers
         assert f"frame-ancestors {' '.join(sites)};" in headers["content-security-policy"]
         assert "x-frame-options" not in headers
-
-    def test_nothing_inline_and_nothing_from_elsewhere_runs(self) -> None:
         policy = content_policy(STUDY)
-        assert "unsafe" not in policy
-        assert "http" not in policy
+        assert "unsafe" not in policy and "http" not in policy
         assert "script-src 'self';" in policy
 
 
-class TestErrors:
-    def test_an_internal_error_reveals_nothing(self, caplog: pytest.LogCaptureFixture) -> None:
-        with caplog.at_level(logging.ERROR, logger="physion.experiment"):
-            answer = client().get(
-                "/fail?id=5f9c-prolific", headers={"authorization": "Bearer good"}
-            )
-        assert answer.status_code == 500
-        assert set(answer.json()) == {"error", "message", "state", "completion"}
-        assert answer.json()["error"] == "server_error"
-        assert SECRET not in answer.text and "Traceback" not in answer.text
-        # The log has the traceback, but neither the participant nor the token.
-        assert SECRET in caplog.text
-        assert "prolific" not in caplog.text and "good" not in caplog.text
+def test_an_internal_error_reveals_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.ERROR, logger="physion.experiment"):
+        answer = client().get("/fail?id=5f9c-prolific", headers={"authorization": "Bearer good"})
+    assert answer.status_code == 500
+    assert set(answer.json()) == {"error", "message", "state", "completion"}
+    assert answer.json()["error"] == "server_error"
+    assert SECRET not in answer.text and "Traceback" not in answer.text
+    # The log has the traceback, but neither the participant nor the token.
+    assert SECRET in caplog.text
+    assert "prolific" not in caplog.text and "good" not in caplog.text
 
 
 ALL = "physion.experiment"

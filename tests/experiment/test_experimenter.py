@@ -95,28 +95,6 @@ def session_of(found: Lab, token: str) -> sa.Row:
 # --- progress ------------------------------------------------------------------------------------
 
 
-def test_states_of_sessions() -> None:
-    names = ("voided_at", "finished_at", "withdrawn_at", "screened_out_at")
-    states = ("void", "finished", "withdrawn", "screened_out")
-    for name, state in zip(names, states, strict=True):
-        row = SimpleNamespace(**dict.fromkeys(names) | {name: 1.0, "last_seen": 1.0})
-        assert session_state(row, 2.0) == state
-    row = SimpleNamespace(**dict.fromkeys(names), last_seen=1000.0)
-    assert [session_state(row, 1000.0 + after) for after in (0, 900, 901)] == [
-        "going", "going", "left",
-    ]  # fmt: skip
-
-
-def test_spans_of_time_and_strange_texts_in_words() -> None:
-    assert [minutes(value) for value in (None, 12.4, 185, 3000)] == [
-        "–",
-        "12 min",
-        "3 h 05",
-        "2 d 2 h",
-    ]
-    assert visible("ab\u202ecd\x00") == "ab\\u202ecd\\u0000"
-
-
 @pytest.mark.slow
 def test_progress_counts_people_and_their_answers(busy: tuple[Lab, Visitor]) -> None:
     found, visitor = busy
@@ -152,15 +130,6 @@ def test_progress_counts_each_condition(tmp_path: Path) -> None:
         head, *shown = table_of(found.experimenter().see().text, 1)
         assert head[:2] == ["Condition", "Counted"]
         assert [row[:2] for row in shown] == [["plain", "2"], ["brief", "3"]]
-
-
-def test_simulated_ones_and_previews_stand_apart(busy: tuple[Lab, Visitor]) -> None:
-    _, visitor = busy
-    for kind, count in (("simulated", SIMULATED), ("preview", PREVIEWS)):
-        text = visitor.see(f"/sessions?kind={kind}").text
-        assert len(references(text)) == count and visitor.see(f"?kind={kind}").status_code == 200
-    strange = visitor.see("?kind=%3Cscript%3E")
-    assert strange.status_code == 200 and "<script>" not in strange.text
 
 
 def test_many_entries_in_a_minute_raise_an_alarm(
@@ -210,6 +179,9 @@ def test_sessions_are_chosen(busy: tuple[Lab, Visitor]) -> None:
     assert "No matching session." in visitor.see("/sessions?state=none").text
     counts = re.findall(r'<span class="count">(\d+)', visitor.see("/sessions").text)
     assert counts == [str(PEOPLE), str(SIMULATED), str(PREVIEWS)]
+    for kind, count in (("simulated", SIMULATED), ("preview", PREVIEWS)):
+        text = visitor.see(f"/sessions?kind={kind}").text
+        assert len(references(text)) == count and visitor.see(f"?kind={kind}").status_code == 200
 
 
 def test_the_list_of_sessions_has_their_numbers(busy: tuple[Lab, Visitor]) -> None:
@@ -315,10 +287,18 @@ def test_a_void_session_does_not_count(small: tuple[Lab, Visitor]) -> None:
     row = session_of(found, walk(found.store, enter(found.store, "Fake"), "done"))
     assert refusal(found.store.enter(Enter(id="Next"))).code == "study_full"
     page = f"/sessions/{row.session}"
+    begin_at = time.time()
     assert visitor.submit(f"{page}/void", action="void").status_code == 303
     assert "This session is void" in visitor.see(page).text
     assert len(read_tables(found.store.engine, found.study)[1]) == 0
     later = begin(found.store, "Next")
+    # Only the chosen session became void.
+    voided = {each.session: each.voided_at for each in sessions_of(found)}
+    assert begin_at <= voided.pop(row.session) <= time.time()
+    assert list(voided.values()) == [None]
+    head, *_, total = table_of(visitor.see().text)
+    cells = dict(zip(head, total, strict=True))
+    assert (cells["Finished"], cells["Void"]) == ("0 of 1", "1")
     assert refusal(found.store.enter(Enter(id="Fake"))).code == "already_took_part"
     assert visitor.submit(f"{page}/void", action="count").status_code == 303
     assert session_of(found, later) and len(read_tables(found.store.engine, found.study)[1]) == 2
@@ -330,23 +310,24 @@ def test_a_void_session_does_not_count(small: tuple[Lab, Visitor]) -> None:
     assert visitor.submit("/sessions/none/void", action="void").status_code == 404
 
 
-def test_only_the_chosen_session_becomes_void(tmp_path: Path) -> None:
-    with lab(tmp_path) as found:
-        engine = found.store.engine
-        names = insert_sessions(engine, found.study, found.secrets, 3, ends=("finished",))
-        visitor = found.experimenter()
-        begin_at = time.time()
-        visitor.submit(f"/sessions/{names[1]}/void", action="void")
-        voided = {row.session: row.voided_at for row in sessions_of(found)}
-        assert [voided[name] is None for name in names] == [True, False, True]
-        assert begin_at <= voided[names[1]] <= time.time()
-        head, *_, total = table_of(visitor.see().text)
-        cells = dict(zip(head, total, strict=True))
-        assert (cells["Finished"], cells["Void"]) == ("2 of 200", "1")
-        visitor.submit(f"/sessions/{names[0]}/void", action="void")
-        visitor.submit(f"/sessions/{names[1]}/void", action="count")
-        voided = {row.session: row.voided_at for row in sessions_of(found)}
-        assert [voided[name] is None for name in names] == [False, True, True]
+def test_the_cookie_goes_nowhere_else_and_ends_with_the_login(lab_of_one: Lab) -> None:
+    for base_url, secure in (("http://testserver", False), ("https://testserver", True)):
+        visitor = lab_of_one.visitor(base_url=base_url)
+        tokens = []
+        for _ in range(2):
+            cookie = visitor.log_in().headers["set-cookie"]
+            words = {word.strip().lower() for word in cookie.split(";")[1:]}
+            assert {"httponly", "samesite=strict", f"path={BASE}"} <= words
+            assert ("secure" in words) == secure and "domain" not in cookie.lower()
+            assert PASSWORD not in cookie
+            tokens.append(cookie.partition(";")[0])
+        assert len(set(tokens)) == 2, "a new token with each login"
+    visitor = lab_of_one.experimenter()
+    cookie = visitor.cookies[COOKIE]
+    assert visitor.submit("/logout").status_code == 303
+    assert COOKIE not in visitor.cookies
+    again = visitor.get(BASE, headers={"cookie": f"{COOKIE}={cookie}"}, follow_redirects=False)
+    assert again.status_code == 303
 
 
 def test_one_session_is_deleted_while_others_answer(small: tuple[Lab, Visitor]) -> None:
@@ -634,29 +615,6 @@ def test_passwords_are_checked_one_at_a_time(
         assert refused.status_code == 429 and "Too many attempts" in refused.text
 
 
-def test_the_cookie_goes_nowhere_else(lab_of_one: Lab) -> None:
-    for base_url, secure in (("http://testserver", False), ("https://testserver", True)):
-        visitor = lab_of_one.visitor(base_url=base_url)
-        tokens = []
-        for _ in range(2):
-            cookie = visitor.log_in().headers["set-cookie"]
-            words = {word.strip().lower() for word in cookie.split(";")[1:]}
-            assert {"httponly", "samesite=strict", f"path={BASE}"} <= words
-            assert ("secure" in words) == secure and "domain" not in cookie.lower()
-            assert PASSWORD not in cookie
-            tokens.append(cookie.partition(";")[0])
-        assert len(set(tokens)) == 2, "a new token with each login"
-
-
-def test_logging_out_ends_the_login_on_the_server(lab_of_one: Lab) -> None:
-    visitor = lab_of_one.experimenter()
-    cookie = visitor.cookies[COOKIE]
-    assert visitor.submit("/logout").status_code == 303
-    assert COOKIE not in visitor.cookies
-    again = visitor.get(BASE, headers={"cookie": f"{COOKIE}={cookie}"}, follow_redirects=False)
-    assert again.status_code == 303
-
-
 def test_a_login_ends_when_idle_and_in_any_case(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -697,3 +655,17 @@ def test_only_files_of_the_package_are_static(lab_of_one: Lab) -> None:
     assert good.status_code == 200 and good.headers["content-type"].startswith("text/css")
     for name in ("../pages.py", "..%2fpages.py", "pages.py", "%2e%2e/access.py", ""):
         assert visitor.see(f"/static/{name}").status_code in (303, 404)
+
+
+def test_states_of_sessions_and_spans_in_words() -> None:
+    names = ("voided_at", "finished_at", "withdrawn_at", "screened_out_at")
+    states = ("void", "finished", "withdrawn", "screened_out")
+    for name, state in zip(names, states, strict=True):
+        row = SimpleNamespace(**dict.fromkeys(names) | {name: 1.0, "last_seen": 1.0})
+        assert session_state(row, 2.0) == state
+    row = SimpleNamespace(**dict.fromkeys(names), last_seen=1000.0)
+    after = [session_state(row, 1000.0 + seconds) for seconds in (0, 900, 901)]
+    assert after == ["going", "going", "left"]
+    spans = [minutes(value) for value in (None, 12.4, 185, 3000)]
+    assert spans == ["–", "12 min", "3 h 05", "2 d 2 h"]
+    assert visible("ab\u202ecd\x00") == "ab\\u202ecd\\u0000"

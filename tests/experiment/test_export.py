@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import re
+import shutil
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import replace
@@ -28,7 +29,7 @@ from physion.core.tables import check_table, read_table
 from physion.experiment.export import export_study as export
 from physion.experiment.export.documents import preregistration, trial_figure, write_documents
 from physion.experiment.export.export_study import GONE, TABLES, export_study
-from physion.experiment.export.tables import read_tables
+from physion.experiment.export.tables import PREVIEW, WITHDRAWN, read_tables
 from physion.experiment.store.database import (
     ANSWERS,
     EVENTS,
@@ -53,13 +54,9 @@ SONA = f"https://lab.sona-systems.com/webstudy_credit.aspx?experiment_id=1&credi
 
 @pytest.fixture(scope="module")
 def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
+    codes = Recruitment(prolific_code=CODE, sona_address=SONA)
     folder = tmp_path_factory.mktemp("study")
-    return make_tiny_study(
-        folder,
-        scenarios=("collide", "drop"),
-        size=64,
-        recruitment=Recruitment(prolific_code=CODE, sona_address=SONA),
-    )
+    return make_tiny_study(folder, scenarios=("collide", "drop"), size=64, recruitment=codes)
 
 
 Fill = Callable[[Path], sa.Engine]
@@ -92,12 +89,6 @@ def fill(study: Study, monkeypatch: pytest.MonkeyPatch) -> Fill:
 @pytest.fixture
 def engine(fill: Fill, database: Path) -> sa.Engine:
     return fill(database)
-
-
-@pytest.fixture
-def small(fill: Fill, tmp_path: Path) -> sa.Engine:
-    """Yield the same in a folder of its own."""
-    return fill(tmp_path / "small")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -152,12 +143,12 @@ def test_csv_and_parquet_hold_the_same(engine: sa.Engine, study: Study, tmp_path
     assert (shown["feedback"] == f"'{NASTY}").sum() == 4 and "'=woman" in set(shown["gender"])
 
 
-def test_details_and_events_are_there(small: sa.Engine, study: Study, tmp_path: Path) -> None:
-    with small.begin() as connection:
+def test_details_and_events_are_there(engine: sa.Engine, study: Study, tmp_path: Path) -> None:
+    with engine.begin() as connection:
         connection.execute(
             sa.update(ANSWERS).where(ANSWERS.c.trial == 2).values(details='{"flashes":[1.5]}')
         )
-    out = export_study(small, study, tmp_path / "out").out
+    out = export_study(engine, study, tmp_path / "out").out
     details = pd.read_parquet(out / "trial_details.parquet")
     trials = pd.read_parquet(out / "trials.parquet")
     keys = ["session", "phase", "trial"]
@@ -177,14 +168,14 @@ def test_details_and_events_are_there(small: sa.Engine, study: Study, tmp_path: 
 
 
 def test_events_are_numbered_and_timed_by_session(
-    small: sa.Engine, study: Study, tmp_path: Path
+    engine: sa.Engine, study: Study, tmp_path: Path
 ) -> None:
-    with small.begin() as connection:
+    with engine.begin() as connection:
         first = connection.execute(sa.select(EVENTS).order_by(EVENTS.c.event)).first()
         assert first is not None
         more = {"kind": "visible", "at_ms": 2345.5, "stored_at": first.stored_at + 1.25}
         connection.execute(sa.insert(EVENTS).values(session=first.session, data={}, **more))
-    out = export_study(small, study, tmp_path / "out").out
+    out = export_study(engine, study, tmp_path / "out").out
     events = pd.read_csv(out / "events.csv").set_index("session").loc[first.session]
     assert events[["number", "kind", "at_ms"]].values.tolist() == [
         [0, "hidden", 1234.5], [1, "visible", 2345.5]]  # fmt: skip
@@ -201,47 +192,49 @@ def test_the_same_data_give_the_same_bytes(fill: Fill, study: Study, tmp_path: P
     assert exports[1] == exports[0]
 
 
-def test_what_was_left_out_is_said(small: sa.Engine, study: Study, tmp_path: Path) -> None:
-    with small.begin() as connection:
-        first = sa.select(ANSWERS.c.session).join(SESSIONS).where(
-            SESSIONS.c.kind == "person", SESSIONS.c.finished_at.is_not(None)
-        )  # fmt: skip
-        session = connection.execute(first).scalars().first()
-        query = sa.update(ANSWERS).where(ANSWERS.c.session == session, ANSWERS.c.trial == 1)
-        connection.execute(query.values(stimulus="gone"))
+def test_what_was_left_out_is_said(engine: sa.Engine, study: Study, tmp_path: Path) -> None:
+    finished = sa.select(SESSIONS.c.session).where(
+        SESSIONS.c.kind == "person", SESSIONS.c.finished_at.is_not(None)
+    )
+    with engine.begin() as connection:
+        changed, emptied, *_ = connection.execute(finished).scalars()
+        answer = sa.update(ANSWERS).where(ANSWERS.c.session == changed, ANSWERS.c.trial == 1)
+        connection.execute(answer.values(stimulus="gone"))
         unanswered = dict.fromkeys(("answered_test", "answered_familiarization"), 0)
-        only = sa.select(sa.func.max(SESSIONS.c.session)).where(
-            SESSIONS.c.kind == "person", SESSIONS.c.finished_at.is_not(None)
-        )
-        name = connection.scalar(only)
-        assert name != session
-        connection.execute(sa.delete(ANSWERS).where(ANSWERS.c.session == name))
+        connection.execute(sa.delete(ANSWERS).where(ANSWERS.c.session == emptied))
         connection.execute(
-            sa.update(SESSIONS).where(SESSIONS.c.session == name).values(**unanswered)
+            sa.update(SESSIONS).where(SESSIONS.c.session == emptied).values(**unanswered)
         )
-    report = export_study(small, study, tmp_path / "out")
+        rows = connection.execute(sa.select(SESSIONS)).fetchall()
+    report = export_study(engine, study, tmp_path / "out")
     counts = {(e["what"], e["kind"], e["reason"]): e["count"] for e in report.left_out}
     assert counts["answer", "any", GONE] == 2
-    with small.connect() as connection:
-        rows = connection.execute(sa.select(SESSIONS)).fetchall()
-    agreed = [r for r in rows if r.kind == "person" and r.consented_at is not None]
-    withdrew = sum(r.withdrawn_at is not None for r in agreed)
-    assert counts["session", "person", "the participant withdrew"] == withdrew > 0
-    assert sum(report.sessions["person"].values()) == len(agreed) - withdrew
+    assert counts["session", "preview", PREVIEW] == 3
+    for kind in ("person", "simulated"):
+        agreed = [r for r in rows if r.kind == kind and r.consented_at is not None]
+        withdrew = sum(r.withdrawn_at is not None for r in agreed)
+        assert counts.get(("session", kind, WITHDRAWN), 0) == withdrew
+        assert sum(report.sessions[kind].values()) == len(agreed) - withdrew
+        ended = sum(r.finished_at is not None and r.withdrawn_at is None for r in agreed)
+        assert report.sessions[kind]["finished"] == ended
+        if kind == "person":
+            line = f"left out: {withdrew} sessions (person): the participant withdrew"
+            assert withdrew > 0 and line in (tmp_path / "out" / "README.md").read_text()
     trials, sessions = (
         pd.read_parquet(tmp_path / "out" / f"{name}.parquet") for name in ("trials", "sessions")
     )
     latest = [trials["answered_at"].max(), sessions["finished_at"].dropna().max()]
     assert report.until == max(latest)
-    assert (
-        f"left out: {withdrew} sessions (person): the participant withdrew"
-        in (tmp_path / "out" / "README.md").read_text()
-    )
+    report = export_study(engine, study, tmp_path / "out", simulated=False, scenario="drop")
+    assert set(report.sessions) == {"person"}
+    reasons = {entry["reason"] for entry in report.left_out}
+    assert "simulated, which was not requested" in reasons
 
 
-def test_nothing_secret_is_exported(small: sa.Engine, study: Study, tmp_path: Path) -> None:
-    out = export_study(small, study, tmp_path / "out").out
-    with small.connect() as connection:
+def test_nothing_secret_is_exported(engine: sa.Engine, study: Study, tmp_path: Path) -> None:
+    out = export_study(engine, study, tmp_path / "out").out
+    assert out.stat().st_mode & 0o077 == 0, "others on the machine cannot read it"
+    with engine.connect() as connection:
         raw = list(connection.execute(sa.select(RAW_IDS.c.raw_id)).scalars())
         absent = connection.execute(
             sa.select(SESSIONS.c.session, SESSIONS.c.participant).where(
@@ -268,15 +261,6 @@ def test_nothing_secret_is_exported(small: sa.Engine, study: Study, tmp_path: Pa
     assert settings[0]["settings"]["title"] == study.title
 
 
-def test_only_people_and_one_scenario(small: sa.Engine, study: Study, tmp_path: Path) -> None:
-    report = export_study(small, study, tmp_path / "out", simulated=False, scenario="drop")
-    assert set(report.sessions) == {"person"}
-    trials = pd.read_csv(tmp_path / "out" / "trials.csv")
-    assert set(trials["scenario"]) == {"drop"} and not trials["simulated"].any()
-    reasons = {entry["reason"] for entry in report.left_out}
-    assert "simulated, which was not requested" in reasons
-
-
 def test_a_study_without_data_is_exported_all_the_same(study: Study, tmp_path: Path) -> None:
     engine = create_database(tmp_path)
     report = export_study(engine, study, tmp_path / "out")
@@ -293,7 +277,7 @@ def test_a_study_without_data_is_exported_all_the_same(study: Study, tmp_path: P
 
 
 def test_a_failure_leaves_nothing_and_the_old_export(
-    small: sa.Engine, study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    engine: sa.Engine, study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
 
@@ -303,50 +287,38 @@ def test_a_failure_leaves_nothing_and_the_old_export(
     with monkeypatch.context() as broken:
         broken.setattr(export, "write_psych_ds", fails)
         with pytest.raises(OSError, match="No space"):
-            export_study(small, study, out)
+            export_study(engine, study, out)
     assert not list(tmp_path.glob("*out*"))
-    export_study(small, study, out)
+    export_study(engine, study, out)
     before = contents(out)
-    for name in ("readme", "read_trials"):
+    for name in ("readme", "read_trials", "detail_table"):  # the last is written behind
         with monkeypatch.context() as broken:
             broken.setattr(export, name, fails)
             with pytest.raises(OSError, match="No space"):
-                export_study(small, study, out)
+                export_study(engine, study, out)
         assert contents(out) == before
         assert [path.name for path in tmp_path.glob("*out*")] == ["out"]
 
 
-def test_a_failure_while_writing_behind_is_not_lost(
-    small: sa.Engine, study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fails(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(export, "detail_table", fails)
-    with pytest.raises(OSError, match="No space"):
-        export_study(small, study, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
 def test_an_export_is_replaced_and_nothing_else(
-    small: sa.Engine, study: Study, tmp_path: Path
+    engine: sa.Engine, study: Study, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    export_study(small, study, out, simulated=False)
-    export_study(small, study, out)
+    export_study(engine, study, out, simulated=False)
+    export_study(engine, study, out)
     both = contents(out)
     (out / "psych-ds" / "notes.txt").write_text("mine")
     with pytest.raises(BadInputError, match=r"psych-ds/notes\.txt was added"):
-        export_study(small, study, out)
+        export_study(engine, study, out)
     (out / "psych-ds" / "notes.txt").unlink()
-    export_study(small, study, out)
+    export_study(engine, study, out)
     assert contents(out) == both
     (out / "study.json").unlink()
     with pytest.raises(BadInputError, match="something else"):
-        export_study(small, study, out)
+        export_study(engine, study, out)
     own = tmp_path / "own"
     own.mkdir()
-    export_study(small, study, own)  # an empty folder is nobody's
+    export_study(engine, study, own)  # an empty folder is nobody's
     other = tmp_path / "other"
     other.mkdir()
     (other / "thesis.tex").write_text("mine")
@@ -354,26 +326,26 @@ def test_an_export_is_replaced_and_nothing_else(
     (tmp_path / "file").write_text("mine")
     for path in (other, tmp_path / "link", tmp_path / "file"):
         with pytest.raises(BadInputError, match="choose another"):
-            export_study(small, study, path)
+            export_study(engine, study, path)
     assert (other / "thesis.tex").read_text() == "mine"
 
 
 def test_what_a_killed_export_left_is_cleared_away(
-    small: sa.Engine, study: Study, tmp_path: Path
+    engine: sa.Engine, study: Study, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    export_study(small, study, out)
+    export_study(engine, study, out)
     whole = contents(out)
     out.rename(tmp_path / ".out.old")  # killed between the two renamings
     (tmp_path / ".out.part" / "psych-ds").mkdir(parents=True)
     (tmp_path / ".out.part" / "trials.csv").write_text("half a")
-    export_study(small, study, out)
+    export_study(engine, study, out)
     assert contents(out) == whole
     assert [path.name for path in tmp_path.glob("*out*")] == ["out"]
 
 
 def test_two_exports_do_not_meet(
-    small: sa.Engine, study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    engine: sa.Engine, study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     inner: list[Exception] = []
     original = export.read_sessions
@@ -381,20 +353,13 @@ def test_two_exports_do_not_meet(
     def once_more(*words: object) -> object:
         monkeypatch.setattr(export, "read_sessions", original)
         with pytest.raises(PhysionError, match="another process") as refused:
-            export_study(small, study, tmp_path / "out")
+            export_study(engine, study, tmp_path / "out")
         inner.append(refused.value)
         return original(*words)  # type: ignore[arg-type]
 
     monkeypatch.setattr(export, "read_sessions", once_more)
-    export_study(small, study, tmp_path / "out")
+    export_study(engine, study, tmp_path / "out")
     assert inner and (tmp_path / "out" / "README.md").exists()
-
-
-def test_others_on_the_machine_cannot_read_it(
-    small: sa.Engine, study: Study, tmp_path: Path
-) -> None:
-    out = export_study(small, study, tmp_path / "out").out
-    assert out.stat().st_mode & 0o077 == 0
 
 
 @pytest.mark.nightly
@@ -438,22 +403,19 @@ def test_physion_compare_takes_the_export(
 def test_the_verb_exports_and_says_what(
     study: Study, fill: Fill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    engine = fill(study.folder)
-    try:
-        options = experiment_export.Options(study.folder, out=tmp_path / "out", json=True)
-        assert experiment_export.main(options) == 0
-        said = json.loads(capsys.readouterr().out)
-        assert said["out"] == str(tmp_path / "out") and said["rows"]["trials"] > 300
-        assert experiment_export.main(experiment_export.Options(study.folder)) == 0
-        text = capsys.readouterr().out
-        assert f"rows: {said['rows']['trials']} trials, " in text
-        assert contents(study.folder / "export") == contents(tmp_path / "out")
-    finally:
-        engine.dispose()
-        for path in study.folder.glob("responses.sqlite*"):
-            path.unlink()
+    served = tmp_path / "served"
+    shutil.copytree(study.folder, served)
     with pytest.raises(BadInputError, match="has the study been served"):
-        experiment_export.main(experiment_export.Options(study.folder))
+        experiment_export.main(experiment_export.Options(served))
+    fill(served).dispose()
+    options = experiment_export.Options(served, out=tmp_path / "out", json=True)
+    assert experiment_export.main(options) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["out"] == str(tmp_path / "out") and said["rows"]["trials"] > 300
+    assert experiment_export.main(experiment_export.Options(served)) == 0
+    text = capsys.readouterr().out
+    assert f"rows: {said['rows']['trials']} trials, " in text
+    assert contents(served / "export") == contents(tmp_path / "out")
 
 
 # --- the preregistration and the figure of the trials ---------------------------------------------
@@ -528,13 +490,8 @@ def test_the_figure_shows_frames_texts_and_durations(tmp_path: Path) -> None:
     assert [read_number(picture) for picture in pictures] == [0, 44, 59, 0, 44]
     cued = pictures[0][96, int(0.2 * 192)].astype(int)
     assert cued[0] > 200 and cued[1:].max() < 60  # the agent is red
-
-
-def test_without_feedback_and_fixation_the_figure_is_shorter(tmp_path: Path) -> None:
-    study = make_tiny_study(
-        tmp_path, test=2, familiarization=1, timing=Timing(fixation_in_familiarization=False)
-    )
-    assert trial_figure(study).count("Fixation") == 1
+    no_cross = replace(study, timing=Timing(fixation_in_familiarization=False))
+    assert svg.count("Fixation") == 2 and trial_figure(no_cross).count("Fixation") == 1
     shorter = trial_figure(replace(study, familiarization_feedback=False))
     assert len(pictures_of(shorter)) == 4 and "Feedback, full movie" not in shorter
 

@@ -21,15 +21,13 @@ from physion.experiment.export import tables as trial_rows
 from physion.experiment.export.export_study import export_study
 from physion.experiment.export.tables import (
     GONE_SCENARIO,
-    PREVIEW,
-    WITHDRAWN,
     SessionSelection,
     read_sessions,
     read_tables,
     read_trials,
     snapshot,
 )
-from physion.experiment.store.database import ANSWERS, PARTICIPANTS, SESSIONS, create_database
+from physion.experiment.store.database import ANSWERS, SESSIONS, create_database
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Study
 from support.experiment.experimenter_rows import insert_sessions
@@ -124,7 +122,6 @@ def test_each_column_is_of_its_own_answer(engine: sa.Engine, study: Study) -> No
 def test_each_column_of_a_session_is_its_own(engine: sa.Engine, study: Study) -> None:
     """All numbers and times of all sessions differ; each is found in its row and column."""
     direct = [column for column in SESSION_COLUMNS if column.name in SESSIONS.c]
-    special = {"scenario", "session", "participant"}
     numeric = [c for c in direct if c.kind in ("integer", "number", "time")]
     assert len(numeric) >= 13
     device = {"user_agent": "a", "refresh_hz": 1, "screen_width": 2, "screen_height": 3,
@@ -153,7 +150,6 @@ def test_each_column_of_a_session_is_its_own(engine: sa.Engine, study: Study) ->
         assert row.recruited_by == values["source"]
         for name in device:
             assert getattr(row, name) == values["device"][name], name
-    assert special <= set(sessions.columns)
 
 
 def test_rows_are_in_the_order_of_time(engine: sa.Engine, study: Study) -> None:
@@ -168,28 +164,6 @@ def test_rows_are_in_the_order_of_time(engine: sa.Engine, study: Study) -> None:
             assert list(phase["trial"]) == list(range(len(phase)))
 
 
-def test_what_is_left_out_is_counted(engine: sa.Engine, study: Study) -> None:
-    with engine.connect() as connection:
-        stored = pd.DataFrame(connection.execute(sa.select(SESSIONS)).mappings().all())
-    agreed = stored["consented_at"].notna()
-    withdrew = agreed & stored["withdrawn_at"].notna()
-    own = stored["kind"] != "preview"
-    with snapshot(engine) as connection:
-        found = read_sessions(connection, study)
-    assert found.left_out["preview", PREVIEW] == 3
-    for kind in ("person", "simulated"):
-        of_kind = stored["kind"] == kind
-        assert found.left_out[kind, WITHDRAWN] == (of_kind & withdrew).sum()
-    assert found.left_out["person", WITHDRAWN] > 0
-    kept = stored[own & agreed & ~withdrew]
-    assert set(found.table.column("session").to_pylist()) == set(kept["session"])
-    assert sum(found.states.values()) == len(kept)
-    assert (
-        found.states["person", "finished"]
-        == ((kept["kind"] == "person") & kept["finished_at"].notna()).sum()
-    )
-
-
 def test_kinds_scenario_and_finished_can_be_chosen(engine: sa.Engine, study: Study) -> None:
     trials, sessions = read_tables(engine, study, kinds=("person",), finished_only=True)
     assert not trials["simulated"].any() and not sessions["simulated"].any()
@@ -201,14 +175,6 @@ def test_kinds_scenario_and_finished_can_be_chosen(engine: sa.Engine, study: Stu
         read_tables(engine, study, kinds=("preview",))
     with pytest.raises(UnknownNameError, match="collide"):
         read_tables(engine, study, scenario="colide")
-
-
-def test_an_empty_study_has_empty_tables(study: Study, database: Path) -> None:
-    engine = create_database(database)
-    trials, sessions = read_tables(engine, study)
-    assert trials.empty and sessions.empty
-    assert list(trials.columns) == [column.name for column in TRIAL_COLUMNS]
-    assert_frame_equal(check_table(trials, TRIAL_COLUMNS, "trials"), trials)
 
 
 def test_cells_that_are_not_known_are_empty(study: Study, database: Path) -> None:
@@ -296,39 +262,24 @@ def test_answers_to_stimuli_that_are_gone_are_named(engine: sa.Engine, study: St
 
 
 NASTY = '=1+1\t"tab"\n-2;@SUM(1) \\ \r n/a'
-Exported = tuple[Path, pd.DataFrame, pd.DataFrame]
 
 
-def make_export(folder: Path, scenarios: tuple[str, ...]) -> Exported:
-    """An export with one participant in all scenarios, and one who is old and writes strangely."""
-    study = make_tiny_study(folder, scenarios=scenarios, size=64)
-    engine = create_database(folder)
-    secrets = Secrets.load(folder)
+@pytest.mark.slow
+def test_psych_ds_has_the_files_and_metadata_that_it_asks_for(tmp_path: Path) -> None:
+    """One participant is in all scenarios; one is old and writes strangely."""
+    study = make_tiny_study(tmp_path, scenarios=("a-b", "a.b", "drop"), size=64)
+    engine = create_database(tmp_path)
+    secrets = Secrets.load(tmp_path)
     insert_sessions(engine, study, secrets, 12)
     insert_sessions(engine, study, secrets, 4, kind="simulated", seed=1, ends=("finished",))
     insert_sessions(engine, study, secrets, 1, seed=2, ends=("finished",), age=99,
                     gender="n/a", education="=other", feedback=NASTY)  # fmt: skip
-    whole = insert_sessions(engine, study, secrets, len(scenarios), seed=3, ends=("finished",))
+    whole = insert_sessions(engine, study, secrets, 3, seed=3, ends=("finished",))
     with engine.begin() as connection:
-        one = connection.execute(
-            SESSIONS.select().where(SESSIONS.c.session == whole[0])
-        ).mappings().one()["participant"]  # fmt: skip
-        connection.execute(
-            SESSIONS.update().where(SESSIONS.c.session.in_(whole)).values(participant=one)
-        )
-        assert connection.scalar(PARTICIPANTS.select().where(PARTICIPANTS.c.participant == one))
-    export_study(engine, study, folder / "out")
-    return (folder / "out", *read_tables(engine, study))
-
-
-@pytest.fixture(scope="module", params=[("collide",), ("a-b", "a.b", "drop")], ids=["one", "three"])
-def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Exported:
-    return make_export(tmp_path_factory.mktemp("study"), request.param)
-
-
-@pytest.mark.slow
-def test_psych_ds_has_the_files_and_metadata_that_it_asks_for(exported: Exported) -> None:
-    folder = exported[0] / "psych-ds"
+        first = sa.select(SESSIONS.c.participant).where(SESSIONS.c.session == whole[0])
+        of_whole = sa.update(SESSIONS).where(SESSIONS.c.session.in_(whole))
+        connection.execute(of_whole.values(participant=connection.scalar(first)))
+    folder = export_study(engine, study, tmp_path / "out").out / "psych-ds"
     metadata = json.loads((folder / "dataset_description.json").read_bytes())
     assert metadata["@type"] == "Dataset" and "schema.org" in metadata["@context"]
     assert all(metadata[key] for key in ("name", "description", "variableMeasured"))

@@ -7,8 +7,6 @@ import json
 import socket
 import time
 from collections.abc import Iterator
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
@@ -21,12 +19,9 @@ from physion.experiment import protocol as wire
 from physion.experiment.protocol import Refused
 from physion.experiment.store.answering import encode_details
 from physion.experiment.store.database import ANSWERS, EVENTS, RAW_IDS, SESSIONS
-from physion.experiment.study.identity import Secrets
-from physion.experiment.study.media import sign_media
 from physion.experiment.web.api import BadBodyError, parse_message
 from support.experiment.app_walk import Person, Served, answer_body, served
 from support.experiment.live_app import HOST, exchange, read_all, running
-from support.experiment.tiny_study import make_tiny_study
 
 NASTY = (
     "<script>alert(1)</script>",
@@ -135,32 +130,35 @@ class TestAnswers:
             assert "marker" not in answer.text and "mmm" not in answer.text
 
 
+EVENT = {"kind": "hidden", "at_ms": 1}
+
+
 class TestEverythingElse:
-    @pytest.mark.parametrize("path", ["/api/enter", "/api/page", "/api/events"])
-    def test_bodies_of_other_endpoints(self, site: Served, tester: Person, path: str) -> None:
+    @pytest.mark.parametrize(("path", "body"), [
+        ("enter", {"id": " "}), ("enter", {"source": "facebook"}), ("enter", {"kind": "simulated"}),
+        ("enter", {"recruiter": {str(i): "" for i in range(11)}}),
+        ("enter", {"device": {"refresh_hz": -60}}),
+        *(("enter", {"visit": key}) for key in
+          ("", "a" * 15, "a" * 65, "a" * 16 + "_", "ä" * 20, "a" * 20 + "\n")),
+        *(("events", {"events": [EVENT, bad]}) for bad in (
+            {"kind": "<script>", "at_ms": 1}, {"kind": "ok", "at_ms": -1}, {"kind": "ok"}, None,
+            {"kind": "ok", "at_ms": 1, "data": {"a": {"b": 1}}},
+        )),
+        ("events", {"events": [EVENT] * 51}),
+        *((path, None) for path in ("enter", "page", "events")),
+    ])  # fmt: skip
+    def test_bodies_of_other_endpoints(
+        self, site: Served, tester: Person, path: str, body: Any
+    ) -> None:
         before = counts(site)
-        assert_refused(post(tester, path, BODIES["deep"]))
+        content = BODIES["deep"] if body is None else json.dumps(body).encode()
+        assert_refused(post(tester, f"/api/{path}", content))
         assert counts(site) == before
 
-    @pytest.mark.parametrize("body", [
-        {"id": " "}, {"source": "facebook"}, {"recruiter": {str(i): "" for i in range(11)}},
-        {"device": {"refresh_hz": -60}}, {"kind": "simulated"},
-    ])  # fmt: skip
-    def test_entering(self, site: Served, body: Any) -> None:
-        before = counts(site)
-        assert_refused(site.client.post("/api/enter", json=body))
-        assert counts(site) == before
-
-    @pytest.mark.parametrize("event", [
-        {"kind": "<script>", "at_ms": 1}, {"kind": "ok", "at_ms": -1}, {"kind": "ok"}, None,
-        {"kind": "ok", "at_ms": 1, "data": {"a": {"b": 1}}},
-    ])  # fmt: skip
-    def test_events(self, site: Served, tester: Person, event: Any) -> None:
-        before = counts(site)
-        good = {"kind": "hidden", "at_ms": 1}
-        assert_refused(post(tester, "/api/events", json.dumps({"events": [good, event]}).encode()))
-        assert_refused(post(tester, "/api/events", json.dumps({"events": [good] * 51}).encode()))
-        assert counts(site) == before
+    def test_an_unknown_page_is_named_by_its_field_with_the_known_ones(self, site: Served) -> None:
+        body = {"page": "nowhere", "data": {}}
+        message = assert_refused(site.client.post("/api/page", json=body))
+        assert message.startswith("page: ") and "'consent'" in message and "?" not in message
 
     @pytest.mark.parametrize("query", ["load=true&load=false", "%ff=%fe"])
     def test_queries(self, tester: Person, query: str) -> None:
@@ -211,29 +209,6 @@ class TestTexts:
         for path in ("/api/texts/{}", "/api/trials/{}", "/static/{}", "/media/{}"):
             answer = site.client.get(path.format(quote(text, safe="")))
             assert_refused(answer, 404, "not_found")
-
-
-def test_an_unknown_page_is_named_by_its_field_with_the_known_ones(site: Served) -> None:
-    body = {"page": "nowhere", "data": {}}
-    message = assert_refused(site.client.post("/api/page", json=body))
-    assert message.startswith("page: ") and "'consent'" in message and "?" not in message
-
-
-class TestSignatures:
-    def test_signatures_of_another_study_are_refused(self, site: Served, tmp_path: Path) -> None:
-        other = make_tiny_study(tmp_path / "other", familiarization=1, test=3, size=64)
-        keys = Secrets.load(other.folder)
-        path = sign_media(other, keys, "collide", 1, "test", 0, "movie")
-        assert_refused(site.client.get(path), 404, "not_found")
-
-    def test_unknown_trials_and_scenarios_are_not_found(self, site: Served) -> None:
-        more = replace(site.study, scenarios=("collide", "drop"))
-        for scenario, phase, trial in (
-            ("collide", "test", 3), ("collide", "test", 999_999), ("drop", "test", 0),
-            ("collide", "familiarization", 1),
-        ):  # fmt: skip
-            path = sign_media(more, site.secrets, scenario, 1, phase, trial, "movie")
-            assert_refused(site.client.get(path), 404, "not_found")
 
 
 TRAVERSALS = (

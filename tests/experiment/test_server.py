@@ -171,44 +171,6 @@ def test_only_named_proxies_are_trusted(tmp_path: Path, trusted: bool) -> None:
         assert (answer.getheader("strict-transport-security") is not None) == trusted
 
 
-class TestFaults:
-    """Faults give one line on standard error and exit code 2."""
-
-    def fail(self, capsys: pytest.CaptureFixture[str], *words: str) -> str:
-        assert main(["experiment", "serve", *words]) == 2
-        printed = capsys.readouterr()
-        assert printed.out == ""
-        assert printed.err.count("\n") == 1 and printed.err.startswith("physion: ")
-        return printed.err
-
-    def test_a_port_in_use(self, study: Study, capsys: pytest.CaptureFixture[str]) -> None:
-        with socket.create_server((HOST, 0)) as taken:
-            port = str(taken.getsockname()[1])
-            error = self.fail(capsys, str(study.folder), "--port", port)
-        assert f"cannot listen on 127.0.0.1 port {port}: Address already in use;" in error
-
-    @pytest.mark.parametrize("host", ["no.such.host.invalid", "256.1.1.1", "203.0.113.7"])
-    def test_a_host_of_another_machine(
-        self, study: Study, capsys: pytest.CaptureFixture[str], host: str
-    ) -> None:
-        words = (str(study.folder), "--host", host, "--port", "0", "--behind-proxy", "10.0.0.1")
-        assert f"cannot listen on {host} port 0" in self.fail(capsys, *words)
-
-    def test_certificates(
-        self, study: Study, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        folder, wrong = str(study.folder), tmp_path / "wrong.pem"
-        wrong.write_text("no certificate")
-        assert "belong together" in self.fail(capsys, folder, "--https-cert", str(wrong))
-        for path in (wrong, tmp_path / "missing.pem"):
-            words = ("--https-cert", str(path), "--https-key", str(path), "--port", "0")
-            assert f"certificate {path}" in self.fail(capsys, folder, *words)
-
-    def test_proxies(self, study: Study, capsys: pytest.CaptureFixture[str]) -> None:
-        for name in ("proxy.example.org", "*", ""):
-            assert "--behind-proxy" in self.fail(capsys, str(study.folder), "--behind-proxy", name)
-
-
 @pytest.mark.parametrize(("address", "readable"), [
     (Address(), False),
     (Address("localhost"), False),
@@ -238,31 +200,6 @@ def test_a_new_password_is_the_first_line_of_a_file(
     after = Secrets.load(folder)
     assert check_password(after, "another password") and not check_password(after, PASSWORD)
     assert (after.hash_key, after.link_key) == (before.hash_key, before.link_key)
-
-
-@pytest.mark.parametrize("port", ["80000", "65536", "-1"])
-def test_invalid_ports_are_refused(
-    study: Study, capsys: pytest.CaptureFixture[str], port: str
-) -> None:
-    assert main(["experiment", "serve", str(study.folder), f"--port={port}"]) == 2
-    said = capsys.readouterr().err
-    assert f"--port must be from 0 to 65535, not {port}" in said and said.count("\n") == 1
-
-
-def test_a_folder_without_a_study_is_refused(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    assert main(["experiment", "serve", str(tmp_path)]) == 2
-    said = capsys.readouterr().err
-    assert "this is not a study folder; create one with physion experiment init" in said
-    assert said.count("\n") == 1
-
-
-def test_the_warning_is_printed(
-    study: Study, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    assert main(["experiment", "serve", str(tmp_path / "nothing"), "--host", "0.0.0.0"]) == 2
-    assert "sent unencrypted" in capsys.readouterr().err
 
 
 SLOW_TO_IMPORT = ("sklearn", "statsmodels", "matplotlib", "numba", "mujoco", "torch")
@@ -328,3 +265,53 @@ def test_the_image_is_built_from_what_is_there(services: dict[str, Any]) -> None
     entry = json.loads(re.findall(r"ENTRYPOINT (.*)", text)[0])
     assert entry[0] in project["scripts"] and entry[1:] == ["experiment"]
     assert set(options_of(json.loads(re.findall(r"^CMD (.*)", text, re.MULTILINE)[0]))) == {"host"}
+
+
+def serve_badly(capsys: pytest.CaptureFixture[str], folder: Path, *words: str) -> str:
+    """Return the one line of a server that cannot start."""
+    assert main(["experiment", "serve", str(folder), *words]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.count("\n") == 1 and printed.err.startswith("physion: ")
+    return printed.err
+
+
+def test_a_port_in_use_is_named(study: Study, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server((HOST, 0)) as taken:
+        port = str(taken.getsockname()[1])
+        error = serve_badly(capsys, study.folder, "--port", port)
+    assert f"cannot listen on 127.0.0.1 port {port}: Address already in use;" in error
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        *((f"--host {host} --port 0 --behind-proxy 10.0.0.1", f"cannot listen on {host} port 0")
+          for host in ("no.such.host.invalid", "256.1.1.1", "203.0.113.7")),
+        *((f"--port={port}", f"--port must be from 0 to 65535, not {port}")
+          for port in ("80000", "65536", "-1")),
+        ("--https-cert WRONG", "belong together"),
+        ("--https-cert WRONG --https-key WRONG --port 0", "certificate WRONG"),
+        ("--https-cert MISSING --https-key MISSING --port 0", "certificate MISSING"),
+        ("--behind-proxy proxy.example.org", "--behind-proxy"),
+        ("--behind-proxy *", "--behind-proxy"),
+        ("--behind-proxy=", "--behind-proxy"),
+    ],
+)  # fmt: skip
+def test_bad_options_are_one_line(
+    study: Study, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: str, said: str
+) -> None:
+    (tmp_path / "wrong.pem").write_text("no certificate")
+    for name in ("wrong", "missing"):
+        path = str(tmp_path / f"{name}.pem")
+        words, said = words.replace(name.upper(), path), said.replace(name.upper(), path)
+    assert said in serve_badly(capsys, study.folder, *words.split())
+
+
+def test_a_folder_without_a_study_is_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    said = serve_badly(capsys, tmp_path)
+    assert "this is not a study folder; create one with physion experiment init" in said
+    assert main(["experiment", "serve", str(tmp_path), "--host", "0.0.0.0"]) == 2
+    assert "sent unencrypted" in capsys.readouterr().err
