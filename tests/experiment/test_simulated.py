@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from physion.cli.main import main
-from physion.core.errors import UnknownNameError
 from physion.core.seeds import generator
 from physion.experiment.protocol import TrialMedia
 from physion.experiment.server_process import ServerProcess
@@ -44,7 +43,7 @@ COLUMNS_OF_PREDICTIONS = (
 )
 
 
-def _stimulus(number: int, label: bool) -> Stimulus:
+def made_stimulus(number: int, label: bool) -> Stimulus:
     return Stimulus(
         stimulus=f"stimulus-{number}", scenario="collide", phase="test", place=number, label=label,
         movie="", map="", full="", frames=45, full_frames=0, rate=30.0, width=8, height=8,
@@ -53,7 +52,7 @@ def _stimulus(number: int, label: bool) -> Stimulus:
 
 
 def test_a_person_answers_the_same_again_and_others_differ() -> None:
-    stimuli = [_stimulus(number, number % 2 == 0) for number in range(40)]
+    stimuli = [made_stimulus(number, number % 2 == 0) for number in range(40)]
     first = [SimulatedPerson(0, 1).predict(stimulus) for stimulus in stimuli]
     assert first == [SimulatedPerson(0, 1).predict(stimulus) for stimulus in stimuli]
     assert first != [SimulatedPerson(0, 2).predict(stimulus) for stimulus in stimuli]
@@ -64,7 +63,7 @@ def test_a_person_answers_the_same_again_and_others_differ() -> None:
 @pytest.mark.slow
 def test_people_are_right_as_often_as_they_should_be_and_slower_where_it_is_hard() -> None:
     people = [SimulatedPerson(0, number) for number in range(100)]
-    stimuli = [_stimulus(number, number % 2 == 0) for number in range(60)]
+    stimuli = [made_stimulus(number, number % 2 == 0) for number in range(60)]
     expected = np.array([[p.probability_correct(s) for s in stimuli] for p in people])
     answers = [[p.predict(s) for s in stimuli] for p in people]
     right = np.array([[(a.response == "yes") == s.label for a, s in zip(row, stimuli, strict=True)]
@@ -83,7 +82,7 @@ def test_people_are_right_as_often_as_they_should_be_and_slower_where_it_is_hard
 @pytest.mark.slow
 def test_answers_follow_the_rasch_model_and_log_normal_times() -> None:
     people = [SimulatedPerson(0, number) for number in range(200)]
-    stimuli = [_stimulus(number, number % 2 == 0) for number in range(60)]
+    stimuli = [made_stimulus(number, number % 2 == 0) for number in range(60)]
     chance = np.array([[p.probability_correct(s) for s in stimuli] for p in people])
     log_odds = np.log(chance / (1 - chance))
     # The sum of a person and a stimulus: differences of people are the same for all stimuli.
@@ -105,7 +104,7 @@ def test_an_answer_is_what_the_pages_would_send() -> None:
     media = TrialMedia(
         trial=3, movie="", map="", frames=45, rate=30.0, width=8, height=8, fixation_ms=700
     )
-    stimulus = _stimulus(0, True)
+    stimulus = made_stimulus(0, True)
     for number, by in ((1, "keyboard"), (2, "mouse")):
         person = SimulatedPerson(0, number)
         found = build_answer(2000, media, "test", person, stimulus)
@@ -119,7 +118,7 @@ def test_an_answer_is_what_the_pages_would_send() -> None:
     # Attention checks are answered as they ask, whatever the person would predict.
     people = [SimulatedPerson(0, number) for number in range(20)]
     for label in (True, False):
-        check = replace(_stimulus(0, label), phase="attention")
+        check = replace(made_stimulus(0, label), phase="attention")
         answers = {build_answer(0, media, "test", person, check).response for person in people}
         assert answers == {"yes" if label else "no"}
 
@@ -143,70 +142,12 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
     )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def served(study: Study) -> tuple[ServerProcess, list[SimulatedVisit], list[SimulatedVisit]]:
-    """Run two simulations on one server: some people leave, then they come back."""
-    plan = SimulationPlan(url="", participants=8, dropouts=0.5, seed=5)
-    secrets = Secrets.load(study.folder)
-    with ServerProcess(study.folder) as server:
-        plan = replace(plan, url=server.url)
-        first = asyncio.run(simulate(study, secrets, plan))
-        second = asyncio.run(simulate(study, secrets, replace(plan, dropouts=0.0)))
-    return server, first, second
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_people_finish_or_leave_and_come_back(
-    served: tuple[ServerProcess, list[SimulatedVisit], list[SimulatedVisit]],
-) -> None:
-    _, first, second = served
-    assert {visit.outcome for visit in first} == {"done", "left"}
-    assert {visit.scenario for visit in first} == {"collide", "drop"}
-    for before, after in zip(first, second, strict=True):
-        assert after.outcome == ("done before" if before.outcome == "done" else "done"), after
-        assert len(before.answers) + len(after.answers) == 6
-        if before.result is not None:
-            right = sum(a.phase == "test" for a in before.answers)
-            assert right == 4 and 0 <= before.result.accuracy <= 1
-
-
-@pytest.mark.slow
-def test_simulated_is_written_in_the_data_for_good(
-    study: Study, served: tuple[ServerProcess, list[SimulatedVisit], list[SimulatedVisit]]
-) -> None:
-    _, first, second = served
-    sessions = stored_sessions(study)
-    assert len(sessions) == 8 and {session.kind for session in sessions.values()} == {"simulated"}
-    assert all(session.finished_at for session in sessions.values())
-    # They behave as browsers do: nothing about their sessions is impossible.
-    assert {session.implausible for session in sessions.values()} == {None}
-    known = [(visit.reference, a) for visit in (*first, *second) for a in visit.answers]
-    stored = stored_answers(study)
-    assert len(stored) == 48
-    for reference, answer in known:
-        row = stored[reference, answer.phase, answer.trial]
-        assert (row.key, row.stimulus, row.response, row.rt_ms, row.showings) == (
-            answer.key, answer.stimulus, answer.response, answer.rt_ms, 1
-        )  # fmt: skip
-    labels = {s.stimulus: s.label for s in study.stimuli}
-    for visit in first:
-        if visit.result is not None:
-            right = [(a.response == "yes") == labels[a.stimulus]
-                     for a in visit.answers if a.phase == "test"]  # fmt: skip
-            assert visit.result.correct == sum(right)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("with_sessions", [False, True])
+@pytest.mark.usefixtures("visits")
 def test_models_are_not_compared_with_only_simulated_participants(
-    study: Study,
-    served: tuple[ServerProcess, list[SimulatedVisit], list[SimulatedVisit]],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    with_sessions: bool,
+    study: Study, tmp_path: Path, capsys: pytest.CaptureFixture[str], with_sessions: bool
 ) -> None:
-    assert len(stored_sessions(study)) == 8
     data, predictions = tmp_path / "data", tmp_path / "m.csv"
     assert main(["experiment", "export", str(study.folder), "--out", str(data)]) == 0
     rows = [f"m,B,{s.scenario},0.9,True,{s.label},{s.stimulus}" for s in study.stimuli]
@@ -265,19 +206,14 @@ def test_another_study_s_server_refuses_the_pilot_link(
 
 @pytest.mark.parametrize(
     ("words", "option"),
-    [(["--participants", "0"], "--participants"), (["--dropouts", "1.5"], "--dropouts")],
-)
+    [("--participants 0", "--participants"), ("--dropouts 1.5", "--dropouts"),
+     ("--scenario colide --url http://127.0.0.1:1", "collide")],
+)  # fmt: skip
 def test_bad_options_are_refused(
-    study: Study, words: list[str], option: str, capsys: pytest.CaptureFixture[str]
+    study: Study, words: str, option: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["experiment", "simulate", str(study.folder), *words]) == 2
+    assert main(["experiment", "simulate", str(study.folder), *words.split()]) == 2
     assert option in capsys.readouterr().err
-
-
-def test_an_unknown_scenario_is_refused_before_anything_is_sent(study: Study) -> None:
-    plan = SimulationPlan(url="http://127.0.0.1:1", scenario="colide")
-    with pytest.raises(UnknownNameError, match="collide"):
-        asyncio.run(simulate(study, Secrets.load(study.folder), plan))
 
 
 @pytest.mark.nightly
@@ -291,11 +227,14 @@ def test_simulated_participants_pass_all_checks(tmp_path: Path) -> None:
     )  # fmt: skip
     with ServerProcess(study.folder) as server:
         plan = SimulationPlan(server.url, participants=4, dropouts=0.0)
-        visits = asyncio.run(simulate(study, Secrets.load(study.folder), plan))
-        assert {visit.outcome for visit in visits} == {"done"}
-        assert all(visit.result is not None and visit.result.trials == 3 for visit in visits)
+        done = asyncio.run(simulate(study, Secrets.load(study.folder), plan))
+        assert {visit.outcome for visit in done} == {"done"}
+        assert all(visit.result is not None and visit.result.trials == 3 for visit in done)
         sessions = list(stored_sessions(study).values())
-        page = read_page(server.url, sessions[0].session)
+        with httpx2.Client(base_url=server.url, follow_redirects=True, timeout=60) as client:
+            own = {"origin": server.url}
+            client.post(f"{BASE}/login", data={"password": PASSWORD}, headers=own)
+            page = client.get(f"{BASE}/sessions/{sessions[0].session}").text
     assert {row.attention_failed for row in sessions} == {0}
     assert {row.comprehension_attempts for row in sessions} == {1}
     assert all(set(row.own_answers) == {each.name for each in OWN_QUESTIONS} for row in sessions)
@@ -303,8 +242,41 @@ def test_simulated_participants_pass_all_checks(tmp_path: Path) -> None:
         assert text in page
 
 
-def read_page(url: str, session: str) -> str:
-    """Return the experimenter's page of a session."""
-    with httpx2.Client(base_url=url, follow_redirects=True, timeout=60) as client:
-        client.post(f"{BASE}/login", data={"password": PASSWORD}, headers={"origin": url})
-        return client.get(f"{BASE}/sessions/{session}").text
+@pytest.fixture(scope="module")
+def visits(study: Study) -> tuple[list[SimulatedVisit], list[SimulatedVisit]]:
+    """Run two simulations on one server: some people leave, then they come back."""
+    secrets = Secrets.load(study.folder)
+    with ServerProcess(study.folder) as server:
+        plan = SimulationPlan(url=server.url, participants=8, dropouts=0.5, seed=5)
+        first = asyncio.run(simulate(study, secrets, plan))
+        second = asyncio.run(simulate(study, secrets, replace(plan, dropouts=0.0)))
+    return first, second
+
+
+@pytest.mark.slow
+def test_people_leave_and_come_back_and_are_simulated_in_the_data_for_good(
+    study: Study, visits: tuple[list[SimulatedVisit], list[SimulatedVisit]]
+) -> None:
+    first, second = visits
+    assert {visit.outcome for visit in first} == {"done", "left"}
+    assert {visit.scenario for visit in first} == {"collide", "drop"}
+    labels = {s.stimulus: s.label for s in study.stimuli}
+    for before, after in zip(first, second, strict=True):
+        assert after.outcome == ("done before" if before.outcome == "done" else "done"), after
+        assert len(before.answers) + len(after.answers) == 6
+        if before.result is not None:
+            right = [(a.response == "yes") == labels[a.stimulus]
+                     for a in before.answers if a.phase == "test"]  # fmt: skip
+            assert len(right) == 4 and before.result.correct == sum(right)
+    sessions = stored_sessions(study)
+    assert len(sessions) == 8 and {session.kind for session in sessions.values()} == {"simulated"}
+    assert all(session.finished_at for session in sessions.values())
+    # They behave as browsers do: nothing about their sessions is impossible.
+    assert {session.implausible for session in sessions.values()} == {None}
+    stored = stored_answers(study)
+    assert len(stored) == 48
+    for visit in (*first, *second):
+        for answer in visit.answers:
+            row = stored[visit.reference, answer.phase, answer.trial]
+            sent = (answer.key, answer.stimulus, answer.response, answer.rt_ms, 1)
+            assert (row.key, row.stimulus, row.response, row.rt_ms, row.showings) == sent
