@@ -28,7 +28,7 @@ from physion.experiment.protocol import REFUSALS, PublicStudy
 from physion.experiment.store.database import SESSIONS
 from physion.experiment.study import texts
 from physion.experiment.study.recruitment import make_pass
-from physion.experiment.study.settings import Recruitment
+from physion.experiment.study.settings import Plausibility, Recruitment
 from physion.experiment.study.study import Study
 from physion.experiment.web.guards import Guards, content_policy
 from support.experiment.app_walk import Person, Served, answer_body, served
@@ -323,6 +323,19 @@ def test_logins_are_logged_without_addresses(
     own = [record for record in caplog.records if record.name.startswith(f"{ALL}.experimenter")]
     assert [record.levelname for record in own] == ["WARNING", "INFO"]
     assert "198.51" not in caplog.text
+
+
+def test_an_answer_before_the_end_of_its_movie_may_come_again(tmp_path: Path) -> None:
+    rules = Plausibility()
+    with served(tmp_path / "s", familiarization=1, test=1, plausibility=rules) as site:
+        person = site.person(id="fast").walk("familiarization")
+        media = person.ask("GET", "/api/trials/familiarization")["trials"][0]
+        for kind in ("movie", "map"):
+            assert site.client.get(media[kind]).status_code == 200
+        shown = {"key": "a-showing-1", "phase": "familiarization", "trial": 0}
+        person.ask("POST", "/api/showings", shown)
+        assert person.answer(0, "familiarization", status=425)["error"] == "too_early"
+        assert person.heard[-1][1].headers["retry-after"] in ("3", "4", "5")
 
 
 # --- static files of the participants' pages ------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
+import time
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from physion.experiment.store.database import TOKENS, open_database
 from physion.experiment.study.identity import SECRET_FILE
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.study import Study
-from support.experiment.browser import SHORT, Visit, answers_to_test, rows_of, served, signed_query
+from support.experiment.browser import Visit, answers_to_test, rows_of, served, signed_query
 
 pytestmark = pytest.mark.slow
 
@@ -257,23 +257,18 @@ def test_another_device_answers_meanwhile(chromium: Any, site: tuple[Study, str]
 @pytest.mark.nightly
 def test_a_server_that_is_killed_and_has_other_keys(chromium: Any, tmp_path: Path) -> None:
     """Answers wait for the server; media URLs that became invalid are requested anew."""
-    with (
-        served(tmp_path, preload=1) as (study, server),
-        Visit(chromium, server.url) as visit,
-    ):
+    with served(tmp_path, preload=1) as (study, server), Visit(chromium, server.url) as visit:
 
-        def restart(other_keys: bool) -> None:
+        def restart_with_other_keys() -> None:
             server.kill()
-            if other_keys:
-                path = study.folder / SECRET_FILE
-                content = json.loads(path.read_text())
-                content["link_key"] = content["link_key"][::-1]
-                path.write_text(json.dumps(content))
+            path = study.folder / SECRET_FILE
+            content = json.loads(path.read_text())
+            path.write_text(json.dumps(content | {"link_key": content["link_key"][::-1]}))
             server.start()
 
         visit.begin("?participant=Killed")
         visit.wait_for_answer()
-        restart(True)
+        restart_with_other_keys()
         # The full movie of practice has its own URL, which becomes invalid meanwhile.
         spoilt: list[str] = []
 
@@ -295,7 +290,7 @@ def test_a_server_that_is_killed_and_has_other_keys(chromium: Any, tmp_path: Pat
         server.kill()
         visit.answer("no")
         visit.page.get_by_text("No connection.").wait_for(state="attached")
-        restart(True)
+        restart_with_other_keys()
         visit.answer("yes")
         visit.answer("no")
         visit.heading("About you")
@@ -455,54 +450,6 @@ def test_a_refused_answer_is_stored_as_event_before_removal(
     }  # fmt: skip
 
 
-class Early:
-    """Makes a visit's answers too early: the server learns of each showing only with its answer.
-
-    The first announcement of a showing is held back, and the one before the answer says that the
-    showing begins now. ``responses``: those to answers, by the key of the answer.
-    """
-
-    def __init__(self, visit: Visit) -> None:
-        self.responses: dict[str, list[Any]] = {}
-        self._first: dict[str, Any] = {}
-        self._held: list[Any] | None = None
-        visit.context.route("**/api/showings", self._announce)
-        visit.context.route("**/api/answers", self._answer)
-        visit.context.on("response", self._note)
-
-    def hold(self) -> None:
-        """Hold back answers that are sent again."""
-        self._held = []
-
-    def release(self) -> None:
-        """Send what was held back."""
-        held, self._held = self._held or [], None
-        for route in held:
-            route.continue_()
-
-    def _announce(self, route: Any) -> None:
-        showing = route.request.post_data_json
-        if showing["key"] not in self._first:
-            self._first[showing["key"]] = route
-            return
-        route.continue_(post_data=json.dumps({**showing, "ago_ms": 0}))
-        first, self._first[showing["key"]] = self._first[showing["key"]], None
-        if first is not None:
-            first.fulfill(json={"showings": 1})
-
-    def _answer(self, route: Any) -> None:
-        again = route.request.post_data_json["key"] in self.responses
-        if again and self._held is not None:
-            self._held.append(route)
-        else:
-            route.continue_()
-
-    def _note(self, response: Any) -> None:
-        if response.url.endswith("/api/answers"):
-            key = response.request.post_data_json["key"]
-            self.responses.setdefault(key, []).append(response)
-
-
 WATCH_TROUBLE = """() => {
   window.troubles = [];
   const status = document.getElementById("status");
@@ -513,53 +460,52 @@ WATCH_TROUBLE = """() => {
 
 
 @pytest.mark.nightly
-def test_answers_that_are_too_early_are_sent_again(chromium: Any, tmp_path: Path) -> None:
+def test_answers_that_are_too_early_are_sent_again(chromium: Any, site: tuple[Study, str]) -> None:
     """After the time that the server says; the participant notices nothing and continues."""
-    timing = replace(SHORT, cue_ms=2000)
-    with (
-        served(tmp_path, test=2, timing=timing) as (study, server),
-        Visit(chromium, server.url, "early") as visit,
-    ):
-        early = Early(visit)
+    study, url = site
+    sent: dict[str, list[tuple[float, Any]]] = {}
+
+    def refuse_once(route: Any) -> None:
+        answer = route.request.post_data_json
+        tries = sent.setdefault(answer["key"], [])
+        tries.append((time.monotonic(), answer))
+        if len(tries) > 1:
+            route.continue_()
+        else:
+            refusal = {"error": "too_early", "message": "too early"}
+            route.fulfill(status=425, headers={"retry-after": "1"}, json=refusal)
+
+    with Visit(chromium, url, "early") as visit:
+        visit.context.route("**/api/answers", refuse_once)
         visit.begin("?participant=Early&language=en")
         visit.page.evaluate(WATCH_TROUBLE)
-        visit.answer("yes")
-        visit.see_feedback()  # comes when the answer is stored
+        visit.practise(1)  # the feedback comes when the answer is stored
         visit.begin_test()
-        early.hold()
         visit.answer("no")
-        visit.page.get_by_text("Trial 2 of 2").wait_for()
+        visit.page.get_by_text("Trial 2 of 3").wait_for()
         assert visit.page.evaluate(KEPT) == [0]
-        early.release()
         visit.wait_for_answer()
         while visit.page.evaluate(KEPT):
             visit.page.wait_for_timeout(50)
         assert visit.page.evaluate("window.troubles") == []
         # A reload does not lose an answer that waits.
-        early.hold()
         with visit.page.expect_response("**/api/answers"):
             visit.page.click(".answer[data-response=yes]")
         assert visit.page.evaluate(KEPT) == [1]
-        early.release()
         visit.page.reload()
+        visit.answer("yes")
         visit.heading("About you")
         assert visit.page.evaluate(KEPT) == []
         assert visit.page.locator("#status").inner_text() == ""
-        statuses = [[one.status for one in sent] for sent in early.responses.values()]
-        for sent in list(early.responses.values())[:2]:
-            refused, accepted = (one.request for one in sent)
-            wait_ms = 1000 * int(sent[0].headers["retry-after"])
-            began = refused.timing["startTime"]
-            assert wait_ms >= 1000 and accepted.timing["startTime"] - began >= wait_ms
-            assert accepted.post_data_json == refused.post_data_json
         assert visit.unexpected() == []
         visit.finish()
-    assert statuses[:2] == [[425, 200]] * 2
-    # The new load of the page sends it at once, which is too early again.
-    assert set(statuses[2][:-1]) == {425} and statuses[2][-1] == 200
+    assert len(sent) == 4
+    for (refused_at, refused), (accepted_at, accepted) in sent.values():
+        assert accepted == refused
+        # The new load of the page sends the second test answer at once.
+        assert accepted_at - refused_at >= 1 or refused["trial"] == 1
+    check_complete(study, "Early", ["no", "yes", "yes"])
     session, answers, events = rows_of(study, "Early")
-    stored = [(row.phase, row.trial, row.response) for row in answers]
-    assert stored == [("familiarization", 0, "yes"), ("test", 0, "no"), ("test", 1, "yes")]
-    assert [row.key for row in answers] == list(early.responses)
+    assert {row.key for row in answers} == set(sent)
     assert session.implausible is None
     assert "answer_refused" not in {event.kind for event in events}
