@@ -159,6 +159,25 @@ def test_racing_tabs_make_one_row(store: Store) -> None:
     assert run(store.state(two)).trial == 1
 
 
+@pytest.fixture(scope="module")
+def machine(
+    small_study: Study, small_secrets: Secrets, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Store]:
+    """One store for all examples; a database for each would take minutes."""
+    store = open_store(small_study, small_secrets, tmp_path_factory.mktemp("machine"))
+    yield store
+    store.close()
+
+
+def new_session(store: Store) -> str:
+    """Empty the tables and begin a session."""
+    with store.engine.begin() as connection:
+        for table in reversed(METADATA.sorted_tables):
+            if table is not STUDIES:
+                connection.execute(delete(table))
+    return walk(store, enter(store), "familiarization")
+
+
 POSTS = st.lists(
     st.one_of(
         st.tuples(st.just("answer"), st.sampled_from(["familiarization", "test"]),
@@ -334,22 +353,3 @@ def test_nothing_is_lost_when_the_server_is_killed_again_and_again(
     with engine.connect() as connection:
         assert connection.scalar(sa.text("PRAGMA integrity_check")) == "ok"
     engine.dispose()
-
-
-@pytest.fixture(scope="module")
-def machine(
-    small_study: Study, small_secrets: Secrets, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Store]:
-    """One store for all examples; a database for each would take minutes."""
-    store = open_store(small_study, small_secrets, tmp_path_factory.mktemp("machine"))
-    yield store
-    store.close()
-
-
-def new_session(store: Store) -> str:
-    """Empty the tables and begin a session."""
-    with store.engine.begin() as connection:
-        for table in reversed(METADATA.sorted_tables):
-            if table is not STUDIES:
-                connection.execute(delete(table))
-    return walk(store, enter(store), "familiarization")

@@ -204,16 +204,6 @@ def test_after_the_last_attempt_the_session_has_ended(
     assert (pd.read_csv(out / "events.csv")["kind"] == ATTEMPT).sum() == 3
 
 
-@contextmanager
-def practice_store(study: Study, folder: Path, rules: Practice) -> Iterator[Store]:
-    """Open a store in which the practice has these rules."""
-    store = open_store(
-        replace(study, practice=rules), Secrets.load(study.folder), folder / "database"
-    )
-    yield store
-    store.close()
-
-
 def test_right_answers_are_not_sent(checking: Study) -> None:
     sent = public_study(checking, Secrets.load(checking.folder)).model_dump_json()
     assert '"comprehension_questions":[{"name":"task","options":["fall","touch"]}' in sent
@@ -236,6 +226,16 @@ def practising(tmp_path_factory: pytest.TempPathFactory) -> Study:
         scenarios=("collide", "drop"), practice=RULES,
         screened_out=EarlyEnd("", "out", ""),
     )  # fmt: skip
+
+
+@contextmanager
+def practice_store(study: Study, folder: Path, rules: Practice) -> Iterator[Store]:
+    """Open a store in which the practice has these rules."""
+    store = open_store(
+        replace(study, practice=rules), Secrets.load(study.folder), folder / "database"
+    )
+    yield store
+    store.close()
 
 
 def practise(store: Store, token: str, name: str, *responses: str) -> SessionState:

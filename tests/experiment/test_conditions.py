@@ -72,6 +72,11 @@ def groups(tmp_path_factory: pytest.TempPathFactory) -> Study:
     return load_study(folder)
 
 
+@pytest.fixture
+def groups_store(groups: Study, database: Path) -> Iterator[Store]:
+    yield from opened(groups, database)
+
+
 def conditions_of(store: Store) -> Counter[str]:
     kept = (r for r in rows(store, SESSIONS) if r.withdrawn_at is None and r.voided_at is None)
     return Counter(row.condition for row in kept)
@@ -95,20 +100,6 @@ def test_conditions_are_filled_equally_and_places_are_given_back(groups_store: S
     run(store.write(lambda c: c.execute(gone)))
     begin(store, "last")
     assert conditions_of(store)["plain"] == 4, "nobody continues the session that was left"
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_ties_are_broken_by_seed(groups: Study, tmp_path: Path) -> None:
-    first = []
-    for seed in range(30):
-        study = replace(groups, seed=seed)
-        url = tmp_path / f"{seed}"
-        store = open_store(study, Secrets.load(study.folder), url)
-        begin(store, "ada")
-        first += [row.condition for row in rows(store, SESSIONS)]
-        store.close()
-    assert len(set(first)) == 3
 
 
 def test_a_person_keeps_the_condition_in_further_sessions(groups: Study, tmp_path: Path) -> None:
@@ -281,8 +272,3 @@ def test_the_analysis_compares_and_chooses_conditions(exported: tuple[Path, Stor
         keep_where(responses, ["brief"])
     with pytest.raises(BadInputError, match="no column language"):
         keep_where(alone, ["language=en"])
-
-
-@pytest.fixture
-def groups_store(groups: Study, database: Path) -> Iterator[Store]:
-    yield from opened(groups, database)

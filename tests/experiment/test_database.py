@@ -90,13 +90,20 @@ def test_a_server_that_was_killed_as_it_began_leaves_a_database_that_can_be_made
         assert connection.execute("PRAGMA user_version").fetchone() == (SCHEMA,)
 
 
-def test_tables_of_another_version_are_refused(engine: Engine, tmp_path: Path) -> None:
+def test_other_files_and_tables_of_another_version_are_refused(
+    engine: Engine, tmp_path: Path
+) -> None:
     with engine.begin() as connection:
         connection.exec_driver_sql("PRAGMA user_version = 9")
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / DATABASE_FILE).write_bytes(b"no database at all" * 100)
     for ask in (create_database, open_database):
         with pytest.raises(BadInputError, match=f"version 9, this .* version {SCHEMA}") as caught:
             ask(tmp_path)
         assert "\n" not in str(caught.value)
+        with pytest.raises(PhysionError, match="cannot be read: file is not a database"):
+            ask(other)
 
 
 def test_errors_tell_no_values(engine: Engine) -> None:
@@ -423,19 +430,3 @@ def test_all_of_a_session_is_forgotten(
     found = bytes_of(tmp_path)
     assert b"Telling" not in found and raw_id(1).encode() not in found
     assert raw_id(2).encode() in found
-
-
-def test_other_files_and_tables_of_another_version_are_refused(
-    engine: Engine, tmp_path: Path
-) -> None:
-    with engine.begin() as connection:
-        connection.exec_driver_sql("PRAGMA user_version = 9")
-    other = tmp_path / "other"
-    other.mkdir()
-    (other / DATABASE_FILE).write_bytes(b"no database at all" * 100)
-    for ask in (create_database, open_database):
-        with pytest.raises(BadInputError, match=f"version 9, this .* version {SCHEMA}") as caught:
-            ask(tmp_path)
-        assert "\n" not in str(caught.value)
-        with pytest.raises(PhysionError, match="cannot be read: file is not a database"):
-            ask(other)

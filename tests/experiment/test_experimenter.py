@@ -119,6 +119,20 @@ def test_progress_counts_people_and_their_answers(busy: tuple[Lab, Visitor]) -> 
     assert shown[-1][0] == "All" and len(shown) == 3
 
 
+def test_states_of_sessions_and_spans_in_words() -> None:
+    names = ("voided_at", "finished_at", "withdrawn_at", "screened_out_at")
+    states = ("void", "finished", "withdrawn", "screened_out")
+    for name, state in zip(names, states, strict=True):
+        row = SimpleNamespace(**dict.fromkeys(names) | {name: 1.0, "last_seen": 1.0})
+        assert session_state(row, 2.0) == state
+    row = SimpleNamespace(**dict.fromkeys(names), last_seen=1000.0)
+    after = [session_state(row, 1000.0 + seconds) for seconds in (0, 900, 901)]
+    assert after == ["going", "going", "left"]
+    spans = [minutes(value) for value in (None, 12.4, 185, 3000)]
+    assert spans == ["–", "12 min", "3 h 05", "2 d 2 h"]
+    assert visible("ab\u202ecd\x00") == "ab\\u202ecd\\u0000"
+
+
 def test_progress_counts_each_condition(tmp_path: Path) -> None:
     groups = (Condition("plain"), Condition("brief"))
     with lab(tmp_path, conditions=groups) as found:
@@ -308,26 +322,6 @@ def test_a_void_session_does_not_count(small: tuple[Lab, Visitor]) -> None:
     assert run(found.store.state(later)).stage == "withdrawn"
     assert refusal(found.store.enter(Enter(id="Next"))).code == "already_took_part"
     assert visitor.submit("/sessions/none/void", action="void").status_code == 404
-
-
-def test_the_cookie_goes_nowhere_else_and_ends_with_the_login(lab_of_one: Lab) -> None:
-    for base_url, secure in (("http://testserver", False), ("https://testserver", True)):
-        visitor = lab_of_one.visitor(base_url=base_url)
-        tokens = []
-        for _ in range(2):
-            cookie = visitor.log_in().headers["set-cookie"]
-            words = {word.strip().lower() for word in cookie.split(";")[1:]}
-            assert {"httponly", "samesite=strict", f"path={BASE}"} <= words
-            assert ("secure" in words) == secure and "domain" not in cookie.lower()
-            assert PASSWORD not in cookie
-            tokens.append(cookie.partition(";")[0])
-        assert len(set(tokens)) == 2, "a new token with each login"
-    visitor = lab_of_one.experimenter()
-    cookie = visitor.cookies[COOKIE]
-    assert visitor.submit("/logout").status_code == 303
-    assert COOKIE not in visitor.cookies
-    again = visitor.get(BASE, headers={"cookie": f"{COOKIE}={cookie}"}, follow_redirects=False)
-    assert again.status_code == 303
 
 
 def test_one_session_is_deleted_while_others_answer(small: tuple[Lab, Visitor]) -> None:
@@ -615,6 +609,26 @@ def test_passwords_are_checked_one_at_a_time(
         assert refused.status_code == 429 and "Too many attempts" in refused.text
 
 
+def test_the_cookie_goes_nowhere_else_and_ends_with_the_login(lab_of_one: Lab) -> None:
+    for base_url, secure in (("http://testserver", False), ("https://testserver", True)):
+        visitor = lab_of_one.visitor(base_url=base_url)
+        tokens = []
+        for _ in range(2):
+            cookie = visitor.log_in().headers["set-cookie"]
+            words = {word.strip().lower() for word in cookie.split(";")[1:]}
+            assert {"httponly", "samesite=strict", f"path={BASE}"} <= words
+            assert ("secure" in words) == secure and "domain" not in cookie.lower()
+            assert PASSWORD not in cookie
+            tokens.append(cookie.partition(";")[0])
+        assert len(set(tokens)) == 2, "a new token with each login"
+    visitor = lab_of_one.experimenter()
+    cookie = visitor.cookies[COOKIE]
+    assert visitor.submit("/logout").status_code == 303
+    assert COOKIE not in visitor.cookies
+    again = visitor.get(BASE, headers={"cookie": f"{COOKIE}={cookie}"}, follow_redirects=False)
+    assert again.status_code == 303
+
+
 def test_a_login_ends_when_idle_and_in_any_case(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -655,17 +669,3 @@ def test_only_files_of_the_package_are_static(lab_of_one: Lab) -> None:
     assert good.status_code == 200 and good.headers["content-type"].startswith("text/css")
     for name in ("../pages.py", "..%2fpages.py", "pages.py", "%2e%2e/access.py", ""):
         assert visitor.see(f"/static/{name}").status_code in (303, 404)
-
-
-def test_states_of_sessions_and_spans_in_words() -> None:
-    names = ("voided_at", "finished_at", "withdrawn_at", "screened_out_at")
-    states = ("void", "finished", "withdrawn", "screened_out")
-    for name, state in zip(names, states, strict=True):
-        row = SimpleNamespace(**dict.fromkeys(names) | {name: 1.0, "last_seen": 1.0})
-        assert session_state(row, 2.0) == state
-    row = SimpleNamespace(**dict.fromkeys(names), last_seen=1000.0)
-    after = [session_state(row, 1000.0 + seconds) for seconds in (0, 900, 901)]
-    assert after == ["going", "going", "left"]
-    spans = [minutes(value) for value in (None, 12.4, 185, 3000)]
-    assert spans == ["–", "12 min", "3 h 05", "2 d 2 h"]
-    assert visible("ab\u202ecd\x00") == "ab\\u202ecd\\u0000"

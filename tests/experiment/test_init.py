@@ -95,6 +95,12 @@ def test_another_seed_chooses_otherwise(dataset: Path) -> None:
     assert len(set(all_of_them)) == 10 and len({frozenset(names) for names in all_of_them}) == 1
 
 
+def draw_of_roll(folder: Path, test: int) -> list[str]:
+    """Return the names of the test trials that are chosen, in order."""
+    chosen = choose_trials(folder, scenarios=["roll"], test=test, practice=2)
+    return [source.stimulus for source in chosen.sources if source.phase == "test"]
+
+
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_presets_alternate_in_the_draw(tmp_path: Path) -> None:
@@ -284,27 +290,6 @@ def test_folders_with_something_in_them_are_refused(
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
-BAD_COMMANDS = {
-    "nothing": "give either --trials DATASET, --scenes official",
-    "--trials DATA --stimuli a.json": "give either",
-    "--scenes official --trials .": "give either --trials DATASET, --scenes",
-    "--trials DATA --movies .": "--movies needs --stimuli",
-    "--scenes official --movies .": "--movies needs --stimuli",
-    "--stimuli a.json": "--stimuli needs --movies",
-    "--stimuli a.json --movies .": "--familiarization LISTS",
-    "--trials . --rendered x": "--rendered goes with --scenes",
-    "--trials nowhere": "does not exist",
-    "--scenes nowhere": "nowhere",
-    "--trials DATA --test 7": "--test must be even",
-    "--scenes official --test 3": "--test must be even",
-    "--scenes official --scenario colide": "'colide'",
-    "--trials DATA --name a/b": "name is 'a/b': must be letters",
-    "--trials DATA --languages en fr": "unknown language 'fr'",
-    "--trials DATA --password-file SHORT": "8 characters or more",
-    "--trials DATA --password-file nowhere": "nowhere is missing",
-}
-
-
 # --- the command ---------------------------------------------------------------------------------
 
 
@@ -361,6 +346,27 @@ def test_the_command_takes_a_password_and_prints_json(
     study = load_study(tmp_path / "study")
     assert printed["digest"] == study.digest and study.participants == 7
     assert check_password(Secrets.load(study.folder), "correct horse battery")
+
+
+BAD_COMMANDS = {
+    "nothing": "give either --trials DATASET, --scenes official",
+    "--trials DATA --stimuli a.json": "give either",
+    "--scenes official --trials .": "give either --trials DATASET, --scenes",
+    "--trials DATA --movies .": "--movies needs --stimuli",
+    "--scenes official --movies .": "--movies needs --stimuli",
+    "--stimuli a.json": "--stimuli needs --movies",
+    "--stimuli a.json --movies .": "--familiarization LISTS",
+    "--trials . --rendered x": "--rendered goes with --scenes",
+    "--trials nowhere": "does not exist",
+    "--scenes nowhere": "nowhere",
+    "--trials DATA --test 7": "--test must be even",
+    "--scenes official --test 3": "--test must be even",
+    "--scenes official --scenario colide": "'colide'",
+    "--trials DATA --name a/b": "name is 'a/b': must be letters",
+    "--trials DATA --languages en fr": "unknown language 'fr'",
+    "--trials DATA --password-file SHORT": "8 characters or more",
+    "--trials DATA --password-file nowhere": "nowhere is missing",
+}
 
 
 @pytest.mark.parametrize("words", BAD_COMMANDS)
@@ -524,9 +530,3 @@ def test_the_command_renders_official_scenes_and_makes_a_study(
     assert main(["experiment", "init", *CONTACT, str(tmp_path / "again"), *words]) == 0
     assert {path: path.stat().st_mtime_ns for path in made.rglob("*.h5")} == before
     assert load_study(tmp_path / "again").stimuli == stimuli
-
-
-def draw_of_roll(folder: Path, test: int) -> list[str]:
-    """Return the names of the test trials that are chosen, in order."""
-    chosen = choose_trials(folder, scenarios=["roll"], test=test, practice=2)
-    return [source.stimulus for source in chosen.sources if source.phase == "test"]

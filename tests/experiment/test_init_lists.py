@@ -53,6 +53,18 @@ def write_media(folder: Path, ids: list[str], maps: Path | None = None) -> None:
         picture.write_bytes(draw_map(number, SIZE))
 
 
+def make_listed(
+    folder: Path, stimuli: Path, familiarization: Path | None, *more: str, code: int = 0
+) -> Path:
+    """Make a study of two lists with the movies in ``folder``; return its folder."""
+    words = ["--stimuli", str(stimuli), "--movies", str(folder / "movies"), *more]
+    if familiarization is not None:
+        words += ["--familiarization", str(familiarization)]
+    assert main(["experiment", "init", *CONTACT, str(folder / "study"), *words]) == code
+    assert (folder / "study").exists() == (code == 0)
+    return folder / "study"
+
+
 def test_the_command_makes_a_study_of_lists(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -292,15 +304,3 @@ def test_bad_columns_of_own_movies_are_named(
     path = write_own(tmp_path / "list.csv", ["a", "b"], scenario=scenario, **more)
     with pytest.raises(BadInputError, match=told):
         list_scenario(path, read_list(path))
-
-
-def make_listed(
-    folder: Path, stimuli: Path, familiarization: Path | None, *more: str, code: int = 0
-) -> Path:
-    """Make a study of two lists with the movies in ``folder``; return its folder."""
-    words = ["--stimuli", str(stimuli), "--movies", str(folder / "movies"), *more]
-    if familiarization is not None:
-        words += ["--familiarization", str(familiarization)]
-    assert main(["experiment", "init", *CONTACT, str(folder / "study"), *words]) == code
-    assert (folder / "study").exists() == (code == 0)
-    return folder / "study"

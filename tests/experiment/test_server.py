@@ -171,102 +171,6 @@ def test_only_named_proxies_are_trusted(tmp_path: Path, trusted: bool) -> None:
         assert (answer.getheader("strict-transport-security") is not None) == trusted
 
 
-@pytest.mark.parametrize(("address", "readable"), [
-    (Address(), False),
-    (Address("localhost"), False),
-    (Address("::1"), False),
-    (Address("0.0.0.0"), True),
-    (Address("192.0.2.1"), True),
-    (Address("lab.example.org"), True),
-    (Address("0.0.0.0", proxies=("10.0.0.1",)), False),
-    (Address("0.0.0.0", certificate=Path("c"), key=Path("k")), False),
-])  # fmt: skip
-def test_unencrypted_addresses(address: Address, readable: bool) -> None:
-    assert address.is_readable_on_the_way() == readable
-
-
-def test_a_new_password_is_the_first_line_of_a_file(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder, file = make_tiny_study(tmp_path / "s", familiarization=1, test=1).folder, tmp_path / "p"
-    before = Secrets.load(folder)
-    words = ["experiment", "serve", str(folder), "--password-file", str(file), "--port=-1"]
-    for content in (b"", b"short\n", b"\xff\xff\xff\xff\xff\xff\xff\xff\xff"):
-        file.write_bytes(content)
-        assert main(words) == 2 and str(file) in capsys.readouterr().err
-    assert Secrets.load(folder) == before
-    file.write_text("another password \nnot this\n")
-    assert main(words) == 2 and "--port" in capsys.readouterr().err
-    after = Secrets.load(folder)
-    assert check_password(after, "another password") and not check_password(after, PASSWORD)
-    assert (after.hash_key, after.link_key) == (before.hash_key, before.link_key)
-
-
-SLOW_TO_IMPORT = ("sklearn", "statsmodels", "matplotlib", "numba", "mujoco", "torch")
-
-
-def test_rules_match_the_analysis() -> None:
-    allowed = get_type_hints(StudySettings)["exclusions"]
-    assert tuple(RULE_SETS) == get_args(allowed)
-
-
-@pytest.mark.slow
-def test_serving_imports_nothing_slow() -> None:
-    found = f"[name for name in {SLOW_TO_IMPORT} if name in sys.modules]"
-    code = f"import sys, physion.experiment.server; print({found})"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
-SERVER = ROOT / "examples" / "server"
-DEFAULTS = {field.name: field.default for field in fields(serve.Options)}
-
-
-@pytest.fixture(scope="module")
-def services() -> dict[str, Any]:
-    yaml = pytest.importorskip("yaml")
-    found: dict[str, Any] = yaml.safe_load((SERVER / "compose.yaml").read_text())
-    subnet = found["networks"]["default"]["ipam"]["config"][0]["subnet"]
-    return {**found["services"], "subnet": subnet}
-
-
-def options_of(command: list[str]) -> dict[str, str]:
-    """Return the options of a command by the names of the fields of `serve.Options`."""
-    assert command[:2] == ["serve", "/study"] and len(command) % 2 == 0
-    pairs = zip(command[2::2], command[3::2], strict=True)
-    return {name.removeprefix("--").replace("-", "_"): value for name, value in pairs}
-
-
-def test_the_command_is_one_that_serve_accepts(services: dict[str, Any]) -> None:
-    options = options_of(services["study"]["command"])
-    assert set(options) <= set(DEFAULTS)
-    assert ipaddress.ip_network(options["behind_proxy"]) == ipaddress.ip_network(services["subnet"])
-    assert services["study"]["volumes"][0].endswith(":/study")
-
-
-def test_the_proxy_reaches_the_study(services: dict[str, Any]) -> None:
-    target = re.search(r"reverse_proxy (\w+):(\d+)", (SERVER / "Caddyfile").read_text())
-    assert target is not None
-    assert target[1] in services and int(target[2]) == DEFAULTS["port"]
-    assert services["proxy"]["volumes"][0].startswith("./Caddyfile:")
-    assert "ports" not in services["study"]
-
-
-def test_the_image_is_built_from_what_is_there(services: dict[str, Any]) -> None:
-    built = services["study"]["build"]
-    text = (SERVER / built["context"] / built["dockerfile"]).resolve().read_text()
-    for line in re.findall(r"^COPY (.*)", text, re.MULTILINE):
-        for name in line.split()[:-1]:
-            assert (ROOT / name).exists(), name
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    version = re.search(r"FROM python:([\d.]+)", text)
-    assert version is not None and project["requires-python"] == f">={version[1]}"
-    assert set(re.findall(r"\.\[(\w+)\]", text)) <= set(project["optional-dependencies"])
-    entry = json.loads(re.findall(r"ENTRYPOINT (.*)", text)[0])
-    assert entry[0] in project["scripts"] and entry[1:] == ["experiment"]
-    assert set(options_of(json.loads(re.findall(r"^CMD (.*)", text, re.MULTILINE)[0]))) == {"host"}
-
-
 def serve_badly(capsys: pytest.CaptureFixture[str], folder: Path, *words: str) -> str:
     """Return the one line of a server that cannot start."""
     assert main(["experiment", "serve", str(folder), *words]) == 2
@@ -315,3 +219,88 @@ def test_a_folder_without_a_study_is_refused(
     assert "this is not a study folder; create one with physion experiment init" in said
     assert main(["experiment", "serve", str(tmp_path), "--host", "0.0.0.0"]) == 2
     assert "sent unencrypted" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("address", "readable"), [
+    (Address(), False),
+    (Address("localhost"), False),
+    (Address("::1"), False),
+    (Address("0.0.0.0"), True),
+    (Address("192.0.2.1"), True),
+    (Address("lab.example.org"), True),
+    (Address("0.0.0.0", proxies=("10.0.0.1",)), False),
+    (Address("0.0.0.0", certificate=Path("c"), key=Path("k")), False),
+])  # fmt: skip
+def test_unencrypted_addresses(address: Address, readable: bool) -> None:
+    assert address.is_readable_on_the_way() == readable
+
+
+def test_a_new_password_is_the_first_line_of_a_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, file = make_tiny_study(tmp_path / "s", familiarization=1, test=1).folder, tmp_path / "p"
+    before = Secrets.load(folder)
+    words = ["experiment", "serve", str(folder), "--password-file", str(file), "--port=-1"]
+    for content in (b"", b"short\n", b"\xff\xff\xff\xff\xff\xff\xff\xff\xff"):
+        file.write_bytes(content)
+        assert main(words) == 2 and str(file) in capsys.readouterr().err
+    assert Secrets.load(folder) == before
+    file.write_text("another password \nnot this\n")
+    assert main(words) == 2 and "--port" in capsys.readouterr().err
+    after = Secrets.load(folder)
+    assert check_password(after, "another password") and not check_password(after, PASSWORD)
+    assert (after.hash_key, after.link_key) == (before.hash_key, before.link_key)
+
+
+SLOW_TO_IMPORT = ("sklearn", "statsmodels", "matplotlib", "numba", "mujoco", "torch")
+
+
+def test_rules_match_the_analysis() -> None:
+    allowed = get_type_hints(StudySettings)["exclusions"]
+    assert tuple(RULE_SETS) == get_args(allowed)
+
+
+@pytest.mark.slow
+def test_serving_imports_nothing_slow() -> None:
+    found = f"[name for name in {SLOW_TO_IMPORT} if name in sys.modules]"
+    code = f"import sys, physion.experiment.server; print({found})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+SERVER = ROOT / "examples" / "server"
+
+
+def options_of(command: list[str]) -> dict[str, str]:
+    """Return the options of a command by the names of the fields of `serve.Options`."""
+    assert command[:2] == ["serve", "/study"] and len(command) % 2 == 0
+    pairs = zip(command[2::2], command[3::2], strict=True)
+    return {name.removeprefix("--").replace("-", "_"): value for name, value in pairs}
+
+
+def test_the_image_is_built_from_what_is_there() -> None:
+    """The example of a server: Docker builds what is here, and starts what serve accepts."""
+    yaml = pytest.importorskip("yaml")
+    compose = yaml.safe_load((SERVER / "compose.yaml").read_text())
+    study, proxy = compose["services"]["study"], compose["services"]["proxy"]
+    defaults = {field.name: field.default for field in fields(serve.Options)}
+    options = options_of(study["command"])
+    assert set(options) <= set(defaults)
+    subnet = compose["networks"]["default"]["ipam"]["config"][0]["subnet"]
+    assert ipaddress.ip_network(options["behind_proxy"]) == ipaddress.ip_network(subnet)
+    assert study["volumes"][0].endswith(":/study") and "ports" not in study
+    target = re.search(r"reverse_proxy (\w+):(\d+)", (SERVER / "Caddyfile").read_text())
+    assert target is not None
+    assert target[1] in compose["services"] and int(target[2]) == defaults["port"]
+    assert proxy["volumes"][0].startswith("./Caddyfile:")
+    text = (SERVER / study["build"]["context"] / study["build"]["dockerfile"]).resolve().read_text()
+    for line in re.findall(r"^COPY (.*)", text, re.MULTILINE):
+        for name in line.split()[:-1]:
+            assert (ROOT / name).exists(), name
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    version = re.search(r"FROM python:([\d.]+)", text)
+    assert version is not None and project["requires-python"] == f">={version[1]}"
+    assert set(re.findall(r"\.\[(\w+)\]", text)) <= set(project["optional-dependencies"])
+    entry = json.loads(re.findall(r"ENTRYPOINT (.*)", text)[0])
+    assert entry[0] in project["scripts"] and entry[1:] == ["experiment"]
+    assert set(options_of(json.loads(re.findall(r"^CMD (.*)", text, re.MULTILINE)[0]))) == {"host"}

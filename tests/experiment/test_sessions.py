@@ -276,15 +276,6 @@ def test_the_scenario_with_fewest_sessions_comes_first_until_the_study_is_full(
     assert finished == {"drop": 4, "collide": 4}
 
 
-def _let_time_pass(store: Store, person: str, seconds: float = ACTIVE_WITHIN + 1) -> None:
-    """Make a session inactive, as if its last request and answer were long ago."""
-    own = SESSIONS.c.participant == participant_hash(store.secrets, "link", person)
-    with store.engine.begin() as connection:
-        names = ("last_seen", "progressed_at")
-        earlier = {name: SESSIONS.c[name] - seconds for name in names}
-        connection.execute(update(SESSIONS).where(own).values(earlier))
-
-
 def test_previews_and_simulations_do_not_count_as_participants(
     store: Store, small_secrets: Secrets
 ) -> None:
@@ -574,27 +565,6 @@ def test_previews_of_other_stimuli_are_in_no_result(
     store.close()
 
 
-def test_one_store_at_a_time_keeps_everything_for_the_next(
-    small_study: Study, small_secrets: Secrets, database: Path
-) -> None:
-    store = open_store(small_study, small_secrets, database)
-    token = walk(store, enter(store, "Ada"), "test")
-    give(store, token, 0)
-    listed = store.trials(token, "test")
-    with pytest.raises(PhysionError, match="another"):
-        open_store(small_study, small_secrets, database)
-    assert store.healthy()
-    store.close()
-    again = open_store(small_study, small_secrets, database)
-    assert refusal(store.enter(Enter())).code == "unavailable"
-    state = run(again.state(token))
-    assert (state.stage, state.trial) == ("test", 1)
-    assert again.trials(token, "test") == listed
-    assert give(again, token, 0).duplicate
-    assert len(rows(again, STUDIES)) == 1
-    again.close()
-
-
 def test_page_loads_are_counted_with_their_trial(store: Store) -> None:
     token = begin(store, "Ada")
     run(store.state(token, True))
@@ -650,15 +620,24 @@ def test_events_too_large_are_refused(store: Store, value: Any, said: str) -> No
     assert rows(store, EVENTS) == []
 
 
-def test_one_store_at_a_time(
-    store: Store, small_study: Study, small_secrets: Secrets, database: Path
+def test_one_store_at_a_time_keeps_everything_for_the_next(
+    small_study: Study, small_secrets: Secrets, database: Path
 ) -> None:
+    store = open_store(small_study, small_secrets, database)
+    token = walk(store, enter(store, "Ada"), "test")
+    give(store, token, 0)
+    listed = store.trials(token, "test")
     with pytest.raises(PhysionError, match="another"):
         open_store(small_study, small_secrets, database)
     assert store.healthy()
     store.close()
     again = open_store(small_study, small_secrets, database)
     assert refusal(store.enter(Enter())).code == "unavailable"
+    state = run(again.state(token))
+    assert (state.stage, state.trial) == ("test", 1)
+    assert again.trials(token, "test") == listed
+    assert give(again, token, 0).duplicate
+    assert len(rows(again, STUDIES)) == 1
     again.close()
 
 

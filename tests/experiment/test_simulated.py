@@ -142,6 +142,46 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
     )  # fmt: skip
 
 
+@pytest.fixture(scope="module")
+def visits(study: Study) -> tuple[list[SimulatedVisit], list[SimulatedVisit]]:
+    """Run two simulations on one server: some people leave, then they come back."""
+    secrets = Secrets.load(study.folder)
+    with ServerProcess(study.folder) as server:
+        plan = SimulationPlan(url=server.url, participants=8, dropouts=0.5, seed=5)
+        first = asyncio.run(simulate(study, secrets, plan))
+        second = asyncio.run(simulate(study, secrets, replace(plan, dropouts=0.0)))
+    return first, second
+
+
+@pytest.mark.slow
+def test_people_leave_and_come_back_and_are_simulated_in_the_data_for_good(
+    study: Study, visits: tuple[list[SimulatedVisit], list[SimulatedVisit]]
+) -> None:
+    first, second = visits
+    assert {visit.outcome for visit in first} == {"done", "left"}
+    assert {visit.scenario for visit in first} == {"collide", "drop"}
+    labels = {s.stimulus: s.label for s in study.stimuli}
+    for before, after in zip(first, second, strict=True):
+        assert after.outcome == ("done before" if before.outcome == "done" else "done"), after
+        assert len(before.answers) + len(after.answers) == 6
+        if before.result is not None:
+            right = [(a.response == "yes") == labels[a.stimulus]
+                     for a in before.answers if a.phase == "test"]  # fmt: skip
+            assert len(right) == 4 and before.result.correct == sum(right)
+    sessions = stored_sessions(study)
+    assert len(sessions) == 8 and {session.kind for session in sessions.values()} == {"simulated"}
+    assert all(session.finished_at for session in sessions.values())
+    # They behave as browsers do: nothing about their sessions is impossible.
+    assert {session.implausible for session in sessions.values()} == {None}
+    stored = stored_answers(study)
+    assert len(stored) == 48
+    for visit in (*first, *second):
+        for answer in visit.answers:
+            row = stored[visit.reference, answer.phase, answer.trial]
+            sent = (answer.key, answer.stimulus, answer.response, answer.rt_ms, 1)
+            assert (row.key, row.stimulus, row.response, row.rt_ms, row.showings) == sent
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("with_sessions", [False, True])
 @pytest.mark.usefixtures("visits")
@@ -240,43 +280,3 @@ def test_simulated_participants_pass_all_checks(tmp_path: Path) -> None:
     assert all(set(row.own_answers) == {each.name for each in OWN_QUESTIONS} for row in sessions)
     for text in ("instructed_1_", "attention", "Failed checks"):
         assert text in page
-
-
-@pytest.fixture(scope="module")
-def visits(study: Study) -> tuple[list[SimulatedVisit], list[SimulatedVisit]]:
-    """Run two simulations on one server: some people leave, then they come back."""
-    secrets = Secrets.load(study.folder)
-    with ServerProcess(study.folder) as server:
-        plan = SimulationPlan(url=server.url, participants=8, dropouts=0.5, seed=5)
-        first = asyncio.run(simulate(study, secrets, plan))
-        second = asyncio.run(simulate(study, secrets, replace(plan, dropouts=0.0)))
-    return first, second
-
-
-@pytest.mark.slow
-def test_people_leave_and_come_back_and_are_simulated_in_the_data_for_good(
-    study: Study, visits: tuple[list[SimulatedVisit], list[SimulatedVisit]]
-) -> None:
-    first, second = visits
-    assert {visit.outcome for visit in first} == {"done", "left"}
-    assert {visit.scenario for visit in first} == {"collide", "drop"}
-    labels = {s.stimulus: s.label for s in study.stimuli}
-    for before, after in zip(first, second, strict=True):
-        assert after.outcome == ("done before" if before.outcome == "done" else "done"), after
-        assert len(before.answers) + len(after.answers) == 6
-        if before.result is not None:
-            right = [(a.response == "yes") == labels[a.stimulus]
-                     for a in before.answers if a.phase == "test"]  # fmt: skip
-            assert len(right) == 4 and before.result.correct == sum(right)
-    sessions = stored_sessions(study)
-    assert len(sessions) == 8 and {session.kind for session in sessions.values()} == {"simulated"}
-    assert all(session.finished_at for session in sessions.values())
-    # They behave as browsers do: nothing about their sessions is impossible.
-    assert {session.implausible for session in sessions.values()} == {None}
-    stored = stored_answers(study)
-    assert len(stored) == 48
-    for visit in (*first, *second):
-        for answer in visit.answers:
-            row = stored[visit.reference, answer.phase, answer.trial]
-            sent = (answer.key, answer.stimulus, answer.response, answer.rt_ms, 1)
-            assert (row.key, row.stimulus, row.response, row.rt_ms, row.showings) == sent

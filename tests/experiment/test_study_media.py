@@ -13,8 +13,6 @@ from typing import Any
 import av
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from PIL import Image
 
 from physion.cli.main import main
@@ -34,45 +32,13 @@ from support.experiment.tiny_study import (
 )
 
 NAMES_OF_COLUMNS = [column.name for column in COLUMNS]
-NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,30}", fullmatch=True)
-FILES = st.from_regex(r"media/[A-Za-z0-9][A-Za-z0-9_-]{0,20}", fullmatch=True)
 
 
-@st.composite
-def stimuli_lists(draw: st.DrawFn) -> list[Stimulus]:
-    names = draw(st.lists(NAMES, min_size=1, max_size=8, unique=True))
-    found = []
-    for place, name in enumerate(names):
-        practice, frames = draw(st.booleans()), draw(st.integers(1, 200))
-        file = draw(FILES)
-        found.append(
-            Stimulus(
-                stimulus=name,
-                scenario=draw(st.sampled_from(["collide", "my-own.scenario"])),
-                phase="familiarization" if practice else "test",
-                place=place,
-                label=draw(st.booleans()),
-                movie=f"{file}.mp4",
-                map=f"{file}.png",
-                full=f"{file}-whole.mp4" if practice else "",
-                frames=frames,
-                full_frames=frames + 1 if practice else 0,
-                rate=draw(st.floats(1, 240)),
-                width=draw(st.integers(16, 4096)),
-                height=draw(st.integers(16, 4096)),
-                look=draw(st.sampled_from(["free", "redyellow"])),
-            )
-        )
-    return found
-
-
-@pytest.mark.slow
-@given(stimuli_lists())
-@settings(
-    max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
-def test_what_is_written_is_read_back(tmp_path: Path, stimuli: list[Stimulus]) -> None:
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     path = tmp_path / "stimuli.csv"
+    odd = {"rate": 29.97002997002997, "scenario": "my-own.scenario", "look": "redyellow"}
+    stimuli = [dataclasses.replace(each, **odd) for each in four_stimuli()]
+    stimuli[0] = dataclasses.replace(stimuli[0], stimulus="00.1+a_b-c", width=16, height=4096)
     write_stimuli(path, stimuli)
     assert list(read_stimuli(path)) == stimuli
 
@@ -89,13 +55,6 @@ def test_a_spreadsheet_may_save_it_in_any_order_of_columns(tmp_path: Path) -> No
     path.write_text(",".join(NAMES_OF_COLUMNS))
     with pytest.raises(BadInputError, match="no rows"):
         read_stimuli(path)
-
-
-def test_a_spreadsheet_may_save_it(tmp_path: Path) -> None:
-    path = written_table(tmp_path)
-    text = path.read_text().replace("True", "TRUE").replace("\n", "\r\n")
-    path.write_bytes(b"\xef\xbb\xbf" + text.encode() + b",,,,,,,,,,,,,\r\n")
-    assert list(read_stimuli(path)) == four_stimuli()
 
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
