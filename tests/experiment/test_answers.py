@@ -84,16 +84,6 @@ def test_only_familiarization_gives_feedback(store: Store, small_study: Study) -
         assert not any(word in words for word in ("label", "correct", 'contact":', "tiny"))
 
 
-def test_the_same_answer_again_is_known_even_much_later(store: Store) -> None:
-    token = walk(store, enter(store, "Ada"), "done")
-    before = rows(store)
-    for phase, trial in (("familiarization", 0), ("familiarization", 2), ("test", 3)):
-        stored = give(store, token, trial, phase)
-        assert stored.duplicate and stored.state.stage == "done"
-        assert (stored.feedback is not None) == (phase == "familiarization")
-    assert rows(store) == before
-
-
 def test_answers_out_of_order_are_refused_with_the_state(store: Store) -> None:
     token = enter(store, "Ada")
     cases = [

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import sqlite3
-import stat
 import threading
 import traceback
 from collections.abc import Callable, Iterator
@@ -75,19 +74,49 @@ def kept(engine: Engine) -> set[int]:
 def test_a_new_database_has_the_tables_and_keeps_them(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="has the study been served"):
         open_database(tmp_path)
+    (tmp_path / DATABASE_FILE).touch()  # left by a server that was killed as it began
     create_database(tmp_path).dispose()
+    with sqlite3.connect(tmp_path / DATABASE_FILE) as connection:
+        assert connection.execute("PRAGMA user_version").fetchone() == (SCHEMA,)
     for engine in (create_database(tmp_path), open_database(tmp_path)):
         assert set(inspect(engine).get_table_names()) == set(METADATA.tables)
         engine.dispose()
 
 
-def test_a_server_that_was_killed_as_it_began_leaves_a_database_that_can_be_made(
-    tmp_path: Path,
+def test_commits_wait_for_the_disk_and_only_the_owner_reads_the_files(
+    engine: Engine, tmp_path: Path
 ) -> None:
-    (tmp_path / DATABASE_FILE).touch()
-    create_database(tmp_path).dispose()
-    with sqlite3.connect(tmp_path / DATABASE_FILE) as connection:
-        assert connection.execute("PRAGMA user_version").fetchone() == (SCHEMA,)
+    with engine.connect() as connection:
+        found = {
+            name: connection.exec_driver_sql(f"PRAGMA {name}").scalar()
+            for name in ("journal_mode", "synchronous", "foreign_keys", "secure_delete")
+        }
+        modes = {path.name: path.stat().st_mode & 0o777 for path in tmp_path.glob("*.sqlite*")}
+    assert found == {"journal_mode": "wal", "synchronous": 2, "foreign_keys": 1, "secure_delete": 1}
+    names = (DATABASE_FILE, f"{DATABASE_FILE}-wal", f"{DATABASE_FILE}-shm")
+    assert os.name != "posix" or modes == dict.fromkeys(names, 0o600)
+
+
+def test_waiting_commands_share_a_commit_and_are_written_before_the_writer_closes(
+    engine: Engine,
+) -> None:
+    commits, reached, go_on = [], threading.Event(), threading.Event()
+    event.listen(engine, "commit", lambda connection: commits.append(1))
+
+    def gate(connection: Connection) -> None:
+        reached.set()
+        assert go_on.wait(30)
+
+    writer = Writer(engine)
+    writer.submit(gate)
+    assert reached.wait(30)
+    futures = [writer.submit(put(number)) for number in range(100)]
+    go_on.set()
+    writer.close()
+    assert all(future.done() for future in futures) and kept(engine) == set(range(100))
+    assert len(commits) == 2
+    with pytest.raises(Refused, match="stopping"):
+        writer.submit(put(999))
 
 
 def test_other_files_and_tables_of_another_version_are_refused(
@@ -126,26 +155,6 @@ def test_errors_tell_no_values(engine: Engine) -> None:
         assert "raw_ids" in said and "5f1e" not in said
 
 
-def test_commits_wait_for_the_disk(engine: Engine) -> None:
-    with engine.connect() as connection:
-        found = {
-            name: connection.exec_driver_sql(f"PRAGMA {name}").scalar()
-            for name in ("journal_mode", "synchronous", "foreign_keys", "secure_delete")
-        }
-    assert found == {"journal_mode": "wal", "synchronous": 2, "foreign_keys": 1, "secure_delete": 1}
-
-
-@pytest.mark.skipif(os.name != "posix", reason="no such file modes on this system")
-def test_only_the_owner_reads_the_file_and_its_log(engine: Engine, tmp_path: Path) -> None:
-    with engine.connect() as connection:
-        connection.execute(text("SELECT * FROM sessions"))
-        modes = {
-            path.name: stat.S_IMODE(path.stat().st_mode) for path in tmp_path.glob("*.sqlite*")
-        }
-    names = (DATABASE_FILE, f"{DATABASE_FILE}-wal", f"{DATABASE_FILE}-shm")
-    assert modes == dict.fromkeys(names, 0o600)
-
-
 def test_nothing_is_acknowledged_before_the_commit(engine: Engine) -> None:
     committing, go_on = threading.Event(), threading.Event()
 
@@ -175,33 +184,6 @@ def test_refusals_and_faults_roll_back_only_their_own_command(engine: Engine) ->
     assert errors == [type(None), Refused, IntegrityError, type(None)]
     assert kept(engine) == {1, 2}
     writer.close()
-
-
-def test_waiting_commands_share_a_commit(engine: Engine) -> None:
-    commits, reached, go_on = [], threading.Event(), threading.Event()
-    event.listen(engine, "commit", lambda connection: commits.append(1))
-
-    def gate(connection: Connection) -> None:
-        reached.set()
-        assert go_on.wait(30)
-
-    writer = Writer(engine)
-    writer.submit(gate)
-    assert reached.wait(30)
-    futures = [writer.submit(put(number)) for number in range(100)]
-    go_on.set()
-    assert [future.result(30) for future in futures] == list(range(100))
-    assert len(commits) == 2
-    writer.close()
-
-
-def test_waiting_commands_are_written_before_the_writer_closes(engine: Engine) -> None:
-    writer = Writer(engine)
-    futures = [writer.submit(put(number)) for number in range(50)]
-    writer.close()
-    assert all(future.done() for future in futures) and kept(engine) == set(range(50))
-    with pytest.raises(Refused, match="stopping"):
-        writer.submit(put(99))
 
 
 def test_a_lock_of_another_program_is_a_refusal_after_which_all_continues(

@@ -376,26 +376,10 @@ def test_ids_are_only_on_the_page_of_payments(busy: tuple[Lab, Visitor]) -> None
     assert f"All {PEOPLE} ids" in words_of(visitor.see("/payments?who=all").text)
 
 
-def test_the_table_of_payments_is_shown_and_sent(tmp_path: Path) -> None:
-    with lab(tmp_path, bonus=Bonus(per_correct=3.0, above=0.0), **ONE) as found:
-        given = {"source": "prolific", "recruiter": {"STUDY_ID": "s1"}}
-        walk(found.store, enter(found.store, "=1+1", **given), "done")  # one of two is right
-        visitor = found.experimenter()
-        page = visitor.see("/payments").text
-        assert "50 %" in page and "3.00" in page and "Download as CSV" in page
-        sent = visitor.see("/payments.csv?who=all")
-        assert sent.headers["content-type"] == "text/csv; charset=utf-8"
-        assert sent.headers["content-disposition"].endswith('-payments.csv"')
-        (cells,) = csv.DictReader(io.StringIO(sent.text))
-        assert tuple(cells) == COLUMNS
-        assert cells["id"] == "'=1+1" and cells["recruiter"] == '{"STUDY_ID": "s1"}'
-        names = ("state", "correct", "accuracy", "bonus")
-        assert [cells[name] for name in names] == ["finished", "1", "0.5000", "3.00"]
-
-
 def finish(found: Lab, person: str, right: int) -> sa.Row:
     """Take part with so many right test answers, the first ones; return the row of the session."""
-    token = walk(found.store, begin(found.store, person, source="mturk"), "test")
+    given = {"source": "mturk", "recruiter": {"hitId": "h1"}}
+    token = walk(found.store, begin(found.store, person, **given), "test")
     row = session_of(found, token)
     order = trial_order(found.study, row.scenario, row.order_seed)["test"]
     for trial, stimulus in enumerate(order):
@@ -405,25 +389,29 @@ def finish(found: Lab, person: str, right: int) -> sa.Row:
     return session_of(found, token)
 
 
-@pytest.mark.slow
 def test_each_person_is_paid_for_the_own_session(tmp_path: Path) -> None:
     settings = {"bonus": Bonus(per_correct=0.25, above=0.5), "participants": 9, "test": 4}
     with lab(tmp_path, **ONE | settings) as found:
         done = {person: finish(found, person, right) for person, right in
-                (("w-ada", 4), ("w-bo", 3), ("w-cy", 1), ("w-di", 4))}  # fmt: skip
+                (("w-ada", 4), ("=w-bo", 3), ("w-cy", 1), ("w-di", 4))}  # fmt: skip
         walk(found.store, begin(found.store, "w-late", source="mturk"), "feedback")
         gone = walk(found.store, begin(found.store, "w-gone", source="mturk"), "test")
         run(found.store.page(gone, PageDone(page="withdraw")))
         visitor = found.experimenter()
         visitor.submit(f"/sessions/{done['w-di'].session}/void", action="void")
-        cells = {
-            row["id"]: row for row in csv.DictReader(io.StringIO(visitor.see("/payments.csv").text))
-        }
-        bonus = {"w-ada": "0.50", "w-bo": "0.25", "w-cy": "0.00", "w-di": "0.00"}
-        right = {"w-ada": 4, "w-bo": 3, "w-cy": 1, "w-di": 4}
+        page = visitor.see("/payments").text
+        assert "75 %" in page and "0.25" in page and "Download as CSV" in page
+        sent = visitor.see("/payments.csv")
+        assert sent.headers["content-type"] == "text/csv; charset=utf-8"
+        assert sent.headers["content-disposition"].endswith('-payments.csv"')
+        assert "'=w-bo" in sent.text, "no formula for a spreadsheet"
+        cells = {row["id"].lstrip("'"): row for row in csv.DictReader(io.StringIO(sent.text))}
+        bonus = {"w-ada": "0.50", "=w-bo": "0.25", "w-cy": "0.00", "w-di": "0.00"}
+        right = {"w-ada": 4, "=w-bo": 3, "w-cy": 1, "w-di": 4}
         assert set(cells) == set(done)
         for person, row in done.items():
             paid = cells[person]
+            assert tuple(paid) == COLUMNS and paid["recruiter"] == '{"hitId": "h1"}'
             assert (paid["reference"], paid["source"]) == (row.reference, "mturk")
             assert (paid["test_trials"], paid["correct"]) == ("4", str(right[person]))
             assert (paid["accuracy"], paid["bonus"]) == (f"{right[person] / 4:.4f}", bonus[person])
@@ -558,7 +546,6 @@ def lab_of_one(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
         yield found
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
 def test_nothing_is_shown_without_login(lab_of_one: Lab, page: str) -> None:
     for cookie in (None, "wrong", "x" * 5000):

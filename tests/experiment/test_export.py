@@ -148,6 +148,10 @@ def test_details_and_events_are_there(engine: sa.Engine, study: Study, tmp_path:
         connection.execute(
             sa.update(ANSWERS).where(ANSWERS.c.trial == 2).values(details='{"flashes":[1.5]}')
         )
+        first = connection.execute(sa.select(EVENTS).order_by(EVENTS.c.event)).first()
+        assert first is not None
+        more = {"kind": "visible", "at_ms": 2345.5, "stored_at": first.stored_at + 1.25}
+        connection.execute(sa.insert(EVENTS).values(session=first.session, data={}, **more))
     out = export_study(engine, study, tmp_path / "out").out
     details = pd.read_parquet(out / "trial_details.parquet")
     trials = pd.read_parquet(out / "trials.parquet")
@@ -158,29 +162,19 @@ def test_details_and_events_are_there(engine: sa.Engine, study: Study, tmp_path:
     assert (details.loc[~third, "details"] == "{}").all()
     events = pd.read_parquet(out / "events.parquet")
     sessions = pd.read_parquet(out / "sessions.parquet")
-    assert events["session"].tolist() == sessions["session"].tolist()
-    assert json.loads(events["data"][0]) == {"trial": 3} and (events["number"] == 0).all()
+    assert events["session"].drop_duplicates().tolist() == sessions["session"].tolist()
+    assert json.loads(events["data"][0]) == {"trial": 3}
+    assert (events["number"] == events["session"].duplicated()).all()
+    own = events.set_index("session").loc[first.session]
+    assert own[["number", "kind", "at_ms"]].values.tolist() == [
+        [0, "hidden", 1234.5], [1, "visible", 2345.5]]  # fmt: skip
+    times = [pd.Timestamp(text).timestamp() for text in own["stored_at"]]
+    assert times == pytest.approx([first.stored_at, first.stored_at + 1.25], abs=0.001)
     words = json.loads((out / "data_dictionary.json").read_bytes())
     for name in ("trials", "sessions", "events"):
         header = (out / f"{name}.csv").read_text().partition("\n")[0].split(",")
         assert [entry["name"] for entry in words[name]] == header
     assert [entry["name"] for entry in words["trial_details"]] == list(details.columns)
-
-
-def test_events_are_numbered_and_timed_by_session(
-    engine: sa.Engine, study: Study, tmp_path: Path
-) -> None:
-    with engine.begin() as connection:
-        first = connection.execute(sa.select(EVENTS).order_by(EVENTS.c.event)).first()
-        assert first is not None
-        more = {"kind": "visible", "at_ms": 2345.5, "stored_at": first.stored_at + 1.25}
-        connection.execute(sa.insert(EVENTS).values(session=first.session, data={}, **more))
-    out = export_study(engine, study, tmp_path / "out").out
-    events = pd.read_csv(out / "events.csv").set_index("session").loc[first.session]
-    assert events[["number", "kind", "at_ms"]].values.tolist() == [
-        [0, "hidden", 1234.5], [1, "visible", 2345.5]]  # fmt: skip
-    times = [pd.Timestamp(text).timestamp() for text in events["stored_at"]]
-    assert times == pytest.approx([first.stored_at, first.stored_at + 1.25], abs=0.001)
 
 
 def test_the_same_data_give_the_same_bytes(fill: Fill, study: Study, tmp_path: Path) -> None:
@@ -360,41 +354,6 @@ def test_two_exports_do_not_meet(
     monkeypatch.setattr(export, "read_sessions", once_more)
     export_study(engine, study, tmp_path / "out")
     assert inner and (tmp_path / "out" / "README.md").exists()
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_physion_compare_takes_the_export(
-    study: Study, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    engine = create_database(tmp_path)
-    insert_sessions(engine, study, Secrets.load(study.folder), 24, ends=("finished",), now=NOW,
-                    feedback=NASTY)  # fmt: skip
-    insert_sessions(engine, study, Secrets.load(study.folder), 4, kind="simulated", seed=1)
-    out = export_study(engine, study, tmp_path / "out").out
-    rows = [
-        {
-            "Model": "guesser", "Readout Type": "C", "Readout Test Data": stimulus.scenario,
-            "Predicted Prob_true": 0.3 + 0.05 * (place % 10), "Predicted Outcome": place % 10 > 4,
-            "Actual Outcome": stimulus.label, "Stimulus Name": stimulus.stimulus,
-            "Dynamics Training Dataset": "all",
-        }
-        for place, stimulus in enumerate(study.stimuli)
-        if stimulus.phase == "test"
-    ]  # fmt: skip
-    pd.DataFrame(rows).to_csv(tmp_path / "predictions.csv", index=False)
-    words = ["compare", str(tmp_path / "predictions.csv"), "--responses", str(out / "trials.csv"),
-             "--sessions", str(out / "sessions.csv"), "--expected", str(out / "expected.csv"),
-             "--resamples", "50", "--out", str(tmp_path / "report"), "--json"]  # fmt: skip
-    assert main(words) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert Path(said["report"]).is_file()
-    people = {row["scenario"]: (row["people"], row["stimuli"]) for row in said["people"]}
-    assert people["collide"] == people["drop"] == (12, 6)
-    left_out = {row["reason"]: row["sessions"] for row in said["people_left_out"]}
-    assert left_out == {"session of a simulated participant": 2}  # of either scenario
-    incomplete = [r for r in said["people_flag_counts"] if r["rule"] == "incomplete"]
-    assert [row["sessions"] for row in incomplete] == [0, 0]
 
 
 # --- the verb -----------------------------------------------------------------------------------

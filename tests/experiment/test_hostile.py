@@ -12,14 +12,9 @@ from urllib.parse import quote
 
 import pytest
 import sqlalchemy as sa
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from physion.experiment import protocol as wire
-from physion.experiment.protocol import Refused
-from physion.experiment.store.answering import encode_details
 from physion.experiment.store.database import ANSWERS, EVENTS, RAW_IDS, SESSIONS
-from physion.experiment.web.api import BadBodyError, parse_message
 from support.experiment.app_walk import Person, Served, answer_body, served
 from support.experiment.live_app import HOST, exchange, read_all, running
 
@@ -286,26 +281,3 @@ class TestRawRequests:
                 b"X-Forwarded-Host: evil.example\r\nX-Forwarded-For: 1.1.1.1\r\n\r\n"
             )  # fmt: skip
             assert b"evil.example" not in answer
-
-
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
-    lambda inner: (
-        st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=9), inner, max_size=4)
-    ),
-    max_leaves=20,
-)
-
-
-@pytest.mark.slow
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(st.dictionaries(st.sampled_from(sorted(wire.Answer.model_fields)), JSON), st.booleans())
-def test_any_json_is_a_message_or_refused(values: dict[str, Any], whole: bool) -> None:
-    body = {**(answer_body(0) if whole else {}), **values}
-    try:
-        message = parse_message(json.dumps(body).encode(), wire.Answer)
-    except BadBodyError:
-        return
-    with contextlib.suppress(Refused):
-        json.loads(encode_details(message))
-    assert 0 <= message.rt_ms <= wire.DAY_MS

@@ -225,24 +225,20 @@ class TestPasses:
         assert key_of(person, raw_id="18") is None is key_of(person, raw_id=None)
         assert key_of(person.replace("person", "study")) is None
 
-    def test_links_open_sessions_of_their_kinds(self, tmp_path: Path) -> None:
-        with served(tmp_path / "s", familiarization=1, test=1) as site:
-            for one in links(site.study, site.secrets, "http://x"):
-                asked = parse_qs(urlsplit(one.address).query)
-                if one.name not in ("link", "preview", "simulated"):
-                    continue
-                more = {"pass": asked["pass"][0]} if "pass" in asked else {}
-                state = site.person(scenario=asked["scenario"][0], **more).last["state"]
-                assert state["kind"] == {"link": "person"}.get(one.name, one.name)
-
 
 class TestCompletion:
-    def test_prolific(self, study: Study, secrets: Secrets) -> None:
-        found = completion(study, secrets, session("prolific"), raw())
-        assert found.code == "C0DE"
-        assert found.url == "https://app.prolific.com/submissions/complete?cc=C0DE"
+    def test_the_code_of_the_recruiter(self, study: Study, secrets: Secrets) -> None:
+        prolific = completion(study, secrets, session("prolific"), raw())
+        assert prolific.code == "C0DE"
+        assert prolific.url == "https://app.prolific.com/submissions/complete?cc=C0DE"
         # Ids are not needed for it.
-        assert completion(study, secrets, session("prolific")) == found
+        assert completion(study, secrets, session("prolific")) == prolific
+        same = replace(study, recruitment=replace(study.recruitment, mturk_code="SAME"))
+        assert completion(same, secrets, session("mturk"), raw()).code == "SAME"
+        link = completion(study, secrets, session("link"))
+        assert (link.code, link.url) == ("THANKS", None)
+        bare = completion(replace(study, recruitment=Recruitment()), secrets, session("link"))
+        assert (bare.code, bare.url) == (None, None)
 
     def test_who_ends_early_has_the_code_of_the_recruiter(self) -> None:
         declined = EarlyEnd("NO", "no consent", "https://lab.example/declined")
@@ -269,25 +265,14 @@ class TestCompletion:
     def test_mturk_forms_go_only_to_its_hosts(self, study: Study, secrets: Secrets) -> None:
         own = session_code(secrets, "5e55")
         assert len(own) == 10 and own != session_code(secrets, "5e56")
-        for host in MTURK_HOSTS:
-            sent = raw("w", assignmentId="a1", turkSubmitTo=f"{host}/")
+        evil = ("https://evil.example", "https://www.mturk.com.evil.example", "",
+                "javascript:alert(1)", "http://www.mturk.com")  # fmt: skip
+        for host in (*MTURK_HOSTS, *evil):
+            sent = raw("w", assignmentId="a1", turkSubmitTo=f"{host}/" if host else "")
             found = completion(study, secrets, session("mturk"), sent)
-            assert found.url == f"{host}/mturk/externalSubmit"
-            assert found.post == {"assignmentId": "a1", "code": own}
-        for host in ("https://evil.example", "https://www.mturk.com.evil.example", "",
-                     "javascript:alert(1)", "http://www.mturk.com"):  # fmt: skip
-            sent = raw("w", assignmentId="a1", turkSubmitTo=host)
-            found = completion(study, secrets, session("mturk"), sent)
-            assert (found.code, found.url, found.post) == (own, None, None)
+            if host in MTURK_HOSTS:
+                assert found.url == f"{host}/mturk/externalSubmit"
+                assert found.post == {"assignmentId": "a1", "code": own}
+            else:
+                assert (found.code, found.url, found.post) == (own, None, None)
         assert completion(study, secrets, session("mturk")).code == own
-
-    def test_one_code_for_all_at_mturk(self, study: Study, secrets: Secrets) -> None:
-        decided = replace(study.recruitment, mturk_code="SAME")
-        one = replace(study, recruitment=decided)
-        assert completion(one, secrets, session("mturk"), raw()).code == "SAME"
-
-    def test_plain_links(self, study: Study, secrets: Secrets) -> None:
-        found = completion(study, secrets, session("link"))
-        assert (found.code, found.url) == ("THANKS", None)
-        bare = completion(replace(study, recruitment=Recruitment()), secrets, session("link"))
-        assert (bare.code, bare.url) == (None, None)

@@ -23,14 +23,6 @@ from support.experiment.browser import (
 
 pytestmark = pytest.mark.slow
 SMALL = {"width": 900, "height": 560}
-HIDE_MOVIES = f"""
-const hide = {HIDE};
-document.addEventListener("playing", () => {{
-  if (!window.hideMovies) return;
-  hide(true);
-  setTimeout(hide, 50, false);
-}}, true);"""
-"""Script that hides the page for a moment whenever a movie starts, if `hideMovies` is set."""
 HIDE_AT = f"""
 const hide = {HIDE};
 window.hideAt = [];
@@ -63,8 +55,14 @@ def test_a_question_or_a_small_window_interrupts_a_trial(
     """It is shown again, and showings are counted; or it continues and its answer is void."""
     study, url = slow
     repeats = study.plausibility.interrupted == "repeat"
-    with Visit(chromium, url, "interrupted") as visit:
-        visit.to_the_test("?participant=Ada&language=en")
+    # As on a laptop with scaling or zoom: everything but the trials is possible.
+    with Visit(chromium, url, "interrupted", viewport=SMALL, screen=SMALL) as visit:
+        visit.begin("?participant=Ada&language=en")
+        visit.heading("Please make the window larger")
+        visit.picture("small")
+        visit.page.set_viewport_size(SIZE)
+        visit.practise(1)
+        visit.begin_test()
         visit.page.locator(".screen").wait_for()
         visit.page.click("#tools button")  # the question whether to stop
         visit.page.locator("dialog[open]").wait_for()
@@ -89,45 +87,11 @@ def test_a_question_or_a_small_window_interrupts_a_trial(
     assert [row.showings for row in test] == ([3, 2, 1] if repeats else [1, 1, 1])
     assert [row.void for row in test] == ([None] * 3 if repeats else ["dialog", "window", None])
     assert [row.frames_shown > 0 for row in test] == [True] * 3
+    assert (test[2].window_width, test[2].window_height) == (1280, 800)
     assert (session.replayed, session.implausible, session.unfetched) == (int(repeats), None, 0)
+    assert "too_small" in {event.kind for event in events}
     reasons = [row.data["reason"] for row in events if row.kind == "trial_interrupted"]
     assert reasons == (["dialog", "window"] if repeats else [])
-
-
-@pytest.mark.nightly
-def test_a_trial_whose_movie_is_hidden_each_time_is_void(
-    chromium: Any, slow: tuple[Study, str]
-) -> None:
-    """At once, or after five repetitions; later trials count again."""
-    study, url = slow
-    showings = 6 if study.plausibility.interrupted == "repeat" else 1
-    with Visit(chromium, url, "hidden") as visit:
-        visit.context.add_init_script(HIDE_MOVIES)
-        visit.begin("?participant=Cy&language=en")
-        visit.practise(1)
-        visit.page.evaluate("window.hideMovies = true")
-        visit.begin_test()
-        visit.wait_for_answer()
-        visit.page.evaluate("window.hideMovies = false")
-        visit.answer("yes")
-        visit.answer("no")
-        visit.answer("no")
-        visit.finish()
-        assert visit.unexpected() == []
-    session, _, events = rows_of(study, "Cy")
-    test = answers_to_test(study, "Cy")
-    assert [row.void for row in test] == ["hidden", None, None]
-    assert [row.showings for row in test] == [showings, 1, 1]
-    details = [json.loads(row.details) for row in test]
-    assert [(one["attempts"], one["hidden"]) for one in details[:2]] == [
-        (showings, showings), (1, 0)]  # fmt: skip
-    assert test[0].visibility_changes >= 2 * showings and test[1].visibility_changes == 0
-    assert [row.frames_shown > 0 for row in test] == [True] * 3
-    # More showings than `max_showings` flag the session.
-    assert (session.replayed, session.implausible) == (int(showings > 2), None)
-    repeated = [row.data for row in events if row.kind == "trial_interrupted"]
-    again = [{"trial": 0, "attempt": i + 1, "reason": "hidden"} for i in range(showings - 1)]
-    assert repeated == again
 
 
 def test_a_trial_that_was_hidden_is_shown_again(chromium: Any, site: tuple[Study, str]) -> None:
@@ -167,34 +131,6 @@ def test_a_trial_that_was_hidden_is_shown_again(chromium: Any, site: tuple[Study
         assert row.cue_ms >= 440
         assert [on for _, on in one["flashes"]] == [True, False]
         assert row.frames_shown > 0
-
-
-@pytest.mark.nightly
-def test_trials_wait_while_the_window_is_too_small(chromium: Any, site: tuple[Study, str]) -> None:
-    study, url = site
-    # As on a laptop with scaling or zoom: everything but the trials is possible.
-    with Visit(chromium, url, "window", viewport=SMALL, screen=SMALL) as visit:
-        visit.begin("?participant=Window")
-        visit.heading("Please make the window larger")
-        visit.picture("small")
-        visit.page.set_viewport_size(SIZE)
-        visit.wait_for_answer()
-        # In the middle of a session, before the next trial.
-        visit.page.set_viewport_size(SMALL)
-        visit.answer("yes")
-        visit.see_feedback()
-        visit.begin_test()
-        visit.heading("Please make the window larger")
-        visit.page.set_viewport_size(SIZE)
-        for _ in range(3):
-            visit.answer("yes")
-        visit.heading("About you")
-        visit.page.reload()  # sends the events
-        visit.heading("About you")
-        assert visit.unexpected() == []
-    _, answers, events = rows_of(study, "Window")
-    assert {(row.window_width, row.window_height) for row in answers[1:]} == {(1280, 800)}
-    assert "too_small" in {event.kind for event in events}
 
 
 def test_movies_that_fail_are_shown_again(chromium: Any, site: tuple[Study, str]) -> None:
