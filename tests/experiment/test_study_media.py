@@ -125,8 +125,7 @@ def test_other_files_are_refused(tmp_path: Path, old: bytes, new: bytes, message
 
 
 @pytest.mark.parametrize(
-    ("first", "second"),
-    [("s_1", "s-redyellow_1"), ("s_1", "s_1_img"), ("s_1_img.mp4", "s_1.hdf5")],
+    ("first", "second"), [("s_1", "s-redyellow_1"), ("s_1", "s_1_img"), ("s_1_img.mp4", "s_1.hdf5")]
 )
 def test_names_that_are_one_to_the_analysis_are_refused(
     tmp_path: Path, first: str, second: str

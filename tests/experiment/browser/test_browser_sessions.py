@@ -12,13 +12,7 @@ import pytest
 
 from physion.experiment.study.settings import Timing
 from physion.experiment.study.study import Study
-from support.experiment.browser import (
-    SHORT,
-    Visit,
-    answers_to_test,
-    rows_of,
-    served,
-)
+from support.experiment.browser import SHORT, Visit, answers_to_test, rows_of, served
 from support.experiment.webkit import WebKit, wait_for, webkit
 
 __all__ = ["webkit"]

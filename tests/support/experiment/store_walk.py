@@ -29,10 +29,7 @@ PAGES: dict[str, dict[str, Any]] = {
     "demographics": {"age": 31, "gender": "woman", "education": "master"},
     "feedback": {"difficulty": 2, "technical_problems": False, "text": "fine"},
 }
-OPTIONAL_PAGES: dict[str, dict[str, Any]] = {
-    "comprehension": RIGHT,
-    "questions": OWN_ANSWERS,
-}
+OPTIONAL_PAGES: dict[str, dict[str, Any]] = {"comprehension": RIGHT, "questions": OWN_ANSWERS}
 """Pages that a study has by its settings alone."""
 ORDER = tuple(stage for stage in stages.STAGES if stage not in stages.ENDED)
 STAGES = tuple(stage for stage in ORDER if stage not in OPTIONAL_PAGES)
