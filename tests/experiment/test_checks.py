@@ -122,7 +122,6 @@ def test_interrupted_checks_and_repeated_answers_do_not_count(checked_store: Sto
     assert (session.attention_failed, session.failed_checks) == (0, None)
 
 
-@pytest.mark.slow
 def test_checks_are_no_trials_of_the_analysis(checked_store: Store, tmp_path: Path) -> None:
     store, study = checked_store, checked_store.study
     for name, failed in (("Ada", 0), ("Bo", 3)):

@@ -200,34 +200,30 @@ def test_every_run_of_the_robustness_has_a_noise_of_its_own(
     assert noise.std() == pytest.approx(0.001, rel=4 / np.sqrt(2 * noise.size))
 
 
-def test_a_preset_that_hardly_varies_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_preset_that_hardly_varies_or_cannot_be_used_is_given_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    task = slots("testing", 1)[0]
+    with monkeypatch.context() as patch:
+        patch.setattr(choosing, "MAX_TRIES", 4)
+        said = r"none of 4 scenes sampled from default is accepted \("
+        with pytest.raises(PhysionError, match=said):
+            choose(GenerateJob(task, Path(), dataclasses.replace(QUICK, min_visible=0.99)))
+
+    def refuse(*_: object) -> object:
+        raise BadSceneError("ball could not be placed in 100 tries: it meets the wall (100)")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(choosing, "sample_scene", refuse)
+        said = r"none of 20 scenes .*it meets the wall \(100\): 20"
+        with pytest.raises(PhysionError, match=said):
+            choose(GenerateJob(task, Path(), QUICK))
     few_scenes(monkeypatch, 1)
     monkeypatch.setattr(choosing, "MAX_ELSEWHERE", 8)
     digest = sample_scene("collide", trial_seed("few", "collide", "x", 0)).physics_digest()
     other = next(split for split in SPLITS if split != split_of(digest))
     with pytest.raises(PhysionError, match="default hardly varies"):
         choose(GenerateJob(slots(other, 1)[0], Path(), QUICK))
-
-
-def test_a_preset_that_cannot_be_placed_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> object:
-        raise BadSceneError("ball could not be placed in 100 tries: it meets the wall (100)")
-
-    monkeypatch.setattr(choosing, "sample_scene", refuse)
-    with pytest.raises(PhysionError, match=r"none of 20 scenes .*it meets the wall \(100\): 20"):
-        choose(GenerateJob(slots("testing", 1)[0], Path(), QUICK))
-
-
-def test_no_draw_says_why() -> None:
-    job = GenerateJob(slots("testing", 1)[0], Path(), dataclasses.replace(QUICK, min_visible=0.99))
-    original, choosing.MAX_TRIES = choosing.MAX_TRIES, 4
-    try:
-        with pytest.raises(
-            PhysionError, match=r"none of 4 scenes sampled from default is accepted \("
-        ):
-            choose(job)
-    finally:
-        choosing.MAX_TRIES = original
 
 
 def test_a_dataset_of_only_states(tmp_path: Path) -> None:

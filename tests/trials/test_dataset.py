@@ -1,4 +1,4 @@
-"""Index and files of a dataset: read, checked, and described."""
+"""Index and files of a dataset: read, checked, and described; marks of unusable trials."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from physion.cli.main import main as cli
 from physion.clips.batch import Spec
 from physion.clips.clips import observed_source, whole_source
 from physion.compute.local import SerialExecutor
-from physion.core.errors import BadInputError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import digest_path
 from physion.report.html import movies_of
 from physion.report.viewer.build import ViewerOptions, build_viewer
-from physion.trials.dataset import Dataset
+from physion.trials.dataset import UNUSABLE, Dataset, mark_unusable, read_unusable
 from physion.trials.index import COLUMNS, index_bytes, read_index, write_index
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, plan_scenes
@@ -28,6 +28,7 @@ from physion.trials.official.export_folder import export_official
 from physion.trials.share.card import write_card
 from physion.trials.state import DRAWN
 from support.hand_made import make_by_hand, make_scene
+from support.viewer_dataset import make_dataset
 
 
 def make(folder: Path) -> None:
@@ -138,7 +139,6 @@ def test_text_of_invalid_bytes_is_one_line(finished: Path, tmp_path: Path) -> No
 
 RGB = Spec(image_size=16, future=1)
 STATE = Spec(inputs=("state",), image_size=16, future=1)
-
 READERS: dict[str, tuple[str, Callable[[Path, Path, bool], Any]]] = {
     "trial": ("trial_file", lambda data, out, verify: Dataset(data, verify=verify).trial("a")),
     "frames": ("movie", lambda data, out, verify: Dataset(data, verify=verify).frames("a")),
@@ -275,3 +275,48 @@ def test_the_verbs_can_skip_the_check(
     tables = ["export", str(folder), str(tmp_path / "s"), "--layout", "result-tables"]
     assert cli([*tables, "--no-verify"]) == 2
     assert "--no-verify does not apply to result-tables" in capsys.readouterr().err
+
+
+# --- marks of unusable trials ---------------------------------------------------------------------
+
+
+@pytest.fixture
+def marked(tmp_path: Path) -> Dataset:
+    return Dataset(make_dataset(tmp_path / "set"))
+
+
+def test_marks_are_added_changed_and_taken_back(marked: Dataset) -> None:
+    assert read_unusable(marked) == {}
+    mark_unusable(marked, {"drop_1": "clips,\n  twice", "drop_0": "dark"})
+    assert read_unusable(marked) == {"drop_0": "dark", "drop_1": "clips, twice"}
+    text = (marked.folder / UNUSABLE).read_text()
+    assert text == 'trial,reason\ndrop_0,dark\ndrop_1,"clips, twice"\n'
+    mark_unusable(marked, {"drop_0": " ", "drop_1": "flickers"})
+    assert read_unusable(marked) == {"drop_1": "flickers"}
+
+
+def test_a_file_of_a_spreadsheet_with_more_columns_is_read(marked: Dataset) -> None:
+    text = "\ufefftrial,by,reason\r\ndrop_0,Ada,dark\r\n"
+    (marked.folder / UNUSABLE).write_text(text, encoding="utf-8")
+    assert read_unusable(marked) == {"drop_0": "dark"}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("trial\ndrop_0\n", "lacks the column.s. reason"),
+        ("", "is not a CSV table"),
+        ("trial,reason\ndrop_0,\n", "row 1 of column 'reason' holds ''"),
+        ("trial,reason\ndrop_0,a\ndrop_9,b\n", "row 2: the dataset has no trial 'drop_9'"),
+    ],
+)
+def test_bad_files_are_refused(marked: Dataset, text: str, message: str) -> None:
+    (marked.folder / UNUSABLE).write_text(text)
+    with pytest.raises(BadInputError, match=message):
+        read_unusable(marked)
+
+
+def test_unknown_trials_are_refused_and_nothing_is_written(marked: Dataset) -> None:
+    with pytest.raises(UnknownNameError, match="closest: drop_0"):
+        mark_unusable(marked, {"drop_1": "dark", "dorp_0": "dark"})
+    assert not (marked.folder / UNUSABLE).exists()

@@ -128,25 +128,22 @@ def test_without_labels_training_trials_hold_no_outcome_and_no_roles(tmp_path: P
 
 def test_observed_frames_need_no_file_with_the_future(finished: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, tmp_path / "set")
+    dataset = Dataset(tmp_path / "set")
     for paths in find_trials(tmp_path / "set"):
+        if paths.trial == "d":
+            shutil.copy(paths.movie, paths.observed_movie)
         paths.movie.unlink()
         paths.trial_file.unlink()
-    dataset = Dataset(tmp_path / "set")
-    assert [len(dataset.observed_frames(name)) for name in dataset.trials()] == [45] * 4
+    assert [len(dataset.observed_frames(name)) for name in "abc"] == [45] * 3
     with pytest.raises(BadInputError, match="46 frames"):
         dataset.observed_frames("a", count=46)
     with pytest.raises(UnknownNameError, match="closest"):
         dataset.observed_frames("aa")
-
-
-def test_an_observed_movie_that_shows_more_is_refused(finished: Path, tmp_path: Path) -> None:
-    shutil.copytree(finished, tmp_path / "set")
-    paths = Dataset(tmp_path / "set").paths("a")
-    shutil.copy(paths.movie, paths.observed_movie)
+    # A movie that shows more is refused.
     with pytest.raises(BadInputError, match="was changed since it was made"):
-        Dataset(tmp_path / "set").observed_frames("a")
+        dataset.observed_frames("d")
     with pytest.raises(BadInputError, match="more than the 45 observed"):
-        Dataset(tmp_path / "set", verify=False).observed_frames("a")
+        Dataset(tmp_path / "set", verify=False).observed_frames("d")
 
 
 def test_second_run_does_nothing(finished: Path) -> None:
@@ -169,9 +166,11 @@ def test_any_missing_file_is_made_again(finished: Path, tmp_path: Path) -> None:
 
 
 def test_more_trials_later_change_none_of_the_first(finished: Path, tmp_path: Path) -> None:
-    assert run(tmp_path / "s", scenes_named("a", "b")).made == ["a", "b"]
-    assert run(tmp_path / "s", scenes_named("a", "b", "c", "d")).made == ["c", "d"]
-    assert tree_digest(tmp_path / "s") == tree_digest(finished)
+    folder = tmp_path / "s"
+    assert run(folder, scenes_named("a", "b")).made == ["a", "b"]
+    (folder / "testing" / "drop" / ".1234-abcd.part").write_bytes(b"half")  # of a killed writer
+    assert run(folder, scenes_named("a", "b", "c", "d")).made == ["c", "d"]
+    assert tree_digest(folder) == tree_digest(finished)
 
 
 @pytest.mark.slow
@@ -184,12 +183,17 @@ def test_workers_and_order_do_not_matter(finished: Path, tmp_path: Path) -> None
 
 
 def test_a_failing_trial_is_reported_and_the_others_continue(tmp_path: Path) -> None:
-    report = run(tmp_path / "s", scenes_named("a", "bad", "c"))
+    folder = tmp_path / "s"
+    (folder / "failures").mkdir(parents=True)
+    (folder / "failures" / "a.txt").write_text("old")
+    report = run(folder, scenes_named("a", "bad", "c"))
     assert report.exit_code == 1 and report.made == ["a", "c"]
     assert report.failed == {"bad": "bad cannot be made"}
-    note = (tmp_path / "s" / "failures" / "bad.txt").read_text()
+    # The note of a failure goes when its trial is made.
+    (path,) = (folder / "failures").iterdir()
+    note = path.read_text()
     assert "Traceback" in note and "make_by_hand" in note and '"name":"bad"' in note
-    assert Dataset(tmp_path / "s").trials() == ["a", "c"]
+    assert Dataset(folder).trials() == ["a", "c"]
 
 
 @pytest.mark.nightly
@@ -198,15 +202,6 @@ def test_a_poison_trial_is_put_aside(tmp_path: Path) -> None:
     report = run(tmp_path / "s", scenes_named("a", "die", "c"), executor=LocalExecutor(1))
     assert report.made == ["a", "c"] and "SIGKILL" in report.failed["die"]
     assert "tries: 3" in (tmp_path / "s" / "failures" / "die.txt").read_text()
-
-
-def test_note_of_a_failure_goes_when_the_trial_is_made(tmp_path: Path) -> None:
-    folder = tmp_path / "s"
-    run(folder, scenes_named("a"))
-    (folder / "failures").mkdir()
-    (folder / "failures" / "b.txt").write_text("old")
-    run(folder, scenes_named("a", "b"))
-    assert not list((folder / "failures").iterdir())
 
 
 class Fault:
@@ -405,27 +400,23 @@ def test_killed_runs_resume_to_the_same_tree(kills: int, trials: int, tmp_path: 
     assert tree_digest(tmp_path / "killed") == tree_digest(tmp_path / "whole")
 
 
-def test_leftovers_of_killed_writers_are_removed(finished: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "s"
-    run(folder, scenes_named("a", "b"))
-    (folder / "testing" / "drop" / ".1234-abcd.part").write_bytes(b"half")
-    run(folder, scenes_named("a", "b", "c", "d"))
-    assert tree_digest(folder) == tree_digest(finished)
-
-
-def test_two_runs_on_one_folder_are_refused(tmp_path: Path) -> None:
-    with folder_lock(tmp_path), pytest.raises(PhysionError, match="another process is writing"):
-        run(tmp_path, scenes_named("a"))
-    assert run(tmp_path, scenes_named("a")).made == ["a"]
-
-
-def test_other_settings_and_foreign_folders_are_refused(finished: Path, tmp_path: Path) -> None:
+def test_folders_of_others_are_refused(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(BadInputError, match=r"settings\.width 256, now 64"):
         run(finished, scenes_named("a"), settings=GenerateSettings(width=64))
     (tmp_path / "thesis.tex").write_text("precious")
     with pytest.raises(BadInputError, match=r"contains 'thesis\.tex'"):
         run(tmp_path, scenes_named("a"))
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+    folder = tmp_path / "s"
+    folder.mkdir()
+    with folder_lock(folder), pytest.raises(PhysionError, match="another process is writing"):
+        run(folder, scenes_named("a"))
+    assert run(folder, scenes_named("a")).made == ["a"]
+    monkeypatch.setattr("physion.trials.making.make.RENDERER", "physion-99")
+    with pytest.raises(BadInputError, match=r"made_by"):
+        run(folder, scenes_named("a", "b"))
 
 
 def test_folder_that_cannot_be_written_is_one_clear_error(tmp_path: Path) -> None:
@@ -437,7 +428,9 @@ def test_folder_that_cannot_be_written_is_one_clear_error(tmp_path: Path) -> Non
             run(folder, scenes_named("a"))
 
 
-def test_broken_trials_are_found_when_the_index_is_made(finished: Path, tmp_path: Path) -> None:
+def test_broken_and_renamed_trials_are_found_when_the_index_is_made(
+    finished: Path, tmp_path: Path
+) -> None:
     folder = tmp_path / "s"
     shutil.copytree(finished, folder)
     paths = Dataset(folder).paths("b")
@@ -447,6 +440,12 @@ def test_broken_trials_are_found_when_the_index_is_made(finished: Path, tmp_path
     assert list(report.failed) == ["b"] and "cut short" in report.failed["b"]
     assert report.exit_code == 1 and Dataset(folder).trials() == ["a", "c", "d"]
     assert report.kept == ["a"]
+    old, new = Dataset(folder).paths("c"), TrialPaths(folder, "testing", "drop", "other")
+    for name, path in old.all().items():
+        path.rename(new.all()[name])
+    table, problems = build_index(folder)
+    assert table["trial"].tolist() == ["a", "d"]
+    assert "is trial 'c' of testing/drop: it was moved or renamed" in problems["other"]
 
 
 @pytest.mark.nightly
@@ -469,17 +468,6 @@ def test_a_file_of_another_size_is_made_again(
         return
     assert report.made == ["b"] and report.kept == ["a", "c", "d"] and not report.failed
     assert tree_digest(folder) == tree_digest(finished)
-
-
-def test_renamed_trials_are_found(finished: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "s"
-    shutil.copytree(finished, folder)
-    old, new = Dataset(folder).paths("b"), TrialPaths(folder, "testing", "drop", "other")
-    for name, path in old.all().items():
-        path.rename(new.all()[name])
-    table, problems = build_index(folder)
-    assert table["trial"].tolist() == ["a", "c", "d"]
-    assert "is trial 'b' of testing/drop: it was moved or renamed" in problems["other"]
 
 
 def test_missing_and_broken_indexes_are_refused(finished: Path, tmp_path: Path) -> None:
@@ -559,15 +547,6 @@ def test_writers_of_one_path_do_not_meet(tmp_path: Path) -> None:
     assert [item.name for item in tmp_path.iterdir()] == ["f"]
     with pytest.raises(FileNotFoundError):
         write_atomic(tmp_path / "no" / "f", b"")
-
-
-def test_a_folder_of_another_version_is_not_resumed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run(tmp_path / "s", scenes_named("a"))
-    monkeypatch.setattr("physion.trials.making.make.RENDERER", "physion-99")
-    with pytest.raises(BadInputError, match=r"made_by"):
-        run(tmp_path / "s", scenes_named("a", "b"))
 
 
 # `physion.generate`: plans, makes and opens a dataset, and says when trials are missing.

@@ -107,17 +107,14 @@ def test_centres_of_mass_move_as_fast_as_the_engine_says(collision: Trial) -> No
     assert error(collision.trajectory.positions) > 0.2, "the ball rolls, and its pivot with it"
 
 
-def test_centres_of_mass_match_solids(collision: Trial) -> None:
+def test_centres_of_mass_match_solids_and_cloth(collision: Trial, hanging: Trial) -> None:
     first = state.centroids(collision)[0]
     np.testing.assert_allclose(first[0], [0.5, 0.0, 0.25], atol=1e-3)
     np.testing.assert_allclose(first[1], [-0.5, 0.0, 0.15], atol=1e-3)
     np.testing.assert_allclose(first[2], [0.0, 0.8, 0.2], atol=1e-3)  # a quarter of its height
-
-
-def test_a_cloth_is_where_its_vertices_are(hanging: Trial) -> None:
     centers = state.centroids(hanging)
-    vertices = hanging.trajectory.cloth_vertices
     assert centers.shape[1] == 3
+    vertices = hanging.trajectory.cloth_vertices
     np.testing.assert_allclose(centers[:, 2], vertices.mean(axis=1), atol=1e-5)
 
 
@@ -163,39 +160,25 @@ def test_world_vertices_rest_where_the_bodies_are(collision: Trial, hanging: Tri
         state.world_vertices(collision, 60)
 
 
-def test_the_object_table_says_what_everything_is(collision: Trial) -> None:
+def test_the_object_table_says_what_everything_is(collision: Trial, hanging: Trial) -> None:
     table = state.object_table(collision).set_index("name")
     ball = table.loc["ball"]
     assert (ball["shape"], ball["mass"], ball["role"]) == ("sphere", 0.5, "agent+probe")
-    assert (ball["static_friction"], ball["dynamic_friction"], ball["restitution"]) == (
-        0.4,
-        0.3,
-        0.2,
-    )
+    friction = ball[["static_friction", "dynamic_friction", "restitution"]]
+    assert tuple(friction) == (0.4, 0.3, 0.2)
     assert tuple(table.loc["box", ["scale_x", "scale_y", "scale_z"]]) == (0.3, 0.3, 0.5)
     assert table["role"].tolist() == ["patient", "agent+probe", "", ""]
     assert table["kinematic"].tolist() == [False, False, True, False]
     assert table["scenery"].tolist() == [False, False, False, True]
-
-
-def test_colours_match_the_look(collision: Trial) -> None:
-    def color(look: str | None) -> tuple[float, ...]:
-        row = state.object_table(collision, look).set_index("name").loc["ball"]
-        return tuple(row[["red", "green", "blue"]])
-
-    assert color(None) == color("redyellow") == (1.0, 0.0, 0.0)
-    assert color("free") == (0.1, 0.2, 0.3)
-
-
-def test_a_cloth_has_a_row_too(hanging: Trial) -> None:
-    row = state.object_table(hanging).iloc[-1]
-    assert (row["name"], row["kind"], row["shape"], row["scale_x"]) == (
-        "sheet",
-        "cloth",
-        "sheet",
-        2,
-    )
-    assert pd.isna(row["static_friction"])
+    # Colours match the look.
+    free = state.object_table(collision, "free").set_index("name").loc["ball"]
+    marked = state.object_table(collision, "redyellow").set_index("name").loc["ball"]
+    colors = [tuple(row[["red", "green", "blue"]]) for row in (ball, marked, free)]
+    assert colors == [(1.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.1, 0.2, 0.3)]
+    cloth = state.object_table(hanging).iloc[-1]
+    names = ("name", "kind", "shape", "scale_x")
+    assert tuple(cloth[name] for name in names) == ("sheet", "cloth", "sheet", 2)
+    assert pd.isna(cloth["static_friction"])
 
 
 def test_the_camera_agrees_with_the_renderer(collision: Trial) -> None:
@@ -216,14 +199,10 @@ def test_the_camera_agrees_with_the_renderer(collision: Trial) -> None:
         u, v, w = inside @ seen[:3]
         assert abs(columns.mean() + 0.5 - u / w) < 0.7
         assert abs(rows.mean() + 0.5 - v / w) < 0.7
-
-
-def test_the_camera_scales_with_the_picture(collision: Trial) -> None:
-    small, large = state.camera_intrinsics(collision), state.camera_intrinsics(collision, 192, 128)
-    np.testing.assert_allclose(large[:2], 2 * small[:2])
-    np.testing.assert_allclose(small[:2, 2], [48, 32])
-    pose = np.linalg.inv(state.camera_extrinsics(collision))
-    np.testing.assert_allclose(pose[:3, 3], collision.scene.camera.position)
+    np.testing.assert_allclose(state.camera_intrinsics(collision, 192, 128)[:2], 2 * inside[:2])
+    np.testing.assert_allclose(inside[:2, 2], [48, 32])
+    position = np.linalg.inv(outside)[:3, 3]
+    np.testing.assert_allclose(position, collision.scene.camera.position)
 
 
 def test_masks_show_agent_and_patient(collision: Trial) -> None:

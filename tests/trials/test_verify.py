@@ -14,7 +14,6 @@ from PIL import Image
 import physion.trials.making.verify as verify_module
 from physion.cli.main import main as cli
 from physion.compute.local import SerialExecutor
-from physion.core.errors import BadInputError
 from physion.trials.dataset import Dataset
 from physion.trials.files import TrialPaths, encode_png
 from physion.trials.index import build_index, read_index, write_index
@@ -32,15 +31,15 @@ from physion.trials.video import encode_movie, read_frames
 from support.hand_made import FRAMES, SIZE, make_by_hand, make_parts, make_scene, tree_digest
 
 
+def make_set(folder: Path, names: tuple[str, ...] = ("a", "b", "c")) -> Path:
+    tasks = plan_scenes("tests", [make_scene(name) for name in names])
+    assert not make_trials(folder, tasks, make=make_by_hand, executor=SerialExecutor()).failed
+    return folder
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    tasks = plan_scenes("tests", [make_scene("a"), make_scene("b")])
-    make_trials(tmp_path / "s", tasks, make=make_by_hand, executor=SerialExecutor())
-    return tmp_path / "s"
-
-
-def test_an_untouched_dataset_has_no_fault(folder: Path) -> None:
-    assert verify_dataset(folder, again=0).faults == []
+    return make_set(tmp_path / "s", ("a", "b"))
 
 
 @pytest.mark.slow
@@ -91,6 +90,7 @@ def test_missing_unlisted_and_relabelled_trials_are_found(folder: Path) -> None:
 
 
 def test_movies_of_a_wrong_length_are_found(folder: Path) -> None:
+    assert verify_dataset(folder, again=0).faults == []
     paths = Dataset(folder).paths("a")
     paths.observed_movie.write_bytes(encode_movie(read_frames(paths.movie, count=50)))
     assert any("has 50 frames, not 45" in fault for fault in verify_dataset(folder, again=0).faults)
@@ -114,11 +114,6 @@ def test_simulating_again_finds_another_motion(folder: Path, tmp_path: Path) -> 
     )
 
 
-def test_a_folder_without_index_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="has no index"):
-        verify_dataset(tmp_path)
-
-
 def test_a_label_that_the_contacts_contradict_is_found(folder: Path) -> None:
     """A whole trial file with a wrong label, and an index that repeats it."""
     paths = Dataset(folder).paths("b")
@@ -130,19 +125,16 @@ def test_a_label_that_the_contacts_contradict_is_found(folder: Path) -> None:
     assert any("labels/contact" in fault for fault in verify_dataset(folder, again=0).faults)
 
 
+SAMPLED = plan_dataset("verify", ["collide"], {"testing": 2}, {"collide": ["default"]})
+SAMPLED_SETTINGS = GenerateSettings(width=64, height=64, jitters=2, passes=("depth", "flow"))
+
+
 @pytest.fixture(scope="module")
 def sampled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two sampled trials with movies, robustness and stored passes."""
     folder = tmp_path_factory.mktemp("sampled") / "d"
-    settings = GenerateSettings(width=64, height=64, jitters=2, passes=("depth", "flow"))
-    tasks = plan_dataset("verify", ["collide"], {"testing": 2}, {"collide": ["default"]})
-    assert not make_trials(folder, tasks, settings, executor=SerialExecutor()).failed
+    assert not make_trials(folder, SAMPLED, SAMPLED_SETTINGS, executor=SerialExecutor()).failed
     return folder
-
-
-@pytest.mark.slow
-def test_a_sampled_dataset_comes_out_the_same_again(sampled: Path) -> None:
-    assert verify_dataset(sampled, again=-1).faults == []
 
 
 @pytest.mark.slow
@@ -165,6 +157,7 @@ def test_strangers_and_trials_of_other_splits_are_named(sampled: Path, tmp_path:
 
 @pytest.mark.slow
 def test_a_trial_made_again_is_indexed_again(sampled: Path, tmp_path: Path) -> None:
+    assert verify_dataset(sampled, again=-1).faults == []
     folder = tmp_path / "d"
     shutil.copytree(sampled, folder)
     index = read_index(folder)
@@ -172,9 +165,7 @@ def test_a_trial_made_again_is_indexed_again(sampled: Path, tmp_path: Path) -> N
     write_index(folder, index)
     paths = Dataset(folder).paths(str(index["trial"][0]))
     paths.trial_file.unlink()
-    tasks = plan_dataset("verify", ["collide"], {"testing": 2}, {"collide": ["default"]})
-    settings = GenerateSettings(width=64, height=64, jitters=2, passes=("depth", "flow"))
-    report = make_trials(folder, tasks, settings, executor=SerialExecutor())
+    report = make_trials(folder, SAMPLED, SAMPLED_SETTINGS, executor=SerialExecutor())
     assert len(report.made) == 1 and verify_dataset(folder, again=0).faults == []
 
 
@@ -264,15 +255,6 @@ def test_trials_of_an_unknown_preset_are_reported_as_not_drawn_again(
     assert printed.count("not drawn again") == 2 and "0 faults, 2 notes" in printed
     assert cli(["verify", str(sampled), "--again", "1", "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)["notes"]) == 1
-
-
-# Two datasets are compared trial by trial.
-
-
-def make_set(folder: Path, names: tuple[str, ...] = ("a", "b", "c")) -> Path:
-    tasks = plan_scenes("tests", [make_scene(name) for name in names])
-    assert not make_trials(folder, tasks, make=make_by_hand, executor=SerialExecutor()).failed
-    return folder
 
 
 @pytest.mark.slow
