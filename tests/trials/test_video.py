@@ -52,6 +52,7 @@ def test_round_trip_keeps_every_frame_and_its_place(movie: Path) -> None:
             np.abs(read[index, 24:32, left + 4 : left + 12].astype(int) - NAMED["red"]).max() < 12
         )
     assert np.abs(read.astype(int) - source).mean() < 2
+    np.testing.assert_array_equal(read_frames(movie, stride=10), read[::10])
 
 
 @pytest.mark.parametrize("name", sorted(NAMED))
