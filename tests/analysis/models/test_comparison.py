@@ -1,4 +1,4 @@
-"""Predictions and people together: which trials count, both ways of scoring, invariances."""
+"""Predictions and people together: which trials count, scores, invariances, contradictions."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import pandas as pd
 import pytest
 from scipy import special, stats
 
-from physion.analysis import Bootstrap, compare_scores, read_predictions
+from physion.analysis import Bootstrap, Comparison, compare_scores, read_predictions
 from physion.analysis.compare import all_results
-from physion.analysis.comparison import NO_LABEL, NOT_PREDICTED, NOT_SEEN
+from physion.analysis.comparison import NO_LABEL, NOT_PREDICTED, NOT_SEEN, check_coverage
 from physion.analysis.metrics import metric_of_arrays, metrics
 from physion.analysis.people.responses import EXCLUDED, LEDGE
 from physion.analysis.sample import sample_of_rows
@@ -25,7 +25,7 @@ from physion.analysis.tables import (
     read_humans,
     read_labels,
 )
-from physion.core.errors import BadInputError
+from physion.core.errors import BadInputError, UnknownNameError
 from physion.report.compare import compare
 
 QUICK = Bootstrap(resamples=200)
@@ -73,6 +73,10 @@ def predictions(
     )
 
 
+def compared(given: pd.DataFrame, people: pd.DataFrame, **settings: object) -> Comparison:
+    return compare_scores(given, people, labels(people), bootstrap=QUICK, **settings)  # type: ignore[arg-type]
+
+
 def score(table: pd.DataFrame, model: str, scenario: str) -> pd.Series:
     rows = table[(table["model"] == model) & (table["scenario"] == scenario)]
     assert len(rows) == 1
@@ -85,7 +89,7 @@ def score(table: pd.DataFrame, model: str, scenario: str) -> pd.Series:
 def test_scores_match_the_joined_rows() -> None:
     people = humans()
     given = predictions(people)
-    found = compare_scores(given, people, labels(people), bootstrap=QUICK)
+    found = compared(given, people)
     truth = np.array(list(labels(people).values()))
     p_yes = np.where(truth, people["accuracy"], 1 - people["accuracy"])
     collide = (people["scenario"] == "collide").to_numpy()
@@ -120,7 +124,7 @@ def test_intervals_of_accuracy_match_the_formula_in_each_scenario_and_the_mean()
     people = pd.concat(
         [humans(20).query("scenario == 'collide'"), humans(9).query("scenario == 'drop'")]
     )
-    found = compare_scores(predictions(people), people, labels(people), bootstrap=QUICK).scores
+    found = compared(predictions(people), people).scores
     rows = {name: score(found, "m · observed", name) for name in ("collide", "drop", MEAN)}
     a = np.array([rows[name]["accuracy"] for name in SCENARIOS])
     df = np.array([19.0, 8.0])
@@ -138,24 +142,14 @@ def test_intervals_of_accuracy_match_the_formula_in_each_scenario_and_the_mean()
         assert rows[name][["accuracy_low", "accuracy_high"]].tolist() == pytest.approx(ends), name
 
 
-def test_the_mean_counts_scenarios_and_the_pool_counts_stimuli() -> None:
-    people = pd.concat(
-        [humans(30).query("scenario == 'collide'"), humans(6).query("scenario == 'drop'")]
-    )
-    given = predictions(people)
-    right = people["scenario"].eq("collide").to_numpy() == given["Actual Outcome"].to_numpy()
-    given["Predicted Outcome"] = right  # accuracy 1 on collide, 0 on drop
-    found = compare_scores(given, people, labels(people), bootstrap=QUICK).scores
-    assert score(found, "m · observed", MEAN)["accuracy"] == pytest.approx(0.5)
-    assert score(found, "m · observed", POOLED)["accuracy"] == pytest.approx(30 / 36)
-
-
 def test_trials_of_another_outcome_are_listed_and_scored_both_ways() -> None:
     people = humans()
     odd = tuple(people["stimulus"].iloc[:3])
     given = predictions(people, changed=odd)
     given["Predicted Outcome"] = given["Actual Outcome"]
-    found = compare_scores(given, people, labels(people), bootstrap=QUICK)
+    found = compared(given, people)
+    # The official outcome and not the simulated one turns accuracy into yes.
+    assert compared(predictions(people), people).stimuli["p_yes"].equals(found.stimuli["p_yes"])
     assert list(found.changed["stimulus"]) == list(odd)
     assert (found.changed["label"] != found.changed["simulated"]).all()
     row = score(found.scores, "m · observed", "collide")
@@ -168,34 +162,13 @@ def test_trials_of_another_outcome_are_listed_and_scored_both_ways() -> None:
     assert row["r_same"] != pytest.approx(row["r"])
 
 
-def test_the_official_label_and_not_the_simulation_turns_accuracy_into_yes() -> None:
-    people = humans()
-    plain = compare_scores(predictions(people), people, labels(people), bootstrap=QUICK)
-    odd = tuple(people["stimulus"].iloc[:3])
-    other = compare_scores(
-        predictions(people, changed=odd), people, labels(people), bootstrap=QUICK
-    )
-    assert plain.stimuli["p_yes"].equals(other.stimuli["p_yes"])
-
-
-def test_people_as_their_own_model_agree_perfectly() -> None:
-    people = humans()
-    truth = np.array(list(labels(people).values()))
-    given = predictions(people)
-    given["Predicted Prob_true"] = np.where(truth, people["accuracy"], 1 - people["accuracy"])
-    row = score(compare_scores(given, people, labels(people)).scores, "m · observed", POOLED)
-    assert row["r"] == pytest.approx(1) and row["rmsd"] == pytest.approx(0, abs=1e-12)
-    assert row["r_low"] == pytest.approx(1) and row["r_high"] == pytest.approx(1)
-    assert row["r"] > row["ceiling"]  # it has the noise of these very people
-
-
 # --- invariances -------------------------------------------------------------------------------
 
 
 def test_the_order_of_rows_changes_nothing_but_their_order() -> None:
     people = humans()
     given = pd.concat([predictions(people), predictions(people, "other", "B", seed=2)])
-    plain = compare_scores(given, people, labels(people), bootstrap=QUICK)
+    plain = compared(given, people)
     mixed = compare_scores(
         given.sample(frac=1, random_state=3),
         people.sample(frac=1, random_state=4),
@@ -211,25 +184,18 @@ def test_the_order_of_rows_changes_nothing_but_their_order() -> None:
 def test_a_model_scores_the_same_with_and_without_others() -> None:
     people = humans()
     both = pd.concat([predictions(people), predictions(people.iloc[::2], "half", seed=2)])
-    together = compare_scores(both, people, labels(people), bootstrap=QUICK).scores
-    alone = compare_scores(predictions(people), people, labels(people), bootstrap=QUICK).scores
+    together = compared(both, people).scores
+    alone = compared(predictions(people), people).scores
     pd.testing.assert_frame_equal(together[together["base_model"] == "m"], alone)
 
 
 def test_either_look_of_a_stimulus_joins() -> None:
     people = humans()
     given = predictions(people)
-    plain = compare_scores(given, people, labels(people), bootstrap=QUICK).scores
-    red = given.assign(
-        **{
-            "Stimulus Name": given["Stimulus Name"].str[:-5]
-            + "-redyellow"
-            + given["Stimulus Name"].str[-5:]
-        }
-    )
-    pd.testing.assert_frame_equal(
-        compare_scores(red, people, labels(people), bootstrap=QUICK).scores, plain
-    )
+    plain = compared(given, people).scores
+    names = given["Stimulus Name"].str[:-5] + "-redyellow" + given["Stimulus Name"].str[-5:]
+    red = given.assign(**{"Stimulus Name": names})
+    pd.testing.assert_frame_equal(compared(red, people).scores, plain)
 
 
 # --- undefined ---------------------------------------------------------------------------------
@@ -239,20 +205,17 @@ def test_constant_predictions_give_nan_with_a_reason() -> None:
     people = humans()
     given = predictions(people)
     given["Predicted Prob_true"] = 0.5
-    scores = compare_scores(given, people, labels(people), bootstrap=QUICK).scores
+    scores = compared(given, people).scores
     row = score(scores, "m · observed", "collide")
     assert np.isnan(row[["r", "r_low", "r_high"]].astype(float)).all()
     assert "P(contact) is constant" in row["reason"]
     assert np.isfinite(row[["accuracy", "accuracy_low", "rmsd", "rmsd_high"]].astype(float)).all()
     mean = score(scores, "m · observed", MEAN)
     assert np.isnan(mean["r"]) and mean["reason"].startswith("r: undefined in collide, drop")
-
-
-def test_constant_in_one_scenario_leaves_no_silent_mean_of_the_rest() -> None:
-    people = humans()
+    # Constant in one scenario only: no silent mean of the rest.
     given = predictions(people)
     given.loc[people["scenario"] == "drop", "Predicted Prob_true"] = 0.5
-    scores = compare_scores(given, people, labels(people), bootstrap=QUICK).scores
+    scores = compared(given, people).scores
     assert np.isnan(score(scores, "m · observed", MEAN)["r"])
     assert np.isfinite(score(scores, "m · observed", POOLED)["r"])
 
@@ -270,13 +233,7 @@ def test_one_stimulus_has_no_interval() -> None:
 
 
 def counts(dropped: pd.DataFrame) -> dict[tuple[str, str], int]:
-    return {
-        (a, r): int(n)
-        for a, r, n in dropped.groupby(["model", "reason"])["stimuli"]
-        .sum()
-        .reset_index()
-        .to_numpy()
-    }
+    return dropped.groupby(["model", "reason"])["stimuli"].sum().to_dict()
 
 
 def test_everything_left_out_is_counted() -> None:
@@ -311,17 +268,12 @@ def test_everything_left_out_is_counted() -> None:
 
 def test_ledges_can_be_kept() -> None:
     people = humans()
-    ledge = (
-        people["stimulus"]
-        .iloc[0]
-        .replace("pilot_it2_collision_simple_box", "pilot_it2_rollingSliding_simple_ledge_box")
-    )
-    people.loc[0, ["stimulus", "scenario"]] = [ledge, "roll"]
-    kept = compare_scores(
-        predictions(people), people, labels(people), exclude_ledge=False, bootstrap=QUICK
-    )
+    people.loc[0, ["stimulus", "scenario"]] = [
+        "pilot_it2_rollingSliding_simple_ledge_box_0000", "roll",
+    ]  # fmt: skip
+    kept = compared(predictions(people), people, exclude_ledge=False)
     assert "roll" in set(kept.scores["scenario"]) and kept.dropped.empty
-    left = compare_scores(predictions(people), people, labels(people), bootstrap=QUICK)
+    left = compared(predictions(people), people)
     assert "roll" not in set(left.scores["scenario"])
 
 
@@ -339,9 +291,7 @@ def test_recorded_outcomes_stand_in_for_labels() -> None:
     odd = tuple(people["stimulus"].iloc[:2])
     given = predictions(people, changed=odd)
     given["Recorded Outcome"] = [str(value) for value in labels(people).values()]
-    with_labels = compare_scores(
-        predictions(people, changed=odd), people, labels(people), bootstrap=QUICK
-    )
+    with_labels = compared(predictions(people, changed=odd), people)
     found = compare_scores(given, people, bootstrap=QUICK)
     pd.testing.assert_frame_equal(found.scores, with_labels.scores)
     assert list(found.changed["stimulus"]) == list(odd)
@@ -353,7 +303,7 @@ def test_the_zone_is_only_for_whole_scenarios() -> None:
     people = humans()
     zone = pd.DataFrame({"scenario": ["collide", "drop"], "low": 0.6, "high": 0.8})
     given = predictions(people.iloc[:-1])
-    table = compare_scores(given, people, labels(people), zone=zone, bootstrap=QUICK).people
+    table = compared(given, people, zone=zone).people
     table = table.set_index("scenario")
     assert table.loc["collide", "zone_low"] == 0.6
     assert np.isnan(table.loc["drop", "zone_low"]) and np.isnan(table.loc[MEAN, "zone_low"])
@@ -411,6 +361,116 @@ def test_nothing_in_common_is_an_error() -> None:
         compare_scores(predictions(people), people)
 
 
+# --- contradictions ---------------------------------------------------------------------------
+
+STEM = SCENARIOS["drop"]
+COUNT = 30
+LABELS = {f"{STEM}_{k:04d}": k % 2 == 0 for k in range(COUNT)}
+
+
+def drop_only() -> pd.DataFrame:
+    """Return people on the stimuli of `LABELS`."""
+    return humans(COUNT).query("scenario == 'drop'").reset_index(drop=True)
+
+
+def mostly_right(right: int = 24, model: str = "m") -> pd.DataFrame:
+    """Return predictions of which the first ``right`` are right."""
+    truth = np.array(list(LABELS.values()))
+    predicted = truth ^ (np.arange(COUNT) >= right)
+    return pd.DataFrame(
+        {"Model": model, "Readout Type": "B", "Predicted Outcome": predicted,
+         "Predicted Prob_true": np.where(predicted, 0.8, 0.3), "Actual Outcome": truth,
+         "Stimulus Name": list(LABELS)}
+    )  # fmt: skip
+
+
+def warnings_of(table: pd.DataFrame, labels: dict[str, bool] = LABELS) -> tuple[str, ...]:
+    return compare_scores(table, drop_only(), labels, bootstrap=QUICK).warnings
+
+
+def test_consistent_tables_give_no_warning() -> None:
+    assert warnings_of(mostly_right()) == ()
+    half = mostly_right()
+    half.loc[3, ["Predicted Prob_true", "Predicted Outcome"]] = [0.5, True]
+    assert warnings_of(half) == ()
+
+
+def test_an_outcome_against_its_probability_is_reported() -> None:
+    table = mostly_right()
+    table.loc[[4, 9], "Predicted Prob_true"] = 1 - table.loc[[4, 9], "Predicted Prob_true"]
+    (warning,) = warnings_of(table)
+    assert "m · observed+simulated" in warning and f"{STEM}_0004" in warning
+    assert "contradicts p_contact in 2 of 30 rows" in warning
+    # Another threshold contradicts as well, but is no mistake.
+    p = np.where(mostly_right()["Predicted Outcome"], 0.95, 0.7)
+    (warning,) = warnings_of(mostly_right().assign(**{"Predicted Prob_true": p}))
+    assert "in 15 of 30 rows" in warning
+    with pytest.raises(BadInputError, match=r"in 30 of 30 rows.*probability of a contact"):
+        warnings_of(
+            mostly_right().assign(**{"Predicted Outcome": ~mostly_right()["Predicted Outcome"]})
+        )
+
+
+def test_opposite_labels_are_refused() -> None:
+    opposite = {name: not value for name, value in LABELS.items()}
+    with pytest.raises(BadInputError, match=r"drop: .* in 30 of 30 stimuli: .*opposite"):
+        warnings_of(mostly_right(), opposite)
+    # More than half differ, but chance could do that: a warning.
+    some = {name: value ^ (k < 17) for k, (name, value) in enumerate(LABELS.items())}
+    (warning,) = warnings_of(mostly_right(), some)
+    assert "in 17 of 30 stimuli" in warning
+    few = {name: value ^ (k < 15) for k, (name, value) in enumerate(LABELS.items())}
+    assert warnings_of(mostly_right(), few) == ()
+
+
+def test_answers_far_below_guessing_are_reported() -> None:
+    (warning,) = warnings_of(mostly_right(2))
+    assert "right in 7% of 30 stimuli" in warning
+    # Always no is wrong for half of the stimuli, which is what guessing gives.
+    never = mostly_right().assign(**{"Predicted Outcome": False, "Predicted Prob_true": 0.1})
+    assert warnings_of(never) == ()
+
+
+def test_a_comparison_on_few_stimuli_is_reported() -> None:
+    (warning,) = warnings_of(mostly_right().head(9))
+    assert "on only 9 stimuli" in warning
+    assert warnings_of(mostly_right().head(10)) == ()
+
+
+def test_missing_labels_of_predicted_stimuli_are_reported() -> None:
+    known = dict(list(LABELS.items())[:25])
+    (warning,) = warnings_of(mostly_right(), known)
+    assert "drop: 5 of 30 stimuli" in warning and f"{STEM}_0025" in warning
+
+
+def test_people_that_lack_stimuli_with_a_label_are_reported() -> None:
+    assert check_coverage(drop_only(), LABELS) == []
+    more = {**LABELS, f"{STEM}_0099": True, "pilot_towers_nb2_x_0001": True}
+    (warning,) = check_coverage(drop_only(), more)
+    assert "drop: 1 of 31 stimuli" in warning and f"{STEM}_0099" in warning
+    ledge = {**LABELS, "pilot_it2_rollingSliding_simple_ledge_box_0001": True}
+    assert check_coverage(drop_only(), ledge) == []
+
+
+def test_a_stimulus_in_two_scenarios_is_refused() -> None:
+    table = pd.concat([mostly_right(), mostly_right(model="n")]).assign(
+        **{"Stimulus Name": [f"own {k % COUNT}" for k in range(2 * COUNT)],
+           "Readout Test Data": ["drop"] * COUNT + ["roll"] * COUNT}
+    )  # fmt: skip
+    with pytest.raises(BadInputError, match="'own 0' is predicted in two scenarios, drop and roll"):
+        name_models(check_predictions(table))
+
+
+def test_a_misspelt_stimulus_to_exclude_is_refused() -> None:
+    rows = name_models(check_predictions(mostly_right()))
+    some = [f"{STEM}_0003", "pilot_towers_nb2_fr015_SJ010_mono0_dis0_occ0_tdwroom_0001"]
+    results = all_results(rows, drop_only(), LABELS, exclude=some, bootstrap=QUICK)
+    assert results.comparison.stimuli["stimulus"].nunique() == COUNT - 1
+    for wrong in (f"{STEM}_003", "pilot_it2_drop_simpel_box_0003"):
+        with pytest.raises(UnknownNameError, match=f"'{wrong}'; closest: {STEM}"):
+            all_results(rows, drop_only(), LABELS, exclude=[wrong], bootstrap=QUICK)
+
+
 # --- predictions -------------------------------------------------------------------------------
 
 
@@ -435,9 +495,7 @@ def test_training_on_each_scenario_in_turn_is_one_model(spelling: str) -> None:
     same = predictions(people, **{"Dynamics Training Dataset": own})
     others = predictions(people, seed=2, **{"Dynamics Training Dataset": "no_" + own})
     everything = predictions(people, seed=3, **{"Dynamics Training Dataset": "all"})
-    found = compare_scores(
-        pd.concat([same, others, everything]), people, labels(people), bootstrap=QUICK
-    )
+    found = compared(pd.concat([same, others, everything]), people)
     assert [name.rsplit(" · ")[-1] for name in found.names] == ["only", "all-but", "all"]
 
 
@@ -445,7 +503,7 @@ def test_a_stray_stimulus_does_not_split_a_model() -> None:
     people = humans()
     given = predictions(people)
     stray = given.iloc[:1].assign(**{"Stimulus Name": "of_no_known_scenario_0001"})
-    found = compare_scores(pd.concat([given, stray]), people, labels(people), bootstrap=QUICK)
+    found = compared(pd.concat([given, stray]), people)
     assert found.names == ["m · observed"]
     assert counts(found.dropped) == {("m · observed", NOT_SEEN): 1}
 
@@ -500,13 +558,13 @@ def test_the_official_outcome_decides_where_simulated_ones_differ() -> None:
     people = humans()
     name = people["stimulus"].iloc[0]
     plain, other = predictions(people), predictions(people, "other", changed=(name,))
-    found = compare_scores(pd.concat([plain, other]), people, labels(people), bootstrap=QUICK)
+    found = compared(pd.concat([plain, other]), people)
     assert list(found.changed["stimulus"]) == [name]
     assert list(found.changed["models"]) == ["other · observed"]
     stimuli = found.stimuli[found.stimuli["stimulus"] == name].set_index("base_model")
     assert set(stimuli["label"]) == {labels(people)[name]}
     assert stimuli.loc["m", "simulated"] != stimuli.loc["other", "simulated"]
-    alone = compare_scores(plain, people, labels(people), bootstrap=QUICK).scores
+    alone = compared(plain, people).scores
     own = found.scores[found.scores["base_model"] == "m"]
     pd.testing.assert_frame_equal(own, alone)
 
@@ -515,7 +573,7 @@ def test_stimulus_and_probability_are_enough() -> None:
     people = humans()
     given = predictions(people)
     short = given[["Stimulus Name", "Predicted Prob_true"]].set_axis(["stimulus", "p"], axis=1)
-    found = compare_scores(short, people, labels(people), bootstrap=QUICK)
+    found = compared(short, people)
     assert found.names == ["model"] and len(found.stimuli) == len(people)
     whole = compare_scores(given.assign(**{"Predicted Outcome": given["Predicted Prob_true"] > 0.5,
         "Actual Outcome": given["Stimulus Name"].map(labels(people))}), people, labels(people),
@@ -530,8 +588,8 @@ def test_predictions_survive_their_files(tmp_path: Path) -> None:
     tables = [predictions(people), predictions(people, "other", "B", seed=2)]
     for path, table in zip(paths, tables, strict=True):
         table.to_csv(path, index=False)
-    direct = compare_scores(pd.concat(tables), people, labels(people), bootstrap=QUICK).scores
-    read = compare_scores(read_predictions(paths), people, labels(people), bootstrap=QUICK).scores
+    direct = compared(pd.concat(tables), people).scores
+    read = compared(read_predictions(paths), people).scores
     pd.testing.assert_frame_equal(direct, read)
     tables[0][["Stimulus Name", "Predicted Prob_true"]].to_csv(paths[0], index=False, sep=";")
     with pytest.raises(BadInputError, match=r"a\.csv separates its columns with semicolons"):
@@ -564,24 +622,12 @@ def test_official_people_as_a_model_reach_the_official_accuracies(official: Path
     assert mean["accuracy"] > mean["human_accuracy"] + 0.05
 
 
-def test_compare_computes_all_that_a_report_draws() -> None:
-    people = humans()
-    both = pd.concat([predictions(people), predictions(people, model="other", seed=5)])
-    found = all_results(both, people, labels(people), bootstrap=QUICK)
-    direct = compare_scores(both, people, labels(people), bootstrap=QUICK)
-    pd.testing.assert_frame_equal(found.comparison.scores, direct.scores)
-    assert found.paired is not None and len(found.paired) == 1
-    assert found.people is None and found.predictions is not None
-    alone = all_results(predictions(people), None, bootstrap=QUICK)
-    assert alone.paired is None and alone.comparison.people.empty
-
-
 # --- metrics of three arrays ---------------------------------------------------------------------
 
 
 def test_a_metric_of_arrays_equals_one_of_a_sample() -> None:
     people = humans()
-    stimuli = compare_scores(predictions(people), people, labels(people), bootstrap=QUICK).stimuli
+    stimuli = compared(predictions(people), people).stimuli
     rows = stimuli[stimuli["scenario"] == "drop"].reset_index(drop=True)
     rows["predicted"] = rows["predicted"].astype(float)
     rows.loc[2, ["p_contact", "predicted"]] = np.nan

@@ -204,20 +204,6 @@ def test_a_perfect_model_lies_in_its_interval_as_often_as_it_should(drawn: Resam
         assert ((low < values) & (values < high)).all(), name
 
 
-def test_a_model_that_knows_people_is_best_and_noise_adds_up(answers: ScenarioAnswers) -> None:
-    p = np.vstack([answers.p_yes(), np.random.default_rng(1).random(25)])
-    models = Models(("people", "chance"), p, (p > 0.5).astype(float))
-    table = measures(models, answers)
-    table = table.set_index(["model", "measure"])
-    assert table.loc[("people", "r"), "value"] == pytest.approx(1)
-    assert table.loc[("people", "rmsd"), "value"] == pytest.approx(0, abs=1e-9)
-    assert table.loc[("people", "kappa"), "value"] > table.loc[("chance", "kappa"), "value"]
-    row = table.loc[("chance", "kappa")]
-    width = {what: row[f"high_{what}"] - row[f"low_{what}"]
-             for what in ("people", "stimuli", "both")}  # fmt: skip
-    assert width["both"] >= 0.95 * max(width["people"], width["stimuli"])
-
-
 def test_a_person_as_a_model_stands_in_the_zone_of_people(answers: ScenarioAnswers) -> None:
     zones = human_zones(answers, split_halves(answers.yes, 50)).set_index(["measure", "of"])
     others = np.arange(12) != 4

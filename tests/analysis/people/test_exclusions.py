@@ -26,7 +26,6 @@ from physion.analysis.people.exclusions import (
     count_flags,
     drop_unexpected,
     find_expected,
-    flag_from_server,
     flag_sessions,
     large_exclusions,
     longest_alternation,
@@ -420,23 +419,17 @@ TRIALS = pd.DataFrame({
 NOTHING = pd.DataFrame(columns=["step", "scenario", "reason", "sessions", "rows"])
 
 
-def test_sessions_are_flagged_by_what_the_server_found() -> None:
-    responses = Responses(TRIALS, SESSIONS, NOTHING)
-    measures = SESSIONS[["session"]].iloc[::-1].reset_index(drop=True)
-    assert list(flag_from_server(responses, measures, "implausible")) == [False, True, False]
-    assert list(flag_from_server(responses, measures, "replayed")) == [True, False, False]
-    old = Responses(TRIALS, SESSIONS[["session"]], NOTHING)
-    assert not flag_from_server(old, measures, "implausible").any()
-
-
 def test_only_preregistered_rules_leave_out_nothing_that_the_server_found() -> None:
     trials, sessions = simulate_study(people=5, stimuli=8, scenarios=("drop",))
-    sessions["implausible"] = ["short", "", "", "", ""]
+    sessions["implausible"] = ["no media, short", "", "", "", ""]
+    sessions["replayed"] = pd.array([0, None, 2, 0, 0], dtype="Int64")
     sessions["failed_checks"] = ["", "attention", "", "", ""]
     responses = as_responses(trials, sessions)
     both = {rules.name: flag_sessions(responses, rules) for rules in RULE_SETS.values()}
     strict, only = both["preregistered"], both["preregistered-only"]
-    assert strict["implausible"].sum() == strict["failed_checks"].sum() == 1
+    for place, rule in enumerate(("implausible", "failed_checks", "replayed")):
+        assert list(strict.index[strict[rule]]) == [place]
+    assert not flag_sessions(as_responses(trials), PREREGISTERED)["implausible"].any()
     assert not only[["implausible", "replayed", "failed_checks"]].to_numpy().any()
     others = [rule for rule in RULES if rule not in ("implausible", "replayed", "failed_checks")]
     pd.testing.assert_frame_equal(strict[others], only[others])

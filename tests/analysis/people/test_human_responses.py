@@ -54,19 +54,7 @@ def test_official_stimuli_are_all_there_and_labelled(people: pd.DataFrame) -> No
     assert set(counts.index) == set(SCENARIOS)
     assert people["label"].notna().all()
     assert not people["stimulus"].map(is_ledge).any()
-
-
-def test_official_stimulus_names_betray_the_scenario_of_their_file(people: pd.DataFrame) -> None:
     assert (people["stimulus"].map(scenario_of) == people["scenario"]).all()
-
-
-@pytest.mark.parametrize("scenario", SCENARIOS)
-def test_mean_accuracy_is_near_the_summary(
-    people: pd.DataFrame, summary: pd.DataFrame, scenario: str
-) -> None:
-    # The summary leaves out 1 to 8 participants more, hence not equal; collide: .807 and .810.
-    mean = people[people["scenario"] == scenario]["accuracy"].mean()
-    assert mean == pytest.approx(summary.loc[scenario, "obs_mean"], abs=0.005)
 
 
 FEWER = {"dominoes": 8, "support": 1, "collide": 2, "contain": 2}
@@ -197,17 +185,15 @@ def test_bad_files_are_refused_in_one_line(tmp_path: Path, text: str, message: s
         read_humans(folder_with(tmp_path, collide=text))
 
 
-def test_bad_folders_are_refused(tmp_path: Path) -> None:
+def test_bad_folders_and_names_of_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="not a folder"):
         read_humans(tmp_path / "none")
     with pytest.raises(BadInputError, match="holds no human_accuracy"):
         read_humans(tmp_path)
     (tmp_path / COLLIDE).write_bytes(bytes(range(256)))
-    with pytest.raises(BadInputError):
+    with pytest.raises(BadInputError, match="collision"):
         read_humans(tmp_path)
-
-
-def test_an_unknown_scenario_in_a_file_name_is_refused(tmp_path: Path) -> None:
+    (tmp_path / COLLIDE).unlink()
     (tmp_path / "human_accuracy-juggling_pilot-x.csv").write_text(HEADER + "a,.9,10\n")
     with pytest.raises(PhysionError, match="juggling"):
         read_humans(tmp_path)

@@ -115,15 +115,6 @@ def test_accuracies_match_plain_grouping(made: Responses) -> None:
         assert ends == pytest.approx(np.percentile(values, [2.5, 97.5]))
 
 
-def test_the_interval_of_people_has_the_width_of_the_standard_error() -> None:
-    test = study(people=100, stimuli=60, scenarios=("drop",), seed=2).test
-    row = accuracy_by_scenario(test).iloc[0]
-    error = row["sd"] / np.sqrt(100)
-    assert (row["accuracy_high"] - row["accuracy_low"]) / (2 * 1.96 * error) == pytest.approx(
-        1, abs=0.1
-    )
-
-
 def test_people_who_are_too_few_or_too_alike_get_reasons(made: Responses) -> None:
     one = made.test[made.test["session"] == "roll-s001"]
     row = accuracy_by_scenario(one, FEW).iloc[0]
@@ -250,23 +241,6 @@ def test_below_chance_is_scipys_binomial_test_and_guards_against_many_looks() ->
 
 
 # --- biases, practice, background ---------------------------------------------------------------
-
-
-def test_a_liking_for_yes_and_for_the_left_are_distinguished(made: Responses) -> None:
-    balanced = yes_bias(made.test, FEW).set_index("scenario")
-    assert balanced["bias_low"].lt(0.1).all() and (balanced["d_prime"] > 0.3).all()
-    generator = np.random.default_rng(0)
-    always = made.test.assign(yes=made.test["yes"] | (generator.random(len(made.test)) < 0.4))
-    liked = yes_bias(always, FEW).set_index("scenario")
-    assert (liked["bias_low"] > 0.1).all() and (liked["criterion_high"] < 0).all()
-    sides = side_bias(always, FEW).set_index("scenario")
-    assert sides["left"].between(0.4, 0.6).all() and (sides["yes_left"] == 12).all()
-    to_left = made.test["buttons"].eq("yes-no")
-    pushed = generator.random(len(made.test)) < 0.4
-    lefty = made.test.assign(yes=np.where(pushed, to_left, made.test["yes"]))
-    found = side_bias(lefty, FEW).set_index("scenario")
-    assert (found["left_low"] > 0.55).all() and (found["p"] < 1e-3).all()
-    assert found["left"].to_numpy() == pytest.approx([0.7, 0.7], abs=0.05)
 
 
 def test_biases_are_means_over_people_by_hand(made: Responses) -> None:
@@ -533,26 +507,13 @@ def test_slopes_and_robust_errors_match_statsmodels() -> None:
             )
             assert row["df"] == fit.df_resid
             assert (row["low"], row["high"]) == pytest.approx(fit.conf_int().iloc[0].tolist())
-    assert found.loc[("H3", "all"), "as_predicted"] == "yes"
+    for effect, verdict in ((-0.05, "yes"), (0.05, "opposite"), (0.0, "not shown")):
+        verdicts = regress_hypotheses(stimuli_table(0, effect)).set_index("hypothesis")
+        assert verdicts.loc["H3", "as_predicted"].iloc[-1] == verdict
     assert found.loc[("H4", "all"), "p"] < 1e-6
     left_out = {"drop": 60, "roll": 40, "link": 20, "all": 120}
     assert found.loc["H1", "left_out"].to_dict() == left_out
     assert found.loc["H1", "reason"].str.contains("not known").all()
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_as_predicted_needs_a_test() -> None:
-    """The sign of b alone is right for one half of all effects that do not exist."""
-    for effect, verdict in ((-0.05, "yes"), (0.05, "opposite")):
-        found = regress_hypotheses(stimuli_table(0, effect)).set_index(["hypothesis", "scenario"])
-        assert found.loc[("H3", "all"), "as_predicted"] == verdict
-    without = pd.concat([regress_hypotheses(stimuli_table(seed, 0.0)) for seed in range(20)])
-    rows = without[without["hypothesis"] == "H3"]
-    assert 20 < (rows["b"] < 0).sum() < 60
-    assert rows["as_predicted"].eq("not shown").equals(rows["p"] >= 0.05)
-    assert rows["as_predicted"].eq("yes").equals((rows["p"] < 0.05) & (rows["b"] < 0))
-    assert rows["as_predicted"].eq("yes").sum() < 8
 
 
 def test_confounded_and_constant_attributes_say_so() -> None:
@@ -579,13 +540,6 @@ def test_single_answers_are_laid_out_for_the_mixed_models(made: Responses) -> No
         assert named - {"~", "+"} <= set(rows.columns)
 
 
-def test_slow_answers_go_with_errors_where_they_were_made_to() -> None:
-    test = study(people=40, stimuli=60, scenarios=("drop", "roll"), seed=5).test
-    stimuli = accuracy_by_stimulus(test, FEW).assign(elements=1, distractors=1, occluders=1)
-    row = regress_hypotheses(stimuli).set_index(["hypothesis", "scenario"]).loc[("H4", "all")]
-    assert row["b"] == pytest.approx(-0.5, abs=0.15) and row["p"] < 1e-6
-
-
 def test_dropping_rows_leaves_other_stimuli_as_they_were(made: Responses) -> None:
     whole = accuracy_by_stimulus(made.test, FEW).set_index("stimulus")
     part = replace(made, trials=made.trials[made.trials["stimulus"] != "roll_003"])
@@ -610,14 +564,3 @@ def test_item_rest_is_the_correlation_with_the_other_answers() -> None:
             assert row["item_rest"] == pytest.approx(np.corrcoef(own, rest)[0, 1])
         else:
             assert np.isnan(row["item_rest"]) and "all answers" in row["reason"]
-
-
-def test_a_stimulus_that_goes_against_ability_is_below_zero() -> None:
-    test = study(people=60, stimuli=25, scenarios=("drop",), seed=1, ability_sd=1.5).test.copy()
-    ability = test.groupby("session")["correct"].transform("mean")
-    odd = test["stimulus"] == test["stimulus"].iloc[0]
-    right = ability[odd] < ability.median()
-    test.loc[odd, "yes"] = test.loc[odd, "label"] == right
-    table = item_statistics(test).set_index("stimulus")["item_rest"]
-    assert table[test["stimulus"].iloc[0]] < -0.4
-    assert table.drop(test["stimulus"].iloc[0]).mean() > 0.1

@@ -1,4 +1,4 @@
-"""The released tables give the published numbers, to the digit; broken tables are refused."""
+"""The released tables give the published numbers and regressions; broken ones are refused."""
 
 from __future__ import annotations
 
@@ -10,7 +10,19 @@ import pandas as pd
 import pytest
 
 from physion.analysis.intervals import Bootstrap
-from physion.analysis.published.claims import TITLES, PublishedResults, results_of
+from physion.analysis.published.claims import (
+    CLAIMS,
+    END_TO_END,
+    TITLES,
+    VISION,
+    Contrast,
+    PublishedResults,
+    contrast_rows,
+    fit_contrast,
+    published_regressions,
+    released_state,
+    results_of,
+)
 from physion.analysis.published.tables import (
     MODELS,
     OBSERVED_AGAIN,
@@ -325,6 +337,128 @@ def test_every_table_has_a_title_and_nothing_is_empty(results: PublishedResults)
     assert described == set(results.descriptions)
 
 
+# --- regressions -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def regressions(released: PublishedTables) -> pd.DataFrame:
+    return published_regressions(released).set_index("claim")
+
+
+def test_the_earlier_state_has_the_rows_of_the_released_notebook(
+    released: PublishedTables,
+) -> None:
+    twice = released_state(released.runs, "twice")
+    counts = twice.groupby("model")["accuracy"].size()
+    # Numbers of observations that the released notebook prints for its regressions.
+    assert len(twice) == 1728 and len(released_state(released.runs, "once")) == 1008
+    assert counts[list(END_TO_END)].sum() == 1080
+    assert counts[["CSWM", "OP3"]].sum() == 288 and counts[list(PARTICLES)].sum() == 72
+    assert counts[["SVG", "pVGG-mlp", "pVGG-lstm", "pDEIT-mlp", "pDEIT-lstm"]].sum() == 936
+
+
+@pytest.mark.parametrize(
+    ("contrast", "b", "se", "df", "t"),
+    [
+        # What lmerTest printed in the released notebook on the state with rows twice.
+        (Contrast("", ("CSWM", "OP3"), high=("CSWM",)), 0.059077, 0.005349, 275.0, 11.04),
+        (
+            Contrast("", ("SVG", *VISION[4:]), column="encoder", high=("Transformer",)),
+            0.0667, 0.003146, 923.0, 21.2,
+        ),
+        (Contrast("", END_TO_END, high=("RPIN",)), 0.05656, 0.003670, 1067.0, 15.41),
+        (
+            Contrast(
+                "", END_TO_END, "readout", ("observed",), ("scenario", "training"),
+                ("observed", "observed+simulated"),
+            ),
+            0.002664, 0.004198, 709.0, 0.635,
+        ),
+        (
+            Contrast("", (*VISION, *PARTICLES), "training", ("only",), ("scenario",),
+                     further=("all-but",)),
+            0.02053, 0.004708, 1718.0, 4.361,
+        ),
+        (
+            Contrast("", (*VISION, *PARTICLES), high=PARTICLES, groups=("scenario", "training")),
+            0.1094, 0.009251, 1717.0, 11.83,
+        ),
+        (
+            Contrast("", PARTICLES, high=("DPI",), groups=("scenario", "training")),
+            0.0003982, 0.02169, 61.0, 0.018,
+        ),
+        (
+            Contrast("", ("GNS", "GNS-R"), high=("GNS-R",), groups=("scenario", "training")),
+            0.007049, 0.023847, 37.0, 0.296,
+        ),
+    ],
+)  # fmt: skip
+def test_fits_match_lmertest(
+    released: PublishedTables, contrast: Contrast, b: float, se: float, df: float, t: float
+) -> None:
+    found = fit_contrast(contrast, released, "twice")
+    assert found["b"] == pytest.approx(b, rel=1e-3)
+    assert found["se"] == pytest.approx(se, rel=1e-3)
+    assert found["df"] == pytest.approx(df, abs=0.01)
+    assert found["t"] == pytest.approx(t, abs=0.006)
+
+
+def test_every_printed_figure_is_met_but_three(regressions: pd.DataFrame) -> None:
+    missed = regressions["met"].str.extract(r"([bt, p]+) not met")[0].dropna()
+    assert dict(missed.str.strip()) == {
+        "RPIN and CSWM": "t", "full readout": "b", "only and all": "b",
+    }  # fmt: skip
+    assert abs(regressions.loc["RPIN and CSWM", "run_t"] - 3.75) < 0.01
+    assert round(regressions.loc["full readout", "run_b"], 3) == 0.064
+    assert round(regressions.loc["only and all", "run_b"], 3) == 0.021
+
+
+def test_op3_is_less_accurate_than_svg_only_with_readout_full(regressions: pd.DataFrame) -> None:
+    pooled, predicting = regressions.loc["OP3 and CSWM"], regressions.loc["OP3 and SVG, predicting"]
+    assert pooled["asked_b"] < -0.04 and pooled["asked_p"] < 1e-6
+    assert predicting["asked_p"] > 0.05 and predicting["asked_rows"] == 120
+    assert "only when readout full" in pooled["differs"]
+
+
+def test_what_the_sentences_ask_for(regressions: pd.DataFrame) -> None:
+    assert regressions.loc["people above chance", "asked_b"] == pytest.approx(0.747, abs=5e-4)
+    assert regressions.loc["people above chance", "run_b"] == pytest.approx(0.707, abs=5e-4)
+    assert regressions.loc["OP3 and CSWM", "asked_b"] < 0
+    ratio = (
+        regressions.loc["pDEIT and pVGG", "asked_b"] / regressions.loc["pDEIT and pVGG", "run_b"]
+    )
+    assert ratio == pytest.approx(1 / 3, abs=0.03)
+    assert regressions.loc["RPIN and CSWM, all", "run_p"] > 0.5
+    assert regressions.loc["pVGG and CSWM, RPIN, predicting", "run_b"] < 0
+
+
+def test_copies_shrink_the_error_and_nothing_else_much(regressions: pd.DataFrame) -> None:
+    twice = regressions[regressions["state"] == "rows twice"]
+    assert len(twice) == 4
+    assert (twice["run_rows"] > 1.5 * twice["once_rows"]).all()
+    ratio = twice["once_se"] / twice["run_se"]
+    assert ratio.between(1.2, 1.5).all()
+    same = regressions[regressions["state"] == "rows once"]
+    assert (same["run_t"] == same["once_t"]).all()
+
+
+def test_every_claim_has_words(regressions: pd.DataFrame) -> None:
+    assert len(regressions) == len(CLAIMS) and regressions.index.is_unique
+    for column in ("sentence", "compared", "asked", "differs"):
+        assert regressions[column].str.len().gt(10).all(), column
+    estimates = [f"{fit}_{name}" for fit in ("run", "once", "asked") for name in ("b", "t", "df")]
+    assert np.isfinite(regressions[estimates].to_numpy(dtype=float)).all()
+
+
+def test_a_contrast_of_nothing_is_refused(released: PublishedTables) -> None:
+    for contrast in (
+        Contrast("nobody", ("nobody",), high=("x",)),
+        Contrast("one side", ("SVG",), high=("SVG",)),
+    ):
+        with pytest.raises(BadInputError, match=contrast.text):
+            contrast_rows(contrast, released, "once")
+
+
 # --- broken tables ------------------------------------------------------------------------------
 
 
@@ -374,17 +508,14 @@ def test_missing_parts_are_named(copy: Path, name: str) -> None:
         read_published(copy)
 
 
-def test_a_run_that_stands_twice_is_refused(copy: Path) -> None:
-    path = copy / "results" / "model_human_accuracies.csv"
-    table = pd.read_csv(path, dtype=str, keep_default_na=False)
-    pd.concat([table, table.iloc[:1]]).to_csv(path, index=False)
-    with pytest.raises(BadInputError, match="two rows"):
-        read_published(copy)
-
-
-def test_a_scenario_without_people_is_refused(copy: Path) -> None:
+def test_a_run_in_two_rows_and_a_scenario_without_people_are_refused(copy: Path) -> None:
     path = copy / "results" / "human_pairwiseCohensKs_by_scenario.csv"
     table = pd.read_csv(path, dtype=str)
     table[table["scenario"] != "drop"].to_csv(path, index=False)
     with pytest.raises(BadInputError, match="drop"):
+        read_published(copy)
+    path = copy / "results" / "model_human_accuracies.csv"
+    table = pd.read_csv(path, dtype=str, keep_default_na=False)
+    pd.concat([table, table.iloc[:1]]).to_csv(path, index=False)
+    with pytest.raises(BadInputError, match="two rows"):
         read_published(copy)

@@ -1,6 +1,8 @@
-"""Metrics: what they are on known answers, what no data may break, when they are undefined."""
+"""Metrics and kappa against scipy, scikit-learn and plain loops; when they are undefined."""
 
 from __future__ import annotations
+
+import warnings
 
 import numpy as np
 import numpy.typing as npt
@@ -10,12 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
+from sklearn.metrics import cohen_kappa_score
 
 from physion.analysis.intervals import Bootstrap
 from physion.analysis.metrics import metrics, score_metrics
 from physion.analysis.sample import Sample, sample_of_rows
 from physion.analysis.statistics import agreement
 from physion.analysis.statistics.agreement import why_no_r
+from physion.core.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
 
@@ -27,24 +31,13 @@ pairs = st.integers(3, 40).flatmap(
 
 
 @given(pairs)
-def test_r_matches_scipy_and_symmetric(pair: Array) -> None:
+def test_r_matches_scipy(pair: Array) -> None:
     x, y = pair
     r = agreement.pearson(x, y)
     if np.ptp(x) == 0 or np.ptp(y) == 0:
         assert np.isnan(r)
         return
     assert r == pytest.approx(stats.pearsonr(x, y).statistic, abs=1e-9)
-    assert r == pytest.approx(agreement.pearson(y, x), abs=1e-12)
-
-
-@given(pairs, st.floats(0.1, 1), st.floats(0, 1))
-def test_r_ignores_scale_and_shift_and_rmsd_does_not(pair: Array, scale: float, by: float) -> None:
-    x, y = pair
-    moved = scale * x + by
-    assert agreement.pearson(moved, y) == pytest.approx(
-        agreement.pearson(x, y), abs=1e-7, nan_ok=True
-    )
-    assert agreement.rmsd(x + by, x) == pytest.approx(by, abs=1e-9)
 
 
 def test_r_of_what_is_undefined() -> None:
@@ -146,11 +139,20 @@ def plain_detection(said: pd.Series, outcome: pd.Series) -> tuple[float, float]:
     return z[0] - z[1], -(z[0] + z[1]) / 2
 
 
-@pytest.mark.slow
+@settings(max_examples=30)
 @given(pairs, st.integers(0, 99))
-def test_metrics_from_sums_are_the_plain_ones(pair: Array, seed: int) -> None:
+def test_metrics_from_sums_are_the_plain_ones_of_the_drawn_rows(pair: Array, seed: int) -> None:
     rows = rows_of(pair, seed)
-    found = {key: value.item() for key, value in scores(rows, np.ones((1, len(rows)))).items()}
+    draws = Bootstrap(resamples=2, seed=seed).weights("collide", len(rows))
+    weights = np.vstack([np.ones(len(rows)), draws])
+    found = scores(rows, weights)
+    for number, weight in enumerate(weights):
+        drawn = rows.loc[np.repeat(rows.index, weight.astype(int))]
+        own = {name: values[number] for name, values in found.items()}
+        assert own == pytest.approx(plain_metrics(drawn), abs=1e-7, nan_ok=True)
+
+
+def plain_metrics(rows: pd.DataFrame) -> dict[str, float]:
     same = rows[rows["label"] == rows["simulated"]]
     expected = {
         "accuracy": (rows["predicted"] == rows["label"]).mean(),
@@ -171,24 +173,7 @@ def test_metrics_from_sums_are_the_plain_ones(pair: Array, seed: int) -> None:
     expected["kappa_beyond_outcome"] = expected["kappa_from_averages"] - (
         (2 * model - 1) * (2 * human - 1)
     )
-    assert found == pytest.approx(expected, abs=1e-7, nan_ok=True)
-
-
-@settings(max_examples=25)
-@given(pairs, st.integers(0, 99))
-def test_resamples_are_what_drawing_rows_gives(pair: Array, seed: int) -> None:
-    rows = rows_of(pair, seed)
-    weights = Bootstrap(resamples=3, seed=seed).weights("collide", len(rows))
-    found = scores(rows, weights)
-    for number, weight in enumerate(weights):
-        drawn = rows.loc[np.repeat(rows.index, weight.astype(int))]
-        plain = agreement.pearson(drawn["p_contact"], drawn["p_yes"])
-        assert found["r"][number] == pytest.approx(plain, abs=1e-7, nan_ok=True)
-        partial = plain_partial(drawn["p_contact"], drawn["p_yes"], drawn["label"])
-        assert found["r_beyond_outcome"][number] == pytest.approx(partial, abs=1e-7, nan_ok=True)
-        assert found["rmsd"][number] == pytest.approx(
-            agreement.rmsd(drawn["p_contact"], drawn["p_yes"]), abs=1e-9
-        )
+    return expected
 
 
 # --- detection --------------------------------------------------------------------------------
@@ -209,23 +194,6 @@ def sample(predicted: np.ndarray, label: np.ndarray, weights: np.ndarray | None 
     )
 
 
-def test_rates_have_half_an_answer_added_to_each_side() -> None:
-    label = np.array([1.0] * 10 + [0.0] * 10)
-    said = np.array([1.0] * 8 + [0.0] * 2 + [1.0] * 3 + [0.0] * 7)
-    hit, alarm = stats.norm.ppf(8.5 / 11), stats.norm.ppf(3.5 / 11)
-    given = sample(said, label)
-    assert metrics.get("d_prime")(given)[0, 0] == pytest.approx(hit - alarm)
-    assert metrics.get("criterion")(given)[0, 0] == pytest.approx(-(hit + alarm) / 2)
-
-
-def test_leaning_to_yes_lowers_the_criterion_and_perfect_answers_are_finite() -> None:
-    label = np.array([1.0, 0.0] * 20)
-    answers = np.stack([label, np.ones(40), np.zeros(40), 1 - label])
-    d, c = (metrics.get(name)(sample(answers, label))[0] for name in ("d_prime", "criterion"))
-    assert np.isfinite(d).all() and d[0] > 3 and d[0] == pytest.approx(-d[3])
-    assert d[1] == pytest.approx(0) and c[1] < -1 and c[2] == pytest.approx(-c[1])
-
-
 def test_gaps_and_left_out_stimuli_do_not_count() -> None:
     label = np.array([1.0] * 6 + [0.0] * 6)
     said = np.array([1.0, 1, 1, 0, np.nan, 0, 1, 0, 0, 0, 0, 0])
@@ -236,3 +204,131 @@ def test_gaps_and_left_out_stimuli_do_not_count() -> None:
     assert found[1] == pytest.approx(metrics.get("d_prime")(sample(said[keep], label[keep]))[0, 0])
     one_class = sample(said[:6], label[:6])
     assert np.isnan(metrics.get("criterion")(one_class)).all()
+
+
+# --- kappa -------------------------------------------------------------------------------------
+
+answers = st.tuples(st.integers(2, 6), st.integers(1, 25)).flatmap(
+    lambda shape: hnp.arrays(np.float64, shape, elements=st.sampled_from([0.0, 1.0]))
+)
+with_gaps = st.tuples(st.integers(2, 6), st.integers(1, 25)).flatmap(
+    lambda shape: hnp.arrays(np.float64, shape, elements=st.sampled_from([0.0, 1.0, np.nan]))
+)
+
+
+def by_scikit_learn(a: Array, b: Array) -> float:
+    shared = ~np.isnan(a) & ~np.isnan(b)
+    if not shared.any():
+        return float("nan")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return float(cohen_kappa_score(a[shared], b[shared]))
+
+
+@settings(max_examples=40, deadline=None)
+@given(with_gaps)
+def test_every_pair_is_as_scikit_learn_has_it(values: Array) -> None:
+    found = agreement.pairwise_kappa(values)
+    for i in range(len(values)):
+        for j in range(len(values)):
+            expected = by_scikit_learn(values[i], values[j])
+            assert found[i, j] == pytest.approx(expected, abs=1e-12, nan_ok=True)
+
+
+def test_kappa_without_variation() -> None:
+    assert np.isnan(agreement.cross_kappa([1, 1, 1], [1, 1, 1])).all()
+    # A constant answer and one that varies: no agreement beyond chance, and defined.
+    assert agreement.cross_kappa([1, 1, 1, 1], [1, 0, 1, 0]).item() == 0.0
+    assert agreement.cross_kappa([1, 0], [0, 1]).item() == -1.0
+
+
+@settings(deadline=None)
+@given(with_gaps)
+def test_correlation_matches_scipy(values: Array) -> None:
+    found = agreement.pairwise_correlation(values)
+    a, b = values[0], values[1]
+    shared = ~np.isnan(a) & ~np.isnan(b)
+    a, b = a[shared], b[shared]
+    if len(a) < 3 or np.ptp(a) == 0 or np.ptp(b) == 0:
+        assert np.isnan(found[0, 1])
+    else:
+        assert found[0, 1] == pytest.approx(stats.pearsonr(a, b).statistic, abs=1e-9)
+
+
+@settings(max_examples=30, deadline=None)
+@given(answers, st.integers(0, 9))
+def test_error_consistency_is_the_kappa_of_being_right(values: Array, seed: int) -> None:
+    labels = np.random.default_rng(seed).integers(0, 2, values.shape[1]).astype(float)
+    found = agreement.pairwise_kappa(agreement.correctness(values, labels))
+    right = (values == labels).astype(float)
+    expected = by_scikit_learn(right[0], right[1])
+    assert found[0, 1] == pytest.approx(expected, abs=1e-12, nan_ok=True)
+
+
+# --- kappa of draws ------------------------------------------------------------------------------
+
+
+@settings(max_examples=30, deadline=None)
+@given(with_gaps, st.integers(0, 99))
+def test_draws_of_stimuli_are_what_repeating_them_gives(values: Array, seed: int) -> None:
+    weights = Bootstrap(resamples=3, seed=seed).weights("x", values.shape[1])
+    found = agreement.resampled_kappa(values, values[0], weights)
+    for row, weight in zip(found, weights, strict=True):
+        drawn = np.repeat(values, weight.astype(int), axis=1)
+        expected = agreement.cross_kappa(drawn, drawn[0])[:, 0]
+        np.testing.assert_allclose(row, expected, atol=1e-12)
+
+
+@settings(max_examples=30, deadline=None)
+@given(with_gaps, st.integers(0, 99))
+def test_draws_of_raters_leave_out_pairs_of_one_rater_with_himself(
+    values: Array, seed: int
+) -> None:
+    matrix = agreement.pairwise_kappa(values)
+    weights = Bootstrap(resamples=4, seed=seed).weights("people", len(values))
+    found = agreement.resampled_mean_of_pairs(matrix, weights)
+    for mean, weight in zip(found, weights, strict=True):
+        drawn = np.repeat(np.arange(len(values)), weight.astype(int))
+        pairs = [
+            matrix[i, j]
+            for place, i in enumerate(drawn)
+            for j in drawn[place + 1 :]
+            if i != j and np.isfinite(matrix[i, j])
+        ]
+        expected = np.mean(pairs) if pairs else np.nan
+        assert mean == pytest.approx(expected, abs=1e-12, nan_ok=True)
+
+
+def test_both_at_once_is_a_draw_of_stimuli_and_then_of_raters() -> None:
+    generator = np.random.default_rng(0)
+    values = (generator.random((8, 30)) < generator.random(30)).astype(float)
+    draws = Bootstrap(resamples=5)
+    stimuli, raters = draws.weights("s", 30), draws.weights("r", 8)
+    both = agreement.resampled_mean_kappa(values, stimuli, raters)
+    for k in range(5):
+        drawn = np.repeat(values, stimuli[k].astype(int), axis=1)
+        expected = agreement.resampled_mean_of_pairs(
+            agreement.pairwise_kappa(drawn), raters[k : k + 1]
+        )
+        assert both[k] == pytest.approx(expected[0], abs=1e-12)
+    alone = agreement.resampled_mean_kappa(values, None, raters)
+    np.testing.assert_array_equal(
+        alone, agreement.resampled_mean_of_pairs(agreement.pairwise_kappa(values), raters)
+    )
+    with pytest.raises(BadInputError, match="draws"):
+        agreement.resampled_mean_kappa(values, None, None)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ([[0, 1, 0.5]], "holds 0.5"),
+        ([["yes", "no"]], "must be numbers"),
+        (np.zeros((2, 2, 2)), "shape"),
+    ],
+)
+def test_answers_that_are_none_are_refused(values: npt.ArrayLike, words: str) -> None:
+    with pytest.raises(BadInputError, match=words):
+        agreement.pairwise_kappa(values)
+    with pytest.raises(BadInputError, match="paired"):
+        agreement.cross_kappa([0, 1], [0, 1, 1])

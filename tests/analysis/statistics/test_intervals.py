@@ -159,12 +159,9 @@ def test_weights_draw_n_of_n_and_depend_only_on_their_names(n: int, seed: int) -
     assert weights.shape == (7, n)
     assert (weights.sum(axis=1) == n).all() and (weights >= 0).all()
     assert np.array_equal(weights, Bootstrap(resamples=7, seed=seed).weights("drop", n))
-
-
-def test_seeds_and_strata_differ() -> None:
-    weights = Bootstrap(resamples=5).weights("drop", 30)
-    assert not np.array_equal(weights, Bootstrap(resamples=5, seed=1).weights("drop", 30))
-    assert not np.array_equal(weights, Bootstrap(resamples=5).weights("link", 30))
+    if n > 20:
+        assert not np.array_equal(weights, Bootstrap(resamples=7, seed=seed + 1).weights("drop", n))
+        assert not np.array_equal(weights, bootstrap.weights("link", n))
 
 
 def test_width_matches_the_normal_interval() -> None:
@@ -174,14 +171,10 @@ def test_width_matches_the_normal_interval() -> None:
     assert high - low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.05)
 
 
-def test_a_higher_level_is_wider() -> None:
-    draws = np.linspace(0, 1, 1001)
+def test_intervals_hold_their_share_of_defined_draws_until_most_are_undefined() -> None:
+    draws = np.linspace(0, 1, 101)
     assert Bootstrap(level=0.95).interval(draws) == pytest.approx((0.025, 0.975))
     assert Bootstrap(level=0.5).interval(draws) == pytest.approx((0.25, 0.75))
-
-
-def test_undefined_draws_are_left_out_until_they_are_most() -> None:
-    draws = np.linspace(0, 1, 101)
     some = np.concatenate([draws, np.full(50, np.nan)])
     assert Bootstrap().interval(some) == Bootstrap().interval(draws)
     most = np.concatenate([draws, np.full(150, np.nan)])
