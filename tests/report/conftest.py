@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -26,6 +27,7 @@ def make_comparison() -> Maker:
     """Builds a comparison of two models on Collide and Drop; ``model`` and ``readout`` are of the
     first one."""
 
+    @functools.cache
     def make(
         model: str = "simulation",
         with_people: bool = True,
@@ -44,18 +46,11 @@ def make_comparison() -> Maker:
         tables = []
         for name, given in ((model, readout), ("encoder", "observed+simulated")):
             p = np.full(24, 0.5) if constant else generator.random(24)
-            tables.append(
-                pd.DataFrame(
-                    {
-                        "Model": name,
-                        "Readout Type": given,
-                        "Predicted Prob_true": p,
-                        "Predicted Outcome": p > 0.5,
-                        "Actual Outcome": actual,
-                        "Stimulus Name": people["stimulus"],
-                    }
-                )
-            )
+            tables.append(pd.DataFrame({
+                "Model": name, "Readout Type": given, "Predicted Prob_true": p,
+                "Predicted Outcome": p > 0.5, "Actual Outcome": actual,
+                "Stimulus Name": people["stimulus"],
+            }))  # fmt: skip
         zone = pd.DataFrame({"scenario": ["collide"], "low": [0.6], "high": [0.8]})
         return compare_scores(
             pd.concat(tables),

@@ -288,17 +288,59 @@ def test_people_on_predicted_stimuli(inputs: ReportInputs, page: str) -> None:
 # --- tests of models ----------------------------------------------------------------------------
 
 
-def test_paired_tests(filled: tuple[ReportInputs, str]) -> None:
-    inputs, page = filled
-    assert inputs.paired is not None
-    check(find(page, "Models against each other"), inputs.paired, {
+TABLES: dict[str, tuple[str, dict[str, Any]]] = {
+    "Models against each other": ("paired", {
         "first": "first", "second": "second", "stimuli": ("stimuli", count),
         "accuracy, first less second": ("accuracy_difference", fixed(3)),
         "only first right": ("only_first", count), "only second right": ("only_second", count),
         "p": ("p_accuracy", p), "Holm": ("p_accuracy_holm", p), "B-H": ("p_accuracy_bh", p),
         "r, first less second": own("r_difference"),
         "p#": ("p_r", p), "Holm#": ("p_r_holm", p), "B-H#": ("p_r_bh", p),
-    })  # fmt: skip
+    }),
+    "What single people reach": ("zones", {
+        "scenario": "scenario", "measure": "measure", "of": "of", "values": ("values", count),
+        "mean": ("mean", fixed(3)), "2.5 %": ("low", fixed(3)), "97.5 %": ("high", fixed(3)),
+        "undefined": ("undefined", count),
+    }),
+    "Accuracy of people, flagged": ("by_scenario", {
+        "scenario": "scenario", "people": ("people", count), "stimuli": ("stimuli", count),
+        "accuracy": own("accuracy", 3), "sd over people": ("sd", fixed(3)), "t": ("t", fixed(1)),
+        "df": ("df", lambda x: str(round(x))), "p": ("p", p),
+        "lowest 2.5 %": ("zone_low", fixed(3)),
+        "highest 2.5 %": ("zone_high", fixed(3)), "consistency": ("consistency", fixed(3)),
+    }),
+    "Saying yes;": ("yes_bias", {
+        "scenario": "scenario", "people": ("people", count), "contact": ("base_rate", fixed(3)),
+        "say yes": ("yes", fixed(3)), "yes less contact": own("bias", 3), "d′": own("d_prime"),
+        "criterion": own("criterion"),
+    }),
+    "Pressing the left button": ("side_bias", {
+        "scenario": "scenario", "yes on the left": ("yes_left", count),
+        "yes on the right": ("yes_right", count), "order unknown": ("unknown", count),
+        "left presses": own("left", 3), "p": ("p", p),
+    }),
+    "Accuracy by who people are": ("background_tests", {
+        "question": "question", "sessions": ("sessions", count), "test": "test",
+        "statistic": ("statistic", fixed(2)), "p": ("p", p),
+    }),
+    "By scenario": ("hypotheses", {
+        "hypothesis": "hypothesis", "scenario": "scenario",
+        "left out": ("left_out", lambda x: str(round(x))),
+        "b": spread("b", "low", "high", 3), "t": ("t", fixed(2)), "p": ("p", p),
+        "r": ("r", fixed(2)),
+    }),
+}  # fmt: skip
+"""Place of a table on the page: the table that it shows, and its columns."""
+
+
+@pytest.mark.parametrize("place", TABLES)
+def test_tables_hold_their_numbers(filled: tuple[ReportInputs, str], place: str) -> None:
+    inputs, page = filled
+    assert inputs.people is not None and inputs.with_people is not None
+    name, columns = TABLES[place]
+    rows = {"paired": inputs.paired, "zones": inputs.with_people.zones} | inputs.people.tables
+    check(find(page, place), rows[name], columns)
+    assert find(page, "Who took part").column("fraction") == ["38 %", "62 %"]
 
 
 def test_counts_of_differing_pairs(filled: tuple[ReportInputs, str]) -> None:
@@ -348,18 +390,6 @@ def test_kappa_of_models_with_each_other(inputs: ReportInputs, page: str) -> Non
 # --- people -------------------------------------------------------------------------------------
 
 
-def test_accuracy_of_people(filled: tuple[ReportInputs, str]) -> None:
-    inputs, page = filled
-    assert inputs.people is not None
-    check(find(page, "Accuracy of people, flagged"), inputs.people.tables["by_scenario"], {
-        "scenario": "scenario", "people": ("people", count), "stimuli": ("stimuli", count),
-        "accuracy": own("accuracy", 3), "sd over people": ("sd", fixed(3)), "t": ("t", fixed(1)),
-        "df": ("df", lambda x: str(round(x))), "p": ("p", p),
-        "lowest 2.5 %": ("zone_low", fixed(3)),
-        "highest 2.5 %": ("zone_high", fixed(3)), "consistency": ("consistency", fixed(3)),
-    })  # fmt: skip
-
-
 def test_agreement_among_people(filled: tuple[ReportInputs, str]) -> None:
     inputs, page = filled
     assert inputs.people is not None
@@ -376,49 +406,6 @@ def test_agreement_among_people(filled: tuple[ReportInputs, str]) -> None:
             row = rows.loc[(scenario, measure)]
             ends = f"{row['mean_low']:.3f} to {row['mean_high']:.3f}"
             assert table.column("interval of the mean", number)[at] == ends
-
-
-def test_inclinations(filled: tuple[ReportInputs, str]) -> None:
-    inputs, page = filled
-    assert inputs.people is not None
-    tables = inputs.people.tables
-    check(find(page, "Saying yes;"), tables["yes_bias"], {
-        "scenario": "scenario", "people": ("people", count), "contact": ("base_rate", fixed(3)),
-        "say yes": ("yes", fixed(3)), "yes less contact": own("bias", 3), "d′": own("d_prime"),
-        "criterion": own("criterion"),
-    })  # fmt: skip
-    check(find(page, "Pressing the left button"), tables["side_bias"], {
-        "scenario": "scenario", "yes on the left": ("yes_left", count),
-        "yes on the right": ("yes_right", count), "order unknown": ("unknown", count),
-        "left presses": own("left", 3), "p": ("p", p),
-    })  # fmt: skip
-    check(find(page, "Accuracy by who people are"), tables["background_tests"], {
-        "question": "question", "sessions": ("sessions", count), "test": "test",
-        "statistic": ("statistic", fixed(2)), "p": ("p", p),
-    })  # fmt: skip
-    assert find(page, "Who took part").column("fraction") == ["38 %", "62 %"]
-
-
-def test_hypotheses(filled: tuple[ReportInputs, str]) -> None:
-    inputs, page = filled
-    assert inputs.people is not None
-    table = find(page, "By scenario")
-    check(table, inputs.people.tables["hypotheses"], {
-        "hypothesis": "hypothesis", "scenario": "scenario",
-        "left out": ("left_out", lambda x: str(round(x))),
-        "b": spread("b", "low", "high", 3), "t": ("t", fixed(2)), "p": ("p", p),
-        "r": ("r", fixed(2)),
-    })  # fmt: skip
-
-
-def test_zones_of_single_people(filled: tuple[ReportInputs, str]) -> None:
-    inputs, page = filled
-    assert inputs.with_people is not None
-    check(find(page, "What single people reach"), inputs.with_people.zones, {
-        "scenario": "scenario", "measure": "measure", "of": "of", "values": ("values", count),
-        "mean": ("mean", fixed(3)), "2.5 %": ("low", fixed(3)), "97.5 %": ("high", fixed(3)),
-        "undefined": ("undefined", count),
-    })  # fmt: skip
 
 
 def test_stimuli_that_mislead_people(inputs: ReportInputs) -> None:

@@ -18,23 +18,29 @@ import pandas as pd
 import pytest
 import scipy.stats
 from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 
 from physion.analysis import Comparison, figure_tables
 from physion.analysis.comparison import ANOTHER
-from physion.analysis.model_tests import fits_of_models, paired_tests, pool_comparison
+from physion.analysis.model_tests import paired_tests, pool_comparison
 from physion.analysis.people.effects import below_chance_level
+from physion.analysis.rollout_errors import COLUMNS, CONSTANT_VELOCITY, ERRORS
 from physion.analysis.scores import COMPUTED
 from physion.analysis.tables import MEAN, name_models
+from physion.cli.main import main
 from physion.core.names import SCENARIOS
 from physion.data.official import official
-from physion.report import html as blocks
-from physion.report import people, scores
 from physion.report.compare import compare
 from physion.report.figures import theme
-from physion.report.figures.by_scenario import measure_figure, model_and_people_figure
+from physion.report.figures.by_scenario import draw_rollout_error as draw
+from physion.report.figures.by_scenario import (
+    measure_figure,
+    model_and_people_figure,
+    rollout_error,
+)
 from physion.report.figures.by_stimulus import (
     SQUARE,
     difficulty_figure,
@@ -43,9 +49,9 @@ from physion.report.figures.by_stimulus import (
     scatter_figure,
 )
 from physion.report.figures.overview import overview
-from physion.report.figures.theme import make_plots
+from physion.report.figures.theme import LIGHT, make_plots
 from physion.report.figures.training import generalization_figure, grouped_figure
-from physion.report.html import Picture, number
+from physion.report.html import number
 from physion.report.inputs import ReportInputs
 from physion.trials.video import encode_movie
 from support.paths import ROOT
@@ -91,12 +97,8 @@ def test_baselines_stand_below_the_models_lighter_and_hollow(make_comparison: Ma
     assert list(figure_tables.r_table(comparison)["model"].unique()) == [model, given, *COMPUTED]
     thirds = figure_tables.thirds_table(comparison)
     assert next(iter(thirds["model"].unique())) == model
-
-
-def test_figures_of_single_answers_show_only_models(make_comparison: Maker) -> None:
-    comparison = make_comparison(model="constant-motion")
-    model = ["encoder · observed+simulated"]
-    assert ReportInputs(comparison).scatter_models() == model
+    # Figures of single answers show models only.
+    assert ReportInputs(comparison).scatter_models() == [model]
 
 
 def test_the_readout_that_sees_the_outcome_is_not_compared_with_people(
@@ -168,17 +170,6 @@ def test_points_are_the_stimuli_in_the_square_of_their_scenario(make_comparison:
     words = [text.get_text() for text in figure.axes[1].texts]
     r = np.corrcoef(*own.loc[own["scenario"] == "drop", ["p_contact", "p_yes"]].T.to_numpy())[0, 1]
     assert words[1] == f"drop, r = {number(r)}"
-
-
-def test_bars_hold_every_stimulus_and_mark_the_tail() -> None:
-    accuracy = np.array([0.02, 0.1, 0.4, 0.55, 0.9, 1.0])
-    rows = pd.DataFrame({"scenario": "drop", "stimulus": [f"s{i}" for i in range(6)],
-                         "accuracy": accuracy, "count": 100})  # fmt: skip
-    figure = difficulty_figure(below_chance_level(rows))
-    bars = {(round(p.get_x(), 3), p.get_hatch()): p.get_height() for p in figure.axes[0].patches}
-    assert sum(bars.values()) == 6
-    tail = {x for (x, hatch) in bars if hatch}
-    assert tail == {0.0, 0.1, 0.4}
 
 
 def test_thirds_are_of_the_stimuli_that_bear_their_name(make_comparison: Maker) -> None:
@@ -429,15 +420,6 @@ def test_the_line_of_response_times_is_the_least_squares_line() -> None:
     assert axis.get_title(loc="right") == f"r = {number(r)}"
 
 
-def test_points_of_a_model_against_people_have_the_model_to_the_right() -> None:
-    table = pd.DataFrame({"model": "DPI", "scenario": ["drop", "roll", MEAN],
-                          "accuracy": [0.6, 0.9, 0.75], "people": [0.7, 0.65, 0.675]})  # fmt: skip
-    axis = model_and_people_figure(table).axes[0]
-    points = [np.asarray(line.get_xydata())[0].tolist() for line in axis.lines[1:]]
-    assert points == [[0.6, 0.7], [0.9, 0.65], [0.75, 0.675]]
-    assert "people" in axis.get_ylabel() and "DPI" in axis.get_xlabel()
-
-
 def test_the_key_tells_the_scenarios_apart() -> None:
     names = [*SCENARIOS, MEAN]
     table = pd.DataFrame({"model": "DPI", "scenario": names, "accuracy": 0.6, "people": 0.7})
@@ -495,21 +477,6 @@ def test_a_figure_without_a_value_is_left_out(
 
     monkeypatch.setattr(figure_tables, "r_table", empty)
     assert "r" not in {plot.name for plot in make_plots(inputs)}
-
-
-def test_generalization_is_relative_to_people(make_comparison: Maker) -> None:
-    comparison, predictions = trained(make_comparison, ["all", "collision"])
-    table = figure_tables.generalization_table(comparison, predictions)
-    cell = table[(table["trained"] == "collide") & (table["tested"] == "drop")].iloc[0]
-    own = comparison.stimuli[
-        (comparison.stimuli["model"] == comparison.names[1])
-        & (comparison.stimuli["scenario"] == "drop")
-    ]
-    right = (own["predicted"] == own["label"]).mean()
-    assert cell["difference"] == pytest.approx(right - own["human_accuracy"].mean())
-    assert set(table["trained"]) == {"all", "collide"} and len(table) == 4
-    words = [t.get_text() for t in generalization_figure(table).axes[0].texts]
-    assert len(words) == 4 and all(word[0] in "+−0" for word in words)
 
 
 def test_a_training_on_one_scenario_is_a_row_of_the_heat_map(make_comparison: Maker) -> None:
@@ -574,49 +541,6 @@ def test_panels_inside_have_neither_ticks_nor_numbers(make_comparison: Maker) ->
     yes, no = (True, True), (False, False)
     assert [x for x, _ in ticks] == [no] * 5 + [yes] * 3
     assert [y for _, y in ticks] == [True, False, False] * 2 + [True, False]
-
-
-# --- one name, one way of writing ----------------------------------------------------------------
-
-
-def pictures(inputs: ReportInputs) -> list[Picture]:
-    blank = {"svg": b"<svg/>", "png": b""}
-    return [Picture(plot.name, blank, blank, plot.caption) for plot in make_plots(inputs)]
-
-
-def test_columns_of_simulated_outcomes_stand_only_where_these_differ(
-    make_comparison: Maker,
-) -> None:
-    comparison = make_comparison()
-    stimuli = comparison.stimuli.assign(simulated=comparison.stimuli["label"])
-    same = dataclasses.replace(comparison, changed=comparison.changed.iloc[:0], stimuli=stimuli)
-    for own, there in ((comparison, True), (same, False)):
-        plain = scores.shown_metrics(own, beyond=False)
-        text = scores.scores_table(own.all_scores, MEAN, plain) + scores.definitions(own)
-        assert ("against simulated outcome" in text) is there
-        assert ("same outcome" in text) is there
-        assert text.count('<th scope="row">') == len(own.names) + len(COMPUTED)
-        cells = text.count("<td>") / text.count('<th scope="row">')
-        assert text.count('scope="col"') - 1 == cells
-
-
-def test_counts_and_gaps_are_written_in_one_way(make_comparison: Maker) -> None:
-    column = blocks.PageColumn("rows", "rows", "count")
-    assert column.cell(pd.Series({"rows": 120000})) == "120000"
-    comparison = make_comparison()
-    assert not re.search(r"\d–", people.averages(comparison) + scores.matrix(comparison, "r"))
-
-
-def test_models_are_held_against_the_first_in_the_files(make_comparison: Maker) -> None:
-    comparison = make_comparison()
-    assert comparison.names != sorted(comparison.names)
-    spread = comparison.scores.assign(accuracy=np.linspace(0.4, 0.9, len(comparison.scores)) ** 2)
-    comparison = dataclasses.replace(comparison, scores=spread)
-    models = fits_of_models(comparison)[0]
-    assert models.fit is not None
-    terms = models.fit.table["term"].tolist()
-    assert len(terms) == 2 and comparison.names[1] in terms[1]
-    assert comparison.names[0] in models.about
 
 
 # --- one file each ------------------------------------------------------------------------------
@@ -726,3 +650,76 @@ def test_the_first_picture_has_one_mark_per_model_and_published_ones_hollow() ->
     (zone,) = axis.patches
     low = official().results / "human_accuracy_by_scenario.csv"
     assert zone.get_x() == pytest.approx(pd.read_csv(low)["pct_2.5"].mean())
+
+
+# --- errors of imagined motion ------------------------------------------------------------------
+
+
+SECONDS = (0.03, 0.06)
+
+
+def table() -> pd.DataFrame:
+    rows = [
+        (panel, model, kind, seconds, 5, slope * seconds, slope * seconds - 0.01,
+         slope * seconds + 0.02)
+        for panel in ("drop", "mean")
+        for model, kind, slope in (
+            ("one", "model", 1.0), ("two", "model", 2.0), (CONSTANT_VELOCITY, "baseline", 50.0)
+        )
+        for seconds in SECONDS
+    ]  # fmt: skip
+    return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+def test_curves_and_bands_match_the_table() -> None:
+    figure = draw(table(), LIGHT)
+    drop, mean = figure.axes[:2]
+    assert drop.get_title("left") == "drop" and mean.get_title("left") == "mean over scenarios"
+    drawn = [line.get_xydata() for line in drop.lines]
+    for points, slope in zip(drawn, (1.0, 2.0, 50.0), strict=True):
+        assert np.allclose(np.asarray(points), [[s, slope * s] for s in SECONDS])
+    bands = [band for band in drop.collections if isinstance(band, PolyCollection)]
+    heights = [band.get_paths()[0].get_extents() for band in bands]
+    assert heights[1].ymin == pytest.approx(0.05) and heights[1].ymax == pytest.approx(0.14)
+    # Constant velocity, here far above the models, does not make their curves flat.
+    assert drop.get_ylim()[1] < 0.4 and drop.get_ylim()[0] == 0
+    styles = {str(line.get_linestyle()) for line in drop.lines}
+    assert len(styles) == 3, "lines differ without colour"
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert names == ["one", "two", CONSTANT_VELOCITY]
+
+
+def test_no_errors_no_figure(make_comparison: Maker) -> None:
+    comparison = make_comparison()
+    assert rollout_error(ReportInputs(comparison)) is None
+    plot = rollout_error(ReportInputs(comparison, rollout_errors=table()))
+    assert plot is not None and plot.table.equals(table())
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_compare_draws_the_errors_that_it_is_given(tmp_path: Path) -> None:
+    predictions = pd.DataFrame(
+        {
+            "Model": "sim",
+            "Readout Type": "B",
+            "Predicted Prob_true": [0.9, 0.2, 0.7, 0.1],
+            "Predicted Outcome": [True, False, True, False],
+            "Actual Outcome": [True, False, False, False],
+            "Stimulus Name": [f"pilot_it2_drop_simple_box_{i:04d}" for i in range(4)],
+        }
+    )
+    predictions.to_csv(tmp_path / "p.csv", index=False)
+    errors = pd.DataFrame(
+        [("sim", "drop", f"drop_testing_{i:04d}", 3, 0.1 * i, 0.4) for i in range(4)],
+        columns=[column.name for column in ERRORS],
+    )
+    errors.to_csv(tmp_path / "e.csv", index=False)
+    arguments = ["compare", str(tmp_path / "p.csv"), "--resamples", "20"]
+    arguments += ["--out", str(tmp_path / "report"), "--rollout-errors"]
+    assert main([*arguments, str(tmp_path / "e.csv")]) == 0
+    drawn = pd.read_csv(tmp_path / "report" / "figures" / "rollout_error.csv")
+    assert drawn["value"].tolist() == pytest.approx([0.15, 0.4])
+    page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
+    assert "Error of imagined motion" in page
+    assert main([*arguments, str(tmp_path / "p.csv")]) == 2

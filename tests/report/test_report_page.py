@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import re
 from collections.abc import Callable
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -11,16 +14,23 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis import Comparison
-from physion.analysis.tables import MEAN
+from physion.analysis import Bootstrap, Comparison, compare_scores
+from physion.analysis.figure_tables import SCENARIO_ZONE
+from physion.analysis.metrics import score_metrics
+from physion.analysis.model_tests import fits_of_models
+from physion.analysis.published.claims import published_results
+from physion.analysis.scores import COMPUTED, MAJORITY, OUTCOME, TWO_PEOPLE
+from physion.analysis.tables import MEAN, POOLED
 from physion.core.errors import BadInputError
-from physion.report import ReportInputs, build_report
+from physion.report import ReportInputs, build_report, people, scores
+from physion.report import html as blocks
 from physion.report.build import report_numbers
 from physion.report.compare import compare
 from physion.report.figures.theme import make_plots
-from physion.report.html import Picture
+from physion.report.html import BASELINES, Picture
 from physion.report.inputs import EXPECTED_METHODS
 from physion.report.page import render_page
+from physion.report.published import build_published_report
 
 Maker = Callable[..., Comparison]
 VOID = {"meta", "img", "source", "br", "hr", "link", "input"}
@@ -129,6 +139,7 @@ def test_without_people_there_is_a_page_too(make_comparison: Maker) -> None:
     assert "Pearson r by scenario" not in text
     assert "Everything that compares with people" in text
     assert {plot.name for plot in make_plots(inputs)} == {"accuracy"}
+    assert "Trials whose simulated outcome differs" not in text
 
 
 def test_numbers_for_machines_say_null_where_undefined(make_comparison: Maker) -> None:
@@ -145,11 +156,6 @@ def test_contents_lead_to_every_section(make_comparison: Maker) -> None:
     places = [f"#{attrs['id']}" for tag, attrs in page.tags if tag == "section"]
     assert page.links() == places and len(places) > 6
     assert "#trials-whose-simulated-outcome-differs" in places
-
-
-def test_without_a_changed_outcome_there_is_no_section_about_them(make_comparison: Maker) -> None:
-    page = render(ReportInputs(make_comparison(with_people=False)))
-    assert "Trials whose simulated outcome differs" not in page.text
 
 
 # --- movies --------------------------------------------------------------------------------------
@@ -173,11 +179,6 @@ def test_bad_movies_are_refused_and_no_page_is_left(make_comparison: Maker, tmp_
         with pytest.raises(BadInputError, match=message):
             build_report(ReportInputs(comparison, movies=movies), tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_a_file_in_the_place_of_the_folder_is_refused(
-    make_comparison: Maker, tmp_path: Path
-) -> None:
     (tmp_path / "out").write_text("mine")
     with pytest.raises(BadInputError, match="is a file"):
         build_report(ReportInputs(make_comparison()), tmp_path / "out")
@@ -235,24 +236,167 @@ def test_files_in_report_out(tmp_path: Path) -> None:
     assert people.loc["collide", "zone_high"] == 0.9
 
 
+# --- tables of scores ---------------------------------------------------------------------------
+
+
+def groups(table: str) -> list[list[list[str]]]:
+    """The cells of each group of rows of a table as text."""
+    bodies = re.findall(r"<tbody>(.*?)</tbody>", table, flags=re.S)
+    return [
+        [
+            [unescape(re.sub(r"<[^>]+>", " ", cell)).strip() for cell in cells]
+            for line in re.findall(r"<tr>(.*?)</tr>", body, flags=re.S)
+            if (cells := re.findall(r"<t[hd][ >].*?</t[hd]>|<td>.*?</td>", line, flags=re.S))
+        ]
+        for body in bodies
+    ]
+
+
+@pytest.fixture
+def with_baseline(make_comparison: Maker) -> Comparison:
+    """A comparison whose first model is a baseline of the package."""
+    return make_comparison(model="constant-motion")
+
+
+def test_baselines_are_a_group_of_their_own(with_baseline: Comparison) -> None:
+    plain = scores.shown_metrics(with_baseline, beyond=False)
+    models, baselines = groups(scores.scores_table(with_baseline.all_scores, MEAN, plain))
+    assert [line[0] for line in models] == ["encoder"]
+    assert [line[0] for line in baselines] == [BASELINES, "constant-motion", *COMPUTED]
+    for key in ("accuracy", "r", "kappa_within_outcomes"):
+        models, baselines = groups(scores.matrix(with_baseline, key))
+        assert models[-1][0] == "encoder · observed+simulated"
+        assert [line[0] for line in baselines][:4] == [
+            BASELINES, "constant-motion · observed", OUTCOME, MAJORITY,
+        ]  # fmt: skip
+
+
+def test_the_cells_are_the_scores_and_empty_where_two_people_have_none(
+    with_baseline: Comparison,
+) -> None:
+    metrics = score_metrics()
+    _, baselines = groups(scores.scores_table(with_baseline.all_scores, POOLED, metrics))
+    names = ["", "readout", "stimuli"]
+    for metric in metrics:
+        names += [metric.name, "ceiling"] if metric.name == "r" else [metric.name]
+    two = dict(zip(names, baselines[-1], strict=True))
+    table = with_baseline.baselines.set_index(["model", "scenario"])
+    row = table.loc[(TWO_PEOPLE, POOLED)]
+    assert two["kappa_from_averages"].split()[0] == f"{row['kappa_from_averages']:.2f}"
+    assert two["accuracy"].split()[0] == f"{row['accuracy']:.2f}"
+    assert two["r"].split()[0] == f"{row['r']:.2f}"
+    assert two["rmsd"] == two["r_beyond_outcome"] == two["difference"] == ""
+    outcome = dict(zip(names, baselines[-3], strict=True))
+    assert outcome["r_beyond_outcome"] == "–" and outcome["r"] != "–"
+
+
+def test_reasons_stand_below_the_table_that_they_are_about(with_baseline: Comparison) -> None:
+    text = {
+        beyond: scores.scores_table(
+            with_baseline.all_scores, MEAN, scores.shown_metrics(with_baseline, beyond=beyond)
+        )
+        for beyond in (False, True)
+    }
+    why = f"{OUTCOME}: r beyond the outcome: undefined in collide, drop"
+    assert why in text[True] and "r beyond" not in text[False]
+
+
+def test_the_page_has_both_tables_and_says_why_one_is_missing(
+    with_baseline: Comparison, make_comparison: Maker
+) -> None:
+    text = scores.scores(with_baseline)
+    assert "Beyond the outcome" in text
+    assert "Not known: the predictions have no column observed_contact" in text
+    alone = scores.scores(make_comparison(with_people=False))
+    assert "Beyond the outcome" not in alone and BASELINES not in alone
+    assert OUTCOME not in alone.lower()
+
+
+def test_later_contacts_have_a_table_and_a_file() -> None:
+    names = [f"pilot_it2_drop_simple_box_{i:04d}" for i in range(12)]
+    p = np.random.default_rng(0).random(12)
+    given = pd.DataFrame(
+        {"Model": "m", "Readout Type": "C", "Predicted Prob_true": p, "Predicted Outcome": p > 0.5,
+         "Actual Outcome": np.arange(12) % 2 == 0, "Stimulus Name": names,
+         "Observed Contact": np.arange(12) % 4 == 0}
+    )  # fmt: skip
+    people = pd.DataFrame(
+        {"stimulus": names, "scenario": "drop", "accuracy": np.arange(8, 20) / 20, "count": 20.0}
+    )
+    labels = {name: i % 2 == 0 for i, name in enumerate(names)}
+    comparison = compare_scores(given, people, labels, bootstrap=Bootstrap(50))
+    text = scores.scores(comparison)
+    assert "Left out: 3 of 12 stimuli (drop 3 of 12)" in text
+    later = ReportInputs(comparison).tables()["comparison_later"]
+    assert set(later["stimuli"]) == {9} and set(later["kind"]) == {"model", "baseline"}
+    without = dataclasses.replace(comparison, later=comparison.later.iloc[:0])
+    assert "comparison_later" not in ReportInputs(without).tables()
+
+
+def test_columns_of_simulated_outcomes_stand_only_where_these_differ(
+    make_comparison: Maker,
+) -> None:
+    comparison = make_comparison()
+    stimuli = comparison.stimuli.assign(simulated=comparison.stimuli["label"])
+    same = dataclasses.replace(comparison, changed=comparison.changed.iloc[:0], stimuli=stimuli)
+    for own, there in ((comparison, True), (same, False)):
+        plain = scores.shown_metrics(own, beyond=False)
+        text = scores.scores_table(own.all_scores, MEAN, plain) + scores.definitions(own)
+        assert ("against simulated outcome" in text) is there
+        assert ("same outcome" in text) is there
+        assert text.count('<th scope="row">') == len(own.names) + len(COMPUTED)
+        cells = text.count("<td>") / text.count('<th scope="row">')
+        assert text.count('scope="col"') - 1 == cells
+
+
+def test_counts_and_gaps_are_written_in_one_way(make_comparison: Maker) -> None:
+    column = blocks.PageColumn("rows", "rows", "count")
+    assert column.cell(pd.Series({"rows": 120000})) == "120000"
+    comparison = make_comparison()
+    assert not re.search(r"\d–", people.averages(comparison) + scores.matrix(comparison, "r"))
+
+
+def test_models_are_held_against_the_first_in_the_files(make_comparison: Maker) -> None:
+    comparison = make_comparison()
+    assert comparison.names != sorted(comparison.names)
+    spread = comparison.scores.assign(accuracy=np.linspace(0.4, 0.9, len(comparison.scores)) ** 2)
+    comparison = dataclasses.replace(comparison, scores=spread)
+    models = fits_of_models(comparison)[0]
+    assert models.fit is not None
+    terms = models.fit.table["term"].tolist()
+    assert len(terms) == 2 and comparison.names[1] in terms[1]
+    assert comparison.names[0] in models.about
+
+
+# --- published results --------------------------------------------------------------------------
+
+
+PUBLISHED = [*(f"panel_{name}" for name in "acde"), "figure_s1", "figure_s3"]
+
+
 @pytest.mark.nightly
 @pytest.mark.slow
-def test_the_official_people_make_a_page(official: Path, tmp_path: Path) -> None:
-    names = pd.read_csv(official / "stimuli" / "stimulus_names_and_labels.csv")
-    p = np.random.default_rng(0).random(len(names))
-    table = pd.DataFrame({"Model": "coin", "Readout Type": "C", "Predicted Prob_true": p})
-    table["Predicted Outcome"], table["Actual Outcome"] = p > 0.5, names["label"]
-    table["Stimulus Name"] = names["stim_ID"]
-    table.to_csv(tmp_path / "p.csv", index=False)
-    result = compare(tmp_path / "p.csv", humans=official / "humans")
-    path = result.report(tmp_path / "out")
-    left = pd.read_csv(tmp_path / "out" / "tables" / "left_out.csv")
-    assert dict(zip(left["reason"], left["stimuli"], strict=True)) == {
-        "Roll stimulus with a ledge": 56
+def test_the_page_of_the_published_results(official: Path, tmp_path: Path) -> None:
+    built = build_published_report(published_results(official), tmp_path / "published")
+    whole = re.sub(r"<(style|figure)>.*?</\1>", " ", built.read_text(encoding="utf-8"), flags=re.S)
+    text = " ".join(unescape(re.sub(r"<[^>]+>", " ", whole)).split())
+    table = pd.read_csv(built.parent / "tables" / "accuracies.csv")
+    for column in ("published", "expected"):
+        values = table.loc[table["model"] == "DPI", column]
+        words = " ".join(f"{value:.3f}" for value in [*values, values.mean()])
+        assert f"DPI {words}" in text
+    assert "mix detection into prediction" in text
+    assert "released table calls pVGG a Transformer" in text
+    assert "only when readout full, which sees the outcome, is pooled in" in text
+    for name in ("S2", "S4", "S5"):
+        assert re.search(rf"Figures that the released tables do not determine .* {name} ", text)
+    assert "interval by the paper's way" in text
+    names = {path.name for path in (built.parent / "figures").iterdir()}
+    assert names == {
+        f"{name}.{kind}" for name in PUBLISHED for kind in ("svg", "pdf", "png", "csv")
     }
-    scores = pd.read_csv(tmp_path / "out" / "tables" / "comparison.csv")
-    scores = scores[scores["base_model"] == "coin"].set_index("scenario")
-    assert scores.loc[MEAN, "accuracy"] == pytest.approx(0.5, abs=0.06)
-    assert scores.loc[MEAN, "r_low"] < 0 < scores.loc[MEAN, "r_high"]
-    assert "coin" in page_of(path).text
-    assert path.stat().st_size < 3_000_000
+    values = json.loads((built.parent / "published.json").read_text())
+    assert len(values["tables"]["accuracies"]) == 88
+    panel = pd.read_csv(built.parent / "figures" / "panel_a.csv")
+    assert set(panel.loc[panel["panel"] == "mean", "zone"]) == {SCENARIO_ZONE}
+    assert panel["value"].notna().all() and len(panel) == 99

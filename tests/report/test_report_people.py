@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis.model_tests import permutations_of
 from physion.analysis.people.responses import PERSON, REHEARSAL
 from physion.analysis.statistics.agreement import cross_kappa
 from physion.analysis.tables import attributes_from_table
@@ -24,7 +23,6 @@ from physion.report.compare import compare
 from physion.report.figures.theme import make_plots
 from physion.report.page import render_page
 from support.small_study import (
-    PEOPLE,
     STEMS,
     STIMULI,
     compare_small,
@@ -72,31 +70,6 @@ def test_every_figure_has_its_files(report: Path) -> None:
 
 
 @pytest.mark.nightly
-def test_flagged_session_is_counted_and_left_out(report: Path) -> None:
-    flags = pd.read_csv(report.parent / "tables" / "people_flags.csv")
-    assert flags.loc[flags["flagged"], "session"].tolist() == ["collide-7"]
-    text = text_of(report)
-    assert "Flagged and left out: 1 of 16 sessions" in text
-    assert "session is flagged 1 16" in text
-    people = pd.read_csv(report.parent / "tables" / "people_by_scenario.csv").set_index("scenario")
-    assert people.loc["collide", "people"] == PEOPLE - 1 and people.loc["drop", "people"] == PEOPLE
-
-
-@pytest.mark.nightly
-def test_with_and_without_flagged_sessions(report: Path) -> None:
-    table = pd.read_csv(report.parent / "tables" / "people_with_and_without.csv")
-    own = table[table["scenario"] == "collide"].set_index("sessions")
-    answers = responses()
-    right = (answers["response"] == "yes") == answers["label"]
-    own_right = right[answers["scenario"] == "collide"]
-    assert own.loc["complete", "accuracy"] == pytest.approx(own_right.mean())
-    assert own.loc["unflagged", "accuracy"] == pytest.approx(own_right[:-STIMULI].mean())
-    tables = [pd.read_csv(report.parent / "tables" / f"{name}.csv")
-              for name in ("comparison", "comparison_with_flagged")]  # fmt: skip
-    assert not np.allclose(tables[0]["r"], tables[1]["r"])
-
-
-@pytest.mark.nightly
 def test_kappa_of_the_figure_is_the_mean_over_people(report: Path) -> None:
     table = pd.read_csv(report.parent / "figures" / "kappa.csv").set_index(["panel", "model"])
     answers = responses()
@@ -120,42 +93,26 @@ def test_band_of_the_paper_bears_its_name(report: Path) -> None:
 
 
 @pytest.mark.nightly
-def test_tests_and_mixed_models_are_reported(report: Path) -> None:
-    text = text_of(report)
-    assert "test of McNemar" in text and "Holm" in text
-    assert "correct ~ scenario + (1|participant) + (1|stimulus)" in text
-    assert "log_rt ~ accuracy + scenario" in text
-    assert "accuracy ~ model + (1|scenario)" in text
+def test_the_page_says_what_was_fitted_and_from_what(report: Path) -> None:
+    text, tables = text_of(report), report.parent / "tables"
+    for words in (
+        "Flagged and left out: 1 of 16 sessions", "session is flagged 1 16", "test of McNemar",
+        "Holm", "correct ~ scenario + (1|participant) + (1|stimulus)", "log_rt ~ accuracy + scenario",
+        "accuracy ~ model + (1|scenario)", "tables/people_items.csv",
+        "Attributes: of 32 stimuli 0 by the table that was given, 32 by their official",
+        "H1, preregistered: Stimuli with more elements are harder (logistic): not fitted",
+    ):  # fmt: skip
+        assert words in text, words
     values = json.loads((report.parent / "report.json").read_text())
     assert len(values["paired_tests"]) == 3
     fitted = {row["term"] for row in values["mixed_flagged"]}
     assert {"flagged", "sd of participant", "sd of stimulus"} <= fitted
-
-
-@pytest.mark.nightly
-def test_items_have_a_table_that_the_page_names(report: Path) -> None:
-    text, tables = text_of(report), report.parent / "tables"
+    first = next(row for row in values["people_hypotheses"] if row["hypothesis"] == "H1")
+    assert first["b"] is None and "predictor" in first["reason"]
     items = pd.read_csv(tables / "people_items.csv")
     assert set(items["stimulus"]) == {
         f"{s}_{i:04d}" for s in STEMS.values() for i in range(STIMULI)
     }
-    assert "tables/people_items.csv" in text
-
-
-@pytest.mark.nightly
-def test_attributes_by_name_are_said_to_be_so(report: Path) -> None:
-    words = "Attributes: of 32 stimuli 0 by the table that was given, 32 by their official"
-    assert words in text_of(report)
-
-
-@pytest.mark.nightly
-def test_hypotheses_without_their_attribute_give_a_reason(report: Path) -> None:
-    values = json.loads((report.parent / "report.json").read_text())
-    first = next(row for row in values["people_hypotheses"] if row["hypothesis"] == "H1")
-    assert first["b"] is None and "predictor" in first["reason"]
-    assert "H1, preregistered: Stimuli with more elements are harder (logistic): not fitted" in (
-        text_of(report)
-    )
 
 
 @pytest.mark.nightly
@@ -171,45 +128,25 @@ def test_bytes_repeat(report: Path, tmp_path: Path) -> None:
 # --- what is refused ----------------------------------------------------------------------------
 
 
-def test_two_kinds_of_people_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="not both"):
-        compare(_predictions(tmp_path), humans=tmp_path, responses=tmp_path / "r.csv")
-
-
-def _predictions(folder: Path) -> Path:
-    predictions().to_csv(folder / "p.csv", index=False)
-    return folder / "p.csv"
-
-
-def test_unknown_rules_are_refused_with_the_known_ones(tmp_path: Path) -> None:
+def test_bad_combinations_are_refused(tmp_path: Path) -> None:
+    predictions().to_csv(tmp_path / "p.csv", index=False)
+    responses().to_csv(tmp_path / "r.csv", index=False)
+    own = {"responses": tmp_path / "r.csv"}
+    labels = {responses()["stimulus"].iloc[0]: False}
+    for given, options, words in (
+        (tmp_path / "p.csv", {**own, "humans": tmp_path}, "not both"),
+        (tmp_path / "p.csv", {**own, "labels": labels}, "ends otherwise"),
+        ((), {}, "no predictions"),
+    ):
+        with pytest.raises(BadInputError, match=words):
+            compare(given, **options)
+    with pytest.raises(BadInputError, match="about predictions"):
+        compare(**own).report(tmp_path / "out", movie_count=3)
+    assert not (tmp_path / "out").exists()
     with pytest.raises(UnknownNameError, match="preregistered"):
         compare_small(tmp_path, rules="preregistred")
-
-
-def test_labels_that_contradict_are_refused(tmp_path: Path) -> None:
-    answers = responses()
-    labels = {answers["stimulus"].iloc[0]: False}
-    answers.to_csv(tmp_path / "r.csv", index=False)
-    with pytest.raises(BadInputError, match="ends otherwise"):
-        compare(_predictions(tmp_path), labels=labels, responses=tmp_path / "r.csv")
-
-
-def test_no_session_left_is_refused(tmp_path: Path) -> None:
-    answers = responses().assign(response="yes")
     with pytest.raises(BadInputError, match="all 16 sessions are flagged"):
-        compare_small(tmp_path, answers)
-
-
-@pytest.mark.nightly
-def test_rules_that_leave_out_many_are_warned_of(report: Path, tmp_path: Path) -> None:
-    answers = responses()
-    lazy = (answers["scenario"] == "drop") & answers["participant"].isin(
-        answers.loc[answers["scenario"] == "drop", "participant"].unique()[:4]
-    )
-    answers.loc[lazy, "response"] = "yes"
-    words = "'streak' leaves out 4 of 8 sessions of drop"
-    assert words not in text_of(report)
-    assert words in page_text(tmp_path, answers=answers)
+        compare_small(tmp_path, responses().assign(response="yes"))
 
 
 @pytest.mark.nightly
@@ -266,11 +203,6 @@ def test_answers_without_times_say_so(tmp_path: Path) -> None:
     assert "no answer has one above 0" in plain(render_page(result.inputs, []))
 
 
-def test_permutations_let_holm_find_something() -> None:
-    for pairs in (1, 50, 190, 400):
-        assert pairs / (1 + permutations_of(pairs)) < 0.05
-
-
 @pytest.mark.nightly
 def test_only_people(report: Path, tmp_path: Path) -> None:
     responses().to_csv(tmp_path / "responses.csv", index=False)
@@ -313,12 +245,3 @@ def test_a_rehearsal_with_only_people_is_marked(
     assert main([*command, "--exclude", str(tmp_path / "exclude.txt")]) == 2
     error = capsys.readouterr().err
     assert f"closest: {STEMS['drop']}_00" in error and error.count("\n") == 1
-
-
-def test_only_people_have_no_results_of_models(tmp_path: Path) -> None:
-    responses().to_csv(tmp_path / "responses.csv", index=False)
-    with pytest.raises(BadInputError, match="about predictions"):
-        compare(responses=tmp_path / "responses.csv").report(tmp_path / "out", movie_count=3)
-    with pytest.raises(BadInputError, match="no predictions"):
-        compare()
-    assert not (tmp_path / "out").exists()

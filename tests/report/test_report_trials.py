@@ -28,7 +28,6 @@ from physion.report.trials import (
     opening_trials,
     outcome,
     pick_readouts,
-    who_was_right,
     widest_gaps,
 )
 from physion.trials.video import encode_movie
@@ -137,18 +136,6 @@ def test_a_model_has_one_turn_and_none_without_an_opinion(make_comparison: Maker
     rows.loc[1, "p_contact"] = 0.01
     chosen = widest_gaps(with_stimuli(make_comparison(), rows), 8)
     assert list(chosen["model"]) == ["m1", "m1"] and list(chosen["stimulus"]) == ["a", "b"]
-
-
-def test_counts_of_who_was_right(make_comparison: Maker) -> None:
-    rows = some_rows(
-        human_accuracy=[0.9, 0.8, 0.7, 0.2, 0.1, 0.5, 0.5],
-        predicted=[True, False, False, True, False, True, False],
-    )
-    table = who_was_right(with_stimuli(make_comparison(), rows))
-    assert table.iloc[0].to_dict() == {
-        "model": "m · observed", "stimuli": 7, "both": 1, "only_people": 2,
-        "only_model": 1, "neither": 1, "divided": 2,
-    }  # fmt: skip
 
 
 # --- cards ----------------------------------------------------------------------------------------
