@@ -1,21 +1,30 @@
-"""physion train and evaluate: resumed after a kill, on two processes as on one, tables."""
+"""physion train and evaluate: resumed after a kill, on two processes as on one, bad input."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+import timm
+import torch
+from safetensors.torch import save_file
 
 from physion.cli.main import main
 from physion.trials.dataset import Dataset
+from physion.trials.index import write_index
+from physion.trials.video import encode_movie
 from support import cell_models, trained_models
-from support.moving_dots import make_dots
+from support.moving_dots import FRAMES, OBSERVED, SIZE, make_dots
 
 MODEL = f"{trained_models.__file__}:NextBrightness"
 SLOW = f"{trained_models.__file__}:SlowBrightness"
@@ -51,25 +60,6 @@ def heed_interrupts() -> None:
 def environment() -> dict[str, str]:
     paths = [str(TESTS), *filter(None, [os.environ.get("PYTHONPATH")])]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_a_second_run_does_nothing_and_says_so(
-    dots: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ["train", MODEL, str(dots.folder), "--out", str(tmp_path), *CPU]
-    assert main(arguments) == 0
-    (folder,) = (tmp_path / "training").iterdir()
-    shown = capsys.readouterr().out
-    assert "trained for 40 steps" in shown and shown.rstrip().endswith(str(folder))
-    before = files_of(tmp_path)
-    assert main(arguments) == 0
-    assert "was trained before" in capsys.readouterr().out
-    assert main([*arguments, "--json"]) == 0
-    (result,) = json.loads(capsys.readouterr().out)["trained"]
-    assert result["loaded"] and result["folder"] == str(folder) and result["steps"] == 40
-    assert result["validation"] < 1 and files_of(tmp_path) == before
 
 
 @pytest.mark.slow
@@ -166,19 +156,6 @@ def test_two_processes_train_as_one_that_accumulates(dots: Dataset, tmp_path: Pa
     assert len(losses) == 40 and losses[-1] < 0.5 * losses[0]
 
 
-@pytest.mark.slow
-def test_evaluate_finds_what_was_trained(
-    dots: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    chosen = ["--option", "encoder=test_vit", "image_size=64", "weights=random", "hidden=16"]
-    chosen += ["steps=5", "batch=4", "--out", str(tmp_path), *CPU]
-    assert main(["train", "frozen-encoder", str(dots.folder), *chosen]) == 0
-    before = {p: p.stat().st_mtime_ns for p in (tmp_path / "training").rglob("*")}
-    assert main(["evaluate", "frozen-encoder", str(dots.folder), *chosen]) == 0
-    assert "predictions: " in capsys.readouterr().out
-    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "training").rglob("*")} == before
-
-
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_models_protocols_and_seeds(
@@ -271,3 +248,131 @@ def test_what_is_interrupted_continues_and_a_second_run_trains_nothing(
     assert main(["train", model, *cells, "--out", str(tmp_path / "whole"), *CPU]) == 0
     one, other = (files_of(tmp_path / name / "training") for name in ("parts", "whole"))
     assert one == other
+
+
+# --- movies, weights and memory that do not suffice ---------------------------------------------
+
+
+HUGE = """
+import torch
+from support.trained_models import NextBrightness
+
+class HugeLoss(NextBrightness):
+    def loss(self, batch):
+        return {"loss": self.net(torch.empty(2**50)).sum()}
+
+class HugeStatistics(NextBrightness):
+    def prepare(self, sample):
+        self.center.fill_(torch.empty(2**50).sum())
+
+class HugeFeatures(NextBrightness):
+    def encode(self, batch):
+        return torch.empty(2**50)
+
+class HugeWeights(NextBrightness):
+    def _apply(self, function, recurse=True):
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB")
+"""
+ENCODE = ["--accelerator", "cpu", "--option", "untrained=true"]
+
+
+def refused(capsys: pytest.CaptureFixture[str], *command: str) -> str:
+    """The one line that a command prints, which ends with exit code 2."""
+    capsys.readouterr()
+    assert main(list(command)) == 2
+    error = capsys.readouterr().err.strip()  # of the end of the line that shows progress
+    assert error.count("\n") == 0 and error.startswith("physion: ")
+    return error
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("verb", "column", "change", "known"),
+    [
+        ("evaluate", "observed_movie", "cut", True),
+        ("train", "movie", "cut", True),
+        ("evaluate", "movie", (-5, SIZE, 30), True),
+        ("train", "movie", (-5, SIZE, 30), True),
+        ("evaluate", "observed_movie", (0, 32, 30), True),
+        ("train", "movie", (0, SIZE, 25), True),
+        ("evaluate", "movie", (0, SIZE, 25), False),
+    ],
+)
+def test_a_movie_that_does_not_fit_is_named(
+    verb: str, column: str, change: Any, known: bool, dots: Dataset, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """A change: frames more than there should be, pixels of a side, frames a second.
+
+    ``known``: the index holds the SHA-256 of the movie as it is.
+    """
+    copy = Dataset(shutil.copytree(dots.folder, tmp_path / "dots"))
+    trial = copy.trials("testing" if verb == "evaluate" else "training")[0]
+    path = getattr(copy.paths(trial), column)
+    frames = OBSERVED if column == "observed_movie" else FRAMES
+    if change == "cut":
+        message = "cannot be read|is damaged|is cut short"
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    else:
+        more, size, rate = change
+        pictures = np.full((frames + more, size, size, 3), 90, np.uint8)
+        path.write_bytes(encode_movie(pictures, rate=rate))
+        message = (
+            f"has {frames + more} frames of {size} x {size} pixels at {rate} a second, not {frames}"
+        )
+    if known:
+        row = copy.index["trial"] == trial
+        sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+        copy.index.loc[row, f"{column}_sha256"] = sha256
+        write_index(copy.folder, copy.index)
+    options = ["--option", "untrained=true"] if verb == "evaluate" else []
+    error = refused(capsys, verb, MODEL, str(copy.folder), "--out", str(tmp_path / "out"), *CPU,
+                    *options)  # fmt: skip
+    assert str(path) in error
+    expected = message if known else "was changed since it was made"
+    assert any(part in error for part in expected.split("|"))
+
+
+def test_memory_that_is_used_up_names_what_to_lower(
+    dots: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "huge.py"
+    file.write_text(HUGE)
+    train = ["train", "", str(dots.folder), "--accelerator", "cpu", "--out", str(tmp_path)]
+    messages = {
+        "HugeLoss": "lower the batch and accumulate more, such as batch 2 and accumulate 2",
+        "HugeStatistics": "use a smaller image_size or size of the model",
+        "HugeWeights": "use a smaller size of the model, or accelerator cpu",
+    }
+    for name, message in messages.items():
+        train[1] = f"{file}:{name}"
+        assert message in refused(capsys, *train, "--option", "batch=4")
+    evaluate = ["evaluate", f"{file}:HugeFeatures", str(dots.folder), "--out", str(tmp_path)]
+    assert "lower the option encoder_batch, now 4" in refused(capsys, *evaluate, *ENCODE)
+    one = [*ENCODE, "encoder_batch=1"]
+    assert "use a smaller image_size or size of the model" in refused(capsys, *evaluate, *one)
+
+
+def test_memory_that_numpy_lacks_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def exhausted(args: list[str]) -> int:
+        np.ones(2**50)
+        return 0
+
+    monkeypatch.setattr("physion.cli.main._run_verb", exhausted)
+    assert "lower the options encoder_batch" in refused(capsys, "ls")
+
+
+def test_weights_of_another_network_name_the_tensors(
+    dots: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "w.safetensors"
+    with torch.random.fork_rng(devices=[]):
+        save_file(timm.create_model("test_resnet", pretrained=False).state_dict(), path)
+    options = ["--option", "encoder=test_vit", "image_size=64", "hidden=4", f"weights={path}"]
+    out = ["--out", str(tmp_path / "out")]
+    command = ["evaluate", "frozen-encoder", str(dots.folder), *out, *ENCODE, *options[1:]]
+    error = refused(capsys, *command)
+    assert "does not fit encoder 'test_vit'" in error
+    assert "patch_embed.proj.weight is missing" in error
