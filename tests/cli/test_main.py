@@ -217,10 +217,7 @@ def test_negative_numbers_and_underscores_are_no_unknown_options(
         ("generate /nowhere --option robust=.9 --option labels=false", "--option is given twice"),
         ("evaluate --option folds=3 mean /nowhere", "--option takes NAME=VALUE, not 'mean'"),
         ("evaluate mean /nowhere --option logistic=3", "takes logistic.NAME=VALUE"),
-        (
-            "evaluate mean /nowhere --surprise --option folds=3",
-            "takes options of models only",
-        ),
+        ("evaluate mean /nowhere --surprise --option folds=3", "takes options of models only"),
         ("generate /nowhere --robust 0.9", "no such option --robust"),
         ("generate /nowhere --option --json", "--option needs a value: NAME=VALUE"),
         ("generate /nowhere --option", "--option needs a value: NAME=VALUE"),

@@ -93,9 +93,7 @@ def test_trials_made_kept_and_failed_are_counted(
     assert (values["made"], values["kept"]) == (["a", "b", "c"], ["d", "e"])
 
 
-def test_every_number_of_a_replay_stands_below_its_name(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_every_number_of_a_replay_stands_below_its_name(capsys: pytest.CaptureFixture[str]) -> None:
     names = [field.name for field in dataclasses.fields(ReplayRow)]
     numbers = {name: 0.011 * (k + 1) for k, name in enumerate(names)}
     values = numbers | {"scenario": "drop", "trials": 9, "milliseconds": 31.0, "real_time": 47.0}

@@ -139,8 +139,7 @@ def test_gap_after_the_time_that_is_looked_ahead() -> None:
 
 
 @pytest.mark.parametrize(
-    ("start", "expected"),
-    [((0.0, 1.5, 0.0), 0.5), ((0.0, 0.9, 0.0), 0.0), ((0.0, 1.3, 1.4), 0.5)],
+    ("start", "expected"), [((0.0, 1.5, 0.0), 0.5), ((0.0, 0.9, 0.0), 0.0), ((0.0, 1.3, 1.4), 0.5)]
 )
 def test_gap_when_cubes_pass_each_other(start: Vec3, expected: float) -> None:
     motion = crossing(agent=start, velocity=(8.0, 0.0, 0.0), patient=(5.0, 0.0, 0.0))

@@ -31,16 +31,7 @@ from physion.models.noisy_simulation import (
 from physion.numerics.elementary import exp_of, standard_normal
 from physion.physics.engine import make_engine, simulate
 from physion.physics.trajectory import Contacts, State, Trajectory
-from physion.scenes.scene import (
-    Body,
-    Camera,
-    Cloth,
-    Joint,
-    Push,
-    Roles,
-    Scene,
-    SurfaceMaterial,
-)
+from physion.scenes.scene import Body, Camera, Cloth, Joint, Push, Roles, Scene, SurfaceMaterial
 from support.paths import ROOT
 
 FRAMES = 120

@@ -60,8 +60,7 @@ def test_likelihood_matches_a_mixture() -> None:
     found = log_likelihood(decoded, pictures, 0.2, "gaussian")
     colors = decoded.colors.permute(0, 3, 4, 1, 2)
     mixture = MixtureSameFamily(
-        Categorical(decoded.masks[:, :, 0].permute(0, 2, 3, 1)),
-        Independent(Normal(colors, 0.2), 1),
+        Categorical(decoded.masks[:, :, 0].permute(0, 2, 3, 1)), Independent(Normal(colors, 0.2), 1)
     )
     assert torch.allclose(found.pixels, mixture.log_prob(pictures.permute(0, 2, 3, 1)), atol=1e-4)
 

@@ -12,14 +12,7 @@ from torch import Tensor, nn
 
 from physion.clips.batch import Batch
 from physion.models.build import build_model, make_settings
-from physion.models.svg import (
-    CodePredictor,
-    Decoder,
-    Encoder,
-    GaussianPredictor,
-    Svg,
-    SvgSettings,
-)
+from physion.models.svg import CodePredictor, Decoder, Encoder, GaussianPredictor, Svg, SvgSettings
 from physion.models.vision import copy_error, moving_pixels
 from support.moving_squares import squares, with_arrays
 

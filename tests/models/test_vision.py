@@ -14,12 +14,7 @@ from torch.distributions import Independent, Normal, kl_divergence
 from physion.clips.batch import Batch
 from physion.core.errors import BadInputError
 from physion.models.build import build_model
-from physion.models.checkpoint import (
-    WEIGHTS,
-    DamagedFileError,
-    tensors_of,
-    write_checkpoint,
-)
+from physion.models.checkpoint import WEIGHTS, DamagedFileError, tensors_of, write_checkpoint
 from physion.models.interface import TrainingSettings
 from physion.models.vision import (
     CHANGE,

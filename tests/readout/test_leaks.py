@@ -21,11 +21,7 @@ from physion.trials.dataset import Dataset
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, plan_dataset
 from support.late_motions import make_late_motions
-from support.leak_checks import (
-    with_exchanged_futures,
-    with_permuted_labels,
-    with_poisoned_futures,
-)
+from support.leak_checks import with_exchanged_futures, with_permuted_labels, with_poisoned_futures
 from support.moving_dots import make_dots
 from support.tiny_models import OPTIONS, TINY
 from support.viewer_dataset import make_dataset

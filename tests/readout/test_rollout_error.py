@@ -135,7 +135,7 @@ def test_a_trial_that_was_cut_has_no_later_frames() -> None:
     particles, poses = start_of(motion, range(2, 45, STRIDE))
     still = standing_still(poses, 60)
     assert motion_error(motion, particles, still, STRIDE, 105)["frames"].tolist() == [
-        *(3, 6, 9, 12, 15),
+        *(3, 6, 9, 12, 15)
     ]
     trajectory = motion.trajectory
     names = ("positions", "rotations", "velocities", "angular_velocities", "cloth_vertices")

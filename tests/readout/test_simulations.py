@@ -206,10 +206,7 @@ def test_a_trial_that_fails_is_named_and_the_others_go_on(tmp_path: Path) -> Non
     shelf: Any = Shelf(4, 3)
     broken = NoisySimulation(CONFIG, Flight(fail="collide_testing_1"))
     evaluation = evaluate(broken, shelf, tmp_path)
-    assert set(evaluation.predictions["stimulus"]) == {
-        "collide_testing_0",
-        "collide_testing_2",
-    }
+    assert set(evaluation.predictions["stimulus"]) == {"collide_testing_0", "collide_testing_2"}
     assert "diverged" in evaluation.evaluated[0].problems["collide_testing_1"]
     assert evaluation.paths[0].name.endswith(".partial.csv")
     whole = NoisySimulation(CONFIG, Flight())

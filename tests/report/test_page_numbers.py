@@ -200,8 +200,7 @@ SCORES = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("place", "scenario"),
-    [("Scores / Mean over scenarios", MEAN), ("All stimuli pooled", POOLED)],
+    ("place", "scenario"), [("Scores / Mean over scenarios", MEAN), ("All stimuli pooled", POOLED)]
 )
 def test_scores_of_models(inputs: ReportInputs, page: str, place: str, scenario: str) -> None:
     table = find(page.partition(">Beyond the outcome<")[0], place)

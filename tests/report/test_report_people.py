@@ -22,13 +22,7 @@ from physion.report.build import report_numbers
 from physion.report.compare import compare
 from physion.report.figures.theme import make_plots
 from physion.report.page import render_page
-from support.small_study import (
-    STEMS,
-    STIMULI,
-    compare_small,
-    predictions,
-    responses,
-)
+from support.small_study import STEMS, STIMULI, compare_small, predictions, responses
 
 pytestmark = pytest.mark.slow
 

@@ -259,9 +259,7 @@ def test_one_sentence_says_what_each_model_was_given(
 
 
 @pytest.mark.slow
-def test_one_sentence_says_which_weights_each_model_started_from(
-    make_comparison: Maker,
-) -> None:
+def test_one_sentence_says_which_weights_each_model_started_from(make_comparison: Maker) -> None:
     found = {"simulation": "none", "encoder": "imagenet"}
     inputs = ReportInputs(make_comparison(), model_weights=found)
     sentence = "Weights that each network started from: encoder: imagenet."

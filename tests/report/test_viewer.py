@@ -25,13 +25,7 @@ from physion.report.viewer.imagined import STEPS, pack_grid
 from physion.report.viewer.movies import fitted
 from physion.trials.dataset import Dataset
 from physion.trials.video import read_frames
-from support.viewer_dataset import (
-    EVIL,
-    FRAMES,
-    PLANS,
-    Plan,
-    make_dataset,
-)
+from support.viewer_dataset import EVIL, FRAMES, PLANS, Plan, make_dataset
 
 SMALL = ViewerOptions(card_size=32, pass_size=32, stride=6)
 
@@ -218,8 +212,7 @@ def test_details_only_where_asked(dataset: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [{"trials": 0}, {"details": -1}, {"stride": 0}, {"card_size": 8}, {"pass_size": 5000}],
+    "wrong", [{"trials": 0}, {"details": -1}, {"stride": 0}, {"card_size": 8}, {"pass_size": 5000}]
 )
 def test_impossible_options_are_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(BadInputError, match=next(iter(wrong))):
@@ -297,7 +290,7 @@ def test_tables_say_what_is_in_the_trial(dataset: Path) -> None:
     trial = Dataset(dataset).trial("drop_0")
     tables = {table["title"]: table for table in viewer_facts.tables(trial)}
     assert list(tables) == [
-        *("Bodies", "Pushes", "Trial", "Parameters of the scenario", "Camera, room, ending"),
+        *("Bodies", "Pushes", "Trial", "Parameters of the scenario", "Camera, room, ending")
     ]
     ball = dict(zip(tables["Bodies"]["header"], tables["Bodies"]["rows"][0], strict=True))
     assert ball["role"] == "agent" and ball["mass (kg)"] == "1.25"
@@ -310,9 +303,7 @@ def test_tables_say_what_is_in_the_trial(dataset: Path) -> None:
     assert facts["seed"] == "ff01" and facts["digest of the motion"] == trial.metadata.digest
     hidden = {tables["Trial"]["rows"][i][0] for i in tables["Trial"]["outcome"]}
     assert {"contact", "first frame of contact", "contact while observed"} <= hidden
-    assert tables["Parameters of the scenario"]["rows"][:2] == [
-        *(["height", "1"], ["key", "1"]),
-    ]
+    assert tables["Parameters of the scenario"]["rows"][:2] == [*(["height", "1"], ["key", "1"])]
 
 
 def test_values_as_people_read_them() -> None:

@@ -394,7 +394,6 @@ def test_trials_are_marked_and_the_file_is_offered(browser: Browser, page: Path)
 # --- what vision models saw and imagined --------------------------------------------------------
 
 
-
 TILES = {
     "svg": ["true", "imagined"],
     "op3": ["true", "imagined", "masks"],

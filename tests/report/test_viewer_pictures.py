@@ -98,10 +98,7 @@ def test_boxes_that_are_not_known_are_left_out() -> None:
     seen[1, 1, 2] = np.nan
     shown[:, 0] = np.nan
     shown[3, 1] = (-9, 0.1, 0.2, 9)
-    one = imagined(
-        shown={"boxes": shown},
-        seen={"rgb": greys(SEEN), "boxes": seen},
-    )
+    one = imagined(shown={"boxes": shown}, seen={"rgb": greys(SEEN), "boxes": seen})
     boxes = packed(one)["boxes"]
     assert boxes[0] == [[0.25] * 4] * 2 and boxes[1] == [[0.25] * 4, None]
     assert boxes[3] == [None, [0.5] * 4] and boxes[6] == [None, [-1, 0.1, 0.2, 2]]

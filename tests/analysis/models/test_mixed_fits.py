@@ -10,12 +10,7 @@ from statsmodels.stats.multitest import multipletests
 
 from physion.analysis.comparison import compare_scores
 from physion.analysis.intervals import Bootstrap
-from physion.analysis.model_tests import (
-    MixedTable,
-    fits_of_models,
-    fits_of_people,
-    group_contrasts,
-)
+from physion.analysis.model_tests import MixedTable, fits_of_models, fits_of_people, group_contrasts
 from physion.analysis.people.results import PeopleResults, analyse_people
 from physion.analysis.tables import MEAN, POOLED, attributes_from_table, name_models
 from physion.core.errors import BadInputError

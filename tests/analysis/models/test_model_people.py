@@ -11,12 +11,7 @@ import pandas as pd
 import pytest
 from sklearn.metrics import cohen_kappa_score
 
-from physion.analysis.compare import (
-    PeopleComparison,
-    all_results,
-    compare_everywhere,
-    tidy_scores,
-)
+from physion.analysis.compare import PeopleComparison, all_results, compare_everywhere, tidy_scores
 from physion.analysis.intervals import Bootstrap, Variance, degrees_of_freedom
 from physion.analysis.metrics import measure_metrics, metrics
 from physion.analysis.people.effects import difficulty_third, r_by_third

@@ -43,11 +43,7 @@ from physion.analysis.people.measures import (
 )
 from physion.analysis.people.responses import Responses
 from physion.analysis.statistics import agreement
-from physion.analysis.statistics.agreement import (
-    correlate_rows,
-    pair_values,
-    pairwise_kappa,
-)
+from physion.analysis.statistics.agreement import correlate_rows, pair_values, pairwise_kappa
 from physion.analysis.tables import (
     ATTRIBUTES,
     MISLABELLED,

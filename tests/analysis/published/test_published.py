@@ -345,9 +345,7 @@ def regressions(released: PublishedTables) -> pd.DataFrame:
     return published_regressions(released).set_index("claim")
 
 
-def test_the_earlier_state_has_the_rows_of_the_released_notebook(
-    released: PublishedTables,
-) -> None:
+def test_the_earlier_state_has_the_rows_of_the_released_notebook(released: PublishedTables) -> None:
     twice = released_state(released.runs, "twice")
     counts = twice.groupby("model")["accuracy"].size()
     # Numbers of observations that the released notebook prints for its regressions.

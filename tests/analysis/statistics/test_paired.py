@@ -17,11 +17,7 @@ from statsmodels.stats.contingency_tables import mcnemar
 from statsmodels.stats.multitest import multipletests
 
 from physion.analysis.intervals import Bootstrap
-from physion.analysis.model_tests import (
-    PooledStimuli,
-    paired_tests,
-    permutations_of,
-)
+from physion.analysis.model_tests import PooledStimuli, paired_tests, permutations_of
 from physion.analysis.statistics.agreement import pearson
 from physion.analysis.statistics.paired import (
     corrected_p,

@@ -38,11 +38,7 @@ from physion.models.particles.rollout import (
     read_window,
     smallest_distance,
 )
-from physion.models.particles.simulator import (
-    CONTACT_SPACINGS,
-    ParticleSimulator,
-    observed_start,
-)
+from physion.models.particles.simulator import CONTACT_SPACINGS, ParticleSimulator, observed_start
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
 from physion.scenes.scene import BodyEvent, Ending
