@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import pytest
 
 import physion
@@ -122,39 +121,13 @@ def test_each_scenario_trains_a_model_that_is_tested_on_all(dots: Dataset, tmp_p
     hits = ((rows["p_contact"] > 0.5) == rows["outcome"]).mean()
     assert scores["one: drop", "full", "collide"] == hits
     planned = physion.train(IMAGINING, dots, tmp_path, dry_run=True, protocols="one", settings=CPU)
-    assert [(plan.name, plan.done) for plan in planned.planned] == [
-        ("collide", True),
-        ("drop", True),
-    ]
+    assert [(one.name, one.done) for one in planned.planned] == [("collide", True), ("drop", True)]
     (single,) = physion.train(
         IMAGINING, dots, tmp_path, dry_run=True, protocols="one", scenario="drop", settings=CPU
     ).planned
     assert single.name == "drop"
     with pytest.raises(BadInputError, match="all-but, only or one"):
         physion.train(IMAGINING, dots, tmp_path, dry_run=True, scenario="drop", settings=CPU)
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_trainings_on_one_scenario_fill_the_heat_map(dots: Dataset, tmp_path: Path) -> None:
-    """From trainings to the figure's table: each cell is the accuracy in the predictions."""
-    given: dict[str, Any] = {"protocols": ("all", "one"), "settings": QUICK}
-    done = physion.evaluate(IMAGINING, dots, tmp_path / "models", **given)
-    physion.compare(done.paths).report(tmp_path / "report")
-    assert (tmp_path / "report" / "figures" / "generalization.png").is_file()
-    cells = pd.read_csv(tmp_path / "report" / "figures" / "generalization.csv")
-    assert len(cells) == 3 * 3 * 2, "readouts, trainings with *all*, tested scenarios"
-    rows = done.predictions
-    rows = rows.assign(
-        right=(rows["p_contact"] > 0.5) == rows["outcome"],
-        trained=rows["dynamics_training_dataset"].replace("", "all"),
-    )
-    expected = rows.groupby(["readout", "trained", "scenario"])["right"].mean()
-    for _, cell in cells.iterrows():
-        readout = cell["model"].partition(" · ")[2]
-        right = expected[readout, cell["trained"], cell["tested"]]
-        assert cell["accuracy"] == pytest.approx(right)
-        assert cell["difference"] == pytest.approx(right - 0.5), "without people: to guessing"
 
 
 @pytest.mark.slow
@@ -234,23 +207,6 @@ def test_evaluate_finds_what_was_trained_and_one_protocol_is_a_part_of_all(
     assert (drop.predictions["p_contact"] == whole["p_contact"]).all()
     untrained = physion.evaluate(UNTRAINED, dots, tmp_path, scenario="drop", settings=QUICK)
     assert set(untrained.predictions["scenario"]) == {"drop"}
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_one_that_fails_does_not_stop_the_others(dots: Dataset, tmp_path: Path) -> None:
-    trained = physion.train([FAILS, IMAGINING], dots, tmp_path, protocols=EVERY, settings=CPU)
-    assert list(trained.failed) == [f"{FAILS}, {protocol}, seed 0" for protocol in EVERY]
-    assert all("no drop, please" in reason for reason in trained.failed.values())
-    assert all("\n" not in reason for reason in trained.failed.values())
-    assert len(trained.trained) == 5
-    evaluated = physion.evaluate(
-        [FAILS, IMAGINING], dots, tmp_path, protocols=("all", "only"), settings=QUICK
-    )
-    assert list(evaluated.failed) == [f"{FAILS}, all, seed 0", f"{FAILS}, only, seed 0"]
-    assert [one.protocol for one in evaluated.evaluated] == ["all", "only"]
-    with pytest.raises(BadInputError, match="no drop, please"):
-        physion.train(FAILS, dots, tmp_path, settings=CPU)
 
 
 def test_a_mistake_is_found_before_anything_is_done(dots: Dataset, tmp_path: Path) -> None:

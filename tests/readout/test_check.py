@@ -312,6 +312,18 @@ def test_half_of_the_tested_trials_fit_where_there_are_no_others(tmp_path: Path)
         take_trials(make_dots(tmp_path / "none", {"readout": 2}, ("drop",)), tmp_path / "x", 8)
 
 
+def write_models(folder: Path) -> Path:
+    """Write a file with a model that leaks and one that does not."""
+    file = folder / "own.py"
+    file.write_text(
+        "from support import leaking_models as leaks\n"
+        "class Cheat(leaks.Cheater):\n"
+        "    def __init__(self): super().__init__(leaks.number_in_the_name)\n"
+        "class Good(leaks.Honest): pass\n"
+    )
+    return file
+
+
 @pytest.mark.slow
 def test_the_verb(
     made: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
@@ -324,12 +336,7 @@ def test_the_verb(
     assert "blob-centroids passed: none of 1 changes moved a prediction" in text
     page = (out / "blob-centroids.html").read_text()
     assert CHANGES["future"].what in page and "must not move a prediction" in page
-    file = tmp_path / "cheater.py"
-    file.write_text(
-        "from support import leaking_models as leaks\n"
-        "class Cheat(leaks.Cheater):\n"
-        "    def __init__(self): super().__init__(leaks.number_in_the_name)\n"
-    )
+    file = write_models(tmp_path)
     code = main(["check", f"{file}:Cheat", str(made.folder), *few, "--changes", "names", "--json"])
     answer = json.loads(capsys.readouterr().out)
     assert code == 1 and answer["refused"] == ["names"] and not answer["passed"]
@@ -400,13 +407,7 @@ def test_evaluate_writes_the_verdict_into_the_table(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("physion.readout.check.CHANGES", {"names": CHANGES["names"]})
-    file = tmp_path / "own.py"
-    file.write_text(
-        "from support import leaking_models as leaks\n"
-        "class Cheat(leaks.Cheater):\n"
-        "    def __init__(self): super().__init__(leaks.number_in_the_name)\n"
-        "class Good(leaks.Honest): pass\n"
-    )
+    file = write_models(tmp_path)
     models = f"{file}:Cheat,{file}:Good"
     command = ["evaluate", models, str(made.folder), "--out", str(tmp_path / "out")]
     assert main([*command, "--check", "--workers", "1"]) == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
@@ -21,6 +22,7 @@ from sklearn.preprocessing import StandardScaler
 from physion.analysis.tables import check_predictions
 from physion.clips.batch import Batch, Provenance, Rollout, Spec
 from physion.core.errors import BadInputError, UnknownNameError
+from physion.core.files import digest_of
 from physion.models import build_model, models
 from physion.models.interface import TrainingSettings
 from physion.readout.decisions import Decided
@@ -38,6 +40,7 @@ from physion.readout.tables import (
     write_table,
 )
 from physion.trials.dataset import Dataset
+from physion.trials.index import write_index
 from support.moving_dots import make_dots
 from support.tiny_models import TINY
 from support.trained_models import NextBrightness
@@ -67,16 +70,6 @@ def accuracy(table: pd.DataFrame, protocol: str) -> float:
     return float(((rows["p_contact"] > 0.5) == rows["outcome"]).mean())
 
 
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_full_is_far_above_chance_and_observed_is_not(done: Evaluation) -> None:
-    """The dot changes direction after the observed part, which therefore does not predict it."""
-    table = done.predictions
-    assert accuracy(table, "full") > 0.5 + 3 * np.sqrt(0.25 / 40)
-    for protocol in ("observed", "observed+simulated"):
-        assert abs(accuracy(table, protocol) - 0.5) < 3 * np.sqrt(0.25 / 40)
-
-
 @pytest.mark.slow
 def test_the_table_has_one_row_per_trial_and_readout(done: Evaluation, dots: Dataset) -> None:
     table = done.predictions
@@ -96,18 +89,14 @@ def test_the_table_has_one_row_per_trial_and_readout(done: Evaluation, dots: Dat
     assert (table["recorded_outcome"] == "").all()
     assert (table["fit_labels"] == "simulated").all()
     assert table["validation_loss"].notna().all() and table["copy_last_loss"].gt(0).all()
-
-
-@pytest.mark.slow
-def test_the_comparison_reads_the_table(done: Evaluation) -> None:
+    # The comparison reads it.
     checked = check_predictions(pd.read_csv(done.paths[0]))
-    assert set(checked["readout"]) == {"observed", "observed+simulated", "full"}
-    assert len(checked) == len(done.predictions)
+    assert set(checked["readout"]) == set(table["readout"]) and len(checked) == len(table)
 
 
 @pytest.mark.slow
-def test_a_second_run_does_nothing_and_says_the_same(
-    done: Evaluation, dots: Dataset, work: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_second_run_does_nothing_and_a_damaged_table_is_made_again(
+    done: Evaluation, dots: Dataset, work: Path
 ) -> None:
     steps: list[str] = []
 
@@ -117,11 +106,18 @@ def test_a_second_run_does_nothing_and_says_the_same(
     again = evaluate("frozen-encoder", dots, work, options=OPTIONS, settings=QUICK, progress=note)
     assert steps == [] and again.paths[0] == done.paths[0]
     pd.testing.assert_frame_equal(again.predictions, done.predictions)
-    content = done.paths[0].read_bytes()
-    done.paths[0].unlink()
+    (path,), content = done.paths, done.paths[0].read_bytes()
+    path.unlink()
     evaluate("frozen-encoder", dots, work, options=OPTIONS, settings=QUICK, progress=note)
     assert "features" not in steps and "training all" not in steps
-    assert done.paths[0].read_bytes() == content
+    assert path.read_bytes() == content
+    # A damaged table is made again.
+    for damaged in (b"\n".join(content.split(b"\n")[:3]) + b"\n", b"", b"\xff\xfe" + content,
+                    content.replace(b"True", b"Trve", 1)):  # fmt: skip
+        path.write_bytes(damaged)
+        again = evaluate("frozen-encoder", dots, work, options=OPTIONS, settings=QUICK)
+        assert again.paths[0].read_bytes() == content != damaged
+        pd.testing.assert_frame_equal(again.predictions, done.predictions)
 
 
 @pytest.mark.slow
@@ -143,25 +139,6 @@ def test_accuracies_are_known_as_soon_as_a_model_has_predicted(dots: Dataset, wo
         opposite = replace(one, path=work / "opposite.csv")
         write_table(table.assign(recorded_outcome=~table["outcome"]), opposite.path)
         assert list(opposite.accuracies().values()) == [pytest.approx(1 - accuracy)]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("damage", ["cut", "empty", "no text", "another number"])
-def test_a_damaged_table_is_made_again(
-    done: Evaluation, dots: Dataset, work: Path, damage: str
-) -> None:
-    content = done.paths[0].read_bytes()
-    changed = {
-        "cut": b"\n".join(content.split(b"\n")[:3]) + b"\n",
-        "empty": b"",
-        "no text": b"\xff\xfe" + content,
-        "another number": content.replace(b"True", b"Trve", 1),
-    }[damage]
-    assert changed != content
-    done.paths[0].write_bytes(changed)
-    again = evaluate("frozen-encoder", dots, work, options=OPTIONS, settings=QUICK)
-    assert again.paths[0].read_bytes() == content
-    pd.testing.assert_frame_equal(again.predictions, done.predictions)
 
 
 @pytest.mark.slow
@@ -235,13 +212,6 @@ def test_an_encoder_without_dynamics_has_two_readouts(
     assert np.allclose(same["p_contact"], again["p_contact"])
 
 
-@pytest.mark.slow
-def test_tables_survive_their_file(done: Evaluation, tmp_path: Path) -> None:
-    write_table(done.predictions, tmp_path / "t.csv")
-    read = read_table(tmp_path / "t.csv")
-    pd.testing.assert_frame_equal(read, done.predictions, check_exact=True)
-
-
 OBSERVED, LATER, FUTURES = (32, 38, 44), (50, 56, 62, 68), 2
 """Frames of a clip of six frames' stride whose context ends at frame 44, by hand."""
 
@@ -269,13 +239,8 @@ class Known:
         return np.array(features, np.float32)
 
     def imagine(self, context: Any, samples: int, seed: int) -> Rollout:
-        futures = [
-            [
-                [values_of(trial, "future", seed, k, step) for step in range(4)]
-                for k in range(samples)
-            ]
-            for trial in context.trials
-        ]
+        futures = [[[values_of(trial, "future", seed, k, step) for step in range(4)]
+                    for k in range(samples)] for trial in context.trials]  # fmt: skip
         return Rollout(features=np.array(futures, np.float32))
 
 
@@ -399,9 +364,8 @@ def rows_of(hits: dict[str, list[bool]], seed: int = 0, **changes: str) -> pd.Da
     """Return predictions that are right or not as ``hits`` says, by scenario."""
     rows = [
         {"model": "m", "init": "random", "protocol": "all", "readout": "full", "seed": str(seed),
-         "benchmark": "v1",
-         "dynamics_training_dataset": "",
-         "scenario": scenario, "outcome": True, "p_contact": float(hit), **changes}
+         "benchmark": "v1", "dynamics_training_dataset": "", "scenario": scenario,
+         "outcome": True, "p_contact": float(hit), **changes}
         for scenario, values in hits.items()
         for hit in values
     ]  # fmt: skip
@@ -488,3 +452,105 @@ def test_the_twin_of_a_trained_model_is_not_trained(dots: Dataset, tmp_path: Pat
     twin = table[table["init"] == "random"]
     assert (twin["note"] == "untrained").all() and (twin["protocol"] == "").all()
     assert not list((tmp_path / "training").glob("**/*.safetensors"))
+
+
+# --- readouts that are fitted on another dataset ------------------------------------------------
+
+
+SCENARIOS = ("collide", "drop")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("dots")
+    make_dots(folder / "tested", {"testing": 6, "readout": 4}, SCENARIOS)
+    make_dots(folder / "fit", {"readout": 12}, SCENARIOS)
+    make_dots(folder / "both", {"testing": 6, "readout": 12}, SCENARIOS)
+    return folder
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_predictions_are_equal_to_one_dataset_with_both_parts(folder: Path) -> None:
+    apart = evaluate("blob-centroids", folder / "tested", folder / "a", fit=folder / "fit")
+    whole = evaluate("blob-centroids", folder / "both", folder / "b").predictions
+    table = apart.predictions
+    pd.testing.assert_frame_equal(table.drop(columns="fit_on"), whole.drop(columns="fit_on"))
+    assert (table["fit_trials"] == 12).all() and set(whole["fit_on"]) == {""}
+    index = Dataset(folder / "fit").index
+    rows = zip(index["scenario"], index["digest"], index["contact"], strict=True)
+    digest = digest_of("\n".join(sorted(f"{s} {d} {int(c)}" for s, d, c in rows)))
+    assert set(table["fit_on"]) == {f"fit {digest[:12]}"}
+    again = evaluate("blob-centroids", folder / "tested", folder / "a", fit=folder / "fit")
+    assert again.evaluated[0].done
+    assert again.paths != evaluate("blob-centroids", folder / "tested", folder / "a").paths
+
+
+def changed(folder: Path, name: str, **columns: object) -> Path:
+    """Return a copy of the set ``fit`` whose index has other values in the first readout trial."""
+    index = Dataset(folder / "fit").index.copy()
+    for column, value in columns.items():
+        index.loc[0, column] = value
+    (folder / name).mkdir()
+    write_index(folder / name, index)
+    return folder / name
+
+
+@pytest.mark.slow
+def test_trials_that_do_not_fit_the_tested_ones_are_refused(folder: Path) -> None:
+    tested = Dataset(folder / "tested").index
+    digest = tested["digest"][tested["split"] == "testing"].iloc[0]
+    make_dots(folder / "drops", {"readout": 4}, ("drop",))
+    (folder / "names").mkdir()
+    write_index(folder / "names", tested.assign(split="readout"))
+    for fit, words in (
+        (changed(folder, "leak", digest=digest), "1 trials of .*leak have motions of tested trial"),
+        (changed(folder, "look", look="free"), "the look of tested trials is"),
+        (changed(folder, "width", width=128), "the size of the movies of tested trials is"),
+        (changed(folder, "rate", playback_seconds=1.0), "the frame rate of tested trials is"),
+        (folder / "drops", "has no trial of collide in the split readout"),
+        (folder / "names", "both have a trial 'collide_testing_0000'"),
+    ):
+        with pytest.raises(BadInputError, match=words):
+            evaluate("blob-centroids", folder / "tested", folder / "c", fit=fit)
+
+
+@pytest.mark.slow
+def test_a_file_of_features_may_have_all_trials_of_both_sets(folder: Path) -> None:
+    sets = [Dataset(folder / "tested").index, Dataset(folder / "fit").index]
+    chosen = pd.concat(sets).drop_duplicates("trial")
+    features = np.random.default_rng(0).normal(size=(len(chosen), 1, 3))
+    arrays = {"names": chosen["trial"].to_numpy(str), "frames": [44], "features": features}
+    np.savez(folder / "all.npz", **arrays)
+    # Readout trials of the tested set, under names that the other set does not have.
+    index = sets[0].copy()
+    own = index["split"] == "readout"
+    index.loc[own, "trial"] = "own_" + index["trial"][own]
+    (folder / "named").mkdir()
+    write_index(folder / "named", index)
+    arrays["names"] = np.append(arrays["names"], index["trial"][own].to_numpy(str))
+    arrays["features"] = np.pad(features, ((0, own.sum()), (0, 0), (0, 0)))
+    np.savez(folder / "own.npz", **arrays)
+    tables = [
+        evaluate(str(path), tested, folder / "d", fit=folder / "fit").predictions
+        for path, tested in (
+            (folder / "all.npz", folder / "tested"),
+            (folder / "own.npz", folder / "named"),
+        )
+    ]
+    assert (tables[0]["p_contact"] == tables[1]["p_contact"]).all() and len(tables[0]) == 12
+
+
+@pytest.mark.slow
+def test_labels_of_other_scenarios_are_not_needed(folder: Path) -> None:
+    index = Dataset(folder / "fit").index.copy()
+    index["contact"] = index["contact"].astype("boolean")
+    index.loc[index["scenario"] == "drop", "contact"] = pd.NA
+    shutil.copytree(folder / "fit", folder / "unlabelled")
+    write_index(folder / "unlabelled", index)
+    model, tested, fit = "blob-centroids", folder / "tested", folder / "unlabelled"
+    done = evaluate(model, tested, folder / "e", fit=fit, scenario="collide").predictions
+    assert set(done["scenario"]) == {"collide"} and done["stimulus"].nunique() == 6
+    for scenario in ("", "drop"):
+        with pytest.raises(BadInputError, match=r"12 trials .* are stored without labels"):
+            evaluate(model, tested, folder / "e", fit=fit, scenario=scenario)

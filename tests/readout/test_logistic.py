@@ -16,8 +16,8 @@ from sklearn.model_selection import GridSearchCV, StratifiedKFold
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from physion.core.errors import BadInputError, UnknownNameError
-from physion.readout.decisions import Readout, released_decision
+from physion.core.errors import BadInputError
+from physion.readout.decisions import released_decision
 from physion.readout.features import StoredFeatures, write_features
 from physion.readout.logistic import (
     C_GRID,
@@ -179,13 +179,6 @@ def test_constant_features_say_the_fraction_of_contacts(released: bool) -> None:
     assert fitted.probability == pytest.approx([0.6, 0.6], abs=1e-3)
 
 
-def test_a_constant_feature_next_to_others_counts_nothing() -> None:
-    features, labels = problem(40, 10)
-    more = np.column_stack([features, np.full(40, 0.1)])
-    plain, added = (fit_readout(x[:30], labels[:30], x[30:]) for x in (features, more))
-    assert added.probability == pytest.approx(plain.probability, abs=1e-9)
-
-
 def test_too_few_trials_of_an_answer_are_said() -> None:
     features, _ = problem(12, 5)
     rare = np.zeros(12, bool)
@@ -233,12 +226,6 @@ def test_bad_features_labels_and_settings_are_refused() -> None:
     for wrong in ({"grid": ()}, {"grid": (1.0, 0.1)}, {"grid": (-1.0, 1.0)}, {"folds": 1}):
         with pytest.raises(BadInputError):
             LogisticSettings(**wrong)  # type: ignore[arg-type]
-
-
-def test_readouts_are_named_as_in_the_paper() -> None:
-    assert [readout for readout in Readout if readout.sees_future] == [Readout.FULL]
-    with pytest.raises(UnknownNameError, match="observed"):
-        Readout.named("observd")
 
 
 def features_of(n: int, steps: int, size: int, seed: int = 0) -> np.ndarray:

@@ -91,8 +91,8 @@ def test_the_page_says_what_was_fitted_and_from_what(report: Path) -> None:
     text, tables = text_of(report), report.parent / "tables"
     for words in (
         "Flagged and left out: 1 of 16 sessions", "session is flagged 1 16", "test of McNemar",
-        "Holm", "correct ~ scenario + (1|participant) + (1|stimulus)", "log_rt ~ accuracy + scenario",
-        "accuracy ~ model + (1|scenario)", "tables/people_items.csv",
+        "Holm", "correct ~ scenario + (1|participant) + (1|stimulus)", "tables/people_items.csv",
+        "log_rt ~ accuracy + scenario", "accuracy ~ model + (1|scenario)",
         "Attributes: of 32 stimuli 0 by the table that was given, 32 by their official",
         "H1, preregistered: Stimuli with more elements are harder (logistic): not fitted",
     ):  # fmt: skip
