@@ -231,23 +231,3 @@ def test_maps_are_shown_for_every_state() -> None:
         maps = model.maps(squares(2, 5, model.spec))
     assert maps.shape == (2, 5, 6, 16, 16)
     assert bool((maps > 0).all()) and bool((maps < 1).all())
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_a_learned_transition_ranks_the_next_state_better_than_a_copy() -> None:
-    """Two pictures determine how squares at constant speed go on."""
-    model = model_of()
-    model.train()
-    optimizer = torch.optim.Adam(model.parameters(), 2e-3)
-    for step in range(100):
-        optimizer.zero_grad()
-        model.loss(squares(16, model.window, model.spec, seed=step))["loss"].backward()
-        optimizer.step()
-    model.eval()
-    held_out = squares(20, model.window, model.spec, seed=10_000)
-    with torch.no_grad():
-        ranks, copied = model.next_state_ranks(held_out)
-        assert model.loss(held_out)["loss"] < model.baseline(held_out)
-    assert len(ranks) == 60 and ranking(copied).hits == 0
-    assert ranking(ranks).hits > 0.4

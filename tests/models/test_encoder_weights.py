@@ -92,18 +92,6 @@ def test_local_files_give_the_network_that_was_saved(
     assert model.provenance().model == f"{NAME}-mlp"
 
 
-def test_another_file_of_the_same_name_is_another_encoder(
-    tmp_path: Path, trained: nn.Module
-) -> None:
-    path = tmp_path / "w.safetensors"
-    digests = []
-    for shift in (0.0, 1.0):
-        save_file({k: v + shift for k, v in trained.state_dict().items()}, path)
-        model = build_model("frozen-encoder", encoder=NAME, image_size=SIZE, weights=str(path))
-        digests.append(model.encoder_digest())  # type: ignore[attr-defined]
-    assert digests[0] != digests[1]
-
-
 class _Evil:
     """Object that runs a command when it is unpickled."""
 
@@ -164,14 +152,6 @@ def test_weights_of_another_network_name_the_tensors_that_differ(
     assert f"{names[0]} is missing; other.weight is unknown; " in text
     shape = tuple(state[names[5]].shape)
     assert f"; {names[5]} is (2, 3), and {shape} in the model" in text and "\n" not in text
-
-
-def test_a_larger_network_that_holds_a_smaller_one_is_refused(tmp_path: Path) -> None:
-    """All tensors of resnet18 are in resnet34, with equal shapes."""
-    path = tmp_path / "w.safetensors"
-    save_file(timm.create_model("resnet34", pretrained=False).state_dict(), path)
-    with pytest.raises(BadInputError, match=r"layer1\.2\S+ is unknown; .*and \d+ more"):
-        create_encoder("resnet18", SIZE, EncoderWeights(str(path)))
 
 
 def test_counters_of_batches_may_be_missing(
@@ -304,13 +284,6 @@ def test_grid_features_follow_what_moves(name: str, image_size: int, channels: i
     change = (features[0] - features[1]).view(4, 4, channels).abs().mean(-1)
     assert change[0, 0] > 0 and change[3, 3] > 0 and not encoder.training
     assert not any(parameter.requires_grad for parameter in encoder.parameters())
-
-
-def test_the_mean_of_the_cells_is_the_pooled_feature() -> None:
-    picture = torch.randn(1, 3, 256, 256, generator=torch.Generator().manual_seed(0))
-    grid = create_encoder("test_resnet", 256, RANDOM, "grid")(picture).view(16, -1).mean(0)
-    pooled = create_encoder("test_resnet", 256, RANDOM)(picture)[0]
-    assert torch.allclose(grid, pooled, atol=1e-5)
 
 
 # Weights of Python distributions: checked, complete, and of networks that recognise pictures.

@@ -72,15 +72,6 @@ def test_changes_of_boxes_are_in_units() -> None:
     assert torch.allclose(changes, torch.tensor([0.0, 1.0, -2.0]), atol=1e-5)
 
 
-@pytest.mark.parametrize("sampling", [1, 2])
-def test_the_region_of_a_constant_picture_is_constant(sampling: int) -> None:
-    maps = torch.tensor([2.0, -3.0]).view(1, 2, 1, 1).expand(1, 2, 16, 16)
-    boxes = torch.tensor([[[0.5, 0.5, 0.3, 0.5], [0.3, 0.6, 0.1, 0.1]]])
-    regions = cut_regions(maps, boxes, 3, 0.1, sampling=sampling, aligned=True)
-    assert regions.shape == (1, 2, 2, 3, 3)
-    assert torch.allclose(regions, torch.tensor([2.0, -3.0])[None, None, :, None, None])
-
-
 def test_the_region_of_a_ramp_has_its_values_at_the_centres_of_the_cells() -> None:
     """A ramp with the column as its value is sampled exactly; pixel centres are at 0.5."""
     columns = torch.arange(20.0) + 0.5

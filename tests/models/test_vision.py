@@ -174,19 +174,6 @@ def test_a_model_overfits_one_batch(name: str, count: int) -> None:
         assert loss < (0.6 if name == "op3" else 0.2) * trivial
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", FIRST)
-def test_equal_steps_give_equal_weights(name: str) -> None:
-    digests = []
-    for _ in range(2):
-        model = model_of(name)
-        batch = squares(3, model.window, model.spec)
-        model.prepare(batch)
-        steps(model, batch, 3)
-        digests.append(model.digest())
-    assert digests[0] == digests[1] != model_of(name).digest()
-
-
 class Killed(Exception):
     """Stands for the end of a process."""
 
@@ -220,24 +207,9 @@ def test_a_resumed_training_gives_the_bytes_of_an_uninterrupted_one(
     resumed = model_of(name)
     path = train(resumed, tmp_path / "parts")
     assert path.read_bytes() == whole
-    assert model_of(name, weights=str(path.parent)).digest() == resumed.digest()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", FIRST)
-def test_saved_weights_give_the_same_features(name: str, tmp_path: Path) -> None:
-    model = model_of(name, seed=3)
-    steps(model, squares(3, model.window, model.spec), 2)
-    model.eval()
-    path = tmp_path / "model.safetensors"
-    write_checkpoint(path, tensors_of(model), {"built_as": model.built_as()})
-    loaded = model_of(name, weights=str(path))
-    assert loaded.trained and loaded.init.startswith("local:")
-    assert loaded.provenance().model == f"{name}-small" and not model.trained
-    assert loaded.digest() == model.digest() != model_of(name).digest()
-    context = context_of(model)
-    pairs = zip(outputs(model, context), outputs(loaded, context), strict=True)
-    assert all(torch.equal(a, b) for a, b in pairs)
+    loaded = model_of(name, weights=str(path.parent))
+    assert loaded.trained and loaded.init.startswith("local:") and not resumed.trained
+    assert loaded.digest() == resumed.digest() != model_of(name).digest()
 
 
 def test_weights_of_another_architecture_are_refused_by_name(tmp_path: Path) -> None:

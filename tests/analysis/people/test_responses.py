@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -173,16 +174,6 @@ def test_copies_and_missing_answers_are_dropped_and_counted(
     assert len(found.trials) == 3 * 16 - 2
 
 
-def test_two_different_answers_to_one_stimulus_are_refused(
-    tables: tuple[pd.DataFrame, pd.DataFrame],
-) -> None:
-    trials = tables[0]
-    for changed in ({"trial": 99}, {"stimulus": "collide_099"}):
-        again = trials.iloc[[12]].assign(rt_ms=5000.0, **changed)
-        with pytest.raises(BadInputError, match=r"two answers to trial .*keep one row"):
-            as_responses(pd.concat([again, trials]))
-
-
 def test_simulated_participants_are_left_out_and_counted(
     tables: tuple[pd.DataFrame, pd.DataFrame], tmp_path: Path
 ) -> None:
@@ -206,27 +197,42 @@ def test_simulated_participants_are_left_out_and_counted(
         read_responses(tmp_path / "people.csv", participants="simulated")
 
 
-def test_contradictions_are_refused(tables: tuple[pd.DataFrame, pd.DataFrame]) -> None:
-    trials, sessions = tables
-    wrong = trials.assign(correct=~trials["correct"].astype(bool))
-    with pytest.raises(BadInputError, match="disagree"):
-        as_responses(wrong)
+def turned_label(trials: pd.DataFrame) -> pd.DataFrame:
     labels = trials.drop(columns="correct")
     at = labels.index[labels["stimulus"] == "collide_001"][0]
     labels.loc[at, "label"] = not labels.loc[at, "label"]
-    with pytest.raises(BadInputError, match="two labels"):
-        as_responses(labels)
-    with pytest.raises(BadInputError, match="two participants"):
-        as_responses(trials.assign(participant=["a"] * 5 + ["b"] * (len(trials) - 5)))
-    with pytest.raises(BadInputError, match="missing from the sessions table"):
-        as_responses(trials, sessions.iloc[1:])
-    with pytest.raises(BadInputError, match="stands in two rows"):
-        as_responses(trials, pd.concat([sessions, sessions]))
-    found = as_responses(trials)
+    return labels
+
+
+@pytest.mark.parametrize(
+    ("change", "of_sessions", "words"),
+    [
+        (lambda t: t.assign(correct=~t["correct"].astype(bool)), None, "disagree"),
+        (turned_label, None, "two labels"),
+        (lambda t: t.assign(participant=["a", *"b" * (len(t) - 1)]), None, "two participants"),
+        (lambda t: t, lambda s: s.iloc[1:], "missing from the sessions table"),
+        (lambda t: t, lambda s: s.assign(scenario="drop"), "missing from the sessions table"),
+        (lambda t: t, lambda s: pd.concat([s, s]), "stands in two rows"),
+        (lambda t: pd.concat([t.iloc[[12]].assign(rt_ms=5000.0, trial=99), t]), None,
+         r"two answers to trial .*keep one row"),
+        (lambda t: pd.concat([t.iloc[[12]].assign(rt_ms=5000.0, stimulus="collide_099"), t]), None,
+         r"two answers to trial .*keep one row"),
+    ],
+)  # fmt: skip
+def test_contradictions_are_refused(
+    tables: tuple[pd.DataFrame, pd.DataFrame], change: Any, of_sessions: Any, words: str
+) -> None:
+    trials, sessions = tables
+    with pytest.raises(BadInputError, match=words):
+        as_responses(change(trials), of_sessions and of_sessions(sessions))
+
+
+def test_other_labels_are_refused(tables: tuple[pd.DataFrame, pd.DataFrame]) -> None:
+    trials, _ = tables
     truth = dict(zip(trials["stimulus"], trials["label"], strict=True))
-    check_labels(found, truth)
+    check_labels(as_responses(trials), truth)
     with pytest.raises(BadInputError, match="ends otherwise"):
-        check_labels(found, truth | {"collide_001_img": not truth["collide_001"]})
+        check_labels(as_responses(trials), truth | {"collide_001_img": not truth["collide_001"]})
 
 
 def test_stimuli_are_left_out_by_list_and_as_ledges(
@@ -325,8 +331,6 @@ def test_a_session_of_two_scenarios_is_an_error() -> None:
     both = trials["session"].replace("drop-s000", "collide-s000")
     with pytest.raises(BadInputError, match="two participants or scenarios"):
         as_responses(trials.assign(session=both), sessions)
-    with pytest.raises(BadInputError, match="missing from the sessions table"):
-        as_responses(trials, sessions.assign(scenario="drop"))
 
 
 # --- checks --------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -78,11 +79,67 @@ def test_a_bad_value_is_named_with_row_and_stimulus(
     assert f"row {row + 1}" in str(fault) and column.split()[0] in fault.message
 
 
-def test_an_outcome_against_its_probability_is_a_warning(tmp_path: Path) -> None:
-    rows = table()
-    rows.loc[1, "Predicted Outcome"] = True
-    (fault,) = check(tmp_path, rows).faults
-    assert (fault.level, fault.row, fault.stimulus) == ("warning", 2, STIMULI[1])
+def index(**changes: object) -> pd.DataFrame:
+    return pd.DataFrame(
+        {"trial": [*STIMULI, "fit_0001"], "scenario": "drop",
+         "split": ["testing"] * 6 + ["readout"], "digest": [f"d{i}" for i in range(7)],
+         "scene_digest": [f"s{i}" for i in range(7)],
+         **changes}
+    )  # fmt: skip
+
+
+def changed(value: object, row: int, column: str, rows: pd.DataFrame | None = None) -> pd.DataFrame:
+    """Return the good table, or ``rows``, with another value."""
+    rows = table() if rows is None else rows
+    rows.loc[row, column] = value
+    return rows
+
+
+OUTCOMES = list(LABELS.values())
+SEEDS = [table(**{"Dynamics Training Seed": seed}) for seed in (0, 1)]
+TWIN = [f"d{i}" for i in range(6)] + ["d4"]
+FAULTS: dict[str, tuple[pd.DataFrame, dict[str, object], list[tuple[Any, ...]]]] = {
+    "an outcome against its probability": (
+        changed(True, 1, "Predicted Outcome"), {}, [("warning", "", 2, STIMULI[1])]),
+    "a duplicate, of another look": (
+        changed(STIMULI[1] + "-redyellow_img.mp4", 4, "Stimulus Name"), {},
+        [("error", "duplicate", 5, "row 2")]),
+    "a missing stimulus of one seed": (
+        pd.concat([SEEDS[0], SEEDS[1].drop(index=3)]), {"labels": LABELS},
+        [("", "missing", None, "1 stimuli"), ("", "missing", None, STIMULI[3])]),
+    "a whole scenario is absent": (
+        table(), {"labels": {**LABELS, "pilot_towers_x_0001": True}},
+        [("warning", "", None, "support")]),
+    "unknown stimuli": (
+        changed("pilot_it2_drop_simple_box_0099", 7, "Stimulus Name",
+                changed("nonsense", 6, "Stimulus Name",
+                        pd.concat([table(), table().iloc[:2]], ignore_index=True))),
+        {"labels": LABELS}, [("error", "unknown", 7, ""), ("warning", "unknown", 8, "")]),
+    "recorded and simulated outcomes that are not the official ones": (
+        table(**{"Recorded Outcome": [*OUTCOMES[:5], not OUTCOMES[5]],
+                 "Actual Outcome": [not OUTCOMES[0], *OUTCOMES[1:]]}),
+        {"labels": LABELS}, [("error", "", 6, ""), ("warning", "", None, "1 rows")]),
+    "a motion of a fitting trial": (
+        table(), {"index": index(digest=TWIN)}, [("", "leak", 5, "fit_0001")]),
+    "a scene of a fitting trial": (
+        table(), {"index": index(scene_digest=TWIN)}, [("", "leak", 5, "fit_0001")]),
+    "a column split": (
+        table(Split=["testing"] * 5 + ["training"]), {"labels": LABELS}, [("", "leak", 6, "")]),
+}  # fmt: skip
+"""Rows, what they are compared with, and level, kind, row and words of the faults."""
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_has_its_kind_row_and_words(name: str, tmp_path: Path) -> None:
+    rows, reference, expected = FAULTS[name]
+    faults = check(tmp_path, rows, **reference).faults
+    for level, kind, row, words in expected:
+        assert [
+            fault for fault in faults
+            if level in fault.level and kind in fault.kind and fault.row == row
+            and words in f"{fault} {fault.stimulus}"
+        ], faults  # fmt: skip
+    assert len(faults) == len({(row, level) for level, _, row, _ in expected})
 
 
 @pytest.mark.parametrize(
@@ -124,75 +181,12 @@ def test_a_column_that_stands_twice_is_refused(tmp_path: Path) -> None:
     assert "twice" in check_predictions_file(path).faults[0].message
 
 
-def test_duplicates_name_both_rows_and_know_looks(tmp_path: Path) -> None:
-    rows = table()
-    rows.loc[4, "Stimulus Name"] = STIMULI[1] + "-redyellow_img.mp4"
-    (fault,) = check(tmp_path, rows).faults
-    assert (fault.kind, fault.row) == ("duplicate", 5) and "row 2" in fault.message
-
-
 def test_seeds_and_readouts_are_no_duplicates(tmp_path: Path) -> None:
-    rows = pd.concat(
-        [
-            table(**{"Dynamics Training Seed": 0}),
-            table(**{"Dynamics Training Seed": 1}),
-            table(**{"Dynamics Training Seed": 0, "Readout Type": "C"}),
-        ]
-    )
+    rows = pd.concat([*SEEDS, SEEDS[0].assign(**{"Readout Type": "C"})])
     assert check(tmp_path, rows, labels=LABELS).errors == 0
 
 
-def test_a_missing_stimulus_is_found_for_its_seed(tmp_path: Path) -> None:
-    rows = pd.concat(
-        [
-            table(**{"Dynamics Training Seed": 0}),
-            table(**{"Dynamics Training Seed": 1}).drop(index=3),
-        ]
-    )
-    (fault,) = check(tmp_path, rows, labels=LABELS).faults
-    assert fault.kind == "missing" and STIMULI[3] in fault.message and "1 stimuli" in fault.message
-
-
-def test_a_whole_scenario_may_be_absent(tmp_path: Path) -> None:
-    labels = {**LABELS, "pilot_towers_x_0001": True}
-    (fault,) = check(tmp_path, table(), labels=labels).faults
-    assert fault.level == "warning" and "support" in fault.message
-
-
-def test_unknown_stimuli(tmp_path: Path) -> None:
-    rows = pd.concat([table(), table().iloc[:2]], ignore_index=True)
-    rows.loc[6, "Stimulus Name"] = "nonsense"
-    rows.loc[7, "Stimulus Name"] = "pilot_it2_drop_simple_box_0099"
-    first, second = check(tmp_path, rows, labels=LABELS).faults
-    assert (first.kind, first.level, first.row) == ("unknown", "error", 7)
-    assert (second.kind, second.level, second.row) == ("unknown", "warning", 8)
-
-
-def test_recorded_outcomes_must_be_the_official_ones(tmp_path: Path) -> None:
-    recorded = [*LABELS.values()]
-    recorded[5] = not recorded[5]
-    actual = [*LABELS.values()]
-    actual[0] = not actual[0]
-    rows = table(**{"Recorded Outcome": recorded, "Actual Outcome": actual})
-    error, warning = check(tmp_path, rows, labels=LABELS).faults
-    assert (error.row, error.level) == (6, "error")
-    assert warning.level == "warning" and "1 rows" in warning.message
-
-
 # --- leakage ------------------------------------------------------------------------------------
-
-
-def index(**changes: object) -> pd.DataFrame:
-    return pd.DataFrame(
-        {
-            "trial": [*STIMULI, "fit_0001"],
-            "scenario": "drop",
-            "split": ["testing"] * 6 + ["readout"],
-            "digest": [f"d{i}" for i in range(7)],
-            "scene_digest": [f"s{i}" for i in range(7)],
-            **changes,
-        }
-    )
 
 
 def test_a_stimulus_of_another_split_leaks(tmp_path: Path) -> None:
@@ -205,13 +199,6 @@ def test_a_stimulus_of_another_split_leaks(tmp_path: Path) -> None:
     assert "readout" in faults[0].message and "training" in faults[1].message
 
 
-@pytest.mark.parametrize("column", ["digest", "scene_digest"])
-def test_a_twin_in_another_split_leaks(tmp_path: Path, column: str) -> None:
-    digests = [f"d{i}" for i in range(6)] + ["d4"]
-    (fault,) = check(tmp_path, table(), index=index(**{column: digests})).faults
-    assert (fault.kind, fault.row) == ("leak", 5) and "fit_0001" in fault.message
-
-
 def test_a_stimulus_that_the_readout_was_fitted_on_leaks_unless_cross_fitted(
     tmp_path: Path,
 ) -> None:
@@ -220,12 +207,6 @@ def test_a_stimulus_that_the_readout_was_fitted_on_leaks_unless_cross_fitted(
     assert (fault.kind, fault.row) == ("leak", 1)
     assert not check(tmp_path, table(Fold=0), labels=LABELS, fitted=fitted).faults
     assert check(tmp_path, table(Fold=-1), labels=LABELS, fitted=fitted).errors == 1
-
-
-def test_a_column_split_is_believed(tmp_path: Path) -> None:
-    split = ["testing"] * 5 + ["training"]
-    (fault,) = check(tmp_path, table(Split=split), labels=LABELS).faults
-    assert (fault.kind, fault.row) == ("leak", 6)
 
 
 def test_an_index_can_be_parquet_csv_or_a_dataset(tmp_path: Path) -> None:
