@@ -17,7 +17,6 @@ import pytest
 from physion.analysis import Bootstrap, Comparison, compare_scores
 from physion.analysis.figure_tables import SCENARIO_ZONE
 from physion.analysis.metrics import score_metrics
-from physion.analysis.model_tests import fits_of_models
 from physion.analysis.published.claims import published_results
 from physion.analysis.scores import COMPUTED, MAJORITY, OUTCOME, TWO_PEOPLE
 from physion.analysis.tables import MEAN, POOLED
@@ -354,18 +353,6 @@ def test_counts_and_gaps_are_written_in_one_way(make_comparison: Maker) -> None:
     assert column.cell(pd.Series({"rows": 120000})) == "120000"
     comparison = make_comparison()
     assert not re.search(r"\d–", people.averages(comparison) + scores.matrix(comparison, "r"))
-
-
-def test_models_are_held_against_the_first_in_the_files(make_comparison: Maker) -> None:
-    comparison = make_comparison()
-    assert comparison.names != sorted(comparison.names)
-    spread = comparison.scores.assign(accuracy=np.linspace(0.4, 0.9, len(comparison.scores)) ** 2)
-    comparison = dataclasses.replace(comparison, scores=spread)
-    models = fits_of_models(comparison)[0]
-    assert models.fit is not None
-    terms = models.fit.table["term"].tolist()
-    assert len(terms) == 2 and comparison.names[1] in terms[1]
-    assert comparison.names[0] in models.about
 
 
 # --- published results --------------------------------------------------------------------------

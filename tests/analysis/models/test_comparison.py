@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from physion.analysis import Bootstrap, Comparison, compare_scores, read_predict
 from physion.analysis.compare import all_results
 from physion.analysis.comparison import NO_LABEL, NOT_PREDICTED, NOT_SEEN, check_coverage
 from physion.analysis.metrics import metric_of_arrays, metrics
+from physion.analysis.model_tests import fits_of_models
 from physion.analysis.people.responses import EXCLUDED, LEDGE
 from physion.analysis.sample import sample_of_rows
 from physion.analysis.tables import (
@@ -620,6 +622,16 @@ def test_official_people_as_a_model_reach_the_official_accuracies(official: Path
     assert mean["r"] == pytest.approx(1)
     # The majority of people is right more often than a single person.
     assert mean["accuracy"] > mean["human_accuracy"] + 0.05
+
+
+def test_models_are_held_against_the_first_in_the_files() -> None:
+    people = humans()
+    both = pd.concat([predictions(people, "z"), predictions(people, "a", seed=2)])
+    found = compared(both, people)
+    spread = found.scores.assign(accuracy=np.linspace(0.4, 0.9, len(found.scores)) ** 2)
+    models = fits_of_models(replace(found, scores=spread))[0]
+    assert models.fit is not None and found.names[0] in models.about
+    assert models.fit.table["term"].tolist() == ["Intercept", "model[T.a · observed]"]
 
 
 # --- metrics of three arrays ---------------------------------------------------------------------

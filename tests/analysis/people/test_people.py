@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -46,6 +49,7 @@ from physion.analysis.statistics import agreement
 from physion.analysis.statistics.agreement import correlate_rows, pair_values, pairwise_kappa
 from physion.analysis.tables import (
     ATTRIBUTES,
+    COLUMNS,
     MISLABELLED,
     attribute_names,
     attributes_from_names,
@@ -56,7 +60,7 @@ from physion.analysis.tables import (
     with_labels,
 )
 from physion.core.errors import BadInputError
-from support.scene_metadata import attributes_from_metadata
+from physion.core.names import canonical_name
 from support.simulated_people import study
 
 Array = npt.NDArray[np.float64]
@@ -349,6 +353,34 @@ def test_official_names_are_read(
         [elements, distractors, occluders], nan_ok=True
     )
     assert row["room"] == room
+
+
+def attributes_from_metadata(folder: Path) -> pd.DataFrame:
+    """Return attributes from all ``<scenario>/<configuration>/metadata.json`` under ``folder``."""
+    rows = []
+    for path in sorted(folder.glob("*/*/metadata.json")):
+        trials = json.loads(path.read_text(encoding="utf-8"))
+        rows += [metadata_row(trial, path.parents[1].name, path.parent.name) for trial in trials]
+    return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+def metadata_row(trial: dict[str, Any], scenario: str, configuration: str) -> dict[str, Any]:
+    def count(key: str) -> float:
+        return float(pd.to_numeric(str(trial.get(key)), errors="coerce"))
+
+    removed = str(trial.get("remove_middle")).lower() == "true"
+    # The generator of Drop inherits a count of 0 that has no meaning.
+    counted = scenario in ("dominoes", "support")
+    return {
+        "stimulus": canonical_name(trial["stimulus_name"]),
+        "scenario": scenario,
+        "configuration": configuration,
+        "elements": count("num_middle_objects") - removed if counted else np.nan,
+        "distractors": count("num_distractors"),
+        "occluders": count("num_occluders"),
+        "room": re.sub(r"^b?'?([a-z]*)'?$", r"\1", str(trial.get("room", ""))),
+        "source": "metadata",
+    }
 
 
 def test_names_with_their_correction_say_what_the_metadata_say(
