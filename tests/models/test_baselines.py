@@ -453,23 +453,14 @@ def test_blobs_over_time_are_exact() -> None:
         return math.sqrt((pixels**2 - 1) / 12) / 128
 
     expected = {
-        "red area": 128 / 128**2,
-        "red x": 20 / 128,
-        "red y": 40 / 128,
-        "red width": deviation(8),
-        "red height": deviation(16),
-        "red slant": 0,
-        "red left": 16 / 128,
-        "red top": 32 / 128,
-        "red right": 24 / 128,
-        "red bottom": 48 / 128,
-        "yellow area": 32**2 / 128**2,
-        "yellow right": 96 / 128,
-        "red to yellow x": 60 / 128,
-        "red to yellow y": 40 / 128,
+        "red area": 128 / 128**2, "red x": 20 / 128, "red y": 40 / 128,
+        "red width": deviation(8), "red height": deviation(16), "red slant": 0,
+        "red left": 16 / 128, "red top": 32 / 128, "red right": 24 / 128, "red bottom": 48 / 128,
+        "yellow area": 32**2 / 128**2, "yellow right": 96 / 128,
+        "red to yellow x": 60 / 128, "red to yellow y": 40 / 128,
         "red to yellow distance": math.hypot(60, 40) / 128,
         "red to yellow gap": math.hypot(64 - 24, 64 - 48) / 128,
-    }
+    }  # fmt: skip
     assert {name: named[0][name] for name in expected} == pytest.approx(expected, abs=1e-6)
     changes = {name: named[1][f"change of {name}"] for name in expected}
     moved = {"red x": 8, "red left": 8, "red right": 8, "red to yellow x": -8}

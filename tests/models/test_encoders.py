@@ -231,13 +231,9 @@ def features_of(model: EncoderModel) -> tuple[torch.Tensor, torch.Tensor]:
     source = MovingValues(count=2, spec=model.spec)
     context = source.context(source.trials).to("cpu")
     seen = model.encode(context)
+    known = Batch(context.trials, context.frames, context.valid, features=seen, future=2)
     with torch.no_grad():
-        later = model.imagine(
-            type(context)(context.trials, context.frames, context.valid, features=seen, future=2),
-            1,
-            0,
-        )
-    return seen, later.features
+        return seen, model.imagine(known, 1, 0).features
 
 
 @pytest.mark.parametrize("fine_tuned", [False, True])
@@ -535,17 +531,11 @@ def test_the_next_feature_is_nearer_than_the_last_one(
         return training
 
     model: Any = build_model(name, **OPTIONS)
+    settings = dataclasses.replace(model.training_settings, steps=300)
     trained = train_model(
-        model,
-        source,
-        source.trials,
-        settings=dataclasses.replace(model.training_settings, steps=300),
-        seed=0,
-        name="all",
-        folder=None,
-        features=features,
-        accelerator="cpu",
-    )
+        model, source, source.trials, settings=settings, seed=0, name="all", folder=None,
+        features=features, accelerator="cpu",
+    )  # fmt: skip
     with torch.no_grad():
         error, last = float(model.loss(testing)["loss"]), float(model.baseline(testing))
     print(f"{model.name()}: {error / last:.3f} of the error of the last feature")

@@ -15,10 +15,6 @@ from torch import Tensor
 
 from physion.core.errors import BadInputError
 from physion.models import Batch, build_model
-from physion.readout.evaluate import evaluate
-from physion.readout.logistic import LogisticSettings
-from physion.readout.settings import EvaluationSettings
-from support.moving_dots import make_dots
 from support.programs import absent
 
 try:
@@ -145,16 +141,6 @@ def test_random_weights_follow_the_seed(published: dict[str, Path]) -> None:
     assert build_model(name, weights="random").digest() == one.digest()
     assert build_model(name, weights="random", seed=1).digest() != one.digest()
     assert one.name() == "random-dinov3-tiny" and one.provenance().init == "random"
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_it_is_evaluated_with_its_twin(published: dict[str, Path], tmp_path: Path) -> None:
-    dots = make_dots(tmp_path / "dots", {"readout": 8, "testing": 4}, ("collide",))
-    quick = EvaluationSettings(accelerator="cpu", logistic=LogisticSettings(grid=(1e-2,)))
-    table = evaluate(f"hf:{published['dinov3']}", dots, tmp_path, quick, twin=True).predictions
-    assert set(table["model"]) == {"dinov3-tiny", "random-dinov3-tiny"}
-    assert set(table["readout"]) == {"observed", "full"}
 
 
 def test_what_cannot_be_loaded_is_one_line(published: dict[str, Path], tmp_path: Path) -> None:

@@ -16,10 +16,6 @@ from torch import Tensor
 
 from physion.core.errors import BadInputError
 from physion.models import Batch, build_model
-from physion.readout.evaluate import evaluate
-from physion.readout.logistic import LogisticSettings
-from physion.readout.settings import EvaluationSettings
-from support.moving_dots import make_dots
 from support.programs import absent
 from support.tiny_models import VIDEO
 
@@ -386,18 +382,6 @@ def test_a_hub_that_cannot_be_reached_is_one_clear_error(monkeypatch: pytest.Mon
 def test_settings_that_make_no_network_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(BadInputError, match=message):
         make("VideoMAE", **options)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [NAMES[0], *(pytest.param(name, marks=pytest.mark.nightly) for name in NAMES[1:])]
-)
-def test_it_is_evaluated_under_observed_and_full(name: str, tmp_path: Path) -> None:
-    dots = make_dots(tmp_path / "dots", {"readout": 8, "testing": 4}, ("collide",))
-    config = EvaluationSettings(accelerator="cpu", logistic=LogisticSettings(grid=(1e-2,)))
-    table = evaluate(name, dots, tmp_path, options=VIDEO, settings=config).predictions
-    assert set(table["readout"]) == {"observed", "full"}
-    assert (table["model"] == f"random-{name}-small").all() and (table["init"] == "random").all()
 
 
 @pytest.mark.nightly
