@@ -191,15 +191,6 @@ def test_a_model_scores_the_same_with_and_without_others() -> None:
     pd.testing.assert_frame_equal(together[together["base_model"] == "m"], alone)
 
 
-def test_either_look_of_a_stimulus_joins() -> None:
-    people = humans()
-    given = predictions(people)
-    plain = compared(given, people).scores
-    names = given["Stimulus Name"].str[:-5] + "-redyellow" + given["Stimulus Name"].str[-5:]
-    red = given.assign(**{"Stimulus Name": names})
-    pd.testing.assert_frame_equal(compared(red, people).scores, plain)
-
-
 # --- undefined ---------------------------------------------------------------------------------
 
 
