@@ -171,7 +171,7 @@ def test_width_matches_the_normal_interval() -> None:
     assert high - low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.05)
 
 
-def test_intervals_contain_their_share_of_defined_draws_until_most_are_undefined() -> None:
+def test_intervals_leave_out_undefined_draws_until_they_are_most() -> None:
     draws = np.linspace(0, 1, 101)
     assert Bootstrap(level=0.95).interval(draws) == pytest.approx((0.025, 0.975))
     assert Bootstrap(level=0.5).interval(draws) == pytest.approx((0.25, 0.75))
