@@ -262,7 +262,11 @@ def _attributes(people: PeopleResults, rows: pd.DataFrame, scenario: str) -> Mix
         together = together[together["scenario"] == "all"]
     about = "Attributes of stimuli together, exploratory, in standard deviations (logistic)"
     names = list(dict.fromkeys(together["attribute"]))
-    plain = {name: re.sub(r"\W", "_", name) for name in names}
+    plain: dict[str, str] = {}
+    for name in names:
+        word = re.sub(r"\W", "_", name)
+        # Two names may differ in signs only, which a formula cannot hold.
+        plain[name] = f"{word}_{len(plain)}" if word in plain.values() else word
     formula = " + ".join([f"correct ~ {' + '.join(plain.values()) or '1'}", f"{scenario}{CROSSED}"])
     if not names:
         return MixedTable("attributes", about, formula, None, "no attribute is known and varies")
