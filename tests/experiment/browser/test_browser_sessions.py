@@ -117,7 +117,6 @@ def test_a_session_by_keyboard_in_german(chromium: Any, site: tuple[Study, str])
     assert {(row.window_width, row.window_height) for row in answers} == {(1024, 600)}
 
 
-@pytest.mark.nightly
 def test_a_session_in_firefox(firefox: Any, site: tuple[Study, str]) -> None:
     study, url = site
     with Visit(firefox, url, "firefox") as visit:
@@ -137,7 +136,6 @@ def test_a_session_in_firefox(firefox: Any, site: tuple[Study, str]) -> None:
     check_answers(session, answers)
 
 
-@pytest.mark.nightly
 def test_a_session_in_webkit(webkit: WebKit, site: tuple[Study, str]) -> None:
     study, url = site
     button = "main .button:not(.quiet):enabled"
