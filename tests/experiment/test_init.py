@@ -214,7 +214,7 @@ def test_what_cannot_be_chosen_is_named(
         choose_trials(dataset if changed is None else tmp_path, **words)
 
 
-def test_familiarization_may_be_chosen_alone(dataset: Path) -> None:
+def test_familiarization_may_be_chosen_by_itself(dataset: Path) -> None:
     assert len(choose_familiarization(dataset, "roll").sources) == 4
 
 
