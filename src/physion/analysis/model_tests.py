@@ -265,8 +265,9 @@ def _attributes(people: PeopleResults, rows: pd.DataFrame, scenario: str) -> Mix
     plain: dict[str, str] = {}
     for name in names:
         word = re.sub(r"\W", "_", name)
-        # Two names may differ in signs only, which a formula cannot hold.
-        plain[name] = f"{word}_{len(plain)}" if word in plain.values() else word
+        while word in plain.values():  # two names may differ in signs only
+            word += "_"
+        plain[name] = word
     formula = " + ".join([f"correct ~ {' + '.join(plain.values()) or '1'}", f"{scenario}{CROSSED}"])
     if not names:
         return MixedTable("attributes", about, formula, None, "no attribute is known and varies")
