@@ -218,7 +218,7 @@ def test_neighbours_equal_brute_force_and_are_kept_while_particles_stay() -> Non
     poses = BodyPoses(x, np.array([rotation_of(body) for body in bodies]))
     before = BodyPoses(x - [[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]], poses.rot)
     points, reach, room = rng.uniform(-0.5, 1.0, (3, 200)), 0.06, 100
-    near = new_neighbours(200, room)
+    near = new_neighbours(200, room, solids, reach)
     bounds = (np.empty((2, 3)), np.empty((2, 3)))
     world_bounds(solids, poses, reach, *bounds)
     find_neighbours(points, reach, -1.0, solids, poses, before, bounds, near)
@@ -243,6 +243,35 @@ def test_neighbours_equal_brute_force_and_are_kept_while_particles_stay() -> Non
     assert (near.counts != counts).any()
 
 
+def test_neighbours_found_among_candidates_are_those_of_a_search_anew() -> None:
+    """Particles and bodies move by steps below, near and above the slack of the candidates."""
+    rng = np.random.default_rng(2)
+    bodies = (
+        Body("a", "cone", (0.0, 0.0, 0.0), (0.4, 0.5, 0.6), (0.8, 0.3, -0.4, 0.2)),
+        Body("b", "prop:bowl", (0.3, 0.2, 0.1), (0.5, 0.5, 0.5)),
+    )
+    solids, reach = fill_bodies(bodies, SPACING), 0.145
+    x = np.array([body.position for body in bodies])
+    old = BodyPoses(x.copy(), np.array([rotation_of(body) for body in bodies]))
+    points = rng.uniform(-0.4, 0.7, (3, 300))
+    kept = new_neighbours(300, 100, solids, reach)
+    bounds = (np.empty((2, 3)), np.empty((2, 3)))
+    for scale in (0.002, 0.005, 0.01, 0.02, 0.05):
+        for _ in range(4):
+            points += rng.uniform(-scale, scale, points.shape)
+            poses = BodyPoses(old.x + rng.uniform(-scale, scale, (2, 3)) / 2, old.rot)
+            world_bounds(solids, poses, reach, *bounds)
+            fresh = new_neighbours(300, 100, solids, reach)
+            for near in (kept, fresh):
+                find_neighbours(points, reach, -1.0, solids, poses, old, bounds, near)
+            assert (kept.counts == fresh.counts).all() and kept.counts.sum() > 1000
+            for v, count in enumerate(kept.counts):
+                for name in ("body", "position", "displacement"):
+                    a, b = getattr(kept, name)[v, :count], getattr(fresh, name)[v, :count]
+                    assert (a == b).all()
+            old = poses
+
+
 def test_springs_join_the_edges_of_the_triangles_and_the_corners_across_them() -> None:
     rows = 5
     springs = sheet_springs(Cloth("c", (0.0, 0.0, 0.0), resolution=rows))
@@ -263,7 +292,7 @@ def test_a_spring_takes_back_its_fraction_of_its_error() -> None:
     )
     points = np.array([[0.0, 0.0, 1.5, 1.0], [0.0, 1.0, 0.0, 1.0], [0.0, 0.0, 0.0, 0.0]])
     shift = np.empty((3, 4))
-    correct_springs(points, springs, shift, np.empty(4))
+    correct_springs(points, springs, shift, np.empty((3, 4)))
     # Particle 2 is 1.5 m from particle 0, half a metre too far: 0.6 / 2 of that along x. Its other
     # spring, to particle 3, is the diagonal of a rectangle of 0.5 m by 1 m.
     long = np.sqrt(1.25)

@@ -26,6 +26,8 @@ MAX_NEIGHBOURS = 100
 further ones are ignored."""
 ROUNDING = 1e-9
 """Metres added to the box of a search, so that rounding excludes no particle."""
+SLACK = 0.02
+"""Metres that a particle moves against a body before the lattice is scanned for it again."""
 
 
 class Solids(NamedTuple):
@@ -55,6 +57,10 @@ class Neighbours(NamedTuple):
     ``counts`` (V,) how many; ``body`` (V, K) the body of each; ``position`` (V, K, 3) metres,
     world; ``displacement`` (V, K, 3) metres that it moved during the substep; ``searched_at``
     (3, V) where the particle was when they were searched, metres.
+
+    Candidates are those within the reach and `SLACK` of ``scanned_at`` (V, N, 3), a point in the
+    frame of each of N bodies, metres: ``candidate_counts`` (V, N) how many, and ``candidates``
+    (V, N, C, 3) their indices in the lattice, in its order.
     """
 
     counts: I64
@@ -62,6 +68,9 @@ class Neighbours(NamedTuple):
     position: F64
     displacement: F64
     searched_at: F64
+    scanned_at: F64
+    candidate_counts: I64
+    candidates: NDArray[np.int16]
 
 
 @kernel
@@ -71,14 +80,20 @@ def new_poses(bodies: int) -> BodyPoses:
 
 
 @kernel
-def new_neighbours(particles: int, room: int) -> Neighbours:
-    """Return room for ``room`` neighbours of each of ``particles`` particles."""
+def new_neighbours(particles: int, room: int, solids: Solids, reach: float) -> Neighbours:
+    """Return room for ``room`` neighbours, within ``reach`` metres, of each of some particles."""
+    # A ball holds at most as many points of a cubic lattice as cubes fit in one that is larger by
+    # half the diagonal of a cube.
+    bodies, most = len(solids.origins), 4.19 * ((reach + SLACK) / solids.spacing + 0.87) ** 3
     return Neighbours(
         np.zeros(particles, np.int64),
         np.empty((particles, room), np.int64),
         np.empty((particles, room, 3)),
         np.empty((particles, room, 3)),
         np.full((3, particles), np.inf),
+        np.full((particles, bodies, 3), np.inf),
+        np.zeros((particles, bodies), np.int64),
+        np.empty((particles, bodies, int(most) + 1, 3), np.int16),
     )
 
 
@@ -145,8 +160,10 @@ def world_bounds(solids: Solids, poses: BodyPoses, reach: float, low: F64, high:
 
 # Contact search: a cloth particle inside the box of a body is taken into that body's frame, where
 # the lattice cells within ``reach`` are a small box of indices. Macklin et al. 2014 search once a
-# substep at the predicted positions, with a hash grid. Here what was found is kept while the
-# particle is within half of the margin of where it was searched and no body moves.
+# substep at the predicted positions, with a hash grid. Here the lattice is scanned with some slack,
+# and candidates are kept until the particle has moved that far against the body; what is within
+# reach of it is found among them. What was found is kept while the particle is within half of the
+# margin of where it was searched and no body moves.
 
 
 @kernel
@@ -183,10 +200,11 @@ def find_neighbours(
     origins, sizes, starts, filled, spacing = solids
     x, rot = poses
     old_x, old_rot = old
-    counts, of_body, position, displacement, searched_at = near
+    counts, of_body, position, displacement, searched_at = near[:5]
+    scanned_at, candidate_counts, candidates = near[5:]
     point, local, outside = np.empty(3), np.empty(3), np.empty(3)
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
-    square = reach * reach
+    square, wide = reach * reach, (reach + SLACK) ** 2
     for v in range(points.shape[1]):
         moved = 0.0
         for k in range(3):
@@ -203,7 +221,7 @@ def find_neighbours(
                 apart = apart or point[k] < box_low[body, k] or point[k] > box_high[body, k]
             if apart:
                 continue
-            total = 0.0
+            total, moved = 0.0, 0.0
             for k in range(3):
                 local[k] = -origins[body, k]
                 for m in range(3):
@@ -211,39 +229,51 @@ def find_neighbours(
                 end = (sizes[body, k] - 1) * spacing
                 outside[k] = max(-local[k], 0.0, local[k] - end) ** 2
                 total += outside[k]
+                moved += (local[k] - scanned_at[v, body, k]) ** 2
             if total >= square:
                 continue
-            for k in range(3):
-                # What the point is outside the lattice along the other axes leaves less along this.
-                left = np.sqrt(square - (total - outside[k])) + ROUNDING
-                low[k] = max(int(np.ceil((local[k] - left) / spacing)), 0)
-                high[k] = min(int(np.floor((local[k] + left) / spacing)), sizes[body, k] - 1)
-            for i in range(low[0], high[0] + 1):
-                dx = local[0] - i * spacing
-                sx = origins[body, 0] + i * spacing
-                for j in range(low[1], high[1] + 1):
-                    dy = local[1] - j * spacing
-                    sy = origins[body, 1] + j * spacing
-                    flat = dx * dx + dy * dy
-                    if flat + outside[2] >= square:
-                        continue
-                    row = starts[body] + (i * sizes[body, 1] + j) * sizes[body, 2]
-                    for k in range(low[2], high[2] + 1):
-                        dz = local[2] - k * spacing
-                        if not (filled[row + k] and flat + dz * dz < square):
+            if moved > (SLACK - ROUNDING) ** 2:
+                listed = 0
+                for k in range(3):
+                    scanned_at[v, body, k] = local[k]
+                    # What the point is outside the lattice along the other axes leaves less along
+                    # this.
+                    left = np.sqrt(wide - (total - outside[k])) + ROUNDING
+                    low[k] = max(int(np.ceil((local[k] - left) / spacing)), 0)
+                    high[k] = min(int(np.floor((local[k] + left) / spacing)), sizes[body, k] - 1)
+                for i in range(low[0], high[0] + 1):
+                    dx = local[0] - i * spacing
+                    for j in range(low[1], high[1] + 1):
+                        dy = local[1] - j * spacing
+                        flat = dx * dx + dy * dy
+                        if flat + outside[2] >= wide:
                             continue
-                        if found == of_body.shape[1]:
-                            break
-                        sz = origins[body, 2] + k * spacing
-                        of_body[v, found] = body
-                        for m in range(3):
-                            now = x[body, m] + rot[body, m, 0] * sx
-                            now = now + rot[body, m, 1] * sy + rot[body, m, 2] * sz
-                            then = old_x[body, m] + old_rot[body, m, 0] * sx
-                            then = then + old_rot[body, m, 1] * sy + old_rot[body, m, 2] * sz
-                            position[v, found, m] = now
-                            displacement[v, found, m] = now - then
-                        found += 1
+                        row = starts[body] + (i * sizes[body, 1] + j) * sizes[body, 2]
+                        for k in range(low[2], high[2] + 1):
+                            dz = local[2] - k * spacing
+                            if filled[row + k] and flat + dz * dz < wide:
+                                candidates[v, body, listed, 0] = i
+                                candidates[v, body, listed, 1] = j
+                                candidates[v, body, listed, 2] = k
+                                listed += 1
+                candidate_counts[v, body] = listed
+            for c in range(candidate_counts[v, body]):
+                i, j, k = candidates[v, body, c]
+                dx, dy, dz = local[0] - i * spacing, local[1] - j * spacing, local[2] - k * spacing
+                if dx * dx + dy * dy + dz * dz >= square or found == of_body.shape[1]:
+                    continue
+                sx = origins[body, 0] + i * spacing
+                sy = origins[body, 1] + j * spacing
+                sz = origins[body, 2] + k * spacing
+                of_body[v, found] = body
+                for m in range(3):
+                    now = x[body, m] + rot[body, m, 0] * sx
+                    now = now + rot[body, m, 1] * sy + rot[body, m, 2] * sz
+                    then = old_x[body, m] + old_rot[body, m, 0] * sx
+                    then = then + old_rot[body, m, 1] * sy + old_rot[body, m, 2] * sz
+                    position[v, found, m] = now
+                    displacement[v, found, m] = now - then
+                found += 1
         counts[v] = found
 
 

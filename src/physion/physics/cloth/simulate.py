@@ -390,7 +390,8 @@ def settle(
     step = options.frame_time / options.substeps
     count, bodies = solids.local.shape[1], len(state.q)
     start, touching = np.zeros((3, count)), np.empty(count, np.int64)
-    near = new_neighbours(count, MAX_NEIGHBOURS)
+    reach = options.rest_distance + options.search_margin
+    near = new_neighbours(count, MAX_NEIGHBOURS, lattices, reach)
     before, poses = new_poses(bodies), new_poses(bodies)
     old_center, old_q = state.center.copy(), state.q.copy()
     for frame in range(frames):
@@ -468,6 +469,9 @@ def _search_solids(
             near.position[first:last],
             near.displacement[first:last],
             near.searched_at[:, first:last],
+            near.scanned_at[first:last],
+            near.candidate_counts[first:last],
+            near.candidates[first:last],
         )
         find_neighbours(points[:, first:last], reach, -1.0, lattices, poses, before, others, part)
         for p in range(first, last):
@@ -553,7 +557,7 @@ def _comes_close(
     bounds = (np.empty((count, 3)), np.empty((count, 3)))
     world_bounds(lattices, poses, options.rest_distance, bounds[0], bounds[1])
     bounds[0][number:], bounds[1][number:] = np.inf, -np.inf
-    near = new_neighbours(points.shape[1], 1)
+    near = new_neighbours(points.shape[1], 1, lattices, options.rest_distance)
     find_neighbours(points, options.rest_distance, -1.0, lattices, poses, poses, bounds, near)
     return bool(near.counts.any())
 

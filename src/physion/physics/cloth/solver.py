@@ -154,9 +154,9 @@ def _relax(
     normal_correction: F64,
 ) -> None:
     """Make the passes of one substep over all constraints; see `run_cloth`."""
-    shift, constraint_count, factor = work
+    shift, constraint_count, correction = work
     for _ in range(options.iterations):
-        correct_springs(points, springs, shift, factor)
+        correct_springs(points, springs, shift, correction)
         constraint_count[:] = springs.degree
         correct_contacts(
             points, start, touching, near, options, shift, constraint_count, normal_correction
@@ -217,13 +217,13 @@ def run_cloth(
     watched = scenery.watched
     number, bodies = points.shape[1], positions.shape[1]
     start = points.copy()
-    work = (np.zeros((3, number)), np.zeros(number), np.zeros(number))
-    near = new_neighbours(number, MAX_NEIGHBOURS)
+    work = (np.zeros((3, number)), np.zeros(number), np.zeros((3, number)))
     touching = np.empty(number, np.int64)
     poses, old = new_poses(bodies), new_poses(bodies)
     bounds = (np.empty((bodies, 3)), np.empty((bodies, 3)))
     step = options.frame_time / options.substeps
     reach = options.rest_distance + options.search_margin
+    near = new_neighbours(number, MAX_NEIGHBOURS, solids, reach)
     near_floor = options.floor + options.floor_gap + options.search_margin
     undeformed = falls_as_one(points, velocities, springs)
     interpolate_poses(positions, rotations, 0, 1.0, old)

@@ -63,52 +63,67 @@ class SheetSprings(NamedTuple):
 
 
 @kernel
-def correct_springs(points: F64, springs: SheetSprings, shift: F64, factor: F64) -> None:
+def correct_springs(points: F64, springs: SheetSprings, shift: F64, correction: F64) -> None:
     """Fill ``shift`` (3, V) with the sums of the corrections that bring springs to their lengths.
 
-    ``points`` (3, V) are positions in metres, ``factor`` (V,) is working memory.
+    ``points`` (3, V) are positions in metres, ``correction`` (3, V) is working memory.
     """
     shift[:] = 0.0
     x, y, z = points[0], points[1], points[2]
+    number = points.shape[1]
     for g in range(len(springs.offsets)):
         offset = springs.offsets[g]
-        first = len(factor) - offset
-        used = factor[:first]
-        _relative_errors(
+        first = number - offset
+        _corrections(
             (x[:first], y[:first], z[:first]),
             (x[offset:], y[offset:], z[offset:]),
             springs.half_stiffness[g, :first],
             springs.lengths[g],
-            used,
+            (correction[0, :first], correction[1, :first], correction[2, :first]),
         )
         for k in range(3):
-            along = points[k]
-            _add_difference(used, along[offset:], along[:first], shift[k, :first])
-            _add_difference(used, along[:first], along[offset:], shift[k, offset:])
+            _add(shift[k], correction[k, :first], offset)
 
 
 @kernel
-def _relative_errors(
-    a: tuple[F64, F64, F64], b: tuple[F64, F64, F64], half: F64, length: float, out: F64
+def _corrections(
+    a: tuple[F64, F64, F64],
+    b: tuple[F64, F64, F64],
+    half: F64,
+    length: float,
+    out: tuple[F64, F64, F64],
 ) -> None:
-    """Fill ``out`` (S,) with k/2 (|b - a| - l) / |b - a| of springs from ``a`` to ``b``.
+    """Fill ``out`` with k/2 (|b - a| - l) (b - a) / |b - a| of springs from ``a`` to ``b``.
 
-    ``a`` and ``b`` are coordinates x, y, z (S,) in metres.
+    All are coordinates x, y, z (S,) in metres.
     """
     ax, ay, az = a
     bx, by, bz = b
-    for s in range(len(out)):
+    cx, cy, cz = out
+    for s in range(len(half)):
         dx, dy, dz = bx[s] - ax[s], by[s] - ay[s], bz[s] - az[s]
         found = np.sqrt(dx * dx + dy * dy + dz * dz)
         error = half[s] * (found - length) / found
-        out[s] = error if found > MIN_LENGTH else 0.0
+        error = error if found > MIN_LENGTH else 0.0
+        cx[s], cy[s], cz[s] = error * dx, error * dy, error * dz
 
 
 @kernel
-def _add_difference(factor: F64, b: F64, a: F64, total: F64) -> None:
-    """Add ``factor * (b - a)``, arrays (S,), to ``total``."""
-    for s in range(len(total)):
-        total[s] += factor[s] * (b[s] - a[s])
+def _add(total: F64, correction: F64, offset: int) -> None:
+    """Add ``correction`` (S,) to the first S of ``total`` (V,), and take it from the last S.
+
+    The last begin ``offset`` = V - S places after the first.
+    """
+    both = max(len(correction) - offset, 0)
+    early, late, same = total[offset : offset + both], correction[offset:], correction[:both]
+    for s in range(min(offset, len(correction))):
+        total[s] += correction[s]
+    for s in range(both):
+        early[s] = early[s] + late[s] - same[s]
+    last = correction[both:]
+    end = total[offset + both :]
+    for s in range(len(last)):
+        end[s] -= last[s]
 
 
 # Vertices, triangles and springs of an undeformed cloth.
