@@ -10,7 +10,7 @@ from physion.models.torch_model import TorchModel
 class MyEncoder(TorchModel):
     """Random convolutions on pictures of 64 x 64 pixels; put your own network here."""
 
-    spec = Spec(image_size=64)  # 7 frames of the observed part, and 18 later ones for *full*
+    spec = Spec(image_size=64)  # every sixth frame: 8 observed ones, and the later ones for *full*
     init = "random"  # where the weights come from, for the table of predictions
 
     def __init__(self, channels: int = 32) -> None:
