@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
@@ -334,13 +334,10 @@ def _people_record(
 #
 # - `OUTCOME`: answers with the official outcome, as a perfect simulator would;
 # - `MAJORITY`: answers as most people did (no where they are divided equally): no answer of yes or
-#   no
-#   agrees with single people more often, so its kappa is the ceiling of models;
+#   no agrees with single people more often, so its kappa is the ceiling of models;
 # - `TWO_PEOPLE`: one person in place of the model, compared with another one.
 #
-# Others come as predictions of models whose names are in `BASELINE_MODELS`. Predictions of
-# `outcome` or `majority-of-people` take the place of the computed baseline, which then stands in
-# no table.
+# Others come as predictions of models whose names are in `BASELINE_MODELS`.
 
 OUTCOME = "recorded outcome"
 MAJORITY = "majority of people"
@@ -350,8 +347,6 @@ COMPUTED = (OUTCOME, MAJORITY, TWO_PEOPLE)
 
 BASELINE_MODELS = frozenset(
     {
-        "outcome",
-        "majority-of-people",
         "state-trees",
         "already-touched",
         "constant-motion",
@@ -364,9 +359,6 @@ BASELINE_MODELS = frozenset(
 )
 """Names of models whose predictions are baselines."""
 
-GIVEN_AS = {OUTCOME: "outcome", MAJORITY: "majority-of-people"}
-"""Names of the models whose predictions take the place of a computed baseline."""
-
 Kind = Literal["model", "baseline"]
 
 
@@ -374,15 +366,6 @@ def kind_of(name: str) -> Kind:
     """Return whether a row of a table is about a model or a baseline, by its name only."""
     model = name.partition(" · ")[0]
     return "baseline" if model in BASELINE_MODELS or name in COMPUTED else "model"
-
-
-def not_given(names: Iterable[str]) -> list[str]:
-    """Return the baselines among `OUTCOME` and `MAJORITY` without predictions.
-
-    ``names``: names of everything of which there are predictions.
-    """
-    models = {name.partition(" · ")[0] for name in names}
-    return [name for name, model in GIVEN_AS.items() if model not in models]
 
 
 def seen_stimuli(stimuli: pd.DataFrame) -> pd.DataFrame:
@@ -399,14 +382,12 @@ def baseline_stimuli(stimuli: pd.DataFrame) -> pd.DataFrame:
     """Return the answers of `OUTCOME` and `MAJORITY` to the stimuli that people answered.
 
     ``stimuli`` and the result have the columns of `Comparison.stimuli`; the result is
-    about each stimulus once, and P(contact) is 0 or 1. Without people, and for baselines whose
-    predictions were given (`GIVEN_AS`), it has no rows.
+    about each stimulus once, and P(contact) is 0 or 1. Without people it has no rows.
     """
     seen = seen_stimuli(stimuli)
     answers = {OUTCOME: seen["label"].astype(bool), MAJORITY: seen["p_yes"] > 0.5}
-    names = not_given(str(model) for model in stimuli["model"].unique())
-    parts = [_answering(seen, name, answers[name]) for name in names]
-    return pd.concat(parts, ignore_index=True) if parts else seen.iloc[:0]
+    parts = [_answering(seen, name, given) for name, given in answers.items()]
+    return pd.concat(parts, ignore_index=True)
 
 
 def _answering(seen: pd.DataFrame, name: str, yes: pd.Series) -> pd.DataFrame:

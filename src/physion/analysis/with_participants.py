@@ -33,7 +33,7 @@ from physion.analysis.people.measures import (
     mean_over_people,
 )
 from physion.analysis.sample import RESAMPLED, Resampled, Sample
-from physion.analysis.scores import MAJORITY, OUTCOME, not_given
+from physion.analysis.scores import MAJORITY, OUTCOME
 from physion.analysis.statistics import agreement
 from physion.analysis.statistics.agreement import correctness, correlate_rows, cross_kappa, rmsd
 from physion.analysis.tables import MEAN
@@ -298,12 +298,11 @@ def _undefined(models: Models, answers: ScenarioAnswers, computes: Computes) -> 
 
 
 def add_baselines(models: Models, answers: ScenarioAnswers) -> Models:
-    """Return the models with `OUTCOME` and `MAJORITY` as the last two, unless they were given."""
+    """Return the models with `OUTCOME` and `MAJORITY` as the last two."""
     rows = {OUTCOME: answers.label, MAJORITY: answers.p_yes() > 0.5}
-    names = not_given(models.names)
-    added = [rows[name].astype(np.float64)[None] for name in names]
+    added = [row.astype(np.float64)[None] for row in rows.values()]
     return Models(
-        (*models.names, *names),
+        (*models.names, *rows),
         np.vstack([models.p_contact, *added]),
         np.vstack([models.predicted, *added]),
     )

@@ -13,7 +13,7 @@ VERBS = {
     "run": "run the whole pipeline: scenes, trials, models, readout, comparison, report",
     "generate": "sample scenes and write trials",
     "replay": "simulate official command logs and compare with the recorded outcomes",
-    "train": "train models on trials, without labels",
+    "train": "train models on trials",
     "evaluate": "train models and readouts on trials and write their predictions",
     "check": "test whether predictions depend on what follows, names, order or outcomes",
     "compare": "compare predictions with people",

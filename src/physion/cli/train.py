@@ -1,5 +1,4 @@
-"""Train models on a dataset without labels; the same command resumes, and evaluate finds the
-results.
+"""Train models on a dataset; the same command resumes, and evaluate finds the results.
 
 Models whose weights ship are trained from random weights. One training that fails does not stop the
 others.

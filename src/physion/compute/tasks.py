@@ -89,7 +89,6 @@ executors: Registry[type] = Registry(
     "executor",
     {
         "local": "physion.compute.local:LocalExecutor",
-        "serial": "physion.compute.local:SerialExecutor",
         "slurm": "physion.compute.slurm:SlurmExecutor",
         "ray": "physion.compute.ray:RayExecutor",
     },

@@ -243,7 +243,7 @@ def test_neighbours_equal_brute_force_and_are_kept_while_particles_stay() -> Non
     assert (near.counts != counts).any()
 
 
-def test_neighbours_found_among_candidates_are_those_of_a_search_anew() -> None:
+def test_neighbours_among_candidates_equal_a_search_anew() -> None:
     """Particles and bodies move by steps below, near and above the slack of the candidates."""
     rng = np.random.default_rng(2)
     bodies = (
