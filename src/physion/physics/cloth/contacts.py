@@ -84,7 +84,8 @@ def new_neighbours(particles: int, room: int, solids: Solids, reach: float) -> N
     """Return room for ``room`` neighbours, within ``reach`` metres, of each of some particles."""
     # A ball holds at most as many points of a cubic lattice as cubes fit in one that is larger by
     # half the diagonal of a cube.
-    bodies, most = len(solids.origins), 4.19 * ((reach + SLACK) / solids.spacing + 0.87) ** 3
+    bodies, radius = len(solids.origins), (reach + SLACK) / solids.spacing + 0.87
+    most = 4.19 * radius * radius * radius
     return Neighbours(
         np.zeros(particles, np.int64),
         np.empty((particles, room), np.int64),
