@@ -64,7 +64,7 @@ class TaskOutcome(Generic[R]):
 
 
 class Executor(Protocol):
-    """Runner of tasks; see `executors` for the implementations."""
+    """Runner of tasks; see `executors` and `SerialExecutor` for the implementations."""
 
     def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[TaskOutcome[R]]:
         """Run ``function`` on every task and yield outcomes as they come, in any order.

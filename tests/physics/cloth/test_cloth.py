@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from physion.core.errors import BadInputError
+from physion.core.errors import BadInputError, BadSceneError
 from physion.numerics.linear_algebra import unit
-from physion.numerics.rotations import rotate_vectors
+from physion.numerics.rotations import rotate_vectors, rotation_matrix
 from physion.physics.cloth.contacts import (
+    SLACK,
     BodyPoses,
     find_neighbours,
     new_neighbours,
@@ -218,10 +219,10 @@ def test_neighbours_equal_brute_force_and_are_kept_while_particles_stay() -> Non
     poses = BodyPoses(x, np.array([rotation_of(body) for body in bodies]))
     before = BodyPoses(x - [[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]], poses.rot)
     points, reach, room = rng.uniform(-0.5, 1.0, (3, 200)), 0.06, 100
-    near = new_neighbours(200, room, solids, reach)
+    near = new_neighbours(200, room, solids, reach, 0.0)
     bounds = (np.empty((2, 3)), np.empty((2, 3)))
     world_bounds(solids, poses, reach, *bounds)
-    find_neighbours(points, reach, -1.0, solids, poses, before, bounds, near)
+    find_neighbours(points, -1.0, solids, poses, before, bounds, near)
     world = [
         rotate_vectors(unit(body.rotation), particles_of(body, SPACING)) + body.position
         for body in bodies
@@ -237,9 +238,9 @@ def test_neighbours_equal_brute_force_and_are_kept_while_particles_stay() -> Non
         assert moved == pytest.approx(np.where(of[:, None] == 1, [0.01, 0.0, 0.0], 0.0), abs=1e-12)
     counts = near.counts.copy()
     points[2] += 0.005
-    find_neighbours(points, reach, 0.006, solids, poses, poses, bounds, near)
+    find_neighbours(points, 0.006, solids, poses, poses, bounds, near)
     assert (near.counts == counts).all()
-    find_neighbours(points, reach, 0.004, solids, poses, poses, bounds, near)
+    find_neighbours(points, 0.004, solids, poses, poses, bounds, near)
     assert (near.counts != counts).any()
 
 
@@ -251,25 +252,51 @@ def test_neighbours_among_candidates_equal_a_search_anew() -> None:
         Body("b", "prop:bowl", (0.3, 0.2, 0.1), (0.5, 0.5, 0.5)),
     )
     solids, reach = fill_bodies(bodies, SPACING), 0.145
-    x = np.array([body.position for body in bodies])
-    old = BodyPoses(x.copy(), np.array([rotation_of(body) for body in bodies]))
+    x, turns = (np.array([getattr(b, n) for b in bodies]) for n in ("position", "rotation"))
+    old = BodyPoses(x, np.array([rotation_matrix(unit(q)) for q in turns]))
     points = rng.uniform(-0.4, 0.7, (3, 300))
-    kept = new_neighbours(300, 100, solids, reach)
+    kept, changed = new_neighbours(300, 100, solids, reach, SLACK), []
     bounds = (np.empty((2, 3)), np.empty((2, 3)))
     for scale in (0.002, 0.005, 0.01, 0.02, 0.05):
         for _ in range(4):
             points += rng.uniform(-scale, scale, points.shape)
-            poses = BodyPoses(old.x + rng.uniform(-scale, scale, (2, 3)) / 2, old.rot)
+            x, turns = (a + rng.uniform(-scale, scale, a.shape) / 2 for a in (x, turns))
+            poses = BodyPoses(x, np.array([rotation_matrix(unit(q)) for q in turns]))
             world_bounds(solids, poses, reach, *bounds)
-            fresh = new_neighbours(300, 100, solids, reach)
+            fresh = new_neighbours(300, 100, solids, reach, 0.0)
+            before = kept.scanned_at.copy()
             for near in (kept, fresh):
-                find_neighbours(points, reach, -1.0, solids, poses, old, bounds, near)
+                find_neighbours(points, -1.0, solids, poses, old, bounds, near)
             assert (kept.counts == fresh.counts).all() and kept.counts.sum() > 1000
             for v, count in enumerate(kept.counts):
                 for name in ("body", "position", "displacement"):
                     a, b = getattr(kept, name)[v, :count], getattr(fresh, name)[v, :count]
                     assert (a == b).all()
+            known = np.isfinite(before).all(axis=2)
+            changed += (
+                [(kept.scanned_at != before).any(axis=2)[known].mean()] if known.any() else []
+            )
             old = poses
+    # Candidates are kept in small steps, and hardly ever in large ones.
+    assert max(changed[:7]) < 0.3 and min(changed[-4:]) > 0.5
+
+
+def test_room_for_candidates_is_enough_in_a_dense_body() -> None:
+    solids = fill_bodies((Body("a", "cube", (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),), 0.02)
+    poses = BodyPoses(np.zeros((1, 3)), np.eye(3)[None])
+    points = np.random.default_rng(3).uniform(0.4, 0.6, (3, 200))
+    for radius in (0.02, 0.03, 0.05, 0.08):
+        near = new_neighbours(200, 1000, solids, radius, 1e-6)
+        bounds = (np.full((1, 3), -1.0), np.full((1, 3), 2.0))
+        find_neighbours(points, -1.0, solids, poses, poses, bounds, near)
+        assert 0 < near.candidate_counts.max() <= near.candidates.shape[2]
+        assert near.candidate_counts.max() > near.candidates.shape[2] / 4
+
+
+def test_a_body_with_too_many_particles_is_refused() -> None:
+    rod = Body("a", "cube", (0.0, 0.0, 0.0), (0.1, 0.1, 40000 * SPACING))
+    with pytest.raises(BadSceneError, match="more than 32767"):
+        fill_bodies((rod,), SPACING)
 
 
 def test_springs_join_the_edges_of_the_triangles_and_the_corners_across_them() -> None:
@@ -299,6 +326,26 @@ def test_a_spring_takes_back_its_fraction_of_its_error() -> None:
     pull = 0.3 * (long - 1) / long * np.array([-0.5, 1.0])
     assert shift[:2, 2] == pytest.approx(np.array([-0.15, 0.0]) + pull)
     assert shift.sum(axis=1) == pytest.approx(0.0, abs=1e-15)
+
+
+def test_corrections_of_springs_are_added_one_family_after_the_other() -> None:
+    """The sums equal, to the byte, those of two passes over each family, first to one end."""
+    rng = np.random.default_rng(4)
+    for rows in (2, 3, 12):
+        springs = sheet_springs(Cloth("c", (0.0, 0.0, 0.0), (1.0, 1.0, 0.0), resolution=rows))
+        points = rng.normal(size=(3, rows**2))
+        shift = np.empty_like(points)
+        correct_springs(points, springs, shift, np.empty_like(points))
+        expected = np.zeros_like(points)
+        for g, offset in enumerate(springs.offsets):
+            a, b = points[:, :-offset], points[:, offset:]
+            d = b - a
+            found = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+            half = springs.half_stiffness[g, : len(found)]
+            factor = half * (found - springs.lengths[g]) / found
+            expected[:, :-offset] += factor * (b - a)
+            expected[:, offset:] += factor * (a - b)
+        assert shift.tobytes() == expected.tobytes()
 
 
 def test_recorded_distance_matches_the_recorded_vertices() -> None:

@@ -27,7 +27,8 @@ further ones are ignored."""
 ROUNDING = 1e-9
 """Metres added to the box of a search, so that rounding excludes no particle."""
 SLACK = 0.02
-"""Metres that a particle moves against a body before the lattice is scanned for it again."""
+"""Metres that a cloth particle moves against a body before the lattice is scanned for it again.
+Time and memory depend on it, results do not."""
 
 
 class Solids(NamedTuple):
@@ -58,9 +59,10 @@ class Neighbours(NamedTuple):
     world; ``displacement`` (V, K, 3) metres that it moved during the substep; ``searched_at``
     (3, V) where the particle was when they were searched, metres.
 
-    Candidates are those within the reach and `SLACK` of ``scanned_at`` (V, N, 3), a point in the
-    frame of each of N bodies, metres: ``candidate_counts`` (V, N) how many, and ``candidates``
-    (V, N, C, 3) their indices in the lattice, in its order.
+    They are searched within ``reach`` metres. Candidates are those within ``reach + slack`` metres
+    of ``scanned_at`` (V, N, 3), a point in the frame of each of N bodies, infinite before the first
+    scan: ``candidate_counts`` (V, N) how many, and ``candidates`` (V, N, C, 3) their indices in the
+    lattice, in its order. With a slack of 0 nothing is kept, and V of these three is 1.
     """
 
     counts: I64
@@ -68,6 +70,8 @@ class Neighbours(NamedTuple):
     position: F64
     displacement: F64
     searched_at: F64
+    reach: float
+    slack: float
     scanned_at: F64
     candidate_counts: I64
     candidates: NDArray[np.int16]
@@ -80,21 +84,29 @@ def new_poses(bodies: int) -> BodyPoses:
 
 
 @kernel
-def new_neighbours(particles: int, room: int, solids: Solids, reach: float) -> Neighbours:
-    """Return room for ``room`` neighbours, within ``reach`` metres, of each of some particles."""
-    # A ball holds at most as many points of a cubic lattice as cubes fit in one that is larger by
-    # half the diagonal of a cube.
-    bodies, radius = len(solids.origins), (reach + SLACK) / solids.spacing + 0.87
-    most = 4.19 * radius * radius * radius
+def new_neighbours(
+    particles: int, room: int, solids: Solids, reach: float, slack: float
+) -> Neighbours:
+    """Return room for the neighbours of ``particles`` particles among ``solids``.
+
+    Each has ``room`` neighbours at most, within ``reach`` metres; for ``slack`` see `Neighbours`.
+    """
+    # A ball holds at most as many points of a cubic lattice as cubes fit in a ball whose radius is
+    # larger by half the diagonal of a cube.
+    bodies, radius = len(solids.origins), (reach + slack) / solids.spacing + 0.87
+    most = min(int(4.19 * radius * radius * radius) + 1, len(solids.filled))
+    kept = particles if slack > 0 else 1
     return Neighbours(
         np.zeros(particles, np.int64),
         np.empty((particles, room), np.int64),
         np.empty((particles, room, 3)),
         np.empty((particles, room, 3)),
         np.full((3, particles), np.inf),
-        np.full((particles, bodies, 3), np.inf),
-        np.zeros((particles, bodies), np.int64),
-        np.empty((particles, bodies, int(most) + 1, 3), np.int16),
+        reach,
+        slack,
+        np.full((kept, bodies, 3), np.inf),
+        np.zeros((kept, bodies), np.int64),
+        np.empty((kept, bodies, most, 3), np.int16),
     )
 
 
@@ -163,14 +175,13 @@ def world_bounds(solids: Solids, poses: BodyPoses, reach: float, low: F64, high:
 # the lattice cells within ``reach`` are a small box of indices. Macklin et al. 2014 search once a
 # substep at the predicted positions, with a hash grid. Here the lattice is scanned with some slack,
 # and candidates are kept until the particle has moved that far against the body; what is within
-# reach of it is found among them. What was found is kept while the particle is within half of the
+# reach of it is found among them. Neighbours are kept while the particle is within half of the
 # margin of where it was searched and no body moves.
 
 
 @kernel
 def find_neighbours(
     points: F64,
-    reach: float,
     keep: float,
     solids: Solids,
     poses: BodyPoses,
@@ -178,14 +189,12 @@ def find_neighbours(
     bounds: tuple[F64, F64],
     near: Neighbours,
 ) -> None:
-    """Fill ``near`` with the solid particles within ``reach`` of every cloth particle.
+    """Fill ``near`` with the solid particles within its reach of every cloth particle.
 
     Parameters
     ----------
     points : (3, V)
         Cloth particles, metres, world.
-    reach : float
-        Metres.
     keep : float
         Metres that a particle may have moved since its last search; below 0 all are searched.
     solids, poses, old
@@ -193,19 +202,19 @@ def find_neighbours(
     bounds : (N, 3), (N, 3)
         Of `world_bounds`.
     near : Neighbours
-        Is filled; at most `MAX_NEIGHBOURS` a particle, in the order of bodies.
+        Of `new_neighbours` for these solids; is filled up to its room, in the order of bodies.
     """
-    # Records are taken apart here, and nothing is called or allocated below: either would cost more
-    # than the search.
+    # Records are taken apart here, and nothing is called or allocated for a particle: either would
+    # cost more than the search.
     box_low, box_high = bounds
     origins, sizes, starts, filled, spacing = solids
     x, rot = poses
     old_x, old_rot = old
     counts, of_body, position, displacement, searched_at = near[:5]
-    scanned_at, candidate_counts, candidates = near[5:]
+    reach, slack, scanned_at, candidate_counts, candidates = near[5:]
     point, local, outside = np.empty(3), np.empty(3), np.empty(3)
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
-    square, wide = reach * reach, (reach + SLACK) ** 2
+    square, wide, still = reach * reach, (reach + slack) ** 2, (slack - ROUNDING) ** 2
     for v in range(points.shape[1]):
         moved = 0.0
         for k in range(3):
@@ -215,14 +224,14 @@ def find_neighbours(
             continue
         for k in range(3):
             searched_at[k, v] = point[k]
-        found = 0
+        found, row_kept = 0, v if slack > 0 else 0
         for body in range(len(origins)):
             apart = False
             for k in range(3):
                 apart = apart or point[k] < box_low[body, k] or point[k] > box_high[body, k]
             if apart:
                 continue
-            total, moved = 0.0, 0.0
+            total, drift = 0.0, 0.0
             for k in range(3):
                 local[k] = -origins[body, k]
                 for m in range(3):
@@ -230,13 +239,13 @@ def find_neighbours(
                 end = (sizes[body, k] - 1) * spacing
                 outside[k] = max(-local[k], 0.0, local[k] - end) ** 2
                 total += outside[k]
-                moved += (local[k] - scanned_at[v, body, k]) ** 2
+                drift += (local[k] - scanned_at[row_kept, body, k]) ** 2
             if total >= square:
                 continue
-            if moved > (SLACK - ROUNDING) ** 2:
+            if slack == 0 or not drift <= still:
                 listed = 0
                 for k in range(3):
-                    scanned_at[v, body, k] = local[k]
+                    scanned_at[row_kept, body, k] = local[k]
                     # What the point is outside the lattice along the other axes leaves less along
                     # this.
                     left = np.sqrt(wide - (total - outside[k])) + ROUNDING
@@ -253,15 +262,16 @@ def find_neighbours(
                         for k in range(low[2], high[2] + 1):
                             dz = local[2] - k * spacing
                             if filled[row + k] and flat + dz * dz < wide:
-                                candidates[v, body, listed, 0] = i
-                                candidates[v, body, listed, 1] = j
-                                candidates[v, body, listed, 2] = k
+                                candidates[row_kept, body, listed, 0] = i
+                                candidates[row_kept, body, listed, 1] = j
+                                candidates[row_kept, body, listed, 2] = k
                                 listed += 1
-                candidate_counts[v, body] = listed
-            for c in range(candidate_counts[v, body]):
-                i, j, k = candidates[v, body, c]
+                candidate_counts[row_kept, body] = listed
+            for c in range(candidate_counts[row_kept, body]):
+                i, j = candidates[row_kept, body, c, 0], candidates[row_kept, body, c, 1]
+                k = candidates[row_kept, body, c, 2]
                 dx, dy, dz = local[0] - i * spacing, local[1] - j * spacing, local[2] - k * spacing
-                if dx * dx + dy * dy + dz * dz >= square or found == of_body.shape[1]:
+                if not dx * dx + dy * dy + dz * dz < square or found == of_body.shape[1]:
                     continue
                 sx = origins[body, 0] + i * spacing
                 sy = origins[body, 1] + j * spacing

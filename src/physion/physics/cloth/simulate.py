@@ -390,8 +390,9 @@ def settle(
     step = options.frame_time / options.substeps
     count, bodies = solids.local.shape[1], len(state.q)
     start, touching = np.zeros((3, count)), np.empty(count, np.int64)
+    # All particles of a solid move: to keep candidates costs more than to scan again.
     reach = options.rest_distance + options.search_margin
-    near = new_neighbours(count, MAX_NEIGHBOURS, lattices, reach)
+    near = new_neighbours(count, MAX_NEIGHBOURS, lattices, reach, 0.0)
     before, poses = new_poses(bodies), new_poses(bodies)
     old_center, old_q = state.center.copy(), state.q.copy()
     for frame in range(frames):
@@ -469,11 +470,13 @@ def _search_solids(
             near.position[first:last],
             near.displacement[first:last],
             near.searched_at[:, first:last],
-            near.scanned_at[first:last],
-            near.candidate_counts[first:last],
-            near.candidates[first:last],
+            near.reach,
+            near.slack,
+            near.scanned_at,
+            near.candidate_counts,
+            near.candidates,
         )
-        find_neighbours(points[:, first:last], reach, -1.0, lattices, poses, before, others, part)
+        find_neighbours(points[:, first:last], -1.0, lattices, poses, before, others, part)
         for p in range(first, last):
             if near.counts[p] > 0 or points[2, p] < near_floor:
                 touching[number] = p
@@ -557,8 +560,8 @@ def _comes_close(
     bounds = (np.empty((count, 3)), np.empty((count, 3)))
     world_bounds(lattices, poses, options.rest_distance, bounds[0], bounds[1])
     bounds[0][number:], bounds[1][number:] = np.inf, -np.inf
-    near = new_neighbours(points.shape[1], 1, lattices, options.rest_distance)
-    find_neighbours(points, options.rest_distance, -1.0, lattices, poses, poses, bounds, near)
+    near = new_neighbours(points.shape[1], 1, lattices, options.rest_distance, 0.0)
+    find_neighbours(points, -1.0, lattices, poses, poses, bounds, near)
     return bool(near.counts.any())
 
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from physion.core.errors import BadSceneError
 from physion.numerics.kernel import kernel
 from physion.numerics.linear_algebra import dot, inverse, multiply, norm, ordered_mean, ordered_sum
 from physion.numerics.rotations import rotation_matrix
@@ -31,6 +32,9 @@ from physion.scenes.shapes.primitives import ConvexPiece, shape
 F64 = NDArray[np.float64]
 Filled = NDArray[np.bool_]
 I64 = NDArray[np.int64]
+
+MOST_A_SIDE = 32767
+"""Most particles along a side of a lattice: their indices are 16-bit integers."""
 
 
 @lru_cache(maxsize=256)
@@ -131,13 +135,22 @@ def fill_bodies(bodies: tuple[Body, ...], spacing: float) -> Solids:
 
 
 def fill_lattices(shapes: Sequence[tuple[str, Vec3] | None], spacing: float) -> Solids:
-    """Return the lattices of shapes at their scales; None stands for an empty one."""
+    """Return the lattices of shapes at their scales; None stands for an empty one.
+
+    Raises `BadSceneError` for a lattice with more than `MOST_A_SIDE` points along a side.
+    """
     lattices = [
         (np.zeros(3), np.zeros((0, 0, 0), np.bool_))
         if found is None
         else fill_shape(found[0], found[1], spacing)
         for found in shapes
     ]
+    for found, (_, filled) in zip(shapes, lattices, strict=True):
+        if found is not None and max(filled.shape) > MOST_A_SIDE:
+            raise BadSceneError(
+                f"body of shape {found[0]!r} has {max(filled.shape)} particles along a side, more "
+                f"than {MOST_A_SIDE}; beside cloth make it smaller, or scenery"
+            )
     counts = np.array([filled.size for _, filled in lattices], np.int64)
     return Solids(
         np.array([origin for origin, _ in lattices], np.float64).reshape(-1, 3),

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from physion.numerics.kernel import kernel
 from physion.physics.cloth.contacts import (
     MAX_NEIGHBOURS,
+    SLACK,
     BodyPoses,
     ClothOptions,
     Neighbours,
@@ -223,12 +224,12 @@ def run_cloth(
     bounds = (np.empty((bodies, 3)), np.empty((bodies, 3)))
     step = options.frame_time / options.substeps
     reach = options.rest_distance + options.search_margin
-    near = new_neighbours(number, MAX_NEIGHBOURS, solids, reach)
+    near = new_neighbours(number, MAX_NEIGHBOURS, solids, reach, SLACK)
     near_floor = options.floor + options.floor_gap + options.search_margin
     undeformed = falls_as_one(points, velocities, springs)
     interpolate_poses(positions, rotations, 0, 1.0, old)
     world_bounds(solids, old, reach, bounds[0], bounds[1])
-    find_neighbours(points, reach, -1.0, solids, old, old, bounds, near)
+    find_neighbours(points, -1.0, solids, old, old, bounds, near)
     moved = False
     for frame in range(len(positions)):
         for part in range(options.substeps if frame > 0 else 0):
@@ -241,7 +242,7 @@ def run_cloth(
             moved = moves
             if moves:
                 world_bounds(solids, poses, reach, bounds[0], bounds[1])
-            find_neighbours(points, reach, keep, solids, poses, old, bounds, near)
+            find_neighbours(points, keep, solids, poses, old, bounds, near)
             count = _list_touching(points, near, near_floor, touching)
             undeformed = undeformed and count == 0
             if not undeformed:

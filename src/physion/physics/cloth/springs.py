@@ -95,7 +95,8 @@ def _corrections(
 ) -> None:
     """Fill ``out`` with k/2 (|b - a| - l) (b - a) / |b - a| of springs from ``a`` to ``b``.
 
-    All are coordinates x, y, z (S,) in metres.
+    ``a``, ``b`` and ``out`` are coordinates x, y, z (S,) in metres, ``half`` (S,) is k/2 and
+    ``length`` l.
     """
     ax, ay, az = a
     bx, by, bz = b
@@ -114,6 +115,7 @@ def _add(total: F64, correction: F64, offset: int) -> None:
 
     The last begin ``offset`` = V - S places after the first.
     """
+    # In the middle both happen, in this order: another one would round otherwise.
     both = max(len(correction) - offset, 0)
     early, late, same = total[offset : offset + both], correction[offset:], correction[:both]
     for s in range(min(offset, len(correction))):
@@ -163,6 +165,7 @@ def sheet_springs(cloth: Cloth) -> SheetSprings:
     x, y = np.divmod(np.arange(rows**2), rows)
     to_x, to_y = x + steps[:, :1], y + steps[:, 1:]
     joined = (to_x < rows) & (to_y >= 0) & (to_y < rows)
+    steps, joined = steps[joined.any(axis=1)], joined[joined.any(axis=1)]
     sides = np.asarray(cloth.size[:2]) / (rows - 1)
     stiffness = np.where(np.arange(len(steps)) < len(EDGES), cloth.stretch, cloth.bend)
     offsets = steps[:, 0] * rows + steps[:, 1]
