@@ -161,9 +161,9 @@ class Pictures:
 class Features:
     """Features of a dataset by all models, computed trial by trial and stored as evaluations do."""
 
-    def __init__(self, folder: Path, dataset: Dataset, names: Sequence[str]) -> None:
+    def __init__(self, folder: Path, dataset: Dataset, models: Mapping[str, Any]) -> None:
         self.index = dataset.index.set_index("trial")
-        self.models = {name: build_model(MODELS[name][0], **MODELS[name][1]) for name in names}
+        self.models = models
         self.store = FeatureStore(folder / "models" / "features", batch=1)
         looks = dict(zip(dataset.index["trial"], dataset.index["look"], strict=True))
         files = dataset.files("trial_file")
@@ -210,6 +210,11 @@ class Features:
         simulated = imagined.features()
         assert simulated is not None, "these models give features"
         return [context, simulated]
+
+
+def built(names: Sequence[str]) -> dict[str, Any]:
+    """Return models of `MODELS` by name."""
+    return {name: build_model(MODELS[name][0], **MODELS[name][1]) for name in names}
 
 
 def interleaved(index: pd.DataFrame) -> list[str]:
@@ -439,7 +444,7 @@ def main() -> None:
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     dataset = make_set(options.folder, options.trials)
-    features = Features(options.folder, dataset, options.only)
+    features = Features(options.folder, dataset, built(options.only))
     count = len(set(dataset.index["scenario"]))
     if options.trials:
         whole = options.trials if options.full is None else options.full
@@ -451,7 +456,8 @@ def main() -> None:
     if options.official:
         stimuli = make_official(options.folder)
         tested = stimuli.index[stimuli.index["split"] == "testing"]
-        compute(Features(options.folder, stimuli, options.only), interleaved(tested), len(tested))
+        of_stimuli = Features(options.folder, stimuli, built(options.only))
+        compute(of_stimuli, interleaved(tested), len(tested))
         text = score(options.folder, stimuli, options.only)
         print(text)
         if options.write:
