@@ -14,7 +14,7 @@ import pytest
 from physion.clips.batch import Batch, Motion, Spec, cut_to_observed
 from physion.clips.clips import observed_source, whole_source
 from physion.clips.source import FutureFrameError, ObservedSource, WholeSource
-from physion.clips.states import cut_motion
+from physion.clips.states import TrialMotions, cut_motion, digest_in, motion_digest
 from physion.core.errors import BadInputError
 from physion.physics.trajectory import Contacts, Trajectory
 from physion.scenes.scene import OBSERVED_FRAMES
@@ -253,3 +253,26 @@ def test_no_scene_tells_the_answer_by_its_parameters(made: Dataset, tmp_path: Pa
     whole = whole_source(changed, SPECS["state"]).whole([RIGID])
     for batch in (observed, whole):
         assert batch.state is not None and dict(batch.state[0].scene.parameters) == {"mass": 2.0}
+
+
+def test_a_file_is_digested_once_and_refused_if_it_changed(
+    made: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = Dataset(shutil.copytree(made.folder, tmp_path / "copy"))
+    files, digested = copy.files("trial_file"), []
+
+    def counted(motion: Motion) -> str:
+        digested.append(motion.scene.name)
+        return motion_digest(motion)
+
+    monkeypatch.setattr("physion.clips.states.motion_digest", counted)
+    first, *_ = files
+    for observed in (True, False, True, False):
+        motions = TrialMotions(files, observed=observed)
+        assert digest_in(motions, first) == motion_digest(motions[first])
+        assert digest_in(dict(motions), first) == motion_digest(motions[first])
+    # Twice from the file, cut and whole, and each time from the plain mapping.
+    assert len(digested) == 2 + 4
+    files[first].path.write_bytes(b"other")
+    with pytest.raises(BadInputError, match="changed"):
+        digest_in(TrialMotions(files, observed=True), first)

@@ -21,7 +21,7 @@ from physion.clips.batch import (
     SCENERY_ID,
     Motion,
 )
-from physion.clips.states import motion_digest
+from physion.clips.states import digest_in
 from physion.core.errors import BadInputError
 from physion.core.version import version_digest
 from physion.rendering.camera import projection_matrix, view_matrix
@@ -57,7 +57,6 @@ class MotionRenderer:
         self._size, self._objects, self._looks = size, objects, looks
         self._passes = tuple(_PASS[name] for name in inputs if name in _PASS)
         self._kept: dict[str, tuple[NDArray[np.float32], NDArray[np.bool_]]] = {}
-        self._digests: dict[str, str] = {}
 
     def read(self, trial: str, frames: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
         """Return the inputs of the clip that shows ``frames``."""
@@ -125,10 +124,8 @@ class MotionRenderer:
 
     def identity(self, trial: str) -> str:
         """Return look, version of the renderer, and digest of scene and motion."""
-        if trial not in self._digests:
-            self._digests[trial] = motion_digest(self._motions[trial])
         version = f"{VERSION}.{version_digest(*PASSES)}"
-        return f"rendered {self._looks[trial]} {version} {self._digests[trial]}"
+        return f"rendered {self._looks[trial]} {version} {digest_in(self._motions, trial)}"
 
 
 def object_ids(scene: Scene) -> NDArray[np.uint8]:

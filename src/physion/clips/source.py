@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.clips.batch import LAST_OBSERVED, Batch, Motion, Spec, clip_frames
-from physion.clips.states import motion_digest
+from physion.clips.states import digest_in
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import digest_of
 
@@ -65,7 +65,6 @@ class TrialReaders:
         state: Mapping[str, Motion] | None = None,
     ) -> None:
         self._lengths, self._readers, self._state = lengths, tuple(readers), state
-        self._state_digests: dict[str, str] = {}
 
     @property
     def trials(self) -> tuple[str, ...]:
@@ -106,9 +105,7 @@ class TrialReaders:
         self.length(trial)
         texts = [reader.identity(trial) for reader in self._readers]
         if self._state is not None:
-            if trial not in self._state_digests:
-                self._state_digests[trial] = motion_digest(self._state[trial])
-            texts.append(f"state {self._state_digests[trial]}")
+            texts.append(f"state {digest_in(self._state, trial)}")
         return texts
 
 

@@ -8,6 +8,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -54,11 +55,20 @@ def motion_digest(motion: Motion) -> str:
     return digest_of("\n".join(texts))
 
 
+def digest_in(motions: Mapping[str, Motion], trial: str) -> str:
+    """Return the `motion_digest` of a trial; of trial files it is computed once in a process."""
+    if isinstance(motions, TrialMotions):
+        return motions.digest(trial)
+    return motion_digest(motions[trial])
+
+
 def _copies(values: object) -> dict[str, Any]:
     """Return copies of the arrays of a dataclass by name."""
     return {name: a.copy() for name, a in vars(values).items() if isinstance(a, np.ndarray)}
 
 
+_DIGESTS: dict[tuple[Path, str, bool], str] = {}
+"""Digests of motions by file, its SHA-256, and whether they are cut."""
 _LEAST_BYTES, _FRACTION = 2**28, 8
 """Motions that were read last are kept in memory up to one eighth of it, or this size."""
 
@@ -95,6 +105,17 @@ class TrialMotions(Mapping[str, Motion]):
         with self._lock:
             self._keep(trial, motion)
         return motion
+
+    def digest(self, trial: str) -> str:
+        """Return the `motion_digest` of a trial, computed once in a process for each file."""
+        if trial in self._files:
+            stored = self._files[trial]
+            stored.check()
+            known = stored.path, stored.sha256, self._observed
+            if known not in _DIGESTS:
+                _DIGESTS[known] = motion_digest(self[trial])
+            return _DIGESTS[known]
+        raise UnknownNameError("trial", trial, self._files)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._files)
