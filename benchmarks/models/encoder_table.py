@@ -1,7 +1,7 @@
 """Encoders with weights beside their random twins: pooled features and grid, in one table.
 
     OMP_NUM_THREADS=1 python benchmarks/models/encoder_table.py FOLDER --trials 1000 [--write]
-        [--only NAME ...]
+        [--only NAME ...] [--features pooled grid mean]
 
 By the protocol of the paper for *observed*: readouts are fitted on --trials own trials a scenario,
 and tested on the official stimuli that people saw, by their recorded outcomes, and on 150 other own
@@ -9,7 +9,8 @@ trials a scenario. Motions are made without movies, and pictures drawn on demand
 picture is drawn once for all rows that see it at that size, and goes through each network once for
 both kinds of features. FOLDER may be that of `ship_readouts.py`: its motions and features are used
 again. The same command resumes; --write puts the rows into ``results/encoders.json``, in place of
-those of the same encoder, and prints all as ``results/encoders.md``.
+those of the same encoder and features, and prints all as ``results/encoders.md``. A grid has 16
+times as many features as a mean: fits of 1,000 trials take minutes a scenario.
 """
 
 from __future__ import annotations
@@ -47,6 +48,11 @@ ENCODERS: Mapping[str, tuple[str, Mapping[str, Any], tuple[str, str]]] = {
     "VGG-16, trained on edges": ("pHEDVGG16-mlp", {}, ("mean", "grid")),
 }
 """Encoders whose weights ship or install by pip: model, its options, and poolings."""
+POOLINGS = ("pooled", "mean", "grid")
+
+
+Variants = Mapping[tuple[str, bool], tuple[str, Mapping[str, Any]]]
+"""Model and its options by pooling and whether it is the twin."""
 
 
 def make_own(folder: Path, split: str, count: int) -> Dataset:
@@ -84,20 +90,20 @@ def share_networks(models: Mapping[str, Any]) -> None:
         trunk.forward_features = keep_last(trunk.forward_features, kept.setdefault(key, []))
 
 
-def variants(name: str) -> dict[tuple[str, bool], tuple[str, dict[str, Any]]]:
-    """Return the models of an encoder by pooling and whether it is the twin."""
+def variants(name: str, chosen: Sequence[str]) -> Variants:
+    """Return the models of an encoder by chosen pooling and whether it is the twin."""
     model, options, poolings = ENCODERS[name]
     return {
         (pooling, twin): (
             model, {**options, "pooling": pooling, **({"weights": "random"} if twin else {})}
         )
-        for pooling in poolings for twin in (False, True)
+        for pooling in poolings if pooling in chosen for twin in (False, True)
     }  # fmt: skip
 
 
-def compute(folder: Path, dataset: Dataset, name: str, trials: Sequence[str]) -> None:
+def compute(folder: Path, dataset: Dataset, made: Variants, trials: Sequence[str]) -> None:
     """Compute the features of trials by all models of an encoder."""
-    models = {f"{name} {k}": build_model(m, **o) for k, (m, o) in variants(name).items()}
+    models = {str(key): build_model(m, **o) for key, (m, o) in made.items()}
     share_networks(models)
     features = Features(folder, dataset, models)
     for number, trial in enumerate(trials, start=1):
@@ -124,10 +130,12 @@ def accuracy(hit: pd.Series[Any]) -> str:
     return f"{mean:.3f} ({mean - half:.3f} to {mean + half:.3f}) | {rigid:.3f}"
 
 
-def rows_of(folder: Path, name: str, fit: Dataset, tests: Sequence[Dataset]) -> list[str]:
+def rows_of(
+    folder: Path, name: str, made: Variants, fit: Dataset, tests: Sequence[Dataset]
+) -> list[str]:
     """Return the rows of the table, of an encoder and its twin."""
     rows, hit = [], {}
-    for (pooling, twin), (model, options) in variants(name).items():
+    for (pooling, twin), (model, options) in made.items():
         cells = []
         for number, dataset in enumerate(tests):
             found = evaluate(
@@ -140,7 +148,7 @@ def rows_of(folder: Path, name: str, fit: Dataset, tests: Sequence[Dataset]) -> 
         most = int(found["fit_trials"].max())
         label = "its random twin" if twin else name
         rows.append([label, pooling, str(most), f"{fitted:.3f}", *cells])
-    for row, (pooling, twin) in zip(rows, variants(name), strict=True):
+    for row, (pooling, twin) in zip(rows, made, strict=True):
         for number in range(len(tests)):
             own, other = hit[pooling, False, number], hit[pooling, True, number]
             if twin:
@@ -172,7 +180,12 @@ def page(tables: Mapping[str, Mapping[str, Any]]) -> str:
             "",
             head,
             "|---" * (head.count("|") - 1) + "|",
-            *(row for name in ENCODERS if name in tables for row in tables[name]["rows"]),
+            *(
+                row
+                for name, (_, _, poolings) in ENCODERS.items()
+                for pooling in poolings
+                for row in tables.get(f"{name}, {pooling}", {"rows": ()})["rows"]
+            ),
             "",
         ]
     )
@@ -186,6 +199,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--trials", type=int, default=1000, help="fitted, a scenario")
     parser.add_argument("--only", nargs="*", choices=ENCODERS, default=list(ENCODERS))
+    parser.add_argument("--features", nargs="*", choices=POOLINGS, default=list(POOLINGS))
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     fit = make_own(options.folder, "readout", options.trials)
@@ -194,24 +208,26 @@ def main() -> None:
     tested = pd.concat([test.index["digest"] for test in tests])
     fit.index = fit.index[~fit.index["digest"].isin(tested)]
     for name in options.only:
+        made = variants(name, options.features)
         for dataset, split in ((fit, "readout"), *((test, "testing") for test in tests)):
             index = dataset.index
-            compute(options.folder, dataset, name, interleaved(index[index["split"] == split]))
-        only = "" if len(options.only) == len(ENCODERS) else f' --only "{name}"'
-        table = {
-            "command": f"`python benchmarks/models/encoder_table.py FOLDER --trials "
-            f"{options.trials}{only} --write`",
-            "date": str(datetime.date.today()),
-            "machine": processor(),
-            "rows": rows_of(options.folder, name, fit, tests),
-        }
-        print(*table["rows"], sep="\n", flush=True)
-        if options.write:
-            stored = RESULTS / "encoders.json"
-            tables = json.loads(stored.read_text()) if stored.is_file() else {}
-            tables[name] = table
-            stored.write_text(json.dumps(tables, indent=1) + "\n")
-            stored.with_suffix(".md").write_text(page(tables))
+            compute(options.folder, dataset, made, interleaved(index[index["split"] == split]))
+        for pooling in dict.fromkeys(pooling for pooling, _ in made):
+            of_one = {key: value for key, value in made.items() if key[0] == pooling}
+            table = {
+                "command": f"`python benchmarks/models/encoder_table.py FOLDER --trials "
+                f'{options.trials} --only "{name}" --features {pooling} --write`',
+                "date": str(datetime.date.today()),
+                "machine": processor(),
+                "rows": rows_of(options.folder, name, of_one, fit, tests),
+            }
+            print(*table["rows"], sep="\n", flush=True)
+            if options.write:
+                stored = RESULTS / "encoders.json"
+                tables = json.loads(stored.read_text()) if stored.is_file() else {}
+                tables[f"{name}, {pooling}"] = table
+                stored.write_text(json.dumps(tables, indent=1) + "\n")
+                stored.with_suffix(".md").write_text(page(tables))
 
 
 if __name__ == "__main__":
