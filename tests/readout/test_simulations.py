@@ -107,8 +107,13 @@ class Shelf:
 
     def files(self, column: str) -> dict[str, Any]:
         assert column == "trial_file"
-        return {name: SimpleNamespace(read=lambda name=name: name.encode(), path=Path(name))
-                for name in self.trials}  # fmt: skip
+        return {
+            name: SimpleNamespace(
+                read=lambda name=name: name.encode(), check=lambda: None, path=Path(name),
+                sha256=trial.scene.to_json() + trial.trajectory.digest(),
+            )
+            for name, trial in self.trials.items()
+        }  # fmt: skip
 
 
 SHELVED: dict[bytes, Any] = {}
