@@ -22,7 +22,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
@@ -35,8 +34,7 @@ from physion.compute.tasks import processor
 from physion.models.build import build_model
 from physion.models.encoders.weights import GridFeatures
 from physion.readout.evaluate import evaluate
-from physion.trials.making.plan import GenerateSettings
-from ship_readouts import SET, Features, interleaved, make_official
+from ship_readouts import SET, SETTINGS, Features, accuracy, hits, interleaved, make_official
 
 RESULTS = Path(__file__).parents[1] / "results"
 TESTED = 150
@@ -58,9 +56,8 @@ Variants = Mapping[tuple[str, bool], tuple[str, Mapping[str, Any]]]
 def make_own(folder: Path, split: str, count: int) -> Dataset:
     """Return a set with ``count`` own trials a scenario, as `ship_readouts` makes them."""
     name = SET if split == "readout" else f"{split}-{count}"
-    settings = GenerateSettings(movies=False, look="redyellow", jitters=0, observed_contact=True)
-    path = folder / (f"{split}-{count}")
-    physion.generate(path, "all", {split: count}, name=name, settings=settings,
+    path = folder / f"{split}-{count}"
+    physion.generate(path, "all", {split: count}, name=name, settings=SETTINGS,
                      executor=SerialExecutor())  # fmt: skip
     return Dataset(path)
 
@@ -111,23 +108,6 @@ def compute(folder: Path, dataset: Dataset, made: Variants, trials: Sequence[str
             features.store.encoded(model, features.sources[key], [trial], "context")
         if number % 100 == 0:
             print(f"{datetime.datetime.now():%H:%M:%S} {number} of {len(trials)}", flush=True)
-
-
-def hits(table: pd.DataFrame) -> pd.Series[Any]:
-    """Return for each trial whether its prediction is right, by the recorded outcome if any."""
-    recorded = table.get("recorded_outcome", pd.Series("", index=table.index)).fillna("")
-    truth = recorded.where(recorded != "", table["outcome"]).astype(str) == "True"
-    found = (table["p_contact"] > 0.5) == truth
-    return found.set_axis(pd.MultiIndex.from_frame(table[["scenario", "stimulus"]]))
-
-
-def accuracy(hit: pd.Series[Any]) -> str:
-    """Return the mean of scenarios with its 95 % interval over stimuli, and that of rigid ones."""
-    found = hit.groupby(level="scenario").agg(["mean", "size"])
-    variance = found["mean"] * (1 - found["mean"]) / found["size"]
-    mean, half = found["mean"].mean(), 1.96 * np.sqrt(variance.sum()) / len(found)
-    rigid = found["mean"].drop("drape", errors="ignore").mean()
-    return f"{mean:.3f} ({mean - half:.3f} to {mean + half:.3f}) | {rigid:.3f}"
 
 
 def rows_of(

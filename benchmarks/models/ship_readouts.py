@@ -92,11 +92,14 @@ LAST = 302
 later, of Support and Link, and weights of all 602 frames would not fit into the package."""
 
 
+SETTINGS = GenerateSettings(movies=False, look="redyellow", jitters=0, observed_contact=True)
+"""Of all own sets."""
+
+
 def make_set(folder: Path, count: int) -> Dataset:
     """Return the set with at least ``count`` readout trials a scenario."""
-    settings = GenerateSettings(movies=False, look="redyellow", jitters=0, observed_contact=True)
     if count:
-        physion.generate(folder / SET, "all", {"readout": count}, name=SET, settings=settings,
+        physion.generate(folder / SET, "all", {"readout": count}, name=SET, settings=SETTINGS,
                          executor=SerialExecutor())  # fmt: skip
     return Dataset(folder / SET)
 
@@ -348,11 +351,30 @@ def ship(features: Features, dataset: Dataset, name: str) -> None:
 # Official stimuli.
 
 
+def hits(table: pd.DataFrame) -> pd.Series[Any]:
+    """Return for each trial whether its prediction is right, by the recorded outcome if any."""
+    recorded = table.get("recorded_outcome", pd.Series("", index=table.index)).fillna("")
+    truth = recorded.where(recorded != "", table["outcome"]).astype(str) == "True"
+    found = (table["p_contact"] > 0.5) == truth
+    return found.set_axis(pd.MultiIndex.from_frame(table[["scenario", "stimulus"]]))
+
+
+def accuracy(hit: pd.Series[Any]) -> str:
+    """Return the mean of scenarios with its 95 % interval over stimuli, and that of rigid ones.
+
+    The interval is 1.96 sqrt(sum of p (1 - p) / n) / scenarios to both sides.
+    """
+    found = hit.groupby(level="scenario").agg(["mean", "size"])
+    variance = found["mean"] * (1 - found["mean"]) / found["size"]
+    mean, half = found["mean"].mean(), 1.96 * np.sqrt(variance.sum()) / len(found)
+    rigid = found["mean"].drop("drape", errors="ignore").mean()
+    return f"{mean:.3f} ({mean - half:.3f} to {mean + half:.3f}) | {rigid:.3f}"
+
+
 def score(folder: Path, dataset: Dataset, names: Sequence[str]) -> str:
     """Return the table of accuracies on the official stimuli, and of likeness to people.
 
-    Intervals of accuracy are of the mean of scenarios: 1.96 times sqrt(sum of p (1 - p) / n) /
-    scenarios. r is pooled over stimuli, with the jackknife intervals of `physion.compare`.
+    r is pooled over stimuli, with the jackknife intervals of `physion.compare`.
     """
     rows, hit = [], {}
     for name in names:
@@ -363,18 +385,13 @@ def score(folder: Path, dataset: Dataset, names: Sequence[str]) -> str:
             readouts=tuple(readout.value for readout in readouts), rendered=True,
         )  # fmt: skip
         table = done.predictions
-        truth = table["recorded_outcome"].where(table["recorded_outcome"] != "", table["outcome"])
-        table["hit"] = (table["p_contact"] > 0.5) == (truth.astype(str) == "True")
         scores = compare(table, humans="official").scores
         of_model = scores["readout"] != ""
         pooled = scores[of_model & (scores["scenario"] == POOLED)].set_index("readout")
         for readout in readouts:
             own = table[table["readout"] == readout.value]
-            hit[name, readout] = own.set_index("stimulus")["hit"]
-            hits = own.groupby("scenario")["hit"].agg(["mean", "size"])
-            variance = hits["mean"] * (1 - hits["mean"]) / hits["size"]
-            mean, half = hits["mean"].mean(), 1.96 * np.sqrt(variance.sum()) / len(hits)
-            rigid = hits["mean"].drop("drape", errors="ignore").mean()
+            hit[name, readout] = hits(own)
+            by_scenario = hits(own).groupby(level="scenario").mean()
             fit, trials = own["cv_accuracy"].groupby(own["scenario"]).first(), own["fit_trials"]
             like = [
                 "-" if readout is Readout.FULL else
@@ -384,11 +401,10 @@ def score(folder: Path, dataset: Dataset, names: Sequence[str]) -> str:
             ]  # fmt: skip
             rows.append(
                 f"| {name} | *{readout.value}* | {trials.max()} | "
-                f"{fit.mean():.3f} | {mean:.3f} ({mean - half:.3f} to {mean + half:.3f}) | "
-                f"{rigid:.3f} | {' | '.join(like)} | "
-                f"{' | '.join(f'{value:.2f}' for value in hits['mean'])} |"
+                f"{fit.mean():.3f} | {accuracy(hits(own))} | {' | '.join(like)} | "
+                f"{' | '.join(f'{value:.2f}' for value in by_scenario)} |"
             )
-            scenarios = [*hits.index]
+            scenarios = [*by_scenario.index]
             print(rows[-1], flush=True)
     twins = []
     for (name, readout), of_model in hit.items():
