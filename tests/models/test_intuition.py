@@ -248,13 +248,14 @@ def test_pixels_are_learned_from_with_masks_boxes_and_motion_as_targets() -> Non
     )
     with torch.no_grad():
         before = model.eval().loss(batch)
-    quick = replace(QUICK, batch=16, steps=40, learning_rate=5e-3, held_out=0.0)
+    quick = replace(QUICK, batch=16, steps=80, learning_rate=5e-3, held_out=0.0)
     settings = {"seed": 0, "name": "all", "folder": None, "accelerator": "cpu", "settings": quick}
     train_model(model, source, source.trials, outcomes=source.outcomes, **settings)
     with torch.no_grad():
         after = model.loss(batch)
-    for part, most in (("outcome", 0.95), ("masks", 0.8), ("boxes", 0.8), ("motion", 0.8)):
-        assert float(after[part]) < most * float(before[part]), part
+    # With seeds 0 to 5 at most .08, .16, .04, .04 of the loss is left; after 40 steps, up to all.
+    for part in ("outcome", "masks", "boxes", "motion"):
+        assert float(after[part]) < 0.5 * float(before[part]), part
     image = model.predict(replace(batch, rgb=batch.rgb.flip(3)))
     assert torch.allclose(model.predict(batch), image, atol=1e-5)
     assert torch.equal(model.predict(batch), model.predict(replace(batch, ids=None, contact=None)))
