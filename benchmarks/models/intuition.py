@@ -1,7 +1,8 @@
 """Measure what models that never simulate predict, and how like people they are.
 
     OMP_NUM_THREADS=1 python benchmarks/models/intuition_trials.py FOLDER --trials 1000 --official
-    OMP_NUM_THREADS=1 python benchmarks/models/intuition.py FOLDER [--samples 8] [--write]
+    OMP_NUM_THREADS=1 python benchmarks/models/intuition.py FOLDER [--samples 8] [--many 200]
+        [--write]
 
 Forests on what `state-trees`, `mask-trees` and `blob-trees` see are fitted on the own trials of
 FOLDER, one per scenario, and tested on the official stimuli that people saw, without those that
@@ -62,12 +63,14 @@ MODELS = ("state-trees", "mask-trees", "blob-trees")
 GIVEN = {"state-trees": "states", "mask-trees": "masks", "blob-trees": "blobs"}
 SCALES = (1.0, 2.0, 4.0)
 """Scales of the noise of simulations; the first is the default."""
+CONTACTS = (0.1, 0.4)
+"""Levels of noise at new contacts, added to the default noise: it grows while a simulation runs."""
 COUNTS = (125, 250, 500, 1000, 2000)
 """Own trials of a scenario in the learning curves."""
 ELSEWHERE = 250
 """Own trials of each other scenario, for forests that have not seen the tested one."""
 COMPARED = (
-    "simulation, noise x 1", "simulation, mean of the levels",
+    "simulation, noise x 1", "simulation, many samples", "simulation, mean of the levels",
     "simulation, levels weighted to people",
 )  # fmt: skip
 """Simulations with which learned answers are compared."""
@@ -324,6 +327,7 @@ def main() -> None:
     )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--samples", type=int, default=8, help="simulations of a stimulus")
+    parser.add_argument("--many", type=int, default=0, help="simulations of one row of its own")
     parser.add_argument("--own", type=int, default=50, help="own trials that fit weights")
     parser.add_argument("--predictions", type=Path, nargs="*", default=[], help="of other models")
     parser.add_argument("--write", action="store_true")
@@ -356,10 +360,24 @@ def main() -> None:
             for scale in SCALES
         }
     )
-    answers |= {str(name): levels[name] for name in levels}
+    growing = pd.DataFrame(
+        {
+            f"simulation, noise x 1 and {level:g} at contacts": simulated(
+                options.folder, scenes, SCALES[0], options.samples, level
+            )
+            for level in CONTACTS
+        }
+    )
+    every_level = levels.join(growing)
+    answers |= {str(name): every_level[name] for name in every_level}
+    if options.many:
+        many = simulated(options.folder, scenes, SCALES[0], options.many)
+        answers["simulation, many samples"] = many
     answers["simulation, mean of the levels"] = levels.mean(axis=1)
-    answers["simulation, level fitted to people"] = best_level(levels, people, scenario)
-    answers["simulation, levels weighted to people"] = weighted_levels(levels, people, scenario)
+    answers["simulation, level fitted to people"] = best_level(every_level, people, scenario)
+    answers["simulation, levels weighted to people"] = weighted_levels(
+        every_level, people, scenario
+    )
     default, weights = answers[str(levels.columns[0])], []
     for given in GIVEN.values():
         answers[f"{given}, spread of simulation"] = with_spread(answers[given], default, scenario)
@@ -383,7 +401,8 @@ def main() -> None:
     text = "\n".join(
         [
             "# Learned intuition and simulation",
-            f"`python benchmarks/models/intuition.py FOLDER --samples {options.samples} --write`, "
+            f"`python benchmarks/models/intuition.py FOLDER --samples {options.samples} "
+            f"--many {options.many} --write`, "
             f"{datetime.date.today()}, {processor()}: {len(trials.tested)} official stimuli "
             f"without contact in the observed part, recorded outcomes; {counts.min()} to "
             f"{counts.max()} own trials per scenario.",
@@ -395,7 +414,9 @@ def main() -> None:
             *curve,
             "",
             "With all own trials; r is with people's answers, intervals are of the jackknife over "
-            f"stimuli; {options.samples} simulations of a stimulus from the true state. Without "
+            f"stimuli; {options.samples} simulations of a stimulus from the true state, *many "
+            f"samples*: {options.many}. Noise at contacts: of the velocities after each of the "
+            "first three new contacts, as a fraction of the speed before it. Without "
             f"the tested scenario, forests saw {ELSEWHERE} trials of each other one. Weights of "
             f"own trials are fitted on {options.own} of each scenario:",
             "",

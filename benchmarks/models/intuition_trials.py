@@ -269,13 +269,17 @@ def make_stored(dataset: Path, kept: Kept, part: int) -> str:
 # Noisy simulations of trials, from the true state at the last observed frame.
 
 
-def simulated(folder: Path, trials: Mapping[str, str], scale: float, samples: int) -> pd.Series:
+def simulated(
+    folder: Path, trials: Mapping[str, str], scale: float, samples: int, contact: float = 0.0
+) -> pd.Series:
     """Return the fraction of noisy simulations with a contact, by trial.
 
-    ``trials`` are scenes, as JSON, by name. What was simulated is kept in FOLDER/simulations.
+    ``trials`` are scenes, as JSON, by name; ``contact`` is the level of noise at new contacts. What
+    was simulated is kept in FOLDER/simulations.
     """
-    model: Any = build_model("noisy-simulation", scales=[scale], samples=samples)
-    path = folder / "simulations" / f"{scale:g}-{samples}.json"
+    model: Any = build_model("noisy-simulation", scales=[scale], samples=samples, contact=contact)
+    name = f"{scale:g}-{samples}" + (f"-contact-{contact:g}" if contact else "")
+    path = folder / "simulations" / f"{name}.json"
     known: dict[str, float] = json.loads(path.read_text()) if path.exists() else {}
     path.parent.mkdir(parents=True, exist_ok=True)
     for number, (trial, text) in enumerate(trials.items(), start=1):

@@ -6,7 +6,8 @@
 Four steps, each resumed by the same command:
 
 1. Motions without movies: readout trials of the published configurations, as in the paper, red and
-   yellow, also with contacts in the observed part; and the official stimuli.
+   yellow, also with contacts in the observed part; and the official stimuli, whose motions none of
+   the readout trials may have.
 2. Features of every model, from pictures rendered on demand. A picture is drawn once for all models
    that see it at that size.
 3. Readouts of every model, kind and scenario, with their accuracy by cross-validation, written to
@@ -96,12 +97,17 @@ SETTINGS = GenerateSettings(movies=False, look="redyellow", jitters=0, observed_
 """Of all own sets."""
 
 
-def make_set(folder: Path, count: int) -> Dataset:
-    """Return the set with at least ``count`` readout trials a scenario."""
+def make_set(folder: Path, count: int, tested: Dataset) -> Dataset:
+    """Return the set with at least ``count`` readout trials a scenario, less motions of ``tested``.
+
+    A sampled scene can be one of the study to the byte: Dominoes has few random numbers.
+    """
     if count:
         physion.generate(folder / SET, "all", {"readout": count}, name=SET, settings=SETTINGS,
                          executor=SerialExecutor())  # fmt: skip
-    return Dataset(folder / SET)
+    dataset = Dataset(folder / SET)
+    dataset.index = dataset.index[~dataset.index["digest"].isin(tested.index["digest"])]
+    return dataset
 
 
 def make_official(folder: Path) -> Dataset:
@@ -459,7 +465,8 @@ def main() -> None:
     parser.add_argument("--official", action="store_true")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    dataset = make_set(options.folder, options.trials)
+    stimuli = make_official(options.folder)
+    dataset = make_set(options.folder, options.trials, stimuli)
     features = Features(options.folder, dataset, built(options.only))
     count = len(set(dataset.index["scenario"]))
     if options.trials:
@@ -470,7 +477,6 @@ def main() -> None:
         for name in options.only:
             ship(features, dataset, name)
     if options.official:
-        stimuli = make_official(options.folder)
         tested = stimuli.index[stimuli.index["split"] == "testing"]
         of_stimuli = Features(options.folder, stimuli, built(options.only))
         compute(of_stimuli, interleaved(tested), len(tested))
