@@ -83,7 +83,7 @@ def _number(what: str) -> str:
     model, _, name = what.removeprefix("mean of 8: ").rpartition(": ")
     if " less " in model:
         name = f"difference of {name}" + (", pooled" if model.startswith("pooled") else "")
-    elif model not in (*MODELS, "two people") and not model.startswith("slope"):
+    elif model not in (*MODELS, "two people"):
         name = what.removeprefix("mean of 8: ")
     return f"{name}, mean of 8" if mean else name
 

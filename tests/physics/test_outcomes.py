@@ -241,7 +241,7 @@ def test_jitter_moves_what_can_move_and_keeps_joints_and_pushes_together() -> No
     assert replace(moved, bodies=scene.bodies, pushes=scene.pushes) == scene
 
 
-# Floors lie 0.03 below what was measured (benchmarks/results/replay.md) and at least 0.05 above
+# Floors lie 0.03 below what was measured (docs/results/physics.md) and at least 0.05 above
 # the base rate, which always guessing the commoner outcome gives. Link's measured agreement is its
 # base rate plus 0.05, so its floor is what was measured.
 FLOORS = [("dominoes", 40, 0.97), ("collide", 40, 0.87)]
