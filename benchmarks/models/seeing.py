@@ -1,6 +1,7 @@
 """Measure how well `seeing-simulation` recovers scenes, and what it answers.
 
-    OMP_NUM_THREADS=1 python benchmarks/models/seeing.py FOLDER [--each 5] [--known] [--write]
+    OMP_NUM_THREADS=1 python benchmarks/models/seeing.py FOLDER [--each 5] [--depth-error 0.02]
+        [--known] [--write]
     OMP_NUM_THREADS=1 python benchmarks/models/seeing.py --priors
 
 Official stimuli that people saw, without cloth and without a contact in the observed part: the
@@ -23,8 +24,12 @@ scenario:
 5. Errors at the last observed frame, median and 90 % quantile: centre of mass and velocity of the
    agent, centre of the other movable objects; and how many have the right shape.
 
-With --write they are written to ``results/seeing.md``. --priors prints density, friction and
-restitution of the bodies of our own presets, from which the constants of the model come.
+With --depth-error E, the depth of each object has an error of standard deviation E, the same in
+all frames, and each pixel another one; rows are in FOLDER/seeing-E.jsonl.
+
+With --write they are written to ``results/seeing.md``, or ``results/seeing-E.md``. --priors prints
+density, friction and restitution of the bodies of our own presets, from which the constants of the
+model come.
 """
 
 from __future__ import annotations
@@ -46,10 +51,10 @@ from scipy.spatial.transform import Rotation, Slerp
 import physion
 from physion.analysis.scores import TWO_PEOPLE
 from physion.analysis.tables import read_humans
-from physion.clips.batch import LAST_OBSERVED, Batch, Motion
+from physion.clips.batch import LAST_OBSERVED, SCENERY_ID, Batch, Motion
 from physion.clips.rendered import MotionRenderer, object_ids
 from physion.core.names import RIGID, canonical_name
-from physion.core.seeds import stable_hash
+from physion.core.seeds import generator, stable_hash
 from physion.core.tables import markdown_table
 from physion.data.official import official
 from physion.models.baselines.motion import gap_in_constant_motion
@@ -78,7 +83,7 @@ from physion.readout.decisions import Readout
 from physion.readout.shipped import find_readouts
 from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, Body, Roles, Scene
 
-RESULTS = Path(__file__).parents[1] / "results" / "seeing.md"
+RESULTS = Path(__file__).parents[1] / "results"
 SAMPLES = 10
 FRAMES_AHEAD = 106
 PRIOR_SCENES = 12
@@ -109,11 +114,12 @@ def chosen_trials(each: int, early: Callable[[Scene], bool]) -> Iterator[tuple[S
         yield from ((s, contact, number) for contact, s, number in filter(None, row))
 
 
-def measure(scene: Scene, contact: bool, number: int) -> ROW:
+def measure(scene: Scene, contact: bool, number: int, error: float) -> ROW:
     """Return what is measured of one trial."""
-    engine, model = make_engine(), build_model("seeing-simulation", samples=SAMPLES)
+    engine = make_engine()
+    model = build_model("seeing-simulation", samples=SAMPLES, depth_error=error)
     motion = Motion(scene, simulate(scene, frames=OBSERVED_FRAMES))
-    batch = _batch(motion, model.spec)
+    batch = _batch(motion, model.spec, error)
     seen: SeenTrial = model.see(batch)[0]  # type: ignore[attr-defined]
     true = cut_trial(scene, motion.trajectory)
 
@@ -160,14 +166,28 @@ def guessed(trial: ObservedTrial) -> ObservedTrial:
     return replace(trial, scene=replace(trial.scene, bodies=tuple(bodies)))
 
 
-def _batch(motion: Motion, spec: Any) -> Batch:
-    """Return the observed frames of one motion that the model looks at."""
-    frames, name = np.array(FRAMES, np.int64), motion.scene.name
+def _batch(motion: Motion, spec: Any, error: float) -> Batch:
+    """Return the observed frames of one motion that the model looks at; depth has an error."""
+    frames = np.array(spec.context_frames() if error else FRAMES, np.int64)
+    name = motion.scene.name
     reader = MotionRenderer(
         {name: motion}, spec.inputs, spec.image_size, spec.objects, {name: "redyellow"}
     )
-    arrays = {key: value[None] for key, value in reader.read(name, frames).items()}
+    arrays: Any = {key: value[None] for key, value in reader.read(name, frames).items()}
+    if error:
+        arrays["depth"] = with_errors(arrays["ids"], arrays["depth"], error, name)
     return Batch((name,), frames[None], np.ones((1, len(frames)), np.bool_), **arrays)
+
+
+def with_errors(
+    ids: NDArray[np.uint8], depth: NDArray[np.float32], error: float, name: str
+) -> NDArray[np.float32]:
+    """Return depth with normal relative errors: one of each object, and one of every pixel."""
+    rng = generator("errors of depth", name)
+    wrong = 1 + error * rng.standard_normal(depth.shape)
+    for number in np.unique(ids[ids != SCENERY_ID]):
+        wrong[ids == number] *= 1 + error * rng.standard_normal()
+    return (depth * wrong).astype(np.float32)
 
 
 def fitted_motion(seen: SeenTrial) -> Motion:
@@ -468,6 +488,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--each", type=int, default=5)
+    parser.add_argument("--depth-error", type=float, default=0.0)
     parser.add_argument("--known", action="store_true")
     parser.add_argument("--version", type=int, default=VERSION)
     parser.add_argument("--write", action="store_true")
@@ -478,7 +499,8 @@ def main() -> None:
     if options.folder is None:
         return
     options.folder.mkdir(parents=True, exist_ok=True)
-    path = options.folder / "seeing.jsonl"
+    name = f"seeing-{options.depth_error:g}" if options.depth_error else "seeing"
+    path = options.folder / f"{name}.jsonl"
     options.known |= options.version != VERSION
     known = read_rows(path, options.version)
 
@@ -497,7 +519,7 @@ def main() -> None:
     rows = [row for row in known.values() if "early" not in row] if options.known else []
     for scene, contact, number in [] if options.known else chosen_trials(options.each, early):
         if scene.name not in known:
-            keep(measure(scene, contact, number))
+            keep(measure(scene, contact, number, options.depth_error))
             row = known[scene.name]
             print(
                 f"{scene.scenario} {scene.name}: contact {contact}, fitted {row['fitted']:.2f}, "
@@ -509,10 +531,11 @@ def main() -> None:
     print(text)
     if options.write:
         today = datetime.date.today().isoformat()
-        RESULTS.write_text(
-            f"# Seeing by simulation\n\n`python benchmarks/models/seeing.py FOLDER`, {len(rows)} "
-            f"trials, {today}, version {options.version} of the model, {SAMPLES} simulations per "
-            f"trial.\n\n"
+        error = f" --depth-error {options.depth_error:g}" if options.depth_error else ""
+        (RESULTS / f"{name}.md").write_text(
+            f"# Seeing by simulation\n\n`python benchmarks/models/seeing.py FOLDER{error}`, "
+            f"{len(rows)} trials, {today}, version {options.version} of the model, {SAMPLES} "
+            f"simulations per trial.\n\n"
             f"{text}\n{priors()}"
         )
 

@@ -21,12 +21,15 @@ from physion.core.errors import BadInputError
 from physion.models.build import build_model
 from physion.models.interface import Model
 from physion.models.seeing.bodies import find, follow
+from physion.models.seeing.hypotheses import see_uncertain
+from physion.models.seeing.masks import MaskFit, traced
 from physion.models.seeing.pixels import Rays, SeenFrame, floor_height, picture_of
-from physion.models.seeing.scenes import Track, joints_of, see_trial, velocities
+from physion.models.seeing.resting import resting_scene, stacked, uncertain_picture
+from physion.models.seeing.scenes import SeenTrial, Track, joints_of, see_trial, velocities
 from physion.models.seeing.simulation import SeeingSimulation
 from physion.models.seeing.solids import Placed, Prior, cost_of, residuals, solid
 from physion.numerics.rotations import rotation_matrices
-from physion.physics.engine import simulate
+from physion.physics.engine import make_engine, simulate
 from physion.readout.decisions import Decided
 from physion.readout.features import Imagined, imagine_clips, write_features
 from physion.readout.imagined import imagine_with
@@ -217,6 +220,137 @@ def test_an_agent_that_is_never_seen_leaves_the_answer_open(rolling: Batch) -> N
     assert model.notes(batch) == ["the agent is never seen"]
 
 
+# Depth with an error.
+
+ERROR = 0.02
+
+
+def with_errors(batch: Batch, seed: int = 0) -> Batch:
+    """Return a batch whose depth has errors of 2 %, of each object and of each pixel."""
+    rng = np.random.default_rng(seed)
+    assert batch.ids is not None and batch.depth is not None
+    wrong = 1 + ERROR * rng.standard_normal(batch.depth.shape)
+    for number in range(1, 4):
+        wrong[batch.ids == number] *= 1 + ERROR * rng.standard_normal()
+    return replace(batch, depth=(batch.depth * wrong).astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("shape", "y", "depth", "on", "entry", "distance"),
+    [
+        ("cube", 0.1, 1.4, True, 1.5, 0.0),
+        ("cube", 0.7, 2.0, True, math.nan, 0.2),  # misses, 0.2 m from the face
+        ("cube", 0.1, 9.0, False, math.nan, 0.4),  # halfway, 0.4 m below the nearest face
+        ("cube", 0.1, 1.6, False, math.nan, 0.05),  # free for the first 0.1 m only
+        ("cube", 0.1, 1.2, False, math.nan, 0.0),
+        ("sphere", 0.3, 1.4, True, 1.6, 0.0),
+        ("sphere", 0.7, 2.0, True, math.nan, 0.2),
+        ("sphere", 0.3, 9.0, False, math.nan, 0.2),
+        ("sphere", 0.6, 9.0, False, math.nan, 0.0),
+    ],
+)
+def test_rays_meet_or_miss_a_solid(
+    shape: str, y: float, depth: float, on: bool, entry: float, distance: float
+) -> None:
+    placed = Placed(solid(shape), np.zeros(3), np.eye(3), np.ones(3))
+    entries, out = traced(placed, ray(y, depth, on))
+    assert entries[0] == pytest.approx(entry, nan_ok=True)
+    assert out[0] == pytest.approx(distance, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_what_stands_on_the_floor_is_found_in_spite_of_errors(rolling: Batch) -> None:
+    batch, made = with_errors(rolling), scene()
+    assert batch.ids is not None and batch.depth is not None and batch.camera is not None
+    picture = uncertain_picture(
+        picture_of(batch.ids[0, 0], batch.depth[0, 0], batch.camera[0]), ERROR
+    )
+    rays = picture.rays(2)
+    assert rays is not None
+    box = made.bodies[1]
+    true = Placed(
+        solid("cube"), np.array(box.position), rotation_matrices(TURNED), np.array(box.scale)
+    )
+    fit = MaskFit(rays, ERROR, rest=0.0)
+    away = replace(
+        true, position=true.position + np.array([0.05, 0.1, 0.0]), scale=true.scale * 1.1
+    )
+    found = fit.solve(away, 20)
+    assert found.extent_z()[0] == pytest.approx(0, abs=1e-9)
+    assert np.linalg.norm(found.middle() - true.middle()) < 0.02
+    # By itself it is as far off as its depth.
+    alone = MaskFit(rays, ERROR).solve(away, 20)
+    assert np.linalg.norm(alone.middle() - true.middle()) < 0.15
+    # Solids that are drawn from the spread of a fit fit nearly as well.
+    draws = np.random.default_rng(0).standard_normal((20, len(fit.values)))
+    squares = [np.mean(fit.residuals(fit.values + fit.spread() @ u) ** 2) for u in draws]
+    assert found.cost < np.median(squares) < found.cost + 0.5
+
+
+@pytest.mark.slow
+def test_what_stands_on_something_still_does_with_other_sizes() -> None:
+    bodies = (
+        Body("ball", "sphere", (-0.9, 0.3, 0.0), (0.3, 0.3, 0.3)),
+        Body("plate", "cube", (0.2, 0.0, 0.0), (1.4, 1.4, 0.01), kinematic=True),
+        Body("lower", "cube", (0.2, 0.1, 0.01), (0.4, 0.4, 0.3), mass=2.0),
+        Body("upper", "cylinder", (0.2, 0.1, 0.31), (0.3, 0.3, 0.3), mass=1.0),
+    )
+    made = replace(scene(), bodies=bodies, pushes=(), roles=Roles("ball", "plate"))
+    batch = with_errors(batch_of(made, 256))
+    assert batch.ids is not None and batch.depth is not None and batch.camera is not None
+    pictures = {
+        frame: uncertain_picture(
+            picture_of(batch.ids[0, row], batch.depth[0, row], batch.camera[0]), ERROR
+        )
+        for row, frame in enumerate((0, 2))
+    }
+    found = resting_scene(pictures, [1, 2, 3, 4], ERROR)
+    numbers = {name: int(n) for name, n in zip(made.names(), object_ids(made)[1:], strict=True)}
+    lower, upper = numbers["lower"], numbers["upper"]
+    assert (found[lower].support, found[upper].support) == (2, lower)
+    assert found[upper].placed.solid.name == "cylinder"
+    for name, body in zip(made.names(), made.bodies, strict=True):
+        place = found[numbers[name]].placed
+        assert place.extent_z()[0] == pytest.approx(body.position[2], abs=0.02)
+        assert np.hypot(*(place.middle()[:2] - body.position[:2])) < 0.06
+    count = sum(one.spread.shape[1] for one in found.values())
+    drawn = stacked(found, np.random.default_rng(1).standard_normal(count))
+    assert drawn[upper].extent_z()[0] == pytest.approx(drawn[lower].extent_z()[1])
+    assert drawn[lower].extent_z()[1] != found[lower].placed.extent_z()[1]
+
+
+@pytest.mark.slow
+def test_a_push_is_found_by_simulation() -> None:
+    made = scene()
+    batch = with_errors(batch_of(made, 256))
+    arrays = batch.ids[0], batch.depth[0], batch.camera[0]  # type: ignore[index]
+    frames = [int(frame) for frame in batch.frames[0]]
+    seen = see_uncertain(frames, *arrays, ERROR, make_engine())
+    true = simulate(made, frames=45)
+    assert seen.trial is not None and seen.note == ""
+    names = list(seen.trial.scene.names())
+    ball = names.index("1")
+    assert seen.trial.scene.bodies[ball].shape == "sphere"
+    found = seen.trial.state
+    assert found.positions[ball] == pytest.approx(true.positions[44, 0].astype(float), abs=0.1)
+    assert found.velocities[ball] == pytest.approx(true.velocities[44, 0].astype(float), abs=0.3)
+    assert len(seen.weighted) > 1 and seen.weighted[0][1] == max(w for _, w in seen.weighted)
+    again = see_uncertain(frames, *arrays, ERROR, make_engine())
+    assert np.array_equal(again.trial.state.positions, found.positions)  # type: ignore[union-attr]
+    model: Any = build_model("seeing-simulation", samples=8, depth_error=ERROR)
+    assert model.imagine(batch, 8, 0).contact.mean() > 0.5
+    missed = with_errors(batch_of(scene(-0.8), 256))
+    assert model.imagine(missed, 8, 0).contact.mean() < 0.5
+
+
+def test_samples_are_shared_by_weight() -> None:
+    trials: Any = ["first", "second", "third"]
+    seen = SeenTrial(trials[0], (), "", tuple(zip(trials, (2.0, 1.0, 0.001), strict=True)))
+    assert seen.shared(9) == [("first", 6), ("second", 3)]
+    assert SeenTrial(trials[0], (), "").shared(4) == [("first", 4)]
+    assert SeenTrial(None, (), "").shared(4) == []
+
+
 def test_bad_input_says_what_is_wrong(rolling: Batch) -> None:
     model = build_model("seeing-simulation", samples=1, image_size=128)
     with pytest.raises(BadInputError, match="needs masks, depth and camera"):
@@ -227,10 +361,12 @@ def test_bad_input_says_what_is_wrong(rolling: Batch) -> None:
         model.imagine(replace(rolling, camera=flat), 1, 0)
     many = rolling.ids.copy()
     many[0, 0, 0, :16] = np.arange(1, 17)
-    with pytest.raises(BadInputError, match=r"trial 'roll' shows 16 objects; .* at most 15"):
+    with pytest.raises(BadInputError, match=r"a trial shows 16 objects; .* at most 15"):
         model.imagine(replace(rolling, ids=many), 1, 0)
     with pytest.raises(BadInputError, match="at least one sample"):
         build_model("seeing-simulation", samples=0)
+    with pytest.raises(BadInputError, match=r"must be 0, or from 0.005 to 0.1, not 0.5"):
+        build_model("seeing-simulation", depth_error=0.5)
 
 
 class Noted(Model):

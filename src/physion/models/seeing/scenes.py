@@ -114,11 +114,37 @@ class SeenTrial:
     - ``trial``: scene and state at the last observed frame; None if agent or patient was never
       seen. The bodies are called by their numbers in `physion.clips.batch.Batch.ids`.
     - ``tracks``: the objects. ``note``: what was not seen, or not well; empty for nothing.
+    - ``weighted``: what else it may have been, with positive weights, best first; by default only
+      ``trial``.
     """
 
     trial: ObservedTrial | None
     tracks: tuple[Track, ...]
     note: str
+    weighted: tuple[tuple[ObservedTrial, float], ...] = ()
+
+    def shared(self, samples: int) -> list[tuple[ObservedTrial, int]]:
+        """Return every trial that it may have been, and how many of the samples it gets.
+
+        Sample i gets the one in whose part of the sum of weights (i + 1/2) / samples is.
+        """
+        if self.trial is None:
+            return []
+        weighted = self.weighted or ((self.trial, 1.0),)
+        ends = np.cumsum([weight for _, weight in weighted])
+        places = np.searchsorted(ends / ends[-1], (np.arange(samples) + 0.5) / samples)
+        counts = np.bincount(places, minlength=len(weighted))
+        return [(trial, int(n)) for (trial, _), n in zip(weighted, counts, strict=True) if n]
+
+
+def numbers_of(ids: NDArray[np.uint8]) -> list[int]:
+    """Return the numbers of the objects; raise `BadInputError` for more than `MOST_OBJECTS`."""
+    numbers = [int(n) for n in np.unique(ids) if n != SCENERY_ID]
+    if len(numbers) > MOST_OBJECTS:
+        raise BadInputError(
+            f"a trial shows {len(numbers)} objects; seeing fits at most {MOST_OBJECTS}"
+        )
+    return numbers
 
 
 FRAMES = (0, 8, 16, 24, 30, 34, 38, 40, 42, 44)
@@ -148,11 +174,7 @@ def see_trial(
     BadInputError
         For more than `MOST_OBJECTS` objects, or another camera than a pinhole camera.
     """
-    numbers = [int(n) for n in np.unique(ids) if n != SCENERY_ID]
-    if len(numbers) > MOST_OBJECTS:
-        raise BadInputError(
-            f"trial {name!r} shows {len(numbers)} objects; seeing fits at most {MOST_OBJECTS}"
-        )
+    numbers = numbers_of(ids)
     rows = {int(frame): row for row, frame in enumerate(frames)}
     chosen = [frame for frame in FRAMES if frame in rows] or sorted(rows)
     pictures = {f: picture_of(ids[rows[f]], depth[rows[f]], camera) for f in chosen}
@@ -399,20 +421,17 @@ def _observed(name: str, tracks: Sequence[Track], seen_floor: float, camera: F64
         spins.append(spin)
     floor = _resting_floor(tracks, seen_floor)
     bodies = tuple(
-        _body(track.number, placed, floor) for track, placed in zip(tracks, poses, strict=True)
+        body_of(track.number, placed, floor) for track, placed in zip(tracks, poses, strict=True)
     )
     for i, body in enumerate(bodies):
         if body.kinematic:
             speeds[i], spins[i] = np.zeros(3), np.zeros(3)
-    view, projection = camera
-    origin = -view[:3, :3].T @ view[:3, 3]
-    target = origin + view[2, :3]
     scene = Scene(
         name,
         "seen",
         bodies,
         Roles(str(AGENT_ID), str(PATIENT_ID)),
-        Camera(_vec3(origin), _vec3(target), 2 * math.atan(1 / abs(float(projection[1, 1])))),
+        camera_of(camera),
         joints=joints_of(tracks, bodies),
         floor=floor,
         ending=Ending(),
@@ -427,6 +446,14 @@ def _observed(name: str, tracks: Sequence[Track], seen_floor: float, camera: F64
         np.zeros((0, 3)),
     )
     return ObservedTrial(scene, state, _touched(tracks))
+
+
+def camera_of(matrices: F64) -> Camera:
+    """Return the camera of a view and a projection matrix (2, 4, 4)."""
+    view, projection = matrices
+    origin = -view[:3, :3].T @ view[:3, 3]
+    angle = 2 * math.atan(1 / abs(float(projection[1, 1])))
+    return Camera(_vec3(origin), _vec3(origin + view[2, :3]), angle)
 
 
 def _last(track: Track, tracks: Sequence[Track], floor: float) -> tuple[Placed, F64, F64]:
@@ -465,7 +492,7 @@ def _holds(vessel: Placed, placed: Placed) -> bool:
     return bool(np.hypot(*(local[:2] / size[:2])) < 0.5 and 0 < local[2] < 1.5 * size[2])
 
 
-def _body(number: int, placed: Placed, floor: float) -> Body:
+def body_of(number: int, placed: Placed, floor: float) -> Body:
     """Return an object as a body, with the mass and the surface that are expected."""
     low, high = placed.extent_z()
     patient, ramp = number == PATIENT_ID, placed.solid.name.startswith(RAMP)
@@ -538,7 +565,7 @@ def _touched(tracks: Sequence[Track]) -> bool:
     at = dict(zip(patient.frames, patient.placed, strict=True))
     if patient.placed[0].size().min() <= 0:
         return False
-    pair = [_body(t.number, t.placed[0], 0.0) for t in (agent, patient)]
+    pair = [body_of(t.number, t.placed[0], 0.0) for t in (agent, patient)]
     gap, _ = gap_of_bodies(pair, [np.zeros(3), np.zeros(3)])
     for frame, a in zip(agent.frames, agent.placed, strict=True):
         b = at.get(frame)

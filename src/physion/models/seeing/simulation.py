@@ -28,6 +28,7 @@ from physion.models.noisy_simulation import (
     ObservedTrial,
     simulate_contacts,
 )
+from physion.models.seeing.hypotheses import see_uncertain
 from physion.models.seeing.scenes import SeenTrial, see_trial
 from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine, simulate
 from physion.rendering.renderer import Renderer
@@ -36,6 +37,8 @@ VERSION = 4
 """To be raised with every change of the code that can alter a prediction."""
 KEPT = 16
 """Trials whose scenes are kept in memory, besides the last batch."""
+LEAST_ERROR, MOST_ERROR = 0.005, 0.1
+"""Relative errors of depth with which masks can be fitted."""
 SHOWN_SIZE = 128
 """Pixels per side of the pictures for the viewer."""
 
@@ -46,8 +49,11 @@ class SeeingSettings(NoiseLevels, ModelSettings):
 
     - ``samples``: simulations per trial. ``engine``: name of the engine. ``seed``: of the noise.
     - ``image_size``: pixels per side of the pictures that it sees.
+    - ``depth_error``: relative error that depth has; 0 for exact depth. With an error the observed
+      frames are simulated, too (`physion.models.seeing.hypotheses`).
     """
 
+    depth_error: float = 0.0
     samples: int = 20
     engine: str = DEFAULT_ENGINE
     seed: int = 0
@@ -58,6 +64,11 @@ class SeeingSettings(NoiseLevels, ModelSettings):
         if self.samples < 1 or self.image_size < 64:
             raise BadInputError(
                 f"{self.model} needs at least one sample, and pictures of at least 64 pixels"
+            )
+        if self.depth_error and not LEAST_ERROR <= self.depth_error <= MOST_ERROR:
+            raise BadInputError(
+                f"depth_error of {self.model} must be 0, or from {LEAST_ERROR} to {MOST_ERROR}, "
+                f"not {self.depth_error:g}"
             )
 
 
@@ -110,9 +121,13 @@ class SeeingSimulation(Model):
             if one.trial is None:
                 contact[row, ::2] = True
                 continue
-            contact[row] = simulate_contacts(
-                one.trial, self.settings, 1.0, samples, seed, self.engine
-            )
+            contact[row] = [
+                touched
+                for trial, count in one.shared(samples)
+                for touched in simulate_contacts(
+                    trial, self.settings, 1.0, count, seed, self.engine
+                )
+            ]
         shown: dict[str, Any] = {}
         if arguments.get("show"):
             pictures = np.stack([self._pictures(one.trial, context.future) for one in seen])
@@ -130,9 +145,9 @@ class SeeingSimulation(Model):
         """Return the SHA-256 of code version, engine, noise and size of pictures."""
         settings = dataclasses.asdict(self.settings)
         levels = {field.name: settings[field.name] for field in dataclasses.fields(NoiseLevels)}
-        return json_digest(
-            [VERSION, NOISE_VERSION, self.engine.name, levels, self.settings.image_size]
-        )
+        error = [self.settings.depth_error] if self.settings.depth_error else []
+        size = self.settings.image_size
+        return json_digest([VERSION, NOISE_VERSION, self.engine.name, levels, size, *error])
 
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions."""
@@ -151,7 +166,12 @@ class SeeingSimulation(Model):
         key = f"{context.trials[row]} {pixels}"
         if key not in self._seen:
             name, frames = context.trials[row], context.frames[row]
-            self._seen[key] = see_trial(name, frames, *arrays)
+            error = self.settings.depth_error
+            self._seen[key] = (
+                see_uncertain([int(f) for f in frames], *arrays, error, self.engine)
+                if error
+                else see_trial(name, frames, *arrays)
+            )
         return self._seen[key]
 
     def _pictures(self, trial: ObservedTrial | None, steps: int) -> Any:

@@ -227,12 +227,10 @@ def fit(
 
 def residuals(placed: Placed, rays: Rays) -> F64:
     """Return the residuals (N,) of rays in metres."""
-    s = placed.solid
-    world, out = np.empty_like(s.planes), np.empty(len(rays.depth))
-    _place(s.planes, placed.position, placed.rotation, placed.scale, world)
+    s, out = placed.solid, np.empty(len(rays.depth))
     _residuals(
-        world, s.starts, placed.position, placed.rotation, placed.scale, (s.low + s.high) / 2,
-        rays.origin, rays.vectors, rays.depth, rays.on, out,
+        place(placed), s.starts, placed.position, placed.rotation, placed.scale,
+        (s.low + s.high) / 2, rays.origin, rays.vectors, rays.depth, rays.on, out,
     )  # fmt: skip
     return out
 
@@ -241,6 +239,13 @@ def cost_of(placed: Placed, rays: Rays, width: float = 0.004) -> float:
     """Return the mean of q / (1 + q) over rays."""
     q = (residuals(placed, rays) / width) ** 2
     return float(np.mean(q / (1 + q)))
+
+
+def place(placed: Placed) -> F64:
+    """Return the planes (P, 4), m and e, of a placed solid."""
+    world = np.empty_like(placed.solid.planes)
+    _place(placed.solid.planes, placed.position, placed.rotation, placed.scale, world)
+    return world
 
 
 @kernel

@@ -1,0 +1,453 @@
+"""What happened in the observed frames, as simulations that are compared with the masks.
+
+The scene of the first frame is at rest (`resting`), and whatever moves then was pushed, falls, or
+was moved by another object. A hypothesis is a scene within the errors of the fits, and at most one
+push; it is simulated through the observed frames, and its masks are compared with those seen:
+
+    mismatch of an object in a frame = |A xor B| / (|A| + |B| + 8) + min(1, d / 15) / 2,
+
+with A its pixels in a picture of `SIZE` pixels a side, B those of the simulation, d the distance of
+their centroids in pixels. Pixels of scenery that may hide objects do not count. The loss is the
+mean over frames and objects; agent and patient count twice.
+
+1. The scene without errors and without push is simulated. The first object that moves otherwise is
+   the one that was pushed; velocity and frame follow from its centroids, taken to the height of
+   its middle.
+2. Hypotheses are drawn in rounds, each from a normal distribution around the best ones so far:
+   first only the push, and the places of what stands on nothing, then everything.
+3. What the masks of the last frame contradict is fitted to them again, with its size, and its
+   velocity is that between the last frames. So each of the best hypotheses gives a scene and a
+   state at the last observed frame, with a weight that falls with its loss.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from physion.clips.batch import AGENT_ID, LAST_OBSERVED, PATIENT_ID, SCENERY_ID
+from physion.core.errors import PhysionError
+from physion.core.seeds import generator
+from physion.models.noisy_simulation import ObservedTrial
+from physion.models.seeing.masks import MaskFit, moved
+from physion.models.seeing.pixels import Rays, picture_of
+from physion.models.seeing.resting import (
+    Picture,
+    Resting,
+    resting_scene,
+    stacked,
+    uncertain_picture,
+)
+from physion.models.seeing.scenes import SeenTrial, Track, body_of, camera_of, joints_of, numbers_of
+from physion.models.seeing.solids import Placed
+from physion.numerics.rotations import rotation_matrices
+from physion.physics.engine import Engine, simulate
+from physion.physics.labels import label_contact
+from physion.physics.trajectory import State, Trajectory
+from physion.rendering.renderer import Renderer
+from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, Ending, Push, Roles, Scene
+
+F64 = NDArray[np.float64]
+Ids = NDArray[np.uint8]
+
+SIZE = 96
+"""Pixels per side of the pictures in which hypotheses are compared."""
+COMPARED = 9
+"""Frames in which they are compared."""
+MISSED = 15.0
+"""Distance of centroids, in pixels, that counts as no match."""
+OTHERWISE = 0.12
+"""Rise of the mismatch with which an object moves otherwise than simulated."""
+STARTED, FAST = 0.5, 2.0
+"""Pixels that it has moved by then, and within four frames, if it was pushed strongly."""
+ROUNDS, DRAWN, BEST = (3, 2), 40, 8
+"""Rounds of both stages, hypotheses of a round, and those that the next one is drawn around."""
+NARROWEST = (0.08, 0.4)
+"""Least standard deviations of the next round, of what was drawn from the start and of the rest."""
+KEPT, TEMPERATURE = 12, 0.01
+"""Hypotheses that are kept, and the difference of losses at which the weight falls by 1/e."""
+CONTRADICTED = 0.12
+"""Mismatch in the last frame above which an object is fitted there again."""
+LAST_FRAMES = (36, 40)
+"""Frames from which, to the last one, its velocity follows."""
+POORLY = 0.3
+"""Loss above which hypotheses explain the masks poorly."""
+SAME_FACTOR = 0.004
+"""Standard deviation of ln s of an object between frames."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Tried:
+    """A simulated hypothesis: its ``loss`` and the mismatches (T, K) of frames and objects."""
+
+    values: F64
+    loss: float
+    mismatches: F64
+    scene: Scene
+    path: Trajectory
+
+
+class Video:
+    """The observed masks, and how well simulations explain them.
+
+    Parameters
+    ----------
+    pictures
+        By frame.
+    camera
+        View and projection matrix (2, 4, 4).
+    numbers
+        Of the objects.
+    """
+
+    def __init__(
+        self, pictures: Mapping[int, Picture], camera: F64, numbers: Sequence[int]
+    ) -> None:
+        self.frames, self.camera, self.numbers = sorted(pictures), camera, list(numbers)
+        height, width = pictures[self.frames[0]].seen.ids.shape
+        rows = ((np.arange(SIZE) + 0.5) * height / SIZE).astype(np.int64)
+        columns = ((np.arange(SIZE) + 0.5) * width / SIZE).astype(np.int64)
+        chosen = np.ix_(rows, columns)
+        self.ids = np.stack([pictures[f].seen.ids[chosen] for f in self.frames])
+        self.before = np.stack([pictures[f].before[chosen] for f in self.frames])
+        self.centroids = self._centroids(self.ids)
+        every = np.linspace(1, len(self.frames) - 1, min(COMPARED, len(self.frames)))
+        self.compared = sorted({round(row) for row in every})
+        weights = [2.0 if number in (AGENT_ID, PATIENT_ID) else 1.0 for number in self.numbers]
+        self.weights = np.array(weights) / sum(weights)
+
+    def _centroids(self, ids: Ids) -> F64:
+        """Return the centroids (T, K, 2), column and row, of objects; NaN of what is not seen."""
+        out = np.full((len(ids), len(self.numbers), 2), np.nan)
+        for t, picture in enumerate(ids):
+            for k, number in enumerate(self.numbers):
+                rows, columns = np.nonzero(picture == number)
+                if len(rows):
+                    out[t, k] = columns.mean(), rows.mean()
+        return out
+
+    def mismatches(self, scene: Scene, path: Trajectory, rows: Sequence[int]) -> F64:
+        """Return the mismatches (len(rows), K) of a simulation."""
+        renderer = Renderer(scene, path, SIZE, SIZE)
+        numbers = np.array([SCENERY_ID, *(int(body.name) for body in scene.bodies)], np.uint8)
+        drawn = np.stack([numbers[renderer.render(self.frames[row], ("ids",)).ids] for row in rows])
+        out = np.zeros((len(rows), len(self.numbers)))
+        centroids = self._centroids(drawn)
+        for t, row in enumerate(rows):
+            counts = ~self.before[row]
+            for k, number in enumerate(self.numbers):
+                seen, made = self.ids[row] == number, drawn[t] == number
+                area = np.count_nonzero(seen) + np.count_nonzero(made)
+                wrong = np.count_nonzero((seen ^ made) & counts) / (area + 8)
+                apart = float(np.hypot(*(centroids[t, k] - self.centroids[row, k])))
+                far = (MISSED if area else 0.0) if math.isnan(apart) else apart
+                out[t, k] = wrong + min(1.0, far / MISSED) / 2
+        return out
+
+    def shift(self, k: int) -> F64:
+        """Return how far the centroid of an object is from its first place, by frame, pixels."""
+        apart = np.hypot(*(self.centroids[:, k] - self.centroids[0, k]).T)
+        return np.asarray(np.where(np.isfinite(apart), apart, 0.0))
+
+    def places(self, k: int, height: float, rows: Sequence[int]) -> tuple[F64, F64]:
+        """Return frames and places (N, 2) of a centroid on the level of a height, metres.
+
+        Only up to the first frame in which that is not known.
+        """
+        view, projection = self.camera
+        origin = -view[:3, :3].T @ view[:3, 3]
+        frames, places = [], []
+        for row in rows:
+            x = (2 * (self.centroids[row, k, 0] + 0.5) / SIZE - 1) / projection[0, 0]
+            y = (1 - 2 * (self.centroids[row, k, 1] + 0.5) / SIZE) / projection[1, 1]
+            ray = np.array([x, y, 1.0]) @ view[:3, :3]
+            along = (height - origin[2]) / ray[2] if abs(ray[2]) > 1e-3 else -1.0
+            if not along > 0:
+                break
+            frames.append(float(self.frames[row]))
+            places.append((origin + along * ray)[:2])
+        return np.array(frames), np.array(places).reshape(-1, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class PushGuess:
+    """Push of an object: ``mean`` and ``spread`` (7,) of what is drawn.
+
+    Velocity along x and y (m/s), place of the push above the middle and beside it (parts of the
+    size), frame, velocity upwards, logarithm of the factor of the mass.
+    """
+
+    number: int
+    mean: F64
+    spread: F64
+
+    def push(self, placed: Placed, mass: float, values: F64) -> tuple[Push, float]:
+        """Return the push of standard normal ``values``, and the mass of the object."""
+        x, y, over, beside, frame, up, heavier = self.mean + self.spread * values
+        mass *= float(np.exp(np.clip(heavier, -2, 2)))
+        velocity = np.array([x, y, up])
+        across = np.array([-y, x, 0.0]) / max(math.hypot(x, y), 1e-6)
+        size = placed.size()
+        point = placed.middle() + across * np.clip(beside, -0.5, 0.5) * size[:2].mean()
+        point[2] += np.clip(over, -0.5, 0.5) * size[2]
+        impulse = mass * velocity
+        frame = int(np.clip(round(frame), 0, LAST_OBSERVED - 1))
+        return Push(str(self.number), _triple(impulse), _triple(point), frame), mass
+
+
+def see_uncertain(
+    frames: Sequence[int],
+    ids: Ids,
+    depth: NDArray[np.floating],
+    camera: F64,
+    error: float,
+    engine: Engine,
+) -> SeenTrial:
+    """Return what was seen of a trial whose depth has an error.
+
+    Parameters
+    ----------
+    frames
+        (T,) numbers of the frames.
+    ids, depth, camera
+        (T, H, W), (T, H, W) and (2, 4, 4), as in `physion.clips.batch.Batch`.
+    error
+        Relative error of depth, of an object in all frames and of each pixel.
+    engine
+        That simulates.
+
+    Raises
+    ------
+    BadInputError
+        As `scenes.see_trial`.
+    """
+    numbers = numbers_of(ids)
+    pictures = {
+        int(frame): uncertain_picture(picture_of(ids[row], depth[row], camera), error)
+        for row, frame in enumerate(frames)
+    }
+    objects = resting_scene(pictures, numbers, error)
+    notes = [
+        f"object {one.number} is first fitted in frame {one.frame}"
+        for one in objects.values()
+        if one.frame != min(pictures)
+    ]
+    unseen = [
+        f"the {word} is never seen"
+        for number, word in ((AGENT_ID, "agent"), (PATIENT_ID, "patient"))
+        if number not in objects
+    ]
+    if unseen:
+        return SeenTrial(None, (), "; ".join(notes + unseen))
+    video = Video(pictures, camera, list(objects))
+    tried = _search(video, objects, _pushed(video, objects, engine), engine)[:KEPT]
+    if not tried:
+        return SeenTrial(None, (), "; ".join([*notes, "no hypothesis could be simulated"]))
+    if tried[0].loss > POORLY:
+        notes.append(f"simulations explain the masks poorly ({tried[0].loss:.2f})")
+    weights = np.exp([-(each.loss - tried[0].loss) / TEMPERATURE for each in tried])
+    found = [_observed(video, objects, pictures, each, rank) for rank, each in enumerate(tried)]
+    tracks = _tracks(video, objects, tried[0], found[0].state)
+    return SeenTrial(found[0], tracks, "; ".join(notes), tuple(zip(found, weights, strict=True)))
+
+
+def _simulated(
+    video: Video,
+    solids: Mapping[int, Placed],
+    engine: Engine,
+    guess: PushGuess | None,
+    values: F64 | None = None,
+) -> tuple[Scene, Trajectory]:
+    """Return a hypothesis as a scene, and its observed frames."""
+    bodies = [body_of(number, solids[number], 0.0) for number in video.numbers]
+    pushes: tuple[Push, ...] = ()
+    if guess is not None and values is not None:
+        k = video.numbers.index(guess.number)
+        push, mass = guess.push(solids[guess.number], bodies[k].mass, values)
+        pushes, bodies[k] = (push,), replace(bodies[k], mass=mass)
+    first = video.frames[0]
+    tracks = [Track(number, (first,), (solids[number],)) for number in video.numbers]
+    scene = Scene(
+        "seen", "seen", tuple(bodies), Roles(str(AGENT_ID), str(PATIENT_ID)),
+        camera_of(video.camera), joints=joints_of(tracks, bodies), floor=0.0, ending=Ending(),
+        pushes=pushes,
+    )  # fmt: skip
+    return scene, simulate(scene, engine=engine, frames=OBSERVED_FRAMES)
+
+
+def _pushed(video: Video, objects: Mapping[int, Resting], engine: Engine) -> PushGuess | None:
+    """Return the push of the object that is the first to move otherwise than without a push."""
+    scene, path = _simulated(video, stacked(objects), engine, None)
+    every = list(range(len(video.frames)))
+    mismatches = video.mismatches(scene, path, every)
+    rises = mismatches - mismatches[0]
+    for fast in (FAST, STARTED):
+        found = []
+        for k, number in enumerate(video.numbers):
+            one, shift = objects[number], video.shift(k)
+            falls = one.fit.rest is None and one.placed.extent_z()[0] > 0.15
+            if falls or one.frame != video.frames[0]:
+                continue
+            started = np.flatnonzero((shift > STARTED) & (rises[:, k] > OTHERWISE))
+            rows = [row for row in started.tolist() if shift[row : row + 4].max() > fast]
+            if rows:
+                late = shift[min(rows[0] + 2, len(shift) - 1)]
+                found.append((int(rows[0]), -float(late), k))
+        for row, _, k in sorted(found)[:1]:
+            return _guess(video, k, row, objects[video.numbers[k]].placed)
+    return None
+
+
+def _guess(video: Video, k: int, row: int, placed: Placed) -> PushGuess | None:
+    """Return the push of an object whose motion is seen from a row on.
+
+    Its velocity is the largest of the first three steps: later it has met something.
+    """
+    rows = range(max(0, row - 2), min(len(video.frames), row + 7))
+    frames, places = video.places(k, float(placed.middle()[2]), rows)
+    if len(frames) < 3:
+        return None
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    if steps.max() < 1e-5:
+        return None
+    start = int(np.argmax(steps > 0.3 * steps.max()))
+    fastest = start + int(np.argmax(steps[start : start + 3]))
+    velocity = (places[fastest + 1] - places[fastest]) / (frames[fastest + 1] - frames[fastest])
+    speed = float(np.linalg.norm(velocity))
+    passed = float((places[fastest] - places[0]) @ velocity) / speed**2
+    frame = float(
+        np.clip(
+            frames[fastest] - passed, frames[max(start - 1, 0)],
+            frames[min(start + 1, len(frames) - 1)],
+        )
+    )  # fmt: skip
+    velocity, speed = velocity / FRAME_TIME, max(speed / FRAME_TIME, 0.3)
+    side, up = 0.2 * speed + 0.1, 0.15 * speed + 0.05
+    mean = np.array([*velocity, 0.0, 0.0, frame, 0.1 * speed, 0.0])
+    return PushGuess(video.numbers[k], mean, np.array([side, side, 0.25, 0.12, 1.5, up, 0.6]))
+
+
+def _search(
+    video: Video, objects: Mapping[int, Resting], guess: PushGuess | None, engine: Engine
+) -> list[_Tried]:
+    """Return all hypotheses that were simulated, best first."""
+    early = [np.full(one.spread.shape[1], one.fit.rest is None) for one in objects.values()]
+    drawn_early = np.concatenate([*early, np.full(7 * (guess is not None), True)])
+    scenes = len(drawn_early) - 7 * (guess is not None)
+    rng = generator("seeing", "hypotheses")
+    mean, spread = np.zeros(len(drawn_early)), drawn_early.astype(float)
+    tried: list[_Tried] = []
+    for stage, rounds in enumerate(ROUNDS):
+        if stage == 1:
+            spread = np.where(drawn_early, spread.clip(0.2), 0.7)
+        for _ in range(rounds if spread.any() else 0):
+            drawn = mean + spread * rng.standard_normal((DRAWN, len(mean)))
+            drawn[0] = mean
+            for values in drawn:
+                try:
+                    solids = stacked(objects, values[:scenes])
+                    scene, path = _simulated(video, solids, engine, guess, values[scenes:])
+                except PhysionError:
+                    continue
+                mismatches = video.mismatches(scene, path, video.compared)
+                loss = float((mismatches @ video.weights).mean())
+                loss += 0.002 * float(np.mean(values[:scenes] ** 2))
+                tried.append(_Tried(values, loss, mismatches, scene, path))
+            tried.sort(key=lambda each: each.loss)
+            del tried[4 * DRAWN :]
+            best = np.array([each.values for each in tried[:BEST]])
+            if not len(best):
+                return []
+            mean, least = best.mean(axis=0), NARROWEST[0]
+            spread = best.std(axis=0)
+            if stage == 0:
+                spread = np.where(drawn_early, spread.clip(least), 0.0)
+            else:
+                spread = np.maximum(spread, np.where(drawn_early, least, NARROWEST[1]))
+    return tried
+
+
+def _observed(
+    video: Video,
+    objects: Mapping[int, Resting],
+    pictures: Mapping[int, Picture],
+    tried: _Tried,
+    rank: int,
+) -> ObservedTrial:
+    """Return scene and state at the last observed frame, corrected by its masks.
+
+    Scenes are named by their rank, so that each gets noise of its own.
+    """
+    scene, path, last = tried.scene, tried.path, video.frames[-1]
+    state = path.state(LAST_OBSERVED)
+    positions, rotations = state.positions.copy(), state.rotations.copy()
+    velocities = state.velocities.copy()
+    wrong = tried.mismatches[-1] > CONTRADICTED
+    for k, number in enumerate(video.numbers):
+        if not wrong[k] or number == PATIENT_ID:
+            continue
+        one, fits = objects[number], {}
+        for frame in (*LAST_FRAMES, last):
+            rays = pictures[frame].rays(number, 240) if frame in pictures else None
+            if rays is not None:
+                fits[frame] = _refitted(one, _placed(one, tried, frame, k), rays)
+        if last not in fits:
+            continue
+        placed = fits.pop(last)
+        positions[k] = placed.position
+        rotations[k] = np.roll(Rotation.from_matrix(placed.rotation).as_quat(), 1)
+        if fits:
+            frame = min(fits)
+            passed = (last - frame) * FRAME_TIME
+            velocities[k] = (placed.middle() - fits[frame].middle()) / passed
+    agent = video.numbers.index(AGENT_ID)
+    touched = bool(label_contact(scene, path).contact) and not wrong[agent]
+    corrected = State(
+        LAST_OBSERVED, positions, rotations, velocities, state.angular_velocities,
+        state.cloth_vertices, state.cloth_velocities,
+    )  # fmt: skip
+    return ObservedTrial(replace(scene, name=f"seen {rank}", pushes=()), corrected, touched)
+
+
+def _tracks(
+    video: Video, objects: Mapping[int, Resting], tried: _Tried, state: State
+) -> tuple[Track, ...]:
+    """Return the poses of the objects in a hypothesis, the last ones corrected."""
+    tracks = []
+    for k, number in enumerate(video.numbers):
+        placed = [_placed(objects[number], tried, frame, k) for frame in video.frames]
+        rotation = rotation_matrices(state.rotations[k : k + 1])[0]
+        placed[-1] = replace(placed[-1], position=state.positions[k], rotation=rotation)
+        tracks.append(Track(number, tuple(video.frames), tuple(placed)))
+    return tuple(tracks)
+
+
+def _placed(one: Resting, tried: _Tried, frame: int, k: int) -> Placed:
+    """Return an object in a frame of a hypothesis."""
+    rotation = rotation_matrices(tried.path.rotations[frame, k : k + 1].astype(np.float64))[0]
+    position = tried.path.positions[frame, k].astype(np.float64)
+    scale = np.array(tried.scene.bodies[k].scale)
+    return Placed(one.placed.solid, position, rotation, scale)
+
+
+def _refitted(one: Resting, start: Placed, rays: Rays) -> Placed:
+    """Return an object in another frame, with its size, near a start or where its mask is."""
+    factor = one.fit.log_factor
+    depth = float(np.median(rays.depth[rays.on])) * math.exp(factor)
+    seen = rays.origin + rays.vectors[rays.on].mean(axis=0) * depth
+    found = []
+    for near in (start, moved(start, seen - start.middle())):
+        fit = MaskFit(
+            rays, one.fit.error, None, False, "given", factor, SAME_FACTOR
+        )  # fmt: skip
+        found.append(fit.solve(near, 8))
+    return min(found, key=lambda placed: placed.cost)
+
+
+def _triple(values: F64) -> tuple[float, float, float]:
+    return (float(values[0]), float(values[1]), float(values[2]))
