@@ -331,6 +331,8 @@ def test_a_push_is_found_by_simulation() -> None:
     names = list(seen.trial.scene.names())
     ball = names.index("1")
     assert seen.trial.scene.bodies[ball].shape == "sphere"
+    box = seen.trial.scene.bodies[names.index("2")]
+    assert box.shape == "cube" and box.scale[2] == pytest.approx(0.5, abs=0.05), "no plate"
     found = seen.trial.state
     assert found.positions[ball] == pytest.approx(true.positions[44, 0].astype(float), abs=0.1)
     assert found.velocities[ball] == pytest.approx(true.velocities[44, 0].astype(float), abs=0.3)

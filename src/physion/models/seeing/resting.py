@@ -6,7 +6,8 @@ stand on: the floor, or the top of what is below its middle. It stays where it w
 nothing that it may stand on explains it nearly as well, and also inside a vessel and on a ramp,
 where the height at which it rests is not known.
 
-Targets are flat in our presets and lie on the floor.
+Targets are flat in our presets and lie on the floor: a patient is a plate or a ring there unless
+something else explains it much better.
 """
 
 from __future__ import annotations
@@ -38,6 +39,8 @@ WORSE, MARGIN = 1.5, 12.0
 """Factor and summand of the sum of squares up to which an object is taken to stand on something."""
 BESIDE = 50.0
 """Sum of squares that is added if it is then no longer above it."""
+POOR_PLATE = 0.1
+"""Cost of a plate above which a patient may be something else."""
 VESSELS = ("bowl", "pipe", "torus")
 RAMP = "ramp"
 
@@ -120,15 +123,29 @@ def resting_scene(
         rays = pictures[frame].rays(number) if pixels[frame] >= LEAST_PIXELS else None
         if rays is None:
             continue
-        fit = find_plate(rays, error) if number == PATIENT_ID else find_shape(rays, error)
-        alone.append(Resting(number, frame, rays, fit))
-    alone.sort(key=lambda one: (one.number != PATIENT_ID, one.placed.extent_z()[0]))
+        alone.append(Resting(number, frame, rays, _alone(number, rays, error)))
+    alone.sort(key=lambda one: (not _plate(one), one.placed.extent_z()[0]))
     found: list[Resting] = []
     for one in alone:
-        if one.number != PATIENT_ID and (one.frame == first or one.fit.upright):
+        if not _plate(one) and (one.frame == first or one.fit.upright):
             _stand(one, found, error)
         found.append(one)
     return {one.number: one for one in found}
+
+
+def _alone(number: int, rays: Rays, error: float) -> MaskFit:
+    """Return the fit of an object by itself."""
+    if number != PATIENT_ID:
+        return find_shape(rays, error)
+    plate = find_plate(rays, error)
+    if plate.placed.cost < POOR_PLATE:
+        return plate
+    other = find_shape(rays, error)
+    return other if other.placed.cost < plate.placed.cost / 2 else plate
+
+
+def _plate(one: Resting) -> bool:
+    return one.fit.sizes == "flat"
 
 
 def _stand(one: Resting, found: Sequence[Resting], error: float) -> None:
@@ -145,7 +162,7 @@ def _stand(one: Resting, found: Sequence[Resting], error: float) -> None:
     held = [
         other
         for other in found
-        if other.number != PATIENT_ID
+        if not _plate(other)
         and above(placed, other.placed)
         and (
             other.placed.solid.name.startswith(RAMP)
@@ -195,9 +212,9 @@ def _carries(lower: Resting, upper: Placed) -> bool:
     name = placed.solid.name
     if name.startswith(RAMP):
         return False
-    if name == "torus" and lower.number != PATIENT_ID:
+    if name == "torus" and not _plate(lower):
         return _same_rings(upper, placed) or _on_rim(upper, placed)
-    return name not in VESSELS or (lower.number == PATIENT_ID and _on_rim(upper, placed))
+    return name not in VESSELS or (_plate(lower) and _on_rim(upper, placed))
 
 
 def _same_rings(upper: Placed, lower: Placed) -> bool:
