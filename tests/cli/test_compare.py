@@ -143,6 +143,15 @@ def test_page_and_terminal_show_the_same_average(capsys: pytest.CaptureFixture[s
             assert shown["m"].startswith(f"{r:.3f}")
 
 
+def test_stimuli_that_people_did_not_see_are_counted_over_all_scenarios() -> None:
+    labels = physion_official().labels
+    p = {name: 0.9 if labels[name] else 0.2 for name in labels if "drop" in name or "link" in name}
+    unseen = [f"{stem}new_{k}" for stem in ("pilot_it2_drop_", "pilot_linking_") for k in range(3)]
+    for names, shown in ((unseen, "6 stimuli"), (unseen[:1], "1 stimulus")):
+        models = {"all": p | dict.fromkeys(names, 0.5), "fewer": p | {names[0]: 0.5}}
+        assert compare(models).notes == (f"{shown} left out: people did not see it",)
+
+
 def test_without_files_it_says_so(capsys: pytest.CaptureFixture[str]) -> None:
     for words, said in (([], "no predictions"), (["--check"], "nothing to check")):
         assert main(["compare", *words]) == 2

@@ -122,8 +122,10 @@ class CompareResult:
         comparison = self.inputs.comparison
         dropped = comparison.dropped
         given = dropped[(dropped["model"] != "") & (dropped["reason"] != NOT_PREDICTED)]
-        counts = given.groupby("reason", sort=False)["stimuli"].max()
-        notes = [f"{count} stimuli left out: {reason}" for reason, count in counts.items()]
+        # Over the scenarios of a model; of several models the largest number counts.
+        by_model = given.groupby(["model", "reason"], sort=False)["stimuli"].sum()
+        counts = by_model.groupby("reason", sort=False).max()
+        notes = [f"{plural(n, 'stimulus')} left out: {reason}" for reason, n in counts.items()]
         if len(comparison.changed):
             names, shown = list(comparison.changed["stimulus"]), 5
             more = f" and {len(names) - shown} more" if len(names) > shown else ""
