@@ -112,6 +112,10 @@ def test_own_stimuli_need_scenario_and_outcome(
         assert main(command) == 2
         error = capsys.readouterr().err
         assert "'mine_1'" in error and advice in error
+    file.write_text("stimulus,p\npilot_it2_drop_x,0.3\npilot_it2_drop_y,0.7\n")
+    assert main(command) == 2
+    assert "are no stimuli of the study" in (error := capsys.readouterr().err)
+    assert "(closest: 'pilot_it2_drop_" in error
     file.write_text("stimulus,p,scenario,outcome\nmine_1,0.3,drop,0\nmine_2,0.7,drop,0\n")
     assert main(command) == 0
     (row,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("own"))
@@ -149,7 +153,19 @@ def test_stimuli_that_people_did_not_see_are_counted_over_all_scenarios() -> Non
     unseen = [f"{stem}new_{k}" for stem in ("pilot_it2_drop_", "pilot_linking_") for k in range(3)]
     for names, shown in ((unseen, "6 stimuli"), (unseen[:1], "1 stimulus")):
         models = {"all": p | dict.fromkeys(names, 0.5), "fewer": p | {names[0]: 0.5}}
-        assert compare(models).notes == (f"{shown} left out: people did not see it",)
+        result = compare(models)
+        assert result.notes == (f"{shown} left out: people did not see it",)
+        counted = f"{len(names)} of {len(p) + len(names)} predicted names"
+        (warning,) = (words for words in result.warnings if counted in words)
+        assert names[0] in warning and "closest: 'pilot_it2_drop_" in warning
+
+
+def test_folders_and_endings_of_files_are_no_part_of_a_name() -> None:
+    names = [name for name in physion_official().labels if "drop" in name][:20]
+    files = [f"m/{names[0]}", f"C:\\m\\{names[1]}_img.webm", f"{names[2]}.npy", *names[3:]]
+    result = compare({"files": dict.fromkeys(files, 0.4), "names": dict.fromkeys(names, 0.4)})
+    assert not result.notes
+    assert set(result.scores.query("base_model.notna()")["stimuli"]) == {20}
 
 
 def test_without_files_it_says_so(capsys: pytest.CaptureFixture[str]) -> None:

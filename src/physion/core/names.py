@@ -53,7 +53,7 @@ CONTROLLERS = {scenario: names.controller for scenario, names in NAMES.items()}
 OFFICIAL_SCENARIOS = {names.experiment: scenario for scenario, names in NAMES.items()}
 """Our name of a scenario by its name in the official tables."""
 
-TABLE_ENDINGS = (".mp4", ".hdf5", "_img")
+TABLE_ENDINGS = (".mp4", ".webm", ".avi", ".mov", ".npy", ".npz", ".hdf5", "_img")
 """Endings of file names that tables of stimuli hold."""
 
 FILE_ENDINGS = (".mp4", ".hdf5", ".png", "_img", "_map")
@@ -78,13 +78,13 @@ _WORDS = {
 
 
 def canonical_name(stimulus: str, endings: Sequence[str] = TABLE_ENDINGS) -> str:
-    """Return the name of a stimulus without file endings and without ``-redyellow``.
+    """Return the name of a stimulus without folders, file endings and ``-redyellow``.
 
     ``-redyellow`` marks the version of a trial with a red agent and a yellow patient; without it,
     tables of both versions can be joined. ``endings`` are removed in their order, each at most
     once: `TABLE_ENDINGS` for names in tables, `FILE_ENDINGS` for names of files.
     """
-    name = stimulus.strip()
+    name = stimulus.strip().replace("\\", "/").rpartition("/")[2]
     for ending in endings:
         name = name.removesuffix(ending)
     return name.replace("-redyellow", "")

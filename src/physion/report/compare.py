@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -480,6 +481,13 @@ def compare(
         if humans is None and labels is None:
             of_study = not official().labels.keys().isdisjoint(rows["stimulus"])
             humans = PACKAGED if of_study else None
+            if not of_study and rows[["outcome", "recorded_outcome"]].isna().all(axis=None):
+                raise BadInputError(
+                    f"{_not_of_study(rows)}; correct the names, or give stimuli of your own a "
+                    "column scenario, and a column outcome or the labels (--labels)"
+                )
+        if not isinstance(humans, pd.DataFrame | None) and find_official(humans) is not None:
+            missing += filter(None, [_not_of_study(rows)])
         averages = _averages(rows, humans, labels, zone, dominoes)
         methods = dict(averages.methods)
         results = all_results(
@@ -502,6 +510,24 @@ def compare(
         rollout_errors=None if errors is None else rollout_error_table(errors, draws.level),
     )
     return CompareResult(tidy_scores(results), results.people, inputs)
+
+
+def _not_of_study(rows: pd.DataFrame) -> str:
+    """Return how many predicted stimuli are not the study's, and the closest name to the first.
+
+    Empty if all are.
+    """
+    names, known = rows["stimulus"].unique(), official().labels
+    unknown = [str(name) for name in names if name not in known]
+    if not unknown:
+        return ""
+    close = get_close_matches(unknown[0], known, n=1)
+    hint = f" (closest: {close[0]!r})" if close else ""
+    are = "is no stimulus" if len(unknown) == 1 else "are no stimuli"
+    return (
+        f"{len(unknown)} of {plural(len(names), 'predicted name')} {are} of the study, such as "
+        f"{unknown[0]!r}{hint}"
+    )
 
 
 def _published_of(stimuli: pd.Series) -> PublishedTables | None:

@@ -104,8 +104,9 @@ def test_readout_labels_are_refused_as_labels(official: Path) -> None:
 
 @pytest.mark.parametrize(
     "spelling",
-    ["a-redyellow_0001", "a_0001_img", "a_0001_img.mp4", "a-redyellow_0001_img", " a_0001.hdf5"],
-)
+    ["a-redyellow_0001", "a_0001_img", "a_0001_img.mp4", "a-redyellow_0001_img", " a_0001.hdf5",
+     "m/a_0001_img.webm", "C:\\m\\a_0001.npy"],
+)  # fmt: skip
 def test_canonical_name(spelling: str) -> None:
     assert canonical_name(spelling) == "a_0001"
 
