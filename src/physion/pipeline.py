@@ -214,7 +214,7 @@ def run(
         result = compare(done.paths, humans=humans, labels=labels or None)
     page = result.report(
         out / "report",
-        methods=methods(settings, dataset.index, options or {}, built, models, decided),
+        methods=methods(settings, dataset.index, options or {}, built, models, decided, encoders),
         movies=page_movies(settings, dataset, result, out / "movies", executor, progress),
         question="Will the red object touch the yellow one?",
     )
@@ -332,17 +332,20 @@ def methods(
     built: Mapping[str, Any],
     models: Mapping[str, Mapping[str, Any]],
     decided: Sequence[str],
+    encoders: Sequence[str],
 ) -> dict[str, str]:
     """Return the settings of a run as texts for the report.
 
     ``options``: what the user gave. ``built``, ``models``: the models, and all their options.
-    ``decided``: models with the decision that was asked for.
+    ``decided``: models with the decision that was asked for. ``encoders``: models that learn and
+    are not trained, since only their readouts that ship are used.
     """
     splits = index.groupby("split").size()
     counts = ", ".join(f"{count} {split}" for split, count in splits.items())
     source = "sampled by this package" if settings.sampled else "official scenes"
     given = [f"{m}:{n}={v}" for m, own in options.items() for n, v in own.items()]
-    steps = [f"{name} {models[name]['steps']} steps" for name in built if _learns(built[name])]
+    trained = [name for name in built if _learns(built[name]) and name not in encoders]
+    steps = [f"{name} {models[name]['steps']} steps" for name in trained]
     samples = [f"{name} {models[name]['samples']}" for name in built if name in SIMULATIONS]
     texts = {
         "Scenes": f"{source}; trials: {counts}; every model sees pictures of its own "

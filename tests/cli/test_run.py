@@ -213,9 +213,12 @@ def test_the_report_states_the_settings_of_the_models_that_ran() -> None:
     ):
         settings = RunSettings(models=names)
         built = {name: build_model(name) for name in names.split(",")}
-        texts = methods(settings, index, options, built, model_options(settings, options), [])
+        texts = methods(settings, index, options, built, model_options(settings, options), [], [])
         assert noise in texts["Noise of the simulation"] and "Training" not in texts
     settings, options = RunSettings(models="frozen-encoder"), {"frozen-encoder": {"steps": 7}}
     built = {"frozen-encoder": build_model("frozen-encoder", weights="random")}
-    texts = methods(settings, index, options, built, model_options(settings, options), [])
+    given = model_options(settings, options)
+    texts = methods(settings, index, options, built, given, [], [])
     assert texts["Training"].startswith("frozen-encoder 7 steps,")
+    texts = methods(settings, index, options, built, given, [], ["frozen-encoder"])
+    assert "Training" not in texts, "only a readout that ships"

@@ -121,6 +121,10 @@ def test_choices_are_stated_or_said_to_be_missing(make_comparison: Maker) -> Non
     assert "Engine mujoco 4" in text and "Extra a word" in text
     assert text.count("not stated") == len(EXPECTED_METHODS) - 1
     assert "jackknife" in text and "left out, as in the study" in text
+    names = inputs.comparison.stimuli["base_model"]
+    known = dataclasses.replace(inputs, model_weights=dict.fromkeys(names, "those of a file"))
+    text = render(known).text
+    assert "started from: " in text and "Encoder weights" not in text, "it is said once"
 
 
 def test_undefined_scores_come_with_their_reason(make_comparison: Maker) -> None:

@@ -233,7 +233,14 @@ def _stimuli(inputs: ReportInputs, shown: Mapping[str, Markup], links: Mapping[s
 
 
 def _methods(inputs: ReportInputs) -> Markup:
-    stated = dict.fromkeys(EXPECTED_METHODS, "not stated") | dict(inputs.methods)
+    stated = dict.fromkeys(EXPECTED_METHODS, "not stated")
+    models = dict.fromkeys(inputs.comparison.stimuli["base_model"].astype(str))
+    unknown = [name for name in models if not inputs.model_weights.get(name)]
+    if not unknown:
+        del stated["Encoder weights"]  # `_summary` has them
+    elif len(unknown) < len(models):
+        stated["Encoder weights"] = f"not stated of {html.listed(unknown)}"
+    stated |= inputs.methods
     rules = {} if inputs.people is None else people_parts.rules_text(inputs.people)
     choices = {**stated, **inputs.comparison.settings, **rules}
     return _summary(inputs) + html.definition_list(choices) + scores.definitions(inputs.comparison)
