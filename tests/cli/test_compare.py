@@ -390,3 +390,25 @@ def test_check_names_the_bad_row(
     first, second = json.loads(capsys.readouterr().out)
     assert (first["errors"], second["errors"]) == (0, 1)
     assert second["faults"][0]["row"] == 42 and second["faults"][0]["level"] == "error"
+
+
+def test_check_takes_the_stimuli_that_compare_takes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those of the study, of which few are enough; names that compare refuses are errors."""
+    names = [name for name in physion_official().labels if "drop" in name][:10]
+    file = tmp_path / "few.csv"
+    for stimuli, code, words in (
+        (names, 0, "0 errors"),
+        ([*names, "nonsense"], 1, "row 11 (nonsense): no such stimulus"),
+        (["nonsense", "more"], 1, "2 errors"),
+    ):
+        file.write_text(
+            "stimulus,p\n" + "".join(f"{name},0.{k}\n" for k, name in enumerate(stimuli))
+        )
+        assert main(["compare", "--check", str(file)]) == code
+        out = capsys.readouterr().out
+        assert words in out and "no list of them" not in out
+    file.write_text("stimulus,p,scenario,outcome\nmine,0.3,drop,0\nother,0.6,drop,1\n")
+    assert main(["compare", "--check", str(file)]) == 0
+    assert "no list of them" in capsys.readouterr().out, "stimuli of one's own"

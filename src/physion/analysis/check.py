@@ -77,11 +77,14 @@ class Reference:
     - ``index``: the trials of a dataset: ``trial``, ``split``, and optionally ``digest`` (of the
       motion) and ``scene_digest``;
     - ``fitted``: canonical names of the stimuli on which the readout was fitted.
+
+    A stimulus without a prediction is an error if all must be predicted (``complete``).
     """
 
     labels: Mapping[str, bool] | None = None
     index: pd.DataFrame | None = None
     fitted: Collection[str] | None = None
+    complete: bool = True
 
 
 @dataclass(frozen=True)
@@ -305,7 +308,7 @@ def _missing(rows: pd.DataFrame, wanted: set[str], against: Reference) -> list[F
             what = f"no stimulus of {where}" if whole else f"{len(names)} stimuli of {where} lack"
             what += "" if whole else f" a prediction, the first is {names[0]}"
             what += " (Roll's ledges, which are not compared)" if ledges else ""
-            level = "warning" if whole or ledges else "error"
+            level = "warning" if whole or ledges or not against.complete else "error"
             faults.append(Fault("missing", f"{model}: {what}", column="stimulus", level=level))
     return faults
 

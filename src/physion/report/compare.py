@@ -50,6 +50,7 @@ from physion.analysis.tables import (
     LABELS_FILE,
     MEAN,
     POOLED,
+    PREDICTIONS,
     DominoesLook,
     check_excluded_names,
     check_predictions,
@@ -63,8 +64,14 @@ from physion.analysis.tables import (
 )
 from physion.compute.tasks import Progress
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.core.names import SCENARIOS
-from physion.core.tables import read_csv, read_table, refuse_duplicates, require_columns
+from physion.core.names import SCENARIOS, canonical_name
+from physion.core.tables import (
+    inspect_table,
+    read_csv,
+    read_table,
+    refuse_duplicates,
+    require_columns,
+)
 from physion.data.official import PACKAGED, find_official, official
 from physion.report.build import build_people_report, build_report
 from physion.report.html import MACROS, plural
@@ -293,7 +300,8 @@ def check_files(
     Parameters
     ----------
     predictions, humans, responses, labels, sessions, rules, expected
-        As in `compare`. Outcomes of the responses serve where no others are given.
+        As in `compare`. Outcomes of the responses serve where no others are given. By default
+        stimuli of the original study need not all be predicted.
     dataset
         Dataset of the trials: no predicted one may be in another split.
     fitted
@@ -332,8 +340,24 @@ def check_files(
         if outcomes is None and read is not None and len(read.test):
             rows = read.test.drop_duplicates("stimulus")
             outcomes = dict(zip(rows["stimulus"], rows["label"].astype(bool), strict=True))
-    reference = Reference(outcomes, index, known)
+    by_default = outcomes is None and not responses and _are_of_study(predictions, index)
+    if by_default:
+        outcomes = dict(official().labels)
+    reference = Reference(outcomes, index, known, complete=not by_default)
     return [*found, *(check_predictions_file(path, reference) for path in predictions)]
+
+
+def _are_of_study(paths: Sequence[Path], index: pd.DataFrame | None) -> bool:
+    """Return whether files of predictions are compared with the people of the original study.
+
+    So are, as in `compare`, those that name one of its stimuli. Those that neither state outcomes
+    nor are of a dataset (``index``) must be, since they are compared with nothing else.
+    """
+    tables = [inspect_table(read_csv(path), PREDICTIONS)[0] for path in paths]
+    rows = pd.concat(tables).reindex(columns=["stimulus", "outcome", "recorded_outcome"])
+    if not official().labels.keys().isdisjoint(rows["stimulus"].astype(str).map(canonical_name)):
+        return True
+    return index is None and bool(rows[["outcome", "recorded_outcome"]].isna().all(axis=None))
 
 
 def compare(
