@@ -12,9 +12,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from physion.cli.evaluate import _print_scores as print_evaluation
 from physion.cli.main import main
 from physion.cli.output import print_scores
 from physion.data.official import official as physion_official
+from physion.readout.evaluation import EvaluatedModel, Evaluation
 from physion.report.compare import compare
 from physion.report.inputs import ReportInputs
 from physion.report.scores import scores
@@ -158,6 +160,18 @@ def test_stimuli_that_people_did_not_see_are_counted_over_all_scenarios() -> Non
         counted = f"{len(names)} of {len(p) + len(names)} predicted names"
         (warning,) = (words for words in result.warnings if counted in words)
         assert names[0] in warning and "closest: 'pilot_it2_drop_" in warning
+
+
+def test_evaluations_print_what_the_comparison_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = [name for name in physion_official().labels if "drop" in name][:3]
+    file = tmp_path / "m.csv"
+    file.write_text("stimulus,p\n" + "".join(f"{name},0.4\n" for name in [*names, "test99_0001"]))
+    print_evaluation(Evaluation([EvaluatedModel("m", "", 0, file, None, True, {})], {}))
+    shown = capsys.readouterr()
+    assert shown.out.startswith("note: 1 stimulus left out")
+    assert shown.err.startswith("physion: warning: compared on only 3 stimuli")
 
 
 def test_folders_and_endings_of_files_are_no_part_of_a_name() -> None:

@@ -128,8 +128,6 @@ def _compare(options: Options) -> int:
         scores = records(result.scores)
         print(json_module.dumps({"report": str(page), "scores": scores, **numbers}))
     else:
-        for note in result.notes:
-            print_line(f"note: {note}")
         print_scores(result, page)
         if result.population is not None:
             print_line("")

@@ -183,11 +183,14 @@ def _print(done: Evaluation, options: Options) -> None:
 
 
 def _print_scores(done: Evaluation) -> None:
-    """Print the table of results, with the people of the study if they saw the stimuli."""
+    """Print warnings and table of results, with the study's people if they saw the stimuli."""
     try:
-        print_scores(compare(done.paths))
+        result = compare(done.paths)
     except BadInputError as error:
         print_warnings([f"no comparison: {error}"])
+        return
+    print_warnings(result.warnings)
+    print_scores(result)
 
 
 def with_errors(scores: pd.DataFrame, name: str) -> list[str]:

@@ -173,10 +173,12 @@ MOST_ROWS = 20
 
 
 def print_scores(result: CompareResult, page: Path | None = None, made: str = "") -> None:
-    """Print the table of results, in at most 25 lines, then the path of the report."""
+    """Print notes and the table of results, in at most 25 lines, then the path of the report."""
     from physion.analysis.results import MARKED, fewest_rows, fitted_elsewhere
     from physion.report.compare import as_text
 
+    for note in result.notes:
+        print_line(f"note: {note}")
     rows = result.results
     shown = fewest_rows(rows, MOST_ROWS)
     print_line(text_table(as_text(shown), f"People and models: {result.heading}"))
