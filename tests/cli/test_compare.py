@@ -53,7 +53,9 @@ def test_two_columns_are_enough_and_the_terminal_shows_the_results(
     command = ["compare", *files, "--out", str(tmp_path / "out")]
     assert main([*command, "--humans", "official"]) == 0
     out = capsys.readouterr().out
-    assert main(command) == 0 and capsys.readouterr().out == out, "known by the stimuli's names"
+    for more in ((), ("--labels", "official")):
+        assert main([*command, *more]) == 0
+        assert capsys.readouterr().out == out, "known by the stimuli's names"
     lines = out.splitlines()
     assert len(lines) <= 26, "25 lines, then the path"
     assert lines[1].split() == ["model", "given", "accuracy", "r", "with", "people", "kappa"]

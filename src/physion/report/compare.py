@@ -396,7 +396,7 @@ def compare(
         Averages of people: ``official`` for the shipped ones, a folder of
         ``human_accuracy-*.csv``, or a table with ``stimulus``, ``scenario``, ``accuracy`` and
         ``count``. None: ``official`` if the predictions name stimuli of the original study and
-        there are no ``labels``, else nobody.
+        there are no ``labels`` but the official ones, else nobody.
     responses
         Answers of single participants in place of ``humans``: the file of our export, or the
         study's raw files.
@@ -502,10 +502,12 @@ def compare(
                 "sessions, expected, attributes, chosen values (where) and "
                 "simulated participants are about responses: give those"
             )
-        if humans is None and labels is None:
-            of_study = not official().labels.keys().isdisjoint(rows["stimulus"])
-            humans = PACKAGED if of_study else None
-            if not of_study and rows[["outcome", "recorded_outcome"]].isna().all(axis=None):
+        if humans is None and not isinstance(labels, Mapping):
+            study = official() if labels is None else find_official(labels)
+            of_study = study and not study.labels.keys().isdisjoint(rows["stimulus"])
+            humans = (labels or PACKAGED) if of_study else None
+            stated = rows[["outcome", "recorded_outcome"]].notna().any(axis=None)
+            if study and not of_study and not stated:
                 raise BadInputError(
                     f"{_not_of_study(rows)}; correct the names, or give stimuli of your own a "
                     "column scenario, and a column outcome or the labels (--labels)"
