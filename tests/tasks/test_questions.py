@@ -240,6 +240,10 @@ def test_a_log_of_inspect_says_what_it_needs(tmp_path: Path) -> None:
         read_answers(path)
     with pytest.raises(MissingExtraError, match=r"physion\.tasks\.inspect needs"):
         importlib.import_module("physion.tasks.inspect")
+    table = tmp_path / "predictions.json"
+    table.write_text('[{"stimulus": "a", "p_contact": 0.3}]')
+    with pytest.raises(BadInputError, match="is not a log of Inspect; save predictions as a CSV"):
+        read_answers(table)
 
 
 def test_the_first_option_of_a_control_is_named() -> None:

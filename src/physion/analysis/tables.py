@@ -96,14 +96,14 @@ ONLY, ALL_BUT = "only", "all-but"
 """Training protocols: only on the tested scenario, or on all but that one."""
 
 PREDICTIONS: tuple[Column, ...] = (
-    must("stimulus", "text", "Name of the trial", also=("Stimulus Name",)),
+    must("stimulus", "text", "Name of the trial", also=("Stimulus Name", "stim_ID")),
     must(
         "p_contact",
         "number",
         "Probability that agent and patient touch",
         low=0,
         high=1,
-        also=("Predicted Prob_true", "probability", "p"),
+        also=("Predicted Prob_true", "probability", "prob", "p"),
     ),
     Column("model", "text", "Name of the model; absent: the name of the file", may_be_empty=False,
            also=("Model",)),

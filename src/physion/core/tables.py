@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -42,17 +43,24 @@ def parse_csv(content: bytes, where: str) -> pd.DataFrame:
 
     Raises `BadInputError` if the content is not such a table.
     """
+    header = content.partition(b"\n")[0]
+    for mark, name in ((b";", "semicolons"), (b"\t", "tabs")):
+        if mark in header and b"," not in header:
+            raise BadInputError(
+                f"{where} separates its columns with {name}; save it as CSV with commas between "
+                "columns, and with points in numbers"
+            )
     try:
         table = pd.read_csv(io.BytesIO(content), dtype=str, keep_default_na=False, encoding="utf-8")
-    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
+        raise BadInputError(
+            f"{where} is not a CSV table: it is no text (UTF-8); save the table as CSV with commas"
+        ) from error
+    except (pd.errors.ParserError, pd.errors.EmptyDataError) as error:
         raise BadInputError(f"{where} is not a CSV table: {error}") from error
     if not isinstance(table.index, pd.RangeIndex):
         # pandas takes the first cells of such rows for an index, which shifts all others.
         raise BadInputError(f"{where}: its rows have more cells than its header")
-    if len(table.columns) == 1 and ";" in str(table.columns[0]):
-        raise BadInputError(
-            f"{where} separates its columns with semicolons; save it as CSV with commas"
-        )
     return table
 
 
@@ -98,7 +106,7 @@ class Column:
 
     ``required``: the column must exist. ``may_be_empty``: a cell may be empty (unknown). The bounds
     ``low`` and ``high`` are inclusive and in ``unit``. ``also``: other headers that it may have in
-    a file, of which the first that is there counts.
+    a file, of which the first that is there counts. Headers may be in any case, with spaces around.
     """
 
     name: str
@@ -188,8 +196,12 @@ def inspect_table(
     """
     typed, bad = {}, []
     missing = []
+    plain = {str(name).strip().lower(): name for name in reversed(table.columns)}
     for column in columns:
-        header = next((name for name in (column.name, *column.also) if name in table), None)
+        names = (column.name, *column.also)
+        exact = (name for name in names if name in table)
+        alike = (plain[name.lower()] for name in names if name.lower() in plain)
+        header = next(chain(exact, alike), None)
         if header is None:
             missing += [column] if column.required else []
             continue

@@ -103,6 +103,12 @@ def _inspect_log(path: Path) -> _Collected:
     try:
         from inspect_ai.log import read_eval_log
     except ImportError as error:
+        content = read_plain(path, MAX_BYTES, follow_links=True)
+        if path.suffix.lower() == ".json" and b'"eval"' not in content:
+            raise BadInputError(
+                f"{path} is not a log of Inspect; save predictions as a CSV table with the columns "
+                "stimulus and p_contact"
+            ) from error
         raise MissingExtraError(f"to read {path}", "inspect") from error
     try:
         log = read_eval_log(str(path), exclude_fields={"events", "messages", "attachments"})

@@ -584,8 +584,22 @@ def test_predictions_survive_their_files(tmp_path: Path) -> None:
     direct = compared(pd.concat(tables), people).scores
     read = compared(read_predictions(paths), people).scores
     pd.testing.assert_frame_equal(direct, read)
-    tables[0][["Stimulus Name", "Predicted Prob_true"]].to_csv(paths[0], index=False, sep=";")
-    with pytest.raises(BadInputError, match=r"a\.csv separates its columns with semicolons"):
+    two = tables[0][["Stimulus Name", "Predicted Prob_true"]]
+    for names in (("Stimulus", " P_contact "), ("stim_ID", "prob")):
+        two.set_axis(names, axis=1).to_csv(paths[0], index=False)
+        assert read_predictions(paths[:1])[["stimulus", "p_contact"]].equals(
+            name_models(tables[0])[["stimulus", "p_contact"]]
+        )
+    for mark, point, name in (
+        (";", ".", "semicolons"),
+        (";", ",", "semicolons"),
+        ("\t", ".", "tabs"),
+    ):
+        two.to_csv(paths[0], index=False, sep=mark, decimal=point)
+        with pytest.raises(BadInputError, match=rf"a\.csv separates its columns with {name}; save"):
+            read_predictions(paths)
+    two.to_parquet(paths[0])
+    with pytest.raises(BadInputError, match=r"a\.csv is not a CSV table: it is no text"):
         read_predictions(paths)
     with pytest.raises(BadInputError, match="no file"):
         read_predictions([])
