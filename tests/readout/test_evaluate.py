@@ -513,6 +513,8 @@ def test_trials_that_do_not_fit_the_tested_ones_are_refused(folder: Path) -> Non
     ):
         with pytest.raises(BadInputError, match=words):
             evaluate("blob-centroids", folder / "tested", folder / "c", fit=fit)
+    with pytest.raises(BadInputError, match="fit has no trial in the split 'testing' to predict"):
+        evaluate("blob-centroids", folder / "fit", folder / "c", fit=folder / "fit")
 
 
 @pytest.mark.slow

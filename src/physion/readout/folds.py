@@ -157,8 +157,11 @@ def plan_folds(index: pd.DataFrame, protocol: Protocol, folds: int, seed: int) -
 def join_for_fit(tested: Dataset, fit: Dataset) -> Dataset:
     """Return a dataset with the testing trials of one and the training and readout of another.
 
-    Raises `BadInputError` if a scenario has nothing to fit a readout on, or a motion is in both.
+    Raises `BadInputError` if there is no testing trial, a scenario has nothing to fit a readout on,
+    or a motion is in both.
     """
+    if not (tested.index["split"] == TESTING).any():
+        raise BadInputError(f"{tested.folder} has no trial in the split {TESTING!r} to predict")
     joined = JoinedDataset([(tested, (TESTING,)), (fit, (TRAINING, READOUT))])
     index = joined.index
     of_test = index["split"] == TESTING
