@@ -12,9 +12,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from physion.cli import output
 from physion.cli.evaluate import _print_scores as print_evaluation
 from physion.cli.main import main
-from physion.cli.output import print_scores
+from physion.cli.output import OutputConsole, print_scores
 from physion.data.official import official as physion_official
 from physion.readout.evaluation import EvaluatedModel, Evaluation
 from physion.report.compare import compare
@@ -162,6 +163,35 @@ def test_stimuli_that_people_did_not_see_are_counted_over_all_scenarios() -> Non
         counted = f"{len(names)} of {len(p) + len(names)} predicted names"
         (warning,) = (words for words in result.warnings if counted in words)
         assert names[0] in warning and "closest: 'pilot_it2_drop_" in warning
+
+
+def test_the_table_fits_its_lines_and_the_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    labels = physion_official().labels
+    names = [name for name in labels if "drop" in name]
+    tables = [
+        pd.DataFrame(
+            {"stimulus": [*names, "nonsense"], "p_contact": 0.4, "model": f"model {k}",
+             "fit_on": f"set {k % 4}", "frames": "2 to 44, 5/s", "benchmark": "v1"}
+        )
+        for k in range(12)
+    ]  # fmt: skip
+    result = compare(tables)
+    for width, frames, intervals in (
+        (None, True, True), (200, True, True), (110, False, True), (80, False, False)
+    ):  # fmt: skip
+        terminal = OutputConsole(highlight=False, force_terminal=width is not None, width=width)
+        monkeypatch.setattr(output, "console", terminal)
+        print_scores(result)
+        lines = capsys.readouterr().out.splitlines()
+        assert len(lines) == 25 and lines[0].startswith("note: ")
+        assert sum(line.startswith("Readouts fitted on") for line in lines) == 4
+        assert ("frames" in lines[2], "intervals" in lines[1], "[" in lines[3]) == (
+            frames, intervals, intervals
+        )  # fmt: skip
+        rows = [line for line in lines[2:] if line.startswith("model ")]
+        assert width is None or max(map(len, rows)) <= width
 
 
 def test_evaluations_print_what_the_comparison_says(

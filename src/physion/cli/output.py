@@ -1,6 +1,7 @@
 """Output of the verbs: results, text tables, progress bars, files that are written atomically.
 
-Text tables are not cut to the width of the terminal, so that they can be searched and piped.
+Text tables are not cut to the width of the terminal, so that they can be searched; the table of
+results leaves out columns there.
 """
 
 from __future__ import annotations
@@ -175,13 +176,14 @@ MOST_ROWS = 20
 def print_scores(result: CompareResult, page: Path | None = None, made: str = "") -> None:
     """Print notes and the table of results, in at most 25 lines, then the path of the report."""
     from physion.analysis.results import MARKED, fewest_rows, fitted_elsewhere
-    from physion.report.compare import as_text
 
+    rows = result.results
+    # Of notes and lines about readouts, one has room below the most rows.
+    more = len(result.notes) + len(fitted_elsewhere(rows)) - 1
+    shown = fewest_rows(rows, max(MOST_ROWS - max(more, 0), 1))
     for note in result.notes:
         print_line(f"note: {note}")
-    rows = result.results
-    shown = fewest_rows(rows, MOST_ROWS)
-    print_line(text_table(as_text(shown), f"People and models: {result.heading}"))
+    print_line(_results_table(shown, f"People and models: {result.heading}"))
     if (shown["source"] != "").any():
         print_line(MARKED)
     for line in fitted_elsewhere(shown):
@@ -191,6 +193,22 @@ def print_scores(result: CompareResult, page: Path | None = None, made: str = ""
         print_line(f"{len(rows) - len(shown)} more rows{where}")
     if page is not None:
         print_line(f"report{made}: {page}")
+
+
+def _results_table(rows: pd.DataFrame, title: str) -> str:
+    """Return a table of results as text.
+
+    On a terminal where it is too wide it is without frames or, if need be, without intervals too.
+    """
+    from physion.report.compare import INTERVALS, as_text
+
+    whole, plain = as_text(rows), as_text(rows, intervals=False)
+    text = text_table(whole, title)
+    for table, head in ((whole, title), (plain, title.removesuffix(INTERVALS))):
+        widest = max(map(len, text.splitlines()[1:]))
+        if console.is_terminal and widest > console.width:
+            text = text_table(table.drop(columns="frames", errors="ignore"), head)
+    return text
 
 
 def text_table(table: pd.DataFrame, title: str = "") -> str:

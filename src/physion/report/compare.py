@@ -92,6 +92,10 @@ _LOOKS = {
 }
 
 
+INTERVALS = "; 95 % intervals"
+"""End of the heading of a table of results with intervals."""
+
+
 @dataclass(frozen=True)
 class CompareResult:
     """Result of `compare`.
@@ -214,15 +218,15 @@ class CompareResult:
         of = "8 scenarios" if set(names) == set(SCENARIOS) else ", ".join(names)
         counts = rows.loc[rows["scenario"] == self.summary_of, "stimuli"]
         each = f"; {counts.iloc[0]} stimuli" if counts.nunique() == 1 else ""
-        return f"{of}; {AVERAGES[self.summary_of]}{each}; 95 % intervals"
+        return f"{of}; {AVERAGES[self.summary_of]}{each}{INTERVALS}"
 
 
-def as_text(results: pd.DataFrame) -> pd.DataFrame:
+def as_text(results: pd.DataFrame, *, intervals: bool = True) -> pd.DataFrame:
     """Return a table of results (`results_table`) for a terminal.
 
     Columns: ``model``, ``given``, ``frames`` with the benchmark, ``check``, ``stimuli`` where their
-    number differs, and ``accuracy``, ``r with people`` and ``kappa`` with their intervals, as far
-    as they are known.
+    number differs, and ``accuracy``, ``r with people`` and ``kappa`` with their intervals, if these
+    are wanted, as far as they are known.
     """
     table = results[["row"]].set_axis(["model"], axis=1)
     if (results["given"] != "").any():
@@ -235,7 +239,8 @@ def as_text(results: pd.DataFrame) -> pd.DataFrame:
         table["stimuli"] = results["stimuli"]
     for heading, name in (("accuracy", "accuracy"), ("r with people", "r"), ("kappa", "kappa")):
         if results[name].notna().any():
-            table[heading] = [with_interval(row, name) for _, row in results.iterrows()]
+            kept = results if intervals else results.drop(columns=[f"{name}_low", f"{name}_high"])
+            table[heading] = [with_interval(row, name) for _, row in kept.iterrows()]
     return table.reset_index(drop=True)
 
 
