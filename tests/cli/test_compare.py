@@ -142,7 +142,9 @@ def test_page_and_terminal_show_the_same_average(capsys: pytest.CaptureFixture[s
         result = compare({"m": given}, humans="official")
         assert isinstance(result.inputs, ReportInputs)
         print_scores(result)
-        assert first.lower() in capsys.readouterr().out
+        out = capsys.readouterr().out
+        assert first.lower() in out
+        assert re.search(r"^\* published.*, mean over scenarios$", out, re.MULTILINE)
         page = str(scores(result.inputs.comparison))
         assert page.index(first) < page.index(other)
         stimuli = result.inputs.comparison.stimuli

@@ -18,7 +18,7 @@ MARK = " *"
 """End of the names of published rows, which were not run here."""
 MARKED = (
     "* published, not run here: trained on all scenarios, readout observed+simulated, the study's "
-    "stimuli"
+    "stimuli, mean over scenarios"
 )
 RESULTS = (
     "row", "group", "readout", "given", "frames", "benchmark", "check", "fit_on", "stimuli",
