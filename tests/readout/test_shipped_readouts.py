@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from physion.models.build import build_model
 from physion.readout.decisions import Readout
 from physion.readout.evaluate import evaluate
 from physion.readout.features import StoredFeatures, write_features
+from physion.readout.folds import unlike_shipped
 from physion.readout.logistic import LogisticSettings, fit_readout, fit_weights
 from physion.readout.shipped import (
     ShippedReadout,
@@ -189,3 +191,22 @@ def test_own_trials_are_fitted_where_there_are_as_many(
     done = evaluate("blob-centroids", tmp_path / "dots", tmp_path / "out", readouts=("observed",))
     assert set(done.predictions["fit_on"]) == {fit_on}
     assert set(done.predictions["fit_trials"]) == {fit_trials}
+    # Movies have 64 pixels per side, as the model's pictures by default.
+    for look, size, words in (
+        ("redyellow", 64, ""),
+        ("redyellow", 128, "stored movies of 64 x 64 pixels, and the model sees 128 ("),
+        ("free", 64, "are not used, since the look of the tested ones is free"),
+    ):
+        write_index(tmp_path / "dots", index.assign(look=look))
+        for _ in ("made", "done before"):
+            done = evaluate(
+                "blob-centroids", tmp_path / "dots", tmp_path / "out", readouts=("observed",),
+                options={"image_size": size},
+            )  # fmt: skip
+            assert len(done.warnings) == bool(words and fit_on)
+            assert all(words in one for one in done.warnings)
+    other = index.assign(playback_seconds=1.51)
+    spec = build_model("blob-centroids").spec
+    assert unlike_shipped(other, spec, rendered=True) == ["a frame rate of 100.0/s, not 30/s"]
+    assert not unlike_shipped(other, build_model("state-trees").spec, rendered=False)
+    assert not unlike_shipped(index, replace(spec, image_size=128), rendered=True)

@@ -27,11 +27,13 @@ from physion.readout.decisions import Readout, decisions
 from physion.readout.folds import (
     TESTING,
     Protocol,
+    ScenarioSplit,
     check_labels,
     check_pictures,
     describe_fit,
     join_for_fit,
     plan_folds,
+    unlike_shipped,
 )
 from physion.readout.logistic import LogisticSettings
 from physion.readout.model_calls import check_identity, is_network
@@ -79,6 +81,7 @@ class EvaluatedModel:
     - ``path``: table of predictions. ``rollout_errors``: errors of imagined motion, if asked for.
     - ``done``: whether the table was there before.
     - ``problems``: reasons of trials without a prediction, by name.
+    - ``warnings``: why a readout that ships may not fit, or was not used, in sentences.
     """
 
     model: str
@@ -88,6 +91,7 @@ class EvaluatedModel:
     rollout_errors: Path | None
     done: bool
     problems: Mapping[str, str]
+    warnings: tuple[str, ...] = ()
 
     def accuracies(self) -> dict[str, float]:
         """Return the mean accuracy over scenarios by name and readout of the model.
@@ -135,11 +139,15 @@ class Evaluation:
 
     @property
     def warnings(self) -> list[str]:
-        """What predictions are not, in sentences: those without a trial to fit a readout on."""
+        """What may be wrong with predictions, in sentences.
+
+        Readouts that ship and may not fit, and predictions without a trial to fit a readout on.
+        """
+        found = list(dict.fromkeys(words for one in self.evaluated for words in one.warnings))
         if self.predictions.empty:
-            return []
+            return found
         unfit = self.predictions[self.predictions["note"].str.contains(NOTHING_TO_FIT)]
-        return [
+        return found + [
             f"{model}, readout {readout}: {len(rows)} predictions are the same number, since "
             f"the readout had {reason}; add trials of the split readout with both outcomes"
             for (model, readout, reason), rows in unfit.groupby(["model", "readout", "note"])
@@ -277,12 +285,17 @@ class _Evaluate:
         evaluated = EvaluatedModel(
             provenance.model, protocol, cell.seed, path, errors_path, done, {}
         )
-        if done or dry_run:
+        if dry_run:
             return evaluated
         protocol_of_folds = cell.protocol or Protocol.ALL
         planned = plan_folds(index, protocol_of_folds, settings.folds, cell.seed)
         folds = rules.arrange(planned, settings.scenario)
         splits = [split for fold in folds for split in fold.scenarios]
+        features = [readout for readout, way in ways.items() if way is Way.FEATURES]
+        warnings = () if rules.together else self._warnings(model, splits, features)
+        evaluated = dataclasses.replace(evaluated, warnings=warnings)
+        if done:
+            return evaluated
         needed = {trial for split in splits for trial in (*split.fit, *split.test)}
         ask(model, "check_trials")(needed, self.dataset.known_trials())
         predictor = Predictor(
@@ -340,13 +353,39 @@ class _Evaluate:
 
     def _shipped(self, model: Model) -> ShippedReadouts | None:
         """Return the readouts that ship for a model and may be used; None to fit them."""
+        return self._offered(model) if self._looks() == {"redyellow"} else None
+
+    def _offered(self, model: Model) -> ShippedReadouts | None:
+        """Return the readouts that ship for a model, unless the settings ask for others."""
         settings = self.settings
         anew = settings.readout_from == "fit" or settings.logistic != LogisticSettings()
         if anew or self.fit_on or settings.decision not in ("", decision_name(model)):
             return None
+        return find_readouts(model)
+
+    def _looks(self) -> set[str]:
         index = self.dataset.index
-        looks = set(index["look"][index["split"] == TESTING])
-        return find_readouts(model) if looks == {"redyellow"} else None
+        return set(index["look"][index["split"] == TESTING])
+
+    def _warnings(
+        self, model: Model, splits: Sequence[ScenarioSplit], readouts: Sequence[Readout]
+    ) -> tuple[str, ...]:
+        """Return what to say of the readouts that ship, if some would be used for ``readouts``."""
+        offered = self._offered(model)
+        if offered is None:
+            return ()
+        pairs = [(offered.find(one, split.scenario), split) for one in readouts for split in splits]
+        if not any(known and known.fit_trials > len(split.fit) for known, split in pairs):
+            return ()
+        name = model.provenance().model
+        if (looks := self._looks()) != {"redyellow"}:
+            return (
+                f"{name}: the readouts that ship are for red and yellow trials and are not used, "
+                f"since the look of the tested ones is {' and '.join(sorted(looks))}",
+            )
+        index, rendered = self.dataset.index, self.settings.rendered
+        unlike = unlike_shipped(index, model.spec, rendered=rendered)
+        return tuple(f"{name}: the readouts that ship may not fit: {words}" for words in unlike)
 
     def _table(
         self,

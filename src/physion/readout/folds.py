@@ -18,6 +18,7 @@ from physion.clips.batch import Spec
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.core.files import digest_of
 from physion.core.seeds import stable_hash
+from physion.scenes.scene import PLAYBACK_RATE
 from physion.trials.dataset import Dataset, JoinedDataset
 from physion.trials.making.whatif import parts_of
 
@@ -213,6 +214,29 @@ def check_pictures(index: pd.DataFrame, spec: Spec, *, rendered: bool) -> None:
                 f"readout {_listed(fit[name])}; use sets that agree"
                 + (", or render all pictures (--rendered)" if name == "size" else "")
             )
+
+
+def unlike_shipped(index: pd.DataFrame, spec: Spec, *, rendered: bool) -> list[str]:
+    """Return how tested trials differ from those on which readouts that ship were fitted.
+
+    Pictures of these were rendered at the model's own size, for movies at `PLAYBACK_RATE`.
+    """
+    if not spec.sees_pictures:
+        return []
+    tested = index[index["split"] == TESTING]
+    found = []
+    rates = (tested["frames"] / tested["playback_seconds"]).round(3)
+    if set(rates) - {PLAYBACK_RATE}:
+        found.append(f"a frame rate of {_listed(rates)}/s, not {PLAYBACK_RATE}/s")
+    stored = "rgb" in spec.inputs and not rendered and index["movie_sha256"].notna().any()
+    small = tested[tested[["width", "height"]].min(axis=1) < spec.image_size]
+    if stored and len(small):
+        sizes = small["width"].astype(str) + " x " + small["height"].astype(str)
+        found.append(
+            f"stored movies of {_listed(sizes)} pixels, and the model sees {spec.image_size} "
+            "(--rendered draws them at that size)"
+        )
+    return found
 
 
 def _listed(values: pd.Series[Any]) -> str:
