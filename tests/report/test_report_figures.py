@@ -639,7 +639,9 @@ def test_the_first_picture_has_one_mark_per_model_and_published_ones_hollow() ->
     assert "V-JEPA 2 ViT-L *" not in table.index, "its likeness to people is not known"
     assert set(table.index) == set(shown.index) - {"V-JEPA 2 ViT-L *"}
     figure = plot.draw(plot.table, theme.LIGHT)
-    (axis,) = figure.axes
+    (axis,), (legend,) = figure.axes, figure.legends
+    figure.draw_without_rendering()
+    assert len(legend.get_texts()) == 7 and not legend.get_window_extent().overlaps(axis.bbox)
     marks = [line for line in axis.lines if line.get_marker() != "None"]
     for line, (name, row) in zip(marks, table.iterrows(), strict=True):
         np.testing.assert_allclose(line.get_xydata(), [[row["accuracy"], row["kappa"]]])

@@ -59,6 +59,10 @@ def overview(inputs: ReportInputs) -> Plot | None:
     return Plot("overview", caption, table.reset_index(drop=True), overview_figure)
 
 
+_PER_LINE = 3
+"""Entries of a line of the legend."""
+
+
 def overview_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
     """Draw one mark per row with its name; ``table``: `COLUMNS` and `ZONE`."""
     marks = {
@@ -71,16 +75,18 @@ def overview_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
     with matplotlib.rc_context(style(theme)):
         figure = Figure(figsize=(6.6, 4.9))
         FigureCanvasAgg(figure)
-        axis = figure.add_axes((0.085, 0.105, 0.9, 0.8))
         zone = table[ZONE].iloc[0].to_numpy(np.float64)
+        kinds = [_kind(group, given) for group, given in zip(table["group"], table["given"],
+                                                             strict=True)]  # fmt: skip
+        handles = _handles(table, kinds, marks, zone, theme)
+        lines = -(-len(handles) // _PER_LINE)
+        axis = figure.add_axes((0.085, 0.105, 0.9, 0.8 - 0.035 * max(lines - 2, 0)))
         if np.isfinite(zone).all():
             left, right, low, high = zone
             axis.add_patch(Rectangle((left, low), right - left, high - low, linewidth=0,
                                      facecolor=theme.zone, alpha=0.7, zorder=0))  # fmt: skip
         axis.axvline(0.5, color=theme.faint, linestyle=":", linewidth=1, zorder=1)
         axis.axhline(0.0, color=theme.faint, linestyle=":", linewidth=1, zorder=1)
-        kinds = [_kind(group, given) for group, given in zip(table["group"], table["given"],
-                                                             strict=True)]  # fmt: skip
         for (_, row), kind in zip(table.iterrows(), kinds, strict=True):
             _mark(axis, row, *marks[kind], theme)
         axis.set_xlabel("accuracy", fontsize=10)
@@ -90,8 +96,8 @@ def overview_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
         axis.set_ylim(min(-0.05, *y) - 0.04, max(*y, *_known(zone[2:])) + 0.05)
         names = [str(name).removesuffix(" *").partition(" · ")[0] for name in table["row"]]
         _place_names(axis, x, y, names, kinds, theme)
-        figure.legend(handles=_handles(table, kinds, marks, zone, theme), loc="upper center",
-                      ncols=3, fontsize=8, columnspacing=1.2, handletextpad=0.4)  # fmt: skip
+        figure.legend(handles=handles, loc="upper center", ncols=_PER_LINE, fontsize=8,
+                      columnspacing=1.2, handletextpad=0.4)  # fmt: skip
     return figure
 
 
