@@ -420,7 +420,10 @@ def plan_official(
     parts["readout"] = [t for t in parts["readout"] if t.scene.physics_digest() not in known]
     tasks: list[TrialTask] = []
     for split, trials in parts.items():
-        chosen = [trial.scene for trial in balanced_trials(trials, limit)]
+        # Of an odd number, more of the fitted trials have the outcome that fewer tested ones have.
+        other = split == "readout" and limit is not None and limit % 2 == 1
+        balanced = balanced_trials(trials, limit, contact_first=not other)
+        chosen = [trial.scene for trial in balanced]
         tasks += plan_scenes("official", chosen, split, recorded)
         if learn and split == "readout":
             for scenario, count in Counter(scene.scenario for scene in chosen).items():
@@ -443,11 +446,14 @@ def _once(logs: TrialSet) -> list[ImportedTrial]:
     return list(found.values())
 
 
-def balanced_trials(trials: Iterable[ImportedTrial], limit: int | None) -> list[ImportedTrial]:
+def balanced_trials(
+    trials: Iterable[ImportedTrial], limit: int | None, *, contact_first: bool = True
+) -> list[ImportedTrial]:
     """Return at most ``limit`` trials per scenario, with and without contact alternately.
 
     The choice depends on names and outcomes only; a larger limit includes the trials of a smaller
-    one. Without a limit all trials are returned.
+    one. Without a limit all trials are returned. ``contact_first``: outcome of the first trial of
+    the first scenario.
     """
     groups: dict[str, list[ImportedTrial]] = defaultdict(list)
     for trial in sorted(trials, key=lambda trial: stable_hash("limit", trial.scene.name)):
@@ -457,7 +463,7 @@ def balanced_trials(trials: Iterable[ImportedTrial], limit: int | None) -> list[
     return [
         trial
         for place, scenario in enumerate(ordered)
-        for trial in _alternating(groups[scenario], first=place % 2 == 0)[:limit]
+        for trial in _alternating(groups[scenario], first=(place % 2 == 0) == contact_first)[:limit]
     ]
 
 

@@ -16,7 +16,7 @@ import pytest
 from physion.cli import output
 from physion.cli.main import main
 from physion.core.errors import BadInputError
-from physion.data.official import official
+from physion.data.official import humans_folder, official
 from physion.models import build_model
 from physion.pipeline import (
     OFFICIAL_MODELS,
@@ -130,6 +130,18 @@ def test_a_larger_limit_adds_to_the_trials_of_a_smaller_one() -> None:
     counts = pd.Series([t.outcome.contact for t in more]).groupby([t.scene.scenario for t in more])
     assert (counts.size() == 7).all() and counts.sum().isin((3, 4)).all()
     assert len(balanced_trials(trials, None)) == len(trials)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("limit", [3, 4])
+def test_tested_and_fitted_trials_together_have_either_outcome_as_often(limit: int) -> None:
+    """Else what says the more frequent outcome of the fit is right more often than by chance."""
+    plan = plan_official(Path("official"), humans_folder(Path("official")), limit)
+    rows = [(task.scenario, task.split, plan.recorded[task.scene.name])
+            for task in plan.tasks if task.scene]  # fmt: skip
+    table = pd.DataFrame(rows, columns=["scenario", "split", "contact"])
+    assert (table.groupby("scenario")["contact"].mean() == 0.5).all()
+    assert (table.groupby(["scenario", "split"]).size() == limit).all()
 
 
 @pytest.mark.slow
