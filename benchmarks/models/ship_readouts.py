@@ -320,7 +320,7 @@ def ship(features: Features, dataset: Dataset, name: str) -> None:
         for r in readouts
     ]
     rows = [f"| *{r.value}* | {' | '.join(a)} |" for r, a in zip(readouts, accuracies, strict=True)]
-    count = int(dataset.index.groupby("scenario").size().min())
+    count = int(dataset.index.groupby("scenario").size().max())
     whole = max(trials.get(Readout.FULL, []), default=0)
     most = max(max(n, default=0) for n in trials.values())
     use = f"physion evaluate {model_name} TRIALS" + "".join(
