@@ -210,7 +210,9 @@ class ChangedTrials:
             return
         known = Trial.open(path)
         moved = known.trajectory if motion is None else motion(known.trajectory)
-        metadata |= {"frames": len(moved), "completed": moved.completed, "digest": moved.digest()}
+        # A trial of a movie only has the digest of the movie.
+        digest = known.metadata.digest if motion is None else moved.digest()
+        metadata |= {"frames": len(moved), "completed": moved.completed, "digest": digest}
         scene = dataclasses.replace(known.scene, name=name) if name else known.scene
         writer = TrialWriter(
             dataclasses.replace(known.metadata, **metadata),

@@ -27,6 +27,8 @@ SETTINGS = "dataset.json"
 """File with the settings that the trials of a folder are made with, written first."""
 FAILURES = "failures"
 """Folder with one text file per trial that could not be made."""
+MOVIE_ALONE = "imported: movie alone"
+"""Engine of a trial of which only the movie is known."""
 
 SAFE_NAME = r"[A-Za-z0-9][A-Za-z0-9._+-]{0,199}"
 """Regular expression of names, which become file names: no separators, no special names."""
@@ -235,8 +237,9 @@ class Metadata:
     - ``playback_rate``: frames per second of the movies.
     - ``completed``: True if everything came to rest before the time limit.
     - ``engine``, ``renderer``, ``package``: names with versions.
-    - ``digest``: SHA-256 of the trajectory.
-    - ``scene_digest``: SHA-256 of everything that determines the motion (`Scene.physics_digest`).
+    - ``digest``: SHA-256 of the trajectory; of the movie where only that is known (`MOVIE_ALONE`).
+    - ``scene_digest``: SHA-256 of everything that determines the motion (`Scene.physics_digest`);
+      of the movie where only that is known.
     - ``attempt``: number of scenes sampled for this trial and rejected before; None for an imported
       scene.
     - ``movies``, ``free_movies``: whether there are movies and a map, and further movies in free

@@ -39,7 +39,12 @@ _FACTS: Mapping[str, IndexColumn] = {
         ("preset", "string", "parameter set of the scenario; missing for an imported scene"),
         ("seed", "string", "entropy of the random numbers, hexadecimal; missing if imported"),
         ("attempt", "Int64", "sampled scenes rejected before this one; missing if imported"),
-        ("scene_digest", "string", "SHA-256 of everything that determines the motion"),
+        (
+            "scene_digest",
+            "string",
+            "SHA-256 of everything that determines the motion; of the movie if imported from it "
+            "only",
+        ),
         (
             "contact",
             "boolean",
@@ -75,7 +80,11 @@ _FACTS: Mapping[str, IndexColumn] = {
         ("engine", "string", "physics engine and its version"),
         ("renderer", "string", "renderer and its version"),
         ("package", "string", "package and its version"),
-        ("digest", "string", "SHA-256 of the motion"),
+        (
+            "digest",
+            "string",
+            "SHA-256 of the motion; of the movie if imported from it only",
+        ),
     )
 }
 

@@ -22,6 +22,9 @@ from physion.compute.local import SerialExecutor
 from physion.compute.run_tasks import RunReport
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.numerics.rotations import rotation_matrix
+from physion.readout.changes import take_trials
+from physion.readout.evaluate import evaluate
+from physion.readout.settings import EvaluationSettings
 from physion.rendering.camera import View
 from physion.scenes.shapes.primitives import shape
 from physion.trials.dataset import Dataset
@@ -34,6 +37,7 @@ from physion.trials.official.names import decode_depth
 from physion.trials.official.read_file import MotionReader, OfficialFile, SceneReader
 from physion.trials.trial_file import Trial, TrialWriter
 from physion.trials.video import count_frames, encode_movie, read_frames
+from support.moving_dots import draw
 from support.official_hand_made import (
     CLOTH,
     FRAMES,
@@ -627,6 +631,28 @@ def test_movies_of_version_1_5_keep_outcome_contact_frame_and_split(
     row = index.loc["pilot_linking_0001"]
     assert (row["scenario"], row["split"], row["contact"]) == ("link", "readout", False)
     assert pd.isna(row["first_frame"])
+
+
+def test_movies_that_fit_a_readout_differ_from_tested_ones(tmp_path: Path) -> None:
+    """They have no motion by which they differ; one of them is a tested movie again."""
+    counts = {"train": 4, "test": 3}
+    for part, count in counts.items():
+        folder = tmp_path / "movies/physion_mp4s" / part
+        folder.mkdir(parents=True)
+        rows = {f"collision_{part}_{n:04d}": {"label": n % 2} for n in range(count)}
+        (folder / "all_video_labels.json").write_text(json.dumps(rows))
+        for number, name in enumerate(rows):
+            # The first number is the seed of both parts.
+            movie = encode_movie(draw(number % 2 == 1, np.random.default_rng(number * count)))
+            (folder / f"{name}.mp4").write_bytes(movie)
+    assert not bring(tmp_path / "movies").failed
+    dataset = Dataset(tmp_path / "movies-in")
+    assert dataset.index["digest"].nunique() == dataset.index["scene_digest"].nunique() == 6
+    assert verify_dataset(dataset.folder).faults == []
+    found = evaluate("blob-centroids", dataset, tmp_path / "out", settings=EvaluationSettings())
+    assert set(found.predictions["fit_trials"]) == {3}
+    taken = take_trials(dataset, tmp_path / "taken", 8)
+    assert taken.trials("readout") == [f"collision_train_{n:04d}" for n in (1, 2, 3)]
 
 
 def test_what_has_no_motion_is_not_exported(core: Path, tmp_path: Path) -> None:

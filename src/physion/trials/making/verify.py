@@ -12,11 +12,12 @@ import pandas as pd
 
 from physion.compute.tasks import Progress, tracked
 from physion.core.errors import BadInputError
+from physion.core.files import file_sha256
 from physion.core.seeds import stable_hash
 from physion.core.settings import read_json
 from physion.physics.labels import label_contact
 from physion.scenes.sampling.sample import load_presets
-from physion.trials.files import FILES, SETTINGS, TrialPaths, find_trials
+from physion.trials.files import FILES, MOVIE_ALONE, SETTINGS, TrialPaths, find_trials
 from physion.trials.index import COLUMNS, has_drawn, index_row, read_index, same_value
 from physion.trials.making.choose import BALANCED, robustness, split_of, wanted_contact
 from physion.trials.making.plan import TrialTask
@@ -186,9 +187,10 @@ def _check_trial(paths: TrialPaths, trial: Trial) -> list[str]:
     for name, path in paths.all(meta.movies, meta.free_movies, trial.labels is not None).items():
         if name in lengths and (found := count_frames(path)) != lengths[name]:
             faults.append(f"{path} has {found} frames, not {lengths[name]}")
-    if trial.trajectory.digest() != meta.digest:
+    shown = file_sha256(paths.movie) if meta.engine == MOVIE_ALONE else ""
+    if (shown or trial.trajectory.digest()) != meta.digest:
         faults.append(f"{paths.trial_file}: field 'trajectory' does not match its digest")
-    if trial.scene.physics_digest() != meta.scene_digest:
+    if (shown or trial.scene.physics_digest()) != meta.scene_digest:
         faults.append(f"{paths.trial_file}: field 'scene' does not match its digest")
     wanted = geometry_arrays(trial.scene, meta.width, meta.height)
     faults += [

@@ -32,7 +32,7 @@ from PIL import Image
 from physion.compute.run_tasks import RunReport, run_tasks
 from physion.compute.tasks import Executor, Progress
 from physion.core.errors import BadInputError, UnknownNameError
-from physion.core.files import folder_for_writing, remove_leftovers
+from physion.core.files import digest_of, folder_for_writing, remove_leftovers
 from physion.core.names import FOLDERS, guess_scenario, plain_name
 from physion.core.settings import parse_json
 from physion.core.version import __version__
@@ -50,6 +50,7 @@ from physion.scenes.scene import (
 )
 from physion.trials.files import (
     INDEX,
+    MOVIE_ALONE,
     SAFE_NAME,
     SETTINGS,
     Metadata,
@@ -396,9 +397,8 @@ def _read_list(path: Path) -> str | None:
 # imported from it can be used by models that see pictures. Its state is unknown: all poses are
 # NaN, the two bodies are placeholders called ``agent`` and ``patient``, the engine is ``imported:
 # movie alone``, and the frame of first contact is None unless the metadata.json next to the movie
-# has it.
+# has it. The digests of motion and scene are of the movie, so that trials differ by them.
 
-ENGINE = "imported: movie alone"
 NOTE = "no state: bodies are placeholders and poses are unknown"
 
 
@@ -430,6 +430,8 @@ def import_movie(job: ImportJob) -> tuple[str, ...]:
         rate=own.rate,
         recorded=job.contact,
     )
+    shown = digest_of(own.full)
+    metadata = replace(metadata, digest=shown, scene_digest=shown)
     files = {"movie": own.full, "observed_movie": own.observed}
     if marked is not None:
         files |= {"free_movie": free.full, "free_observed_movie": free.observed}
@@ -483,7 +485,7 @@ def _unknown_motion(frames: int) -> Trajectory:
         cloth_distance=np.full(frames, np.nan, np.float32),
         contacts=Contacts.empty(),
         completed=False,
-        engine=ENGINE,
+        engine=MOVIE_ALONE,
     )
 
 
