@@ -21,7 +21,7 @@ from physion.clips.batch import Batch
 from physion.core.errors import BadInputError, PhysionError
 from physion.models import models
 from physion.models.build import OutOfMemoryError
-from physion.readout.changes import CHANGES, ChangedTrials, take_trials
+from physion.readout.changes import CHANGES, ChangedTrials, copy_others, take_trials
 from physion.readout.check import REFUSED, SHOWN, CheckedModel, _is_of_the_machine
 from physion.readout.evaluation import Evaluation, run_evaluations
 from physion.readout.settings import choose_models
@@ -60,7 +60,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     rng = np.random.default_rng(0)
     table["seed"] = [f"{n:x}" for n in rng.permutation(len(table))]
     write_index(folder, table)
-    (folder / "labels.json").write_text(json.dumps(told))
+    (folder / "more/tables").mkdir(parents=True)
+    for path in (folder / "labels.json", folder / "more/tables/labels.json"):
+        path.write_text(json.dumps(told))
     for number, trial in enumerate(dataset.trials("testing")):
         for path in folder.glob(f"testing/*/{trial}*"):
             os.utime(path, (10**9 + number, 10**9 + number))
@@ -114,6 +116,7 @@ PLANTED: dict[str, tuple[leaks.Tells, str]] = {
     "the name of the scene in the trial file": (leaks.scene_name_in_the_file, "names"),
     "a text file next to the trial": (leaks.file_beside, "names"),
     "a table of labels in the folder": (leaks.table_of_labels, "names"),
+    "a table of labels in a folder of the folder": (leaks.table_in_a_folder, "names"),
     "the time of change of a file": (leaks.time_of_the_file, "files"),
     "the size of the observed movie": (leaks.size_of_the_observed_movie, "files"),
     "the title of the observed movie": (leaks.title_of_the_movie, "files"),
@@ -201,6 +204,21 @@ def test_random_numbers_may_follow_the_names(made: Dataset, tmp_path: Path) -> N
     assert leaking.refused == ["names"]
     few = run(made, leaks.Imagining(), tmp_path, "names").table
     assert few["verdict"].tolist() == [SHOWN] and "too few trials" in few["note"][0]
+
+
+def test_files_in_folders_are_copied_and_large_ones_named(
+    made: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tables = made.folder / "more/tables"
+    (tmp_path / "copy").mkdir()
+    assert copy_others(made, tmp_path / "copy") == []
+    copied = {path.name for path in (tmp_path / "copy").rglob("*") if path.is_file()}
+    beside = {f"{trial}.txt" for trial in made.trials("testing")}
+    assert copied == beside | {"labels.json", "index.parquet", "index.parquet.sha256"}
+    assert (tmp_path / "copy/more/tables/labels.json").is_file()
+    monkeypatch.setattr("physion.readout.changes._LARGEST", (tables / "labels.json").stat().st_size)
+    (warning,) = run(made, leaks.Honest(), tmp_path, "again").warnings
+    assert "2 files are too large" in warning and "labels.json" in warning
 
 
 def changed(dataset: Dataset, change: str, folder: Path) -> tuple[ChangedTrials, Dataset]:

@@ -89,11 +89,32 @@ def take_trials(dataset: Dataset, folder: Path, most: int) -> Dataset:
         for path in here.parent.glob(f"{glob.escape(here.stem)}[._]*"):
             if path.is_file():
                 shutil.copy2(path, there.parent)
-    for path in dataset.folder.iterdir():
-        if path.is_file() and path.stat().st_size < _LARGEST:
-            shutil.copy2(path, folder)
     write_index(folder, chosen.reset_index(drop=True))
     return Dataset(folder)
+
+
+def copy_others(dataset: Dataset, folder: Path) -> list[Path]:
+    """Copy files that belong to no trial to their places in ``folder``; return those left out.
+
+    Those are the files of `_LARGEST` bytes or more. What is in ``folder`` already stays.
+    """
+    names = dataset.index[["split", "scenario", "trial"]].itertuples(index=False)
+    every = [TrialPaths(dataset.folder, *map(str, name)) for name in names]
+    of_trials = {getattr(paths, column) for paths in every for column in FILES}
+    left_out = []
+    for place, folders, files in os.walk(dataset.folder):
+        here = Path(place)
+        folders[:] = sorted(name for name in folders if (here / name).resolve() != folder.resolve())
+        for path in (here / name for name in sorted(files)):
+            there = folder / path.relative_to(dataset.folder)
+            if path in of_trials or there.exists() or not path.is_file():
+                continue
+            if path.stat().st_size >= _LARGEST:
+                left_out.append(path)
+                continue
+            there.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(path, there)
+    return left_out
 
 
 def _balanced(rows: pd.DataFrame, count: int) -> pd.DataFrame:

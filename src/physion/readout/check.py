@@ -30,7 +30,7 @@ from physion.models.build import OutOfMemoryError, build_model
 from physion.models.feature_table import FeatureTable
 from physion.models.interface import Model, can
 from physion.readout.benchmark import benchmark_of
-from physion.readout.changes import CHANGES, Change, ChangedTrials, take_trials
+from physion.readout.changes import CHANGES, Change, ChangedTrials, copy_others, take_trials
 from physion.readout.decisions import Readout
 from physion.readout.evaluation import run_evaluations
 from physion.readout.folds import READOUT
@@ -178,6 +178,7 @@ def check_model(
     wanted = [CHANGES[name] for name in changes or CHANGES]
     with tempfile.TemporaryDirectory(dir=out, prefix="copies-") as folder:
         first = take_trials(opened, Path(folder) / "first", trials)
+        large = copy_others(opened, first.folder)
         features = built if isinstance(built, FeatureTable) else None
         if features is not None:
             features.check_trials(first.trials(), opened.known_trials())
@@ -193,7 +194,13 @@ def check_model(
             twin = chosen.random_twin(built) if features is None else None
             rows += work.rows_of_others(twin)
         table = pd.DataFrame(rows, columns=list(COLUMNS))
-        return CheckedModel(name, table, work.warnings())
+        warnings = work.warnings()
+        if large:
+            warnings.append(
+                f"{len(large)} files are too large to be copied, such as {large[0]}: what a model "
+                "reads of them is not checked; move them out of the dataset to check without them"
+            )
+        return CheckedModel(name, table, warnings)
 
 
 def check_models(
