@@ -182,6 +182,17 @@ def test_a_model_with_a_planted_leak_is_refused(leak: str, made: Dataset, tmp_pa
     assert run(made, model(), tmp_path, change).refused == [change]
 
 
+@pytest.mark.slow
+def test_nothing_after_the_last_frame_of_v1_5_may_be_seen(made: Dataset, tmp_path: Path) -> None:
+    """That is frame 15 of Collide, which the observed movie goes beyond."""
+    for change in ("future", "length"):
+        leaking = leaks.Cheater(leaks.last_observed_picture)
+        assert run(made, leaking, tmp_path, change).passed
+        assert run(made, leaking, tmp_path, change, benchmark="v1.5").refused == [change]
+        (row,) = run(made, leaks.Honest(), tmp_path, change, benchmark="v1.5").table.itertuples()
+        assert row.verdict == "passed" and row.moved == 0
+
+
 def test_answers_in_a_cache_on_disk_are_refused(made: Dataset, tmp_path: Path) -> None:
     answers = {t: 0.9 * (n % 2) for n, t in enumerate(made.trials("testing"))}
     done = run(made, leaks.CacheOnDisk(tmp_path / "cache.json", answers), tmp_path, "names")

@@ -110,6 +110,10 @@ def last_picture(dataset: Dataset, trial: str) -> float:
     return float(read_frames(dataset.paths(trial).movie)[-1].mean() / 255)
 
 
+def last_observed_picture(dataset: Dataset, trial: str) -> float:
+    return float(read_frames(dataset.paths(trial).observed_movie)[-1].mean() / 255)
+
+
 def first_picture_after(dataset: Dataset, trial: str) -> float:
     return float(read_frames(dataset.paths(trial).movie, start=45, count=1).mean() / 255)
 

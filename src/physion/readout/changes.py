@@ -15,6 +15,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,7 @@ from physion.trials.files import FILES, TrialPaths, encode_png
 from physion.trials.index import as_table, write_index
 from physion.trials.state import DRAWN
 from physion.trials.trial_file import Trial, TrialWriter
-from physion.trials.video import encode_movie, read_frames, repack_movie
+from physion.trials.video import encode_movie, read_frames, repack_movie, replace_end
 
 Pictures = NDArray[np.uint8]
 _MOTION = (
@@ -137,7 +138,8 @@ class ChangedTrials:
 
     Files that stay as they are are links to the first ones. ``names`` has the name in the copy by
     the original name of every tested trial. Randomness comes from ``rng``. ``splits``: whose trials
-    are changed, where it is not only the tested ones.
+    are changed, where it is not only the tested ones. ``last``: by scenario the last frame that may
+    be seen, where it is not the last observed one.
     """
 
     def __init__(
@@ -146,9 +148,10 @@ class ChangedTrials:
         folder: Path,
         rng: np.random.Generator,
         splits: Sequence[str] = (TESTING,),
+        last: Mapping[str, int] = MappingProxyType({}),
     ) -> None:
         shutil.copytree(source.folder, folder, copy_function=_link)
-        self.folder, self.rng = folder, rng
+        self.folder, self.rng, self.last = folder, rng, last
         rows = source.index.to_dict("records")
         self._fit = [row for row in rows if row["split"] not in splits]
         self._rows: dict[str, dict[Any, Any]] = {
@@ -290,18 +293,20 @@ def _exchange_futures(trials: ChangedTrials, *, shorten: bool) -> None:
 
 def _replace_future(trials: ChangedTrials, trial: str, seen: int, count: int) -> None:
     """Replace all frames of a trial from ``seen`` on by noise, up to ``count`` frames."""
-    rng = trials.rng
+    rng, row = trials.rng, trials.row(trial)
+    last = trials.last.get(row["scenario"], seen)
+    hidden = seen - min(seen, last + 1)
+    seen -= hidden
 
     def noisy(path: Path) -> Pictures:
         first = read_frames(path, count=seen)
-        height, width = first.shape[1:3]
-        later = np.empty((count - seen, height, width, 3), np.uint8)
-        cells = (-(-height // _CELL), -(-width // _CELL), 3)
-        for start in range(0, len(later), _STILL):
-            noise = rng.integers(0, 256, cells, np.uint8)
-            picture = noise.repeat(_CELL, axis=0).repeat(_CELL, axis=1)[:height, :width]
-            later[start : start + _STILL] = picture
-        return np.concatenate([first, later])
+        return np.concatenate([first, _noise(rng, (count - seen, *first.shape[1:]))])
+
+    for column in _OBSERVED if hidden else ():
+        path: Path = getattr(trials.paths(trial), column)
+        if path.is_file():
+            size = read_frames(path, count=1).shape[1:]
+            trials.write(path, replace_end(path, _noise(rng, (hidden, *size))))
 
     def moved(trajectory: Trajectory) -> Trajectory:
         arrays: dict[str, Any] = {}
@@ -315,13 +320,24 @@ def _replace_future(trials: ChangedTrials, trial: str, seen: int, count: int) ->
         arrays["contacts"] = _select(contacts, contacts.frame < seen)
         return dataclasses.replace(trajectory, completed=not trajectory.completed, **arrays)
 
-    row = trials.row(trial)
     frames = int(row["frames"])
     trials.change_movies(trial, _WHOLE, noisy)
     trials.change_file(trial, motion=moved)
     row["frames"] = count
     row["playback_seconds"] *= count / frames
     row["physics_seconds"] *= (count - 1) / max(frames - 1, 1)
+
+
+def _noise(rng: np.random.Generator, shape: tuple[int, ...]) -> Pictures:
+    """Return frames of random squares (frames, height, width, 3)."""
+    count, height, width, _ = shape
+    frames = np.empty(shape, np.uint8)
+    cells = (-(-height // _CELL), -(-width // _CELL), 3)
+    for start in range(0, count, _STILL):
+        noise = rng.integers(0, 256, cells, np.uint8)
+        picture = noise.repeat(_CELL, axis=0).repeat(_CELL, axis=1)[:height, :width]
+        frames[start : start + _STILL] = picture
+    return frames
 
 
 def _select(contacts: Contacts, rows: NDArray[Any]) -> Contacts:

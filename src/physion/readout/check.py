@@ -265,7 +265,8 @@ class _Check:
                 self._left_out.append(f"{change.name} is skipped: it changes movies, and {reason}")
                 return []
         folder = self._first.folder.parent / "changed"
-        trials = ChangedTrials(self._first, folder, generator("check", change.name))
+        last = benchmark_of(self._model, self._settings.benchmark).last
+        trials = ChangedTrials(self._first, folder, generator("check", change.name), last=last)
         try:
             change.apply(trials)
             after, why = self._predict(self._model, trials.finish()), ""

@@ -309,6 +309,19 @@ def encode_movie(frames: NDArray[np.uint8], *, rate: int = PLAYBACK_RATE, crf: i
     return encoder.finish()
 
 
+def replace_end(path: Path, later: NDArray[np.uint8]) -> bytes:
+    """Return the bytes of a movie that ends with ``later``; the frames before stay exactly."""
+    with open_movie(path) as decoder:
+        frames, width, height, rate = decoder.properties
+        encoder = MovieEncoder(width, height, frames, rate=round(rate), crf=0)
+        for picture in decoder.pictures(range(frames - len(later))):
+            plain = av.VideoFrame.from_ndarray(picture.to_ndarray(), format=picture.format.name)
+            encoder.add(plain)  # without time and type in the first movie
+    for frame in later:
+        encoder.add(frame)
+    return encoder.finish()
+
+
 def repack_movie(path: Path) -> bytes:
     """Return the bytes of an MP4 file with the same pictures, and nothing else of the first one."""
     buffer = io.BytesIO()
