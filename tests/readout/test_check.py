@@ -58,7 +58,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     table, problems = build_index(folder)
     assert problems == {}
     rng = np.random.default_rng(0)
-    table["seed"] = [f"{n:x}" for n in rng.permutation(len(table))]
+    for column in ("seed", "engine", "renderer", "package", "scene_digest"):
+        table[column] = [f"{n:x}" for n in rng.permutation(len(table))]
     write_index(folder, table)
     (folder / "more/tables").mkdir(parents=True)
     for path in (folder / "labels.json", folder / "more/tables/labels.json"):
@@ -120,7 +121,10 @@ PLANTED: dict[str, tuple[leaks.Tells, str]] = {
     "the time of change of a file": (leaks.time_of_the_file, "files"),
     "the size of the observed movie": (leaks.size_of_the_observed_movie, "files"),
     "the title of the observed movie": (leaks.title_of_the_movie, "files"),
-    "the seed in the index": (leaks.seed_in_the_index, "files"),
+    **{
+        f"the {column} in the index": (leaks.in_the_index(column), "files")
+        for column in ("seed", "engine", "renderer", "package", "scene_digest")
+    },
     "an attribute of the HDF5 file": (leaks.attribute_in_the_file, "files"),
     "the id map in the trial file": (leaks.ids_in_the_file, "files"),
     "the map of agent and patient": (leaks.map_of_agent_and_patient, "files"),

@@ -139,8 +139,8 @@ def number_in_the_index(dataset: Dataset, trial: str) -> float:
     return int(row(dataset, trial)["index"]) % 2 == 0
 
 
-def seed_in_the_index(dataset: Dataset, trial: str) -> float:
-    return fraction(str(row(dataset, trial)["seed"]))
+def in_the_index(column: str) -> Tells:
+    return lambda dataset, trial: fraction(str(row(dataset, trial)[column]))
 
 
 def digest_in_the_index(dataset: Dataset, trial: str) -> float:

@@ -43,7 +43,8 @@ _MOTION = (
 _WHOLE, _OBSERVED = ("movie", "free_movie"), ("observed_movie", "free_observed_movie")
 _FACTS = (
     "preset", "seed", "attempt", "first_frame", "min_distance", "robust", "elements",
-    "distractors", "occluders", "agent_fraction", "patient_fraction", *DRAWN,
+    "distractors", "occluders", "agent_fraction", "patient_fraction", "engine", "renderer",
+    "package", "scene_digest", *DRAWN,
 )  # fmt: skip
 """Columns of the index that no evaluation reads."""
 _CELL = 8
@@ -415,7 +416,7 @@ def _files(trials: ChangedTrials) -> None:
             row.update({name: before[other][name] for name in _FACTS})
             origin: dict[str, Any] = {
                 name: None if pd.isna(row[name]) else row[name]
-                for name in ("preset", "seed", "attempt")
+                for name in ("preset", "seed", "attempt", "renderer", "package", "scene_digest")
             }
             trials.change_file(trial, compatible=True, no_ids=True, **origin)
             paths = trials.paths(trial)
