@@ -18,6 +18,7 @@ import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
+import physion
 from physion.checking import check
 from physion.cli.main import main
 from physion.clips.batch import Batch, Provenance, Spec
@@ -202,6 +203,10 @@ def test_files_of_the_evaluator_give_the_predictions_of_the_same_features(
     assert set(theirs["model"]) == {"mynet"}
     assert set(theirs["inputs"]) == {"features of unstated frames"}
     assert set(theirs["benchmark"]) == {"v1.5"} and theirs["readout_c"].nunique() == 1
+    for table, out, frames in ((own, "own", "up to 44"), (theirs, "theirs", "")):
+        assert set(table["frames"]) == {frames}
+        shown = physion.compare(list((tmp_path / out / "predictions").glob("*.csv"))).summary
+        assert set(shown["frames"]) == {": ".join(filter(None, ["v1.5", frames]))}
     np.testing.assert_allclose(theirs["p_contact"], own["p_contact"], atol=1e-9)
     detection = evaluator_files(tmp_path / "mynet" / "ocd", dots, given)
     table = predicted(str(detection), dots, tmp_path / "ocd")

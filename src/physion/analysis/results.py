@@ -163,6 +163,12 @@ def results_table(
     return table.iloc[np.argsort(-order, kind="stable")].reset_index(drop=True)
 
 
+def says_frames(results: pd.DataFrame) -> bool:
+    """Return whether a row that was run here says which frames it saw, or its benchmark."""
+    own = results[results["source"] == ""]
+    return bool((own[["frames", "benchmark"]] != "").any(axis=None))
+
+
 def frames_with_benchmark(results: pd.DataFrame) -> list[str]:
     """Return benchmark and frames of the rows of a table of results, such as v1: 2 to 44, 5/s."""
     pairs = zip(results["benchmark"], results["frames"], strict=True)

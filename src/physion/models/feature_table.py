@@ -107,7 +107,8 @@ class FeatureTable(Model):
         self._model = tables[0].get("model", "").strip() or self._model
         if not self._model.isprintable():
             raise self._error(f"model must be a name of printable characters, not {self._model!r}")
-        self._seen = f"features up to frame {frames[-1]}"
+        self.frames = "" if self._of_evaluator else f"up to {frames[-1]}"
+        """Frames that the features depend on, as the file says."""
         self._sha256 = digest_of(" ".join(file_sha256(one) for one in paths))
 
     def _read(self, path: Path) -> dict[str, Any]:
@@ -250,8 +251,8 @@ class FeatureTable(Model):
 
     def provenance(self) -> Provenance:
         """Return the name of the row, and the hash of the file in place of the weights'."""
-        inputs = "features of unstated frames" if self._of_evaluator else self._seen
-        return Provenance(self._model, f"local:{self._sha256[:12]}", inputs=inputs)
+        of = self.frames.replace("up to", "up to frame") or "of unstated frames"
+        return Provenance(self._model, f"local:{self._sha256[:12]}", inputs=f"features {of}")
 
     def digest(self) -> str:
         """Return the SHA-256 of the content of the files."""

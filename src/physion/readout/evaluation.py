@@ -21,6 +21,7 @@ from physion.compute.tasks import Executor, Progress, tracked
 from physion.core.errors import BadInputError
 from physion.core.files import digest_path, is_whole, json_digest
 from physion.core.version import __version__
+from physion.models.feature_table import FeatureTable
 from physion.models.interface import Model, TrainingSettings, ask, can
 from physion.readout.benchmark import Benchmark, benchmark_of
 from physion.readout.decisions import Readout, decisions
@@ -328,7 +329,9 @@ class _Evaluate:
             predictor.restore()
         row = index.iloc[0]
         rate = round(float(row["frames"] / row["playback_seconds"]), 3)
-        frames = functools.partial(rules.describe_frames, model.spec, rate=rate)
+        frames: Callable[..., str] = functools.partial(rules.describe_frames, model.spec, rate=rate)
+        if isinstance(model, FeatureTable):
+            frames = lambda readout, scenario: model.frames  # noqa: E731
         verdict = self.verdicts.get(cell.chosen.name, "")
         table = make_table(predictions, provenance, index, rules.name, frames, verdict)
         if table.empty:

@@ -32,7 +32,8 @@ COLUMNS = (
 - ``init``: initial weights of the model. ``inputs``: what the model was given of a trial: names of
   `clips.batch.INPUTS` with commas, ``outcomes``, ``answers of people``, or ``base rate`` (nothing).
 - ``frames``: first and last frame that it sees, and how many a second of the movie, such as
-  ``2 to 44, 5/s``; empty where it sees none here. ``benchmark``: rules (`readout.benchmark`).
+  ``2 to 44, 5/s``; ``up to 44`` of features that were computed elsewhere; empty where it sees none
+  here. ``benchmark``: rules (`readout.benchmark`).
 - ``check``: verdict of `physion.check`, such as ``passed``; empty if it was not asked for.
 - ``p_contact``: P(contact). ``outcome``: of the trial as it was shown; ``recorded_outcome``: of the
   official recording, empty where there is none; ``observed_contact``: whether agent and patient

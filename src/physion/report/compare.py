@@ -42,6 +42,7 @@ from physion.analysis.results import (
     frames_with_benchmark,
     published_rows,
     results_table,
+    says_frames,
     zone_of_people,
 )
 from physion.analysis.rollout_errors import read_rollout_errors, rollout_error_table
@@ -231,7 +232,7 @@ def as_text(results: pd.DataFrame, *, intervals: bool = True) -> pd.DataFrame:
     table = results[["row"]].set_axis(["model"], axis=1)
     if (results["given"] != "").any():
         table["given"] = results["given"]
-    if (results["frames"] != "").any():
+    if says_frames(results):
         table["frames"] = frames_with_benchmark(results)
     if (results["check"] != "").any():
         table["check"] = results["check"]

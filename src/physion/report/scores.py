@@ -11,7 +11,7 @@ from physion.analysis.compare import tidy_scores
 from physion.analysis.comparison import SETTING, Comparison
 from physion.analysis.metrics import BEYOND_OUTCOME, Metric, score_metrics
 from physion.analysis.model_tests import MixedTable, permutations_of
-from physion.analysis.results import MARKED, fitted_elsewhere, frames_with_benchmark
+from physion.analysis.results import MARKED, fitted_elsewhere, frames_with_benchmark, says_frames
 from physion.analysis.scores import AVERAGES, TWO_PEOPLE, runs_table, shown_average
 from physion.analysis.tables import MEAN, POOLED, in_order
 from physion.core.html import Markup, joined
@@ -97,8 +97,8 @@ def results(inputs: ReportInputs) -> Markup:
         "r beyond the outcome": "beyond",
     }  # fmt: skip
     chosen = measures if inputs.comparison.has_people else {"accuracy": "accuracy"}
-    shown = {"frames": frames_with_benchmark(rows), "check": list(rows["check"])}
-    known = {name: of for name, of in shown.items() if (rows[name] != "").any()}
+    known = {"frames": frames_with_benchmark(rows)} if says_frames(rows) else {}
+    known |= {"check": list(rows["check"])} if (rows["check"] != "").any() else {}
     cells = [
         [str(row["row"]), str(row["given"]), *(of[k] for of in known.values()),
          *(_result(row, key) for key in chosen.values())]
