@@ -221,6 +221,12 @@ def test_random_numbers_may_follow_the_names(made: Dataset, tmp_path: Path) -> N
     assert few["verdict"].tolist() == [SHOWN] and "too few trials" in few["note"][0]
 
 
+@pytest.mark.slow
+def test_without_random_numbers_nothing_may_follow_the_names(made: Dataset, tmp_path: Path) -> None:
+    (row,) = run(made, leaks.ImaginesTheName(), tmp_path, "names").table.itertuples()
+    assert row.verdict == REFUSED and row.note == "another seed moves no prediction"
+
+
 def test_files_in_folders_are_copied_and_large_ones_named(
     made: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

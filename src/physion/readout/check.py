@@ -8,6 +8,7 @@ predictions is shown, and how accurate a twin with random weights and one that k
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import shutil
@@ -28,7 +29,7 @@ from physion.core.errors import BadInputError, PhysionError, UnknownNameError, o
 from physion.core.seeds import generator
 from physion.models.build import OutOfMemoryError, build_model
 from physion.models.feature_table import FeatureTable
-from physion.models.interface import Model, can
+from physion.models.interface import Model, ask, can
 from physion.readout.benchmark import benchmark_of
 from physion.readout.changes import CHANGES, Change, ChangedTrials, copy_others, take_trials
 from physion.readout.decisions import Readout
@@ -310,6 +311,8 @@ class _Check:
             return {"verdict": PASSED, "note": "rounding" if moved else ""}
         if not (change.renames and self._imagines(readout)):
             return {"verdict": REFUSED, "note": ""}
+        if not self._draws:
+            return {"verdict": REFUSED, "note": "another seed moves no prediction"}
         # The names determine the random numbers of an imagined future. Others may make it another
         # one, but not worse.
         worse = _scores(before, before["p_contact"].to_numpy()) - _scores(before, after)
@@ -324,6 +327,16 @@ class _Check:
 
     def _imagines(self, readout: str) -> bool:
         return readout == Readout.OBSERVED_SIMULATED.value and can(self._model, "imagine")
+
+    @functools.cached_property
+    def _draws(self) -> bool:
+        """Whether another seed moves predictions of imagined futures."""
+        seed, other = ask(self._model, "seed"), copy.copy(self._model)
+        other.seed = (self._settings.seed if seed is None else seed) + 1
+        simulated = (Readout.OBSERVED_SIMULATED.value,)
+        found = self._predict(other, self._first, readouts=simulated).set_index("stimulus")
+        before = self._before[self._before["readout"] == simulated[0]].set_index("stimulus")
+        return bool((found["p_contact"].reindex(before.index) != before["p_contact"]).any())
 
     def left(self, change: Change) -> list[dict[str, Any]]:
         """Return the rows of a change that is not possible for a table of features."""
