@@ -460,6 +460,18 @@ def test_evaluate_writes_the_verdict_into_the_table(
     assert "2 of 2 evaluations to do" in capsys.readouterr().out
 
 
+def test_trials_without_a_prediction_are_named(tmp_path: Path) -> None:
+    dots = make_dots(tmp_path / "dots", {"readout": 4, "testing": 4}, ("drop",))
+    lost = dots.trials("testing")[1]
+    dots.paths(lost).observed_movie.write_bytes(b"damaged")
+    done = check(leaks.Honest(), dots, tmp_path, trials=8, changes=["again"])
+    assert done.table["trials"].tolist() == [3]
+    assert (
+        f"1 of 4 tested trials have no prediction and are not judged, such as {lost}"
+        in (done.warnings[0])
+    )
+
+
 class Failing(leaks.Honest):
     """Model that raises ``error`` after some evaluations, each of which is one call."""
 

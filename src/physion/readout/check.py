@@ -33,8 +33,8 @@ from physion.models.interface import Model, ask, can
 from physion.readout.benchmark import benchmark_of
 from physion.readout.changes import CHANGES, Change, ChangedTrials, copy_others, take_trials
 from physion.readout.decisions import Readout
-from physion.readout.evaluation import run_evaluations
-from physion.readout.folds import READOUT
+from physion.readout.evaluation import Evaluation, run_evaluations
+from physion.readout.folds import READOUT, TESTING
 from physion.readout.model_calls import check_identity
 from physion.readout.predictor import ways
 from physion.readout.settings import ChosenModel, EvaluationSettings, choose_models
@@ -253,7 +253,15 @@ class _Check:
         self._executor = executor
         self._repeats = False  # whether `again` could be predicted
         self._left_out: list[str] = []
-        self._before = self._predict(model, first)
+        done = self._evaluate(model, first)
+        self._before = done.predictions
+        tested = first.trials(TESTING)
+        missing = {t: why for one in done.evaluated for t, why in one.problems.items()}
+        if lost := [trial for trial in tested if trial in missing]:
+            self._left_out.append(
+                f"{len(lost)} of {len(tested)} tested trials have no prediction and are not "
+                f"judged, such as {lost[0]}: {missing[lost[0]]}"
+            )
         self._readouts = list(dict.fromkeys(self._before["readout"]))
 
     def rows(self, change: Change) -> list[dict[str, Any]]:
@@ -402,21 +410,27 @@ class _Check:
         return set(self._first.index["look"]) == {"redyellow"}
 
     def _predict(self, model: Model, dataset: Dataset, **changes: Any) -> pd.DataFrame:
-        """Return the table of predictions of the tested trials of a dataset.
+        """Return the table of predictions of the tested trials of a dataset."""
+        return self._evaluate(model, dataset, **changes).predictions
+
+    def _evaluate(self, model: Model, dataset: Dataset, **changes: Any) -> Evaluation:
+        """Evaluate a model on the tested trials of a dataset; its predictions are read already.
 
         What the model computes of trials that fit the readout, which no change touches, is kept.
         """
         near = self._first.folder.parent
         kept = dict.fromkeys(self._first.trials(READOUT), near / "kept")
         with tempfile.TemporaryDirectory(dir=near) as folder:
-            return run_evaluations(
+            done = run_evaluations(
                 choose_models(model),
                 dataset,
                 Path(folder),
                 dataclasses.replace(self._settings, **changes),
                 stored=kept,
                 executor=self._executor,
-            ).predictions
+            )
+            _ = done.predictions  # which must be read before the folder is deleted
+            return done
 
     def warnings(self) -> list[str]:
         """Return why the check could say less than it should."""
