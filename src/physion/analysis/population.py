@@ -9,8 +9,11 @@ which both do. With means over stimuli::
 
 The raters are, for the fraction p of n members who say yes, or q of another population's:
 
-- two *members*, drawn anew for each stimulus. Of one population, who are different members:
-  a = b = p, c = p - p (1 - p) n / (n - 1). Of two populations: a = p, b = q, c = p q;
+- two *members*. Of models: every two different members, or every member of one population with
+  every one of the other, whose answers are a and b, 1 or 0, and c = a b; kappa is the mean over
+  these pairs, without those whose two members always give one and the same answer. Of people only
+  p is known: a person is drawn anew for each stimulus, with a = p; of a person and a member with
+  the answer b, c = p b; of two people a = b = p, c = p - p (1 - p) n / (n - 1);
 - two *majorities*: m is 1 where p > 1/2, 0 where p < 1/2, and 1/2 where members are divided
   equally, as if a fair coin decided. Of two populations: a = m(p), b = m(q), c = m(p) m(q). Of one
   population with itself: of two random halves. Of k = n p answers yes, x are in the half of
@@ -72,7 +75,10 @@ class PopulationResults:
 
 
 class _Raters(NamedTuple):
-    """Probabilities (s,) with which two raters say yes to each stimulus, and both do."""
+    """Probabilities with which two raters say yes to each stimulus, and both do.
+
+    They are (s, pairs): one column for each pair of raters.
+    """
 
     first: Array
     second: Array
@@ -85,6 +91,8 @@ class _Population:
 
     ``yes``: fraction of the members who say yes; ``count``: members; ``label``: outcome 1 or 0.
     ``by_member``: accuracy of each member, by scenario (k,); empty where it is not known.
+    ``answers``: 1 or 0 of each member, (s, members); of people, whose answers are not known, P(yes)
+    as the only one.
     """
 
     name: str
@@ -92,6 +100,7 @@ class _Population:
     count: Sequence[Array]
     label: Sequence[Array]
     by_member: Sequence[Array]
+    answers: Sequence[Array]
 
     def majority(self, at: int) -> Array:
         """Return the answers of the majority, 1 or 0, or 1/2 for a tie."""
@@ -106,9 +115,14 @@ class _Population:
         return 1 - np.abs(self.yes[at] - self.label[at])
 
     def pair(self, at: int) -> _Raters:
-        """Return two different members."""
+        """Return every two different members; NaN for one member."""
+        if self.by_member and self.answers[at].shape[1] > 1:
+            one, other = np.triu_indices(self.answers[at].shape[1], 1)
+            first, second = self.answers[at][:, one], self.answers[at][:, other]
+            return _Raters(first, second, first * second)
         yes = self.yes[at]
-        return _Raters(yes, yes, yes - pair_difference(yes, self.count[at]) / 2)
+        both = yes - pair_difference(yes, self.count[at]) / 2
+        return _Raters(*(of[:, None] for of in (yes, yes, both)))
 
     def halves(self, at: int) -> _Raters:
         """Return the majorities of two random halves; NaN for one member."""
@@ -124,7 +138,7 @@ class _Population:
         sums = [
             np.sum(np.where(p > 0, p * x, 0.0), axis=1) for x in (first, second, first * second)
         ]
-        return _Raters(*(np.where(count > 1, x, np.nan) for x in sums))
+        return _Raters(*(np.where(count > 1, x, np.nan)[:, None] for x in sums))
 
 
 def _majority(yes: Array) -> Array:
@@ -176,14 +190,16 @@ def compare_populations(
         right = [(answers[part] == label[:, None]).mean(axis=0)
                  for part, label in zip(parts, labels, strict=True)]  # fmt: skip
         count = [np.full(len(label), float(len(members))) for label in labels]
-        populations.append(_Population(str(name), yes, count, labels, right))
+        each = [answers[part] for part in parts]
+        populations.append(_Population(str(name), yes, count, labels, right, each))
     populations.sort(key=lambda one: -np.mean([one.right(k).mean() for k in range(len(parts))]))
     if comparison.has_people:
         yes, count = (
             [about[column].to_numpy(np.float64)[part] for part in parts]
             for column in ("p_yes", "count")
         )
-        populations.insert(0, _Population(PEOPLE, yes, count, labels, ()))
+        fractions = [of[:, None] for of in yes]
+        populations.insert(0, _Population(PEOPLE, yes, count, labels, (), fractions))
     return PopulationResults(
         pd.concat([_consensus(one, scenarios, level) for one in populations], ignore_index=True),
         _agreement(populations, scenarios, level),
@@ -249,11 +265,12 @@ def _raters(first: _Population, second: _Population) -> dict[str, Callable[[int]
         return {"members": first.pair, "majorities": first.halves}
 
     def members(at: int) -> _Raters:
-        a, b = first.yes[at], second.yes[at]
+        one, other = first.answers[at], second.answers[at]
+        a, b = np.repeat(one, other.shape[1], axis=1), np.tile(other, one.shape[1])
         return _Raters(a, b, a * b)
 
     def majorities(at: int) -> _Raters:
-        a, b = first.majority(at), second.majority(at)
+        a, b = first.majority(at)[:, None], second.majority(at)[:, None]
         return _Raters(a, b, a * b)
 
     return {"members": members, "majorities": majorities}
@@ -300,20 +317,21 @@ def _mean_of(values: Callable[[int], Array], less: Callable[[int], Array] | None
 def _disagreement_of(raters: Callable[[int], _Raters]) -> Compute:
     def compute(at: int, weights: Array) -> Array:
         first, second, both = _means(raters(at), weights)
-        return first + second - 2 * both
+        return np.asarray((first + second - 2 * both).mean(axis=1))
 
     return compute
 
 
 def _kappa_of(raters: Callable[[int], _Raters]) -> Compute:
     def compute(at: int, weights: Array) -> Array:
-        return kappa_from_fractions(*_means(raters(at), weights))
+        kappa = kappa_from_fractions(*_means(raters(at), weights))
+        return np.nansum(kappa, axis=1) / np.isfinite(kappa).sum(axis=1)
 
     return compute
 
 
 def _means(raters: _Raters, weights: Array) -> tuple[Array, Array, Array]:
-    first, second, both = (weights @ of / weights.sum(axis=1) for of in raters)
+    first, second, both = (weights @ of / weights.sum(axis=1, keepdims=True) for of in raters)
     return first, second, both
 
 

@@ -7,6 +7,7 @@ from itertools import combinations, product
 import numpy as np
 import pandas as pd
 import pytest
+from sklearn.metrics import cohen_kappa_score
 
 from physion.analysis.comparison import compare_scores
 from physion.analysis.population import MODELS, PEOPLE, PopulationResults, compare_populations
@@ -114,6 +115,29 @@ def test_halves_of_a_population_against_all_ways_to_halve_it() -> None:
     assert found["disagreement_majorities"] == pytest.approx(a + b - 2 * both)
     expected = 1 - (a + b - 2 * both) / (a * (1 - b) + b * (1 - a))
     assert found["kappa_majorities"] == pytest.approx(expected)
+
+
+def test_kappa_of_members_is_the_mean_of_cohens_kappa_over_pairs() -> None:
+    rng = np.random.default_rng(2)
+    labels = np.arange(30) % 2 == 0
+    first, second = rng.random((3, 30)) < 0.7, rng.random((2, 30)) < 0.4
+    first[0] = True  # who always say yes, and no, have a kappa of 0 with each other
+    second[0] = False
+    found = populations([*predicted(first, "a"), *predicted(second, "b")], labels).agreement
+    pairs = {
+        ("a", "a"): combinations(first, 2),
+        ("b", "b"): combinations(second, 2),
+        ("a", "b"): product(first, second),
+    }
+    for (one, other), raters in pairs.items():
+        expected = np.mean([cohen_kappa_score(x, y) for x, y in raters])
+        chosen = found["first"].isin([one, other]) & found["second"].isin([one, other])
+        chosen &= (found["first"] == found["second"]) == (one == other)
+        chosen &= found["scenario"] == "drop"
+        assert found.loc[chosen, "kappa_members"].tolist() == [pytest.approx(expected, abs=1e-12)]
+    extremes = np.stack([np.ones(30, bool), np.zeros(30, bool)])
+    own = row(populations(predicted(extremes), labels).agreement, first="m", scenario=MEAN)
+    assert own["kappa_members"] == 0 and own["disagreement_members"] == 1
 
 
 def test_two_members_whose_ties_are_half_right() -> None:
