@@ -325,7 +325,7 @@ def _disagreement_of(raters: Callable[[int], _Raters]) -> Compute:
 def _kappa_of(raters: Callable[[int], _Raters]) -> Compute:
     def compute(at: int, weights: Array) -> Array:
         kappa = kappa_from_fractions(*_means(raters(at), weights))
-        return np.nansum(kappa, axis=1) / np.isfinite(kappa).sum(axis=1)
+        return np.asarray(np.nansum(kappa, axis=1) / np.isfinite(kappa).sum(axis=1))
 
     return compute
 
