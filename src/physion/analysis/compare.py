@@ -240,6 +240,7 @@ def all_results(
         about_people = fits_of_people(people, progress)
     pooled = pool_comparison(main)
     several = len(main.names) > 1
+    together = compare_populations(main, predictions, draws.level) if population else None
     return ComparisonResults(
         main,
         predictions=predictions,
@@ -249,8 +250,12 @@ def all_results(
         paired=paired_tests(pooled, draws) if several else None,
         mixed=(*about_people, *fits_of_models(main, predictions)),
         contrasts=group_contrasts(main, predictions, groups) if groups else None,
-        population=compare_populations(main, predictions, draws.level) if population else None,
-        warnings=(*(people.warnings if people else ()), *main.warnings),
+        population=together,
+        warnings=(
+            *(people.warnings if people else ()),
+            *main.warnings,
+            *(together.warnings if together else ()),
+        ),
     )
 
 

@@ -67,11 +67,13 @@ class PopulationResults:
     - ``differences``: accuracy of each population less people's: ``population``, ``scenario``,
       ``stimuli``, ``consensus``, ``member``, by scenario from the largest difference of the
       consensus to the smallest, then `MEAN`. Empty without people.
+    - ``warnings``: how many stimuli are left out, as a sentence, if any.
     """
 
     consensus: pd.DataFrame
     agreement: pd.DataFrame
     differences: pd.DataFrame
+    warnings: tuple[str, ...] = ()
 
 
 class _Raters(NamedTuple):
@@ -176,9 +178,14 @@ def compare_populations(
             "a population needs several models: give predictions of several seeds or checkpoints "
             "of one model (--population)"
         )
-    wide = rows.pivot(index="stimulus", columns="model", values="predicted").dropna().sort_index()
+    every = rows.pivot(index="stimulus", columns="model", values="predicted")
+    wide = every.dropna().sort_index()
     if wide.empty:
         raise BadInputError("no stimulus is predicted by all members of the populations")
+    warning = (
+        f"populations: {len(every) - len(wide)} of {len(every)} stimuli are left out, since not "
+        "all members predict them"
+    )
     about = rows.drop_duplicates("stimulus").set_index("stimulus").loc[wide.index]
     scenarios = in_order(about["scenario"])
     parts = [(about["scenario"] == name).to_numpy() for name in scenarios]
@@ -204,6 +211,7 @@ def compare_populations(
         pd.concat([_consensus(one, scenarios, level) for one in populations], ignore_index=True),
         _agreement(populations, scenarios, level),
         _differences(populations, scenarios, level),
+        (warning,) if len(wide) < len(every) else (),
     )
 
 

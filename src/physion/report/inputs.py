@@ -104,8 +104,8 @@ class ReportInputs(ComparisonResults):
                 "left_out_with_people": self.with_people.dropped,
             }
         if self.population is not None:
-            found |= {f"population_{one.name}": getattr(self.population, one.name)
-                      for one in fields(self.population)}  # fmt: skip
+            names = ("consensus", "agreement", "differences")
+            found |= {f"population_{name}": getattr(self.population, name) for name in names}
         found |= _mixed_tables(self.mixed)
         if self.people is not None:
             found |= _people_tables(self.people)

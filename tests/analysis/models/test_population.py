@@ -162,6 +162,10 @@ def test_who_is_one_population() -> None:
     single[2]["readout"] = "full"
     found = populations(single, labels).consensus
     assert set(found["population"]) == {MODELS} and set(found["members"]) == {2}
+    # Only what all members predict counts, and what does not is said.
+    cut = populations([single[0], single[1].iloc[:9]], labels)
+    assert set(cut.consensus["stimuli"]) == {9} and found["stimuli"].max() == 12
+    assert "3 of 12 stimuli are left out" in cut.warnings[0]
     with pytest.raises(BadInputError, match="several seeds"):
         populations(single[:1], labels)
 
