@@ -201,6 +201,9 @@ def test_files_of_the_evaluator_give_the_predictions_of_the_same_features(
     own = predicted(str(tmp_path / "net.npz"), dots, tmp_path / "own")
     theirs = predicted(str(path), dots, tmp_path / "theirs")
     assert set(theirs["model"]) == {"mynet"}
+    found = evaluate(str(path), dots, tmp_path / "theirs", QUICK, twin=True)
+    assert len(found.evaluated) == 1 and len(found.warnings) == 1
+    assert "test_features.hdf5: no random twin can be made" in found.warnings[0]
     assert set(theirs["inputs"]) == {"features of unstated frames"}
     assert set(theirs["benchmark"]) == {"v1.5"} and theirs["readout_c"].nunique() == 1
     for table, out, frames in ((own, "own", "up to 44"), (theirs, "theirs", "")):

@@ -117,10 +117,12 @@ class Evaluation:
 
     - ``evaluated``: one entry for every model, training protocol and seed.
     - ``failed``: reasons of those that failed, by model, protocol and seed.
+    - ``without_twin``: names of models whose random twin was asked for and cannot be made.
     """
 
     evaluated: Sequence[EvaluatedModel]
     failed: Mapping[str, str]
+    without_twin: Sequence[str] = ()
 
     @property
     def paths(self) -> list[Path]:
@@ -142,17 +144,24 @@ class Evaluation:
     def warnings(self) -> list[str]:
         """What may be wrong with predictions, in sentences.
 
-        Readouts that ship and may not fit, and predictions without a trial to fit a readout on.
+        Readouts that ship and may not fit, models without a twin, and predictions without a trial
+        to fit a readout on.
         """
         found = list(dict.fromkeys(words for one in self.evaluated for words in one.warnings))
+        if self.without_twin:
+            found.append(
+                f"{', '.join(self.without_twin)}: no random twin can be made of a table of "
+                "features or a class of your own; evaluate one with random weights as another model"
+            )
         if self.predictions.empty:
             return found
         unfit = self.predictions[self.predictions["note"].str.contains(NOTHING_TO_FIT)]
-        return found + [
+        found += [
             f"{model}, readout {readout}: {len(rows)} predictions are the same number, since "
             f"the readout had {reason}; add trials of the split readout with both outcomes"
             for (model, readout, reason), rows in unfit.groupby(["model", "readout", "note"])
         ]
+        return found
 
     @property
     def problems(self) -> dict[str, str]:
@@ -219,7 +228,11 @@ def run_evaluations(
     do: Callable[[Cell], EvaluatedModel] = work
     if elsewhere is None:
         do = functools.partial(work, executor=executor, progress=progress, dry_run=dry_run)
-    return Evaluation(*run_cells(cells, do, out, "evaluations", elsewhere, progress, finished))
+    lacking = [c.chosen.name for c in cells if c.built is not None and c.chosen.lacks_twin(c.built)]
+    return Evaluation(
+        *run_cells(cells, do, out, "evaluations", elsewhere, progress, finished),
+        tuple(dict.fromkeys(lacking)) if settings.twin else (),
+    )
 
 
 def _is_trained(model: Any, settings: EvaluationSettings) -> bool:

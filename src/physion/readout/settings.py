@@ -22,6 +22,7 @@ from physion.compute.tasks import Executor, Progress
 from physion.core.errors import BadInputError, PhysionError
 from physion.core.settings import OPTION_ONLY, field_types, parse_pairs, read_settings, split_names
 from physion.models.build import build_model, build_untrained, option_names
+from physion.models.feature_table import FeatureTable
 from physion.models.interface import RANDOM, Model, TrainingSettings, ask, can
 from physion.models.user_files import is_file_name
 from physion.readout.folds import Protocol
@@ -147,6 +148,12 @@ class ChosenModel:
         if WEIGHTS not in option_names(self.model) or built.provenance().init == RANDOM:
             return None
         return dataclasses.replace(self, options={**self.options, WEIGHTS: RANDOM}, twin=True)
+
+    def lacks_twin(self, built: Any) -> bool:
+        """Return whether no twin of a table of features or a user's class can be made."""
+        own = not isinstance(self.model, str) or is_file_name(self.model)
+        table = isinstance(built, FeatureTable)
+        return (own or table) and built.provenance().init != RANDOM
 
     def stays_random(self, model: Any) -> bool:
         """Return whether a built model is a twin that is not trained, as dynamics would be."""
