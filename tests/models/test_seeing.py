@@ -24,7 +24,7 @@ from physion.models.seeing.bodies import find, follow
 from physion.models.seeing.hypotheses import see_uncertain
 from physion.models.seeing.masks import MaskFit, traced
 from physion.models.seeing.pixels import Rays, SeenFrame, floor_height, picture_of
-from physion.models.seeing.resting import resting_scene, stacked, uncertain_picture
+from physion.models.seeing.resting import resting_scene, stacked, uncertain_frame
 from physion.models.seeing.scenes import SeenTrial, Track, joints_of, see_trial, velocities
 from physion.models.seeing.simulation import SeeingSimulation
 from physion.models.seeing.solids import Placed, Prior, cost_of, residuals, solid
@@ -262,7 +262,7 @@ def test_rays_meet_or_miss_a_solid(
 def test_what_stands_on_the_floor_is_found_in_spite_of_errors(rolling: Batch) -> None:
     batch, made = with_errors(rolling), scene()
     assert batch.ids is not None and batch.depth is not None and batch.camera is not None
-    picture = uncertain_picture(
+    picture = uncertain_frame(
         picture_of(batch.ids[0, 0], batch.depth[0, 0], batch.camera[0]), ERROR
     )
     rays = picture.rays(2)
@@ -299,7 +299,7 @@ def test_what_stands_on_something_still_does_with_other_sizes() -> None:
     batch = with_errors(batch_of(made, 256))
     assert batch.ids is not None and batch.depth is not None and batch.camera is not None
     pictures = {
-        frame: uncertain_picture(
+        frame: uncertain_frame(
             picture_of(batch.ids[0, row], batch.depth[0, row], batch.camera[0]), ERROR
         )
         for row, frame in enumerate((0, 2))

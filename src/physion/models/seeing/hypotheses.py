@@ -6,7 +6,7 @@ push; it is simulated through the observed frames, and its masks are compared wi
 
     mismatch of an object in a frame = |A xor B| / (|A| + |B| + 8) + min(1, d / 15) / 2,
 
-with A its pixels in a picture of `SIZE` pixels a side, B those of the simulation, d the distance of
+with A its pixels in a picture of `SIZE` pixels a side, B its simulated ones, d the distance of
 their centroids in pixels. Pixels of scenery that may hide objects do not count. The loss is the
 mean over frames and objects; agent and patient count twice.
 
@@ -37,11 +37,11 @@ from physion.models.noisy_simulation import ObservedTrial
 from physion.models.seeing.masks import MaskFit, moved
 from physion.models.seeing.pixels import Rays, picture_of
 from physion.models.seeing.resting import (
-    Picture,
     Resting,
+    UncertainFrame,
     resting_scene,
     stacked,
-    uncertain_picture,
+    uncertain_frame,
 )
 from physion.models.seeing.scenes import SeenTrial, Track, body_of, camera_of, joints_of, numbers_of
 from physion.models.seeing.solids import Placed
@@ -106,7 +106,7 @@ class Video:
     """
 
     def __init__(
-        self, pictures: Mapping[int, Picture], camera: F64, numbers: Sequence[int]
+        self, pictures: Mapping[int, UncertainFrame], camera: F64, numbers: Sequence[int]
     ) -> None:
         self.frames, self.camera, self.numbers = sorted(pictures), camera, list(numbers)
         height, width = pictures[self.frames[0]].seen.ids.shape
@@ -178,8 +178,8 @@ class Video:
 class PushGuess:
     """Push of an object: ``mean`` and ``spread`` (7,) of what is drawn.
 
-    Velocity along x and y (m/s), place of the push above the middle and beside it (parts of the
-    size), frame, velocity upwards, logarithm of the factor of the mass.
+    Velocity along x and y (m/s), place of the push above the middle and to one side of it (parts of
+    the size), frame, velocity upwards, logarithm of the factor of the mass.
     """
 
     number: int
@@ -188,12 +188,12 @@ class PushGuess:
 
     def push(self, placed: Placed, mass: float, values: F64) -> tuple[Push, float]:
         """Return the push of standard normal ``values``, and the mass of the object."""
-        x, y, over, beside, frame, up, heavier = self.mean + self.spread * values
+        x, y, over, aside, frame, up, heavier = self.mean + self.spread * values
         mass *= float(np.exp(np.clip(heavier, -2, 2)))
         velocity = np.array([x, y, up])
         across = np.array([-y, x, 0.0]) / max(math.hypot(x, y), 1e-6)
         size = placed.size()
-        point = placed.middle() + across * np.clip(beside, -0.5, 0.5) * size[:2].mean()
+        point = placed.middle() + across * np.clip(aside, -0.5, 0.5) * size[:2].mean()
         point[2] += np.clip(over, -0.5, 0.5) * size[2]
         impulse = mass * velocity
         frame = int(np.clip(round(frame), 0, LAST_OBSERVED - 1))
@@ -228,7 +228,7 @@ def see_uncertain(
     """
     numbers = numbers_of(ids)
     pictures = {
-        int(frame): uncertain_picture(picture_of(ids[row], depth[row], camera), error)
+        int(frame): uncertain_frame(picture_of(ids[row], depth[row], camera), error)
         for row, frame in enumerate(frames)
     }
     objects = resting_scene(pictures, numbers, error)
@@ -375,7 +375,7 @@ def _search(
 def _observed(
     video: Video,
     objects: Mapping[int, Resting],
-    pictures: Mapping[int, Picture],
+    pictures: Mapping[int, UncertainFrame],
     tried: _Tried,
     rank: int,
 ) -> ObservedTrial:

@@ -14,7 +14,7 @@ S is `EDGE`, the precision of the border of a mask. W < 1, since errors of a sur
 independent from pixel to pixel. Residuals r of rays are limited, r / sqrt(1 + (r / L)^2), as masks
 of what is partly hidden end too early.
 
-Parameters are the logarithms of the scales (those of a round shape are tied), x and y, the rotation
+Parameters are the logarithms of the scales (tied for a round shape), x and y, the rotation
 about the vertical (or a rotation vector, of what is not upright), z of what stands on nothing
 known, and ln(s). The sum of squares is minimised by the method of Levenberg and Marquardt with
 differences for derivatives.
@@ -131,15 +131,15 @@ def _trace(
                 slopes[k] += world[k, i] * vectors[n, i]
         first, deepest, least = np.inf, 0.0, np.inf
         for piece in range(pieces):
-            enter, leave, beside = -np.inf, np.inf, False
+            enter, leave, outside = -np.inf, np.inf, False
             for k in range(starts[piece], starts[piece + 1]):
                 if slopes[k] < -1e-12:
                     enter = max(enter, offsets[k] / slopes[k])
                 elif slopes[k] > 1e-12:
                     leave = min(leave, offsets[k] / slopes[k])
                 elif offsets[k] < 0.0:
-                    beside = True
-            meets = enter < leave and leave > 0.0 and not beside
+                    outside = True
+            meets = enter < leave and leave > 0.0 and not outside
             if meets and on[n]:
                 first = min(first, enter)
                 continue
@@ -375,7 +375,7 @@ def _upright(each: Solid, rays: Rays, rest: float | None, turns: int) -> Iterato
             yield _filled(each, rotation, low, high, rest)
 
 
-def _turned(each: Solid, rays: Rays) -> Iterator[Placed]:
+def _any_rotation(each: Solid, rays: Rays) -> Iterator[Placed]:
     """Yield starts of a shape in all rotations; none of a ball, which is always upright."""
     values = generator("seeing", "rotations of a mask").standard_normal((ROTATIONS, 4))
     values /= np.linalg.norm(values, axis=1, keepdims=True)
@@ -451,7 +451,7 @@ def find_shape(
     if rest is None and min(map(rank, best)) > UPRIGHT_COST:
         turned = []
         for each in library():
-            for start in _turned(each, rays):
+            for start in _any_rotation(each, rays):
                 one = MaskFit(few, error, None, False)
                 one.solve(start, 4)
                 turned.append((rank(one), one))

@@ -37,7 +37,7 @@ THIN = 0.12
 """Height in metres of things in which nothing can be, so that what is above them stands on them."""
 WORSE, MARGIN = 1.5, 12.0
 """Factor and summand of the sum of squares up to which an object is taken to stand on something."""
-BESIDE = 50.0
+NOT_ABOVE = 50.0
 """Sum of squares that is added if it is then no longer above it."""
 POOR_PLATE = 0.1
 """Cost of a plate above which a patient may be something else."""
@@ -46,7 +46,7 @@ RAMP = "ramp"
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class UncertainFrame:
     """A frame whose depth has a relative error.
 
     - ``seen``: ids, depth and rays. ``far`` (H, W): depth up to which rays are surely free of what
@@ -64,7 +64,7 @@ class Picture:
         return replace(self.seen, depth=depth).rays(number, count)
 
 
-def uncertain_picture(seen: SeenFrame, error: float) -> Picture:
+def uncertain_frame(seen: SeenFrame, error: float) -> UncertainFrame:
     """Return a frame as one whose depth has a relative error."""
     down = seen.vectors[..., 2]
     with np.errstate(divide="ignore"):
@@ -72,7 +72,7 @@ def uncertain_picture(seen: SeenFrame, error: float) -> Picture:
     scenery = seen.ids == SCENERY_ID
     on_floor = scenery & (seen.depth > floor * (1 - 4 * error))
     far = np.where(on_floor, floor, seen.depth * (1 - 3 * error) - 0.02)
-    return Picture(seen, far, scenery & ~on_floor)
+    return UncertainFrame(seen, far, scenery & ~on_floor)
 
 
 @dataclass(eq=False)
@@ -101,7 +101,7 @@ class Resting:
 
 
 def resting_scene(
-    pictures: Mapping[int, Picture], numbers: Sequence[int], error: float
+    pictures: Mapping[int, UncertainFrame], numbers: Sequence[int], error: float
 ) -> dict[int, Resting]:
     """Return the objects by number, those below before those above.
 
@@ -148,20 +148,20 @@ def _plate(one: Resting) -> bool:
     return one.fit.sizes == "flat"
 
 
-def _stand(one: Resting, found: Sequence[Resting], error: float) -> None:
+def _stand(one: Resting, others: Sequence[Resting], error: float) -> None:
     """Fit an object again on what explains it best, if anything does nearly as well."""
     placed = one.placed
     low, middle = placed.extent_z()[0], float(placed.middle()[2])
     below = [
         other
-        for other in found
+        for other in others
         if above(placed, other.placed)
         and (other.placed.extent_z()[1] < middle + 0.05 * _same_rings(placed, other.placed))
         and _carries(other, placed)
     ]
     held = [
         other
-        for other in found
+        for other in others
         if not _plate(other)
         and above(placed, other.placed)
         and (
@@ -189,7 +189,7 @@ def _stand(one: Resting, found: Sequence[Resting], error: float) -> None:
             one.fit.placed = drawn_nearer(placed, one.rays.origin, level)
             one.fit.rest, one.support = level, number
         return
-    by_number = {other.number: other for other in found}
+    by_number = {other.number: other for other in others}
     tried: list[tuple[float, int, MaskFit, int | None]] = []
     for level, number in levels:
         lower = LOWER if placed.solid.name == "cylinder" else HIGHER
@@ -198,7 +198,7 @@ def _stand(one: Resting, found: Sequence[Resting], error: float) -> None:
         fit = find_shape(one.rays, error, level, placed)
         squares = fit.placed.cost * len(one.rays.depth)
         if number is not None and not above(fit.placed, by_number[number].placed):
-            squares += BESIDE
+            squares += NOT_ABOVE
         tried.append((squares, len(tried), fit, number))
     if tried:
         squares, _, fit, number = min(tried, key=lambda each: each[:2])
