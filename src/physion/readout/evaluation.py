@@ -228,10 +228,11 @@ def run_evaluations(
     do: Callable[[Cell], EvaluatedModel] = work
     if elsewhere is None:
         do = functools.partial(work, executor=executor, progress=progress, dry_run=dry_run)
-    lacking = [c.chosen.name for c in cells if c.built is not None and c.chosen.lacks_twin(c.built)]
+    built = [cell for cell in cells if settings.twin and cell.built is not None]
+    lacking = [cell.chosen.name for cell in built if cell.chosen.lacks_twin(cell.built)]
     return Evaluation(
         *run_cells(cells, do, out, "evaluations", elsewhere, progress, finished),
-        tuple(dict.fromkeys(lacking)) if settings.twin else (),
+        tuple(dict.fromkeys(lacking)),
     )
 
 

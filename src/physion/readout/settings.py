@@ -153,7 +153,9 @@ class ChosenModel:
         """Return whether no twin of a table of features or a user's class can be made."""
         own = not isinstance(self.model, str) or is_file_name(self.model)
         table = isinstance(built, FeatureTable)
-        return (own or table) and built.provenance().init != RANDOM
+        # A wrong provenance is refused where predictions are made, with a message that says it.
+        init = getattr(built.provenance(), "init", "")
+        return (own or table) and init != RANDOM
 
     def stays_random(self, model: Any) -> bool:
         """Return whether a built model is a twin that is not trained, as dynamics would be."""
