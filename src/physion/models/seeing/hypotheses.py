@@ -34,7 +34,8 @@ from physion.clips.batch import AGENT_ID, LAST_OBSERVED, PATIENT_ID, SCENERY_ID
 from physion.core.errors import PhysionError
 from physion.core.seeds import generator
 from physion.models.noisy_simulation import ObservedTrial
-from physion.models.seeing.masks import MaskFit, moved
+from physion.models.seeing.bodies import moved_with
+from physion.models.seeing.masks import MaskFit
 from physion.models.seeing.pixels import Rays, picture_of
 from physion.models.seeing.resting import (
     Resting,
@@ -441,7 +442,7 @@ def _refitted(one: Resting, start: Placed, rays: Rays) -> Placed:
     depth = float(np.median(rays.depth[rays.on])) * math.exp(factor)
     seen = rays.origin + rays.vectors[rays.on].mean(axis=0) * depth
     found = []
-    for near in (start, moved(start, seen - start.middle())):
+    for near in (start, moved_with(start, seen - start.middle())):
         fit = MaskFit(
             rays, one.fit.error, None, False, "given", factor, SAME_FACTOR
         )  # fmt: skip

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.core.seeds import generator
+from physion.models.seeing.bodies import moved_with
 from physion.models.seeing.pixels import Rays
 from physion.models.seeing.solids import Placed, Solid, library, place, solid
 from physion.numerics.kernel import kernel
@@ -47,8 +48,8 @@ MOST_DEPTH, MOST_EDGE = 3.0, 6.0
 """Limits of residuals of depth and of borders, in standard deviations."""
 STEP = 3e-4
 """Change of a parameter for the derivatives."""
-FEW, SOME = 140, 280
-"""Rays of the search over starts, and of the fit that follows."""
+FEW = 140
+"""Rays of the search over starts."""
 SIMPLER = 0.0008
 """Cost by which a shape must fit better than one that comes before it in the library."""
 UPRIGHT_COST = 0.09
@@ -309,12 +310,7 @@ def _limited(r: F64, most: float) -> F64:
 
 def standing(placed: Placed, level: float) -> Placed:
     """Return a solid moved up or down until its lower end is at a height, metres."""
-    return moved(placed, np.array([0, 0, level - placed.extent_z()[0]]))
-
-
-def moved(placed: Placed, shift: F64) -> Placed:
-    """Return a solid moved by ``shift`` (3,), metres."""
-    return replace(placed, position=placed.position + shift)
+    return moved_with(placed, np.array([0, 0, level - placed.extent_z()[0]]))
 
 
 def drawn_nearer(placed: Placed, origin: F64, level: float) -> Placed:
@@ -383,7 +379,7 @@ def _any_rotation(each: Solid, rays: Rays) -> Iterator[Placed]:
     start = _filled(each, np.eye(3), low, high, None)
     for rotation in [] if each.ball else rotation_matrices(values):
         turned = replace(start, rotation=rotation)
-        yield moved(turned, start.middle() - turned.middle())
+        yield moved_with(turned, start.middle() - turned.middle())
 
 
 def _first(fits: Iterable[tuple[float, MaskFit]], count: int) -> list[MaskFit]:
@@ -473,7 +469,7 @@ def find_plate(rays: Rays, error: float) -> MaskFit:
                 scale = upright.scale * (factor, factor, 1.0)
                 scale[2] = PLATE / (each.high - each.low)[2]
                 wide = replace(upright, scale=scale)
-                wide = moved(wide, upright.middle() + part * away - wide.middle())
+                wide = moved_with(wide, upright.middle() + part * away - wide.middle())
                 starts.append(standing(wide, 0.0))
             coarse = MaskFit(few, error, 0.0, sizes="flat", edge=COARSE[0])
             for start in sorted(starts, key=coarse.cost)[:2]:

@@ -22,12 +22,11 @@ from numpy.typing import NDArray
 from physion.clips.batch import PATIENT_ID, SCENERY_ID
 from physion.models.seeing.masks import MaskFit, drawn_nearer, find_plate, find_shape, standing
 from physion.models.seeing.pixels import LEAST_PIXELS, Rays, SeenFrame
+from physion.models.seeing.scenes import CLEAR_PIXELS, RAMP, VESSELS
 from physion.models.seeing.solids import Placed
 
 F64 = NDArray[np.float64]
 
-CLEAR_PIXELS = 40
-"""Pixels with which an object is fitted in the first frame."""
 RAYS = 360
 """Rays of an object."""
 HIGHER, LOWER = 0.35, 1.0
@@ -41,8 +40,6 @@ NOT_ABOVE = 50.0
 """Sum of squares that is added if it is then no longer above it."""
 POOR_PLATE = 0.1
 """Cost of a plate above which a patient may be something else."""
-VESSELS = ("bowl", "pipe", "torus")
-RAMP = "ramp"
 
 
 @dataclass(frozen=True, eq=False)
