@@ -56,6 +56,7 @@ OFFICIAL_MODELS = (
     "gns",
     "intuition-masks",
     "blob-trees",
+    "rpin",
     "pEffNetLite0-mlp",
 )
 """Models of a run on official scenes; those that take no time come first, so that rows appear. An
@@ -82,7 +83,7 @@ class RunSettings:
     sampled: bool = False
     """Sample scenes of Dominoes, Collide and Drop instead; nobody has seen them."""
     models: str | None = None
-    """Names of models with commas (physion ls models); default: for official scenes eleven, and
+    """Names of models with commas (physion ls models); default: for official scenes twelve, and
     the random twin of one."""
     out: Path | None = None
     """Folder for trials, predictions and the report; default: runs/official or runs/sampled."""
@@ -134,7 +135,7 @@ def run(
     """Make trials, let models predict them, compare all with people, and write the report.
 
     Without settings, a balanced sample of the official scenes that ship with the package is
-    simulated, and eleven models, with the random twin of one, are compared with the people of the
+    simulated, and twelve models, with the random twin of one, are compared with the people of the
     original study. A second run resumes, and a larger ``limit`` only adds.
 
     Parameters
@@ -194,11 +195,15 @@ def run(
         progress=progress,
         on_evaluated=on_evaluated,
     )
-    # What encoders imagine would have to be trained, and whole movies take longer than all the rest
-    # (physion evaluate has both): only the readouts of the observed part are used, which ship.
+    # What encoders imagine would have to be trained, and whole movies take longer than all the rest:
+    # only readouts of the observed part are used. Of RPIN only those that ship, for the same reason
+    # (physion evaluate has all).
+    others = [name for name in models if name not in (*decided, *encoders)]
+    kinds = {name: _shipped_kinds(built[name]) for name in others}
     groups: list[tuple[Sequence[str], dict[str, Any]]] = [
         (decided, {"decision": settings.decision}),
-        ([name for name in models if name not in (*decided, *encoders)], {}),
+        ([name for name in others if not kinds[name]], {}),
+        *(([name], {"readouts": kinds[name]}) for name in others if kinds[name]),
         (encoders, {"readouts": ("observed",), "twin": settings.models is None}),
     ]
     done = Evaluation([], {})
@@ -224,6 +229,12 @@ def run(
 def _learns(model: Any) -> bool:
     """Return whether an evaluation trains a built model."""
     return can(model, "loss") and not ask(model, "trained")
+
+
+def _shipped_kinds(model: Any) -> tuple[str, ...]:
+    """Return the kinds of readouts that ship for a built model."""
+    shipped = find_readouts(model)
+    return () if shipped is None else shipped.kinds
 
 
 def decided_models(built: Mapping[str, Model], decision: str) -> list[str]:

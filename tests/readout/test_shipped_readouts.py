@@ -44,6 +44,12 @@ MODELS = {
     "op3-small": ("op3", {}),
 }
 """Models that files belong to, by name."""
+ALL = ("observed", "observed+simulated", "full")
+KINDS = {
+    "state-trees": ALL[:1], "rpin-small": ALL[:2], "cswm-small": ALL, "svg-small": ALL,
+    "op3-small": ALL,
+}  # fmt: skip
+"""Readouts of models, where they are not observed and full."""
 
 
 def problem(n: int, steps: int, size: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -161,6 +167,7 @@ def test_files_are_small_and_belong_to_models() -> None:
             continue
         found = find_readouts(model)
         assert found is not None and found.sha256 == ShippedReadouts(path).sha256
+        assert found.kinds == KINDS.get(name, ("observed", "full"))
         card = path.with_suffix(".md").read_text()
         assert model.readout_digest() in card
         for scenario in SCENARIOS:

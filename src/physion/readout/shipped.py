@@ -81,6 +81,12 @@ class ShippedReadouts:
         self._facts = _header(path)
         self._tensors = load(content)
 
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Return the readouts of which some scenario has one, such as observed."""
+        names = {name.split("/")[0] for name in self._facts["readouts"]}
+        return tuple(readout.value for readout in Readout if readout.value in names)
+
     def find(self, readout: Readout, scenario: str) -> ShippedReadout | None:
         """Return the readout of a scenario, None if there is none."""
         name = f"{readout.value}/{scenario}"
