@@ -195,9 +195,9 @@ def run(
         progress=progress,
         on_evaluated=on_evaluated,
     )
-    # What encoders imagine would have to be trained, and whole movies take longer than all the rest:
-    # only readouts of the observed part are used. Of RPIN only those that ship, for the same reason
-    # (physion evaluate has all).
+    # What encoders imagine would have to be trained, and whole movies take longer than all the
+    # rest: only readouts of the observed part are used. Of RPIN only those that ship, for the same
+    # reason (physion evaluate has all).
     others = [name for name in models if name not in (*decided, *encoders)]
     kinds = {name: _shipped_kinds(built[name]) for name in others}
     groups: list[tuple[Sequence[str], dict[str, Any]]] = [

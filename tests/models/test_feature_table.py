@@ -196,7 +196,9 @@ def test_files_of_the_evaluator_give_the_predictions_of_the_same_features(
     dots: Dataset, tmp_path: Path
 ) -> None:
     given = arrays(dots)
-    write(tmp_path / "net.npz", given | {"benchmark": "v1.5"})
+    collide = np.char.startswith(given["names"], "collide")[:, None]
+    frames = np.where(collide, np.minimum(given["frames"], 15), given["frames"])
+    write(tmp_path / "net.npz", given | {"benchmark": "v1.5", "frames": frames})
     path = evaluator_files(tmp_path / "mynet" / "ocp", dots, given)
     own = predicted(str(tmp_path / "net.npz"), dots, tmp_path / "own")
     theirs = predicted(str(path), dots, tmp_path / "theirs")
@@ -251,6 +253,14 @@ def with_nan(given: dict[str, Any]) -> dict[str, Any]:
         (lambda a: a | {"names": np.full(24, "a")}, "the name 'a' occurs twice"),
         (lambda a: a | {"features": a["features"].astype(int)}, "features are int64"),
         (lambda a: {"names": a["names"], "features": a["features"]}, "no array 'frames'"),
+        (
+            lambda a: a | {"benchmark": "v1.5"},
+            r"frame 44 comes after the observed part of 'collide_.*', whose last frame is 15",
+        ),
+        (
+            lambda a: a | {"frames": np.tile(a["frames"], (23, 1))},
+            "frames must be integers, one for each time step, or a row of them for each trial",
+        ),
         (lambda a: a | {"benchmark": "2"}, "benchmark must be v1 or v1.5, not '2'"),
         (lambda a: a | {"readout": "later"}, "readout must be observed or full, not 'later'"),
         (lambda a: a | {"names": a["names"].astype(object)}, "pickled objects are refused"),

@@ -3,7 +3,8 @@
 A table is an ``.npz`` or HDF5 file with these arrays:
 
 - ``names`` (n): names of trials, in any order.
-- ``frames`` (T): for each time step the last frame of the movie that it depends on, from 0 on.
+- ``frames`` (T) or (n, T): for each time step the last frame of the movie that it depends on, from
+  0 on; of each trial where movies were cut at different frames.
 - ``features`` (n, T, D): floating-point numbers.
 - ``model``: name of the row; optional, by default, or if blank, the file's name.
 - ``readout``: ``observed`` or ``full``; optional, by default ``observed``, which excludes all
@@ -24,7 +25,7 @@ import contextlib
 import copy
 import math
 import zipfile
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,16 +75,17 @@ class FeatureTable(Model):
         if len(self.rows) < len(names):
             twice = next(name for row, name in enumerate(names) if self.rows[name] != row)
             raise self._error(f"the name {twice!r} occurs twice")
-        frames, shape = tables[0]["frames"], tables[0]["features"].shape[1:]
+        shape = tables[0]["features"].shape[1:]
         if any(table["features"].shape[1:] != shape for table in tables):
             raise self._error(f"{' and '.join(EVALUATOR)} have features of different shapes")
         self.features = np.concatenate([table["features"] for table in tables])
+        frames = np.concatenate([table["frames"] for table in tables])
         readout = str(tables[0].get("readout", _OBSERVED))
         if readout not in (_OBSERVED, _FULL):
             raise self._error(f"readout must be {_OBSERVED} or {_FULL}, not {readout!r}")
         if self._of_evaluator and self.path.absolute().parent.name == "ocd":
             readout = _FULL
-        self._check_frames(frames, readout)
+        self._check_frames(frames, readout, names)
         unfit = np.argwhere(~np.isfinite(self.features))
         if len(unfit):
             row, step = unfit[0][:2]
@@ -107,8 +109,9 @@ class FeatureTable(Model):
         self._model = tables[0].get("model", "").strip() or self._model
         if not self._model.isprintable():
             raise self._error(f"model must be a name of printable characters, not {self._model!r}")
-        self.frames = "" if self._of_evaluator else f"up to {frames[-1]}"
+        self.frames = "" if self._of_evaluator else f"up to {frames.max()}"
         """Frames that the features depend on, as the file says."""
+        self._last = frames[:, -1]
         self._sha256 = digest_of(" ".join(file_sha256(one) for one in paths))
 
     def _read(self, path: Path) -> dict[str, Any]:
@@ -132,9 +135,14 @@ class FeatureTable(Model):
                 table["frames"], values = (np.asarray(file[name][()]) for name in _NEEDED[1:])
                 texts = ("model", "readout", "benchmark")
                 table |= {name: _text(file[name][()]) for name in texts if name in file}
-        rows, steps = len(table["names"]), table["frames"].size
-        if table["frames"].ndim != 1 or table["frames"].dtype.kind not in "iu":
-            raise self._error("frames must be integers, one for each time step")
+        rows, frames = len(table["names"]), table["frames"]
+        whole = frames.dtype.kind in "iu" and frames.ndim in (1, 2)
+        if not whole or (frames.ndim == 2 and len(frames) != rows):
+            raise self._error(
+                "frames must be integers, one for each time step, or a row of them for each trial"
+            )
+        steps = frames.shape[-1]
+        table["frames"] = np.broadcast_to(frames, (rows, steps))
         if values.ndim != 3 or values.shape[:2] != (rows, steps) or not values.size:
             raise self._error(
                 f"features are {values.shape} for {rows} names and {steps} frames, expected "
@@ -166,18 +174,33 @@ class FeatureTable(Model):
                 what = "pickled objects are refused; save names as an array of text (dtype str)"
             raise BadInputError(f"features {path} cannot be read: {what}") from error
 
-    def _check_frames(self, frames: NDArray[Any], readout: str) -> None:
+    def _check_frames(self, frames: NDArray[Any], readout: str, names: Sequence[str]) -> None:
+        """Check frames (n, T) of the trials ``names``."""
         if (frames < 0).any() or (np.diff(frames.astype(np.int64)) < 0).any():
             raise self._error("frames must be 0 or more and must not decrease")
-        if readout == _OBSERVED and frames[-1] > LAST_OBSERVED:
+        if readout == _FULL:
+            return
+        self._check_last(dict(zip(names, frames[:, -1].tolist(), strict=True)), {})
+        if frames.shape[1] > LAST_OBSERVED + 1:
             raise self._error(
-                f"frame {frames[-1]} comes after the observed part, whose last frame is "
-                f"{LAST_OBSERVED}; leave it out, or add readout={_FULL!r} to the file"
+                f"{frames.shape[1]} time steps are more than the {LAST_OBSERVED + 1} observed "
+                "frames; put tokens of one time into one row of features"
             )
-        if readout == _OBSERVED and len(frames) > LAST_OBSERVED + 1:
+
+    def _check_last(self, found: Mapping[str, int], allowed: Mapping[str, int]) -> None:
+        """Raise `BadInputError` for a last frame of a trial that is later than the allowed one."""
+        for name, frame in found.items():
+            last = allowed.get(name, LAST_OBSERVED)
+            if frame <= last:
+                continue
+            of_all = last == LAST_OBSERVED
+            where = "" if of_all else f" of {name!r}"
+            instead = f"add readout={_FULL!r} to the file"
+            if not of_all:
+                instead = "let the file have a row of frames for each trial"
             raise self._error(
-                f"{len(frames)} time steps are more than the {LAST_OBSERVED + 1} observed frames; "
-                "put tokens of one time into one row of features"
+                f"frame {frame} comes after the observed part{where}, whose last frame is {last}; "
+                f"leave it out, or {instead}"
             )
 
     def _key(self, name: str) -> str:
@@ -191,7 +214,11 @@ class FeatureTable(Model):
         return BadInputError(f"features {self.path}: {what}")
 
     def check_trials(self, needed: Collection[str], known: Collection[str]) -> None:
-        """Raise `BadInputError` for trials without features, and for features of no trial."""
+        """Raise `BadInputError` for trials without features, and for features of no trial.
+
+        A mapping ``needed`` says the last frame of each trial that may be seen; a later one is
+        refused too.
+        """
         missing = sorted(trial for trial in needed if self._key(trial) not in self.rows)
         if missing:
             raise self._error(
@@ -204,6 +231,9 @@ class FeatureTable(Model):
                 f"{len(unknown)} of {len(self.rows)} names are unknown to the dataset, such as "
                 f"{unknown[0]!r}; leave them out, or choose the dataset that was encoded"
             )
+        if isinstance(needed, Mapping) and self.frames and not self.answers:
+            last = {trial: int(self._last[self.rows[trial]]) for trial in needed}
+            self._check_last(last, needed)
 
     def of_trials(self, trials: Collection[str]) -> FeatureTable:
         """Return the table of these trials only, as far as it has them."""

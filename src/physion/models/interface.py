@@ -366,8 +366,8 @@ class Model:
     def check_trials(self, needed: Collection[str], known: Collection[str]) -> None:
         """Raise `BadInputError` if a model knows trials by name, and does not know these.
 
-        ``needed``: names of the trials that are tested or fit a readout; ``known``: of all trials
-        of the dataset.
+        ``needed``: by name of the trials that are tested or fit a readout the last frame that may
+        be seen; ``known``: names of all trials of the dataset.
         """
 
     def built_as(self) -> dict[str, Any]:

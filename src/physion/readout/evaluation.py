@@ -16,7 +16,7 @@ from typing import Any
 
 import pandas as pd
 
-from physion.clips.batch import Provenance
+from physion.clips.batch import LAST_OBSERVED, Provenance
 from physion.compute.tasks import Executor, Progress, tracked
 from physion.core.errors import BadInputError
 from physion.core.files import digest_path, is_whole, json_digest
@@ -311,7 +311,9 @@ class _Evaluate:
         evaluated = dataclasses.replace(evaluated, warnings=warnings)
         if done:
             return evaluated
-        needed = {trial for split in splits for trial in (*split.fit, *split.test)}
+        used = {trial for split in splits for trial in (*split.fit, *split.test)}
+        needed = dict.fromkeys(sorted(used), LAST_OBSERVED)
+        needed |= rules.last_frames(index[index["trial"].isin(used)])
         ask(model, "check_trials")(needed, self.dataset.known_trials())
         predictor = Predictor(
             self.dataset,
