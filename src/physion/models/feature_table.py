@@ -187,9 +187,9 @@ class FeatureTable(Model):
                 "frames; put tokens of one time into one row of features"
             )
 
-    def _check_last(self, found: Mapping[str, int], allowed: Mapping[str, int]) -> None:
+    def _check_last(self, frames: Mapping[str, int], allowed: Mapping[str, int]) -> None:
         """Raise `BadInputError` for a last frame of a trial that is later than the allowed one."""
-        for name, frame in found.items():
+        for name, frame in frames.items():
             last = allowed.get(name, LAST_OBSERVED)
             if frame <= last:
                 continue
