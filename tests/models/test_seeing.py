@@ -304,7 +304,7 @@ def test_what_stands_on_something_still_does_with_other_sizes() -> None:
         )
         for row, frame in enumerate((0, 2))
     }
-    found = resting_scene(pictures, [1, 2, 3, 4], ERROR)
+    found = resting_scene(pictures, [1, 2, 3, 4], ERROR, {})
     numbers = {name: int(n) for name, n in zip(made.names(), object_ids(made)[1:], strict=True)}
     lower, upper = numbers["lower"], numbers["upper"]
     assert (found[lower].support, found[upper].support) == (2, lower)

@@ -35,6 +35,7 @@ from physion.core.errors import PhysionError
 from physion.core.seeds import generator
 from physion.models.noisy_simulation import ObservedTrial
 from physion.models.seeing.bodies import moved_with
+from physion.models.seeing.expected import expect
 from physion.models.seeing.masks import MaskFit
 from physion.models.seeing.pixels import Rays, picture_of
 from physion.models.seeing.resting import (
@@ -228,11 +229,12 @@ def see_uncertain(
         As `scenes.see_trial`.
     """
     numbers = numbers_of(ids)
+    depth, expected = expect(frames, ids, depth, camera)
     pictures = {
         int(frame): uncertain_frame(picture_of(ids[row], depth[row], camera), error)
         for row, frame in enumerate(frames)
     }
-    objects = resting_scene(pictures, numbers, error)
+    objects = resting_scene(pictures, numbers, error, expected)
     notes = [
         f"object {one.number} is first fitted in frame {one.frame}"
         for one in objects.values()

@@ -23,7 +23,7 @@ differences for derivatives.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -52,6 +52,16 @@ FEW = 140
 """Rays of the search over starts."""
 SIMPLER = 0.0008
 """Cost by which a shape must fit better than one that comes before it in the library."""
+TRUST = 4.0
+"""Weight of residuals of what is expected: those of rays are many, and not independent."""
+LIKELY = 0.04
+"""Cost of a shape whose probability is less by a factor of e."""
+LEAST_LIKELY = -4.5
+"""Log probability of a shape that is tried."""
+UNKNOWN = 1e6
+"""Standard deviation of what is not known."""
+LEAST_SIZE = 1e-3
+"""Metres, for logarithms."""
 UPRIGHT_COST = 0.09
 """Cost above which an upright shape does not fit."""
 NOT_UPRIGHT = 0.02
@@ -173,6 +183,62 @@ def traced(placed: Placed, rays: Rays) -> tuple[F64, F64]:
     return entries, out
 
 
+Normal = tuple[float, float]
+"""Mean and standard deviation."""
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """What is expected of an object before it is fitted.
+
+    - ``factor_error``: standard deviation of ln(s). ``shapes``: log probability by name.
+    - ``low``: height of the lower end in the first frame, metres; ``height``, ``wide`` and
+      ``narrow``: logarithms of its height and of the sides of the box around it, metres.
+    - ``middle``: place (3,) in the world and standard deviations (3,) along ``axes`` (3, 3); None
+      if it is not seen.
+    """
+
+    factor_error: float
+    shapes: Mapping[str, float]
+    low: Normal
+    height: Normal
+    wide: Normal
+    narrow: Normal
+    axes: F64
+    middle: tuple[F64, F64] | None
+
+    def in_another_frame(self) -> Expected:
+        """Return what is expected where only sizes and shape are the same."""
+        return replace(self, low=(0.0, UNKNOWN), middle=None)
+
+    def residuals(self, placed: Placed, *, flat: bool, stands: bool) -> list[float]:
+        """Return residuals of a solid.
+
+        ``flat``: its height is given. ``stands``: so is its lower end.
+        """
+        corners = placed.corners()
+        sides = np.sort(np.ptp(corners[:, :2], axis=0))
+        found = [
+            _gap(math.log(max(sides[1], LEAST_SIZE)), self.wide),
+            _gap(math.log(max(sides[0], LEAST_SIZE)), self.narrow),
+        ]
+        if self.middle is not None:
+            apart = self.axes.T @ (placed.middle() - self.middle[0])
+            found += [_gap(d, (0.0, e)) for d, e in zip(apart, self.middle[1], strict=True)]
+        low, high = placed.extent_z()
+        if not flat:
+            found.append(_gap(math.log(max(high - low, LEAST_SIZE)), self.height))
+            if not stands:
+                found.append(_gap(low, self.low))
+        return found
+
+
+def _gap(value: float, expected: Normal) -> float:
+    """Return how far a value is from what is expected; more than six deviations count less."""
+    r = (value - expected[0]) / expected[1]
+    return float(TRUST * r / math.sqrt(1 + (r / 6) ** 2))
+
+
 @dataclass(eq=False)
 class MaskFit:
     """Fit of one solid to the rays of a frame, near a start.
@@ -195,6 +261,7 @@ class MaskFit:
     factor: float = 0.0
     factor_error: float | None = None
     edge: float = EDGE
+    expected: Expected | None = None
     start: Placed = field(init=False)
     values: F64 = field(init=False)
 
@@ -241,7 +308,14 @@ class MaskFit:
         ahead = WEIGHT * np.where(np.isnan(entries[on]), 0.0, ahead) / (error * seen)
         edges = out / self.edge
         logs = np.log(placed.scale)
-        prior = [(factor - self.factor) / (self.factor_error or error)]
+        known = self.factor_error or error
+        if self.expected is not None and not self.factor_error:
+            known = self.expected.factor_error / TRUST
+        prior = [(factor - self.factor) / known]
+        if self.expected is not None and self.sizes != "given":
+            flat, stands = self.sizes == "flat", self.rest is not None
+            prior += self.expected.residuals(placed, flat=flat, stands=stands)
+        logs = np.log(placed.scale)
         if self.sizes == "flat":
             prior.append(logs[0] - logs[1])
         elif self.sizes == "free":
@@ -391,7 +465,11 @@ def _first(fits: Iterable[tuple[float, MaskFit]], count: int) -> list[MaskFit]:
 
 
 def find_shape(
-    rays: Rays, error: float, rest: float | None = None, known: Placed | None = None
+    rays: Rays,
+    error: float,
+    rest: float | None = None,
+    known: Placed | None = None,
+    expected: Expected | None = None,
 ) -> MaskFit:
     """Return the fit of the shape of the library that explains rays best.
 
@@ -408,14 +486,20 @@ def find_shape(
         fits as well as before.
     """
     few, ranked, ranks = rays.first(FEW), [], [each.name for each in library()]
+    likely = list(library())
+    if expected is not None:
+        likely = [each for each in likely if expected.shapes[each.name] > LEAST_LIKELY]
 
     def rank(one: MaskFit) -> float:
-        return one.placed.cost + SIMPLER * ranks.index(one.placed.solid.name)
+        name = one.placed.solid.name
+        if expected is not None:
+            return one.placed.cost - LIKELY * expected.shapes[name]
+        return one.placed.cost + SIMPLER * ranks.index(name)
 
     def polished(starts: Iterable[MaskFit], steps: int = 12) -> list[MaskFit]:
         fits = []
         for each in starts:
-            fits.append(MaskFit(rays, error, rest, each.upright))
+            fits.append(MaskFit(rays, error, rest, each.upright, expected=expected))
             fits[-1].solve(each.placed, steps)
         return fits
 
@@ -424,11 +508,11 @@ def find_shape(
         if known is not None and known.solid is each:
             starts.append(standing(known, rest or 0.0))
             starts.append(drawn_nearer(known, rays.origin, rest or 0.0))
-        trial = MaskFit(few, error, rest)
+        trial = MaskFit(few, error, rest, expected=expected)
         starts.sort(key=trial.cost)
         fits = []
         for start in starts[:most]:
-            one = MaskFit(few, error, rest)
+            one = MaskFit(few, error, rest, expected=expected)
             one.solve(start, 8)
             fits.append((rank(one), one))
         return fits
@@ -438,7 +522,7 @@ def find_shape(
         if found[0].placed.cost < 1.3 * known.cost + 0.01:
             return found[0]
         ranked += searched(known.solid, 4, 8)
-    for each in library():
+    for each in likely:
         ranked += searched(each, 3, 2)
     best = polished(_first(ranked, 4))
     if min(map(rank, best)) > UPRIGHT_COST / 1.5:
@@ -446,16 +530,16 @@ def find_shape(
             best += polished(_first(searched(near.placed.solid, 6, 6), 1))
     if rest is None and min(map(rank, best)) > UPRIGHT_COST:
         turned = []
-        for each in library():
+        for each in likely:
             for start in _any_rotation(each, rays):
-                one = MaskFit(few, error, None, False)
+                one = MaskFit(few, error, None, False, expected=expected)
                 one.solve(start, 4)
                 turned.append((rank(one), one))
         best += polished(_first(turned, 4), 20)
     return min(best, key=lambda one: rank(one) + NOT_UPRIGHT * (not one.upright))
 
 
-def find_plate(rays: Rays, error: float) -> MaskFit:
+def find_plate(rays: Rays, error: float, expected: Expected | None = None) -> MaskFit:
     """Return the fit of a flat target on the floor: a plate or a ring of the height `PLATE`."""
     fits = []
     for name in ("cube", "torus"):
@@ -471,14 +555,18 @@ def find_plate(rays: Rays, error: float) -> MaskFit:
                 wide = replace(upright, scale=scale)
                 wide = moved_with(wide, upright.middle() + part * away - wide.middle())
                 starts.append(standing(wide, 0.0))
-            coarse = MaskFit(few, error, 0.0, sizes="flat", edge=COARSE[0])
+            coarse = MaskFit(few, error, 0.0, sizes="flat", expected=expected, edge=COARSE[0])
             for start in sorted(starts, key=coarse.cost)[:2]:
                 for edge in COARSE:
-                    start = MaskFit(few, error, 0.0, sizes="flat", edge=edge).solve(start, 12)
+                    start = MaskFit(
+                        few, error, 0.0, sizes="flat", expected=expected, edge=edge
+                    ).solve(start, 12)
                 tried.append(start)
         tried.sort(key=lambda placed: placed.cost)
         for start in tried[:2]:
-            fits.append(MaskFit(rays, error, 0.0, sizes="flat"))
+            fits.append(MaskFit(rays, error, 0.0, sizes="flat", expected=expected))
             fits[-1].solve(start, 15)
     rings = [NOT_UPRIGHT / 2 * (one.placed.solid.name == "torus") for one in fits]
+    if expected is not None:
+        rings = [-LIKELY * expected.shapes[one.placed.solid.name] for one in fits]
     return min(zip(fits, rings, strict=True), key=lambda pair: pair[0].placed.cost + pair[1])[0]

@@ -12,6 +12,7 @@ something else explains it much better.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,7 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.clips.batch import PATIENT_ID, SCENERY_ID
-from physion.models.seeing.masks import MaskFit, drawn_nearer, find_plate, find_shape, standing
+from physion.models.seeing.masks import (
+    Expected,
+    MaskFit,
+    drawn_nearer,
+    find_plate,
+    find_shape,
+    standing,
+)
 from physion.models.seeing.pixels import LEAST_PIXELS, Rays, SeenFrame
 from physion.models.seeing.scenes import CLEAR_PIXELS, RAMP, VESSELS
 from physion.models.seeing.solids import Placed
@@ -38,6 +46,8 @@ WORSE, MARGIN = 1.5, 12.0
 """Factor and summand of the sum of squares up to which an object is taken to stand on something."""
 NOT_ABOVE = 50.0
 """Sum of squares that is added if it is then no longer above it."""
+NOT_FLAT = 0.05
+"""Expected height in metres above which a patient is no plate."""
 POOR_PLATE = 0.1
 """Cost of a plate above which a patient may be something else."""
 
@@ -98,7 +108,10 @@ class Resting:
 
 
 def resting_scene(
-    pictures: Mapping[int, UncertainFrame], numbers: Sequence[int], error: float
+    pictures: Mapping[int, UncertainFrame],
+    numbers: Sequence[int],
+    error: float,
+    expected: Mapping[int, Expected],
 ) -> dict[int, Resting]:
     """Return the objects by number, those below before those above.
 
@@ -110,6 +123,8 @@ def resting_scene(
         Of the objects.
     error
         Relative error of depth.
+    expected
+        What is expected of the objects in the first frame, by number.
     """
     first = min(pictures)
     alone = []
@@ -120,24 +135,28 @@ def resting_scene(
         rays = pictures[frame].rays(number) if pixels[frame] >= LEAST_PIXELS else None
         if rays is None:
             continue
-        alone.append(Resting(number, frame, rays, _alone(number, rays, error)))
+        told = expected.get(number)
+        if told is not None and frame != first:
+            told = told.in_another_frame()
+        alone.append(Resting(number, frame, rays, _alone(number, rays, error, told)))
     alone.sort(key=lambda one: (not _plate(one), one.placed.extent_z()[0]))
     found: list[Resting] = []
     for one in alone:
         if not _plate(one) and (one.frame == first or one.fit.upright):
-            _stand(one, found, error)
+            _stand(one, found, error, one.fit.expected)
         found.append(one)
     return {one.number: one for one in found}
 
 
-def _alone(number: int, rays: Rays, error: float) -> MaskFit:
+def _alone(number: int, rays: Rays, error: float, expected: Expected | None) -> MaskFit:
     """Return the fit of an object by itself."""
-    if number != PATIENT_ID:
-        return find_shape(rays, error)
-    plate = find_plate(rays, error)
+    tall = expected is not None and expected.height[0] > math.log(NOT_FLAT)
+    if number != PATIENT_ID or tall:
+        return find_shape(rays, error, expected=expected)
+    plate = find_plate(rays, error, expected)
     if plate.placed.cost < POOR_PLATE:
         return plate
-    other = find_shape(rays, error)
+    other = find_shape(rays, error, expected=expected)
     return other if other.placed.cost < plate.placed.cost / 2 else plate
 
 
@@ -145,7 +164,9 @@ def _plate(one: Resting) -> bool:
     return one.fit.sizes == "flat"
 
 
-def _stand(one: Resting, others: Sequence[Resting], error: float) -> None:
+def _stand(
+    one: Resting, others: Sequence[Resting], error: float, expected: Expected | None
+) -> None:
     """Fit an object again on what explains it best, if anything does nearly as well."""
     placed = one.placed
     low, middle = placed.extent_z()[0], float(placed.middle()[2])
@@ -179,6 +200,14 @@ def _stand(one: Resting, others: Sequence[Resting], error: float) -> None:
     levels = [
         (level, number) for level, number in levels if not any(0 < t - level < THIN for t in tops)
     ]
+    if expected is not None:
+        levels = [
+            (level, number)
+            for level, number in levels
+            if abs(level - expected.low[0]) < max(0.04, 4 * expected.low[1])
+        ]
+        if not levels:
+            return
     if not one.fit.upright:
         level, number = min(levels, key=lambda pair: abs(low - pair[0]))
         distance = float(np.median(one.rays.depth[one.rays.on]))
@@ -192,7 +221,7 @@ def _stand(one: Resting, others: Sequence[Resting], error: float) -> None:
         lower = LOWER if placed.solid.name == "cylinder" else HIGHER
         if not -HIGHER < low - level < lower:
             continue
-        fit = find_shape(one.rays, error, level, placed)
+        fit = find_shape(one.rays, error, level, placed, expected)
         squares = fit.placed.cost * len(one.rays.depth)
         if number is not None and not above(fit.placed, by_number[number].placed):
             squares += NOT_ABOVE

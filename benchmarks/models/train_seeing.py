@@ -1,0 +1,298 @@
+"""Train the network of what is expected of objects, of `seeing-simulation` with errors of depth.
+
+    physion generate TRIALS --full --no-movies
+    OMP_NUM_THREADS=1 python benchmarks/models/train_seeing.py FOLDER --trials TRIALS
+        [--count 16000] [--steps 24000] [--write]
+
+Of own rigid trials the frames that the network sees are rendered, each object's depth gets an
+error, and tokens and true values are stored in FOLDER, 1,000 trials a file; the same command
+resumes. In the training each object gets another error in every step, and trials are mirrored at
+random. 700 trials train nothing. Printed are, on them, the error of the depth of objects that
+move, before and after, and how many shapes are right. --write puts the weights into the package,
+with a card.
+
+Trials with the scene of an official one are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import time
+from collections.abc import Set
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import save_file
+from torch import Tensor
+from torch.nn import functional
+
+from physion import Dataset
+from physion.clips.batch import SCENERY_ID, Motion
+from physion.clips.rendered import MotionRenderer, object_ids
+from physion.compute.tasks import processor
+from physion.core.names import RIGID
+from physion.core.seeds import generator
+from physion.data.official import official
+from physion.models.seeing.expected import (
+    CROP,
+    ERROR,
+    FRAMES,
+    MEASURED,
+    MOST,
+    VALUES,
+    ExpectationNetwork,
+    frames_of,
+    tokens_of,
+)
+from physion.models.seeing.solids import Placed, library, solid
+from physion.numerics.rotations import rotation_matrices
+from physion.trials.trial_file import Trial
+
+SHIPPED = Path(__file__).parents[2] / "src/physion/data/seeing"
+SHAPES = [each.name for each in library()]
+PART, HELD_OUT, BATCH, SIZE = 1000, 700, 64, 256
+RATE = 3e-3
+"""Largest learning rate, of one cycle."""
+WEIGHTS = {"values": 0.15, "shape": 0.3, "middle": 0.2}
+"""Of the losses, besides that of the depth."""
+
+
+def told(scene: Any, path: Any, numbers: Any, errors: Any, tokens: Any) -> NDArray[np.float32]:
+    """Return the true values (K, 10) of objects, NaN of those that are no shape of the library.
+
+    Error of depth, lower end, height, sides, number of the shape, whether it stays, and its middle
+    along the axes of the camera.
+    """
+    known = object_ids(scene)[1:].tolist()
+    rows = np.full((len(numbers), 10), np.nan, np.float32)
+    for row, number in enumerate(numbers):
+        i = known.index(number)
+        body = scene.bodies[i]
+        rows[row, 0], rows[row, 6] = errors[number], body.kinematic
+        if body.shape not in SHAPES:
+            continue
+        turn = rotation_matrices(path.rotations[0, i : i + 1].astype(float))[0]
+        place = path.positions[0, i].astype(float)
+        placed = Placed(solid(body.shape), place, turn, np.array(body.scale, float))
+        low, high = placed.extent_z()
+        sides = np.ptp(placed.corners()[:, :2], axis=0)
+        rows[row, 1:5] = low, high - low, sides.max(), sides.min()
+        rows[row, 5] = SHAPES.index(body.shape)
+        rows[row, 7:] = tokens.axes.T @ (placed.middle() - tokens.origin)
+    return rows
+
+
+def tokens_of_trial(name: str, path: Path, known: Set[str]) -> tuple[Any, ...] | None:
+    """Return numbers, true values and height of the camera of a trial; None if it shows nothing.
+
+    ``known``: digests of the physics of trials that are left out.
+    """
+    trial = Trial.open(path)
+    if trial.scene.physics_digest() in known:
+        return None
+    scene, motion = trial.scene, Motion(trial.scene, trial.trajectory)
+    reader = MotionRenderer(
+        {name: motion}, ("ids", "depth", "camera"), SIZE, 1, {name: "redyellow"}
+    )
+    shown = reader.read(name, np.array(FRAMES))
+    rng = generator("seeing", "errors of depth", name)
+    ids, depth = (
+        shown["ids"],
+        shown["depth"] * (1 + ERROR * rng.standard_normal(shown["depth"].shape)),
+    )
+    errors = {}
+    for number in np.unique(ids[ids != SCENERY_ID]).tolist():
+        factor = 1 + ERROR * rng.standard_normal()
+        depth[ids == number] *= factor
+        errors[number] = np.log(factor)
+    tokens = tokens_of(ids, depth, shown["camera"])
+    if not tokens.numbers:
+        return None
+    true = told(scene, trial.trajectory, tokens.numbers, errors, tokens)
+    return tokens.values, true, scene.camera.position[2]
+
+
+def make(folder: Path, dataset: Dataset, count: int) -> None:
+    """Store the tokens of ``count`` trials, one of each scenario in turn."""
+    index = dataset.index
+    known = {trial.scene.physics_digest() for trial in official().trials}
+    index = index[index["scenario"].isin(RIGID) & (index["split"] != "familiarization")]
+    order = index.groupby("scenario").cumcount()
+    names = index.assign(order=order).sort_values(["order", "scenario"])["trial"].tolist()[:count]
+    files = dataset.files("trial_file")
+    for start in range(0, len(names), PART):
+        path = folder / f"tokens-{start}.npz"
+        if path.exists():
+            continue
+        made = [
+            tokens_of_trial(name, files[name].path, known) for name in names[start : start + PART]
+        ]
+        rows = [one for one in made if one is not None]
+        values = np.zeros((len(rows), MOST, VALUES), np.float16)
+        true = np.full((len(rows), MOST, 10), np.nan, np.float32)
+        for row, (seen, expected, _) in enumerate(rows):
+            values[row, : len(seen)], true[row, : len(seen)] = seen, expected
+        kept = folder / "part.npz"
+        np.savez(
+            kept, values=values, true=true, height=np.array([one[2] for one in rows], np.float32)
+        )
+        kept.rename(path)
+        print(f"{datetime.datetime.now():%H:%M:%S} {start + len(made)} of {len(names)}", flush=True)
+
+
+def with_errors(values: Tensor, change: Tensor, height: Tensor) -> Tensor:
+    """Return numbers of objects whose logarithm of depth is changed (B, K)."""
+    frames, factor = frames_of(values).clone(), torch.exp(change)[..., None]
+    seen = frames[..., 0] > 0
+    frames[..., 1:3] *= factor[..., None]
+    frames[..., 4] = torch.where(
+        seen, ((frames[..., 4] + 1) / factor - 1).clamp(-1, 1), frames[..., 4]
+    )
+    camera = torch.zeros(len(values), 1, 1, 3)
+    camera[..., 2] = height[:, None, None]
+    moved = camera + (frames[..., 6:9] - camera) * factor[..., None]
+    frames[..., 6:9] = torch.where(seen[..., None], moved, frames[..., 6:9])
+    frames[..., 9:24] *= factor[..., None]
+    return torch.cat([frames.flatten(-2), values[..., frames.shape[-2] * frames.shape[-1] :]], -1)
+
+
+def mirrored(values: Tensor) -> Tensor:
+    """Return numbers of objects in the mirror image of trials.
+
+    Whether something is cut off on the left stays, since it is not known for the right.
+    """
+    frames = frames_of(values).clone()
+    frames[..., 7] *= -1
+    frames[..., 10], frames[..., 13] = -frames[..., 13], -frames[..., 10].clone()
+    for first in (15, 24):
+        cells = frames[..., first : first + 9].reshape(*frames.shape[:-1], 3, 3)
+        frames[..., first : first + 9] = cells.flip(-1).flatten(-2)
+    start = frames.shape[-2] * frames.shape[-1]
+    masks = values[..., start:-2].reshape(*values.shape[:-1], 2, CROP, CROP).flip(-1).flatten(-3)
+    return torch.cat([frames.flatten(-2), masks, values[..., -2:]], -1)
+
+
+def losses(out: Tensor, values: Tensor, true: Tensor, there: Tensor) -> Tensor:
+    """Return the loss: negative logarithms of normal densities, and the cross entropy of shapes."""
+    sizes = torch.log(true[..., 2:5].clamp(min=0.005))
+    wanted = torch.cat([true[..., :1] / ERROR, true[..., 1:2], sizes], -1)
+    known = there & torch.isfinite(true[..., 5])
+    means, logs = out[..., : 2 * MEASURED : 2], out[..., 1 : 2 * MEASURED : 2].clamp(-5, 3)
+    density = logs + 0.5 * ((wanted.nan_to_num() - means) * torch.exp(-logs)) ** 2
+    depth = density[..., 0][there].mean()
+    rest = density[..., 1:][known].sum(-1).mean()
+    logits = out[..., 2 * MEASURED : -6][known]
+    shape = functional.cross_entropy(logits, true[..., 5][known].long())
+    frames = frames_of(values)
+    first = (frames[..., 0] > 0).float().argmax(-1)[..., None, None]
+    seen = known & (frames[..., 0] > 0).any(-1)
+    centroid = frames[..., 6:9].gather(2, first.expand(*first.shape[:2], 1, 3))[:, :, 0]
+    logs = out[..., -5::2][seen].clamp(-6, 3)
+    apart = (true[..., 7:] - centroid)[seen] - out[..., -6::2][seen]
+    middle = (logs + 0.5 * (apart * torch.exp(-logs)) ** 2).sum(-1).mean()
+    total: Tensor = (
+        depth + WEIGHTS["values"] * rest + WEIGHTS["shape"] * shape + WEIGHTS["middle"] * middle
+    )
+    return total
+
+
+def train(folder: Path, steps: int) -> tuple[ExpectationNetwork, str]:
+    """Return the trained network, and its errors on held-out trials as text."""
+    parts = [np.load(path) for path in sorted(folder.glob("tokens-*.npz"))]
+    values, true, height = (
+        torch.from_numpy(np.concatenate([part[name] for part in parts]).astype(np.float32))
+        for name in ("values", "true", "height")
+    )
+    there = torch.isfinite(true[..., 0])
+    rng = generator("seeing", "training")
+    order = rng.permutation(len(values))
+    held, fit = order[:HELD_OUT], order[HELD_OUT:]
+    torch.manual_seed(0)
+    network = ExpectationNetwork()
+    frames = frames_of(values[fit][there[fit]]).flatten(-2)
+    network.mean.copy_(frames.mean(0))
+    network.sd.copy_(frames.std(0).clamp(1e-3))
+    optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=0.01)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, steps, pct_start=0.1)
+
+    def batch_of(rows: Any, mirror: bool) -> tuple[Tensor, Tensor, Tensor]:
+        new = ERROR * torch.from_numpy(rng.standard_normal((len(rows), MOST))).float()
+        expected = true[rows].clone()
+        seen = with_errors(values[rows], new - expected[..., 0].nan_to_num(), height[rows])
+        expected[..., 0] = torch.where(there[rows], new, expected[..., 0])
+        if mirror:
+            chosen = torch.from_numpy(rng.random(len(rows)) < 0.5)
+            seen = torch.where(chosen[:, None, None], mirrored(seen), seen)
+            expected[chosen, :, 8] *= -1
+        return seen, expected, there[rows]
+
+    start = time.process_time()
+    for step in range(1, steps + 1):
+        seen, expected, known = batch_of(rng.choice(fit, BATCH), True)
+        loss = losses(network(seen, known), seen, expected, known)
+        optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimizer.step()
+        schedule.step()
+        if step % 1000 == 0:
+            print(f"{datetime.datetime.now():%H:%M:%S} step {step}: loss {loss:.3f}", flush=True)
+    seconds = time.process_time() - start
+    network.eval()
+    with torch.no_grad():
+        seen, expected, known = batch_of(held, False)
+        out = network(seen, known)
+    loss = losses(out, seen, expected, known)
+    moving = known & (expected[..., 6] == 0)
+    shaped = moving & torch.isfinite(expected[..., 5])
+    left = ERROR * out[..., 0] - expected[..., 0]
+    right = (out[..., 2 * MEASURED : -6].argmax(-1) == expected[..., 5])[shaped].float().mean()
+    before, after = expected[..., 0][moving], left[moving]
+    text = (
+        f"{len(fit)} trials, {steps} steps of {BATCH}, {seconds:.0f} s of processor time. On "
+        f"{len(held)} other trials: loss {loss:.3f}; error of depth of movable objects, root mean "
+        f"square {before.square().mean().sqrt():.4f} before and {after.square().mean().sqrt():.4f} "
+        f"after, median {before.abs().median():.4f} and {after.abs().median():.4f}; shapes right "
+        f"{right:.3f}"
+    )
+    return network, text
+
+
+def main() -> None:
+    """Make what is missing, train, and write the weights."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--trials", type=Path, help="folder of own trials; else only those stored")
+    parser.add_argument("--count", type=int, default=16000)
+    parser.add_argument("--steps", type=int, default=24000)
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    options.folder.mkdir(parents=True, exist_ok=True)
+    if options.trials is not None:
+        make(options.folder, Dataset(options.trials), options.count)
+    if not options.steps:
+        return
+    network, text = train(options.folder, options.steps)
+    print(text)
+    if options.write:
+        SHIPPED.mkdir(exist_ok=True)
+        halves = {name: value.half() for name, value in network.state_dict().items()}
+        save_file(halves, SHIPPED / "expected.safetensors")
+        command = "python benchmarks/models/train_seeing.py FOLDER --trials TRIALS --write"
+        lines = [
+            "# What is expected of objects", "",
+            "Network of `physion.models.seeing.expected`, rounded to float16.", "",
+            f"`{command}`, {datetime.date.today()}, {processor()}, one thread: {text}.",
+        ]  # fmt: skip
+        (SHIPPED / "expected.md").write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()

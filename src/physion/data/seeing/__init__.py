@@ -1,0 +1,1 @@
+"""Readouts that ship, with a card for each."""
