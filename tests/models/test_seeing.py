@@ -367,7 +367,7 @@ def test_bad_input_says_what_is_wrong(rolling: Batch) -> None:
         model.imagine(replace(rolling, ids=many), 1, 0)
     with pytest.raises(BadInputError, match="at least one sample"):
         build_model("seeing-simulation", samples=0)
-    with pytest.raises(BadInputError, match=r"must be 0, or from 0.005 to 0.1, not 0.5"):
+    with pytest.raises(BadInputError, match=r"must be 0, or from 0.005 to 0.04, not 0.5"):
         build_model("seeing-simulation", depth_error=0.5)
 
 

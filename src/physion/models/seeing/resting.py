@@ -4,7 +4,8 @@ Depth with an error of 2 % is wrong by 8 cm at 4 m, but what stands on the floor
 says. From the bottom up, every object is fitted by itself, and then again on each thing that it may
 stand on: the floor, or the top of what is below its middle. It stays where it was, in the air, if
 nothing that it may stand on explains it nearly as well, and also inside a vessel and on a ramp,
-where the height at which it rests is not known.
+where the height at which it rests is not known. Where a height is expected (`expected`), it stands
+only on what is near that.
 
 Targets are flat in our presets and lie on the floor: a patient is a plate or a ring there unless
 something else explains it much better.

@@ -33,12 +33,12 @@ from physion.models.seeing.scenes import SeenTrial, see_trial
 from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine, simulate
 from physion.rendering.renderer import Renderer
 
-VERSION = 4
+VERSION = 5
 """To be raised with every change of the code that can alter a prediction."""
 KEPT = 16
 """Trials whose scenes are kept in memory, besides the last batch."""
-LEAST_ERROR, MOST_ERROR = 0.005, 0.1
-"""Relative errors of depth with which masks can be fitted."""
+LEAST_ERROR, MOST_ERROR = 0.005, 0.04
+"""Relative errors of depth; what is expected of objects was learned with 0.02."""
 SHOWN_SIZE = 128
 """Pixels per side of the pictures for the viewer."""
 
@@ -49,7 +49,8 @@ class SeeingSettings(NoiseLevels, ModelSettings):
 
     - ``samples``: simulations per trial. ``engine``: name of the engine. ``seed``: of the noise.
     - ``image_size``: pixels per side of the pictures that it sees.
-    - ``depth_error``: relative error that depth has; 0 for exact depth. With an error the observed
+    - ``depth_error``: relative error that depth has; 0 for exact depth. With an error a network
+      says what is expected of the objects (`physion.models.seeing.expected`), and the observed
       frames are simulated, too (`physion.models.seeing.hypotheses`).
     """
 
