@@ -263,7 +263,7 @@ class ExpectationNetwork(nn.Module):
 
 
 def frames_of(values: Tensor) -> Tensor:
-    """Return the numbers (..., T, `COLUMNS`) of frames from those of objects."""
+    """Return the numbers (B, K, T, `COLUMNS`) of frames in ``values`` (B, K, `VALUES`)."""
     numbers = values[..., : len(FRAMES) * COLUMNS]
     return numbers.reshape(*values.shape[:-1], len(FRAMES), COLUMNS)
 

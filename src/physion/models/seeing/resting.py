@@ -49,8 +49,8 @@ NOT_ABOVE = 50.0
 """Sum of squares that is added if it is then no longer above it."""
 NOT_FLAT = 0.05
 """Expected height in metres above which a patient is no plate."""
-POOR_PLATE = 0.1
-"""Cost of a plate above which a patient may be something else."""
+POOR_PLATE, UNEXPECTED = 0.1, 2.0
+"""Costs of a plate above which a patient may be something else, also something unexpected."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +157,8 @@ def _alone(number: int, rays: Rays, error: float, expected: Expected | None) -> 
     plate = find_plate(rays, error, expected)
     if plate.placed.cost < POOR_PLATE:
         return plate
+    if plate.placed.cost > UNEXPECTED:
+        expected = None  # Patients of the trials that trained the network are flat.
     other = find_shape(rays, error, expected=expected)
     return other if other.placed.cost < plate.placed.cost / 2 else plate
 
