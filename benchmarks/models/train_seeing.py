@@ -2,7 +2,7 @@
 
     physion generate TRIALS --full --no-movies
     OMP_NUM_THREADS=1 python benchmarks/models/train_seeing.py FOLDER --trials TRIALS
-        [--count 16000] [--steps 24000] [--write]
+        [--count 16000] [--steps 20000] [--write]
 
 Of own rigid trials the frames that the network sees are rendered, each object's depth gets an
 error, and tokens and true values are stored in FOLDER, 1,000 trials a file; the same command
@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 from torch.nn import functional
 
@@ -34,6 +34,7 @@ from physion import Dataset
 from physion.clips.batch import SCENERY_ID, Motion
 from physion.clips.rendered import MotionRenderer, object_ids
 from physion.compute.tasks import processor
+from physion.core.files import write_with_digest
 from physion.core.names import RIGID
 from physion.core.seeds import generator
 from physion.data.official import official
@@ -44,6 +45,7 @@ from physion.models.seeing.expected import (
     MEASURED,
     MOST,
     VALUES,
+    WEIGHTS,
     ExpectationNetwork,
     frames_of,
     tokens_of,
@@ -57,7 +59,7 @@ SHAPES = [each.name for each in library()]
 PART, HELD_OUT, BATCH, SIZE = 1000, 700, 64, 256
 RATE = 3e-3
 """Largest learning rate, of one cycle."""
-WEIGHTS = {"values": 0.15, "shape": 0.3, "middle": 0.2}
+SHARES = {"values": 0.15, "shape": 0.3, "middle": 0.2}
 """Of the losses, besides that of the depth."""
 
 
@@ -100,10 +102,8 @@ def tokens_of_trial(name: str, path: Path, known: Set[str]) -> tuple[Any, ...] |
     )
     shown = reader.read(name, np.array(FRAMES))
     rng = generator("seeing", "errors of depth", name)
-    ids, depth = (
-        shown["ids"],
-        shown["depth"] * (1 + ERROR * rng.standard_normal(shown["depth"].shape)),
-    )
+    ids = shown["ids"]
+    depth = shown["depth"] * (1 + ERROR * rng.standard_normal(ids.shape))
     errors = {}
     for number in np.unique(ids[ids != SCENERY_ID]).tolist():
         factor = 1 + ERROR * rng.standard_normal()
@@ -195,7 +195,7 @@ def losses(out: Tensor, values: Tensor, true: Tensor, there: Tensor) -> Tensor:
     apart = (true[..., 7:] - centroid)[seen] - out[..., -6::2][seen]
     middle = (logs + 0.5 * (apart * torch.exp(-logs)) ** 2).sum(-1).mean()
     total: Tensor = (
-        depth + WEIGHTS["values"] * rest + WEIGHTS["shape"] * shape + WEIGHTS["middle"] * middle
+        depth + SHARES["values"] * rest + SHARES["shape"] * shape + SHARES["middle"] * middle
     )
     return total
 
@@ -270,7 +270,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--trials", type=Path, help="folder of own trials; else only those stored")
     parser.add_argument("--count", type=int, default=16000)
-    parser.add_argument("--steps", type=int, default=24000)
+    parser.add_argument("--steps", type=int, default=20000)
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -284,7 +284,7 @@ def main() -> None:
     if options.write:
         SHIPPED.mkdir(exist_ok=True)
         halves = {name: value.half() for name, value in network.state_dict().items()}
-        save_file(halves, SHIPPED / "expected.safetensors")
+        write_with_digest(SHIPPED / WEIGHTS, save(halves))
         command = "python benchmarks/models/train_seeing.py FOLDER --trials TRIALS --write"
         lines = [
             "# What is expected of objects", "",

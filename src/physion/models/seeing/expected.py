@@ -26,10 +26,11 @@ from importlib.resources import as_file, files
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import load_file
+from safetensors.torch import load
 from torch import Tensor, nn
 
 from physion.clips.batch import AGENT_ID, PATIENT_ID, SCENERY_ID
+from physion.core.files import check_digest, file_sha256
 from physion.models.seeing.masks import Expected
 from physion.models.seeing.pixels import SeenFrame, picture_of
 from physion.models.seeing.solids import library
@@ -38,6 +39,8 @@ from physion.scenes.scene import FRAME_TIME, GRAVITY
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 
+FOLDER, WEIGHTS = "physion.data.seeing", "expected.safetensors"
+"""Package and file of the weights."""
 ERROR = 0.02
 """Relative error of depth in the training."""
 FRAMES = (0, 10, 20, 30, 38, 44)
@@ -272,9 +275,17 @@ def frames_of(values: Tensor) -> Tensor:
 def _network() -> ExpectationNetwork:
     """Return the network with the weights of the package."""
     network = ExpectationNetwork()
-    with as_file(files("physion.data.seeing") / "expected.safetensors") as path:
-        network.load_state_dict({name: v.float() for name, v in load_file(path).items()})
+    with as_file(files(FOLDER)) as folder:
+        content = (folder / WEIGHTS).read_bytes()
+        check_digest(folder / WEIGHTS, content, "install the package again")
+    network.load_state_dict({name: value.float() for name, value in load(content).items()})
     return network.eval()
+
+
+def weights_sha256() -> str:
+    """Return the SHA-256 of the weights of the package."""
+    with as_file(files(FOLDER)) as folder:
+        return file_sha256(folder / WEIGHTS)
 
 
 def expect(
@@ -285,11 +296,11 @@ def expect(
     Parameters
     ----------
     frames
-        (T,) numbers of the frames, with all of `FRAMES`.
+        (T,) numbers of the frames. Where one of `FRAMES` is missing, the nearest is taken.
     ids, depth, camera
         (T, H, W), (T, H, W) and (2, 4, 4), as in `physion.clips.batch.Batch`.
     """
-    rows = [list(frames).index(frame) for frame in FRAMES]
+    rows = [int(np.argmin(np.abs(np.array(frames) - frame))) for frame in FRAMES]
     tokens = tokens_of(ids[rows], np.asarray(depth, np.float64)[rows], camera)
     better, found = np.array(depth, np.float64), dict[int, Expected]()
     if not tokens.numbers:

@@ -8,7 +8,9 @@ standard deviations:
 - ray on the object that misses the solid:  g / S, with g the least distance from a piece, in
   metres, halfway between the planes that let the ray in and out
 - free ray:  d / S, with d the depth below the surface halfway along its way through the solid
-- ln(s) / E, and weak expectations of equal scales.
+- ln(s) / E, and weak expectations of equal scales. Where more is expected of the object
+  (`Expected`), the standard deviation of ln(s) is the one expected, and further residuals are the
+  differences of sizes, lower end and middle from what is expected, all times `TRUST`.
 
 S is `EDGE`, the precision of the border of a mask. W < 1, since errors of a surface are not
 independent from pixel to pixel. Residuals r of rays are limited, r / sqrt(1 + (r / L)^2), as masks
@@ -53,7 +55,8 @@ FEW = 140
 SIMPLER = 0.0008
 """Cost by which a shape must fit better than one that comes before it in the library."""
 TRUST = 4.0
-"""Weight of residuals of what is expected: those of rays are many, and not independent."""
+"""Weight of what is expected. There are hundreds of residuals of rays, whose errors are alike, so
+that they would count for too much."""
 LIKELY = 0.04
 """Cost of a shape whose probability is less by a factor of e."""
 LEAST_LIKELY = -4.5
@@ -246,6 +249,7 @@ class MaskFit:
     - ``error``: relative error of depth. ``factor_error``: of ln s, about ``factor``.
     - ``rest``: height of what the object stands on, metres; None if it is not known.
     - ``upright``: whether it only turns about the vertical.
+    - ``expected``: what is expected of the object, if anything is known.
     - ``sizes``: *free*, *flat* (the height is given) or *given*. ``edge``: standard deviation of
       borders; a larger one first, since far from them limited residuals have no slope.
 
@@ -307,7 +311,6 @@ class MaskFit:
         ahead = np.where(np.isnan(entries[on]), 0.0, entries[on] - seen * math.exp(factor))
         ahead = WEIGHT * np.where(np.isnan(entries[on]), 0.0, ahead) / (error * seen)
         edges = out / self.edge
-        logs = np.log(placed.scale)
         known = self.factor_error or error
         if self.expected is not None and not self.factor_error:
             known = self.expected.factor_error / TRUST

@@ -144,7 +144,7 @@ def resting_scene(
     found: list[Resting] = []
     for one in alone:
         if not _plate(one) and (one.frame == first or one.fit.upright):
-            _stand(one, found, error, one.fit.expected)
+            _stand(one, found, error)
         found.append(one)
     return {one.number: one for one in found}
 
@@ -167,11 +167,9 @@ def _plate(one: Resting) -> bool:
     return one.fit.sizes == "flat"
 
 
-def _stand(
-    one: Resting, others: Sequence[Resting], error: float, expected: Expected | None
-) -> None:
+def _stand(one: Resting, others: Sequence[Resting], error: float) -> None:
     """Fit an object again on what explains it best, if anything does nearly as well."""
-    placed = one.placed
+    placed, expected = one.placed, one.fit.expected
     low, middle = placed.extent_z()[0], float(placed.middle()[2])
     below = [
         other

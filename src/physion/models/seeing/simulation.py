@@ -28,6 +28,7 @@ from physion.models.noisy_simulation import (
     ObservedTrial,
     simulate_contacts,
 )
+from physion.models.seeing.expected import weights_sha256
 from physion.models.seeing.hypotheses import see_uncertain
 from physion.models.seeing.scenes import SeenTrial, see_trial
 from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine, simulate
@@ -143,10 +144,12 @@ class SeeingSimulation(Model):
         return self._engine
 
     def digest(self) -> str:
-        """Return the SHA-256 of code version, engine, noise and size of pictures."""
+        """Return the SHA-256 of code version, engine, noise, size of pictures, and weights."""
         settings = dataclasses.asdict(self.settings)
         levels = {field.name: settings[field.name] for field in dataclasses.fields(NoiseLevels)}
-        error = [self.settings.depth_error] if self.settings.depth_error else []
+        error = []
+        if self.settings.depth_error:
+            error = [self.settings.depth_error, weights_sha256()]
         size = self.settings.image_size
         return json_digest([VERSION, NOISE_VERSION, self.engine.name, levels, size, *error])
 
@@ -154,7 +157,7 @@ class SeeingSimulation(Model):
         """Return name and versions for the table of predictions."""
         return Provenance(
             model=self.settings.model,
-            init="none",
+            init=f"shipped:{weights_sha256()[:12]}" if self.settings.depth_error else "none",
             encoder_type="bodies fitted to true masks and depth",
             dynamics_type="physics engine",
             versions=f"{self.engine.name}, physion {__version__}",
