@@ -28,8 +28,6 @@ from physion.models.noisy_simulation import (
     ObservedTrial,
     simulate_contacts,
 )
-from physion.models.seeing.expected import weights_sha256
-from physion.models.seeing.hypotheses import see_uncertain
 from physion.models.seeing.scenes import SeenTrial, see_trial
 from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine, simulate
 from physion.rendering.renderer import Renderer
@@ -147,9 +145,7 @@ class SeeingSimulation(Model):
         """Return the SHA-256 of code version, engine, noise, size of pictures, and weights."""
         settings = dataclasses.asdict(self.settings)
         levels = {field.name: settings[field.name] for field in dataclasses.fields(NoiseLevels)}
-        error = []
-        if self.settings.depth_error:
-            error = [self.settings.depth_error, weights_sha256()]
+        error = [self.settings.depth_error, self._weights()] if self.settings.depth_error else []
         size = self.settings.image_size
         return json_digest([VERSION, NOISE_VERSION, self.engine.name, levels, size, *error])
 
@@ -157,11 +153,19 @@ class SeeingSimulation(Model):
         """Return name and versions for the table of predictions."""
         return Provenance(
             model=self.settings.model,
-            init=f"shipped:{weights_sha256()[:12]}" if self.settings.depth_error else "none",
+            init=f"shipped:{self._weights()[:12]}" if self.settings.depth_error else "none",
             encoder_type="bodies fitted to true masks and depth",
             dynamics_type="physics engine",
             versions=f"{self.engine.name}, physion {__version__}",
         )
+
+    @staticmethod
+    def _weights() -> str:
+        """Return the SHA-256 of the weights that fits with errors of depth need."""
+        # Imported late: it needs torch, which exact depth does not.
+        from physion.models.seeing.expected import weights_sha256
+
+        return weights_sha256()
 
     def _see(self, context: Batch, row: int) -> SeenTrial:
         """Return what is seen of a trial; the last ones are remembered."""
@@ -171,11 +175,14 @@ class SeeingSimulation(Model):
         if key not in self._seen:
             name, frames = context.trials[row], context.frames[row]
             error = self.settings.depth_error
-            self._seen[key] = (
-                see_uncertain([int(f) for f in frames], *arrays, error, self.engine)
-                if error
-                else see_trial(name, frames, *arrays)
-            )
+            if error:
+                # Imported late: it needs torch, which exact depth does not.
+                from physion.models.seeing.hypotheses import see_uncertain
+
+                numbers = [int(frame) for frame in frames]
+                self._seen[key] = see_uncertain(numbers, *arrays, error, self.engine)
+            else:
+                self._seen[key] = see_trial(name, frames, *arrays)
         return self._seen[key]
 
     def _pictures(self, trial: ObservedTrial | None, steps: int) -> Any:
