@@ -1,14 +1,14 @@
 """Make own trials and official stimuli in memory, and keep only what models of intuition see.
 
     OMP_NUM_THREADS=1 python benchmarks/models/intuition_trials.py FOLDER --trials 1000 [--official]
-    python benchmarks/models/intuition_trials.py FOLDER --trials 2000 --workers 16 --pixels 96
+    python benchmarks/models/intuition_trials.py FOLDER --stored TRIALS --models intuition-pixels
 
 A trial is sampled from the published configurations in turn, simulated until agent and patient
 touch, and drawn at the observed frames. Of trials with the digest of a training trial, without a
 contact in the observed part, and with agent and patient visible in the first frame, the features of
-all `MODELS` are written to FOLDER/own, in files of `EACH` trials; with --pixels the pictures and
-masks, and not what forests see. With --official the same of the stimuli that people saw goes to
-FOLDER/official; with --stored the trials of a dataset go to FOLDER/own. The same command continues.
+all `MODELS` are written to FOLDER/own, in files of `EACH` trials. With --official the same of the
+stimuli that people saw goes to FOLDER/official; with --stored the trials of a dataset go to
+FOLDER/own, but for those with the scene of an official one. The same command continues.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ from numpy.typing import NDArray
 
 from physion import Dataset
 from physion.clips.batch import Batch, Motion, Spec
-from physion.clips.rendered import object_ids
 from physion.clips.source import ObservedSource, TrialReaders
 from physion.clips.states import TrialMotions, cut_motion
 from physion.core.errors import BadSceneError
@@ -41,21 +40,20 @@ from physion.core.names import RIGID, SCENARIOS, canonical_name
 from physion.core.seeds import trial_seed
 from physion.data.official import official
 from physion.models.build import build_model, build_untrained
-from physion.models.intuition import mask_tokens
-from physion.models.intuition_pixels import SEEN
 from physion.physics.engine import make_engine
 from physion.physics.labels import label_contact
 from physion.readout.decisions import fraction_of_futures
 from physion.readout.folds import describe_fit
 from physion.readout.model_calls import is_network
-from physion.rendering.renderer import Renderer
-from physion.scenes.looks import in_look
 from physion.scenes.sampling.sample import load_presets, sample_scene
 from physion.scenes.scene import OBSERVED_FRAMES, Scene
 from physion.trials.making.choose import split_of
 from ship_readouts import Pictures
 
-MODELS = ("state-trees", "mask-trees", "blob-trees", "intuition-states", "intuition-masks")
+MODELS = (
+    "state-trees", "mask-trees", "blob-trees", "intuition-states", "intuition-masks",
+    "intuition-pixels",
+)  # fmt: skip
 EACH = 25
 """Trials of a file."""
 LOOK = "redyellow"
@@ -93,19 +91,14 @@ def encoder(name: str, **settings: Any) -> Any:
 
 @dataclass(frozen=True)
 class Kept:
-    """What is kept of trials: features of ``models``, or pictures of ``pixels`` a side."""
+    """What is kept of trials: features of ``models``."""
 
     folder: Path
     models: Sequence[str] = MODELS
-    pixels: int = 0
 
 
 def see(motion: Motion, kept: Kept) -> dict[str, NDArray[Any]]:
-    """Return the features of a motion by model; with ``pixels``, also pictures and masks.
-
-    Pictures and masks have ``pixels`` a side, and the frames that `intuition-pixels` looks at; then
-    only tokens of `intuition-states` and `intuition-masks` are made, and no features of forests.
-    """
+    """Return the features of a motion by model."""
     name = motion.scene.name
     motions, looks = {name: cut_motion(motion)}, {name: LOOK}
     drawn: dict[int, Pictures] = {}
@@ -125,23 +118,7 @@ def see(motion: Motion, kept: Kept) -> dict[str, NDArray[Any]]:
             found = model.encode(batch.to("cpu") if is_network(model) else batch)
         return np.asarray(found[0], np.float32)
 
-    if not (pixels := kept.pixels):
-        return {model: features(encoder(model)) for model in kept.models}
-    masks = encoder("intuition-masks", image_size=pixels)
-    frames = np.array(masks.spec.context_frames())
-    late = frames[list(SEEN)]
-    renderer = Renderer(in_look(motion.scene, LOOK), motion.trajectory, pixels, pixels)
-    numbers = object_ids(motion.scene)
-    shown = [
-        renderer.render(int(frame), ("color", "ids") if frame in late else ("ids",))
-        for frame in frames
-    ]
-    ids = numbers[np.stack([frame.ids for frame in shown])]  # type: ignore[misc]
-    return {
-        "intuition-states": features(encoder("intuition-states")),
-        "intuition-masks": mask_tokens(ids, masks.settings.objects).reshape(len(frames), -1),
-        "rgb": np.stack([shown[row].color for row in SEEN]), "ids": ids[list(SEEN)],
-    }  # fmt: skip
+    return {model: features(encoder(model)) for model in kept.models}
 
 
 def own_trial(scenario: str, number: int, kept: Kept) -> Seen:
@@ -220,12 +197,8 @@ def there(path: Path, kept: Kept) -> bool:
     if not path.exists():
         return False
     with np.load(path) as stored:
-        pictures = "rgb" in stored.files
-        missing = [name for name in kept.models if name not in stored.files]
-        if pictures != bool(kept.pixels) or (missing and not pictures):
-            raise SystemExit(f"{path} was made with other --models or --pixels; take a new FOLDER")
-        if pictures and stored["rgb"].shape[-2] != kept.pixels:
-            raise SystemExit(f"{path} has pictures of another size; take a new FOLDER")
+        if any(name not in stored.files for name in kept.models):
+            raise SystemExit(f"{path} was made with other --models; take a new FOLDER")
     return True
 
 
@@ -251,17 +224,38 @@ def make_official(kept: Kept, part: int) -> str:
     return ""
 
 
+@cache
+def opened(folder: Path) -> tuple[pd.DataFrame, TrialMotions, str]:
+    """Return the index, motions and digest of a dataset.
+
+    Without trials with a contact in the observed part.
+    """
+    dataset = Dataset(folder)
+    index = dataset.index[~dataset.index["observed_contact"].astype(bool)].set_index("trial")
+    motions = TrialMotions(dataset.files("trial_file"), observed=True)
+    return index, motions, describe_fit(dataset).split()[-1]
+
+
+@cache
+def official_digests() -> frozenset[str]:
+    """Return the digests of the physics of all official scenes."""
+    return frozenset(trial.scene.physics_digest() for trial in official().trials)
+
+
 def make_stored(dataset: Path, kept: Kept, part: int) -> str:
-    """Make one file of trials of a dataset, without those with a contact in the observed part."""
-    opened = Dataset(dataset)
-    digest = describe_fit(opened).split()[-1]
+    """Make one file of trials of a dataset, without those with the scene of an official one."""
+    index, motions, digest = opened(dataset)
     path = kept.folder / "own" / f"stored-{digest}-{part:04d}.npz"
     if not there(path, kept):
-        index = opened.index.set_index("trial")
-        index = index[~index["observed_contact"].astype(bool)].iloc[part * EACH : (part + 1) * EACH]
-        motions = TrialMotions(opened.files("trial_file"), observed=True)
-        rows = {str(trial): row for trial, row in index.iterrows()}
-        write(path, [stored_trial(trial, row, motions[trial], kept) for trial, row in rows.items()])
+        rows = index.iloc[part * EACH : (part + 1) * EACH].to_dict("index")
+        write(
+            path,
+            [
+                stored_trial(str(trial), row, motions[str(trial)], kept)
+                for trial, row in rows.items()
+                if motions[str(trial)].scene.physics_digest() not in official_digests()
+            ],
+        )
         return path.stem
     return ""
 
@@ -336,7 +330,6 @@ def main() -> None:
     parser.add_argument("--official", action="store_true")
     parser.add_argument("--stored", type=Path, help="dataset whose trials are taken, too")
     parser.add_argument("--models", nargs="*", choices=MODELS, default=list(MODELS))
-    parser.add_argument("--pixels", type=int, default=0, help="keep pictures of this size")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=math.inf, help="stop after this time")
     options = parser.parse_args()
@@ -345,10 +338,10 @@ def main() -> None:
     parts = range(-(-len(official_scenes()) // EACH)) if options.official else range(0)
     # Masks tell whether agent and patient are visible.
     models = tuple(dict.fromkeys((*options.models, "intuition-masks")))
-    kept = Kept(options.folder, models, options.pixels)
+    kept = Kept(options.folder, models)
     count = 0
     if options.stored:
-        count = int((~Dataset(options.stored).index["observed_contact"].astype(bool)).sum())
+        count = len(opened(options.stored)[0])
     end = time.monotonic() + options.seconds
     with ProcessPoolExecutor(options.workers) as pool:
         made = [pool.submit(make_official, kept, part) for part in parts]

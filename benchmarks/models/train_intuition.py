@@ -6,7 +6,8 @@
 The trainer is the one of `physion train`; the same command resumes. The last tenth of the own
 trials of every scenario trains nothing: on them, and on the official stimuli without a contact in
 the observed part, networks are tested, and compared with forests that saw the same training trials,
-where their features are stored. With --start a training begins from other weights. Predictions
+where their features are stored. With --start a training begins from other weights, that of pixels
+from those of masks. Predictions
 of official stimuli go to FOLDER/predictions, where ``intuition.py --predictions`` reads them,
 weights to FOLDER/training. With --all-but every network is also trained without the tested
 scenario. With --write the table is written to ``results/intuition_networks.md``; --weights names
@@ -29,17 +30,14 @@ import numpy as np
 import pandas as pd
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from intuition_trials import load, names_stored
 from physion.clips.batch import Batch, Spec
 from physion.compute.tasks import processor
 from physion.core.files import digest_of
-from physion.models.baselines.trees import blob_features
 from physion.models.build import build_untrained
 from physion.models.checkpoint import BUILT_AS, tensors_of, write_checkpoint
 from physion.models.interface import ask
-from physion.models.intuition_pixels import SEEN, blobs_of_masks, colored
 from physion.readout.trees import fit_forest
 from physion.training.loop import CARD
 from physion.training.train import train_model
@@ -50,20 +48,17 @@ SAME = {
     "intuition-pixels": "blob-trees",
 }  # fmt: skip
 """Forests that see as much as a network."""
+SAME_TOKENS = {"intuition-pixels": "intuition-masks"}
+"""Models that may begin from the weights of another one, whose tokens have the same columns."""
 TOGETHER = 64
 """Trials that are predicted at a time."""
 
 
 class OwnSource:
-    """Source of the context of trials that are in memory, as the trainer takes it.
+    """Source of the context of trials whose features `intuition_trials.load` read."""
 
-    ``made``: what `intuition_trials.load` read; ``pixels``: its pictures and masks, on the device.
-    """
-
-    def __init__(
-        self, spec: Spec, made: Mapping[str, NDArray[Any]], pixels: Mapping[str, Tensor]
-    ) -> None:
-        self.spec, self._made, self._pixels = spec, made, pixels
+    def __init__(self, spec: Spec, made: Mapping[str, NDArray[Any]]) -> None:
+        self.spec, self._made = spec, made
         self.rows = {str(trial): row for row, trial in enumerate(made["trial"])}
 
     def length(self, trial: str) -> int:
@@ -75,21 +70,9 @@ class OwnSource:
         return digest_of(str(self._made["scene"][self.rows[trial]]))
 
     def context(self, trials: Sequence[str]) -> Batch:
-        """Return pictures, and masks, of the observed frames.
-
-        A frame that the model does not look at shows the next one that it looks at.
-        """
-        rows = [self.rows[trial] for trial in trials]
-        wanted = self.spec.context_frames()
-        frames = np.tile(np.array(wanted), (len(rows), 1))
-        pixels: dict[str, Tensor] = {}
-        if self._pixels:
-            stored = torch.tensor(np.searchsorted(SEEN, np.arange(len(wanted))))
-            chosen = torch.tensor(rows)
-            for name, values in self._pixels.items():
-                device = values.device
-                pixels[name] = values[chosen.to(device)][:, stored.to(device)]
-        return Batch(tuple(trials), frames, np.ones(frames.shape, np.bool_), **pixels)
+        """Return which frames are observed."""
+        frames = np.tile(np.array(self.spec.context_frames()), (len(trials), 1))
+        return Batch(tuple(trials), frames, np.ones(frames.shape, np.bool_))
 
 
 class Learner:
@@ -97,18 +80,11 @@ class Learner:
 
     def __init__(self, name: str, folder: Path, options: argparse.Namespace) -> None:
         self.name, self.folder, self.options = name, folder, options
-        tokens = ask(build_untrained(name), "learns_from") == "features"
-        # Trials with pictures have no features of forests; those of blobs are made of pictures.
-        stored = [n for n in (name, SAME[name]) if n in names_stored(folder / "own")]
-        read = stored if tokens else ["rgb", "ids"]
+        read = [n for n in (name, SAME[name]) if n in names_stored(folder / "own")]
         self.own, self.asked = load(folder / "own", read), load(folder / "official", read)
         keep = ~self.asked["observed_contact"]
         keep &= np.isin(self.asked["scenario"], np.unique(self.own["scenario"]))
         self.asked = {key: values[keep] for key, values in self.asked.items()}
-        self.pixels = {id(made): _on_device(made) for made in (self.own, self.asked)}
-        for made in (self.own, self.asked):
-            if pictures := self.pixels[id(made)]:
-                made["blob-trees"] = _blobs(pictures["rgb"])
         self.held = np.zeros(len(self.own["trial"]), np.bool_)
         for scenario in np.unique(self.own["scenario"]):
             rows = np.flatnonzero(self.own["scenario"] == scenario)
@@ -117,10 +93,14 @@ class Learner:
     def train(self, without: str = "") -> dict[str, NDArray[np.float64]]:
         """Return P(contact) of held-out and official trials, of a network without a scenario."""
         model: Any = build_untrained(self.name, **self._options())
+        if self.options.start and self.name in SAME_TOKENS:
+            other: Any = build_untrained(SAME_TOKENS[self.name], **self._start(SAME_TOKENS))
+            model.load_state_dict(other.state_dict())
+            model.trained, model.init = True, other.init
         self.title = model.name
         fit = ~self.held & (self.own["scenario"] != without)
         trials = [str(trial) for trial in self.own["trial"][fit]]
-        source = OwnSource(model.spec, self.own, self.pixels[id(self.own)])
+        source = OwnSource(model.spec, self.own)
         outcomes = dict(zip(trials, self.own["contact"][fit].tolist(), strict=True))
         settings = ask(model, "training_settings")
         changed = {
@@ -200,22 +180,26 @@ class Learner:
 
     def _options(self) -> dict[str, Any]:
         pairs = [pair.split("=") for pair in self.options.option]
-        if self.options.start:
-            size = dict(pairs).get("size", "small")
-            pairs.append(["weights", str(self.options.start / f"{self.name}-{size}.safetensors")])
-        return {key: json.loads(value) if value[0].isdigit() else value for key, value in pairs}
+        given = {key: json.loads(value) if value[0].isdigit() else value for key, value in pairs}
+        return {**given, **self._start({})}
+
+    def _start(self, same: Mapping[str, str]) -> dict[str, Any]:
+        """Return the weights that a training begins from, of this model or one in ``same``."""
+        name = same.get(self.name, self.name)
+        if self.options.start is None or (name == self.name and name in SAME_TOKENS):
+            return {}
+        return {"weights": str(self.options.start / f"{name}-small.safetensors")}
 
     @torch.no_grad()
     def _predict(
         self, model: Any, made: Mapping[str, NDArray[Any]], chosen: NDArray[np.bool_]
     ) -> NDArray[np.float64]:
-        source, found = OwnSource(model.spec, made, self.pixels[id(made)]), []
+        source, found = OwnSource(model.spec, made), []
         names = [str(trial) for trial in made["trial"][chosen]]
         for start in range(0, len(names), TOGETHER):
             batch = source.context(names[start : start + TOGETHER])
-            if self.name in made:
-                rows = [source.rows[trial] for trial in batch.trials]
-                batch = replace(batch, features=made[self.name][rows])
+            rows = [source.rows[trial] for trial in batch.trials]
+            batch = replace(batch, features=made[self.name][rows])
             found.append(model.predict(batch.to(model.device)).cpu().numpy())
         return np.concatenate(found).astype(np.float64)
 
@@ -227,18 +211,6 @@ def device() -> str:
 
 def _flat(values: NDArray[Any]) -> NDArray[Any]:
     return values.reshape(len(values), -1)
-
-
-def _on_device(made: dict[str, NDArray[Any]]) -> dict[str, Tensor]:
-    """Move pictures and masks to the GPU, if there is one."""
-    target = "cuda" if torch.cuda.is_available() else "cpu"
-    return {n: torch.from_numpy(made.pop(n)).to(target) for n in ("rgb", "ids") if n in made}
-
-
-def _blobs(rgb: Tensor) -> NDArray[np.float32]:
-    """Return what red and yellow pixels of pictures (N, T, H, W, 3) tell, as `blob-trees` does."""
-    told = torch.cat([blobs_of_masks(colored(part).float()).cpu() for part in rgb.split(TOGETHER)])
-    return np.stack([blob_features((of[:, 0], of[:, 1])) for of in told.numpy()])
 
 
 def _say(what: str, done: int, total: int) -> None:

@@ -55,6 +55,7 @@ OFFICIAL_MODELS = (
     "dpi",
     "gns",
     "intuition-masks",
+    "intuition-pixels",
     "blob-trees",
     "rpin",
     "pEffNetLite0-mlp",
@@ -83,7 +84,7 @@ class RunSettings:
     sampled: bool = False
     """Sample scenes of Dominoes, Collide and Drop instead; nobody has seen them."""
     models: str | None = None
-    """Names of models with commas (physion ls models); default: for official scenes twelve, and
+    """Names of models with commas (physion ls models); default: for official scenes thirteen, and
     the random twin of one."""
     out: Path | None = None
     """Folder for trials, predictions and the report; default: runs/official or runs/sampled."""
@@ -135,7 +136,7 @@ def run(
     """Make trials, let models predict them, compare all with people, and write the report.
 
     Without settings, a balanced sample of the official scenes that ship with the package is
-    simulated, and twelve models, with the random twin of one, are compared with the people of the
+    simulated, and thirteen models, with the random twin of one, are compared with the people of the
     original study. A second run resumes, and a larger ``limit`` only adds.
 
     Parameters

@@ -10,14 +10,15 @@ import pytest
 import torch
 
 from physion.clips.batch import Batch, Motion
+from physion.clips.rendered import MotionRenderer
 from physion.core.errors import BadInputError
-from physion.models.baselines.pixels import color_masks
-from physion.models.baselines.trees import mask_blob
 from physion.models.build import build_model
 from physion.models.interface import TrainingSettings
 from physion.models.intuition import VIEWS, mask_tokens, state_tokens
-from physion.models.intuition_pixels import _moved, blobs_of_masks, boxes_of_masks, colored
+from physion.models.segmentation import segment
+from physion.physics.engine import simulate
 from physion.physics.trajectory import Contacts, Trajectory
+from physion.scenes.sampling.sample import sample_scene
 from physion.scenes.scene import Body, Camera, Cloth, Roles, Scene
 from physion.training.train import train_model
 from support.clip_source import ClipSource
@@ -162,15 +163,6 @@ class MovingSquares(ClipSource):
         return replace(clips(ids, frames[0]), trials=tuple(trials))
 
 
-class ColoredSquares(MovingSquares):
-    """The same as pictures: agent red, patient yellow, the others grey, and the true masks."""
-
-    def clips(self, trials: Any, frames: Any) -> Batch:
-        batch = super().clips(trials, frames)
-        colors = np.array([[90, 90, 90], [220, 20, 20], [220, 210, 20], [50, 50, 60]], np.uint8)
-        return replace(batch, rgb=torch.from_numpy(colors)[batch.ids.long()])
-
-
 QUICK = TrainingSettings(steps=50, batch=64, learning_rate=3e-3, validate_every=50)
 
 
@@ -233,74 +225,45 @@ def test_other_frames_and_sizes_are_refused_in_one_line() -> None:
         build_model("intuition-states", objects=2, weights="random")
     with pytest.raises(BadInputError, match="must be a multiple of heads"):
         build_model("intuition-states", width=30, weights="random")
-    with pytest.raises(BadInputError, match="no weights are shipped for intuition-pixels-small"):
-        build_model("intuition-pixels", weights="shipped")
 
 
-@pytest.mark.slow
-def test_pixels_are_learned_from_with_masks_boxes_and_motion_as_targets() -> None:
-    small = {"image_size": 16, "channels": (8, 16, 16, 16), "width": 32, "layers": 1, "slots": 3}
-    small["shift"] = 1
-    model: Any = build_model("intuition-pixels", **small)
-    source: Any = ColoredSquares(model.spec, 16)
-    batch = replace(
-        source.context(source.trials), contact=torch.tensor([*source.outcomes.values()])
-    )
+def pictures(rgb: Any, names: Any) -> Batch:
+    """Return a batch of pictures (B, T, H, W, 3)."""
+    frames = np.tile(FRAMES, (len(rgb), 1))
+    return Batch(tuple(names), frames, np.ones(frames.shape, np.bool_), rgb=rgb).to("cpu")
+
+
+def test_pixels_become_the_tokens_of_the_masks_that_are_found() -> None:
+    made = sample_scene("drop", 7003)
+    seen = Motion(made, simulate(made, frames=45))
+    renderer = MotionRenderer({"new": seen}, ("rgb", "ids"), 96, 1, {"new": "redyellow"})
+    drawn = renderer.read("new", FRAMES)
+    model: Any = build_model("intuition-pixels", weights="random")
+    true: Any = build_model("intuition-masks", weights="random")
+    batch = pictures(drawn["rgb"][None], ["new"])
+    tokens = model.encode(batch)
+    assert np.array_equal(tokens[0].reshape(15, 8, -1), mask_tokens(segment(drawn["rgb"]), 8))
+    expected = true.encode(clips(drawn["ids"][None]))[0].reshape(15, 8, -1)
+    found = tokens[0].reshape(15, 8, -1)
+    # Agent and patient: there, area, x, y and the others, in fractions of the picture.
+    assert (found[:, :2] - expected[:, :2]).abs().mean() < 0.01
     with torch.no_grad():
-        before = model.eval().loss(batch)
-    quick = replace(QUICK, batch=16, steps=80, learning_rate=5e-3, held_out=0.0)
-    settings = {"seed": 0, "name": "all", "folder": None, "accelerator": "cpu", "settings": quick}
-    train_model(model, source, source.trials, outcomes=source.outcomes, **settings)
+        assert torch.equal(model.predict(batch), model.predict(replace(batch, features=tokens)))
+    assert model.notes(batch) == [""]
+    assert model.encoder_digest() != true.encoder_digest()
+
+
+def test_pictures_without_red_and_yellow_are_refused_and_a_single_one_is_noted() -> None:
+    model: Any = build_model("intuition-pixels", weights="random")
+    model.base_rate.fill_(0.25)
+    grey = np.full((2, 15, 96, 96, 3), 90, np.uint8)
+    one = pictures(grey[:1], ["a"])
     with torch.no_grad():
-        after = model.loss(batch)
-    # With seeds 0 to 5 at most .08, .16, .04, .04 of the loss is left; after 40 steps, up to all.
-    for part in ("outcome", "masks", "boxes", "motion"):
-        assert float(after[part]) < 0.5 * float(before[part]), part
-    image = model.predict(replace(batch, rgb=batch.rgb.flip(3)))
-    assert torch.allclose(model.predict(batch), image, atol=1e-5)
-    assert torch.equal(model.predict(batch), model.predict(replace(batch, ids=None, contact=None)))
-
-
-def test_colours_and_blobs_equal_the_baselines() -> None:
-    rng = np.random.default_rng(3)
-    rgb = rng.integers(0, 256, (4, 9, 7, 3), dtype=np.uint8)
-    rgb[0], rgb[1, 2:6, 3:5], rgb[2, :, :] = 90, (200, 20, 30), (220, 190, 20)
-    red, yellow = color_masks(rgb)
-    found = colored(torch.from_numpy(rgb))
-    assert red.any() and yellow.any()
-    assert np.array_equal(found.numpy(), np.stack([red, yellow], 1))
-    told = blobs_of_masks(found.float())
-    expected = np.stack([mask_blob(red), mask_blob(yellow)], 1)
-    assert np.allclose(told.numpy(), expected, atol=2e-6)
-
-
-def test_pictures_are_moved_and_what_comes_in_is_empty() -> None:
-    maps = torch.arange(24.0).reshape(1, 2, 3, 4).repeat(3, 1, 1, 1)
-    out = _moved(maps, torch.tensor([[0, 1, 3], [0, -2, 0]]))
-    assert torch.equal(out[0], maps[0])
-    expected = torch.zeros(2, 3, 4)
-    expected[:, 1:, :2] = maps[1, :, :2, 2:]
-    assert torch.equal(out[1], expected) and not out[2].any()
-
-
-def test_boxes_are_the_edges_of_masks() -> None:
-    masks = torch.zeros(2, 8, 4)
-    masks[0, 2:5, 1:3] = 1
-    found, there = boxes_of_masks(masks)
-    assert found.tolist() == [[0.25, 0.25, 0.75, 0.625], [0, 0, 0, 0]]
-    assert there.tolist() == [True, False]
-
-
-def test_a_trial_without_red_and_yellow_is_refused_and_one_without_yellow_noted() -> None:
-    model: Any = build_model("intuition-pixels", image_size=16)
-    source: Any = ColoredSquares(model.spec, 2)
-    batch = source.context(source.trials)
-    batch.rgb[0][batch.ids[0] == 2] = 90
-    with torch.no_grad():
-        assert model.predict(batch)[0] == model.base_rate
-    assert model.notes(batch) == ["agent or patient never visible: base rate", ""]
-    batch.rgb[:] = 90
-    with pytest.raises(BadInputError, match=r"in 2 trials, such as .*nothing is red or yellow"):
-        model.predict(batch)
-    with pytest.raises(BadInputError, match="image_size must be a multiple of 16"):
-        build_model("intuition-pixels", image_size=50)
+        assert model.predict(one).tolist() == [0.25]
+    assert model.notes(one) == ["agent or patient never visible: base rate"]
+    with pytest.raises(BadInputError, match="in 2 trials, such as 'a', nothing is red or yellow"):
+        model.predict(pictures(grey, ["a", "b"]))
+    with pytest.raises(BadInputError, match=r"pictures \(input rgb\) of 96 x 96 are needed, not"):
+        model.predict(pictures(grey[:, :, :48, :48], ["a", "b"]))
+    with pytest.raises(BadInputError, match="image_size must be 96"):
+        build_model("intuition-pixels", image_size=64, weights="random")

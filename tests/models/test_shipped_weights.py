@@ -29,7 +29,7 @@ from support.moving_squares import with_arrays
 
 NAMES = tuple(sorted(shipped_digests()))
 PARTICLES, VISION = {"dpi", "gns", "gns-ransac"}, {"svg", "op3", "cswm", "rpin"}
-INTUITION = {"intuition-states", "intuition-masks"}
+INTUITION = {"intuition-states", "intuition-masks", "intuition-pixels"}
 
 
 def test_all_models_that_must_have_weights_do() -> None:
@@ -81,10 +81,10 @@ def test_intuition_knows_how_new_scenes_end(name: str) -> None:
             motion = Motion(scene, simulate(scene))
             cut = Motion(scene, cut_to_observed(scene, motion.trajectory))
             given: dict[str, Any] = {"state": (cut,)}
-            if "ids" in model.spec.inputs:
+            if model.spec.inputs != ("state",):
                 size, looks = model.spec.image_size, {"new": "redyellow"}
-                drawn = MotionRenderer({"new": cut}, ("ids",), size, 1, looks).read("new", frames)
-                given = {"ids": drawn["ids"][None]}
+                drawn = MotionRenderer({"new": cut}, model.spec.inputs, size, 1, looks)
+                given = {key: of[None] for key, of in drawn.read("new", frames).items()}
             batch = Batch(("new",), frames[None], np.ones((1, len(frames)), np.bool_), **given)
             answer = float(model.predict(batch.to("cpu"))[0])
             right.append((answer > 0.5) == label_contact(scene, motion.trajectory).contact)

@@ -219,8 +219,6 @@ class Model:
     learns_outcomes
         Whether the model is trained on the context of trials with their outcomes
         (``Batch.contact``), and not on windows without labels.
-    targets
-        Inputs, as in `Spec`, that its training sees too, such as boxes to be predicted.
     window
         Frames of a training clip, at ``spec.stride``, from a random start; 0: context and future
         of the `Spec`, or twice the context where the future depends on the movie.
@@ -241,7 +239,6 @@ class Model:
     trained: bool = False
     learns_from: LearnsFrom = "clips"
     learns_outcomes: bool = False
-    targets: tuple[str, ...] = ()
     window: int = 0
     training_settings: TrainingSettings = TrainingSettings()
     calibration_trials: int = 0

@@ -2,7 +2,8 @@
 
 One network for all scenarios. It simulates nothing and knows no physics: it has seen many trials
 and how they ended. An object is a token, which holds its track over the observed frames 2, 5, ...,
-44, from the true state (`intuition-states`) or from its mask (`intuition-masks`):
+44, from the true state (`intuition-states`), from its true mask (`intuition-masks`), or from the
+mask that a network finds in pictures (`intuition-pixels`, `physion.models.segmentation`):
 
     x_k = f(track_k, track_k - track_agent, track_k - track_patient, constants_k),
 
@@ -51,8 +52,8 @@ from physion.models.interface import (
     SizedSettings,
     Sizes,
     TrainingSettings,
-    can,
 )
+from physion.models.segmentation import SIDE, segment, weights_sha256
 from physion.models.torch_model import TorchModel, initial_weights, weights_digest
 from physion.numerics.linear_algebra import norm
 from physion.numerics.rotations import rotate_vectors, rotation_matrices
@@ -64,7 +65,9 @@ VERSION = 1
 # What a token holds. Columns of a track are of every frame, constants of the object. A mirror image
 # of a trial has the same columns in another order, some with the other sign.
 
-STATE, MASK = "states", "masks"
+STATE, MASK, PIXELS = "states", "masks", "pixels"
+INPUTS = {STATE: "state", MASK: "ids", PIXELS: "rgb"}
+"""What is seen, as an input of a `Spec`."""
 _CORNERS = tuple(f"corner {x}{y}{z}" for x in "-+" for y in "-+" for z in "-+")
 
 
@@ -120,7 +123,7 @@ VIEWS: Mapping[str, TokenColumns] = {
         swapped=(("left", "right"),),
     ),
 }  # fmt: skip
-"""Columns by what is seen.
+"""Columns by what is seen; found masks have the same columns as true ones.
 
 - ``states``: centre of the bounding box in metres, directions of two axes of the body, velocity
   and angular velocity (asinh of m/s and rad/s); size in metres, fraction of the bounding box that
@@ -310,6 +313,11 @@ class IntuitionSettings(SizedSettings):
         self.at_least(1, "image_size", "width", "layers", "heads", "members")
         self.at_least(3, "objects")
         self.at_least(0, "dropout", "noise")
+        if self.model == f"intuition-{PIXELS}" and self.image_size != SIDE:
+            raise BadInputError(
+                f"{self.model}: image_size must be {SIDE}, since objects are found in pictures of "
+                f"this size only, not {self.image_size}"
+            )
         if self.width % self.heads:
             raise BadInputError(
                 f"{self.model}: width {self.width} must be a multiple of heads {self.heads}"
@@ -397,117 +405,25 @@ class TokenNetwork(nn.Module):
 
 
 class Intuition(TorchModel):
-    """Base of models that learn P(contact) from outcomes; subclasses have ``logits``.
-
-    Parameters
-    ----------
-    settings
-        What the user chose.
-    spec
-        What the model asks for.
-    training
-        Optimiser and schedule, which are not part of the digest.
-    """
+    """Intuition from true states, true masks or pictures, given as tokens of objects."""
 
     answers = "observed"
     learns_outcomes = True
-    settings: Any
-    sees = ""
-    """What it looks at, for the column *Encoder Type*."""
-
-    def __init__(self, settings: Any, spec: Spec, training: TrainingSettings) -> None:
-        super().__init__()
-        settings.check_shipped()
-        self.name = f"{settings.model}-{settings.size}"
-        self.settings, self.spec, self.training_settings = settings, spec, training
-        self.seed, self.window = settings.seed, spec.context
-        self.base_rate = nn.Buffer(torch.tensor(0.5))
-
-    def logits(self, batch: Batch) -> Tensor:
-        """Return logits (M, B) of the answers of M networks or images."""
-        raise NotImplementedError
-
-    def seen(self, batch: Batch) -> Tensor:
-        """Return whether agent and patient are both seen in some frame (B,)."""
-        raise NotImplementedError
-
-    def predict(self, batch: Batch) -> Tensor:
-        """Return P(contact) (B,), the mean over networks and mirror images.
-
-        Where agent or patient is never seen it is the base rate of the training trials.
-        """
-        if batch.features is None and can(self, "encode"):
-            batch = replace(batch, features=self.encode(batch))
-        answers = self.logits(batch).sigmoid().mean(0)
-        return torch.where(self.seen(batch), answers, self.base_rate)
-
-    def notes(self, batch: Batch) -> list[str]:
-        """Return for each trial whether it never shows agent or patient."""
-        hidden = "agent or patient never visible: base rate"
-        return ["" if seen else hidden for seen in self.seen(batch).tolist()]
-
-    def prepare(self, sample: Batch) -> None:
-        """Set the base rate from training trials, unless weights were given."""
-        if not self.trained:
-            self.base_rate.copy_(sample.contact.float().mean())
-
-    def baseline(self, batch: Batch) -> Tensor:
-        """Return the cross entropy of the base rate."""
-        odds = torch.logit(self.base_rate.clamp(0.01, 0.99)).expand(len(batch))
-        return functional.binary_cross_entropy_with_logits(odds, batch.contact.float())
-
-    def provenance(self) -> Provenance:
-        """Return name, size and origin of the weights."""
-        return Provenance(
-            model=self.name,
-            init=self.init,
-            encoder_type=self.sees,
-            encoder_training_task="outcomes",
-            dynamics_type="none",
-            versions=f"torch {torch.__version__}",
-        )
-
-    def digest(self) -> str:
-        """Return the SHA-256 of code version, settings and weights."""
-        return weights_digest([*self._digested(), torch.__version__], self.state_dict().items())
-
-    def built_as(self) -> dict[str, Any]:
-        """Return what the weights were made for: name, with the size, and version."""
-        return {"model": self.name, "version": VERSION}
-
-    def _digested(self) -> list[Any]:
-        settings = {k: v for k, v in asdict(self.settings).items() if k not in ("weights", "seed")}
-        return [self.name, VERSION, settings, repr(self.spec)]
-
-    def _check_frames(self, batch: Batch) -> None:
-        """Raise `BadInputError` for other frames than those that the model learns from."""
-        wanted = self.spec.context_frames()
-        shown = batch.frames.cpu().numpy() if isinstance(batch.frames, Tensor) else batch.frames
-        for trial, frames in zip(batch.trials, shown.tolist(), strict=True):
-            if tuple(frames) != wanted:
-                listed = ", ".join(str(frame) for frame in (*wanted[:2], "...", wanted[-1]))
-                raise BadInputError(
-                    f"{self.name}, trial {trial!r}: frames {listed} are needed, not "
-                    f"{len(frames)} frames up to {frames[-1]}; read clips with the model's spec"
-                )
-
-
-class TokenIntuition(Intuition):
-    """Intuition from true states or masks, given as tokens of objects."""
-
     learns_from: LearnsFrom = "features"
+    training_settings = TRAINING
     settings: IntuitionSettings
 
     def __init__(self, settings: IntuitionSettings) -> None:
+        super().__init__()
+        settings.check_shipped()
+        self.name = f"{settings.model}-{settings.size}"
         self.kind = settings.model.partition("-")[2]
-        self.sees = f"{self.kind} of up to {settings.objects} objects"
-        spec = Spec(
-            inputs=("state",) if self.kind == STATE else ("ids",),
-            image_size=settings.image_size, stride=STRIDE, context=CONTEXT, future=0,
-            framewise=False,
+        self.settings, self.seed, self.window = settings, settings.seed, CONTEXT
+        self.spec = Spec(
+            inputs=(INPUTS[self.kind],), image_size=settings.image_size, stride=STRIDE,
+            context=CONTEXT, future=0, framewise=False,
         )  # fmt: skip
-        super().__init__(settings, spec, TRAINING)
-        self.view = VIEWS[self.kind]
+        self.view = VIEWS[STATE if self.kind == STATE else MASK]
         tracked, places = len(self.view.track), len(self.view.place)
         inputs = CONTEXT * (tracked + 2 * places) + len(self.view.constants)
         with initial_weights(settings.model, settings.seed):
@@ -518,6 +434,7 @@ class TokenIntuition(Intuition):
                 for _ in range(settings.members)
             )
         columns = len(self.view.columns)
+        self.base_rate = nn.Buffer(torch.tensor(0.5))
         self.center = nn.Buffer(torch.zeros(columns))
         self.scale = nn.Buffer(torch.ones(columns))
         order, signs = self.view.mirror()
@@ -525,12 +442,38 @@ class TokenIntuition(Intuition):
         self.signs = nn.Buffer(torch.tensor(signs), persistent=False)
         load_named(self, settings.weights)
 
+    def provenance(self) -> Provenance:
+        """Return name, size and origin of the weights."""
+        return Provenance(
+            model=self.name,
+            init=self.init,
+            encoder_type=f"{self.kind} of up to {self.settings.objects} objects",
+            encoder_training_task="outcomes",
+            dynamics_type="none",
+            versions=f"torch {torch.__version__}",
+        )
+
+    def digest(self) -> str:
+        """Return the SHA-256 of code version, settings and weights."""
+        settings = {k: v for k, v in asdict(self.settings).items() if k not in ("weights", "seed")}
+        made = [self.name, VERSION, settings, repr(self.spec), *self._segmentation()]
+        return weights_digest([*made, torch.__version__], self.state_dict().items())
+
     def encoder_digest(self) -> str:
-        """Return the SHA-256 of what determines the tokens: no weights."""
-        return weights_digest([self.kind, VERSION, self.settings.objects, repr(self.spec)])
+        """Return the SHA-256 of what determines the tokens: no weights but of the segmentation."""
+        made = [self.kind, VERSION, self.settings.objects, repr(self.spec)]
+        return weights_digest([*made, *self._segmentation()])
+
+    def built_as(self) -> dict[str, Any]:
+        """Return what the weights were made for: name, with the size, and version."""
+        return {"model": self.name, "version": VERSION}
 
     def encode(self, batch: Batch) -> Tensor:
-        """Return the tokens of all objects (B, T, K D), which depend on no weights."""
+        """Return the tokens of all objects (B, T, K D), which depend on no trained weights.
+
+        Raises `BadInputError` if nothing is red or yellow in any of several trials, where pictures
+        are seen: they have another look.
+        """
         self._check_frames(batch)
         objects = self.settings.objects
         if self.kind == STATE:
@@ -541,15 +484,24 @@ class TokenIntuition(Intuition):
             tokens = [mask_tokens(ids, objects) for ids in self._ids(batch)]
         return torch.from_numpy(np.stack(tokens)).flatten(2).to(self.device)
 
+    def predict(self, batch: Batch) -> Tensor:
+        """Return P(contact) (B,), the mean over networks and mirror images.
+
+        Where agent or patient is never seen it is the base rate of the training trials.
+        """
+        if batch.features is None:
+            batch = replace(batch, features=self.encode(batch))
+        answers = self.logits(batch).sigmoid().mean(0)
+        return torch.where(self.seen(batch), answers, self.base_rate)
+
     def notes(self, batch: Batch) -> list[str]:
         """Return for each trial whether it never shows agent or patient, or too many objects."""
-        most = self.settings.objects
-        many = [
-            f"{count} objects, only {most} are looked at" if count > most else ""
-            for count in self._counts(batch)
-        ]
-        pairs = zip(super().notes(batch), many, strict=True)
-        return ["; ".join(filter(None, pair)) for pair in pairs]
+        most, notes = self.settings.objects, []
+        for seen, count in zip(self.seen(batch).tolist(), self._counts(batch), strict=True):
+            hidden = "" if seen else "agent or patient never visible: base rate"
+            many = f"{count} objects, only {most} are looked at" if count > most else ""
+            notes.append("; ".join(filter(None, (hidden, many))))
+        return notes
 
     def logits(self, batch: Batch) -> Tensor:
         """Return logits (2 members, B), each member of the trial and of its mirror image."""
@@ -564,15 +516,20 @@ class TokenIntuition(Intuition):
 
     def prepare(self, sample: Batch) -> None:
         """Set base rate, mean and deviation of the values of objects, unless weights were given."""
-        super().prepare(sample)
         if self.trained:
             return
+        self.base_rate.copy_(sample.contact.float().mean())
         tokens = self._tokens(sample)
         values = tokens[tokens[..., 0] > 0]
         # What says whether something is there keeps its values.
         kept = torch.tensor([name == "there" for name in self.view.columns], device=values.device)
         self.center.copy_(values.mean(0).masked_fill(kept, 0.0))
         self.scale.copy_(values.std(0).clamp(min=1e-3).masked_fill(kept, 1.0))
+
+    def baseline(self, batch: Batch) -> Tensor:
+        """Return the cross entropy of the base rate."""
+        odds = torch.logit(self.base_rate.clamp(0.01, 0.99)).expand(len(batch))
+        return functional.binary_cross_entropy_with_logits(odds, batch.contact.float())
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return the mean cross entropy of the outcomes, and how many answers are right."""
@@ -621,20 +578,50 @@ class TokenIntuition(Intuition):
         assert values.shape[2] == steps * tracks.shape[3]
         return torch.cat([values, constants], -1), there
 
+    def _segmentation(self) -> list[str]:
+        """Return the SHA-256 of the weights that find objects in pictures, if they are used."""
+        return [weights_sha256()] if self.kind == PIXELS else []
+
+    def _check_frames(self, batch: Batch) -> None:
+        """Raise `BadInputError` for other frames than those that the model learns from."""
+        wanted = self.spec.context_frames()
+        shown = batch.frames.cpu().numpy() if isinstance(batch.frames, Tensor) else batch.frames
+        for trial, frames in zip(batch.trials, shown.tolist(), strict=True):
+            if tuple(frames) != wanted:
+                listed = ", ".join(str(frame) for frame in (*wanted[:2], "...", wanted[-1]))
+                raise BadInputError(
+                    f"{self.name}, trial {trial!r}: frames {listed} are needed, not "
+                    f"{len(frames)} frames up to {frames[-1]}; read clips with the model's spec"
+                )
+
     def _ids(self, batch: Batch) -> NDArray[np.uint8]:
-        """Return the objects of pixels (B, T, H, W), after a check of their size."""
-        size = self.settings.image_size
-        if batch.ids is None or tuple(batch.ids.shape[2:]) != (size, size):
-            found = "none" if batch.ids is None else tuple(batch.ids.shape[2:])
+        """Return the objects of pixels (B, T, H, W), true or found, after a check of their size."""
+        size, name = self.settings.image_size, INPUTS[self.kind]
+        given = getattr(batch, name)
+        if given is None or tuple(given.shape[2:4]) != (size, size):
+            found = "none" if given is None else tuple(given.shape[2:4])
+            what = "pictures" if self.kind == PIXELS else "objects of pixels"
             raise BadInputError(
-                f"{self.name}: objects of pixels (input ids) of {size} x {size} are needed, not "
+                f"{self.name}: {what} (input {name}) of {size} x {size} are needed, not "
                 f"{found}; give clips of this size, or --option image_size"
             )
-        ids = batch.ids.cpu().numpy() if isinstance(batch.ids, Tensor) else batch.ids
-        return np.asarray(ids)
+        values = np.asarray(given.cpu() if isinstance(given, Tensor) else given)
+        if self.kind == MASK:
+            return values
+        ids = np.stack([segment(pictures) for pictures in values])
+        if len(ids) > 1 and not np.isin(ids, (AGENT_ID, PATIENT_ID)).any():
+            raise BadInputError(
+                f"{self.name}: in {len(ids)} trials, such as {batch.trials[0]!r}, nothing is red "
+                "or yellow; it sees agent and patient by these colours only, so take trials in the "
+                "look redyellow"
+            )
+        return ids
 
     def _counts(self, batch: Batch) -> Sequence[int]:
         """Return the number of objects of every clip, which may be more than there are tokens."""
+        if self.kind == PIXELS:
+            there = self._tokens(batch)[..., 0] > 0
+            return [int(one) for one in there.any(1).sum(-1)]
         if self.kind == MASK:
             return [len(np.unique(ids[ids > 0])) for ids in self._ids(batch)]
         scenes = [motion.scene for motion in motions(batch, self.name)]

@@ -37,7 +37,7 @@ from physion.readout.model_calls import (
 from physion.readout.settings import EvaluationSettings
 from physion.readout.shipped import ShippedReadout, ShippedReadouts
 from physion.readout.tables import ScenarioPredictions, describe_labels
-from physion.readout.train import Trainer, training_spec
+from physion.readout.train import Trainer
 from physion.trials.dataset import Dataset
 
 # Which readouts a model supports, and how its predictions are made under each.
@@ -224,7 +224,7 @@ class Predictor:
 
             self._trainer = Trainer(
                 model,
-                self._training,
+                self._whole,
                 self._store,
                 dataset.index,
                 training,
@@ -274,14 +274,6 @@ class Predictor:
             # A table of features needs no frames.
             windows=self.rules.windows(self.rules.select(index)) if self.model.spec.inputs else {},
         )
-
-    @property
-    def _training(self) -> WholeSource:
-        """Source of what a training reads."""
-        spec = training_spec(self.model)
-        if spec == self.model.spec:
-            return self._whole
-        return whole_source(self.dataset, spec, rendered=self.settings.rendered)
 
     def _longest(self, split: ScenarioSplit) -> int:
         """Return the frames of the longest trial that the readout of a scenario sees."""

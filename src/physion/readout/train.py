@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from physion.clips.batch import Spec
 from physion.clips.clips import whole_source
 from physion.clips.source import Part, WholeSource
 from physion.compute.tasks import Executor, Progress
@@ -67,8 +66,8 @@ class Trainings:
 class Trainer:
     """One model with its initial weights, which is trained on one set of trials after the other.
 
-    - ``source``: clips with the model's `training_spec`. ``store``: features that models are
-      trained on. ``index``: of the dataset.
+    - ``source``: clips with the model's `Spec`. ``store``: features that models are trained on.
+      ``index``: of the dataset.
     - ``settings``: optimiser and schedule. ``folder``: of all trainings. ``fabric``: devices.
     - ``progress``: called after every step.
     """
@@ -136,12 +135,6 @@ class Trainer:
         outcomes = recorded.where(recorded.notna(), self.index["contact"])
         pairs = zip(self.index["trial"], outcomes, strict=True)
         return {str(trial): bool(value) for trial, value in pairs if not pd.isna(value)}
-
-
-def training_spec(model: Any) -> Spec:
-    """Return what the training of a model reads: its `Spec`, and its targets."""
-    spec: Spec = model.spec
-    return dataclasses.replace(spec, inputs=(*spec.inputs, *ask(model, "targets")))
 
 
 def train(
@@ -250,7 +243,7 @@ class _Train:
         assert training is not None, "checked before"
         trainer = Trainer(
             model,
-            whole_source(self.dataset, training_spec(model), rendered=settings.rendered),
+            whole_source(self.dataset, model.spec, rendered=settings.rendered),
             FeatureStore(self.out / "features", batch=settings.encoder_batch),
             self.dataset.index,
             training,

@@ -1,1 +1,1 @@
-"""Readouts that ship, with a card for each."""
+"""Weights of what is expected of objects, with a card."""

@@ -1,0 +1,1 @@
+"""Weights of the network that finds objects in pictures, with a card."""

@@ -1,0 +1,225 @@
+"""Objects in pictures: which pixels are agent, patient, another object or scenery.
+
+A network with an encoder and a decoder (as U-Net, Ronneberger et al., 2015) sees a picture, and
+which of its pixels are red or yellow. For every pixel p it gives logits of four classes, and the
+offset o(p) from p to the centre of its object, as in Panoptic-DeepLab (Cheng et al., 2020). Agent
+and patient are classes. Pixels of the class of other objects vote for the places p + o(p): the
+maxima of the smoothed votes are the objects, and each pixel belongs to the nearest one. Over time
+an object is continued by the one that is nearest to where it should be,
+
+    d = |c_t - c_{t-1} - v|_1 + .7 |s_t - s_{t-1}|_1,
+
+with its centre c, velocity v, and size s (square root of the area, halves of width and height);
+pairs are chosen so that the sum of d is least.
+
+The network was trained on own pictures in red and yellow, of 96 pixels a side, with true masks
+(``benchmarks/models/train_segmentation.py``).
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.resources import as_file, files
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import load
+from scipy import ndimage
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor, nn
+from torch.nn import functional
+
+from physion.clips.batch import AGENT_ID, FIRST_OTHER_ID, PATIENT_ID, SCENERY_ID
+from physion.core.files import check_digest, file_sha256
+from physion.models.baselines.pixels import color_masks
+
+F64 = NDArray[np.float64]
+
+FOLDER, WEIGHTS = "physion.data.segmentation", "segmentation.safetensors"
+"""Package and file of the weights."""
+SIDE = 96
+"""Pixels per side of the pictures."""
+CLASSES = (SCENERY_ID, AGENT_ID, PATIENT_ID, FIRST_OTHER_ID)
+OFFSET = 10.0
+"""The network gives offsets in this fraction of the picture: 10 for a whole side."""
+CHANNELS = (24, 32, 64, 96)
+"""Of the maps with 1/2, 1/4, 1/8 and 1/16 of the resolution."""
+CELLS = 48
+"""Cells of votes per side."""
+LEAST_VOTES, LEAST_PIXELS = 0.6, 6
+"""Smoothed votes, and pixels, below which there is no object."""
+FAR = 0.12, 0.01
+"""Largest d between frames, and by how much it rises with each frame in which nothing was seen."""
+MOST = 60
+"""Objects of a trial that are told apart."""
+
+
+class SegmentationNetwork(nn.Module):
+    """Pictures (N, 5, H, W), see `network_input`, to class logits and offsets (N, 6, H, W)."""
+
+    def __init__(self, channels: tuple[int, int, int, int] = CHANNELS) -> None:
+        super().__init__()
+        first, second, third, fourth = channels
+        self.stem = nn.Sequential(
+            nn.Conv2d(5, first, 5, stride=2, padding=2), nn.GroupNorm(8, first), nn.GELU()
+        )
+        self.down = nn.ModuleList(
+            [_halved(first, second), _halved(second, third), _halved(third, fourth)]
+        )
+        self.lift = nn.ModuleList(
+            [nn.Conv2d(fourth, third, 1), nn.Conv2d(third, second, 1), nn.Conv2d(second, first, 1)]
+        )
+        self.join = nn.ModuleList([_Residual(third), _Residual(second), _Residual(first)])
+        self.out = nn.Conv2d(first, 4 * (len(CLASSES) + 2), 3, padding=1)
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        """Return logits of `CLASSES`, and the offset in x and y in units of 1 / `OFFSET`."""
+        maps = [self.stem(pictures)]
+        for down in self.down:
+            maps.append(down(maps[-1]))
+        joined = maps.pop()
+        for lift, join in zip(self.lift, self.join, strict=True):
+            joined = join(functional.interpolate(lift(joined), scale_factor=2) + maps.pop())
+        return functional.pixel_shuffle(self.out(joined), 2)
+
+
+def _halved(inputs: int, outputs: int) -> nn.Sequential:
+    """Return layers that halve the resolution, and a residual block."""
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, stride=2, padding=1),
+        nn.GroupNorm(8, outputs),
+        nn.GELU(),
+        _Residual(outputs),
+    )
+
+
+class _Residual(nn.Module):
+    """Maps x + f(x), f being two convolutions."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv2d(width, width, 3, padding=1),
+            nn.GroupNorm(8, width),
+            nn.GELU(),
+            nn.Conv2d(width, width, 3, padding=1),
+        )
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """Return maps of the same shape."""
+        out: Tensor = maps + self.layers(maps)
+        return out
+
+
+def network_input(rgb: NDArray[np.uint8]) -> Tensor:
+    """Return what the network sees of pictures (N, H, W, 3): colours, which are red, and yellow."""
+    colors = torch.from_numpy(rgb).permute(0, 3, 1, 2).float() / 127.5 - 1
+    return torch.cat([colors, torch.from_numpy(np.stack(color_masks(rgb), 1)).float()], 1)
+
+
+def segment(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the objects of pixels (T, H, W) of the pictures of a trial (T, `SIDE`, `SIDE`, 3).
+
+    Numbers are those of ``Batch.ids``: `AGENT_ID`, `PATIENT_ID`, from `FIRST_OTHER_ID` the others,
+    each with the same number in all pictures, and `SCENERY_ID`.
+    """
+    with torch.no_grad():
+        found = _network()(network_input(rgb)).double().numpy()
+    return follow(np.stack([group(of[: len(CLASSES)], of[len(CLASSES) :]) for of in found]))
+
+
+def group(logits: F64, offsets: F64) -> NDArray[np.uint8]:
+    """Return the objects of the pixels of one picture (H, W).
+
+    Parameters
+    ----------
+    logits, offsets
+        (4, H, W) and (2, H, W), as the network gives them.
+    """
+    best = logits.argmax(0)
+    ids: NDArray[np.uint8] = np.array(CLASSES, np.uint8)[best]
+    rows, columns = np.nonzero(ids == FIRST_OTHER_ID)
+    ids[rows, columns] = SCENERY_ID
+    if len(rows) < LEAST_PIXELS:
+        return ids
+    places = (np.stack([columns, rows], -1) + 0.5) / np.array(best.shape)[::-1]
+    votes = places + offsets[:, rows, columns].T / OFFSET
+    cells = np.clip((votes * CELLS).astype(int), 0, CELLS - 1)
+    counts = np.zeros((CELLS, CELLS))
+    np.add.at(counts, (cells[:, 1], cells[:, 0]), 1.0)
+    smooth = ndimage.gaussian_filter(counts, 0.8, mode="constant")
+    peaks = (smooth == ndimage.maximum_filter(smooth, 3)) & (smooth > LEAST_VOTES)
+    if not peaks.any():
+        return ids
+    centers = (np.argwhere(peaks)[:, ::-1] + 0.5) / CELLS
+    for _ in range(2):
+        nearest = ((votes[:, None] - centers) ** 2).sum(-1).argmin(1)
+        centers = np.stack([votes[nearest == k].mean(0) for k in np.unique(nearest)])
+    nearest = ((votes[:, None] - centers) ** 2).sum(-1).argmin(1)
+    number = FIRST_OTHER_ID
+    for k in range(len(centers)):
+        own = nearest == k
+        if own.sum() >= LEAST_PIXELS and number < np.iinfo(np.uint8).max:
+            ids[rows[own], columns[own]] = number
+            number += 1
+    return ids
+
+
+def follow(ids: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return objects (T, H, W) of which each has one number, from those of single pictures."""
+    out = np.where(ids >= FIRST_OTHER_ID, SCENERY_ID, ids).astype(np.uint8)
+    seen = np.zeros((0, 5))
+    velocity, last = np.zeros((0, 2)), np.zeros(0, int)
+    for time, picture in enumerate(ids):
+        numbers = [int(n) for n in np.unique(picture) if n >= FIRST_OTHER_ID]
+        now = np.array([_described(picture == n) for n in numbers]).reshape(-1, 5)
+        ahead = seen[:, None] + np.pad(velocity, ((0, 0), (0, 3)))[:, None]
+        distance = np.abs(now - ahead) @ np.array([1, 1, 0.7, 0.7, 0.7])
+        own = np.full(len(numbers), -1)
+        for track, place in zip(*linear_sum_assignment(distance), strict=True):
+            missed = time - last[track] - 1
+            if distance[track, place] < FAR[0] + FAR[1] * missed:
+                own[place] = track
+                velocity[track] = (now[place, :2] - seen[track, :2]) / (missed + 1)
+                seen[track], last[track] = now[place], time
+        for place, number in enumerate(numbers):
+            if own[place] < 0 and len(seen) < MOST:
+                own[place] = len(seen)
+                seen = np.vstack([seen, now[place]])
+                velocity, last = np.vstack([velocity, np.zeros(2)]), np.append(last, time)
+            if own[place] >= 0:
+                out[time][picture == number] = FIRST_OTHER_ID + own[place]
+    return out
+
+
+def _described(mask: NDArray[np.bool_]) -> F64:
+    """Return centre, square root of the area, and halves of width and height, in sides."""
+    rows, columns = np.nonzero(mask)
+    height, width = mask.shape
+    return np.array(
+        [
+            columns.mean() / width,
+            rows.mean() / height,
+            np.sqrt(len(rows) / mask.size),
+            np.ptp(columns) / (2 * width),
+            np.ptp(rows) / (2 * height),
+        ]
+    )
+
+
+@cache
+def _network() -> SegmentationNetwork:
+    """Return the network with the weights of the package."""
+    network = SegmentationNetwork()
+    with as_file(files(FOLDER)) as folder:
+        content = (folder / WEIGHTS).read_bytes()
+        check_digest(folder / WEIGHTS, content, "install the package again")
+    network.load_state_dict({name: value.float() for name, value in load(content).items()})
+    return network.eval()
+
+
+def weights_sha256() -> str:
+    """Return the SHA-256 of the weights of the package."""
+    with as_file(files(FOLDER)) as folder:
+        return file_sha256(folder / WEIGHTS)

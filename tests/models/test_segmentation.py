@@ -1,0 +1,105 @@
+"""Objects in pictures: grouping, following over time, and the trained network on new scenes."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+import pytest
+
+from physion.clips.batch import Motion
+from physion.clips.rendered import MotionRenderer
+from physion.models.segmentation import CLASSES, OFFSET, SIDE, follow, group, segment
+from physion.physics.engine import simulate
+from physion.scenes.sampling.sample import sample_scene
+
+DRAWN = np.array([0, 1, 2, 3, 3, 3], np.uint8)
+"""Class of each object of `layout`."""
+
+
+def layout() -> Any:
+    """Agent, patient, two boxes side by side, and one below."""
+    ids = np.zeros((SIDE, SIDE), np.uint8)
+    ids[10:30, 10:20], ids[60:70, 50:90] = 1, 2
+    ids[20:40, 40:52], ids[20:40, 52:70], ids[40:56, 45:60] = 3, 4, 5
+    return ids
+
+
+def outputs(ids: Any) -> tuple[Any, Any]:
+    """What a network without error gives: logits, and offsets to the centres."""
+    kinds = DRAWN[ids]
+    logits = np.stack([(kinds == kind) * 1.0 for kind in range(len(CLASSES))])
+    rows, columns = (np.indices(ids.shape) + 0.5) / SIDE
+    offsets = np.zeros((2, *ids.shape))
+    for number in np.unique(ids):
+        mask = ids == number
+        offsets[0][mask] = OFFSET * (columns[mask].mean() - columns[mask])
+        offsets[1][mask] = OFFSET * (rows[mask].mean() - rows[mask])
+    return logits, offsets
+
+
+def same_parts(found: Any, ids: Any) -> bool:
+    """Whether two pictures have the same objects, whatever their numbers."""
+    pairs = set(zip(found.ravel().tolist(), ids.ravel().tolist(), strict=True))
+    return len(pairs) == len({a for a, _ in pairs}) == len({b for _, b in pairs})
+
+
+def test_objects_that_touch_are_told_apart_by_their_centres() -> None:
+    ids = layout()
+    found = group(*outputs(ids))
+    assert same_parts(found, ids)
+    assert ((found == 1) == (ids == 1)).all() and ((found == 2) == (ids == 2)).all()
+    # Errors of half a cell change nothing but single pixels.
+    logits, offsets = outputs(ids)
+    noise = np.random.default_rng(0).normal(0, OFFSET * 0.005, offsets.shape)
+    noisy = group(logits, offsets + noise)
+    for number in (3, 4, 5):
+        mask = ids == number
+        most = np.bincount(noisy[mask]).argmax()
+        assert np.mean(noisy[mask] == most) > 0.95
+    nothing = np.zeros((SIDE, SIDE), np.uint8)
+    assert not group(*outputs(nothing)).any()
+    speck = nothing.copy()
+    speck[5, 5:8] = 3
+    assert not group(*outputs(speck)).any(), "three pixels are no object"
+
+
+def test_objects_keep_their_numbers_over_time() -> None:
+    frames = np.zeros((8, SIDE, SIDE), np.uint8)
+    for time, picture in enumerate(frames):
+        first, second = (3, 4) if time % 2 else (4, 3)  # numbers of single pictures mean nothing
+        picture[10:18, 5 + 8 * time : 13 + 8 * time] = first
+        if time not in (3, 4):  # hidden
+            picture[60:80, 20:30] = second
+        if time >= 6:
+            picture[40:50, 80:90] = 5
+        picture[90:95, 0:9] = 1
+    found = follow(frames)
+    moving = {int(found[t, 12, 8 + 8 * t]) for t in range(8)}
+    resting = {int(found[t, 70, 25]) for t in (0, 1, 2, 5, 6, 7)}
+    later = {int(found[t, 45, 85]) for t in (6, 7)}
+    assert len(moving) == len(resting) == len(later) == 1
+    assert len(moving | resting | later) == 3 and min(moving | resting | later) >= 3
+    assert (found[:, 92, 4] == 1).all() and ((found > 0) == (frames > 0)).all()
+    assert follow(np.zeros((2, 4, 4), np.uint8)).shape == (2, 4, 4)
+
+
+@pytest.mark.parametrize("scenario", ["dominoes", "drop", "collide"])
+def test_the_trained_network_finds_the_objects_of_new_scenes(scenario: str) -> None:
+    scene = sample_scene(scenario, 7003)
+    motion = Motion(scene, simulate(scene, frames=45))
+    looks, frames = {"new": "redyellow"}, np.array([2, 23, 44])
+    drawn = MotionRenderer({"new": motion}, ("rgb", "ids"), SIDE, 1, looks).read("new", frames)
+    found, true = segment(drawn["rgb"]), drawn["ids"]
+    assert found.shape == true.shape and found.dtype == np.uint8
+    for ours, theirs in ((found == 1, true == 1), (found == 2, true == 2), (found > 0, true > 0)):
+        assert (ours & theirs).sum() > 0.75 * (ours | theirs).sum()
+    assert (segment(drawn["rgb"]) == found).all()
+
+
+def test_weights_have_a_card_and_are_small() -> None:
+    folder = files("physion.data.segmentation")
+    assert len(folder.joinpath("segmentation.safetensors").read_bytes()) < 1_000_000
+    card = folder.joinpath("segmentation.md").read_text()
+    assert "train_segmentation.py" in card and "intersection over union" in card
