@@ -7,8 +7,8 @@ A trial is sampled from the published configurations in turn, simulated until ag
 touch, and drawn at the observed frames. Of trials with the digest of a training trial, without a
 contact in the observed part, and with agent and patient visible in the first frame, the features of
 all `MODELS` are written to FOLDER/own, in files of `EACH` trials. With --official the same of the
-stimuli that people saw goes to FOLDER/official; with --stored the trials of a dataset go to
-FOLDER/own, but for those with the scene of an official one. The same command continues.
+stimuli that people saw goes to FOLDER/official; with --stored the training trials of a dataset go
+to FOLDER/own, but for those with the scene of an official one. The same command continues.
 """
 
 from __future__ import annotations
@@ -225,15 +225,12 @@ def make_official(kept: Kept, part: int) -> str:
 
 
 @cache
-def opened(folder: Path) -> tuple[pd.DataFrame, TrialMotions, str]:
-    """Return the index, motions and digest of a dataset.
-
-    Without trials with a contact in the observed part.
-    """
+def opened(folder: Path) -> tuple[pd.DataFrame, Any, str]:
+    """Return training trials without a contact in the observed part, their files, and a digest."""
     dataset = Dataset(folder)
-    index = dataset.index[~dataset.index["observed_contact"].astype(bool)].set_index("trial")
-    motions = TrialMotions(dataset.files("trial_file"), observed=True)
-    return index, motions, describe_fit(dataset).split()[-1]
+    index = dataset.index[dataset.index["split"] == "training"]
+    index = index[~index["observed_contact"].astype(bool)].set_index("trial")
+    return index, dataset.files("trial_file"), describe_fit(dataset).split()[-1]
 
 
 @cache
@@ -244,9 +241,10 @@ def official_digests() -> frozenset[str]:
 
 def make_stored(dataset: Path, kept: Kept, part: int) -> str:
     """Make one file of trials of a dataset, without those with the scene of an official one."""
-    index, motions, digest = opened(dataset)
+    index, files, digest = opened(dataset)
     path = kept.folder / "own" / f"stored-{digest}-{part:04d}.npz"
     if not there(path, kept):
+        motions = TrialMotions(files, observed=True)
         rows = index.iloc[part * EACH : (part + 1) * EACH].to_dict("index")
         write(
             path,
@@ -306,7 +304,6 @@ def load(folder: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
             for name, parts in facts.items():
                 parts.append(stored[name])
     out = {name: np.concatenate(parts) for name, parts in facts.items()}
-    # Pictures are large: they are read into one array, which is not copied.
     start = 0
     for path in paths:
         with np.load(path) as stored:

@@ -202,9 +202,12 @@ def _matrices(comparison: Comparison, rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def stored_official(released: PublishedTables) -> Tested:
-    """Return the scores of shipped weights on official stimuli (``official_all.csv``)."""
+    """Return the scores of shipped weights on official stimuli (``official_all.csv``).
+
+    The file is ``tables/comparison.csv`` of `physion compare`.
+    """
     scores = pd.read_csv(RESULTS / "official_all.csv").drop(columns="kind")
-    scores = scores.assign(model=scores["model"].map(STORED)).dropna(subset=["model"])
+    scores = scores.assign(model=scores["base_model"].map(STORED)).dropna(subset=["model"])
     rows = scores[scores["scenario"].isin(SCENARIOS)]
     runs = rows[["model", "scenario", "readout", "accuracy"]].assign(
         training="all", seed=0, kappa=rows["kappa_from_averages"]

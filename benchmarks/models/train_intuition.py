@@ -7,10 +7,9 @@ The trainer is the one of `physion train`; the same command resumes. The last te
 trials of every scenario trains nothing: on them, and on the official stimuli without a contact in
 the observed part, networks are tested, and compared with forests that saw the same training trials,
 where their features are stored. With --start a training begins from other weights, that of pixels
-from those of masks. Predictions
-of official stimuli go to FOLDER/predictions, where ``intuition.py --predictions`` reads them,
-weights to FOLDER/training. With --all-but every network is also trained without the tested
-scenario. With --write the table is written to ``results/intuition_networks.md``; --weights names
+from those of masks. Predictions of official stimuli go to FOLDER/predictions, where ``intuition.py
+--predictions`` reads them, weights to FOLDER/training. With --all-but every network is also trained
+without the tested scenario. With --write the table is written to ``results/intuition_networks.md``; --weights names
 a folder for the weights of all scenarios as float16.
 """
 
@@ -93,8 +92,10 @@ class Learner:
     def train(self, without: str = "") -> dict[str, NDArray[np.float64]]:
         """Return P(contact) of held-out and official trials, of a network without a scenario."""
         model: Any = build_untrained(self.name, **self._options())
-        if self.options.start and self.name in SAME_TOKENS:
-            other: Any = build_untrained(SAME_TOKENS[self.name], **self._start(SAME_TOKENS))
+        if self.options.start:
+            same = SAME_TOKENS.get(self.name, self.name)
+            weights = str(self.options.start / f"{same}-small.safetensors")
+            other: Any = build_untrained(same, **self._options(), weights=weights)
             model.load_state_dict(other.state_dict())
             model.trained, model.init = True, other.init
         self.title = model.name
@@ -180,15 +181,7 @@ class Learner:
 
     def _options(self) -> dict[str, Any]:
         pairs = [pair.split("=") for pair in self.options.option]
-        given = {key: json.loads(value) if value[0].isdigit() else value for key, value in pairs}
-        return {**given, **self._start({})}
-
-    def _start(self, same: Mapping[str, str]) -> dict[str, Any]:
-        """Return the weights that a training begins from, of this model or one in ``same``."""
-        name = same.get(self.name, self.name)
-        if self.options.start is None or (name == self.name and name in SAME_TOKENS):
-            return {}
-        return {"weights": str(self.options.start / f"{name}-small.safetensors")}
+        return {key: json.loads(value) if value[0].isdigit() else value for key, value in pairs}
 
     @torch.no_grad()
     def _predict(
@@ -229,7 +222,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--models", nargs="*", choices=SAME, default=list(SAME)[:2])
+    parser.add_argument("--models", nargs="*", choices=SAME, default=list(SAME))
     parser.add_argument("--steps", type=int, default=0, help="of the training; 0: the model's own")
     parser.add_argument("--batch", type=int, default=0, help="clips a step; 0: the model's own")
     parser.add_argument("--learning-rate", type=float, default=0.0, help="0: the model's own")

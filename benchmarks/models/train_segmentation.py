@@ -62,7 +62,7 @@ JITTER, NOISE = 0.1, 0.02
 def make(folder: Path, dataset: Dataset, count: int) -> None:
     """Store pictures and masks of ``count`` trials, one of each scenario in turn."""
     known = {trial.scene.physics_digest() for trial in official().trials}
-    index = dataset.index[dataset.index["split"] != "familiarization"]
+    index = dataset.index[dataset.index["split"] == "training"]
     order = index.groupby("scenario").cumcount()
     names = index.assign(order=order).sort_values(["order", "scenario"])["trial"].tolist()[:count]
     motions = TrialMotions(dataset.files("trial_file"), observed=True)
@@ -115,8 +115,11 @@ def losses(found: Tensor, kinds: Tensor, offsets: Tensor) -> tuple[Tensor, Tenso
 
 def train(folder: Path, steps: int) -> tuple[SegmentationNetwork, str]:
     """Return the trained network, and its errors on held-out trials as text."""
-    parts = [np.load(path) for path in sorted(folder.glob("pictures-*.npz"))]
+    paths = sorted(folder.glob("pictures-*.npz"), key=lambda path: int(path.stem.split("-")[1]))
+    parts = [np.load(path) for path in paths]
     *fit, held = [(part["rgb"], part["ids"]) for part in parts]
+    if not fit or len(held[0]) < HELD:
+        raise SystemExit(f"{folder} has {len(paths)} files; two of {PART} trials are needed")
     rng = generator("segmentation", "training")
     torch.manual_seed(0)
     network = SegmentationNetwork()
@@ -183,7 +186,7 @@ def main() -> None:
     )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--trials", type=Path, help="folder of own trials; else only those stored")
-    parser.add_argument("--count", type=int, default=24000)
+    parser.add_argument("--count", type=int, default=15000)
     parser.add_argument("--steps", type=int, default=4000)
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
@@ -197,7 +200,10 @@ def main() -> None:
         SHIPPED.mkdir(exist_ok=True)
         halves = {name: value.half() for name, value in network.state_dict().items()}
         write_with_digest(SHIPPED / WEIGHTS, save(halves))
-        command = "python benchmarks/models/train_segmentation.py FOLDER --trials TRIALS --write"
+        command = (
+            "python benchmarks/models/train_segmentation.py FOLDER --trials TRIALS "
+            f"--count {options.count} --steps {options.steps} --write"
+        )
         lines = [
             "# Objects in pictures", "",
             "Network of `physion.models.segmentation`, rounded to float16.", "",

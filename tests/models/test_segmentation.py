@@ -85,7 +85,38 @@ def test_objects_keep_their_numbers_over_time() -> None:
     assert follow(np.zeros((2, 4, 4), np.uint8)).shape == (2, 4, 4)
 
 
-@pytest.mark.parametrize("scenario", ["dominoes", "drop", "collide"])
+def test_a_hidden_object_is_expected_where_its_motion_leads() -> None:
+    frames = np.zeros((8, SIDE, SIDE), np.uint8)
+    for time in (0, 1, 2, 5, 6, 7):  # hidden in 3 and 4
+        frames[time, 10:18, 5 + 8 * time : 13 + 8 * time] = 3
+    found = follow(frames)
+    assert {int(found[t, 12, 8 + 8 * t]) for t in (0, 1, 2, 5, 6, 7)} == {3}
+
+
+def test_an_object_that_vanishes_takes_no_other_ones_place() -> None:
+    frames = np.zeros((2, SIDE, SIDE), np.uint8)
+    frames[:, 10:20, 10:20] = 3
+    frames[0, 70:80, 70:80] = 4
+    frames[1, 10:20, 10:20] = 0
+    frames[1, 10:20, 14:24], frames[1, 40:50, 40:50] = 5, 3
+    found = follow(frames)
+    assert found[0, 15, 15] == found[1, 15, 18] == 3
+    assert found[0, 75, 75] == 4 and found[1, 45, 45] == 5
+
+
+def test_equal_votes_of_neighbours_are_one_object() -> None:
+    ids = np.zeros((SIDE, SIDE), np.uint8)
+    ids[40:44, 40:44] = 3
+    logits, offsets = outputs(ids)
+    assert np.unique(group(logits, offsets)).tolist() == [0, 3]
+    # Half of the pixels point to one cell, half to the next one.
+    rows, columns = np.nonzero(ids)
+    offsets[1][ids > 0] = OFFSET * (0.4 - (rows + 0.5) / SIDE)
+    offsets[0][ids > 0] = OFFSET * ((20.5 + (columns % 2)) / 48 - (columns + 0.5) / SIDE)
+    assert np.unique(group(logits, offsets)).tolist() == [0, 3]
+
+
+@pytest.mark.parametrize("scenario", ["support", "drop", "collide"])
 def test_the_trained_network_finds_the_objects_of_new_scenes(scenario: str) -> None:
     scene = sample_scene(scenario, 7003)
     motion = Motion(scene, simulate(scene, frames=45))
@@ -95,7 +126,10 @@ def test_the_trained_network_finds_the_objects_of_new_scenes(scenario: str) -> N
     assert found.shape == true.shape and found.dtype == np.uint8
     for ours, theirs in ((found == 1, true == 1), (found == 2, true == 2), (found > 0, true > 0)):
         assert (ours & theirs).sum() > 0.75 * (ours | theirs).sum()
-    assert (segment(drawn["rgb"]) == found).all()
+    # Other objects of the first frame are found one by one.
+    numbers = [n for n in np.unique(true[0]) if n > 2 and (true[0] == n).sum() >= 30]
+    own = [int(np.bincount(found[0][true[0] == n]).argmax()) for n in numbers]
+    assert min(own, default=3) >= 3 and len(set(own)) >= 0.7 * len(own)
 
 
 def test_weights_have_a_card_and_are_small() -> None:

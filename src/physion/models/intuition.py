@@ -53,7 +53,7 @@ from physion.models.interface import (
     Sizes,
     TrainingSettings,
 )
-from physion.models.segmentation import SIDE, segment, weights_sha256
+from physion.models.segmentation import SIDE, segment, segmentation_version
 from physion.models.torch_model import TorchModel, initial_weights, weights_digest
 from physion.numerics.linear_algebra import norm
 from physion.numerics.rotations import rotate_vectors, rotation_matrices
@@ -282,7 +282,7 @@ def mask_tokens(ids: NDArray[np.uint8], objects: int) -> NDArray[np.float32]:
 class IntuitionSettings(SizedSettings):
     """Settings of a model of intuition; also see `SizedSettings`.
 
-    - ``image_size``: pixels per side of the masks.
+    - ``image_size``: pixels per side of the masks; from pixels always 96.
     - ``objects``: tokens K. With more objects the largest masks, or the bodies nearest to the line
       from agent to patient, are kept.
     - ``width``, ``layers``, ``heads``: of the network. ``dropout``: in training.
@@ -441,6 +441,8 @@ class Intuition(TorchModel):
         self.order = nn.Buffer(torch.tensor(order), persistent=False)
         self.signs = nn.Buffer(torch.tensor(signs), persistent=False)
         load_named(self, settings.weights)
+        # Until a training says otherwise: dropout and noise would change answers.
+        self.eval()
 
     def provenance(self) -> Provenance:
         """Return name, size and origin of the weights."""
@@ -448,7 +450,7 @@ class Intuition(TorchModel):
             model=self.name,
             init=self.init,
             encoder_type=f"{self.kind} of up to {self.settings.objects} objects",
-            encoder_training_task="outcomes",
+            encoder_training_task="segmentation" if self.kind == PIXELS else "outcomes",
             dynamics_type="none",
             versions=f"torch {torch.__version__}",
         )
@@ -465,15 +467,12 @@ class Intuition(TorchModel):
         return weights_digest([*made, *self._segmentation()])
 
     def built_as(self) -> dict[str, Any]:
-        """Return what the weights were made for: name, with the size, and version."""
-        return {"model": self.name, "version": VERSION}
+        """Return what the weights were made for: name, with the size, version, and segmentation."""
+        made: dict[str, Any] = {"model": self.name, "version": VERSION}
+        return made | ({"segmentation": segmentation_version()} if self.kind == PIXELS else {})
 
     def encode(self, batch: Batch) -> Tensor:
-        """Return the tokens of all objects (B, T, K D), which depend on no trained weights.
-
-        Raises `BadInputError` if nothing is red or yellow in any of several trials, where pictures
-        are seen: they have another look.
-        """
+        """Return the tokens of all objects (B, T, K D), which the training does not change."""
         self._check_frames(batch)
         objects = self.settings.objects
         if self.kind == STATE:
@@ -497,7 +496,11 @@ class Intuition(TorchModel):
     def notes(self, batch: Batch) -> list[str]:
         """Return for each trial whether it never shows agent or patient, or too many objects."""
         most, notes = self.settings.objects, []
-        for seen, count in zip(self.seen(batch).tolist(), self._counts(batch), strict=True):
+        ids = None if self.kind == STATE else self._ids(batch)
+        if ids is not None:
+            tokens = np.stack([mask_tokens(one, most) for one in ids])
+            batch = replace(batch, features=torch.from_numpy(tokens).flatten(2).to(self.device))
+        for seen, count in zip(self.seen(batch).tolist(), self._counts(batch, ids), strict=True):
             hidden = "" if seen else "agent or patient never visible: base rate"
             many = f"{count} objects, only {most} are looked at" if count > most else ""
             notes.append("; ".join(filter(None, (hidden, many))))
@@ -579,8 +582,8 @@ class Intuition(TorchModel):
         return torch.cat([values, constants], -1), there
 
     def _segmentation(self) -> list[str]:
-        """Return the SHA-256 of the weights that find objects in pictures, if they are used."""
-        return [weights_sha256()] if self.kind == PIXELS else []
+        """Return what the masks depend on that are found in pictures; nothing of other models."""
+        return [segmentation_version(), torch.__version__] if self.kind == PIXELS else []
 
     def _check_frames(self, batch: Batch) -> None:
         """Raise `BadInputError` for other frames than those that the model learns from."""
@@ -600,30 +603,21 @@ class Intuition(TorchModel):
         given = getattr(batch, name)
         if given is None or tuple(given.shape[2:4]) != (size, size):
             found = "none" if given is None else tuple(given.shape[2:4])
-            what = "pictures" if self.kind == PIXELS else "objects of pixels"
+            pixels = self.kind == PIXELS
+            what = "pictures" if pixels else "objects of pixels"
             raise BadInputError(
                 f"{self.name}: {what} (input {name}) of {size} x {size} are needed, not "
-                f"{found}; give clips of this size, or --option image_size"
+                f"{found}; give clips of this size" + (", or --option image_size") * (not pixels)
             )
         values = np.asarray(given.cpu() if isinstance(given, Tensor) else given)
         if self.kind == MASK:
             return values
-        ids = np.stack([segment(pictures) for pictures in values])
-        if len(ids) > 1 and not np.isin(ids, (AGENT_ID, PATIENT_ID)).any():
-            raise BadInputError(
-                f"{self.name}: in {len(ids)} trials, such as {batch.trials[0]!r}, nothing is red "
-                "or yellow; it sees agent and patient by these colours only, so take trials in the "
-                "look redyellow"
-            )
-        return ids
+        return np.stack([segment(pictures) for pictures in values])
 
-    def _counts(self, batch: Batch) -> Sequence[int]:
+    def _counts(self, batch: Batch, ids: NDArray[np.uint8] | None) -> Sequence[int]:
         """Return the number of objects of every clip, which may be more than there are tokens."""
-        if self.kind == PIXELS:
-            there = self._tokens(batch)[..., 0] > 0
-            return [int(one) for one in there.any(1).sum(-1)]
-        if self.kind == MASK:
-            return [len(np.unique(ids[ids > 0])) for ids in self._ids(batch)]
+        if ids is not None:
+            return [len(np.unique(one[one > 0])) for one in ids]
         scenes = [motion.scene for motion in motions(batch, self.name)]
         return [
             sum(not body.scenery for body in scene.bodies) + len(scene.cloths) for scene in scenes

@@ -5,12 +5,12 @@ which of its pixels are red or yellow. For every pixel p it gives logits of four
 offset o(p) from p to the centre of its object, as in Panoptic-DeepLab (Cheng et al., 2020). Agent
 and patient are classes. Pixels of the class of other objects vote for the places p + o(p): the
 maxima of the smoothed votes are the objects, and each pixel belongs to the nearest one. Over time
-an object is continued by the one that is nearest to where it should be,
+an object that was last seen at time s is continued by the one nearest to where it should be,
 
-    d = |c_t - c_{t-1} - v|_1 + .7 |s_t - s_{t-1}|_1,
+    d = |c_t - c_s - (t - s) v|_1 + .7 |a_t - a_s|_1,
 
-with its centre c, velocity v, and size s (square root of the area, halves of width and height);
-pairs are chosen so that the sum of d is least.
+with its centre c, velocity v, and size a (square root of the area, halves of width and height);
+pairs are chosen so that the sum of d is least, and none is farther apart than `FAR`.
 
 The network was trained on own pictures in red and yellow, of 96 pixels a side, with true masks
 (``benchmarks/models/train_segmentation.py``).
@@ -36,6 +36,7 @@ from physion.models.baselines.pixels import color_masks
 
 F64 = NDArray[np.float64]
 
+VERSION = 1
 FOLDER, WEIGHTS = "physion.data.segmentation", "segmentation.safetensors"
 """Package and file of the weights."""
 SIDE = 96
@@ -150,9 +151,12 @@ def group(logits: F64, offsets: F64) -> NDArray[np.uint8]:
     np.add.at(counts, (cells[:, 1], cells[:, 0]), 1.0)
     smooth = ndimage.gaussian_filter(counts, 0.8, mode="constant")
     peaks = (smooth == ndimage.maximum_filter(smooth, 3)) & (smooth > LEAST_VOTES)
-    if not peaks.any():
+    # Neighbours with equal votes are one maximum.
+    labels, count = ndimage.label(peaks, np.ones((3, 3)))
+    if not count:
         return ids
-    centers = (np.argwhere(peaks)[:, ::-1] + 0.5) / CELLS
+    middles = np.array(ndimage.center_of_mass(peaks, labels, np.arange(1, count + 1)))
+    centers = (middles[:, ::-1] + 0.5) / CELLS
     for _ in range(2):
         nearest = ((votes[:, None] - centers) ** 2).sum(-1).argmin(1)
         centers = np.stack([votes[nearest == k].mean(0) for k in np.unique(nearest)])
@@ -174,14 +178,17 @@ def follow(ids: NDArray[np.uint8]) -> NDArray[np.uint8]:
     for time, picture in enumerate(ids):
         numbers = [int(n) for n in np.unique(picture) if n >= FIRST_OTHER_ID]
         now = np.array([_described(picture == n) for n in numbers]).reshape(-1, 5)
-        ahead = seen[:, None] + np.pad(velocity, ((0, 0), (0, 3)))[:, None]
-        distance = np.abs(now - ahead) @ np.array([1, 1, 0.7, 0.7, 0.7])
+        steps = time - last
+        ahead = seen + np.pad(velocity * steps[:, None], ((0, 0), (0, 3)))
+        distance = np.abs(now - ahead[:, None]) @ np.array([1, 1, 0.7, 0.7, 0.7])
+        limit = FAR[0] + FAR[1] * (steps - 1)
         own = np.full(len(numbers), -1)
-        for track, place in zip(*linear_sum_assignment(distance), strict=True):
-            missed = time - last[track] - 1
-            if distance[track, place] < FAR[0] + FAR[1] * missed:
+        # What is too far apart costs the same, so that it does not take part in the choice.
+        costs = np.minimum(distance, limit[:, None])
+        for track, place in zip(*linear_sum_assignment(costs), strict=True):
+            if distance[track, place] < limit[track]:
                 own[place] = track
-                velocity[track] = (now[place, :2] - seen[track, :2]) / (missed + 1)
+                velocity[track] = (now[place, :2] - seen[track, :2]) / steps[track]
                 seen[track], last[track] = now[place], time
         for place, number in enumerate(numbers):
             if own[place] < 0 and len(seen) < MOST:
@@ -211,15 +218,17 @@ def _described(mask: NDArray[np.bool_]) -> F64:
 @cache
 def _network() -> SegmentationNetwork:
     """Return the network with the weights of the package."""
-    network = SegmentationNetwork()
+    with torch.device("meta"):
+        network = SegmentationNetwork()
     with as_file(files(FOLDER)) as folder:
         content = (folder / WEIGHTS).read_bytes()
         check_digest(folder / WEIGHTS, content, "install the package again")
-    network.load_state_dict({name: value.float() for name, value in load(content).items()})
+    weights = {name: value.float() for name, value in load(content).items()}
+    network.load_state_dict(weights, assign=True)
     return network.eval()
 
 
-def weights_sha256() -> str:
-    """Return the SHA-256 of the weights of the package."""
+def segmentation_version() -> str:
+    """Return the version of this code, and the start of the SHA-256 of the weights."""
     with as_file(files(FOLDER)) as folder:
-        return file_sha256(folder / WEIGHTS)
+        return f"{VERSION} {file_sha256(folder / WEIGHTS)[:12]}"
