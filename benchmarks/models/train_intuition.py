@@ -9,8 +9,9 @@ the observed part, networks are tested, and compared with forests that saw the s
 where their features are stored. With --start a training begins from other weights, that of pixels
 from those of masks. Predictions of official stimuli go to FOLDER/predictions, where ``intuition.py
 --predictions`` reads them, weights to FOLDER/training. With --all-but every network is also trained
-without the tested scenario. With --write the table is written to ``results/intuition_networks.md``; --weights names
-a folder for the weights of all scenarios as float16.
+without the tested scenario. With --write the table is written to
+``results/intuition_networks.md``; --weights names a folder for the weights of all scenarios as
+float16.
 """
 
 from __future__ import annotations

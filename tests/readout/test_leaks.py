@@ -30,8 +30,8 @@ QUICK = EvaluationSettings(accelerator="cpu", logistic=LogisticSettings(grid=(1e
 TREES = {"blob-trees", "mask-trees", "state-trees"}
 KINDS = {
     "VideoMAE", "blob-centroids", "chance", "constant-motion", "copy-last-frame", "cswm",
-    "dpi", "frozen-encoder", "gns", "intuition-masks", "intuition-pixels", "intuition-states", "mask-trees",
-    "noisy-simulation",
+    "dpi", "frozen-encoder", "gns", "intuition-masks", "intuition-pixels", "intuition-states",
+    "mask-trees", "noisy-simulation",
 }  # fmt: skip
 """Quick models of each kind; the nightly tests have the others."""
 PREDICTING = ("observed", "observed+simulated")
