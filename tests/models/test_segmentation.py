@@ -45,7 +45,7 @@ def same_parts(found: Any, ids: Any) -> bool:
     return len(pairs) == len({a for a, _ in pairs}) == len({b for _, b in pairs})
 
 
-def test_objects_that_touch_are_told_apart_by_their_centres() -> None:
+def test_objects_that_touch_are_separated_by_their_centres() -> None:
     ids = layout()
     found = group(*outputs(ids))
     assert same_parts(found, ids)

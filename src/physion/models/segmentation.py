@@ -53,7 +53,7 @@ LEAST_VOTES, LEAST_PIXELS = 0.6, 6
 FAR = 0.12, 0.01
 """Largest d between frames, and by how much it rises with each frame in which nothing was seen."""
 MOST = 60
-"""Objects of a trial that are told apart."""
+"""Largest number of other objects of a trial."""
 
 
 class SegmentationNetwork(nn.Module):
@@ -122,7 +122,7 @@ def network_input(rgb: NDArray[np.uint8]) -> Tensor:
 def segment(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the objects of pixels (T, H, W) of the pictures of a trial (T, `SIDE`, `SIDE`, 3).
 
-    Numbers are those of ``Batch.ids``: `AGENT_ID`, `PATIENT_ID`, from `FIRST_OTHER_ID` the others,
+    Numbers are as in ``Batch.ids``: `AGENT_ID`, `PATIENT_ID`, from `FIRST_OTHER_ID` the others,
     each with the same number in all pictures, and `SCENERY_ID`.
     """
     with torch.no_grad():
@@ -171,7 +171,7 @@ def group(logits: F64, offsets: F64) -> NDArray[np.uint8]:
 
 
 def follow(ids: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return objects (T, H, W) of which each has one number, from those of single pictures."""
+    """Return the objects of pictures (T, H, W), each with the same number in all of them."""
     out = np.where(ids >= FIRST_OTHER_ID, SCENERY_ID, ids).astype(np.uint8)
     seen = np.zeros((0, 5))
     velocity, last = np.zeros((0, 2)), np.zeros(0, int)
