@@ -27,7 +27,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from safetensors.torch import save
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from physion import Dataset
@@ -262,6 +262,17 @@ def train(folder: Path, steps: int) -> tuple[ExpectationNetwork, str]:
     return network, text
 
 
+def write_network(path: Path, network: nn.Module, title: str, command: str, text: str) -> None:
+    """Write the weights of a network, rounded to float16, and a card, into the package."""
+    path.parent.mkdir(exist_ok=True)
+    halves = {name: value.half() for name, value in network.state_dict().items()}
+    write_with_digest(path, save(halves))
+    path.with_suffix(".md").write_text(
+        f"{title}, rounded to float16.\n\n`{command}`, {datetime.date.today()}, {processor()}, "
+        f"one thread: {text}.\n"
+    )
+
+
 def main() -> None:
     """Make what is missing, train, and write the weights."""
     parser = argparse.ArgumentParser(
@@ -282,16 +293,14 @@ def main() -> None:
     network, text = train(options.folder, options.steps)
     print(text)
     if options.write:
-        SHIPPED.mkdir(exist_ok=True)
-        halves = {name: value.half() for name, value in network.state_dict().items()}
-        write_with_digest(SHIPPED / WEIGHTS, save(halves))
-        command = "python benchmarks/models/train_seeing.py FOLDER --trials TRIALS --write"
-        lines = [
-            "# What is expected of objects", "",
-            "Network of `physion.models.seeing.expected`, rounded to float16.", "",
-            f"`{command}`, {datetime.date.today()}, {processor()}, one thread: {text}.",
-        ]  # fmt: skip
-        (SHIPPED / "expected.md").write_text("\n".join(lines) + "\n")
+        write_network(
+            SHIPPED / WEIGHTS,
+            network,
+            "# What is expected of objects\nNetwork of `physion.models.seeing.expected`",
+            "python benchmarks/models/train_seeing.py FOLDER --trials TRIALS --count "
+            f"{options.count} --steps {options.steps} --write",
+            text,
+        )
 
 
 if __name__ == "__main__":

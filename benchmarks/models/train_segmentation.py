@@ -4,9 +4,9 @@
     OMP_NUM_THREADS=1 python benchmarks/models/train_segmentation.py FOLDER --trials TRIALS
         [--count 24000] [--steps 4000] [--write]
 
-Of every trial three observed frames are rendered, in red and yellow, and stored in FOLDER with
-their masks, 1,000 trials a file; the same command resumes. In the training pictures are mirrored,
-and brightness, contrast and noise vary. The loss is
+Of training trials three observed frames are rendered, in red and yellow, and stored in FOLDER
+with their masks, 1,000 trials a file; the same command resumes. In the training pictures are
+mirrored, and brightness, contrast and noise vary. The loss is
 
     cross entropy of the class of pixels + SHARE * mean |offset - o|_1 of pixels of other objects.
 
@@ -27,7 +27,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import save
 from torch import Tensor
 from torch.nn import functional
 
@@ -35,8 +34,6 @@ from physion import Dataset
 from physion.clips.batch import FIRST_OTHER_ID
 from physion.clips.rendered import object_ids
 from physion.clips.states import TrialMotions
-from physion.compute.tasks import processor
-from physion.core.files import write_with_digest
 from physion.core.seeds import generator
 from physion.data.official import official
 from physion.models.segmentation import (
@@ -50,6 +47,7 @@ from physion.models.segmentation import (
 from physion.rendering.renderer import Renderer
 from physion.scenes.looks import in_look
 from physion.scenes.scene import OBSERVED_FRAMES
+from train_seeing import write_network
 
 SHIPPED = Path(__file__).parents[2] / "src/physion/data/segmentation"
 PART, FRAMES, BATCH, HELD = 1000, 3, 32, 512
@@ -197,19 +195,14 @@ def main() -> None:
     network, text = train(options.folder, options.steps)
     print(text)
     if options.write:
-        SHIPPED.mkdir(exist_ok=True)
-        halves = {name: value.half() for name, value in network.state_dict().items()}
-        write_with_digest(SHIPPED / WEIGHTS, save(halves))
-        command = (
-            "python benchmarks/models/train_segmentation.py FOLDER --trials TRIALS "
-            f"--count {options.count} --steps {options.steps} --write"
+        write_network(
+            SHIPPED / WEIGHTS,
+            network,
+            "# Objects in pictures\nNetwork of `physion.models.segmentation`",
+            "python benchmarks/models/train_segmentation.py FOLDER --trials TRIALS --count "
+            f"{options.count} --steps {options.steps} --write",
+            text,
         )
-        lines = [
-            "# Objects in pictures", "",
-            "Network of `physion.models.segmentation`, rounded to float16.", "",
-            f"`{command}`, {datetime.date.today()}, {processor()}, one thread: {text}.",
-        ]  # fmt: skip
-        (SHIPPED / "segmentation.md").write_text("\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":

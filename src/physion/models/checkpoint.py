@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors.torch import load, save
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
@@ -222,6 +222,7 @@ def _shown(values: Mapping[str, Any], key: str) -> str:
 
 FOLDER = "physion.data.weights"
 """Name of the folder with the weights that are installed with the package."""
+Network = TypeVar("Network", bound=nn.Module)
 BUILT_AS = "built_as"
 """Metadata key of weights: the return value of the model's ``built_as()``."""
 
@@ -232,6 +233,38 @@ def shipped_digests() -> dict[str, str]:
     found = [file for file in files(FOLDER).iterdir() if file.name.endswith(ending)]
     texts = {file.name.removesuffix(ending): file.read_text() for file in found}
     return {name: texts[name].partition(" ")[0] for name in sorted(texts)}
+
+
+def load_packaged(network: Callable[[], Network], package: str, name: str) -> Network:
+    """Return a network that is a part of models, with its weights from a file of the package.
+
+    Parameters
+    ----------
+    network
+        Makes it, here without random weights.
+    package, name
+        Where the file with its ``state_dict`` is. Half precision becomes single precision.
+
+    Raises
+    ------
+    BadInputError
+        If the file was changed.
+    """
+    with as_file(files(package)) as folder:
+        content = (folder / name).read_bytes()
+        check_digest(folder / name, content, "install the package again")
+    with torch.device("meta"):
+        made = network()
+    weights = {key: value.float() for key, value in load(content).items()}
+    made.load_state_dict(weights, assign=True)
+    made.eval()
+    return made
+
+
+def packaged_sha256(package: str, name: str) -> str:
+    """Return the SHA-256 of a file of the package."""
+    with as_file(files(package)) as folder:
+        return file_sha256(folder / name)
 
 
 def load_named(model: Any, weights: str) -> None:

@@ -19,31 +19,30 @@ The network was trained on own pictures in red and yellow, of 96 pixels a side, 
 from __future__ import annotations
 
 from functools import cache
-from importlib.resources import as_file, files
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import load
 from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor, nn
 from torch.nn import functional
 
 from physion.clips.batch import AGENT_ID, FIRST_OTHER_ID, PATIENT_ID, SCENERY_ID
-from physion.core.files import check_digest, file_sha256
 from physion.models.baselines.pixels import color_masks
+from physion.models.checkpoint import load_packaged, packaged_sha256
 
 F64 = NDArray[np.float64]
 
 VERSION = 1
+"""Counts changes of this code that change what is found."""
 FOLDER, WEIGHTS = "physion.data.segmentation", "segmentation.safetensors"
 """Package and file of the weights."""
 SIDE = 96
 """Pixels per side of the pictures."""
 CLASSES = (SCENERY_ID, AGENT_ID, PATIENT_ID, FIRST_OTHER_ID)
 OFFSET = 10.0
-"""The network gives offsets in this fraction of the picture: 10 for a whole side."""
+"""Factor of the offsets that the network gives: they are in tenths of a side of the picture."""
 CHANNELS = (24, 32, 64, 96)
 """Of the maps with 1/2, 1/4, 1/8 and 1/16 of the resolution."""
 CELLS = 48
@@ -75,7 +74,7 @@ class SegmentationNetwork(nn.Module):
         self.out = nn.Conv2d(first, 4 * (len(CLASSES) + 2), 3, padding=1)
 
     def forward(self, pictures: Tensor) -> Tensor:
-        """Return logits of `CLASSES`, and the offset in x and y in units of 1 / `OFFSET`."""
+        """Return logits of `CLASSES`, and the offset in x and y, in tenths of a side."""
         maps = [self.stem(pictures)]
         for down in self.down:
             maps.append(down(maps[-1]))
@@ -218,17 +217,9 @@ def _described(mask: NDArray[np.bool_]) -> F64:
 @cache
 def _network() -> SegmentationNetwork:
     """Return the network with the weights of the package."""
-    with torch.device("meta"):
-        network = SegmentationNetwork()
-    with as_file(files(FOLDER)) as folder:
-        content = (folder / WEIGHTS).read_bytes()
-        check_digest(folder / WEIGHTS, content, "install the package again")
-    weights = {name: value.float() for name, value in load(content).items()}
-    network.load_state_dict(weights, assign=True)
-    return network.eval()
+    return load_packaged(SegmentationNetwork, FOLDER, WEIGHTS)
 
 
 def segmentation_version() -> str:
     """Return the version of this code, and the start of the SHA-256 of the weights."""
-    with as_file(files(FOLDER)) as folder:
-        return f"{VERSION} {file_sha256(folder / WEIGHTS)[:12]}"
+    return f"{VERSION} {packaged_sha256(FOLDER, WEIGHTS)[:12]}"

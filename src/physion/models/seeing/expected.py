@@ -21,16 +21,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import as_file, files
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import load
 from torch import Tensor, nn
 
 from physion.clips.batch import AGENT_ID, PATIENT_ID, SCENERY_ID
-from physion.core.files import check_digest, file_sha256
+from physion.models.checkpoint import load_packaged, packaged_sha256
 from physion.models.seeing.masks import Expected
 from physion.models.seeing.pixels import SeenFrame, picture_of
 from physion.models.seeing.solids import library
@@ -274,18 +272,12 @@ def frames_of(values: Tensor) -> Tensor:
 @cache
 def _network() -> ExpectationNetwork:
     """Return the network with the weights of the package."""
-    network = ExpectationNetwork()
-    with as_file(files(FOLDER)) as folder:
-        content = (folder / WEIGHTS).read_bytes()
-        check_digest(folder / WEIGHTS, content, "install the package again")
-    network.load_state_dict({name: value.float() for name, value in load(content).items()})
-    return network.eval()
+    return load_packaged(ExpectationNetwork, FOLDER, WEIGHTS)
 
 
 def weights_sha256() -> str:
     """Return the SHA-256 of the weights of the package."""
-    with as_file(files(FOLDER)) as folder:
-        return file_sha256(folder / WEIGHTS)
+    return packaged_sha256(FOLDER, WEIGHTS)
 
 
 def expect(
