@@ -176,8 +176,10 @@ def official_trial(scene: Scene, contact: bool, kept: Kept) -> Seen:
 
 def stored_trial(trial: str, row: Mapping[str, Any], motion: Motion, kept: Kept) -> Seen:
     """Return a trial that is stored in a dataset, with its row of the index."""
+    preset = load_presets(row["scenario"]).get(row["preset"])
+    configuration = preset.official if preset and preset.official else row["preset"]
     return Seen(
-        trial, row["scenario"], row["preset"], bool(row["contact"]), bool(row["observed_contact"]),
+        trial, row["scenario"], configuration, bool(row["contact"]), bool(row["observed_contact"]),
         motion.scene.to_json(), see(motion, kept),
     )  # fmt: skip
 
@@ -333,9 +335,9 @@ def main() -> None:
     # Scenarios in turn, so that what is there is always of all of them.
     tasks = [(s, part) for part in range(options.trials // EACH) for s in options.scenarios]
     parts = range(-(-len(official_scenes()) // EACH)) if options.official else range(0)
-    # Masks tell whether agent and patient are visible.
-    models = tuple(dict.fromkeys((*options.models, "intuition-masks")))
-    kept = Kept(options.folder, models)
+    # Masks tell whether agent and patient are visible in own trials; stored ones were chosen so.
+    masks = ("intuition-masks",) if options.trials else ()
+    kept = Kept(options.folder, tuple(dict.fromkeys((*options.models, *masks))))
     count = 0
     if options.stored:
         count = len(opened(options.stored)[0])

@@ -76,13 +76,12 @@ MODELS: Mapping[str, tuple[str, Mapping[str, Any], tuple[Readout, ...]]] = {
         "pEffNetLite0-mlp", {"weights": "random"}, (Readout.OBSERVED, Readout.FULL)
     ),
     "cswm-small": ("cswm", {}, tuple(Readout)),
-    "rpin-small": ("rpin", {}, (Readout.OBSERVED, Readout.OBSERVED_SIMULATED)),
+    "rpin-small": ("rpin", {}, tuple(Readout)),
     "svg-small": ("svg", {}, tuple(Readout)),
     "op3-small": ("op3", {}, tuple(Readout)),
 }  # fmt: skip
 """By name of the file: model, options and kinds of readouts. The dynamics of pEffNetLite0 do not
-ship, so that they are trained, and their readouts fitted, where it is evaluated. *full* of RPIN
-would take .6 of the 4 MB that readouts have."""
+ship, so that they are trained, and their readouts fitted, where it is evaluated."""
 
 
 LEAST = 100

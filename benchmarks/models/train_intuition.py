@@ -8,10 +8,12 @@ trials of every scenario trains nothing: on them, and on the official stimuli wi
 the observed part, networks are tested, and compared with forests that saw the same training trials,
 where their features are stored. With --start a training begins from other weights, that of pixels
 from those of masks. Predictions of official stimuli go to FOLDER/predictions, where ``intuition.py
---predictions`` reads them, weights to FOLDER/training. With --all-but every network is also trained
-without the tested scenario. With --write the table is written to
-``results/intuition_networks.md``; --weights names a folder for the weights of all scenarios as
-float16.
+--predictions`` reads them, weights to FOLDER/training. --weights names a folder for the weights of
+all scenarios as float16. Other trainings answer what a network has to have seen: --counts, the
+first trials of each scenario only; --unseen, without the configuration of the tested trial
+(`FOLDS` trainings, each without a part of the configurations); --all-but, without its scenario.
+With --write the table is written to ``results/intuition_networks.md``, with these trainings to
+``results/intuition_unseen.md``.
 """
 
 from __future__ import annotations
@@ -42,7 +44,9 @@ from physion.readout.trees import fit_forest
 from physion.training.loop import CARD
 from physion.training.train import train_model
 
-RESULTS = Path(__file__).parents[1] / "results" / "intuition_networks.md"
+RESULTS = Path(__file__).parents[1] / "results"
+FOLDS = 5
+"""Parts of the configurations of each scenario."""
 SAME = {
     "intuition-states": "state-trees", "intuition-masks": "mask-trees",
     "intuition-pixels": "blob-trees",
@@ -86,12 +90,19 @@ class Learner:
         keep &= np.isin(self.asked["scenario"], np.unique(self.own["scenario"]))
         self.asked = {key: values[keep] for key, values in self.asked.items()}
         self.held = np.zeros(len(self.own["trial"]), np.bool_)
+        self.number = np.zeros(len(self.held), np.int64)
         for scenario in np.unique(self.own["scenario"]):
             rows = np.flatnonzero(self.own["scenario"] == scenario)
             self.held[rows[-max(len(rows) // 10, 1) :]] = True
+            self.number[rows] = np.arange(len(rows))
 
-    def train(self, without: str = "") -> dict[str, NDArray[np.float64]]:
-        """Return P(contact) of held-out and official trials, of a network without a scenario."""
+    def train(
+        self, name: str = "all", chosen: NDArray[np.bool_] | None = None
+    ) -> dict[str, NDArray[np.float64]]:
+        """Return P(contact) of held-out and official trials, of a network trained on some trials.
+
+        Without ``chosen`` (of all own trials) these are all that are not held out.
+        """
         model: Any = build_untrained(self.name, **self._options())
         if self.options.start:
             same = SAME_TOKENS.get(self.name, self.name)
@@ -100,7 +111,7 @@ class Learner:
             model.load_state_dict(other.state_dict())
             model.trained, model.init = True, other.init
         self.title = model.name
-        fit = ~self.held & (self.own["scenario"] != without)
+        fit = ~self.held if chosen is None else ~self.held & chosen
         trials = [str(trial) for trial in self.own["trial"][fit]]
         source = OwnSource(model.spec, self.own)
         outcomes = dict(zip(trials, self.own["contact"][fit].tolist(), strict=True))
@@ -118,10 +129,10 @@ class Learner:
         source_of_trials: Any = source
         done = train_model(
             model, source_of_trials, trials, seed=0, accelerator=self.options.accelerator,
-            name=f"no_{without}" if without else "all", folder=self.folder / "training",
+            name=name, folder=self.folder / "training",
             settings=settings, features=features, outcomes=outcomes, progress=_say,
         )  # fmt: skip
-        if self.options.weights and not without:
+        if self.options.weights and chosen is None:
             halves = {
                 k: v.half() if v.is_floating_point() else v for k, v in tensors_of(model).items()
             }
@@ -132,13 +143,38 @@ class Learner:
             card += f"## Hardware\n{device()}\n\nThe weights are rounded to float16.\n"
             path.with_suffix(".md").write_text(card)
         print(
-            f"{self.name} {without or 'all'}: held-out loss {done.validation:.3f}, base rate "
+            f"{self.name} {name}: held-out loss {done.validation:.3f}, base rate "
             f"{done.baseline:.3f}, {time.process_time() - start:.0f} s, {done.folder}", flush=True,
         )  # fmt: skip
         return {
             "own": self._predict(model, self.own, self.held),
             "official": self._predict(model, self.asked, np.full(len(self.asked["trial"]), True)),
         }
+
+    def train_apart(
+        self, name: str, own: NDArray[Any], asked: NDArray[Any]
+    ) -> dict[str, NDArray[np.float64]]:
+        """Return P(contact) of networks that have not seen the group of the trial.
+
+        ``own`` and ``asked`` are the groups of own trials and official stimuli.
+        """
+        held = own[self.held]
+        answers = {"own": np.full(len(held), np.nan), "official": np.full(len(asked), np.nan)}
+        for group in np.unique(own):
+            found = self.train(f"{name}_{group}", own != group)
+            for part, groups in (("own", held), ("official", asked)):
+                answers[part][groups == group] = found[part][groups == group]
+        return answers
+
+    def configurations(self) -> list[NDArray[np.int64]]:
+        """Return the number of the fold of own trials and of official stimuli."""
+        folds: dict[tuple[str, str], int] = {}
+        both = [self.own, self.asked]
+        names = {pair for made in both for pair in _configurations(made)}
+        for scenario in {scenario for scenario, _ in names}:
+            inside = sorted(pair for pair in names if pair[0] == scenario)
+            folds |= {pair: number % FOLDS for number, pair in enumerate(inside)}
+        return [np.array([folds[pair] for pair in _configurations(made)]) for made in both]
 
     def forests(self) -> dict[str, NDArray[np.float64]]:
         """Return P(contact) of forests of each scenario, fitted on the same trials, if possible."""
@@ -160,8 +196,13 @@ class Learner:
             list(pool.map(answer, np.unique(self.own["scenario"])))
         return found
 
-    def row(self, name: str, answers: Mapping[str, NDArray[np.float64]]) -> str:
-        """Return a row of the table: accuracies of own trials and official stimuli."""
+    def row(
+        self, name: str, answers: Mapping[str, NDArray[np.float64]], trials: int | None = None
+    ) -> str:
+        """Return a row of the table: accuracies of own trials and official stimuli.
+
+        ``trials`` is the number of fit trials of a scenario where these are not all.
+        """
         own, asked = self.own, self.asked
         held = {key: own[key][self.held] for key in ("scenario", "contact")}
         scores = [
@@ -170,7 +211,7 @@ class Learner:
         ]
         rigid = [one.drop("drape", errors="ignore").mean() for one in scores]
         each = " | ".join(f"{value:.2f}" for value in scores[1])
-        fit = int((~self.held).sum() / len(scores[0]))
+        fit = trials or int((~self.held).sum() / len(scores[0]))
         return f"| {name} | {fit} | {rigid[0]:.3f} | {rigid[1]:.3f} | {each} |"
 
     def keep(self, name: str, answers: NDArray[np.float64]) -> None:
@@ -203,6 +244,12 @@ def device() -> str:
     return torch.cuda.get_device_name() if torch.cuda.is_available() else processor()
 
 
+def _configurations(made: Mapping[str, NDArray[Any]]) -> list[tuple[str, str]]:
+    """Return scenario and configuration of trials; one with _2 at its end is a second name."""
+    names = (str(name).removesuffix("_2") for name in made["configuration"])
+    return list(zip(made["scenario"].tolist(), names, strict=True))
+
+
 def _flat(values: NDArray[Any]) -> NDArray[Any]:
     return values.reshape(len(values), -1)
 
@@ -231,7 +278,9 @@ def main() -> None:
     parser.add_argument("--weights", type=Path, help="folder for weights")
     parser.add_argument("--start", type=Path, help="folder of weights to start from")
     parser.add_argument("--option", nargs="*", default=[], help="NAME=VALUE of the model")
-    parser.add_argument("--all-but", action="store_true")
+    parser.add_argument("--counts", nargs="*", type=int, default=[], help="trials of a scenario")
+    parser.add_argument("--unseen", action="store_true", help="configurations")
+    parser.add_argument("--all-but", action="store_true", help="scenarios")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     rows = []
@@ -247,24 +296,34 @@ def main() -> None:
             both = {part: (answers[part] + forests[part]) / 2 for part in answers}
             rows.append(learner.row(f"mean of both, {name}", both))
             print("\n".join(rows[-2:]), flush=True)
+        own, asked = learner.own, learner.asked
+        others = {
+            f"{name}, {count} trials": (
+                learner.train(f"first_{count}", learner.number < count),
+                count,
+            )
+            for count in options.counts
+        }
+        if options.unseen:
+            answers = learner.train_apart("fold", *learner.configurations())
+            others[f"{name}, configuration unseen"] = answers, None
         if options.all_but:
-            scenarios = np.unique(learner.own["scenario"])
-            apart = {part: np.full(len(values), np.nan) for part, values in answers.items()}
-            for scenario in scenarios:
-                found = learner.train(str(scenario))
-                for part, of in (("own", learner.own["scenario"][learner.held]),
-                                 ("official", learner.asked["scenario"])):  # fmt: skip
-                    apart[part][of == scenario] = found[part][of == scenario]
-            learner.keep(f"{name}, scenario unseen", apart["official"])
-            rows.append(learner.row(f"{name}, scenario unseen", apart))
+            answers = learner.train_apart("no", own["scenario"], asked["scenario"])
+            others[f"{name}, scenario unseen"] = answers, None
+        for title, (answers, count) in others.items():
+            learner.keep(title, answers["official"])
+            rows.append(learner.row(title, answers, count))
             print(rows[-1], flush=True)
     scenarios = [str(s) for s in np.unique(learner.own["scenario"])]
+    given = " --start WEIGHTS" * bool(options.start)
+    given += f" --steps {options.steps}" * bool(options.steps)
+    given += f" --counts {' '.join(map(str, options.counts))}" * bool(options.counts)
+    given += " --unseen" * options.unseen + " --all-but" * options.all_but
     text = "\n".join(
         [
             "# Networks of intuition and forests",
             f"`python benchmarks/models/train_intuition.py FOLDER --models "
-            f"{' '.join(options.models)}{' --start WEIGHTS' if options.start else ''} --write`, "
-            f"{datetime.date.today()}, {device()}.",
+            f"{' '.join(options.models)}{given} --write`, {datetime.date.today()}, {device()}.",
             "",
             "Accuracy of networks over all scenarios, and of forests, one per scenario, where "
             "features for them are stored: on the last tenth of the own trials, and on "
@@ -274,8 +333,6 @@ def main() -> None:
             + " The training began from weights that may have seen these own trials, also those "
             "that are held out." * bool(options.start),
             "",
-            "**Accuracy; with --start, own trials may have had a part in the first training**",
-            "",
             "| model | trials per scenario | own, rigid | official, rigid "
             f"| {' | '.join(scenarios)} |",
             "|---|---|---|---" + "|---" * len(scenarios) + "|",
@@ -283,7 +340,9 @@ def main() -> None:
         ]
     )
     if options.write:
-        RESULTS.write_text(text + "\n")
+        other = options.counts or options.unseen or options.all_but
+        path = RESULTS / f"intuition_{'unseen' if other else 'networks'}.md"
+        path.write_text(text + "\n")
 
 
 if __name__ == "__main__":

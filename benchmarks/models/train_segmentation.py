@@ -6,7 +6,8 @@
 
 Of training trials three observed frames are rendered, in red and yellow, and stored in FOLDER
 with their masks, 1,000 trials a file; the same command resumes. In the training pictures are
-mirrored, and brightness, contrast and noise vary. The loss is
+mirrored, and brightness, contrast and noise vary; in half of them also colours (`recolor`), since
+the red and the yellow of other renderers are darker or paler. The loss is
 
     cross entropy of the class of pixels + SHARE * mean |offset - o|_1 of pixels of other objects.
 
@@ -31,7 +32,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from physion import Dataset
-from physion.clips.batch import FIRST_OTHER_ID
+from physion.clips.batch import AGENT_ID, FIRST_OTHER_ID, PATIENT_ID
 from physion.clips.rendered import object_ids
 from physion.clips.states import TrialMotions
 from physion.core.seeds import generator
@@ -55,6 +56,10 @@ RATE, WARM_UP = 2e-3, 100
 SHARE = 0.2
 JITTER, NOISE = 0.1, 0.02
 """Standard deviations of contrast and brightness of a picture, and of its pixels."""
+DARK, PALE = {AGENT_ID: (0.3, 1.1), PATIENT_ID: (0.5, 1.1)}, {AGENT_ID: 0.4, PATIENT_ID: 0.7}
+"""Range of the factor of the colour of agent and patient, and largest share of grey in it."""
+GAMMA, TINT = (0.7, 1.5), 0.08
+"""Range of the exponent of a picture, and standard deviation of the factors of its channels."""
 
 
 def make(folder: Path, dataset: Dataset, count: int) -> None:
@@ -103,6 +108,24 @@ def targets(ids: Tensor) -> tuple[Tensor, Tensor]:
     return ids.long().clamp(max=FIRST_OTHER_ID), OFFSET * by_picture.float()
 
 
+def recolor(
+    rgb: NDArray[np.uint8], ids: NDArray[np.uint8], rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    """Return a picture (H, W, 3) in other colours.
+
+    A pixel c of agent or patient becomes f (c + g (max c - c)), with f of `DARK` and g up to
+    `PALE`; then all pixels become t c^e, with e of `GAMMA` and factors t of the channels.
+    """
+    colors = rgb / 255
+    for role, factors in DARK.items():
+        own = ids == role
+        grey = colors[own].max(-1, keepdims=True, initial=0)
+        paler = colors[own] + rng.uniform(0, PALE[role]) * (grey - colors[own])
+        colors[own] = rng.uniform(*factors) * paler
+    colors = colors ** rng.uniform(*GAMMA) * (1 + TINT * rng.normal(size=3))
+    return np.rint(255 * np.clip(colors, 0, 1)).astype(np.uint8)
+
+
 def losses(found: Tensor, kinds: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
     """Return the cross entropy of the classes, and the mean error of the offsets."""
     entropy = functional.cross_entropy(found[:, : len(CLASSES)], kinds)
@@ -132,6 +155,8 @@ def train(folder: Path, steps: int) -> tuple[SegmentationNetwork, str]:
         rgb, ids = (np.stack([part[kind][row] for part, row in rows]) for kind in (0, 1))
         if rng.random() < 0.5:
             rgb, ids = rgb[:, :, ::-1].copy(), ids[:, :, ::-1].copy()
+        half = BATCH // 2
+        rgb[:half] = [recolor(*pair, rng) for pair in zip(rgb[:half], ids[:half], strict=True)]
         seen = network_input(rgb)
         gain, lift = JITTER * torch.randn(2, BATCH, 3, 1, 1)
         seen[:, :3] = seen[:, :3] * (1 + gain) + lift + NOISE * torch.randn(BATCH, 3, SIDE, SIDE)
