@@ -309,9 +309,9 @@ def mixed_on_own(
 
 
 def predicted(path: Path, trials: Trials) -> dict[str, pd.Series]:
-    """Return the answers of a table of predictions, by model."""
+    """Return the answers of a table of predictions, by model: *observed*, else what it has."""
     table = pd.read_csv(path)
-    if "readout" in table:
+    if "readout" in table and "observed" in set(table["readout"]):
         table = table[table["readout"] == "observed"]
     table = table.assign(stimulus=table["stimulus"].map(canonical_name))
     return {
@@ -382,7 +382,8 @@ def main() -> None:
     for given in GIVEN.values():
         answers[f"{given}, spread of simulation"] = with_spread(answers[given], default, scenario)
         answers[f"simulation, spread of {given}"] = with_spread(default, answers[given], scenario)
-    for given in (*GIVEN.values(), *given_answers):
+    learned = [name for name in given_answers if name.startswith("intuition")]
+    for given in (*GIVEN.values(), *learned):
         both = (answers[given] + answers["simulation, mean of the levels"]) / 2
         answers[f"mean of {given} and simulation"] = both
         pair = pd.DataFrame({given: answers[given], **levels})

@@ -1,7 +1,7 @@
 """Measure how well `seeing-simulation` recovers scenes, and what it answers.
 
-    OMP_NUM_THREADS=1 python benchmarks/models/seeing.py FOLDER [--each 5] [--depth-error 0.02]
-        [--known] [--write]
+    OMP_NUM_THREADS=1 python benchmarks/models/seeing.py FOLDER [--each 5]
+        [--depth-error 0.02 | --no-depth] [--known] [--write]
     OMP_NUM_THREADS=1 python benchmarks/models/seeing.py --priors
 
 Official stimuli that people saw, without cloth and without a contact in the observed part: the
@@ -25,11 +25,12 @@ scenario:
    agent, centre of the other movable objects; and how many have the right shape.
 
 With --depth-error E, the depth of each object has an error of standard deviation E, the same in
-all frames, and each pixel another one; rows are in FOLDER/seeing-E.jsonl.
+all frames, and each pixel another one; rows are in FOLDER/seeing-E.jsonl. With --no-depth masks and
+the camera are all that is seen; rows are in FOLDER/seeing-masks.jsonl.
 
-With --write they are written to ``results/seeing.md``, or ``results/seeing-E.md``. --priors prints
-density, friction and restitution of the bodies of our own presets, from which the constants of the
-model come.
+With --write they are written to ``results/seeing.md``, ``seeing-E.md`` or ``seeing-masks.md``.
+--priors prints density, friction and restitution of the bodies of our own presets, from which the
+constants of the model come.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ import argparse
 import datetime
 import itertools
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -116,12 +117,12 @@ def chosen_trials(each: int, early: Callable[[Scene], bool]) -> Iterator[tuple[S
         yield from ((s, contact, number) for contact, s, number in filter(None, row))
 
 
-def measure(scene: Scene, contact: bool, number: int, error: float) -> ROW:
-    """Return what is measured of one trial."""
+def measure(scene: Scene, contact: bool, number: int, given: Mapping[str, Any]) -> ROW:
+    """Return what is measured of one trial, with options of the model."""
     engine = make_engine()
-    model = build_model("seeing-simulation", samples=SAMPLES, depth_error=error)
+    model = build_model("seeing-simulation", samples=SAMPLES, **given)
     motion = Motion(scene, simulate(scene, frames=OBSERVED_FRAMES))
-    batch = _batch(motion, model.spec, error)
+    batch = _batch(motion, model.spec, bool(given), given.get("depth_error", 0.0))
     seen: SeenTrial = model.see(batch)[0]  # type: ignore[attr-defined]
     true = cut_trial(scene, motion.trajectory)
 
@@ -134,7 +135,7 @@ def measure(scene: Scene, contact: bool, number: int, error: float) -> ROW:
         "scenario": scene.scenario,
         "contact": contact,
         "looked at": number
-        < (LOOKED_AT_WITH_ERRORS if error else LOOKED_AT.get(scene.scenario, 1)),
+        < (LOOKED_AT_WITH_ERRORS if given else LOOKED_AT.get(scene.scenario, 1)),
         "fitted": float(np.mean(model.imagine(batch, SAMPLES, 0).contact)),
         "true": answer(true, NoiseLevels(), SAMPLES),
         "true, no noise": answer(true, STILL, 1),
@@ -169,9 +170,12 @@ def guessed(trial: ObservedTrial) -> ObservedTrial:
     return replace(trial, scene=replace(trial.scene, bodies=tuple(bodies)))
 
 
-def _batch(motion: Motion, spec: Any, error: float) -> Batch:
-    """Return the observed frames of one motion that the model looks at; depth has an error."""
-    frames = np.array(spec.context_frames() if error else FRAMES, np.int64)
+def _batch(motion: Motion, spec: Any, every: bool, error: float) -> Batch:
+    """Return the observed frames of one motion that the model looks at; depth may have an error.
+
+    ``every``: whether these are all frames that it asks for; else `FRAMES`.
+    """
+    frames = np.array(spec.context_frames() if every else FRAMES, np.int64)
     name = motion.scene.name
     reader = MotionRenderer(
         {name: motion}, spec.inputs, spec.image_size, spec.objects, {name: "redyellow"}
@@ -492,6 +496,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--each", type=int, default=5)
     parser.add_argument("--depth-error", type=float, default=0.0)
+    parser.add_argument("--no-depth", action="store_true")
     parser.add_argument("--known", action="store_true")
     parser.add_argument("--version", type=int, default=VERSION)
     parser.add_argument("--write", action="store_true")
@@ -502,7 +507,11 @@ def main() -> None:
     if options.folder is None:
         return
     options.folder.mkdir(parents=True, exist_ok=True)
+    given: dict[str, Any] = {"depth_error": options.depth_error} if options.depth_error else {}
+    if options.no_depth:
+        given["depth"] = False
     name = f"seeing-{options.depth_error:g}" if options.depth_error else "seeing"
+    name = "seeing-masks" if options.no_depth else name
     path = options.folder / f"{name}.jsonl"
     options.known |= options.version != VERSION
     known = read_rows(path, options.version)
@@ -522,7 +531,7 @@ def main() -> None:
     rows = [row for row in known.values() if "early" not in row] if options.known else []
     for scene, contact, number in [] if options.known else chosen_trials(options.each, early):
         if scene.name not in known:
-            keep(measure(scene, contact, number, options.depth_error))
+            keep(measure(scene, contact, number, given))
             row = known[scene.name]
             print(
                 f"{scene.scenario} {scene.name}: contact {contact}, fitted {row['fitted']:.2f}, "
@@ -535,6 +544,7 @@ def main() -> None:
     if options.write:
         today = datetime.date.today().isoformat()
         error = f" --depth-error {options.depth_error:g}" if options.depth_error else ""
+        error += " --no-depth" * options.no_depth
         (RESULTS / f"{name}.md").write_text(
             f"# Seeing by simulation\n\n`python benchmarks/models/seeing.py FOLDER{error}`, "
             f"{len(rows)} trials, {today}, version {options.version} of the model, {SAMPLES} "

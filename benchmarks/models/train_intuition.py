@@ -33,6 +33,7 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
+from intuition_controls import slope
 from intuition_trials import load, names_stored
 from physion.clips.batch import Batch, Spec
 from physion.compute.tasks import processor
@@ -196,6 +197,11 @@ class Learner:
             list(pool.map(answer, np.unique(self.own["scenario"])))
         return found
 
+    def rigid(self, answers: Mapping[str, NDArray[np.float64]]) -> float:
+        """Return the mean accuracy over rigid scenarios on official stimuli."""
+        right = by_scenario(answers["official"], self.asked["scenario"], self.asked["contact"])
+        return float(right.drop("drape", errors="ignore").mean())
+
     def row(
         self, name: str, answers: Mapping[str, NDArray[np.float64]], trials: int | None = None
     ) -> str:
@@ -283,7 +289,7 @@ def main() -> None:
     parser.add_argument("--all-but", action="store_true", help="scenarios")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    rows = []
+    rows, curves = [], []
     for name in options.models:
         learner = Learner(name, options.folder, options)
         answers = learner.train()
@@ -304,6 +310,11 @@ def main() -> None:
             )
             for count in options.counts
         }
+        if options.counts:
+            rigid = [learner.rigid(one) for one, _ in others.values()]
+            most = int((~learner.held).sum() / len(np.unique(own["scenario"])))
+            rises = slope([*options.counts, most], [*rigid, learner.rigid(answers)])
+            curves.append(f"{name} {rises:+.3f}")
         if options.unseen:
             answers = learner.train_apart("fold", *learner.configurations())
             others[f"{name}, configuration unseen"] = answers, None
@@ -337,6 +348,9 @@ def main() -> None:
             f"| {' | '.join(scenarios)} |",
             "|---|---|---|---" + "|---" * len(scenarios) + "|",
             *rows,
+            *["", f"Each doubling of the trials adds, rigid: {', '.join(curves)}."][
+                : 2 * bool(curves)
+            ],
         ]
     )
     if options.write:

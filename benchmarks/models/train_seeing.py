@@ -1,15 +1,17 @@
-"""Train the network of what is expected of objects, of `seeing-simulation` with errors of depth.
+"""Train the networks of what is expected of objects, of `seeing-simulation` without exact depth.
 
     physion generate TRIALS --full --no-movies
     OMP_NUM_THREADS=1 python benchmarks/models/train_seeing.py FOLDER --trials TRIALS
-        [--count 16000] [--steps 20000] [--write]
+        [--count 16000] [--steps 20000] [--no-depth] [--write]
 
 Of own rigid trials the frames that the network sees are rendered, each object's depth gets an
 error, and tokens and true values are stored in FOLDER, 1,000 trials a file; the same command
 resumes. In the training each object gets another error in every step, and trials are mirrored at
-random. 700 trials train nothing. Printed are, on them, the error of the depth of objects that
-move, before and after, and how many shapes are right. --write puts the weights into the package,
-with a card.
+random. With --no-depth the network for masks only is trained, from the same tokens: each object's
+depth is where the floor is below it (`physion.models.seeing.expected.assumed_depth`), and what is
+nearer or farther in its pixels is left out. 700 trials train nothing. Printed are, on them, the
+error of the depth of objects that move, before and after, and how many shapes are right. --write
+puts the weights into the package, with a card.
 
 Trials with the scene of an official one are left out.
 """
@@ -42,12 +44,13 @@ from physion.models.seeing.expected import (
     CROP,
     ERROR,
     FRAMES,
-    MEASURED,
     MOST,
     VALUES,
     WEIGHTS,
     ExpectationNetwork,
+    floor_depth,
     frames_of,
+    split,
     tokens_of,
 )
 from physion.models.seeing.solids import Placed, library, solid
@@ -145,8 +148,8 @@ def make(folder: Path, dataset: Dataset, count: int) -> None:
 
 
 def with_errors(values: Tensor, change: Tensor, height: Tensor) -> Tensor:
-    """Return numbers of objects whose logarithm of depth is changed (B, K)."""
-    frames, factor = frames_of(values).clone(), torch.exp(change)[..., None]
+    """Return numbers of objects whose logarithm of depth is changed (B, K, 1 or T)."""
+    frames, factor = frames_of(values).clone(), torch.exp(change)
     seen = frames[..., 0] > 0
     frames[..., 1:3] *= factor[..., None]
     frames[..., 4] = torch.where(
@@ -158,6 +161,25 @@ def with_errors(values: Tensor, change: Tensor, height: Tensor) -> Tensor:
     frames[..., 6:9] = torch.where(seen[..., None], moved, frames[..., 6:9])
     frames[..., 9:24] *= factor[..., None]
     return torch.cat([frames.flatten(-2), values[..., frames.shape[-2] * frames.shape[-1] :]], -1)
+
+
+def standing_on_floor(values: Tensor, errors: Tensor, height: Tensor) -> tuple[Tensor, Tensor]:
+    """Return numbers of objects that stand on the floor by assumption, and its errors (B, K, T).
+
+    ``errors`` (B, K): the error that the logarithm of their depth has. The result's is NaN in
+    frames that do not show the object.
+    """
+    frames = frames_of(values)
+    seen, depth, camera = frames[..., 0] > 0, frames[..., 1], height[:, None, None]
+    slopes = (frames[..., 8] + frames[..., 11] - camera) / depth.clamp(min=0.1)
+    assumed = torch.from_numpy(floor_depth(-camera.numpy(), slopes.numpy()))
+    change = torch.where(seen, torch.log(assumed / depth.clamp(min=0.1)), 0.0)
+    out = with_errors(values, change, height)
+    of_objects = frames_of(out)
+    floor = torch.where(slopes < -1e-4, -camera / slopes, 50.0)
+    of_objects[..., 4] = torch.where(seen, (floor / assumed - 1).clamp(-1, 1), 0.0)
+    of_objects[..., 15:24] = 0.0
+    return out, torch.where(seen, change + errors[..., None], torch.nan)
 
 
 def mirrored(values: Tensor) -> Tensor:
@@ -176,31 +198,43 @@ def mirrored(values: Tensor) -> Tensor:
     return torch.cat([frames.flatten(-2), masks, values[..., -2:]], -1)
 
 
-def losses(out: Tensor, values: Tensor, true: Tensor, there: Tensor) -> Tensor:
-    """Return the loss: negative logarithms of normal densities, and the cross entropy of shapes."""
+def density(given: Tensor, wanted: Tensor, least: float = -5.0) -> Tensor:
+    """Return negative logarithms of normal densities (...) of means and log deviations (..., 2)."""
+    mean, logs = given[..., 0], given[..., 1].clamp(least, 3)
+    out: Tensor = logs + 0.5 * ((wanted.nan_to_num() - mean) * torch.exp(-logs)) ** 2
+    return out
+
+
+def losses(
+    out: Tensor, values: Tensor, true: Tensor, there: Tensor, of_frames: Tensor | None
+) -> Tensor:
+    """Return the loss: negative logarithms of normal densities, and the cross entropy of shapes.
+
+    ``of_frames``: errors of depth of every frame, if depth is assumed.
+    """
+    measured, shapes, middles, errors = split(out)
     sizes = torch.log(true[..., 2:5].clamp(min=0.005))
     wanted = torch.cat([true[..., :1] / ERROR, true[..., 1:2], sizes], -1)
     known = there & torch.isfinite(true[..., 5])
-    means, logs = out[..., : 2 * MEASURED : 2], out[..., 1 : 2 * MEASURED : 2].clamp(-5, 3)
-    density = logs + 0.5 * ((wanted.nan_to_num() - means) * torch.exp(-logs)) ** 2
-    depth = density[..., 0][there].mean()
-    rest = density[..., 1:][known].sum(-1).mean()
-    logits = out[..., 2 * MEASURED : -6][known]
-    shape = functional.cross_entropy(logits, true[..., 5][known].long())
+    densities = density(measured, wanted)
+    depth = densities[..., 0][there].mean()
+    if of_frames is not None:
+        seen = torch.isfinite(of_frames)
+        depth = (depth + density(errors, of_frames / ERROR)[seen].mean()) / 2
+    rest = densities[..., 1:][known].sum(-1).mean()
+    shape = functional.cross_entropy(shapes[known], true[..., 5][known].long())
     frames = frames_of(values)
     first = (frames[..., 0] > 0).float().argmax(-1)[..., None, None]
     seen = known & (frames[..., 0] > 0).any(-1)
     centroid = frames[..., 6:9].gather(2, first.expand(*first.shape[:2], 1, 3))[:, :, 0]
-    logs = out[..., -5::2][seen].clamp(-6, 3)
-    apart = (true[..., 7:] - centroid)[seen] - out[..., -6::2][seen]
-    middle = (logs + 0.5 * (apart * torch.exp(-logs)) ** 2).sum(-1).mean()
+    middle = density(middles[seen], (true[..., 7:] - centroid)[seen], -6).sum(-1).mean()
     total: Tensor = (
         depth + SHARES["values"] * rest + SHARES["shape"] * shape + SHARES["middle"] * middle
     )
     return total
 
 
-def train(folder: Path, steps: int) -> tuple[ExpectationNetwork, str]:
+def train(folder: Path, steps: int, depth: bool) -> tuple[ExpectationNetwork, str]:
     """Return the trained network, and its errors on held-out trials as text."""
     parts = [np.load(path) for path in sorted(folder.glob("tokens-*.npz"))]
     values, true, height = (
@@ -212,28 +246,36 @@ def train(folder: Path, steps: int) -> tuple[ExpectationNetwork, str]:
     order = rng.permutation(len(values))
     held, fit = order[:HELD_OUT], order[HELD_OUT:]
     torch.manual_seed(0)
-    network = ExpectationNetwork()
+    network = ExpectationNetwork(depth=depth)
+    assumed = None
+    if not depth:
+        values, assumed = standing_on_floor(values, true[..., 0].nan_to_num(), height)
+        # Of the first frame that shows the object.
+        first = torch.isfinite(assumed).float().argmax(-1, keepdim=True)
+        true[..., 0] = torch.where(there, assumed.gather(-1, first)[..., 0].nan_to_num(), torch.nan)
     frames = frames_of(values[fit][there[fit]]).flatten(-2)
     network.mean.copy_(frames.mean(0))
     network.sd.copy_(frames.std(0).clamp(1e-3))
     optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=0.01)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, steps, pct_start=0.1)
 
-    def batch_of(rows: Any, mirror: bool) -> tuple[Tensor, Tensor, Tensor]:
-        new = ERROR * torch.from_numpy(rng.standard_normal((len(rows), MOST))).float()
-        expected = true[rows].clone()
-        seen = with_errors(values[rows], new - expected[..., 0].nan_to_num(), height[rows])
-        expected[..., 0] = torch.where(there[rows], new, expected[..., 0])
+    def batch_of(rows: Any, mirror: bool) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+        expected, seen = true[rows].clone(), values[rows]
+        if depth:
+            new = ERROR * torch.from_numpy(rng.standard_normal((len(rows), MOST))).float()
+            change = (new - expected[..., 0].nan_to_num())[..., None]
+            seen = with_errors(seen, change, height[rows])
+            expected[..., 0] = torch.where(there[rows], new, expected[..., 0])
         if mirror:
             chosen = torch.from_numpy(rng.random(len(rows)) < 0.5)
             seen = torch.where(chosen[:, None, None], mirrored(seen), seen)
             expected[chosen, :, 8] *= -1
-        return seen, expected, there[rows]
+        return seen, expected, there[rows], None if assumed is None else assumed[rows]
 
     start = time.process_time()
     for step in range(1, steps + 1):
-        seen, expected, known = batch_of(rng.choice(fit, BATCH), True)
-        loss = losses(network(seen, known), seen, expected, known)
+        seen, expected, known, of_frames = batch_of(rng.choice(fit, BATCH), True)
+        loss = losses(network(seen, known), seen, expected, known, of_frames)
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -244,13 +286,14 @@ def train(folder: Path, steps: int) -> tuple[ExpectationNetwork, str]:
     seconds = time.process_time() - start
     network.eval()
     with torch.no_grad():
-        seen, expected, known = batch_of(held, False)
+        seen, expected, known, of_frames = batch_of(held, False)
         out = network(seen, known)
-    loss = losses(out, seen, expected, known)
+    loss = losses(out, seen, expected, known, of_frames)
+    measured, shapes, _, errors = split(out)
     moving = known & (expected[..., 6] == 0)
     shaped = moving & torch.isfinite(expected[..., 5])
-    left = ERROR * out[..., 0] - expected[..., 0]
-    right = (out[..., 2 * MEASURED : -6].argmax(-1) == expected[..., 5])[shaped].float().mean()
+    left = ERROR * measured[..., 0, 0] - expected[..., 0]
+    right = (shapes.argmax(-1) == expected[..., 5])[shaped].float().mean()
     before, after = expected[..., 0][moving], left[moving]
     text = (
         f"{len(fit)} trials, {steps} steps of {BATCH}, {seconds:.0f} s of processor time. On "
@@ -259,6 +302,13 @@ def train(folder: Path, steps: int) -> tuple[ExpectationNetwork, str]:
         f"after, median {before.abs().median():.4f} and {after.abs().median():.4f}; shapes right "
         f"{right:.3f}"
     )
+    if of_frames is not None:
+        late = (ERROR * errors[..., -1, 0] - of_frames[..., -1])[moving]
+        late = late[torch.isfinite(late)]
+        text += (
+            f"; in the last frame, root mean square {late.square().mean().sqrt():.4f}, "
+            f"median {late.abs().median():.4f}"
+        )
     return network, text
 
 
@@ -282,6 +332,7 @@ def main() -> None:
     parser.add_argument("--trials", type=Path, help="folder of own trials; else only those stored")
     parser.add_argument("--count", type=int, default=16000)
     parser.add_argument("--steps", type=int, default=20000)
+    parser.add_argument("--no-depth", action="store_true", help="the network for masks only")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -290,15 +341,15 @@ def main() -> None:
         make(options.folder, Dataset(options.trials), options.count)
     if not options.steps:
         return
-    network, text = train(options.folder, options.steps)
+    network, text = train(options.folder, options.steps, not options.no_depth)
     print(text)
     if options.write:
         write_network(
-            SHIPPED / WEIGHTS,
+            SHIPPED / WEIGHTS[not options.no_depth],
             network,
             "# What is expected of objects\nNetwork of `physion.models.seeing.expected`",
             "python benchmarks/models/train_seeing.py FOLDER --trials TRIALS --count "
-            f"{options.count} --steps {options.steps} --write",
+            f"{options.count} --steps {options.steps}{' --no-depth' * options.no_depth} --write",
             text,
         )
 

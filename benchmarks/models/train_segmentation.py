@@ -9,7 +9,7 @@ with their masks, 1,000 trials a file; the same command resumes. In the training
 mirrored, and brightness, contrast and noise vary; in half of them also colours (`recolor`), since
 the red and the yellow of other renderers are darker or paler. The loss is
 
-    cross entropy of the class of pixels + SHARE * mean |offset - o|_1 of pixels of other objects.
+    cross entropy of the class of pixels + SHARE * mean |offset - o|_1 of pixels of objects.
 
 Printed are, on the trials of the last file, which train nothing, intersection over union by class
 and the error of the offsets. --write puts the weights into the package, with a card.
@@ -32,7 +32,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from physion import Dataset
-from physion.clips.batch import AGENT_ID, FIRST_OTHER_ID, PATIENT_ID
+from physion.clips.batch import AGENT_ID, FIRST_OTHER_ID, PATIENT_ID, SCENERY_ID
 from physion.clips.rendered import object_ids
 from physion.clips.states import TrialMotions
 from physion.core.seeds import generator
@@ -129,9 +129,9 @@ def recolor(
 def losses(found: Tensor, kinds: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
     """Return the cross entropy of the classes, and the mean error of the offsets."""
     entropy = functional.cross_entropy(found[:, : len(CLASSES)], kinds)
-    others = kinds == FIRST_OTHER_ID
+    objects = kinds != SCENERY_ID
     error = (found[:, len(CLASSES) :] - offsets).abs().sum(1)
-    return entropy, (error * others).sum() / others.sum().clamp(min=1)
+    return entropy, (error * objects).sum() / objects.sum().clamp(min=1)
 
 
 def train(folder: Path, steps: int) -> tuple[SegmentationNetwork, str]:

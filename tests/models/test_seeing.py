@@ -343,6 +343,11 @@ def test_a_push_is_found_by_simulation() -> None:
     assert model.imagine(batch, 8, 0).contact.mean() > 0.5
     missed = with_errors(batch_of(scene(-0.8), 256))
     assert model.imagine(missed, 8, 0).contact.mean() < 0.5
+    only_masks: Any = build_model("seeing-simulation", samples=8, depth=False)
+    assert only_masks.spec.inputs == ("ids", "camera")
+    assert only_masks.imagine(replace(batch, depth=None), 8, 0).contact.shape == (1, 8)
+    [without] = only_masks.see(replace(batch, depth=None))
+    assert without.trial is not None and without.trial.scene.bodies[0].name == "1"
 
 
 def test_samples_are_shared_by_weight() -> None:
@@ -369,6 +374,8 @@ def test_bad_input_says_what_is_wrong(rolling: Batch) -> None:
         build_model("seeing-simulation", samples=0)
     with pytest.raises(BadInputError, match=r"must be 0, or from 0.005 to 0.04, not 0.5"):
         build_model("seeing-simulation", depth_error=0.5)
+    with pytest.raises(BadInputError, match="depth_error is for depth that is seen"):
+        build_model("seeing-simulation", depth_error=0.02, depth=False)
 
 
 class Noted(Model):

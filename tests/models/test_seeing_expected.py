@@ -26,8 +26,10 @@ from physion.models.seeing.expected import (
     VALUES,
     ExpectationNetwork,
     Tokens,
+    assumed_depth,
     expect,
     frames_of,
+    split,
     tokens_of,
 )
 from physion.models.seeing.masks import TRUST, Expected
@@ -88,7 +90,7 @@ def test_another_factor_of_depth_changes_tokens_as_in_training(seen: Shown, trai
         depth[seen["ids"] == number] *= np.exp(by)
     change = np.pad(change, (0, len(found.numbers) - len(change)))
     height = torch.tensor([-(seen["camera"][0, :3, :3].T @ seen["camera"][0, :3, 3])[2]]).float()
-    made = training.with_errors(values_of(found), torch.tensor(change)[None].float(), height)
+    made = training.with_errors(values_of(found), torch.tensor(change)[None, :, None].float(), height)
     expected = tokens(seen, depth=depth).values
     assert np.abs(expected - found.values).max() > 0.02
     made = made[0].numpy()
@@ -135,6 +137,39 @@ def test_free_fall_says_the_error_of_depth() -> None:
     assert (ExpectationNetwork._fall(frames) == 0).all(), "it stays where it is"
 
 
+def test_masks_by_themselves_make_the_tokens_that_were_trained(seen: Shown, training: Any) -> None:
+    """What stands on the floor is there, and tokens of depth become those of assumed depth."""
+    assumed = assumed_depth(seen["ids"], seen["camera"])
+    scenery = seen["ids"] == SCENERY_ID
+    floor = scenery & (np.abs(assumed / seen["depth"] - 1) < 0.02)
+    assert floor.sum() > 0.1 * scenery.sum()
+    found = tokens(seen)
+    height = torch.tensor([-(seen["camera"][0, :3, :3].T @ seen["camera"][0, :3, 3])[2]]).float()
+    errors = torch.zeros(1, len(found.numbers))
+    made, wrong = training.standing_on_floor(values_of(found), errors, height)
+    expected = tokens(seen, depth=assumed).values
+    made = made[0].numpy()
+    assert np.abs(expected - found.values).max() > 0.02
+    assert np.abs(made - expected).max() < 0.02 and np.abs(made - expected).mean() < 1e-3
+    for k, number in enumerate(found.numbers):
+        mask = seen["ids"][0] == number
+        there = np.median(seen["depth"][0][mask])
+        assert float(wrong[0, k, 0]) == pytest.approx(np.log(assumed[0][mask][0] / there), abs=0.01)
+
+
+def test_the_parts_of_what_the_network_gives(seen: Shown) -> None:
+    values = values_of(tokens(seen))
+    there = torch.ones(values.shape[:2], dtype=torch.bool)
+    for depth, count in ((True, 0), (False, len(FRAMES))):
+        with torch.no_grad():
+            out = ExpectationNetwork(depth=depth)(values, there)
+        measured, shapes, middle, errors = split(out)
+        assert measured.shape[2:] == (5, 2) and middle.shape[2:] == (3, 2)
+        assert errors.shape[2:] == (count, 2)
+        parts = [part.reshape(*part.shape[:2], -1) for part in (measured, shapes, middle, errors)]
+        assert torch.equal(torch.cat(parts, -1), out)
+
+
 def test_residuals_are_distances_in_standard_deviations() -> None:
     box = Placed(solid("cube"), np.array([1.0, 2.0, 0.1]), np.eye(3), np.array([0.4, 0.2, 0.5]))
     low, high = box.extent_z()
@@ -170,3 +205,21 @@ def test_depth_is_better_than_it_was() -> None:
                 errors[name].append(float(np.median(found[mask] / true["depth"][mask]) - 1))
     before, after = (np.sqrt(np.mean(np.square(errors[name]))) for name in errors)
     assert after < before / 2, (before, after)
+
+
+@pytest.mark.slow
+def test_masks_say_how_far_away_objects_are() -> None:
+    """Depth of scenes that trained nothing, from masks and the camera only."""
+    errors: dict[str, list[float]] = {"assumed": [], "expected": []}
+    for scenario in RIGID:
+        made = replace(sample_scene(scenario, 77), name=f"{scenario} 77")
+        true = shown(made)
+        assumed = assumed_depth(true["ids"], true["camera"])
+        found, _ = expect(FRAMES, true["ids"], None, true["camera"])
+        for number in np.unique(true["ids"][0][true["ids"][0] != SCENERY_ID]):
+            mask = true["ids"][0] == number
+            for name, depth in (("assumed", assumed), ("expected", found)):
+                error = np.median(depth[0][mask] / true["depth"][0][mask]) - 1
+                errors[name].append(abs(float(error)))
+    assumed_error, expected_error = (np.median(errors[name]) for name in errors)
+    assert expected_error < 0.02 < assumed_error, (assumed_error, expected_error)

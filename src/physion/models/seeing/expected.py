@@ -1,4 +1,4 @@
-"""What is expected of every object before it is fitted, from masks and depth with an error.
+"""What is expected of every object before it is fitted, from masks, and depth with an error.
 
 Depth with an error of 2 % leaves an object uncertain by 8 cm at 4 m. More is known: where it meets
 the floor, what it stands on, how large such things are, how fast it falls. A network, trained on
@@ -13,6 +13,11 @@ frame; the logarithms of its height and of the sides of the box around it, along
 world; and the place of its middle, from the centroid of its mask. Depth is divided by 1 + e, and
 the rest is what the fit expects (`masks.Expected`).
 
+Without depth every object is first taken to stand on the floor, where the ray through its lowest
+pixels meets it (`assumed_depth`). Another network of the same kind, which was trained with such
+depth, gives e in each of the frames besides: nothing else says that an object is in the air, or
+moves towards the camera.
+
 Places are in axes of the camera: x is ahead, y to the left, z up, the origin below the camera.
 """
 
@@ -20,7 +25,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,8 +43,9 @@ from physion.scenes.scene import FRAME_TIME, GRAVITY
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 
-FOLDER, WEIGHTS = "physion.data.seeing", "expected.safetensors"
-"""Package and file of the weights."""
+FOLDER = "physion.data.seeing"
+WEIGHTS = {True: "expected.safetensors", False: "expected-masks.safetensors"}
+"""Package and files of the weights, with and without depth."""
 ERROR = 0.02
 """Relative error of depth in the training."""
 FRAMES = (0, 10, 20, 30, 38, 44)
@@ -56,6 +63,8 @@ MEASURED = 5
 """Numbers that are predicted besides place and shape: error, lower end, height, sides."""
 FALLS = 0.15
 """Part of the free fall by which an object may fall farther or less far than freely."""
+NEAREST, FARTHEST = 0.5, 12.0
+"""Range of depth in metres in which an object is taken to stand on the floor."""
 FEW = 4
 """Pixels below which an object is not seen."""
 SPREAD = 1.5
@@ -174,13 +183,13 @@ def _small(rows: NDArray[np.int64], columns: NDArray[np.int64]) -> F32:
 class ExpectationNetwork(nn.Module):
     """Tokens of objects to what is expected of them.
 
-    ``mean`` and ``sd``: of the numbers of frames in the training.
+    ``mean`` and ``sd``: of the numbers of frames in the training. ``depth``: whether it is seen.
     """
 
     mean: Tensor
     sd: Tensor
 
-    def __init__(self, width: int = 96, rounds: int = 3) -> None:
+    def __init__(self, *, depth: bool = True, width: int = 96, rounds: int = 3) -> None:
         super().__init__()
         numbers = len(FRAMES) * COLUMNS
         self.crop = nn.Sequential(nn.Linear(2 * CROP**2, 96), nn.GELU(), nn.Linear(96, 48))
@@ -199,7 +208,7 @@ class ExpectationNetwork(nn.Module):
             )
             for _ in range(rounds)
         )
-        outputs = 2 * MEASURED + len(library()) + 6
+        outputs = 2 * MEASURED + len(library()) + 6 + 2 * len(FRAMES) * (not depth)
         self.out = nn.Sequential(
             nn.LayerNorm(width), nn.Linear(width, 128), nn.GELU(), nn.Linear(128, outputs)
         )
@@ -210,7 +219,8 @@ class ExpectationNetwork(nn.Module):
         """Return what is expected (B, K, .) of objects (B, K, `VALUES`) that are ``there`` (B, K).
 
         In turn: means and logarithms of standard deviations of `MEASURED` numbers in turn, logits
-        of the shapes, and the same as first of the middle.
+        of the shapes, and the same as first of the middle and, without depth, of e in each frame
+        (`split`).
         """
         batch, objects = there.shape
         other = ~torch.eye(objects, dtype=torch.bool, device=there.device)
@@ -269,19 +279,61 @@ def frames_of(values: Tensor) -> Tensor:
     return numbers.reshape(*values.shape[:-1], len(FRAMES), COLUMNS)
 
 
+def split(out: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the parts of what the network gives, of all measured numbers first the mean.
+
+    Measured numbers (..., `MEASURED`, 2), logits of shapes, middle (..., 3, 2), e of the frames
+    (..., T, 2), with T = 0 if depth is seen.
+    """
+    ends = np.cumsum([2 * MEASURED, len(library()), 6])
+    measured, shapes, middle, errors = out.tensor_split(ends.tolist(), -1)
+    pairs = [part.reshape(*part.shape[:-1], -1, 2) for part in (measured, middle)]
+    frames = errors.reshape(*errors.shape[:-1], errors.shape[-1] // 2, 2)
+    return pairs[0], shapes, pairs[1], frames
+
+
 @cache
-def _network() -> ExpectationNetwork:
+def _network(depth: bool) -> ExpectationNetwork:
     """Return the network with the weights of the package."""
-    return load_packaged(ExpectationNetwork, FOLDER, WEIGHTS)
+    return load_packaged(partial(ExpectationNetwork, depth=depth), FOLDER, WEIGHTS[depth])
 
 
-def weights_sha256() -> str:
+def weights_sha256(*, depth: bool) -> str:
     """Return the SHA-256 of the weights of the package."""
-    return packaged_sha256(FOLDER, WEIGHTS)
+    return packaged_sha256(FOLDER, WEIGHTS[depth])
+
+
+def assumed_depth(ids: NDArray[np.uint8], camera: F64) -> F64:
+    """Return the depth (T, H, W) of masks if everything stands on the floor, metres.
+
+    Scenery is the floor, and `FARTHEST` where that is farther away. An object has one depth in a
+    frame, where the ray through the middle of its lowest row of pixels meets the floor.
+    """
+    blank = np.zeros(ids.shape[1:])
+    seen = picture_of(ids[0], blank, camera)
+    floor = floor_depth(-seen.origin[2], seen.vectors[..., 2])
+    depth = np.repeat(floor[None], len(ids), axis=0)
+    for picture, of in zip(ids, depth, strict=True):
+        for number in np.unique(picture[picture != SCENERY_ID]):
+            mask = picture == number
+            rows, _ = np.nonzero(mask)
+            lowest = seen.vectors[mask][rows == rows.max(), 2].mean()
+            of[mask] = floor_depth(-seen.origin[2], lowest)
+    return depth
+
+
+def floor_depth(height: float, slopes: Any) -> Any:
+    """Return the depth at which rays meet the floor, from `NEAREST` to `FARTHEST`, metres.
+
+    ``height``: of the floor above the camera, which is negative. ``slopes``: height of rays at
+    depth 1.
+    """
+    down = np.minimum(slopes, height / FARTHEST)
+    return np.maximum(height / down, NEAREST)
 
 
 def expect(
-    frames: Sequence[int], ids: NDArray[np.uint8], depth: NDArray[np.floating], camera: F64
+    frames: Sequence[int], ids: NDArray[np.uint8], depth: NDArray[np.floating] | None, camera: F64
 ) -> tuple[F64, Mapping[int, Expected]]:
     """Return depth with less error, and what is expected of the objects by number.
 
@@ -290,34 +342,40 @@ def expect(
     frames
         (T,) numbers of the frames. Where one of `FRAMES` is missing, the nearest is taken.
     ids, depth, camera
-        (T, H, W), (T, H, W) and (2, 4, 4), as in `physion.clips.batch.Batch`.
+        (T, H, W), (T, H, W) and (2, 4, 4), as in `physion.clips.batch.Batch`. Depth may be None.
     """
     rows = [int(np.argmin(np.abs(np.array(frames) - frame))) for frame in FRAMES]
-    tokens = tokens_of(ids[rows], np.asarray(depth, np.float64)[rows], camera)
-    better, found = np.array(depth, np.float64), dict[int, Expected]()
+    given = depth is not None
+    better = np.array(assumed_depth(ids, camera) if depth is None else depth, np.float64)
+    tokens = tokens_of(ids[rows], better[rows], camera)
+    found = dict[int, Expected]()
     if not tokens.numbers:
         return better, found
     there = torch.ones(1, len(tokens.numbers), dtype=torch.bool)
     with torch.no_grad():
-        out = _network()(torch.from_numpy(tokens.values)[None], there)[0]
+        out = _network(given)(torch.from_numpy(tokens.values)[None], there)[0].double()
     names = [each.name for each in library()]
-    logits = out[:, 2 * MEASURED : -6]
-    shapes = torch.log_softmax(logits, -1).double().numpy()
-    numbers = out.double().numpy()
+    measured, logits, middles, errors = (part.numpy() for part in split(out))
+    shapes = torch.log_softmax(torch.from_numpy(logits), -1).numpy()
     for k, number in enumerate(tokens.numbers):
-        means, logs = numbers[k, : 2 * MEASURED : 2], numbers[k, 1 : 2 * MEASURED : 2]
+        means, logs = measured[k].T
         spreads = SPREAD * np.exp(np.clip(logs, -5, 3))
         error, low, height, wide, narrow = (
             (float(mean), max(float(spread), LEAST[name]))
             for name, mean, spread in zip(LEAST, means, spreads, strict=False)
         )
-        better[ids == number] /= np.exp(ERROR * error[0])
+        if given:
+            better[ids == number] /= np.exp(ERROR * error[0])
+        else:
+            nearer = np.exp(-ERROR * errors[k, :, 0])
+            for row, frame in enumerate(frames):
+                better[row][ids[row] == number] *= np.interp(frame, FRAMES, nearer)
         seen = frames_of(torch.from_numpy(tokens.values[k]))[:, [0, 6, 7, 8]].double().numpy()
         shown = seen[seen[:, 0] > 0]
         middle = None
         if len(shown):
-            place = tokens.origin + tokens.axes @ (shown[0, 1:] + numbers[k, -6::2])
-            spread = SPREAD * np.exp(np.clip(numbers[k, -5::2], -6, 3))
+            place = tokens.origin + tokens.axes @ (shown[0, 1:] + middles[k, :, 0])
+            spread = SPREAD * np.exp(np.clip(middles[k, :, 1], -6, 3))
             middle = place, np.maximum(spread, LEAST["middle"])
         found[number] = Expected(
             factor_error=max(ERROR * error[1], LEAST["factor"]),

@@ -205,21 +205,22 @@ class PushGuess:
 def see_uncertain(
     frames: Sequence[int],
     ids: Ids,
-    depth: NDArray[np.floating],
+    depth: NDArray[np.floating] | None,
     camera: F64,
     error: float,
     engine: Engine,
 ) -> SeenTrial:
-    """Return what was seen of a trial whose depth has an error.
+    """Return what was seen of a trial whose depth has an error, or is not seen.
 
     Parameters
     ----------
     frames
         (T,) numbers of the frames.
     ids, depth, camera
-        (T, H, W), (T, H, W) and (2, 4, 4), as in `physion.clips.batch.Batch`.
+        (T, H, W), (T, H, W) and (2, 4, 4), as in `physion.clips.batch.Batch`. Depth may be None.
     error
-        Relative error of depth, of an object in all frames and of each pixel.
+        Relative error of depth, of an object in all frames and of each pixel; also of what is
+        expected without depth.
     engine
         That simulates.
 

@@ -1,4 +1,4 @@
-"""Model `seeing-simulation`: from masks and depth to a scene, then noisy simulation.
+"""Model `seeing-simulation`: from masks, with or without depth, to a scene, then noisy simulation.
 
 The observed frames are seen as masks of the objects, depth and the camera, which are an oracle of
 perception: which pixel belongs to which object, and which object is agent and patient, is known.
@@ -38,6 +38,8 @@ KEPT = 16
 """Trials whose scenes are kept in memory, besides the last batch."""
 LEAST_ERROR, MOST_ERROR = 0.005, 0.04
 """Relative errors of depth; what is expected of objects was learned with 0.02."""
+EXPECTED_ERROR = 0.02
+"""Relative error of the depth that is expected where none is seen."""
 SHOWN_SIZE = 128
 """Pixels per side of the pictures for the viewer."""
 
@@ -51,9 +53,11 @@ class SeeingSettings(NoiseLevels, ModelSettings):
     - ``depth_error``: relative error that depth has; 0 for exact depth. With an error a network
       says what is expected of the objects (`physion.models.seeing.expected`), and the observed
       frames are simulated, too (`physion.models.seeing.hypotheses`).
+    - ``depth``: whether depth is seen. Without it a network says how far away masks are.
     """
 
     depth_error: float = 0.0
+    depth: bool = True
     samples: int = 20
     engine: str = DEFAULT_ENGINE
     seed: int = 0
@@ -70,6 +74,11 @@ class SeeingSettings(NoiseLevels, ModelSettings):
                 f"depth_error of {self.model} must be 0, or from {LEAST_ERROR} to {MOST_ERROR}, "
                 f"not {self.depth_error:g}"
             )
+        if self.depth_error and not self.depth:
+            raise BadInputError(
+                f"{self.model}: depth_error is for depth that is seen; leave out depth=false or "
+                "depth_error"
+            )
 
 
 class SeeingSimulation(Model):
@@ -85,7 +94,7 @@ class SeeingSimulation(Model):
     def __init__(self, settings: SeeingSettings) -> None:
         self.settings = settings
         self.spec = Spec(
-            inputs=("ids", "depth", "camera"),
+            inputs=("ids", *("depth",) * settings.depth, "camera"),
             image_size=settings.image_size,
             stride=2,
             context=LAST_OBSERVED // 2 + 1,
@@ -96,10 +105,10 @@ class SeeingSimulation(Model):
 
     def see(self, context: Batch) -> list[SeenTrial]:
         """Return scene and state of every trial, and what could not be seen."""
-        if context.ids is None or context.depth is None or context.camera is None:
+        if any(getattr(context, name) is None for name in self.spec.inputs):
             raise BadInputError(
-                f"{self.settings.model} needs masks, depth and camera of every trial (inputs ids, "
-                "depth, camera)"
+                f"{self.settings.model} needs masks, {'depth ' * self.settings.depth}and camera of "
+                f"every trial (inputs {', '.join(self.spec.inputs)})"
             )
         seen = [self._see(context, row) for row in range(len(context))]
         while len(self._seen) > max(KEPT, len(seen)):
@@ -145,44 +154,50 @@ class SeeingSimulation(Model):
         """Return the SHA-256 of code version, engine, noise, size of pictures, and weights."""
         settings = dataclasses.asdict(self.settings)
         levels = {field.name: settings[field.name] for field in dataclasses.fields(NoiseLevels)}
-        error = [self.settings.depth_error, self._weights()] if self.settings.depth_error else []
+        error = [self.settings.depth_error, self._weights()] if self._uncertain else []
         size = self.settings.image_size
         return json_digest([VERSION, NOISE_VERSION, self.engine.name, levels, size, *error])
+
+    @property
+    def _uncertain(self) -> bool:
+        """Whether a network says what is expected of the objects."""
+        return self.settings.depth_error > 0 or not self.settings.depth
 
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions."""
         return Provenance(
             model=self.settings.model,
-            init=f"shipped:{self._weights()[:12]}" if self.settings.depth_error else "none",
+            init=f"shipped:{self._weights()[:12]}" if self._uncertain else "none",
             encoder_type="bodies fitted to true masks and depth",
             dynamics_type="physics engine",
             versions=f"{self.engine.name}, physion {__version__}",
         )
 
-    @staticmethod
-    def _weights() -> str:
-        """Return the SHA-256 of the weights that fits with errors of depth need."""
+    def _weights(self) -> str:
+        """Return the SHA-256 of the weights that fits without exact depth need."""
         # Imported late: it needs torch, which exact depth does not.
         from physion.models.seeing.expected import weights_sha256
 
-        return weights_sha256()
+        return weights_sha256(depth=self.settings.depth)
 
     def _see(self, context: Batch, row: int) -> SeenTrial:
         """Return what is seen of a trial; the last ones are remembered."""
-        arrays = (context.ids[row], context.depth[row], context.camera[row])
-        pixels = digest_of(b"".join(array.tobytes() for array in arrays))
+        ids, camera = context.ids[row], context.camera[row]
+        depth = context.depth[row] if self.settings.depth else None
+        seen = (ids, camera) if depth is None else (ids, depth, camera)
+        pixels = digest_of(b"".join(array.tobytes() for array in seen))
         key = f"{context.trials[row]} {pixels}"
         if key not in self._seen:
             name, frames = context.trials[row], context.frames[row]
-            error = self.settings.depth_error
-            if error:
+            if depth is None or self.settings.depth_error:
                 # Imported late: it needs torch, which exact depth does not.
                 from physion.models.seeing.hypotheses import see_uncertain
 
                 numbers = [int(frame) for frame in frames]
-                self._seen[key] = see_uncertain(numbers, *arrays, error, self.engine)
+                error = self.settings.depth_error or EXPECTED_ERROR
+                self._seen[key] = see_uncertain(numbers, ids, depth, camera, error, self.engine)
             else:
-                self._seen[key] = see_trial(name, frames, *arrays)
+                self._seen[key] = see_trial(name, frames, ids, depth, camera)
         return self._seen[key]
 
     def _pictures(self, trial: ObservedTrial | None, steps: int) -> Any:
