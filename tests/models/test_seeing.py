@@ -347,7 +347,7 @@ def test_a_push_is_found_by_simulation() -> None:
     assert only_masks.spec.inputs == ("ids", "camera")
     assert only_masks.imagine(replace(batch, depth=None), 8, 0).contact.shape == (1, 8)
     [without] = only_masks.see(replace(batch, depth=None))
-    assert without.trial is not None and without.trial.scene.bodies[0].name == "1"
+    assert without.trial is not None and {"1", "2"} <= set(without.trial.scene.names())
 
 
 def test_samples_are_shared_by_weight() -> None:

@@ -90,7 +90,8 @@ def test_another_factor_of_depth_changes_tokens_as_in_training(seen: Shown, trai
         depth[seen["ids"] == number] *= np.exp(by)
     change = np.pad(change, (0, len(found.numbers) - len(change)))
     height = torch.tensor([-(seen["camera"][0, :3, :3].T @ seen["camera"][0, :3, 3])[2]]).float()
-    made = training.with_errors(values_of(found), torch.tensor(change)[None, :, None].float(), height)
+    by = torch.tensor(change)[None, :, None].float()
+    made = training.with_errors(values_of(found), by, height)
     expected = tokens(seen, depth=depth).values
     assert np.abs(expected - found.values).max() > 0.02
     made = made[0].numpy()

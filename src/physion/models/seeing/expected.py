@@ -322,7 +322,7 @@ def assumed_depth(ids: NDArray[np.uint8], camera: F64) -> F64:
     return depth
 
 
-def floor_depth(height: float, slopes: Any) -> Any:
+def floor_depth(height: Any, slopes: Any) -> Any:
     """Return the depth at which rays meet the floor, from `NEAREST` to `FARTHEST`, metres.
 
     ``height``: of the floor above the camera, which is negative. ``slopes``: height of rays at
