@@ -347,7 +347,8 @@ def main() -> None:
         write_network(
             SHIPPED / WEIGHTS[not options.no_depth],
             network,
-            f"# What is expected of objects{' from masks only' * options.no_depth}\nNetwork of `physion.models.seeing.expected`",
+            f"# What is expected of objects{' from masks only' * options.no_depth}\n"
+            "Network of `physion.models.seeing.expected`",
             "python benchmarks/models/train_seeing.py FOLDER --trials TRIALS --count "
             f"{options.count} --steps {options.steps}{' --no-depth' * options.no_depth} --write",
             text,
