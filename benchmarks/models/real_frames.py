@@ -32,7 +32,7 @@ def main() -> None:
     parser.add_argument("movies", type=Path, nargs="+")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    frames = build_model("intuition-pixels").spec.context_frames()
+    frames = build_model("intuition-pixels", weights="random").spec.context_frames()
     colors = generator("real frames").integers(70, 230, (256, 3)).astype(np.uint8)
     colors[[0, AGENT_ID, PATIENT_ID]] = (255, 255, 255), (220, 30, 30), (230, 200, 20)
     rows = []

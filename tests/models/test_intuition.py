@@ -265,29 +265,3 @@ def test_pictures_without_red_and_yellow_have_the_base_rate_and_a_note() -> None
         model.predict(pictures(grey[:, :, :48, :48], ["a", "b"]))
     with pytest.raises(BadInputError, match="image_size must be 96"):
         build_model("intuition-pixels", image_size=64, weights="random")
-
-
-@pytest.mark.parametrize("scenario", ["support", "collide"])
-def test_other_colours_are_followed_from_masks_of_the_first_frame(scenario: str) -> None:
-    scene = sample_scene(scenario, 7003)
-    seen = Motion(scene, simulate(scene, frames=45))
-    renderer = MotionRenderer({"new": seen}, ("rgb", "ids"), 96, 1, {"new": "free"})
-    drawn = renderer.read("new", FRAMES)
-    model: Any = build_model("intuition-pixels", first_masks=True)
-    assert model.spec.inputs == ("rgb", "ids")
-    only_first = drawn["ids"].copy()
-    only_first[1:] = 0
-    batch = replace(pictures(drawn["rgb"][None], ["new"]), ids=torch.from_numpy(only_first[None]))
-    found = model.encode(batch)[0].reshape(15, 8, -1)
-    expected = mask_tokens(drawn["ids"], 8)
-    assert np.array_equal(found[0, :2], expected[0, :2])
-    assert (
-        found[:, :2, 0].mean() > 0.9
-        and np.abs(found[:, :2, 2:4] - expected[:, :2, 2:4]).mean() < 0.03
-    )
-    assert model.notes(batch) == [""]
-    without = replace(batch, ids=None)
-    with pytest.raises(BadInputError, match=r"objects of pixels \(input ids\) of 96 x 96"):
-        model.predict(without)
-    with pytest.raises(BadInputError, match="first_masks is for intuition-pixels"):
-        build_model("intuition-masks", first_masks=True)

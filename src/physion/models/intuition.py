@@ -283,9 +283,6 @@ class IntuitionSettings(SizedSettings):
     """Settings of a model of intuition; also see `SizedSettings`.
 
     - ``image_size``: pixels per side of the masks; from pixels always 96.
-    - ``first_masks``: from pixels, whether the masks of agent and patient in the first of the
-      frames are given, and they are followed from there, whatever their colours. Otherwise they
-      are red and yellow.
     - ``objects``: tokens K. With more objects the largest masks, or the bodies nearest to the line
       from agent to patient, are kept.
     - ``width``, ``layers``, ``heads``: of the network. ``dropout``: in training.
@@ -296,7 +293,6 @@ class IntuitionSettings(SizedSettings):
 
     model: str = "intuition-masks"
     image_size: int = 96
-    first_masks: bool = False
     objects: int = 8
     width: int = 96
     layers: int = 3
@@ -306,7 +302,6 @@ class IntuitionSettings(SizedSettings):
     members: int = 1
 
     sizes: ClassVar[Sizes] = {"small": {}}
-    any_weights: ClassVar[frozenset[str]] = SizedSettings.any_weights | {"first_masks"}
 
     @classmethod
     def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -322,11 +317,6 @@ class IntuitionSettings(SizedSettings):
             raise BadInputError(
                 f"{self.model}: image_size must be {SIDE}, since objects are found in pictures of "
                 f"this size only, not {self.image_size}"
-            )
-        if self.first_masks and self.model != f"intuition-{PIXELS}":
-            raise BadInputError(
-                f"{self.model}: first_masks is for intuition-{PIXELS}, which finds objects in "
-                "pictures; leave it out"
             )
         if self.width % self.heads:
             raise BadInputError(
@@ -430,9 +420,8 @@ class Intuition(TorchModel):
         self.kind = settings.model.partition("-")[2]
         self.settings, self.seed, self.window = settings, settings.seed, CONTEXT
         self.spec = Spec(
-            inputs=(INPUTS[self.kind], *("ids",) * settings.first_masks),
-            image_size=settings.image_size, stride=STRIDE, context=CONTEXT, future=0,
-            framewise=False,
+            inputs=(INPUTS[self.kind],), image_size=settings.image_size, stride=STRIDE,
+            context=CONTEXT, future=0, framewise=False,
         )  # fmt: skip
         self.view = VIEWS[STATE if self.kind == STATE else MASK]
         tracked, places = len(self.view.track), len(self.view.place)
@@ -508,8 +497,7 @@ class Intuition(TorchModel):
         """Return for each trial whether it never shows agent or patient, or too many objects."""
         most, notes = self.settings.objects, []
         ids = None if self.kind == STATE else self._ids(batch)
-        colored = self.kind == PIXELS and not self.settings.first_masks
-        roles = "red agent or yellow patient" if colored else "agent or patient"
+        roles = "red agent or yellow patient" if self.kind == PIXELS else "agent or patient"
         if ids is not None:
             tokens = np.stack([mask_tokens(one, most) for one in ids])
             batch = replace(batch, features=torch.from_numpy(tokens).flatten(2).to(self.device))
@@ -611,27 +599,21 @@ class Intuition(TorchModel):
                 )
 
     def _ids(self, batch: Batch) -> NDArray[np.uint8]:
-        """Return the objects of pixels (B, T, H, W), true or found."""
-        if self.kind == MASK:
-            return self._input(batch, "ids", "objects of pixels")
-        pictures = self._input(batch, "rgb", "pictures")
-        if not self.settings.first_masks:
-            return np.stack([segment(rgb) for rgb in pictures])
-        masks = self._input(batch, "ids", "objects of pixels")
-        return np.stack([segment(rgb, ids[0]) for rgb, ids in zip(pictures, masks, strict=True)])
-
-    def _input(self, batch: Batch, name: str, what: str) -> NDArray[np.uint8]:
-        """Return an input of the batch, after a check of its size."""
-        size, given = self.settings.image_size, getattr(batch, name)
+        """Return the objects of pixels (B, T, H, W), true or found, after a check of their size."""
+        size, name = self.settings.image_size, INPUTS[self.kind]
+        given = getattr(batch, name)
         if given is None or tuple(given.shape[2:4]) != (size, size):
             found = "none" if given is None else tuple(given.shape[2:4])
+            pixels = self.kind == PIXELS
+            what = "pictures" if pixels else "objects of pixels"
             raise BadInputError(
                 f"{self.name}: {what} (input {name}) of {size} x {size} are needed, not "
-                f"{found}; give clips of this size"
-                + (", or --option image_size")
-                * (self.kind == MASK)
+                f"{found}; give clips of this size" + (", or --option image_size") * (not pixels)
             )
-        return np.asarray(given.cpu() if isinstance(given, Tensor) else given)
+        values = np.asarray(given.cpu() if isinstance(given, Tensor) else given)
+        if self.kind == MASK:
+            return values
+        return np.stack([segment(pictures) for pictures in values])
 
     def _counts(self, batch: Batch, ids: NDArray[np.uint8] | None) -> Sequence[int]:
         """Return the number of objects of every clip, which may be more than there are tokens."""

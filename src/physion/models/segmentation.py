@@ -118,35 +118,27 @@ def network_input(rgb: NDArray[np.uint8]) -> Tensor:
     return torch.cat([colors, torch.from_numpy(np.stack(color_masks(rgb), 1)).float()], 1)
 
 
-def segment(rgb: NDArray[np.uint8], first: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+def segment(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the objects of pixels (T, H, W) of the pictures of a trial (T, `SIDE`, `SIDE`, 3).
 
     Numbers are as in ``Batch.ids``: `AGENT_ID`, `PATIENT_ID`, from `FIRST_OTHER_ID` the others,
-    each with the same number in all pictures, and `SCENERY_ID`. With ``first``, the true objects
-    (H, W) of the first picture, agent and patient are those there, whatever their colours, and
-    are followed like other objects.
+    each with the same number in all pictures, and `SCENERY_ID`.
     """
     with torch.no_grad():
         found = _network()(network_input(rgb)).double().numpy()
-    n, colored = len(CLASSES), first is None
-    ids = np.stack([group(of[:n], of[n:], colored=colored) for of in found])
-    return follow(ids) if first is None else follow_roles(ids, first)
+    return follow(np.stack([group(of[: len(CLASSES)], of[len(CLASSES) :]) for of in found]))
 
 
-def group(logits: F64, offsets: F64, *, colored: bool = True) -> NDArray[np.uint8]:
+def group(logits: F64, offsets: F64) -> NDArray[np.uint8]:
     """Return the objects of the pixels of one picture (H, W).
 
     Parameters
     ----------
     logits, offsets
         (4, H, W) and (2, H, W), as the network gives them.
-    colored
-        Whether agent and patient are known by their colours; else they are other objects.
     """
     best = logits.argmax(0)
     ids: NDArray[np.uint8] = np.array(CLASSES, np.uint8)[best]
-    if not colored:
-        ids[ids != SCENERY_ID] = FIRST_OTHER_ID
     rows, columns = np.nonzero(ids == FIRST_OTHER_ID)
     ids[rows, columns] = SCENERY_ID
     if len(rows) < LEAST_PIXELS:
@@ -171,7 +163,7 @@ def group(logits: F64, offsets: F64, *, colored: bool = True) -> NDArray[np.uint
     number = FIRST_OTHER_ID
     for k in range(len(centers)):
         own = nearest == k
-        if own.sum() >= LEAST_PIXELS and number < np.iinfo(np.uint8).max - PATIENT_ID:
+        if own.sum() >= LEAST_PIXELS and number < np.iinfo(np.uint8).max:
             ids[rows[own], columns[own]] = number
             number += 1
     return ids
@@ -204,30 +196,6 @@ def follow(ids: NDArray[np.uint8]) -> NDArray[np.uint8]:
                 velocity, last = np.vstack([velocity, np.zeros(2)]), np.append(last, time)
             if own[place] >= 0:
                 out[time][picture == number] = FIRST_OTHER_ID + own[place]
-    return out
-
-
-def follow_roles(ids: NDArray[np.uint8], first: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the objects of pictures (T, H, W) as `follow`, with agent and patient among them.
-
-    In the first picture these have the pixels of ``first``. What was found there is left out if
-    most of it is agent or patient.
-    """
-    pictures = ids.copy()
-    shown = pictures[0]
-    roles = np.isin(first, (AGENT_ID, PATIENT_ID))
-    for number in np.unique(shown[roles & (shown != SCENERY_ID)]):
-        if 2 * (roles & (shown == number)).sum() > (shown == number).sum():
-            shown[shown == number] = SCENERY_ID
-    highest = np.iinfo(np.uint8).max
-    for role in (AGENT_ID, PATIENT_ID):
-        shown[first == role] = highest - role
-    found = follow(pictures)
-    out = found.copy()
-    for role in (AGENT_ID, PATIENT_ID):
-        own = found[0][first == role]
-        if len(own) and own[0] != SCENERY_ID:
-            out[found == own[0]] = role
     return out
 
 
