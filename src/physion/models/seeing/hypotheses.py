@@ -16,7 +16,8 @@ mean over frames and objects; agent and patient count twice.
 2. Hypotheses are drawn in rounds, each from a normal distribution around the best ones so far:
    first only the push, and the places of what stands on nothing, then everything.
 3. What the masks of the last frame contradict is fitted to them again, with its size, and its
-   velocity is that between the last frames. So each of the best hypotheses gives a scene and a
+   velocity is that between the last frames. Without depth it stays about as far away as in the
+   hypothesis. So each of the best hypotheses gives a scene and a
    state at the last observed frame, with a weight that falls with its loss.
 """
 
@@ -36,7 +37,7 @@ from physion.core.seeds import generator
 from physion.models.noisy_simulation import ObservedTrial
 from physion.models.seeing.bodies import moved_with
 from physion.models.seeing.expected import expect
-from physion.models.seeing.masks import MaskFit
+from physion.models.seeing.masks import MaskFit, traced
 from physion.models.seeing.pixels import Rays, picture_of
 from physion.models.seeing.resting import (
     Resting,
@@ -79,8 +80,9 @@ LAST_FRAMES = (36, 40)
 """Frames from which, to the last one, its velocity follows."""
 POORLY = 0.3
 """Loss above which hypotheses explain the masks poorly."""
-SAME_FACTOR = 0.004
-"""Standard deviation of ln s of an object between frames."""
+SAME_FACTOR, SAME_DEPTH = 0.004, 0.02
+"""Standard deviation of ln s of an object between frames; without depth, of the logarithm of its
+depth about that of the hypothesis."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,11 +107,19 @@ class Video:
         View and projection matrix (2, 4, 4).
     numbers
         Of the objects.
+    depth
+        Whether depth is seen.
     """
 
     def __init__(
-        self, pictures: Mapping[int, UncertainFrame], camera: F64, numbers: Sequence[int]
+        self,
+        pictures: Mapping[int, UncertainFrame],
+        camera: F64,
+        numbers: Sequence[int],
+        *,
+        depth: bool = True,
     ) -> None:
+        self.depth = depth
         self.frames, self.camera, self.numbers = sorted(pictures), camera, list(numbers)
         height, width = pictures[self.frames[0]].seen.ids.shape
         rows = ((np.arange(SIZE) + 0.5) * height / SIZE).astype(np.int64)
@@ -229,7 +239,7 @@ def see_uncertain(
     BadInputError
         As `scenes.see_trial`.
     """
-    numbers = numbers_of(ids)
+    numbers, seen_depth = numbers_of(ids), depth is not None
     depth, expected = expect(frames, ids, depth, camera)
     pictures = {
         int(frame): uncertain_frame(picture_of(ids[row], depth[row], camera), error)
@@ -248,7 +258,7 @@ def see_uncertain(
     ]
     if unseen:
         return SeenTrial(None, (), "; ".join(notes + unseen))
-    video = Video(pictures, camera, list(objects))
+    video = Video(pictures, camera, list(objects), depth=seen_depth)
     tried = _search(video, objects, _pushed(video, objects, engine), engine)[:KEPT]
     if not tried:
         return SeenTrial(None, (), "; ".join([*notes, "no hypothesis could be simulated"]))
@@ -399,7 +409,8 @@ def _observed(
         for frame in (*LAST_FRAMES, last):
             rays = pictures[frame].rays(number, 240) if frame in pictures else None
             if rays is not None:
-                fits[frame] = _refitted(one, _placed(one, tried, frame, k), rays)
+                axis = None if video.depth else video.camera[0, 2, :3]
+                fits[frame] = _refitted(one, _placed(one, tried, frame, k), rays, axis)
         if last not in fits:
             continue
         placed = fits.pop(last)
@@ -439,17 +450,27 @@ def _placed(one: Resting, tried: _Tried, frame: int, k: int) -> Placed:
     return Placed(one.placed.solid, position, rotation, scale)
 
 
-def _refitted(one: Resting, start: Placed, rays: Rays) -> Placed:
-    """Return an object in another frame, with its size, near a start or where its mask is."""
-    factor = one.fit.log_factor
-    depth = float(np.median(rays.depth[rays.on])) * math.exp(factor)
-    seen = rays.origin + rays.vectors[rays.on].mean(axis=0) * depth
+def _refitted(one: Resting, start: Placed, rays: Rays, axis: F64 | None) -> Placed:
+    """Return an object in another frame, with its size, near a start or where its mask is.
+
+    ``axis`` (3,): of the camera, if depth is not seen, so that it is as far away as the start.
+    """
+    factor, deviation = one.fit.log_factor, SAME_FACTOR
+    median, center = float(np.median(rays.depth[rays.on])), rays.vectors[rays.on].mean(axis=0)
+    if axis is None:
+        depth = median * math.exp(factor)
+    else:
+        depth = max(float(axis @ (start.middle() - rays.origin)), 0.1)
+    there = moved_with(start, rays.origin + center * depth - start.middle())
+    if axis is not None:
+        entries, _ = traced(there, rays)
+        front = entries[rays.on]
+        near = float(np.nanmedian(front)) if np.isfinite(front).any() else depth
+        factor, deviation = math.log(near / median), SAME_DEPTH
     found = []
-    for near in (start, moved_with(start, seen - start.middle())):
-        fit = MaskFit(
-            rays, one.fit.error, None, False, "given", factor, SAME_FACTOR
-        )  # fmt: skip
-        found.append(fit.solve(near, 8))
+    for guess in (start, there):
+        fit = MaskFit(rays, one.fit.error, None, False, "given", factor, deviation)
+        found.append(fit.solve(guess, 8))
     return min(found, key=lambda placed: placed.cost)
 
 
