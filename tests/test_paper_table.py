@@ -68,8 +68,8 @@ def test_stored_scores_equal_their_files(claims: Any) -> None:
     means = scores[scores["scenario"] == "mean"].set_index(["base_model", "readout"])["accuracy"]
     runs = claims.stored_official(released).tables.runs.groupby(["model", "readout"])["accuracy"]
     assert runs.mean()["CSWM", "full"] == pytest.approx(means["cswm-small", "full"], abs=1e-4)
-    # Of RPIN and EfficientNet two readouts, of particle models one.
-    assert len(runs) == 3 * 3 + 2 + 2 + 3
+    # Of EfficientNet two readouts, of particle models one.
+    assert len(runs) == 4 * 3 + 2 + 3
     lines = claims.SMALL.read_text().splitlines()
     mean = next(line for line in lines if line.startswith("dpi-small") and " mean " in line)
     own = claims.stored_own(released)

@@ -46,7 +46,7 @@ MODELS = {
 """Models that files belong to, by name."""
 ALL = ("observed", "observed+simulated", "full")
 KINDS = {
-    "state-trees": ALL[:1], "rpin-small": ALL[:2], "cswm-small": ALL, "svg-small": ALL,
+    "state-trees": ALL[:1], "rpin-small": ALL, "cswm-small": ALL, "svg-small": ALL,
     "op3-small": ALL,
 }  # fmt: skip
 """Readouts of models, where they are not observed and full."""

@@ -82,7 +82,7 @@ POORLY = 0.3
 """Loss above which hypotheses explain the masks poorly."""
 SAME_FACTOR, SAME_DEPTH = 0.004, 0.02
 """Standard deviation of ln s of an object between frames; without depth, of the logarithm of its
-depth about that of the hypothesis."""
+depth, about the depth in the hypothesis."""
 
 
 @dataclass(frozen=True, eq=False)
