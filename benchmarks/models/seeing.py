@@ -28,6 +28,9 @@ With --depth-error E, the depth of each object has an error of standard deviatio
 all frames, and each pixel another one; rows are in FOLDER/seeing-E.jsonl. With --no-depth masks and
 the camera are all that is seen; rows are in FOLDER/seeing-masks.jsonl.
 
+--against FILE compares with the rows of another run (.jsonl), or with predictions of a model
+(.csv), on the same stimuli.
+
 With --write they are written to ``results/seeing.md``, ``seeing-E.md`` or ``seeing-masks.md``.
 --priors prints density, friction and restitution of the bodies of our own presets, from which the
 constants of the model come.
@@ -450,6 +453,49 @@ def _markdown(rows: Sequence[ROW]) -> str:
     return markdown_table(names, [[row[name] for name in names] for row in rows])
 
 
+def against(rows: Sequence[ROW], paths: Sequence[Path]) -> str:
+    """Return paired differences of right answers from other rows, or from other predictions."""
+    lines = []
+    for path in paths:
+        if path.suffix == ".csv":
+            table = pd.read_csv(path)
+            other = dict(
+                zip(table["stimulus"].map(canonical_name), table["p_contact"], strict=True)
+            )
+        else:
+            other = {
+                canonical_name(name): row["fitted"]
+                for name, row in read_rows(path, VERSION).items()
+                if "early" not in row
+            }
+        inside = [row for row in rows if canonical_name(row["stimulus"]) in other]
+        outside = [row for row in rows if canonical_name(row["stimulus"]) not in other]
+        contact = [row["contact"] for row in inside]
+        ours = right([row["fitted"] for row in inside], contact)
+        theirs = right([other[canonical_name(row["stimulus"])] for row in inside], contact)
+        line = {
+            "against": path.stem,
+            "trials": len(inside),
+            "fitted state": _mean(ours),
+            "other": _mean(theirs),
+            "difference": _mean(ours - theirs),
+            "other trials": len(outside),
+            "fitted state there": "-",
+            "less true state there": "-",
+        }
+        if len(outside) > 1:
+            fitted, true = (
+                right([row[name] for row in outside], [row["contact"] for row in outside])
+                for name in ("fitted", "true")
+            )
+            line |= {
+                "fitted state there": _mean(fitted),
+                "less true state there": _mean(fitted - true),
+            }
+        lines.append(line)
+    return _markdown(lines)
+
+
 def priors() -> str:
     """Return what our own presets have, as Markdown: medians, and quantiles of the density."""
     scenes = {
@@ -498,6 +544,7 @@ def main() -> None:
     parser.add_argument("--depth-error", type=float, default=0.0)
     parser.add_argument("--no-depth", action="store_true")
     parser.add_argument("--known", action="store_true")
+    parser.add_argument("--against", type=Path, nargs="*", default=[], help="rows, or predictions")
     parser.add_argument("--version", type=int, default=VERSION)
     parser.add_argument("--write", action="store_true")
     parser.add_argument("--priors", action="store_true")
@@ -540,6 +587,8 @@ def main() -> None:
             )
         rows.append(known[scene.name])
     text = tables(rows)
+    if options.against:
+        text += f"\n{against(rows, options.against)}"
     print(text)
     if options.write:
         today = datetime.date.today().isoformat()

@@ -165,6 +165,8 @@ class Learner:
             found = self.train(f"{name}_{group}", own != group)
             for part, groups in (("own", held), ("official", asked)):
                 answers[part][groups == group] = found[part][groups == group]
+        if np.isnan(answers["official"]).any():
+            raise SystemExit("some official stimuli are of a group without own trials; make more")
         return answers
 
     def configurations(self) -> list[NDArray[np.int64]]:
@@ -289,6 +291,10 @@ def main() -> None:
     parser.add_argument("--all-but", action="store_true", help="scenarios")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
+    if options.start and (options.unseen or options.all_but):
+        raise SystemExit(
+            "weights of --start may have seen all: leave it out for --unseen, --all-but"
+        )
     rows, curves = [], []
     for name in options.models:
         learner = Learner(name, options.folder, options)
@@ -303,6 +309,9 @@ def main() -> None:
             rows.append(learner.row(f"mean of both, {name}", both))
             print("\n".join(rows[-2:]), flush=True)
         own, asked = learner.own, learner.asked
+        fit = pd.Series(own["scenario"][~learner.held]).value_counts()
+        if max(options.counts, default=0) > fit.min():
+            raise SystemExit(f"--counts: some scenario has only {fit.min()} trials for training")
         others = {
             f"{name}, {count} trials": (
                 learner.train(f"first_{count}", learner.number < count),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from physion.core.errors import BadInputError
 from physion.models.build import build_model
 from physion.models.interface import Model
 from physion.models.seeing.bodies import find, follow
-from physion.models.seeing.hypotheses import see_uncertain
+from physion.models.seeing.hypotheses import _refitted, see_uncertain
 from physion.models.seeing.masks import MaskFit, traced
 from physion.models.seeing.pixels import Rays, SeenFrame, floor_height, picture_of
 from physion.models.seeing.resting import resting_scene, stacked, uncertain_frame
@@ -518,3 +519,18 @@ def test_scenes_of_every_scenario_are_recovered(scenario: str) -> None:
             errors.append(np.linalg.norm(tracks[number].middle() - true.middle()))
             right.append(tracks[number].solid.name == body.shape)
     assert np.median(errors) < 0.01 and np.mean(right) >= 0.75
+
+
+def test_what_would_be_behind_the_camera_is_not_fitted_again(rolling: Batch) -> None:
+    assert rolling.ids is not None and rolling.depth is not None and rolling.camera is not None
+    camera = rolling.camera[0]
+    rays = picture_of(rolling.ids[0, 0], rolling.depth[0, 0], camera).rays(1)
+    assert rays is not None
+    axis = camera[0, 2, :3]
+    behind = rays.origin - 0.75 * axis
+    start = Placed(solid("cube"), behind, np.eye(3), np.full(3, 0.5))
+    one: Any = SimpleNamespace(fit=SimpleNamespace(log_factor=0.0, error=ERROR))
+    assert _refitted(one, start, rays, axis) is start
+    # A large one at .6 m has the camera inside.
+    start = replace(start, position=rays.origin + 0.6 * axis, scale=np.full(3, 2.0))
+    assert np.isfinite(_refitted(one, start, rays, axis).position).all()

@@ -36,7 +36,7 @@ from physion.core.errors import PhysionError
 from physion.core.seeds import generator
 from physion.models.noisy_simulation import ObservedTrial
 from physion.models.seeing.bodies import moved_with
-from physion.models.seeing.expected import expect
+from physion.models.seeing.expected import NEAREST, expect
 from physion.models.seeing.masks import MaskFit, traced
 from physion.models.seeing.pixels import Rays, picture_of
 from physion.models.seeing.resting import (
@@ -453,19 +453,23 @@ def _placed(one: Resting, tried: _Tried, frame: int, k: int) -> Placed:
 def _refitted(one: Resting, start: Placed, rays: Rays, axis: F64 | None) -> Placed:
     """Return an object in another frame, with its size, near a start or where its mask is.
 
-    ``axis`` (3,): of the camera, if depth is not seen, so that it is as far away as the start.
+    ``axis`` (3,): of the camera, if depth is not seen, so that it is as far away as the start; a
+    start that is too near to be seen stays.
     """
     factor, deviation = one.fit.log_factor, SAME_FACTOR
     median, center = float(np.median(rays.depth[rays.on])), rays.vectors[rays.on].mean(axis=0)
     if axis is None:
         depth = median * math.exp(factor)
     else:
-        depth = max(float(axis @ (start.middle() - rays.origin)), 0.1)
+        depth = float(axis @ (start.middle() - rays.origin))
+        if depth < NEAREST:
+            return start
     there = moved_with(start, rays.origin + center * depth - start.middle())
     if axis is not None:
         entries, _ = traced(there, rays)
         front = entries[rays.on]
-        near = float(np.nanmedian(front)) if np.isfinite(front).any() else depth
+        front = front[front > 0]  # A large object may have the camera inside.
+        near = float(np.median(front)) if len(front) else depth
         factor, deviation = math.log(near / median), SAME_DEPTH
     found = []
     for guess in (start, there):

@@ -1,11 +1,11 @@
 """Model `seeing-simulation`: from masks, with or without depth, to a scene, then noisy simulation.
 
-The observed frames are seen as masks of the objects, depth and the camera, which are an oracle of
-perception: which pixel belongs to which object, and which object is agent and patient, is known.
-`scenes.see_trial` fits shapes of the library to them; from the scene and the state at the last
-observed frame the engine simulates with noise, as in `physion.models.noisy_simulation`. Nothing is
-fitted to outcomes, and nothing but these inputs is known of a trial: no mass, friction, joint,
-scenario, or body that does not move.
+The observed frames are seen as masks of the objects, the camera, and depth if it is given, an
+oracle of perception: which pixel belongs to which object, and which object is agent and patient, is
+known. `scenes.see_trial` fits shapes of the library to them, `hypotheses.see_uncertain` if depth is
+not exact or not there; from the scene and the state at the last observed frame the engine simulates
+with noise, as in `physion.models.noisy_simulation`. Nothing is fitted to outcomes, and nothing but
+these inputs is known of a trial: no mass, friction, joint, scenario, or body that does not move.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class SeeingSimulation(Model):
         """Return scene and state of every trial, and what could not be seen."""
         if any(getattr(context, name) is None for name in self.spec.inputs):
             raise BadInputError(
-                f"{self.settings.model} needs masks, {'depth ' * self.settings.depth}and camera of "
+                f"{self.settings.model} needs masks{', depth' * self.settings.depth} and camera of "
                 f"every trial (inputs {', '.join(self.spec.inputs)})"
             )
         seen = [self._see(context, row) for row in range(len(context))]
@@ -168,10 +168,17 @@ class SeeingSimulation(Model):
         return Provenance(
             model=self.settings.model,
             init=f"shipped:{self._weights()[:12]}" if self._uncertain else "none",
-            encoder_type="bodies fitted to true masks and depth",
+            encoder_type=f"bodies fitted to {self._given()}",
             dynamics_type="physics engine",
             versions=f"{self.engine.name}, physion {__version__}",
         )
+
+    def _given(self) -> str:
+        """Return what is seen of the objects."""
+        if not self.settings.depth:
+            return "true masks"
+        error = self.settings.depth_error
+        return "true masks and depth" + f" with an error of {error:g}" * (error > 0)
 
     def _weights(self) -> str:
         """Return the SHA-256 of the weights that fits without exact depth need."""
