@@ -26,20 +26,28 @@ OTHERS = {
     "CITATION.cff": "files/CITATION.cff",
 }
 """Files of the repository by their path, and where the site has them."""
-COPIED = (*(ROOT / "benchmarks" / "results").glob("*"), *(ROOT / "examples").rglob("*"))
+LINK = re.compile(r"(\]\s?)\(([^()\s]+)\)")
 
 
 def on_files(files: Files, *, config: Any) -> Files:
     """Add the generated pages and the files that pages link to."""
     for name, text in pages().items():
         files.append(File.generated(config, name, content=text))
-    copied = [path for path in COPIED if path.is_file() and "__pycache__" not in path.parts]
-    for path in (*copied, ROOT / "CITATION.cff"):
-        name = f"files/{path.relative_to(ROOT).as_posix()}"
-        # As text, so that a browser shows it and mkdocs makes no page of it.
-        name = f"{name}.txt" if path.suffix == ".md" else name
-        files.append(File.generated(config, name, content=path.read_bytes()))
+    for path in sorted(linked()):
+        files.append(File.generated(config, place(path), content=(ROOT / path).read_bytes()))
     return files
+
+
+def linked() -> set[str]:
+    """Return the files outside of ``docs``, and not among the pages, that pages link to."""
+    sources = [*(ROOT / "docs").rglob("*.md"), *(ROOT / n for n in OTHERS if n.endswith(".md"))]
+    found = {
+        first_file(os.path.normpath(page.parent.relative_to(ROOT) / match[2].partition("#")[0]))
+        for page in sources
+        for match in LINK.finditer(page.read_text(encoding="utf-8"))
+        if "://" not in match[2]
+    }
+    return {p for p in found if place(p).startswith("files/") and (ROOT / p).is_file()}
 
 
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
@@ -61,19 +69,26 @@ def relink(markdown: str, here: PurePosixPath, there: PurePosixPath) -> str:
         path = os.path.normpath(here / target)
         return f"{match[1]}({os.path.relpath(place(path), there)}{hash_}{anchor})"
 
-    return re.sub(r"(\]\s?)\(([^()\s]+)\)", lead, markdown)
+    return LINK.sub(lead, markdown)
 
 
 def place(path: str) -> str:
     """Return where the site has a file of the repository."""
     if path in OTHERS:
         return OTHERS[path]
-    if (ROOT / path).is_dir():
-        members = sorted(p for p in (ROOT / path).iterdir() if p.is_file())
-        path = members[0].relative_to(ROOT).as_posix()
+    path = first_file(path)
     if path.startswith("docs/"):
         return path.removeprefix("docs/")
+    # As text, so that a browser shows it and mkdocs makes no page of it.
     return f"files/{path}.txt" if path.endswith(".md") else f"files/{path}"
+
+
+def first_file(path: str) -> str:
+    """Return a path in the repository, of a folder the path of its first file."""
+    if not (ROOT / path).is_dir():
+        return path
+    files = sorted(member for member in (ROOT / path).iterdir() if member.is_file())
+    return files[0].relative_to(ROOT).as_posix() if files else path
 
 
 def pages() -> dict[str, str]:

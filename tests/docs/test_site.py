@@ -52,7 +52,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.nightly
 @pytest.mark.slow
 def test_every_page_is_built_and_loads_nothing_from_elsewhere(site: Path) -> None:
     pages = sorted(site.rglob("*.html"))
@@ -75,7 +74,6 @@ def test_every_page_is_built_and_loads_nothing_from_elsewhere(site: Path) -> Non
     assert not re.findall(r"(?:url\(|@import )[\"']?(?:https?:)?//[^)]*", styles)
 
 
-@pytest.mark.nightly
 @pytest.mark.slow
 def test_generated_pages_say_what_the_package_says(site: Path) -> None:
     verbs = (site / "verbs.html").read_text(encoding="utf-8")
