@@ -266,7 +266,7 @@ STORED_ABOUT = (
     "**Weights of the package.** The scores are those of [the page on models and people]"
     "(models.md#official-stimuli): {official} official stimuli with the readouts that ship "
     "([official_all.csv](../../benchmarks/results/official_all.csv)), fitted on 1,000 trials per "
-    "scenario, but *full* of OP3 on 394; and {own} own trials with "
+    "scenario; and {own} own trials with "
     "readouts of 200 ([small.txt](../../benchmarks/results/small.txt)). These models have the size "
     "`small` and were trained on our own trials of all scenarios. On official stimuli they see "
     "frames 2, 8, ..., 44, and particle models decide by *end*, as in the paper; on own trials, "
