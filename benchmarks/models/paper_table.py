@@ -43,6 +43,7 @@ import pandas as pd
 import physion
 from paper_claims import GENERALISED, IMAGENET, NAMES
 from paper_page import Finished, write_page
+from physion import Dataset
 from physion.analysis.published.tables import PARTICLES
 from physion.cli.output import text_table
 from physion.compute.local import SerialExecutor
@@ -150,12 +151,23 @@ class Part:
         return {"protocols": (self.protocol,), "seeds": self.seeds, "accelerator": "cpu",
                 "rendered": self.rendered or self.model in IMAGENET}  # fmt: skip
 
+    def fit_set(self) -> Dataset:
+        """Return the set that models are trained and readouts are fitted on.
+
+        Motions that are tested are left out: a sampled scene can be one of the study to the byte.
+        """
+        dataset = Dataset(self.folder / FIT)
+        for tested in TESTED:
+            known = Dataset(self.folder / tested).index["digest"]
+            dataset.index = dataset.index[~dataset.index["digest"].isin(known)]
+        return dataset
+
     def train(self, *, dry_run: bool = False, steps: int = 0) -> Trainings:
         """Train what is missing."""
         if self.shipped:
             return Trainings([], [], {})
         return physion.train(
-            self.options(steps), self.folder / FIT, self.folder / OUT, dry_run=dry_run,
+            self.options(steps), self.fit_set(), self.folder / OUT, dry_run=dry_run,
             **self.shared(),
         )  # fmt: skip
 
@@ -163,7 +175,7 @@ class Part:
         """Evaluate on a set what was trained."""
         readouts = ("observed+simulated",) if self.protocol == "one" else ()
         return physion.evaluate(
-            self.options(steps), self.folder / tested, self.folder / OUT, fit=self.folder / FIT,
+            self.options(steps), self.folder / tested, self.folder / OUT, fit=self.fit_set(),
             readouts=readouts, dry_run=dry_run, **self.shared(),
         )  # fmt: skip
 

@@ -18,11 +18,15 @@ pixels meets it (`assumed_depth`). Another network of the same kind, which was t
 depth, gives e in each of the frames besides: nothing else says that an object is in the air, or
 moves towards the camera.
 
+What falls freely from the first frame on says by itself how far away it is (`fall_of`). Both depths
+are averaged, with their precisions as weights.
+
 Places are in axes of the camera: x is ahead, y to the left, z up, the origin below the camera.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -69,6 +73,20 @@ FEW = 4
 """Pixels below which an object is not seen."""
 SPREAD = 1.5
 """Factor of the standard deviations, since fits have errors of their own."""
+STRAIGHT = 0.7
+"""Pixels by which the middle of what falls freely may be elsewhere."""
+SAME_AREA = 0.2
+"""Part by which its mask may change; else it is hidden."""
+LEAST_FALL = 14
+"""Steps that it falls at least, which are 10 cm."""
+BELOW = -0.06
+"""Least height of its lower end, metres."""
+FRONT = 0.25
+"""Part of the size of an object by which what is seen of it is nearer than its middle."""
+FALL_ERROR = 0.7
+"""Error of the distance that it has fallen, pixels."""
+FALL_LOW = 0.02
+"""Least standard deviation of the height of its lower end, metres."""
 LEAST = {"factor": 0.002, "low": 0.01, "height": 0.08, "wide": 0.05, "narrow": 0.05, "middle": 0.01}
 """Least standard deviations, metres or of logarithms."""
 
@@ -332,6 +350,86 @@ def floor_depth(height: Any, slopes: Any) -> Any:
     return np.maximum(height / down, NEAREST)
 
 
+@dataclass(frozen=True, eq=False)
+class Fall:
+    """A free fall from the first frame on: where the object is in that frame.
+
+    ``depth`` of what is seen of it, metres, and its relative ``error``; ``low``: slope of the ray
+    to its lower end, height by depth; ``last``: number of the last frame in which it still falls.
+    """
+
+    depth: float
+    error: float
+    low: float
+    last: int
+
+
+def fall_of(
+    frames: Sequence[int], ids: NDArray[np.uint8], number: int, vectors: F64, height: float
+) -> Fall | None:
+    """Return the free fall of an object, None if it does not fall from the first frame on.
+
+    The ray through the middle of its mask has the slope s, height by distance along the floor. What
+    starts from rest and falls stays at its distance r, so that in frame f, after f + 1 steps,
+
+        s_f = s - q_f / r,    q_f = g dt^2 (f + 1) (f + 2) / 2.
+
+    s and 1 / r are fitted by least squares to as many frames from the first one on as there are in
+    which differences stay below `STRAIGHT` pixels, and the object stays above the floor. What moves
+    otherwise, such as a ball on a ramp, would have to be far below it.
+
+    Parameters
+    ----------
+    frames
+        (T,) numbers of the frames.
+    ids
+        (T, H, W), as in `physion.clips.batch.Batch`.
+    number
+        Of the object.
+    vectors
+        Rays (H, W, 3) of the pixels to depth 1.
+    height
+        Of the camera, metres.
+    """
+    pixel = float(np.linalg.norm(vectors[0, 1] - vectors[0, 0]))
+    masks = ids == number
+    areas = masks.sum((1, 2))
+    rays = []
+    for mask, area in zip(masks, areas, strict=True):
+        cut = mask[[0, -1]].any() or mask[:, [0, -1]].any()
+        if area < FEW or cut or abs(area / areas[0] - 1) > SAME_AREA:
+            break
+        rays.append(vectors[mask].mean(0))
+    if not rays:
+        return None
+    x, y, z = np.array(rays).T
+    level = np.hypot(x, y)
+    slopes, angles = z / level, np.arctan2(y, x)
+    steps = np.array(frames[: len(rays)]) + 1
+    fallen = GRAVITY * FRAME_TIME**2 * steps * (steps + 1) / 2
+    bottom = np.flatnonzero(masks[0].any(1))[-1]
+    low = float(vectors[bottom][masks[0, bottom], 2].mean())
+    for count in range(len(rays), 0, -1):
+        if steps[count - 1] <= LEAST_FALL:
+            return None
+        matrix = np.column_stack([np.ones(count), -fallen[:count]])
+        found, *_ = np.linalg.lstsq(matrix, slopes[:count], rcond=None)
+        wrong = np.abs(slopes[:count] - matrix @ found).max()
+        turned = np.abs(angles[:count] - angles[:count].mean()).max()
+        if max(wrong, turned) > STRAIGHT * pixel:
+            continue
+        if found[1] < 1 / FARTHEST:
+            return None
+        distance, deepest = 1 / float(found[1]), float(fallen[count - 1])
+        depth = distance / float(level[0])
+        if height + low * depth - deepest < BELOW:
+            return None
+        depth *= 1 - FRONT * pixel * math.sqrt(areas[0])
+        error = FALL_ERROR * pixel * distance / (deepest - float(fallen[0]))
+        return Fall(depth, error, low, int(frames[count - 1]))
+    return None
+
+
 def expect(
     frames: Sequence[int], ids: NDArray[np.uint8], depth: NDArray[np.floating] | None, camera: F64
 ) -> tuple[F64, Mapping[int, Expected]]:
@@ -351,6 +449,7 @@ def expect(
     found = dict[int, Expected]()
     if not tokens.numbers:
         return better, found
+    first = picture_of(ids[0], better[0], camera)
     there = torch.ones(1, len(tokens.numbers), dtype=torch.bool)
     with torch.no_grad():
         out = _network(given)(torch.from_numpy(tokens.values)[None], there)[0].double()
@@ -366,19 +465,34 @@ def expect(
         )
         if given:
             better[ids == number] /= np.exp(ERROR * error[0])
-        else:
-            nearer = np.exp(-ERROR * errors[k, :, 0])
-            for row, frame in enumerate(frames):
-                better[row][ids[row] == number] *= np.interp(frame, FRAMES, nearer)
-        seen = frames_of(torch.from_numpy(tokens.values[k]))[:, [0, 6, 7, 8]].double().numpy()
-        shown = seen[seen[:, 0] > 0]
-        middle = None
-        if len(shown):
-            place = tokens.origin + tokens.axes @ (shown[0, 1:] + middles[k, :, 0])
+        of_frames = frames_of(torch.from_numpy(tokens.values[k])).double().numpy()
+        shown = of_frames[:, 0] > 0
+        middle, factor_error = None, max(ERROR * error[1], LEAST["factor"])
+        fall = None if given else fall_of(frames, ids, number, first.vectors, first.origin[2])
+        if shown.any():
+            place = tokens.origin + tokens.axes @ (of_frames[shown][0, 6:9] + middles[k, :, 0])
             spread = SPREAD * np.exp(np.clip(middles[k, :, 1], -6, 3))
             middle = place, np.maximum(spread, LEAST["middle"])
+            if not given:
+                # In frames between those that the network sees the logarithm of the corrected depth
+                # is interpolated: what moves evenly away from the floor keeps an even speed so,
+                # while the depth of the floor below it jumps where another object hides its end.
+                known = np.log(of_frames[shown, 1]) - ERROR * errors[k, shown, 0]
+                if fall is not None:
+                    weight = fall.error**-2 / (fall.error**-2 + factor_error**-2)
+                    known[0] += weight * (math.log(fall.depth) - known[0])
+                    factor_error = (fall.error**-2 + factor_error**-2) ** -0.5
+                    reach = abs(fall.low) * math.exp(known[0])
+                    low = (
+                        first.origin[2] + fall.low * math.exp(known[0]),
+                        max(factor_error * reach, FALL_LOW),
+                    )
+                    middle = None
+                path = np.exp(np.interp(frames, np.array(FRAMES)[shown], known))
+                for row in np.flatnonzero((ids == number).any((1, 2))):
+                    better[row][ids[row] == number] = path[row]
         found[number] = Expected(
-            factor_error=max(ERROR * error[1], LEAST["factor"]),
+            factor_error=factor_error,
             shapes=dict(zip(names, shapes[k].tolist(), strict=True)),
             low=low, height=height, wide=wide, narrow=narrow, axes=tokens.axes, middle=middle,
         )  # fmt: skip
