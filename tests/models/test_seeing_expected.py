@@ -198,7 +198,7 @@ def rays_of_a_level_camera() -> NDArray[np.float64]:
     return np.stack(np.broadcast_arrays(1.0, -at[None, :], -at[:, None]), -1)
 
 
-def ball(x: float, y: float, z: float, radius: float) -> NDArray[np.uint8]:
+def ball(x: float, y: float, z: float, radius: float = 0.12) -> NDArray[np.uint8]:
     """Return the picture of a ball with number 1; y and z are from the camera."""
     vectors, middle = rays_of_a_level_camera(), np.array([x, y, z])
     along = vectors @ middle / np.linalg.norm(vectors, axis=-1)
@@ -217,7 +217,7 @@ def dropped(frame: int, part: float = 1.0) -> float:
 
 @pytest.mark.parametrize("distance", [2.5, 4.0])
 def test_a_free_fall_says_how_far_away_it_is(distance: float) -> None:
-    ids = np.stack([ball(distance, 0.3, 0.5 - dropped(f), 0.12) for f in SEEN_FRAMES])
+    ids = np.stack([ball(distance, 0.3, 0.5 - dropped(f)) for f in SEEN_FRAMES])
     found = fall_of(SEEN_FRAMES, ids, 1, rays_of_a_level_camera(), 1.2)
     assert found is not None and found.last == 44
     assert found.depth == pytest.approx(distance - 2 / 3 * 0.12, rel=0.02)
@@ -227,7 +227,7 @@ def test_a_free_fall_says_how_far_away_it_is(distance: float) -> None:
 
 def test_a_fall_that_ends_counts_up_to_there() -> None:
     heights = [0.5 - dropped(min(f, 30)) for f in SEEN_FRAMES]
-    ids = np.stack([ball(3.0, 0.0, height, 0.12) for height in heights])
+    ids = np.stack([ball(3.0, 0.0, height) for height in heights])
     found = fall_of(SEEN_FRAMES, ids, 1, rays_of_a_level_camera(), 1.2)
     assert found is not None and found.last in (30, 32)
     assert found.depth == pytest.approx(3.0 - 2 / 3 * 0.12, rel=0.03)
@@ -245,18 +245,18 @@ def test_a_fall_that_ends_counts_up_to_there() -> None:
     ],
 )
 def test_what_does_not_fall_freely_is_no_fall(path: Any) -> None:
-    ids = np.stack([ball(*path(frame), 0.12) for frame in SEEN_FRAMES])
+    ids = np.stack([ball(*path(frame)) for frame in SEEN_FRAMES])
     assert fall_of(SEEN_FRAMES, ids, 1, rays_of_a_level_camera(), 1.2) is None
 
 
 def test_what_is_hidden_or_cut_off_is_no_fall() -> None:
-    ids = np.stack([ball(3.0, 0.0, 0.5 - dropped(f), 0.12) for f in SEEN_FRAMES])
+    ids = np.stack([ball(3.0, 0.0, 0.5 - dropped(f)) for f in SEEN_FRAMES])
     rays = rays_of_a_level_camera()
     assert fall_of(SEEN_FRAMES, ids, 2, rays, 1.2) is None, "it is never seen"
     hidden = ids.copy()
     hidden[3:, :, :128] = SCENERY_ID
     assert fall_of(SEEN_FRAMES, hidden, 1, rays, 1.2) is None
-    above = np.stack([ball(3.0, 0.0, 1.7 - dropped(f), 0.12) for f in SEEN_FRAMES])
+    above = np.stack([ball(3.0, 0.0, 1.7 - dropped(f)) for f in SEEN_FRAMES])
     assert fall_of(SEEN_FRAMES, above, 1, rays, 1.2) is None
 
 
