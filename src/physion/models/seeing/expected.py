@@ -39,7 +39,7 @@ from torch import Tensor, nn
 
 from physion.clips.batch import AGENT_ID, PATIENT_ID, SCENERY_ID
 from physion.models.checkpoint import load_packaged, packaged_sha256
-from physion.models.seeing.masks import Expected
+from physion.models.seeing.masks import UNKNOWN, Expected
 from physion.models.seeing.pixels import SeenFrame, picture_of
 from physion.models.seeing.solids import library
 from physion.scenes.scene import FRAME_TIME, GRAVITY
@@ -81,12 +81,12 @@ LEAST_FALL = 14
 """Steps that it falls at least, which are 10 cm."""
 BELOW = -0.06
 """Least height of its lower end, metres."""
-FRONT = 0.25
+FRONT, FRONT_ERROR = 0.25, 0.12
 """Part of the size of an object by which what is seen of it is nearer than its middle."""
 FALL_ERROR = 0.7
 """Error of the distance that it has fallen, pixels."""
-FALL_LOW = 0.02
-"""Least standard deviation of the height of its lower end, metres."""
+ASIDE = 0.1
+"""Standard deviation of where its middle is in its mask, as a part of its size."""
 LEAST = {"factor": 0.002, "low": 0.01, "height": 0.08, "wide": 0.05, "narrow": 0.05, "middle": 0.01}
 """Least standard deviations, metres or of logarithms."""
 
@@ -354,13 +354,16 @@ def floor_depth(height: Any, slopes: Any) -> Any:
 class Fall:
     """A free fall from the first frame on: where the object is in that frame.
 
-    ``depth`` of what is seen of it, metres, and its relative ``error``; ``low``: slope of the ray
-    to its lower end, height by depth; ``last``: number of the last frame in which it still falls.
+    ``middle`` (3,): its middle, from the camera, metres, and the relative ``error`` of how far away
+    that is. ``size`` in metres, the square root of the area of its mask. ``depth`` of what is seen
+    of it, and the relative ``depth_error``. ``last``: number of the last frame in which it falls.
     """
 
-    depth: float
+    middle: F64
     error: float
-    low: float
+    size: float
+    depth: float
+    depth_error: float
     last: int
 
 
@@ -407,8 +410,7 @@ def fall_of(
     slopes, angles = z / level, np.arctan2(y, x)
     steps = np.array(frames[: len(rays)]) + 1
     fallen = GRAVITY * FRAME_TIME**2 * steps * (steps + 1) / 2
-    bottom = np.flatnonzero(masks[0].any(1))[-1]
-    low = float(vectors[bottom][masks[0, bottom], 2].mean())
+    low = vectors[np.flatnonzero(masks[0].any(1))[-1], 0, 2]
     for count in range(len(rays), 0, -1):
         if steps[count - 1] <= LEAST_FALL:
             return None
@@ -424,9 +426,16 @@ def fall_of(
         depth = distance / float(level[0])
         if height + low * depth - deepest < BELOW:
             return None
-        depth *= 1 - FRONT * pixel * math.sqrt(areas[0])
         error = FALL_ERROR * pixel * distance / (deepest - float(fallen[0]))
-        return Fall(depth, error, low, int(frames[count - 1]))
+        size = pixel * math.sqrt(areas[0])
+        return Fall(
+            middle=np.asarray(rays[0] * depth),
+            error=error,
+            size=size * depth,
+            depth=depth * (1 - FRONT * size),
+            depth_error=math.hypot(error, FRONT_ERROR * size),
+            last=int(frames[count - 1]),
+        )
     return None
 
 
@@ -479,15 +488,13 @@ def expect(
                 # while the depth of the floor below it jumps where another object hides its end.
                 known = np.log(of_frames[shown, 1]) - ERROR * errors[k, shown, 0]
                 if fall is not None:
-                    weight = fall.error**-2 / (fall.error**-2 + factor_error**-2)
+                    precision = fall.depth_error**-2
+                    weight = precision / (precision + factor_error**-2)
                     known[0] += weight * (math.log(fall.depth) - known[0])
-                    factor_error = (fall.error**-2 + factor_error**-2) ** -0.5
-                    reach = abs(fall.low) * math.exp(known[0])
-                    low = (
-                        first.origin[2] + fall.low * math.exp(known[0]),
-                        max(factor_error * reach, FALL_LOW),
-                    )
-                    middle = None
+                    factor_error = (precision + factor_error**-2) ** -0.5
+                    along = np.abs(tokens.axes.T @ fall.middle)
+                    spread = np.hypot(fall.error * along, ASIDE * fall.size)
+                    middle, low = (first.origin + fall.middle, spread), (low[0], UNKNOWN)
                 path = np.exp(np.interp(frames, np.array(FRAMES)[shown], known))
                 for row in np.flatnonzero((ids == number).any((1, 2))):
                     better[row][ids[row] == number] = path[row]
