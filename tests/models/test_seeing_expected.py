@@ -261,7 +261,7 @@ def test_what_is_hidden_or_cut_off_is_no_fall() -> None:
 
 
 @pytest.mark.slow
-def test_depth_of_what_falls_is_better_than_that_of_the_network(
+def test_falls_tell_depth_better_than_the_network_does(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     errors: dict[bool, list[float]] = {True: [], False: []}
