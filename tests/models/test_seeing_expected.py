@@ -249,6 +249,13 @@ def test_what_does_not_fall_freely_is_no_fall(path: Any) -> None:
     assert fall_of(SEEN_FRAMES, ids, 1, rays_of_a_level_camera(), 1.2) is None
 
 
+def test_nothing_falls_below_a_camera_that_looks_down() -> None:
+    ids = np.stack([ball(3.0 + dropped(f), 0.0, 0.0, 0.12) for f in SEEN_FRAMES])
+    level = rays_of_a_level_camera()
+    down = np.stack([level[..., 2], level[..., 1], -level[..., 0]], -1)
+    assert fall_of(SEEN_FRAMES, ids, 1, down, 4.2) is None
+
+
 def test_what_is_hidden_or_cut_off_is_no_fall() -> None:
     ids = np.stack([ball(3.0, 0.0, 0.5 - dropped(f)) for f in SEEN_FRAMES])
     rays = rays_of_a_level_camera()

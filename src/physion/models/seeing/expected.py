@@ -73,6 +73,8 @@ FEW = 4
 """Pixels below which an object is not seen."""
 SPREAD = 1.5
 """Factor of the standard deviations, since fits have errors of their own."""
+LEVEL = 0.1
+"""Least distance along the floor of a ray of depth 1: below a camera heights say nothing."""
 STRAIGHT = 0.7
 """Pixels by which the middle of what falls freely may be elsewhere."""
 SAME_AREA = 0.2
@@ -407,6 +409,8 @@ def fall_of(
         return None
     x, y, z = np.array(rays).T
     level = np.hypot(x, y)
+    if level.min() < LEVEL:
+        return None
     slopes, angles = z / level, np.arctan2(y, x)
     steps = np.array(frames[: len(rays)]) + 1
     fallen = GRAVITY * FRAME_TIME**2 * steps * (steps + 1) / 2
