@@ -598,7 +598,7 @@ def main() -> None:
             f"# Seeing by simulation\n\n`python benchmarks/models/seeing.py FOLDER{error}`, "
             f"{len(rows)} trials, {today}, version {options.version} of the model, {SAMPLES} "
             f"simulations per trial.\n\n"
-            f"{text}\n{priors()}"
+            f"{text}\n\n{priors()}"
         )
 
 
