@@ -272,12 +272,12 @@ def _trees(motion: Motion, scenario: str) -> float:
     return float(readout.fitted.probability(features.reshape(1, -1))[0])
 
 
-def read_rows(path: Path, version: int | None) -> dict[str, ROW]:
-    """Return what is already measured with a version of the model (None: any), by stimulus."""
+def read_rows(path: Path, version: int) -> dict[str, ROW]:
+    """Return what is already measured with a version of the model, by stimulus."""
     if not path.exists():
         return {}
     rows = [json.loads(line) for line in path.read_text().splitlines()]
-    return {row["stimulus"]: row for row in rows if version in (None, row["version"])}
+    return {row["stimulus"]: row for row in rows if row["version"] == version}
 
 
 def _errors(seen: SeenTrial, motion: Motion) -> list[ROW]:
@@ -465,7 +465,7 @@ def against(rows: Sequence[ROW], paths: Sequence[Path]) -> str:
         else:
             other = {
                 canonical_name(name): row["fitted"]
-                for name, row in read_rows(path, None).items()
+                for name, row in read_rows(path, VERSION).items()
                 if "early" not in row
             }
         inside = [row for row in rows if canonical_name(row["stimulus"]) in other]

@@ -14,7 +14,6 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-import physion.models.seeing.expected as module
 from physion import sample_scene
 from physion.clips.batch import SCENERY_ID, Motion
 from physion.clips.rendered import MotionRenderer
@@ -29,7 +28,6 @@ from physion.models.seeing.expected import (
     Tokens,
     assumed_depth,
     expect,
-    fall_of,
     frames_of,
     split,
     tokens_of,
@@ -186,115 +184,6 @@ def test_residuals_are_distances_in_standard_deviations() -> None:
     assert len(expected.residuals(box, flat=True, stands=False)) == 5
     later = expected.in_another_frame().residuals(box, flat=False, stands=False)
     assert later == pytest.approx(TRUST * np.array([0, -1, 0, 0]), rel=0.06, abs=1e-5)
-
-
-PIXELS = 256
-FOV = np.tan(np.pi / 6)
-
-
-def rays_of_a_level_camera() -> NDArray[np.float64]:
-    """Return the rays (H, W, 3) of a camera that looks along x, with 60 degrees."""
-    at = (2 * (np.arange(PIXELS) + 0.5) / PIXELS - 1) * FOV
-    return np.stack(np.broadcast_arrays(1.0, -at[None, :], -at[:, None]), -1)
-
-
-def ball(x: float, y: float, z: float, radius: float = 0.12) -> NDArray[np.uint8]:
-    """Return the picture of a ball with number 1; y and z are from the camera."""
-    vectors, middle = rays_of_a_level_camera(), np.array([x, y, z])
-    along = vectors @ middle / np.linalg.norm(vectors, axis=-1)
-    inside = middle @ middle - along**2 < radius**2
-    return np.where(inside, 1, SCENERY_ID).astype(np.uint8)
-
-
-SEEN_FRAMES = list(range(0, 45, 2))
-
-
-def dropped(frame: int, part: float = 1.0) -> float:
-    """Return how far something has fallen, less in frame 0, with a part of the acceleration."""
-    steps = frame + 1
-    return part * 9.81 * 0.01**2 * (steps * (steps + 1) - 2) / 2
-
-
-@pytest.mark.parametrize("distance", [2.5, 4.0])
-def test_a_free_fall_says_how_far_away_it_is(distance: float) -> None:
-    ids = np.stack([ball(distance, 0.3, 0.5 - dropped(f)) for f in SEEN_FRAMES])
-    found = fall_of(SEEN_FRAMES, ids, 1, rays_of_a_level_camera(), 1.2)
-    assert found is not None and found.last == 44
-    assert found.depth == pytest.approx(distance - 2 / 3 * 0.12, rel=0.02)
-    assert found.error < min(0.02, found.depth_error)
-    assert found.middle == pytest.approx([distance, 0.3, 0.5], rel=0.02)
-
-
-def test_a_fall_that_ends_counts_up_to_there() -> None:
-    heights = [0.5 - dropped(min(f, 30)) for f in SEEN_FRAMES]
-    ids = np.stack([ball(3.0, 0.0, height) for height in heights])
-    found = fall_of(SEEN_FRAMES, ids, 1, rays_of_a_level_camera(), 1.2)
-    assert found is not None and found.last in (30, 32)
-    assert found.depth == pytest.approx(3.0 - 2 / 3 * 0.12, rel=0.03)
-
-
-@pytest.mark.parametrize(
-    "path",
-    [
-        lambda f: (3.0, 0.0, -0.8),  # rests
-        lambda f: (3.0, 0.0, 0.5 - 0.02 * f),  # sinks evenly
-        lambda f: (3.0, 0.02 * f, 0.5 - dropped(f)),  # is thrown to the side
-        lambda f: (3.0, dropped(f, 0.2), -0.5 - dropped(f, 0.2)),  # rolls down a ramp to the side
-        lambda f: (3.0 - dropped(f, 0.2), 0.0, -0.5 - dropped(f, 0.2)),  # towards the camera
-        lambda f: (3.0, 0.0, -0.3 - dropped(f, 0.3)),  # is slowed down
-    ],
-)
-def test_what_does_not_fall_freely_is_no_fall(path: Any) -> None:
-    ids = np.stack([ball(*path(frame)) for frame in SEEN_FRAMES])
-    assert fall_of(SEEN_FRAMES, ids, 1, rays_of_a_level_camera(), 1.2) is None
-
-
-def test_nothing_falls_below_a_camera_that_looks_down() -> None:
-    ids = np.stack([ball(3.0 + dropped(f), 0.0, 0.0, 0.12) for f in SEEN_FRAMES])
-    level = rays_of_a_level_camera()
-    down = np.stack([level[..., 2], level[..., 1], -level[..., 0]], -1)
-    assert fall_of(SEEN_FRAMES, ids, 1, down, 4.2) is None
-
-
-def test_what_is_hidden_or_cut_off_is_no_fall() -> None:
-    ids = np.stack([ball(3.0, 0.0, 0.5 - dropped(f)) for f in SEEN_FRAMES])
-    rays = rays_of_a_level_camera()
-    assert fall_of(SEEN_FRAMES, ids, 2, rays, 1.2) is None, "it is never seen"
-    hidden = ids.copy()
-    hidden[3:, :, :128] = SCENERY_ID
-    assert fall_of(SEEN_FRAMES, hidden, 1, rays, 1.2) is None
-    above = np.stack([ball(3.0, 0.0, 1.7 - dropped(f)) for f in SEEN_FRAMES])
-    assert fall_of(SEEN_FRAMES, above, 1, rays, 1.2) is None
-
-
-@pytest.mark.slow
-def test_falls_tell_depth_better_than_the_network_does(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    errors: dict[bool, list[float]] = {True: [], False: []}
-    for seed in range(8):
-        made = replace(sample_scene("drop", seed), name=f"drop {seed}")
-        true = shown(made, tuple(SEEN_FRAMES))
-        agent = true["ids"][0] == 1
-        for falls, errors_of in errors.items():
-            with monkeypatch.context() as patch:
-                if not falls:
-                    patch.setattr(module, "fall_of", lambda *_: None)
-                found, _ = expect(SEEN_FRAMES, true["ids"], None, true["camera"])
-            gap = np.median(found[0][agent] / true["depth"][0][agent]) - 1
-            errors_of.append(abs(float(gap)))
-    assert np.median(errors[True]) < np.median(errors[False]) / 2, errors
-
-
-def test_depth_between_frames_of_the_network_changes_evenly() -> None:
-    made = sample_scene("collide", 3)
-    true = shown(made, tuple(SEEN_FRAMES))
-    ids = true["ids"].copy()
-    ids[[5, 10]] = SCENERY_ID  # Frames 10 and 20: nothing is seen in these.
-    found, _ = expect(SEEN_FRAMES, ids, None, true["camera"])
-    depths = [float(np.median(found[k][ids[k] == 1])) for k in (0, 3, 7, 12, 15)]
-    slopes = np.diff(np.log(depths)) / np.diff([SEEN_FRAMES[k] for k in (0, 3, 7, 12, 15)])
-    assert np.ptp(slopes) < 1e-9, "one line from frame 0 to frame 30"
 
 
 @pytest.mark.slow

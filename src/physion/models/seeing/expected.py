@@ -18,15 +18,11 @@ pixels meets it (`assumed_depth`). Another network of the same kind, which was t
 depth, gives e in each of the frames besides: nothing else says that an object is in the air, or
 moves towards the camera.
 
-What falls freely from the first frame on says by itself how far away it is (`fall_of`). Both depths
-are averaged, with their precisions as weights.
-
 Places are in axes of the camera: x is ahead, y to the left, z up, the origin below the camera.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -39,7 +35,7 @@ from torch import Tensor, nn
 
 from physion.clips.batch import AGENT_ID, PATIENT_ID, SCENERY_ID
 from physion.models.checkpoint import load_packaged, packaged_sha256
-from physion.models.seeing.masks import UNKNOWN, Expected
+from physion.models.seeing.masks import Expected
 from physion.models.seeing.pixels import SeenFrame, picture_of
 from physion.models.seeing.solids import library
 from physion.scenes.scene import FRAME_TIME, GRAVITY
@@ -73,22 +69,6 @@ FEW = 4
 """Pixels below which an object is not seen."""
 SPREAD = 1.5
 """Factor of the standard deviations, since fits have errors of their own."""
-LEVEL = 0.1
-"""Least distance along the floor of a ray of depth 1: below a camera heights say nothing."""
-STRAIGHT = 0.7
-"""Pixels by which the middle of what falls freely may be elsewhere."""
-SAME_AREA = 0.2
-"""Part by which its mask may change; else it is hidden."""
-LEAST_FALL = 14
-"""Steps that it falls at least, which are 10 cm."""
-BELOW = -0.06
-"""Least height of its lower end, metres."""
-FRONT, FRONT_ERROR = 0.25, 0.12
-"""Part of the size of an object by which what is seen of it is nearer than its middle."""
-FALL_ERROR = 0.7
-"""Error of the distance that it has fallen, pixels."""
-ASIDE = 0.1
-"""Standard deviation of where its middle is in its mask, as a part of its size."""
 LEAST = {"factor": 0.002, "low": 0.01, "height": 0.08, "wide": 0.05, "narrow": 0.05, "middle": 0.01}
 """Least standard deviations, metres or of logarithms."""
 
@@ -352,97 +332,6 @@ def floor_depth(height: Any, slopes: Any) -> Any:
     return np.maximum(height / down, NEAREST)
 
 
-@dataclass(frozen=True, eq=False)
-class Fall:
-    """A free fall from the first frame on: where the object is in that frame.
-
-    ``middle`` (3,): its middle, from the camera, metres, and the relative ``error`` of how far away
-    that is. ``size`` in metres, the square root of the area of its mask. ``depth`` of what is seen
-    of it, and the relative ``depth_error``. ``last``: number of the last frame in which it falls.
-    """
-
-    middle: F64
-    error: float
-    size: float
-    depth: float
-    depth_error: float
-    last: int
-
-
-def fall_of(
-    frames: Sequence[int], ids: NDArray[np.uint8], number: int, vectors: F64, height: float
-) -> Fall | None:
-    """Return the free fall of an object, None if it does not fall from the first frame on.
-
-    The ray through the middle of its mask has the slope s, height by distance along the floor. What
-    starts from rest and falls stays at its distance r, so that in frame f, after f + 1 steps,
-
-        s_f = s - q_f / r,    q_f = g dt^2 (f + 1) (f + 2) / 2.
-
-    s and 1 / r are fitted by least squares to as many frames from the first one on as there are in
-    which differences stay below `STRAIGHT` pixels, and the object stays above the floor. What moves
-    otherwise, such as a ball on a ramp, would have to be far below it.
-
-    Parameters
-    ----------
-    frames
-        (T,) numbers of the frames.
-    ids
-        (T, H, W), as in `physion.clips.batch.Batch`.
-    number
-        Of the object.
-    vectors
-        Rays (H, W, 3) of the pixels to depth 1.
-    height
-        Of the camera, metres.
-    """
-    pixel = float(np.linalg.norm(vectors[0, 1] - vectors[0, 0]))
-    masks = ids == number
-    areas = masks.sum((1, 2))
-    rays = []
-    for mask, area in zip(masks, areas, strict=True):
-        cut = mask[[0, -1]].any() or mask[:, [0, -1]].any()
-        if area < FEW or cut or abs(area / areas[0] - 1) > SAME_AREA:
-            break
-        rays.append(vectors[mask].mean(0))
-    if not rays:
-        return None
-    x, y, z = np.array(rays).T
-    level = np.hypot(x, y)
-    if level.min() < LEVEL:
-        return None
-    slopes, angles = z / level, np.arctan2(y, x)
-    steps = np.array(frames[: len(rays)]) + 1
-    fallen = GRAVITY * FRAME_TIME**2 * steps * (steps + 1) / 2
-    low = vectors[np.flatnonzero(masks[0].any(1))[-1], 0, 2]
-    for count in range(len(rays), 0, -1):
-        if steps[count - 1] <= LEAST_FALL:
-            return None
-        matrix = np.column_stack([np.ones(count), -fallen[:count]])
-        found, *_ = np.linalg.lstsq(matrix, slopes[:count], rcond=None)
-        wrong = np.abs(slopes[:count] - matrix @ found).max()
-        turned = np.abs(angles[:count] - angles[:count].mean()).max()
-        if max(wrong, turned) > STRAIGHT * pixel:
-            continue
-        if found[1] < 1 / FARTHEST:
-            return None
-        distance, deepest = 1 / float(found[1]), float(fallen[count - 1])
-        depth = distance / float(level[0])
-        if height + low * depth - deepest < BELOW:
-            return None
-        error = FALL_ERROR * pixel * distance / (deepest - float(fallen[0]))
-        size = pixel * math.sqrt(areas[0])
-        return Fall(
-            middle=np.asarray(rays[0] * depth),
-            error=error,
-            size=size * depth,
-            depth=depth * (1 - FRONT * size),
-            depth_error=math.hypot(error, FRONT_ERROR * size),
-            last=int(frames[count - 1]),
-        )
-    return None
-
-
 def expect(
     frames: Sequence[int], ids: NDArray[np.uint8], depth: NDArray[np.floating] | None, camera: F64
 ) -> tuple[F64, Mapping[int, Expected]]:
@@ -462,7 +351,6 @@ def expect(
     found = dict[int, Expected]()
     if not tokens.numbers:
         return better, found
-    first = picture_of(ids[0], better[0], camera)
     there = torch.ones(1, len(tokens.numbers), dtype=torch.bool)
     with torch.no_grad():
         out = _network(given)(torch.from_numpy(tokens.values)[None], there)[0].double()
@@ -478,32 +366,19 @@ def expect(
         )
         if given:
             better[ids == number] /= np.exp(ERROR * error[0])
-        of_frames = frames_of(torch.from_numpy(tokens.values[k])).double().numpy()
-        shown = of_frames[:, 0] > 0
-        middle, factor_error = None, max(ERROR * error[1], LEAST["factor"])
-        fall = None if given else fall_of(frames, ids, number, first.vectors, first.origin[2])
-        if shown.any():
-            place = tokens.origin + tokens.axes @ (of_frames[shown][0, 6:9] + middles[k, :, 0])
+        else:
+            nearer = np.exp(-ERROR * errors[k, :, 0])
+            for row, frame in enumerate(frames):
+                better[row][ids[row] == number] *= np.interp(frame, FRAMES, nearer)
+        seen = frames_of(torch.from_numpy(tokens.values[k]))[:, [0, 6, 7, 8]].double().numpy()
+        shown = seen[seen[:, 0] > 0]
+        middle = None
+        if len(shown):
+            place = tokens.origin + tokens.axes @ (shown[0, 1:] + middles[k, :, 0])
             spread = SPREAD * np.exp(np.clip(middles[k, :, 1], -6, 3))
             middle = place, np.maximum(spread, LEAST["middle"])
-            if not given:
-                # In frames between those that the network sees the logarithm of the corrected depth
-                # is interpolated: what moves evenly away from the floor keeps an even speed so,
-                # while the depth of the floor below it jumps where another object hides its end.
-                known = np.log(of_frames[shown, 1]) - ERROR * errors[k, shown, 0]
-                if fall is not None:
-                    precision = fall.depth_error**-2
-                    weight = precision / (precision + factor_error**-2)
-                    known[0] += weight * (math.log(fall.depth) - known[0])
-                    factor_error = (precision + factor_error**-2) ** -0.5
-                    along = np.abs(tokens.axes.T @ fall.middle)
-                    spread = np.hypot(fall.error * along, ASIDE * fall.size)
-                    middle, low = (first.origin + fall.middle, spread), (low[0], UNKNOWN)
-                path = np.exp(np.interp(frames, np.array(FRAMES)[shown], known))
-                for row in np.flatnonzero((ids == number).any((1, 2))):
-                    better[row][ids[row] == number] = path[row]
         found[number] = Expected(
-            factor_error=factor_error,
+            factor_error=max(ERROR * error[1], LEAST["factor"]),
             shapes=dict(zip(names, shapes[k].tolist(), strict=True)),
             low=low, height=height, wide=wide, narrow=narrow, axes=tokens.axes, middle=middle,
         )  # fmt: skip
