@@ -296,7 +296,7 @@ def write_page(
         write_plot(plot, pictures)
         if write:
             # Few colours, for a third of the bytes.
-            drawn = Image.open(pictures / f"{plot.name}.png").convert("RGB").quantize(64)
+            drawn = Image.open(pictures / f"{plot.name}.png").convert("RGB").quantize(256)
             drawn.save(RESULTS / f"paper_{plot.name}.png", optimize=True)
     text = page_text(parts, scale, command, tested, table, [plot.name for plot in plots])
     if write:

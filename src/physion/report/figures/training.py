@@ -66,7 +66,8 @@ def grouped_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
             axis.grid(axis="y", color=theme.zone, linewidth=0.5)
             axis.set_axisbelow(True)
             axis.legend(handles=_group_handles(groups, people, theme), loc="lower center",
-                        bbox_to_anchor=(0.5, 1.02 + 0.18 / len(models)), ncols=5, fontsize=8,
+                        bbox_to_anchor=(0.5, 1.02 + 0.18 / len(models)), fontsize=8,
+                        ncols=5 if len(names) < 3 else 2,
                         handletextpad=0.4, columnspacing=1.2)  # fmt: skip
     return figure
 
