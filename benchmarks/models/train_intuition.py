@@ -13,7 +13,7 @@ all scenarios as float16. Other trainings answer what a network has to have seen
 first trials of each scenario only; --unseen, without the configuration of the tested trial
 (`FOLDS` trainings, each without a part of the configurations); --all-but, without its scenario.
 With --write the table is written to ``results/intuition_networks.md``, with these trainings to
-``results/intuition_unseen.md``.
+``results/MODELS_unseen.md``.
 """
 
 from __future__ import annotations
@@ -364,7 +364,8 @@ def main() -> None:
     )
     if options.write:
         other = options.counts or options.unseen or options.all_but
-        path = RESULTS / f"intuition_{'unseen' if other else 'networks'}.md"
+        unseen = f"{'_'.join(options.models)}_unseen.md"
+        path = RESULTS / (unseen if other else "intuition_networks.md")
         path.write_text(text + "\n")
 
 
