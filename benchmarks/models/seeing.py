@@ -1,7 +1,7 @@
 """Measure how well `seeing-simulation` recovers scenes, and what it answers.
 
     OMP_NUM_THREADS=1 python benchmarks/models/seeing.py FOLDER [--each 5]
-        [--depth-error 0.02 | --no-depth] [--known] [--write]
+        [--depth-error 0.02 | --no-depth] [--own DATASET] [--known] [--write]
     OMP_NUM_THREADS=1 python benchmarks/models/seeing.py --priors
 
 Official stimuli that people saw, without cloth and without a contact in the observed part: the
@@ -28,6 +28,9 @@ With --depth-error E, the depth of each object has an error of standard deviatio
 all frames, and each pixel another one; rows are in FOLDER/seeing-E.jsonl. With --no-depth masks and
 the camera are all that is seen; rows are in FOLDER/seeing-masks.jsonl.
 
+--own DATASET measures stored testing trials of our own instead, by their labels, without people.
+Rows and tables have names that end in -own.
+
 --against FILE compares with the rows of another run (.jsonl), or with predictions of a model
 (.csv), on the same stimuli.
 
@@ -42,6 +45,7 @@ import argparse
 import datetime
 import itertools
 import json
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -99,19 +103,31 @@ STILL = NoiseLevels(position=0.0, velocity=0.0, mass=0.0)
 ROW = dict[str, Any]
 
 
-def chosen_trials(each: int, early: Callable[[Scene], bool]) -> Iterator[tuple[Scene, bool, int]]:
-    """Yield scenes, recorded outcomes and numbers, one of every scenario and outcome in turn.
-
-    Those for which ``early`` is true are left out.
-    """
+def official_scenes() -> list[tuple[Scene, bool]]:
+    """Return the scenes that people saw, and their recorded outcomes."""
     seen = set(read_humans(official().humans)["stimulus"])
     trials = [t for t in official().trials if canonical_name(t.scene.name) in seen]
-    trials = [t for t in trials if not t.scene.cloths]
-    trials.sort(key=lambda t: stable_hash("noise", t.scene.name))
+    return [(t.scene, bool(t.outcome.contact)) for t in trials]
+
+
+def own_scenes(folder: Path) -> list[tuple[Scene, bool]]:
+    """Return the scenes of stored testing trials, and their labels."""
+    dataset = physion.Dataset(folder)
+    contact = dataset.index.set_index("trial")["contact"]
+    return [(dataset.trial(t).scene, bool(contact[t])) for t in dataset.trials("testing")]
+
+
+def chosen_trials(
+    trials: Sequence[tuple[Scene, bool]], each: int, early: Callable[[Scene], bool]
+) -> Iterator[tuple[Scene, bool, int]]:
+    """Yield scenes, outcomes and numbers, one of every scenario and outcome in turn.
+
+    Scenes with cloth are left out, and those for which ``early`` is true.
+    """
     groups: dict[tuple[str, bool], list[Scene]] = {}
-    for trial in trials:
-        key = trial.scene.scenario, bool(trial.outcome.contact)
-        groups.setdefault(key, []).append(trial.scene)
+    for scene, contact in sorted(trials, key=lambda trial: stable_hash("noise", trial[0].name)):
+        if not scene.cloths:
+            groups.setdefault((scene.scenario, contact), []).append(scene)
     late = [
         zip(itertools.repeat(contact), (s for s in group if not early(s)), range(each))
         for (_, contact), group in sorted(groups.items())
@@ -120,8 +136,8 @@ def chosen_trials(each: int, early: Callable[[Scene], bool]) -> Iterator[tuple[S
         yield from ((s, contact, number) for contact, s, number in filter(None, row))
 
 
-def measure(scene: Scene, contact: bool, number: int, given: Mapping[str, Any]) -> ROW:
-    """Return what is measured of one trial, with options of the model."""
+def measure(scene: Scene, contact: bool, number: float, given: Mapping[str, Any]) -> ROW:
+    """Return what is measured of one trial, the ``number``-th, with options of the model."""
     engine = make_engine()
     model = build_model("seeing-simulation", samples=SAMPLES, **given)
     motion = Motion(scene, simulate(scene, frames=OBSERVED_FRAMES))
@@ -354,8 +370,8 @@ def _exchanged(table: pd.DataFrame) -> pd.Series:
     return found
 
 
-def tables(rows: Sequence[ROW]) -> str:
-    """Return all tables as Markdown."""
+def tables(rows: Sequence[ROW], own: bool) -> str:
+    """Return all tables as Markdown; nobody has seen ``own`` trials."""
     table = pd.DataFrame(list(rows))
     hits = pd.DataFrame({name: right(table[name], table["contact"]) for name in list(NAMES)[:-1]})
     hits["exchanged"] = _exchanged(table)
@@ -390,18 +406,20 @@ def tables(rows: Sequence[ROW]) -> str:
             }
         )
     fresh = hits.index[~table["looked at"]]
+    chosen = {f"all ({len(hits)})": hits.index}
+    if len(fresh) < len(hits):
+        chosen[f"not looked at before ({len(fresh)})"] = fresh
     compared = [("fitted", name) for name in NAMES if name != "fitted"]
     compared.append(("fitted, state-trees", "true, state-trees"))
     differences = [
         {
             "accuracy of": NAMES[a],
             "minus": NAMES[b],
-            f"all ({len(hits)})": _mean(hits[a] - hits[b]),
-            f"not looked at before ({len(fresh)})": _mean((hits[a] - hits[b])[fresh]),
+            **{title: _mean((hits[a] - hits[b])[index]) for title, index in chosen.items()},
         }
         for a, b in compared
     ]
-    parts = [answers, others, differences, _people(table), errors]
+    parts = [answers, others, differences, *([] if own else [_people(table)]), errors]
     return "\n\n".join(map(_markdown, parts)) + "\n"
 
 
@@ -543,6 +561,7 @@ def main() -> None:
     parser.add_argument("--each", type=int, default=5)
     parser.add_argument("--depth-error", type=float, default=0.0)
     parser.add_argument("--no-depth", action="store_true")
+    parser.add_argument("--own", type=Path, help="dataset, in place of the official stimuli")
     parser.add_argument("--known", action="store_true")
     parser.add_argument("--against", type=Path, nargs="*", default=[], help="rows, or predictions")
     parser.add_argument("--version", type=int, default=VERSION)
@@ -559,6 +578,7 @@ def main() -> None:
         given["depth"] = False
     name = f"seeing-{options.depth_error:g}" if options.depth_error else "seeing"
     name = "seeing-masks" if options.no_depth else name
+    name += "-own" * bool(options.own)
     path = options.folder / f"{name}.jsonl"
     options.known |= options.version != VERSION
     known = read_rows(path, options.version)
@@ -576,9 +596,12 @@ def main() -> None:
         return "early" in known.get(scene.name, {})
 
     rows = [row for row in known.values() if "early" not in row] if options.known else []
-    for scene, contact, number in [] if options.known else chosen_trials(options.each, early):
+    trials: Sequence[tuple[Scene, bool]] = []
+    if not options.known:
+        trials = own_scenes(options.own) if options.own else official_scenes()
+    for scene, contact, number in chosen_trials(trials, options.each, early):
         if scene.name not in known:
-            keep(measure(scene, contact, number, given))
+            keep(measure(scene, contact, math.inf if options.own else number, given))
             row = known[scene.name]
             print(
                 f"{scene.scenario} {scene.name}: contact {contact}, fitted {row['fitted']:.2f}, "
@@ -586,14 +609,14 @@ def main() -> None:
                 flush=True,
             )
         rows.append(known[scene.name])
-    text = tables(rows)
+    text = tables(rows, bool(options.own))
     if options.against:
         text += f"\n{against(rows, options.against)}"
     print(text)
     if options.write:
         today = datetime.date.today().isoformat()
         error = f" --depth-error {options.depth_error:g}" if options.depth_error else ""
-        error += " --no-depth" * options.no_depth
+        error += " --no-depth" * options.no_depth + " --own DATASET" * bool(options.own)
         (RESULTS / f"{name}.md").write_text(
             f"# Seeing by simulation\n\n`python benchmarks/models/seeing.py FOLDER{error}`, "
             f"{len(rows)} trials, {today}, version {options.version} of the model, {SAMPLES} "
