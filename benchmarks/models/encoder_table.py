@@ -22,7 +22,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import torch
 from torch import Tensor
 
@@ -34,7 +33,16 @@ from physion.compute.tasks import processor
 from physion.models.build import build_model
 from physion.models.encoders.weights import GridFeatures
 from physion.readout.evaluate import evaluate
-from ship_readouts import SET, SETTINGS, Features, accuracy, hits, interleaved, make_official
+from ship_readouts import (
+    SET,
+    SETTINGS,
+    Features,
+    accuracy,
+    hits,
+    interleaved,
+    make_official,
+    untested,
+)
 
 RESULTS = Path(__file__).parents[1] / "results"
 TESTED = 150
@@ -182,11 +190,8 @@ def main() -> None:
     parser.add_argument("--features", nargs="*", choices=POOLINGS, default=list(POOLINGS))
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    fit = make_own(options.folder, "readout", options.trials)
     tests = (make_official(options.folder), make_own(options.folder, "testing", TESTED))
-    # A sampled scene can be one of the study to the byte: Dominoes has few random numbers.
-    tested = pd.concat([test.index["digest"] for test in tests])
-    fit.index = fit.index[~fit.index["digest"].isin(tested)]
+    fit = untested(make_own(options.folder, "readout", options.trials), *tests)
     for name in options.only:
         made = variants(name, options.features)
         for dataset, split in ((fit, "readout"), *((test, "testing") for test in tests)):

@@ -57,6 +57,7 @@ from physion.readout.tables import read_table
 from physion.readout.train import Trainings
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, TrialTask
+from ship_readouts import untested
 
 MODELS = tuple(name for name in NAMES if name != "gns-ransac")
 PROTOCOLS = ("all", "only", "one", "all-but")
@@ -152,15 +153,8 @@ class Part:
                 "rendered": self.rendered or self.model in IMAGENET}  # fmt: skip
 
     def fit_set(self) -> Dataset:
-        """Return the set that models are trained and readouts are fitted on.
-
-        Motions that are tested are left out: a sampled scene can be one of the study to the byte.
-        """
-        dataset = Dataset(self.folder / FIT)
-        for tested in TESTED:
-            known = Dataset(self.folder / tested).index["digest"]
-            dataset.index = dataset.index[~dataset.index["digest"].isin(known)]
-        return dataset
+        """Return the set that models are trained and readouts are fitted on."""
+        return untested(Dataset(self.folder / FIT), *(Dataset(self.folder / t) for t in TESTED))
 
     def train(self, *, dry_run: bool = False, steps: int = 0) -> Trainings:
         """Train what is missing."""

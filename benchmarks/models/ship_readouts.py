@@ -97,15 +97,20 @@ SETTINGS = GenerateSettings(movies=False, look="redyellow", jitters=0, observed_
 
 
 def make_set(folder: Path, count: int, tested: Dataset) -> Dataset:
-    """Return the set with at least ``count`` readout trials a scenario, less motions of ``tested``.
-
-    A sampled scene can be one of the study to the byte: Dominoes has few random numbers.
-    """
+    """Return the set with ``count`` readout trials a scenario or more, less those of ``tested``."""
     if count:
         physion.generate(folder / SET, "all", {"readout": count}, name=SET, settings=SETTINGS,
                          executor=SerialExecutor())  # fmt: skip
-    dataset = Dataset(folder / SET)
-    dataset.index = dataset.index[~dataset.index["digest"].isin(tested.index["digest"])]
+    return untested(Dataset(folder / SET), tested)
+
+
+def untested(dataset: Dataset, *tested: Dataset) -> Dataset:
+    """Return a dataset without trials that have the motion of a tested one.
+
+    A sampled scene can be one of the study to the byte: Dominoes has few random numbers.
+    """
+    known = pd.concat([other.index["digest"] for other in tested])
+    dataset.index = dataset.index[~dataset.index["digest"].isin(known)]
     return dataset
 
 
