@@ -23,6 +23,8 @@ scenario:
 4. Likeness to people, by `physion.compare`.
 5. Errors at the last observed frame, median and 90 % quantile: centre of mass and velocity of the
    agent, centre of the other movable objects; and how many have the right shape.
+6. Trials in which the answers from the fitted and the true state differ, by the first cause that
+   applies.
 
 With --depth-error E, the depth of each object has an error of standard deviation E, the same in
 all frames, and each pixel another one; rows are in FOLDER/seeing-E.jsonl. With --no-depth masks and
@@ -99,6 +101,8 @@ LOOKED_AT = {"support": 3}
 """Trials per scenario and outcome that were looked at while the fit was written; 1 of others."""
 LOOKED_AT_WITH_ERRORS = 3
 """The same of fits with errors of depth, of every scenario."""
+SLOW = 0.1
+"""Error of a velocity in m/s that counts as a cause."""
 STILL = NoiseLevels(position=0.0, velocity=0.0, mass=0.0)
 ROW = dict[str, Any]
 
@@ -358,6 +362,38 @@ def area(p: Any, contact: Any) -> float:
     return float(np.mean((difference > 0) + 0.5 * (difference == 0)))
 
 
+def _cause(row: Mapping[str, Any]) -> str:
+    """Return why the answer of a trial may differ from the one from the true state."""
+    objects = row["objects"] if isinstance(row["objects"], list) else []
+    agents = [o for o in objects if o["agent"]]
+    if not objects:
+        return "agent or patient never seen"
+    if (row["true, guessed"] > 0.5) == (row["fitted"] > 0.5):
+        return "masses and friction: the true state gives the answer, too, if they are guessed"
+    if not all(o["shape"] for o in objects):
+        return "an object has another shape"
+    if "last seen" in row["note"] or "first fitted" in row["note"]:
+        return "an object is hidden at the start or at the end"
+    for name, group, most in (("the agent", agents, 0.01), ("another object", objects, 0.03)):
+        if any(o["center"] > most for o in group):
+            return f"{name} is more than {100 * most:.0f} cm off"
+    if any(o["velocity"] > SLOW for o in objects):
+        return f"a velocity is more than {SLOW:g} m/s off"
+    return "none of these"
+
+
+def _causes(table: pd.DataFrame) -> list[ROW]:
+    """Return how many trials of each cause are answered otherwise than from the true state."""
+    differ = table[(table["fitted"] > 0.5) != (table["true"] > 0.5)]
+    causes = pd.Series([_cause(row) for row in differ.to_dict("records")], differ.index)
+    rows = []
+    for cause, part in differ.groupby(causes.astype(object)):
+        hits = (right(part[name], part["contact"]).sum() for name in ("fitted", "true"))
+        counts = dict(zip(("fitted state right", "true state right"), map(int, hits), strict=True))
+        rows.append({"cause": cause, "trials": len(part), **counts})
+    return sorted(rows, key=lambda row: -row["trials"])
+
+
 def _exchanged(table: pd.DataFrame) -> pd.Series:
     """Return for each trial how often the answers for the others of its scenario are right."""
     found = pd.Series(np.nan, table.index)
@@ -419,8 +455,9 @@ def tables(rows: Sequence[ROW], own: bool) -> str:
         }
         for a, b in compared
     ]
-    parts = [answers, others, differences, *([] if own else [_people(table)]), errors]
-    return "\n\n".join(map(_markdown, parts)) + "\n"
+    people = [] if own else [_people(table)]
+    parts = [answers, others, differences, *people, errors, _causes(table)]
+    return "\n\n".join(_markdown(rows) for rows in parts if rows) + "\n"
 
 
 def _people(table: pd.DataFrame) -> list[ROW]:
