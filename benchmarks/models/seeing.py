@@ -514,6 +514,7 @@ def against(rows: Sequence[ROW], paths: Sequence[Path]) -> str:
     for path in paths:
         if path.suffix == ".csv":
             table = pd.read_csv(path)
+            table = table[table["readout"] != Readout.FULL.value]
             other = dict(
                 zip(table["stimulus"].map(canonical_name), table["p_contact"], strict=True)
             )
