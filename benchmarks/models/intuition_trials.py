@@ -284,8 +284,8 @@ def simulated(
             )
             frames = np.array([model.spec.context_frames()])
             batch = Batch((trial,), frames, np.ones(frames.shape, np.bool_), state=(seen,))
-            contact = np.asarray(model.imagine(batch, samples, 0, scale=scale).contact)
-            known[trial] = float(fraction_of_futures(contact)[0])
+            touches = np.asarray(model.imagine(batch, samples, 0, scale=scale).contact)
+            known[trial] = float(fraction_of_futures(touches)[0])
         if number % 20 == 0 or number == len(trials):
             write_atomic(path, json.dumps(known).encode())
     return pd.Series(known)[list(trials)]
