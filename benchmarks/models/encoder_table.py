@@ -41,7 +41,7 @@ from ship_readouts import (
     hits,
     interleaved,
     make_official,
-    untested,
+    without_motions,
 )
 
 RESULTS = Path(__file__).parents[1] / "results"
@@ -191,7 +191,7 @@ def main() -> None:
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     tests = (make_official(options.folder), make_own(options.folder, "testing", TESTED))
-    fit = untested(make_own(options.folder, "readout", options.trials), *tests)
+    fit = without_motions(make_own(options.folder, "readout", options.trials), *tests)
     for name in options.only:
         made = variants(name, options.features)
         for dataset, split in ((fit, "readout"), *((test, "testing") for test in tests)):

@@ -50,10 +50,10 @@ from intuition_controls import (
     weighted_levels,
     with_spread,
 )
-from intuition_trials import load, simulated
+from intuition_trials import load, predicted, simulated
 from physion.analysis.tables import MEAN, POOLED, read_humans
 from physion.compute.tasks import processor
-from physion.core.names import RIGID, canonical_name
+from physion.core.names import RIGID
 from physion.data.official import official
 from physion.readout.trees import fit_forest
 from physion.report.compare import CompareResult, compare
@@ -309,18 +309,6 @@ def mixed_on_own(
     return mixed, rows
 
 
-def predicted(path: Path, trials: Trials) -> dict[str, pd.Series]:
-    """Return the answers of a table of predictions, by model: *observed*, else what it has."""
-    table = pd.read_csv(path)
-    if "readout" in table and "observed" in set(table["readout"]):
-        table = table[table["readout"] == "observed"]
-    table = table.assign(stimulus=table["stimulus"].map(canonical_name))
-    return {
-        str(model): rows.set_index("stimulus")["p_contact"][trials.tested.index]
-        for model, rows in table.groupby("model")
-    }
-
-
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(
@@ -349,7 +337,7 @@ def main() -> None:
             )
     given_answers: dict[str, pd.Series] = {}
     for path in options.predictions:
-        given_answers |= predicted(path, trials)
+        given_answers |= {name: p[trials.tested.index] for name, p in predicted(path).items()}
     answers |= given_answers
     answers["base rate of the configuration"] = trials.base_rates()
     scenes = trials.tested["scene"].to_dict()
@@ -404,7 +392,8 @@ def main() -> None:
         [
             "# Learned intuition and simulation",
             f"`python benchmarks/models/intuition.py FOLDER --samples {options.samples} "
-            f"--many {options.many} --write`, "
+            f"--many {options.many} {'--predictions FILES.csv ' * bool(options.predictions)}"
+            "--write`, "
             f"{datetime.date.today()}, {processor()}: {len(trials.tested)} official stimuli "
             f"without contact in the observed part, recorded outcomes; {counts.min()} to "
             f"{counts.max()} own trials per scenario.",

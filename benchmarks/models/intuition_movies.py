@@ -2,12 +2,13 @@
 
     python benchmarks/models/intuition_movies.py FOLDER PREDICTIONS.csv OUT [--each 4] [--write]
 
-FOLDER is that of `intuition.py`, whose simulations (noise x 1, 200 samples) are taken; PREDICTIONS
-are of a model on the official stimuli. Of those without a contact in the observed part, the ones
-with the largest difference of P(contact) are drawn, one of a scenario: ``--each`` that people
-answer more as the model does, and as many that they answer more as simulation does. OUT gets a
-movie of each, up to the end of the trial as our engine simulates it, and a picture with frames 0,
-22 and 44, and the last one. --write writes picture and table to ``results/intuition_movies``.
+FOLDER is the one of `intuition.py`, run with ``--many 200``: its simulations are taken. PREDICTIONS
+is a table of `physion evaluate`, of one model on the official stimuli. From stimuli without a
+contact in the observed part, the ones with the largest difference of P(contact) are drawn, at most
+one per scenario: ``--each`` on which people are nearer to the model, and as many on which they are
+nearer to simulation. OUT gets a movie of each, up to the end of the trial as our engine simulates
+it. --write writes the table, and a picture with frames 0, 22 and 44 and the last one, to
+``results/intuition_movies``.
 """
 
 from __future__ import annotations
@@ -15,16 +16,17 @@ from __future__ import annotations
 import argparse
 import datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from PIL import Image
 
-from intuition_trials import load, simulated
+from intuition_trials import load, predicted, simulated
 from physion.analysis.tables import read_humans
 from physion.clips.batch import LAST_OBSERVED
-from physion.core.names import RIGID, canonical_name
+from physion.core.names import RIGID
 from physion.core.tables import markdown_table
 from physion.data.official import official
 from physion.physics.engine import simulate
@@ -36,33 +38,32 @@ from physion.trials.video import encode_movie
 
 RESULTS = Path(__file__).parents[1] / "results" / "intuition_movies"
 SAMPLES, SIZE, SHOWN = 200, 256, 160
+MOST = 100
+"""Stimuli with the largest differences, about which the page says to what people are nearer."""
 SHOWN_FRAMES = (0, LAST_OBSERVED // 2, LAST_OBSERVED)
 
 
 def differing(folder: Path, predictions: Path) -> pd.DataFrame:
-    """Return stimuli with both answers, those of people, and outcomes; largest difference first."""
+    """Return stimuli with all answers and outcomes; the largest difference comes first."""
     made = load(folder / "official", [])
     facts = pd.DataFrame({n: made[n] for n in ("scenario", "contact", "scene")}, made["trial"])
     facts = facts[~made["observed_contact"] & facts["scenario"].isin(RIGID)]
     people = read_humans(official().humans).set_index("stimulus")
     facts = facts[facts.index.isin(people.index)]
-    table = pd.read_csv(predictions)
-    table.index = pd.Index(table["stimulus"].map(canonical_name))
-    facts["model"] = table["p_contact"].reindex(facts.index)
+    (answers,) = predicted(predictions).values()
+    facts["model"] = answers.reindex(facts.index)
     facts = facts.dropna(subset="model")
     facts["simulation"] = simulated(folder, facts["scene"].to_dict(), 1.0, SAMPLES)
     accuracy = people["accuracy"].reindex(facts.index).astype(float)
     facts["people"] = accuracy.where(facts["contact"].astype(bool), 1 - accuracy)
+    apart = [(facts["people"] - facts[name]).abs() for name in ("model", "simulation")]
+    facts["nearer"] = np.where(apart[0] < apart[1], "model", "simulation")
     gap = (facts["model"] - facts["simulation"]).abs()
     return facts.loc[gap.sort_values(ascending=False, kind="stable").index]
 
 
 def chosen(table: pd.DataFrame, each: int) -> pd.DataFrame:
-    """Return the first stimuli of each kind, one of a scenario."""
-    nearer = (table["people"] - table["model"]).abs() < (
-        table["people"] - table["simulation"]
-    ).abs()
-    table = table.assign(nearer=np.where(nearer, "model", "simulation"))
+    """Return the first stimuli of each kind, at most one per scenario."""
     first = table.drop_duplicates(["nearer", "scenario"])
     return pd.concat(part.head(each) for _, part in first.groupby("nearer"))
 
@@ -71,9 +72,8 @@ def drawn(scene: Scene) -> tuple[NDArray[np.uint8], bool]:
     """Return all frames (T, H, W, 3) of a trial, and whether agent and patient touch there."""
     path = simulate(scene)
     renderer = Renderer(with_role_colors(scene), path, SIZE, SIZE)
-    frames = [renderer.render(frame, ("color",)).color for frame in range(len(path))]
-    pictures = np.stack([frame for frame in frames if frame is not None])
-    return pictures, bool(label_contact(scene, path).contact)
+    frames: Any = [renderer.render(frame, ("color",)).color for frame in range(len(path))]
+    return np.stack(frames), bool(label_contact(scene, path).contact)
 
 
 def main() -> None:
@@ -90,12 +90,14 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     strips: list[NDArray[np.uint8]] = []
     rows: list[list[object]] = []
-    table = chosen(differing(options.folder, options.predictions), options.each)
+    every = differing(options.folder, options.predictions)
+    first = every.head(MOST)
+    table = chosen(every, options.each)
     for name, row in table.iterrows():
         pictures, contact = drawn(Scene.from_json(row["scene"]))
         (options.out / f"{name}.mp4").write_bytes(encode_movie(pictures))
-        last = [pictures[frame] for frame in (*SHOWN_FRAMES, -1)]
-        small = [np.asarray(Image.fromarray(one).resize((SHOWN, SHOWN))) for one in last]
+        some = [Image.fromarray(pictures[frame]) for frame in (*SHOWN_FRAMES, -1)]
+        small = [np.asarray(one.resize((SHOWN, SHOWN))) for one in some]
         strips.append(np.concatenate(small, axis=1))
         answers = [f"{row[column]:.2f}" for column in ("people", "model", "simulation")]
         ends = ["contact" if touches else "no contact" for touches in (row["contact"], contact)]
@@ -107,14 +109,17 @@ def main() -> None:
     strips += [np.full_like(strips[0], 255)] * (2 * half - len(strips))
     columns = [np.concatenate(strips[:half]), np.concatenate(strips[half:])]
     picture = Image.fromarray(np.concatenate(columns, axis=1)).quantize(256)
-    picture.save(options.out / "differ.png", optimize=True)
     if options.write:
         picture.save(RESULTS.with_suffix(".png"), optimize=True)
         RESULTS.with_suffix(".md").write_text(
             "# Stimuli on which intuition and simulation differ most\n\n"
             f"`python benchmarks/models/intuition_movies.py FOLDER {options.predictions.name} OUT "
-            f"--write`, {datetime.date.today()}. Answers are P(contact), of people the fraction "
-            f"that say yes, of simulation {SAMPLES} samples.\n\n{text}\n\n"
+            f"--write`, {datetime.date.today()}. Answers are P(contact), from {SAMPLES} "
+            "simulations, from the model, and as the fraction of people who say yes.\n\n"
+            f"Of the {MOST} stimuli that differ most people are nearer to the model on "
+            f"{(first['nearer'] == 'model').sum()}, of all {len(every)} on "
+            f"{(every['nearer'] == 'model').sum()}; {int(first['contact'].sum())} of the {MOST} "
+            f"end with a contact.\n\n{text}\n\n"
             "Frames 0, 22, 44 and the last one, by our engine, of each, down the left column and "
             "then the right one:\n\n![stimuli](intuition_movies.png)\n"
         )

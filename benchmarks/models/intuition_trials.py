@@ -291,6 +291,21 @@ def simulated(
     return pd.Series(known)[list(trials)]
 
 
+def predicted(path: Path) -> dict[str, pd.Series]:
+    """Return the answers of a table of predictions, by model: *observed*, else what it has.
+
+    P(contact) is by the canonical name of the stimulus.
+    """
+    table = pd.read_csv(path)
+    if "readout" in table and "observed" in set(table["readout"]):
+        table = table[table["readout"] == "observed"]
+    table = table.assign(stimulus=table["stimulus"].map(canonical_name))
+    return {
+        str(model): rows.set_index("stimulus")["p_contact"]
+        for model, rows in table.groupby("model")
+    }
+
+
 def names_stored(folder: Path) -> list[str]:
     """Return the names of what is stored of the trials in a folder."""
     with np.load(min(folder.glob("*.npz"))) as stored:

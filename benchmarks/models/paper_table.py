@@ -57,7 +57,7 @@ from physion.readout.tables import read_table
 from physion.readout.train import Trainings
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, TrialTask
-from ship_readouts import untested
+from ship_readouts import without_motions
 
 MODELS = tuple(name for name in NAMES if name != "gns-ransac")
 PROTOCOLS = ("all", "only", "one", "all-but")
@@ -154,7 +154,9 @@ class Part:
 
     def fit_set(self) -> Dataset:
         """Return the set that models are trained and readouts are fitted on."""
-        return untested(Dataset(self.folder / FIT), *(Dataset(self.folder / t) for t in TESTED))
+        return without_motions(
+            Dataset(self.folder / FIT), *(Dataset(self.folder / t) for t in TESTED)
+        )
 
     def train(self, *, dry_run: bool = False, steps: int = 0) -> Trainings:
         """Train what is missing."""

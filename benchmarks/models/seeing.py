@@ -1,7 +1,7 @@
 """Measure how well `seeing-simulation` recovers scenes, and what it answers.
 
     OMP_NUM_THREADS=1 python benchmarks/models/seeing.py FOLDER [--each 5]
-        [--depth-error 0.02 | --no-depth] [--own DATASET] [--known] [--write]
+        [--depth-error 0.02 | --no-depth] [--own DATASET] [--known] [--against FILES] [--write]
     OMP_NUM_THREADS=1 python benchmarks/models/seeing.py --priors
 
 Official stimuli that people saw, without cloth and without a contact in the observed part: the
@@ -23,18 +23,18 @@ scenario:
 4. Likeness to people, by `physion.compare`.
 5. Errors at the last observed frame, median and 90 % quantile: centre of mass and velocity of the
    agent, centre of the other movable objects; and how many have the right shape.
-6. Trials in which the answers from the fitted and the true state differ, by the first cause that
-   applies.
+6. What is wrong with trials in which the answer from the fitted state is worse or better than the
+   one from the true state, and with the others.
 
 With --depth-error E, the depth of each object has an error of standard deviation E, the same in
 all frames, and each pixel another one; rows are in FOLDER/seeing-E.jsonl. With --no-depth masks and
 the camera are all that is seen; rows are in FOLDER/seeing-masks.jsonl.
 
 --own DATASET measures stored testing trials of our own instead, by their labels, without people.
-Rows and tables have names that end in -own.
+Names of files end in the name of the dataset.
 
---against FILE compares with the rows of another run (.jsonl), or with predictions of a model
-(.csv), on the same stimuli.
+--against FILE compares with the rows of another run (.jsonl), or with a table of `physion evaluate`
+(.csv, of one model), on the same stimuli.
 
 With --write they are written to ``results/seeing.md``, ``seeing-E.md`` or ``seeing-masks.md``.
 --priors prints density, friction and restitution of the bodies of our own presets, from which the
@@ -47,7 +47,6 @@ import argparse
 import datetime
 import itertools
 import json
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -59,6 +58,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 import physion
+from intuition_trials import predicted
 from physion.analysis.scores import TWO_PEOPLE
 from physion.analysis.tables import read_humans
 from physion.clips.batch import LAST_OBSERVED, SCENERY_ID, Batch, Motion
@@ -101,8 +101,6 @@ LOOKED_AT = {"support": 3}
 """Trials per scenario and outcome that were looked at while the fit was written; 1 of others."""
 LOOKED_AT_WITH_ERRORS = 3
 """The same of fits with errors of depth, of every scenario."""
-SLOW = 0.1
-"""Error of a velocity in m/s that counts as a cause."""
 STILL = NoiseLevels(position=0.0, velocity=0.0, mass=0.0)
 ROW = dict[str, Any]
 
@@ -115,10 +113,12 @@ def official_scenes() -> list[tuple[Scene, bool]]:
 
 
 def own_scenes(folder: Path) -> list[tuple[Scene, bool]]:
-    """Return the scenes of stored testing trials, and their labels."""
+    """Return the scenes of stored testing trials without an observed contact, and their labels."""
     dataset = physion.Dataset(folder)
-    contact = dataset.index.set_index("trial")["contact"]
-    return [(dataset.trial(t).scene, bool(contact[t])) for t in dataset.trials("testing")]
+    rows = dataset.index[(dataset.index["split"] == "testing") & ~dataset.index["observed_contact"]]
+    rows = rows[rows["scenario"].isin(RIGID)]
+    pairs = zip(rows["trial"], rows["contact"].astype(bool), strict=True)
+    return [(dataset.trial(trial).scene, contact) for trial, contact in pairs]
 
 
 def chosen_trials(
@@ -140,8 +140,8 @@ def chosen_trials(
         yield from ((s, contact, number) for contact, s, number in filter(None, row))
 
 
-def measure(scene: Scene, contact: bool, number: float, given: Mapping[str, Any]) -> ROW:
-    """Return what is measured of one trial, the ``number``-th, with options of the model."""
+def measure(scene: Scene, contact: bool, looked_at: bool, given: Mapping[str, Any]) -> ROW:
+    """Return what is measured of one trial, with options of the model."""
     engine = make_engine()
     model = build_model("seeing-simulation", samples=SAMPLES, **given)
     motion = Motion(scene, simulate(scene, frames=OBSERVED_FRAMES))
@@ -157,8 +157,7 @@ def measure(scene: Scene, contact: bool, number: float, given: Mapping[str, Any]
         "version": VERSION,
         "scenario": scene.scenario,
         "contact": contact,
-        "looked at": number
-        < (LOOKED_AT_WITH_ERRORS if given else LOOKED_AT.get(scene.scenario, 1)),
+        "looked at": looked_at,
         "fitted": float(np.mean(model.imagine(batch, SAMPLES, 0).contact)),
         "true": answer(true, NoiseLevels(), SAMPLES),
         "true, no noise": answer(true, STILL, 1),
@@ -362,36 +361,41 @@ def area(p: Any, contact: Any) -> float:
     return float(np.mean((difference > 0) + 0.5 * (difference == 0)))
 
 
-def _cause(row: Mapping[str, Any]) -> str:
-    """Return why the answer of a trial may differ from the one from the true state."""
-    objects = row["objects"] if isinstance(row["objects"], list) else []
-    agents = [o for o in objects if o["agent"]]
-    if not objects:
-        return "agent or patient never seen"
-    if (row["true, guessed"] > 0.5) == (row["fitted"] > 0.5):
-        return "masses and friction: the true state gives the answer, too, if they are guessed"
-    if not all(o["shape"] for o in objects):
-        return "an object has another shape"
-    if "last seen" in row["note"] or "first fitted" in row["note"]:
-        return "an object is hidden at the start or at the end"
-    for name, group, most in (("the agent", agents, 0.01), ("another object", objects, 0.03)):
-        if any(o["center"] > most for o in group):
-            return f"{name} is more than {100 * most:.0f} cm off"
-    if any(o["velocity"] > SLOW for o in objects):
-        return f"a velocity is more than {SLOW:g} m/s off"
-    return "none of these"
+PROPERTIES: Mapping[str, Callable[[ROW], bool]] = {
+    "masses and friction: if guessed, the true state gives another answer": lambda row: (
+        (row["true, guessed"] > 0.5) != (row["true"] > 0.5)
+    ),
+    "an object has another shape": lambda row: not all(o["shape"] for o in row["objects"]),
+    "something was not seen well (a note)": lambda row: row["note"] != "",
+    "the agent is more than 1 cm off": lambda row: any(
+        o["center"] > 0.01 for o in row["objects"] if o["agent"]
+    ),
+    "another object is more than 3 cm off": lambda row: any(
+        o["center"] > 0.03 for o in row["objects"] if not o["agent"]
+    ),
+    "a velocity is more than .3 m/s off": lambda row: any(
+        o["velocity"] > 0.3 for o in row["objects"]
+    ),
+}
+"""What may be wrong with a fitted trial."""
 
 
-def _causes(table: pd.DataFrame) -> list[ROW]:
-    """Return how many trials of each cause are answered otherwise than from the true state."""
-    differ = table[(table["fitted"] > 0.5) != (table["true"] > 0.5)]
-    causes = pd.Series([_cause(row) for row in differ.to_dict("records")], differ.index)
-    rows = []
-    for cause, part in differ.groupby(causes.astype(object)):
-        hits = (right(part[name], part["contact"]).sum() for name in ("fitted", "true"))
-        counts = dict(zip(("fitted state right", "true state right"), map(int, hits), strict=True))
-        rows.append({"cause": cause, "trials": len(part), **counts})
-    return sorted(rows, key=lambda row: -row["trials"])
+def _properties(table: pd.DataFrame) -> list[ROW]:
+    """Return how many trials have each property: where both states are as often right, and else.
+
+    Trials without a fitted state are left out.
+    """
+    table = table[table["objects"].notna()]
+    hits = [right(table[name], table["contact"]) for name in ("fitted", "true")]
+    groups = {"worse": hits[0] < hits[1], "better": hits[0] > hits[1], "same": hits[0] == hits[1]}
+    parts = {name: table[chosen].to_dict("records") for name, chosen in groups.items()}
+    return [
+        {
+            "of the trials in which the answer from the fitted state is": name,
+            **{f"{kind} ({len(rows)})": sum(map(has, rows)) for kind, rows in parts.items()},
+        }
+        for name, has in PROPERTIES.items()
+    ]
 
 
 def _exchanged(table: pd.DataFrame) -> pd.Series:
@@ -456,7 +460,7 @@ def tables(rows: Sequence[ROW], own: bool) -> str:
         for a, b in compared
     ]
     people = [] if own else [_people(table)]
-    parts = [answers, others, differences, *people, errors, _causes(table)]
+    parts = [answers, others, differences, *people, errors, _properties(table)]
     return "\n\n".join(_markdown(rows) for rows in parts if rows) + "\n"
 
 
@@ -513,11 +517,8 @@ def against(rows: Sequence[ROW], paths: Sequence[Path]) -> str:
     lines = []
     for path in paths:
         if path.suffix == ".csv":
-            table = pd.read_csv(path)
-            table = table[table["readout"] != Readout.FULL.value]
-            other = dict(
-                zip(table["stimulus"].map(canonical_name), table["p_contact"], strict=True)
-            )
+            (answers,) = predicted(path).values()
+            other = answers.to_dict()
         else:
             other = {
                 canonical_name(name): row["fitted"]
@@ -616,7 +617,7 @@ def main() -> None:
         given["depth"] = False
     name = f"seeing-{options.depth_error:g}" if options.depth_error else "seeing"
     name = "seeing-masks" if options.no_depth else name
-    name += "-own" * bool(options.own)
+    name += f"-{options.own.name}" if options.own else ""
     path = options.folder / f"{name}.jsonl"
     options.known |= options.version != VERSION
     known = read_rows(path, options.version)
@@ -639,7 +640,8 @@ def main() -> None:
         trials = own_scenes(options.own) if options.own else official_scenes()
     for scene, contact, number in chosen_trials(trials, options.each, early):
         if scene.name not in known:
-            keep(measure(scene, contact, math.inf if options.own else number, given))
+            looked = LOOKED_AT_WITH_ERRORS if given else LOOKED_AT.get(scene.scenario, 1)
+            keep(measure(scene, contact, not options.own and number < looked, given))
             row = known[scene.name]
             print(
                 f"{scene.scenario} {scene.name}: contact {contact}, fitted {row['fitted']:.2f}, "
@@ -655,6 +657,8 @@ def main() -> None:
         today = datetime.date.today().isoformat()
         error = f" --depth-error {options.depth_error:g}" if options.depth_error else ""
         error += " --no-depth" * options.no_depth + " --own DATASET" * bool(options.own)
+        if options.against:
+            error += " --known --write --against " + " ".join(p.name for p in options.against)
         (RESULTS / f"{name}.md").write_text(
             f"# Seeing by simulation\n\n`python benchmarks/models/seeing.py FOLDER{error}`, "
             f"{len(rows)} trials, {today}, version {options.version} of the model, {SAMPLES} "

@@ -97,15 +97,15 @@ SETTINGS = GenerateSettings(movies=False, look="redyellow", jitters=0, observed_
 
 
 def make_set(folder: Path, count: int, tested: Dataset) -> Dataset:
-    """Return the set with ``count`` readout trials a scenario or more, less those of ``tested``."""
+    """Return the set with at least ``count`` readout trials per scenario, none of them tested."""
     if count:
         physion.generate(folder / SET, "all", {"readout": count}, name=SET, settings=SETTINGS,
                          executor=SerialExecutor())  # fmt: skip
-    return untested(Dataset(folder / SET), tested)
+    return without_motions(Dataset(folder / SET), tested)
 
 
-def untested(dataset: Dataset, *tested: Dataset) -> Dataset:
-    """Return a dataset without trials that have the motion of a tested one.
+def without_motions(dataset: Dataset, *tested: Dataset) -> Dataset:
+    """Leave out the trials of a dataset that have the motion of a tested one, and return it.
 
     A sampled scene can be one of the study to the byte: Dominoes has few random numbers.
     """

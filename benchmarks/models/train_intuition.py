@@ -13,7 +13,7 @@ all scenarios as float16. Other trainings answer what a network has to have seen
 first trials of each scenario only; --unseen, without the configuration of the tested trial
 (`FOLDS` trainings, each without a part of the configurations); --all-but, without its scenario.
 With --write the table is written to ``results/intuition_networks.md``, with these trainings to
-``results/MODELS_unseen.md``.
+``results/MODEL_unseen.md``, of one model at a time.
 """
 
 from __future__ import annotations
@@ -295,6 +295,9 @@ def main() -> None:
         raise SystemExit(
             "weights of --start may have seen all: leave it out for --unseen, --all-but"
         )
+    other = options.counts or options.unseen or options.all_but
+    if other and len(options.models) > 1:
+        raise SystemExit("--counts, --unseen and --all-but need one of --models")
     rows, curves = [], []
     for name in options.models:
         learner = Learner(name, options.folder, options)
@@ -363,10 +366,8 @@ def main() -> None:
         ]
     )
     if options.write:
-        other = options.counts or options.unseen or options.all_but
-        unseen = f"{'_'.join(options.models)}_unseen.md"
-        path = RESULTS / (unseen if other else "intuition_networks.md")
-        path.write_text(text + "\n")
+        name = f"{options.models[0]}_unseen.md" if other else "intuition_networks.md"
+        (RESULTS / name).write_text(text + "\n")
 
 
 if __name__ == "__main__":
