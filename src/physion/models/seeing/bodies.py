@@ -55,6 +55,12 @@ costs below which the simpler solution is taken; a tenth of the cost is added to
 FITS = {"bowl": 0.05, "pipe": 0.04, "sphere": 0.03, "torus": 0.04}
 """Cost up to which an upright shape is accepted; 0.02 for the others. The collision pieces of
 hollow shapes and their drawn meshes differ by a millimetre."""
+TALLEST = {"cube": math.inf, "cylinder": 12.0, "bowl": 1.2, "torus": 0.4}
+TALL, LONGEST = 4.5, 3.5
+"""Largest height of a shape in its own frame, over its mean width (`TALL` of shapes that are not
+named), and largest length over width, of all but cubes. A pole that is hidden at both ends, such
+as among rings, would fit a cone of 30 m, too. In scenes of our presets the heights are up to 10 of
+cylinders, 0.9 of bowls, 0.25 of rings and 3.5 of the others, the lengths up to 3."""
 NEAR_FLOOR = 0.04
 """Height in metres of the lowest seen point up to which an object is taken to reach the floor."""
 ROTATIONS = 16
@@ -99,7 +105,7 @@ def find(rays: Rays, prior: Prior, solids: Sequence[Solid] | None = None) -> Pla
         found.append(min(polished, key=lambda placed: placed.cost))
         if found[-1].cost < (ROUGH if found[-1].solid.ball else ENOUGH):
             break
-    best = min(found, key=lambda placed: placed.cost)
+    best = min(found, key=lambda placed: (not _likely(placed), placed.cost))
     if best.cost > FITS.get(best.solid.name, 0.02):
         starts = [
             fit(start, few, FREE, prior, widths=(0.05, 0.015), steps=5)
@@ -111,7 +117,7 @@ def find(rays: Rays, prior: Prior, solids: Sequence[Solid] | None = None) -> Pla
             found.append(fit(start, some, FREE, prior, widths=(0.02, 0.004), steps=10))
             if found[-1].cost < (ROUGH if found[-1].solid.ball else ENOUGH):
                 break
-    found.sort(key=lambda placed: placed.cost)
+    found.sort(key=lambda placed: (not _likely(placed), placed.cost))
     return refine(_several(found, KEPT), rays, prior)
 
 
@@ -132,7 +138,15 @@ def refine(starts: Sequence[Placed], rays: Rays, prior: Prior) -> Placed:
             tied = _centred(replace(whole, scale=scale), whole.middle())
             tied = fit(tied, rays, EQUAL, prior, widths=(0.02, 0.004), steps=10)
             tried.append((tied.cost + rank, tied))
-    return min(tried, key=lambda pair: pair[0])[1]
+    return min(tried, key=lambda pair: (not _likely(pair[1]), pair[0]))[1]
+
+
+def _likely(placed: Placed) -> bool:
+    """Return whether a solid is no taller or longer than its shape is in our presets."""
+    wide, deep, high = (placed.solid.high - placed.solid.low) * placed.scale
+    tallest = TALLEST.get(placed.solid.name, TALL)
+    level = placed.solid.name == "cube" or max(wide, deep) <= LONGEST * min(wide, deep)
+    return bool(level and high <= tallest * math.sqrt(wide * deep))
 
 
 def _squares(placed: Placed) -> Iterator[Placed]:
@@ -218,6 +232,12 @@ def _upright(each: Solid, rays: Rays, floor: float, flat: bool) -> Iterator[Plac
                 yield _filling(each, rotation, low, high)
         else:
             yield _filling(each, rotation, *_extended(low, high, rotation, rays, (0, 1, 2)))
+            if each.name == "torus":
+                # A ring is lower than `_extended` takes it to be.
+                ring = _filling(each, rotation, *_extended(low, high, rotation, rays, (0, 1)))
+                yield _centred(
+                    replace(ring, scale=ring.scale[:2].max() * np.ones(3)), ring.middle()
+                )
 
 
 def _any_rotation(each: Solid, rays: Rays) -> Iterator[Placed]:
