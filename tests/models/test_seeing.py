@@ -123,6 +123,38 @@ def test_residuals_are_distances_in_metres(
     assert residuals(placed, ray(y, depth, on))[0] == pytest.approx(expected, abs=1e-9)
 
 
+def pole_with_rings() -> Scene:
+    """Return a pole on a foot, hidden below by rings of which each hides a part of the next."""
+    heights = (0.72, 0.802, 0.895, 1.002, 1.12, 1.252, 1.395)
+    rings = [
+        Body(f"ring {n}", "torus", (0.0, 0.0, height), (0.325 + 0.05 * n,) * 3)
+        for n, height in enumerate(heights)
+    ]
+    bodies = (
+        rings[3],
+        Body("box", "cube", (1.2, 0.0, 0.0), (0.3, 0.3, 0.3)),
+        Body("foot", "cylinder", (0.0, 0.0, 0.0), (0.4, 0.4, 0.7), mass=20.0),
+        Body("pole", "cylinder", (0.0, 0.0, 0.7), (0.15, 0.15, 1.5), mass=5.0),
+        *(ring for ring in rings if ring is not rings[3]),
+    )
+    camera = Camera((2.3, -3.1, 1.8), (0.0, 0.0, 0.8))
+    joints = (Joint("foot", "pole"),)
+    return Scene("pole", "link", bodies, Roles("ring 3", "box"), camera, joints=joints)
+
+
+@pytest.mark.slow
+def test_rings_and_poles_that_are_hidden_at_both_ends_are_found() -> None:
+    made = pole_with_rings()
+    batch = batch_of(made, 256)
+    (seen,) = SeeingSimulation(build_model("seeing-simulation").settings).see(batch)
+    assert seen.trial is not None
+    numbers = object_ids(made)[1:].tolist()
+    found = {body.name: body for body in seen.trial.scene.bodies}
+    for number, body in zip(numbers, made.bodies, strict=True):
+        assert found[str(number)].shape == body.shape, body.name
+        assert found[str(number)].scale == pytest.approx(body.scale, rel=0.08), body.name
+
+
 def test_a_hole_is_free() -> None:
     down = np.array([[0.0, 0.0, -1.0]])
     rays = Rays(np.array([0.0, 0.0, 3.0]), down, np.array([3.0]), np.array([False]))
