@@ -512,8 +512,8 @@ def _markdown(rows: Sequence[ROW]) -> str:
     return markdown_table(names, [[row[name] for name in names] for row in rows])
 
 
-def against(rows: Sequence[ROW], paths: Sequence[Path]) -> str:
-    """Return paired differences of right answers from other rows, or from other predictions."""
+def against(rows: Sequence[ROW], paths: Sequence[Path], version: int) -> str:
+    """Return paired differences of right answers from rows of a version, or from predictions."""
     lines = []
     for path in paths:
         if path.suffix == ".csv":
@@ -522,7 +522,7 @@ def against(rows: Sequence[ROW], paths: Sequence[Path]) -> str:
         else:
             other = {
                 canonical_name(name): row["fitted"]
-                for name, row in read_rows(path, VERSION).items()
+                for name, row in read_rows(path, version).items()
                 if "early" not in row
             }
         inside = [row for row in rows if canonical_name(row["stimulus"]) in other]
@@ -651,7 +651,7 @@ def main() -> None:
         rows.append(known[scene.name])
     text = tables(rows, bool(options.own))
     if options.against:
-        text += f"\n{against(rows, options.against)}"
+        text += f"\n{against(rows, options.against, options.version)}"
     print(text)
     if options.write:
         today = datetime.date.today().isoformat()
