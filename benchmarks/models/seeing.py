@@ -657,6 +657,7 @@ def main() -> None:
         today = datetime.date.today().isoformat()
         error = f" --depth-error {options.depth_error:g}" if options.depth_error else ""
         error += " --no-depth" * options.no_depth + " --own DATASET" * bool(options.own)
+        error += f" --version {options.version}" * (options.version != VERSION)
         if options.against:
             error += " --known --write --against " + " ".join(p.name for p in options.against)
         (RESULTS / f"{name}.md").write_text(
