@@ -36,7 +36,7 @@ from physion.scenes.looks import with_role_colors
 from physion.scenes.scene import Scene
 from physion.trials.video import encode_movie
 
-RESULTS = Path(__file__).parents[1] / "results" / "intuition_movies"
+RESULTS = Path(__file__).parents[1] / "results" / "intuition_movies.md"
 SAMPLES, SIZE, SHOWN = 200, 256, 160
 MOST = 100
 """Stimuli with the largest differences, about which the page says to what people are nearer."""
@@ -111,7 +111,7 @@ def main() -> None:
     picture = Image.fromarray(np.concatenate(columns, axis=1)).quantize(256)
     if options.write:
         picture.save(RESULTS.with_suffix(".png"), optimize=True)
-        RESULTS.with_suffix(".md").write_text(
+        RESULTS.write_text(
             "# Stimuli on which intuition and simulation differ most\n\n"
             f"`python benchmarks/models/intuition_movies.py FOLDER {options.predictions.name} OUT "
             f"--write`, {datetime.date.today()}. Answers are P(contact), from {SAMPLES} "

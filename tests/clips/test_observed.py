@@ -156,7 +156,12 @@ def reachable(start: object) -> Iterator[object]:
             for kind in type(thing).__mro__:
                 names |= {*getattr(kind, "__slots__", ())}
             waiting += [getattr(thing, name, None) for name in names]
-            bound = [getattr(thing, name, None) for name in dir(type(thing)) if name != "__dict__"]
+            # Python 3.11.2 makes a wrong __weakref__ of a dataclass with slots.
+            bound = [
+                getattr(thing, name, None)
+                for name in dir(type(thing))
+                if name not in ("__dict__", "__weakref__")
+            ]
             for function in bound:
                 cells = getattr(function, "__closure__", None) or ()
                 waiting += [cell.cell_contents for cell in cells]
