@@ -47,6 +47,7 @@ import argparse
 import datetime
 import itertools
 import json
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -63,7 +64,7 @@ from physion.analysis.scores import TWO_PEOPLE
 from physion.analysis.tables import read_humans
 from physion.clips.batch import LAST_OBSERVED, SCENERY_ID, Batch, Motion
 from physion.clips.rendered import MotionRenderer, object_ids
-from physion.core.names import RIGID, canonical_name
+from physion.core.names import RIGID, SCENARIOS, canonical_name
 from physion.core.seeds import generator, stable_hash
 from physion.core.tables import markdown_table
 from physion.data.official import official
@@ -116,7 +117,6 @@ def own_scenes(folder: Path) -> list[tuple[Scene, bool]]:
     """Return the scenes of stored testing trials without an observed contact, and their labels."""
     dataset = physion.Dataset(folder)
     rows = dataset.index[(dataset.index["split"] == "testing") & ~dataset.index["observed_contact"]]
-    rows = rows[rows["scenario"].isin(RIGID)]
     pairs = zip(rows["trial"], rows["contact"].astype(bool), strict=True)
     return [(dataset.trial(trial).scene, contact) for trial, contact in pairs]
 
@@ -126,12 +126,11 @@ def chosen_trials(
 ) -> Iterator[tuple[Scene, bool, int]]:
     """Yield scenes, outcomes and numbers, one of every scenario and outcome in turn.
 
-    Scenes with cloth are left out, and those for which ``early`` is true.
+    Scenes for which ``early`` is true are left out.
     """
     groups: dict[tuple[str, bool], list[Scene]] = {}
     for scene, contact in sorted(trials, key=lambda trial: stable_hash("noise", trial[0].name)):
-        if not scene.cloths:
-            groups.setdefault((scene.scenario, contact), []).append(scene)
+        groups.setdefault((scene.scenario, contact), []).append(scene)
     late = [
         zip(itertools.repeat(contact), (s for s in group if not early(s)), range(each))
         for (_, contact), group in sorted(groups.items())
@@ -146,7 +145,10 @@ def measure(scene: Scene, contact: bool, looked_at: bool, given: Mapping[str, An
     model = build_model("seeing-simulation", samples=SAMPLES, **given)
     motion = Motion(scene, simulate(scene, frames=OBSERVED_FRAMES))
     batch = _batch(motion, model.spec, bool(given), given.get("depth_error", 0.0))
+    start = time.process_time()
     seen: SeenTrial = model.see(batch)[0]  # type: ignore[attr-defined]
+    answered = float(np.mean(model.imagine(batch, SAMPLES, 0).contact))
+    seconds = time.process_time() - start
     true = cut_trial(scene, motion.trajectory)
 
     def answer(trial: Any, levels: NoiseLevels, samples: int) -> float:
@@ -158,7 +160,8 @@ def measure(scene: Scene, contact: bool, looked_at: bool, given: Mapping[str, An
         "scenario": scene.scenario,
         "contact": contact,
         "looked at": looked_at,
-        "fitted": float(np.mean(model.imagine(batch, SAMPLES, 0).contact)),
+        "seconds": seconds,
+        "fitted": answered,
         "true": answer(true, NoiseLevels(), SAMPLES),
         "true, no noise": answer(true, STILL, 1),
         "true, guessed": answer(guessed(true), NoiseLevels(), SAMPLES),
@@ -601,6 +604,7 @@ def main() -> None:
     parser.add_argument("--depth-error", type=float, default=0.0)
     parser.add_argument("--no-depth", action="store_true")
     parser.add_argument("--own", type=Path, help="dataset, in place of the official stimuli")
+    parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=RIGID)
     parser.add_argument("--known", action="store_true")
     parser.add_argument("--against", type=Path, nargs="*", default=[], help="rows, or predictions")
     parser.add_argument("--version", type=int, default=VERSION)
@@ -635,9 +639,11 @@ def main() -> None:
         return "early" in known.get(scene.name, {})
 
     rows = [row for row in known.values() if "early" not in row] if options.known else []
+    rows = [row for row in rows if row["scenario"] in options.scenarios]
     trials: Sequence[tuple[Scene, bool]] = []
     if not options.known:
         trials = own_scenes(options.own) if options.own else official_scenes()
+        trials = [trial for trial in trials if trial[0].scenario in options.scenarios]
     for scene, contact, number in chosen_trials(trials, options.each, early):
         if scene.name not in known:
             looked = LOOKED_AT_WITH_ERRORS if given else LOOKED_AT.get(scene.scenario, 1)

@@ -12,8 +12,9 @@ moved.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -39,8 +40,9 @@ from physion.numerics.rotations import axis_angle_matrix, rotation_matrices
 
 F64 = NDArray[np.float64]
 
-FEW, SOME = 140, 280
-"""Rays of the first and the second search; the last one takes all."""
+FEW, SOME, MANY = 140, 280, 600
+"""Rays of the first search, of the second one, and of the choice between what they found. Only what
+fits well is fitted to all rays."""
 YAWS, FLAT_YAWS = 3, 9
 """Rotations about the vertical from which a shape that is not round starts, and of flat ones."""
 FLAT = 0.06
@@ -52,21 +54,33 @@ size then."""
 ENOUGH, ROUGH, GOOD = 0.0004, 0.01, 0.0005
 """Cost that ends the search, the same of a ball, whose drawn mesh has corners, and difference of
 costs below which the simpler solution is taken; a tenth of the cost is added to it."""
-FITS = {"bowl": 0.05, "pipe": 0.04, "sphere": 0.03, "torus": 0.04}
-"""Cost up to which an upright shape is accepted; 0.02 for the others. The collision pieces of
-hollow shapes and their drawn meshes differ by a millimetre."""
+SHARP, EQUAL_WEIGHT = (0.002, 0.001), 0.1
+"""First and last c of the last fit of what fits well, and weight of equal scales there."""
+FITS, EXACT = {"bowl": 0.06, "sphere": 0.016}, 0.004
+"""Cost up to which a shape is accepted, and of the others. The collision pieces of bowls and their
+drawn meshes differ by a millimetre, and the ball that is fitted has no corners."""
 TALLEST = {"cube": math.inf, "cylinder": 12.0, "bowl": 1.2, "torus": 0.4}
 TALL, LONGEST = 4.5, 3.5
 """Largest height of a shape in its own frame, over its mean width (`TALL` of shapes that are not
 named), and largest length over width, of all but cubes. A pole that is hidden at both ends, such
 as among rings, would fit a cone of 30 m, too. In scenes of our presets the heights are up to 10 of
 cylinders, 0.9 of bowls, 0.25 of rings and 3.5 of the others, the lengths up to 3."""
+LEVEL = ("cube", "cylinder", "torus")
+"""Shapes that may be flat, as `FLAT` says; in our presets these are targets."""
+UNLIKELY = 0.1
+"""Cost that is added to a shape with other proportions. What is seen well has them if it must."""
 NEAR_FLOOR = 0.04
 """Height in metres of the lowest seen point up to which an object is taken to reach the floor."""
-ROTATIONS = 16
+ALIKE, WORSE = 0.7, 0.001
+"""Largest difference of logarithms of the scales of two objects that may be alike, and cost, with
+the last c of `SHARP`, by which one may fit worse with the scales of the other."""
+ROTATIONS = (16, 64)
+"""Random rotations that are tried first, and where none of them fits."""
 KEPT = 5
 PER_SHAPE = 2
-"""Random rotations, and solutions that are fitted with all rays, at most so many of one shape."""
+"""Solutions that are fitted with all rays, and how many of them have one shape."""
+EXPECTED = 0.05
+"""Weight of the distance from where an object that is followed is expected."""
 SAME, STILL = 1.3, 0.008
 """Factor and summand of the cost up to which an object counts as not moved."""
 LOST = 0.015
@@ -103,50 +117,84 @@ def find(rays: Rays, prior: Prior, solids: Sequence[Solid] | None = None) -> Pla
             for start in starts[: 4 if flat else 1]
         ]
         found.append(min(polished, key=lambda placed: placed.cost))
-        if found[-1].cost < (ROUGH if found[-1].solid.ball else ENOUGH):
+        if _enough(found[-1]):
             break
-    best = min(found, key=lambda placed: (not _likely(placed), placed.cost))
-    if best.cost > FITS.get(best.solid.name, 0.02):
+    for first, last in itertools.pairwise((0, *ROTATIONS)):
+        if flat or any(_fits(placed) for placed in found):
+            break
         starts = [
             fit(start, few, FREE, prior, widths=(0.05, 0.015), steps=5)
             for each in choice
-            for start in _any_rotation(each, rays)
+            for start in _any_rotation(each, rays, _rotations()[first:last])
         ]
         starts.sort(key=lambda placed: cost_of(placed, few, 0.015))
         for start in _several(starts, 8):
             found.append(fit(start, some, FREE, prior, widths=(0.02, 0.004), steps=10))
-            if found[-1].cost < (ROUGH if found[-1].solid.ball else ENOUGH):
+            if _enough(found[-1]):
                 break
-    found.sort(key=lambda placed: (not _likely(placed), placed.cost))
-    return refine(_several(found, KEPT), rays, prior)
+    # Unlikely ones last, but the best of all among those that are fitted again.
+    found.sort(key=lambda placed: placed.cost)
+    likely = [placed for placed in found if _rank(placed) == placed.cost]
+    return refine(_several([*likely, *found], KEPT - 1) + found[:1], rays, prior)
 
 
 def refine(starts: Sequence[Placed], rays: Rays, prior: Prior) -> Placed:
     """Return the simplest of the solutions near some starts that fit nearly as well as the best."""
     order = list(TURNS)
-    tried: list[tuple[float, Placed]] = []
+    tried: list[tuple[float, Placed, F64]] = []
+    many = rays.first(MANY)
     for start in starts:
         rank = 0.0003 * order.index(start.solid.name)
-        whole = fit(start, rays, FREE, prior, widths=(0.01, 0.004), steps=10)
+        whole = fit(start, many, FREE, prior, widths=(0.01, 0.004), steps=10)
+        if whole.cost >= GOOD:
+            # Points far outside pull nothing: their cost is at its limit.
+            wider = fit(_covering(whole, many), many, FREE, prior, widths=(0.01, 0.004), steps=10)
+            whole = min(whole, wider, key=lambda placed: placed.cost)
         allowed = GOOD + 0.1 * whole.cost
-        tried.append((whole.cost + rank + 2 * allowed, whole))
+        tried.append((whole.cost + rank + 2 * allowed, whole, FREE))
         for tied in _squares(whole):
-            tied = fit(tied, rays, ROUND, prior, widths=(0.02, 0.004), steps=10)
-            tried.append((tied.cost + rank + allowed, tied))
+            tied = fit(tied, many, ROUND, prior, widths=(0.02, 0.004), steps=10)
+            tried.append((tied.cost + rank + allowed, tied, ROUND))
         scale = np.full(3, np.exp(np.mean(np.log(whole.scale))))
         if np.abs(np.log(scale / whole.scale)).max() < 0.3:
             tied = _centred(replace(whole, scale=scale), whole.middle())
-            tied = fit(tied, rays, EQUAL, prior, widths=(0.02, 0.004), steps=10)
-            tried.append((tied.cost + rank, tied))
-    return min(tried, key=lambda pair: (not _likely(pair[1]), pair[0]))[1]
+            tied = fit(tied, many, EQUAL, prior, widths=(0.02, 0.004), steps=10)
+            tried.append((tied.cost + rank, tied, EQUAL))
+    _, best, free = min(tried, key=lambda tried: tried[0] + _rank(tried[1]) - tried[1].cost)
+    if best.cost >= GOOD:
+        return best
+    # Every drawn point fits, so that borders are known better than to the usual width.
+    prior = replace(prior, equal=EQUAL_WEIGHT)
+    sharp = fit(best, rays, free, prior, widths=SHARP, steps=10)
+    return replace(sharp, cost=cost_of(sharp, rays))
 
 
-def _likely(placed: Placed) -> bool:
-    """Return whether a solid is no taller or longer than its shape is in our presets."""
+def _covering(placed: Placed, rays: Rays) -> Placed:
+    """Return a solid that is as much longer along its axes as reaches all seen points."""
+    low, high = _box(placed.rotation, rays, 0.0)
+    middle, half = placed.middle() @ placed.rotation, placed.size() / 2
+    low, high = np.minimum(low, middle - half), np.maximum(high, middle + half)
+    return _filling(placed.solid, placed.rotation, low, high)
+
+
+def _rank(placed: Placed) -> float:
+    """Return the cost, and `UNLIKELY` of what is taller or longer than its shape in our presets."""
     wide, deep, high = (placed.solid.high - placed.solid.low) * placed.scale
     tallest = TALLEST.get(placed.solid.name, TALL)
-    level = placed.solid.name == "cube" or max(wide, deep) <= LONGEST * min(wide, deep)
-    return bool(level and high <= tallest * math.sqrt(wide * deep))
+    likely = placed.solid.name == "cube" or max(wide, deep) <= LONGEST * min(wide, deep)
+    likely = likely and high <= tallest * math.sqrt(wide * deep)
+    likely = likely and (placed.solid.name in LEVEL or high >= FLAT * max(wide, deep))
+    return placed.cost + (0.0 if likely else UNLIKELY)
+
+
+def _fits(placed: Placed) -> bool:
+    """Return whether no other rotation has to be looked for."""
+    return _rank(placed) < FITS.get(placed.solid.name, EXACT)
+
+
+def _enough(placed: Placed) -> bool:
+    """Return whether nothing better has to be looked for."""
+    return _rank(placed) < (ROUGH if placed.solid.ball else ENOUGH)
 
 
 def _squares(placed: Placed) -> Iterator[Placed]:
@@ -164,6 +212,60 @@ def _squares(placed: Placed) -> Iterator[Placed]:
         yield _centred(replace(placed, scale=scale), placed.middle() + shift)
 
 
+def alike(found: Mapping[int, Placed], rays: Mapping[int, Rays], prior: Prior) -> dict[int, Placed]:
+    """Return solids of which those of one shape have the same scales, where that fits as well.
+
+    What is hidden of one is seen of another. Where all three scales of a solid are equal, nothing
+    is hidden that has to be known.
+    """
+    result = dict(found)
+    groups: dict[str, set[int]] = {}
+    for number, placed in found.items():
+        if np.ptp(placed.scale) > 0.01 * placed.scale.max() and placed.cost < GOOD:
+            groups.setdefault(placed.solid.name, set()).add(number)
+    for left in groups.values():
+        while len(left) > 1:
+            options = []
+            for giver in sorted(left):
+                taken = {
+                    number: other
+                    for number in left - {giver}
+                    if (other := _scaled_as(found[giver], found[number], rays[number], prior))
+                }
+                total = sum(cost_of(other, rays[n], SHARP[1]) for n, other in taken.items())
+                options.append((len(taken), -total, giver, taken))
+            count, _, giver, taken = max(options, key=lambda option: option[:3])
+            if not count:
+                break
+            result |= taken
+            left -= {giver, *taken}
+    return result
+
+
+def _scaled_as(giver: Placed, placed: Placed, rays: Rays, prior: Prior) -> Placed | None:
+    """Return a solid with the scales of another one; None if it does not fit as well then."""
+    turned = giver.scale[[1, 0, 2]] if giver.solid.name == "cube" else giver.scale
+    scale = min(
+        (giver.scale, turned), key=lambda scale: float(np.abs(np.log(scale / placed.scale)).max())
+    )
+    change = np.log(scale / placed.scale)
+    if np.abs(change).max() > ALIKE:
+        return None
+    axis = int(np.argmax(np.abs(change)))
+    shift = (scale - placed.scale)[axis] * (placed.solid.high - placed.solid.low)[axis] / 2
+    best: Placed | None = None
+    for side in (0.0, 1.0, -1.0):
+        middle = placed.middle() + side * shift * placed.rotation[:, axis]
+        other = _centred(replace(placed, scale=scale), middle)
+        other = fit(other, rays, POSE, prior, widths=(0.01, SHARP[1]), steps=10)
+        if best is None or other.cost < best.cost:
+            best = other
+    assert best is not None
+    if best.cost > cost_of(placed, rays, SHARP[1]) + WORSE:
+        return None
+    return replace(best, cost=cost_of(best, rays))
+
+
 def follow(
     before: Placed, rays: Rays, prior: Prior, guesses: Sequence[Placed] = ()
 ) -> tuple[Placed, bool]:
@@ -178,9 +280,14 @@ def follow(
     prior
         What is expected of its pose.
     guesses
-        Other poses from which the search starts.
+        Other poses from which the search starts; the first one is expected.
     """
     some = rays.first(SOME)
+    ahead = (*guesses, before)[0]
+    # Where both ends are hidden, it has moved along itself as before.
+    middle, low = ahead.middle(), ahead.extent_z()[0]
+    center = (float(middle[0]), float(middle[1]))
+    prior = Prior(prior.floor, low, EXPECTED, center, EXPECTED)
     if cost_of(before, some) <= SAME * before.cost + STILL:
         return before, False
     starts = [before, *guesses]
@@ -188,7 +295,8 @@ def follow(
     best = min(found, key=lambda placed: placed.cost)
     if best.cost > LOST + before.cost:
         turns = [turn @ best.rotation for angle in ANGLES for turn in _axis_turns(angle)]
-        turned = [replace(best, rotation=rotation) for rotation in (*turns, *_rotations())]
+        turns += _rotations()[: ROTATIONS[0]]
+        turned = [replace(best, rotation=rotation) for rotation in turns]
         few = rays.first(FEW)
         wide = [
             fit(_centred(placed, best.middle()), few, POSE, prior, widths=(0.03, 0.01), steps=6)
@@ -240,10 +348,10 @@ def _upright(each: Solid, rays: Rays, floor: float, flat: bool) -> Iterator[Plac
                 )
 
 
-def _any_rotation(each: Solid, rays: Rays) -> Iterator[Placed]:
-    """Yield starts of a shape in all rotations; one is enough of a ball."""
+def _any_rotation(each: Solid, rays: Rays, rotations: Sequence[F64]) -> Iterator[Placed]:
+    """Yield starts of a shape with rotations; a ball needs none."""
     if not each.ball:
-        for rotation in _rotations():
+        for rotation in rotations:
             box = _box(rotation, rays)
             yield _filling(each, rotation, *_extended(*box, rotation, rays, (0, 1, 2)))
 
@@ -288,7 +396,7 @@ def _centred(placed: Placed, middle: F64) -> Placed:
 @cache
 def _rotations() -> tuple[F64, ...]:
     """Return rotation matrices, uniform in the space of rotations."""
-    values = generator("seeing", "rotations of a shape").standard_normal((ROTATIONS, 4))
+    values = generator("seeing", "rotations of a shape").standard_normal((ROTATIONS[-1], 4))
     values /= np.linalg.norm(values, axis=1, keepdims=True)
     return tuple(rotation_matrices(values))
 

@@ -32,9 +32,10 @@ from scipy.spatial.transform import Rotation
 
 from physion.clips.batch import AGENT_ID, LAST_OBSERVED, PATIENT_ID, SCENERY_ID
 from physion.core.errors import BadInputError
+from physion.core.seeds import generator
 from physion.models.gaps import gap_of_bodies
 from physion.models.noisy_simulation import ObservedTrial
-from physion.models.seeing.bodies import find, follow, moved_with, refine
+from physion.models.seeing.bodies import alike, find, follow, moved_with, refine
 from physion.models.seeing.pixels import LEAST_PIXELS, Rays, SeenFrame, floor_height, picture_of
 from physion.models.seeing.solids import FREE, POSE, Placed, Prior, cost_of, fit
 from physion.physics.rigid.bodies import body_mass
@@ -57,6 +58,8 @@ F64 = NDArray[np.float64]
 
 MOST_OBJECTS = 15
 """Largest number of objects of a trial."""
+RAYS = 1500
+"""Rays to which the shape and the size of an object are fitted; others to its later poses."""
 CLEAR_PIXELS = 40
 """Pixels in frame 0 with which an object is fitted there."""
 DENSITY, RING_DENSITY = 32.0, 4.0
@@ -89,6 +92,11 @@ CHANGED = 0.004
 """Cost by which a later frame must fit worse before the size is questioned."""
 TOUCHING = 0.003
 """Gap in metres at which objects count as touching."""
+STRETCHED, HIDDEN_BY = ("cube", "cylinder"), (0.9, 1.1)
+"""Shapes whose sides may be hidden, and factors of the length that are not seen then."""
+SPREAD, UNSEEN, OTHERS = 0.3, 0.001, 9
+"""Standard deviation of the logarithm of a hidden length, as of the two widths of boxes in our
+towers; cost by which it may fit worse; and how many other scenes are drawn."""
 FASTEST_SPIN = 7.0
 """Radians per second that the engine allows."""
 RAISED = 0.01
@@ -147,7 +155,7 @@ def numbers_of(ids: NDArray[np.uint8]) -> list[int]:
     return numbers
 
 
-FRAMES = (0, 8, 16, 24, 30, 34, 38, 40, 42, 44)
+FRAMES = (0, 8, 16, 24, 30, 34, 38, 40, 42, 43, 44)
 """Frames that are looked at."""
 
 
@@ -185,7 +193,7 @@ def see_trial(
         pixels = {frame: picture.pixels(number) for frame, picture in pictures.items()}
         first = chosen[0]
         base = first if pixels[first] >= CLEAR_PIXELS else max(chosen, key=lambda f: pixels[f])
-        rays = pictures[base].rays(number)
+        rays = pictures[base].rays(number, RAYS)
         if rays is None:
             notes.append(f"object {number} has fewer than {LEAST_PIXELS} pixels")
             continue
@@ -196,6 +204,9 @@ def see_trial(
         if base != first:
             notes.append(f"object {number} is first fitted in frame {base}")
     found = _stacked(found, pictures, floor)
+    rays_of = {n: r for n, (base, _) in found.items() if (r := pictures[base].rays(n, RAYS))}
+    same = alike({n: placed for n, (_, placed) in found.items()}, rays_of, Prior(floor=floor))
+    found = {n: (base, same[n]) for n, (base, _) in found.items()}
     tracks = tuple(_track(number, *found[number], pictures, floor) for number in found)
     notes += [
         f"object {track.number} is last seen in frame {track.frames[-1]}"
@@ -208,8 +219,12 @@ def see_trial(
         if number not in found
     ]
     notes += [f"the {word} is never seen" for word in unseen]
-    trial = None if unseen else _observed(name, tracks, floor, camera)
-    return SeenTrial(trial, tracks, "; ".join(notes))
+    if unseen:
+        return SeenTrial(None, tracks, "; ".join(notes))
+    trial = _observed(name, tracks, floor, camera)
+    others = [_observed(name, o, floor, camera) for o in _other_sizes(name, tracks, pictures)]
+    weighted = tuple((one, 1.0) for one in (trial, *others)) if others else ()
+    return SeenTrial(trial, tracks, "; ".join(notes), weighted)
 
 
 # Objects on others.
@@ -237,9 +252,10 @@ def _stacked(
             and _carries(result[other][1], placed)
         ]
         if not below:
-            tops = (result[n][1].extent_z()[1] for n in resting if _carries(result[n][1], placed))
+            # Also what falls is there in the first frame.
+            tops = (result[n][1].extent_z()[1] for n in first if _carries(result[n][1], placed))
             level = max((top for top in tops if top < bottom), default=floor)
-            longer = _grounded(placed, pictures[frames[0]].rays(number), level)
+            longer = _grounded(placed, pictures[frames[0]].rays(number, RAYS), level)
             if number in resting or _rests(number, longer, pictures):
                 result[number] = (frames[0], longer)
             continue
@@ -249,12 +265,23 @@ def _stacked(
         above = [
             n for n in resting if n != number and _stands_on(result[n][1], placed)
         ]  # so far as known
+        first_rays = pictures[frames[0]].rays(support, RAYS)
+        if first_rays is not None and bottom > top:
+            # Its upper end may be hidden by what stands on it.
+            low = result[support][1].extent_z()[0]
+            for higher in _reaching(result[support][1], low, bottom):
+                cost = cost_of(higher, first_rays)
+                if cost < result[support][1].cost + CHANGED / 2:
+                    result[support], top = (frames[0], replace(higher, cost=cost)), bottom
         neighbours = [result[support][1], *(result[n][1] for n in above)]
         center = np.mean([each.middle()[:2] for each in neighbours], axis=0)
         prior = Prior(floor, top, 0.3, (float(center[0]), float(center[1])), 0.05)
-        rays = pictures[frames[0]].rays(number)
+        rays = pictures[frames[0]].rays(number, RAYS)
         if rays is not None:
-            result[number] = (frames[0], refine([placed], rays, prior))
+            longer_too = _reaching(placed, top, placed.extent_z()[1])
+            again = refine([placed, *longer_too], rays, prior)
+            if again.cost < placed.cost + CHANGED / 2:
+                result[number] = (frames[0], again)
     return result
 
 
@@ -270,16 +297,28 @@ def _grounded(placed: Placed, rays: Rays | None, floor: float) -> Placed:
 
     What hides its lower end hides how long it is. It stays as it is where that does not fit.
     """
-    low, high = placed.extent_z()
-    axis = int(np.argmax(np.abs(placed.rotation[2])))
-    if rays is None or low - floor < RAISED or abs(placed.rotation[2, axis]) < UPRIGHT:
+    longer = _reaching(placed, floor, placed.extent_z()[1])
+    if rays is None or not longer:
         return placed
-    scale, before = placed.scale.copy(), placed.middle()
-    scale[axis] *= (high - floor) / (high - low)
-    longer = replace(placed, scale=scale)
-    shift = before - longer.middle() - np.array([0, 0, (low - floor) / 2])
-    found = refine([moved_with(longer, shift)], rays, Prior(floor, floor, 3.0))
+    found = refine(longer, rays, Prior(floor, floor, 3.0))
     return found if found.cost < placed.cost + CHANGED else placed
+
+
+def _reaching(placed: Placed, low: float, high: float) -> list[Placed]:
+    """Return an upright object as one that reaches from a height to another one.
+
+    Nothing if it does so already, or is not upright.
+    """
+    bottom, top = placed.extent_z()
+    axis = int(np.argmax(np.abs(placed.rotation[2])))
+    change = max(bottom - low, high - top)
+    if change < RAISED / 2 or abs(placed.rotation[2, axis]) < UPRIGHT:
+        return []
+    scale, before = placed.scale.copy(), placed.middle()
+    scale[axis] *= (high - low) / (top - bottom)
+    longer = replace(placed, scale=scale)
+    shift = before - longer.middle() + np.array([0, 0, (low + high - bottom - top) / 2])
+    return [moved_with(longer, shift)]
 
 
 def _rests(number: int, placed: Placed, pictures: Mapping[int, SeenFrame]) -> bool:
@@ -345,12 +384,66 @@ def _followed(
             turn = Rotation.from_matrix(poses[-1].rotation @ poses[-2].rotation.T).as_rotvec()
             turned = Rotation.from_rotvec(turn * passed).as_matrix() @ ahead.rotation
             ahead = replace(ahead, rotation=turned)
-            guesses += [ahead, moved_with(ahead, guesses[0].middle() - ahead.middle())]
+            guesses = [ahead, *guesses, moved_with(ahead, guesses[0].middle() - ahead.middle())]
         placed, _ = follow(poses[-1], rays, prior, guesses)
         frames.append(frame)
         poses.append(placed)
         means.append(mean)
     return Track(number, tuple(frames), tuple(poses))
+
+
+def _other_sizes(
+    name: str, tracks: Sequence[Track], pictures: Mapping[int, SeenFrame]
+) -> list[list[Track]]:
+    """Return what the objects may have been, too, where sides are hidden; nothing if none is.
+
+    How long an object is towards a hidden side is drawn from a distribution around what was fitted,
+    and taken if it is seen in no frame.
+    """
+    rays = {(t.number, f): pictures[f].rays(t.number) for t in tracks for f in t.frames}
+    seen = {key: value for key, value in rays.items() if value is not None}
+    sides = {
+        track.number: [
+            (axis, side)
+            for axis in range(3)
+            for side in (-1, 1)
+            if track.placed[0].solid.name in STRETCHED
+            and all(_longer(track, axis, side, f, seen) is not None for f in HIDDEN_BY)
+        ]
+        for track in tracks
+    }
+    if not any(sides.values()):
+        return []
+    rng = generator("seeing", "hidden sides", name)
+    result = []
+    for _ in range(OTHERS):
+        other = []
+        for track in tracks:
+            for axis, side in sides[track.number]:
+                factor = math.exp(SPREAD * rng.standard_normal())
+                track = _longer(track, axis, side, factor, seen) or track
+            other.append(track)
+        result.append(other)
+    return result
+
+
+def _longer(
+    track: Track, axis: int, side: int, factor: float, rays: Mapping[tuple[int, int], Rays]
+) -> Track | None:
+    """Return an object that is longer towards a side by a factor; None where that would be seen."""
+    first, scale = track.placed[0], track.placed[0].scale.copy()
+    scale[axis] *= factor
+    shift = side * (factor - 1) * first.size()[axis] / 2
+    placed = []
+    for frame, before in zip(track.frames, track.placed, strict=True):
+        after = replace(before, scale=scale)
+        middle = before.middle() + shift * before.rotation[:, axis]
+        after = moved_with(after, middle - after.middle())
+        known = rays[track.number, frame]
+        if cost_of(after, known, 0.001) > cost_of(before, known, 0.001) + UNSEEN:
+            return None
+        placed.append(after)
+    return Track(track.number, track.frames, tuple(placed))
 
 
 def center_of_mass(placed: Placed) -> F64:

@@ -32,7 +32,7 @@ from physion.models.seeing.scenes import SeenTrial, see_trial
 from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine, simulate
 from physion.rendering.renderer import Renderer
 
-VERSION = 7
+VERSION = 8
 """To be raised with every change of the code that can alter a prediction."""
 KEPT = 16
 """Trials whose scenes are kept in memory, besides the last batch."""
@@ -93,11 +93,12 @@ class SeeingSimulation(Model):
 
     def __init__(self, settings: SeeingSettings) -> None:
         self.settings = settings
+        stride = 2 if self._uncertain else 1
         self.spec = Spec(
             inputs=("ids", *("depth",) * settings.depth, "camera"),
             image_size=settings.image_size,
-            stride=2,
-            context=LAST_OBSERVED // 2 + 1,
+            stride=stride,
+            context=LAST_OBSERVED // stride + 1,
         )
         self.samples, self.seed = settings.samples, settings.seed
         self._engine: Engine | None = None

@@ -6,14 +6,14 @@ point is x = p + R S u, and its distance in metres from the plane, outside posit
 
     m . x - e,    m = R S^-1 n / |S^-1 n|,    e = d / |S^-1 n| + m . p.
 
-A ball is |u| <= 1/2 about its centre; with w = S^-1 u / |u| its distance is (|u| - 1/2) / |w|, to
-first order.
+A ball is |u| <= b about its centre, with b the mean radius of the drawn one, which has corners at
+1/2; with w = S^-1 u / |u| its distance is (|u| - b) / |w|, to first order.
 
 Residual of a ray o + t v that sees the object at depth D: the distance of the observed point from
 the plane through which the ray enters the first piece that it meets (point to plane). Where that is
 positive, or the ray meets nothing, it is the least over pieces of the largest distance from a
 plane, which is at most the true distance. Residual of a free ray: for each piece that it meets
-before D - 4 mm, the depth below the nearest plane halfway between entry and exit, or D; the largest
+before D - 1 mm, the depth below the nearest plane halfway between entry and exit, or D; the largest
 counts.
 
 The fit minimises the sum of q / (1 + q), q = (r / c)^2 (Geman and McClure), over position, rotation
@@ -35,12 +35,20 @@ from numpy.typing import NDArray
 
 from physion.models.seeing.pixels import Rays
 from physion.numerics.kernel import kernel
-from physion.scenes.shapes.primitives import shape
+from physion.scenes.shapes.primitives import (
+    PIPE_INNER,
+    ROUND_SEGMENTS,
+    pipe_section,
+    ring_pieces,
+    shape,
+)
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-CLEARANCE = 0.004
+BALL = 0.4973
+"""Radius of the ball that has the volume of the drawn one."""
+CLEARANCE = 0.001
 """Metres before what is seen in which an object may still be on a free ray."""
 
 
@@ -90,12 +98,19 @@ TURNS = {
 
 @cache
 def solid(name: str) -> Solid:
-    """Return a shape of the library; what has no cavity is the convex hull of its mesh."""
+    """Return a shape of the library as it is drawn.
+
+    What has no cavity is the convex hull of its mesh. A pipe has a piece for each of its sides: its
+    collision pieces have half as many. Bowls are made of their collision pieces.
+    """
     from scipy.spatial import ConvexHull
 
     built = shape(name)
     corners = built.mesh.vertices
-    parts = [corners] if len(built.pieces) == 1 else [p.mesh.vertices for p in built.pieces]
+    pieces = built.pieces
+    if name == "pipe":
+        pieces = ring_pieces([np.array(pipe_section(PIPE_INNER))], ROUND_SEGMENTS, 1)
+    parts = [corners] if len(pieces) == 1 else [p.mesh.vertices for p in pieces]
     planes, starts = [np.zeros((0, 4))], [0]
     for part in [] if name == "sphere" else parts:
         # The hull's triangles of one face have the same plane, but for rounding.
@@ -161,7 +176,8 @@ class Prior:
     """What is expected of a pose before it is fitted; weights are of residuals in metres.
 
     - ``floor``: height that nothing is below. ``rest``: height of what the object stands on, with
-      ``rest_weight``. ``center``: x and y of its middle, with ``center_weight``.
+      ``rest_weight``. ``center``: x and y of its middle, with ``center_weight``. ``equal``: weight
+      of equal scales.
     """
 
     floor: float = 0.0
@@ -169,12 +185,12 @@ class Prior:
     rest_weight: float = 0.0
     center: tuple[float, float] = (0.0, 0.0)
     center_weight: float = 0.0
+    equal: float = 1.0
 
     def values(self) -> F64:
-        """Return the numbers (6,) that the kernels take."""
-        return np.array(
-            [self.floor, self.rest, self.rest_weight, *self.center, self.center_weight], np.float64
-        )
+        """Return the numbers (7,) that the kernels take."""
+        center = (*self.center, self.center_weight)
+        return np.array([self.floor, self.rest, self.rest_weight, *center, self.equal], np.float64)
 
 
 POSE = np.eye(9)[:, :6]
@@ -312,7 +328,7 @@ def _residuals(
                 ]
             a = ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2]
             b = ray[0] * local[0] + ray[1] * local[1] + ray[2] * local[2]
-            c = local[0] * local[0] + local[1] * local[1] + local[2] * local[2] - 0.25
+            c = local[0] * local[0] + local[1] * local[1] + local[2] * local[2] - BALL * BALL
             square = b * b - a * c
             hit = square > 0.0
             entry = leave = 0.0
@@ -344,7 +360,7 @@ def _residuals(
                 w[i] = u[i] / scale[i]
                 length += w[i] * w[i]
             size = np.sqrt(size)
-            distance = (size - 0.5) * size / max(np.sqrt(length), 1e-12)
+            distance = (size - BALL) * size / max(np.sqrt(length), 1e-12)
             out[n] = distance if on[n] else max(-distance, 0.0)
             continue
         for k in range(len(world)):
@@ -419,8 +435,8 @@ def _priors(
         for k in range(len(corners)):
             lowest = min(lowest, a * corners[k, 0] + b * corners[k, 1] + c * corners[k, 2])
     lowest += position[2]
-    out[0] = 0.004 * (logs[0] - logs[1])
-    out[1] = 0.002 * (logs[2] - 0.5 * (logs[0] + logs[1]))
+    out[0] = 0.004 * prior[6] * (logs[0] - logs[1])
+    out[1] = 0.002 * prior[6] * (logs[2] - 0.5 * (logs[0] + logs[1]))
     out[2] = 3.0 * min(0.0, lowest - prior[0])
     out[3] = prior[2] * (lowest - prior[1])
     for i in range(2):
@@ -518,7 +534,7 @@ def _fit(
         Start, and result: pose and logarithms of the scales.
     free : (9, K)
         Directions in which parameters change together.
-    prior : (6,)
+    prior : (7,)
         See `Prior.values`.
     wide, narrow : float
         First and last c, metres. ``steps``: largest number of steps.

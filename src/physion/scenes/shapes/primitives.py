@@ -471,12 +471,12 @@ def _torus_section(inner: float) -> Outline:
 
 @shapes.register("pipe")
 def _pipe() -> Shape:
-    mesh = revolve(_pipe_section(PIPE_INNER), ROUND_SEGMENTS, closed=True, smooth=CURVED)
-    pieces = ring_pieces([np.array(_pipe_section(PIPE_PIECE_INNER))], PIPE_SECTORS, 1)
+    mesh = revolve(pipe_section(PIPE_INNER), ROUND_SEGMENTS, closed=True, smooth=CURVED)
+    pieces = ring_pieces([np.array(pipe_section(PIPE_PIECE_INNER))], PIPE_SECTORS, 1)
     return Shape("pipe", mesh, pieces, hollow=True)
 
 
-def _pipe_section(inner: float) -> Outline:
+def pipe_section(inner: float) -> Outline:
     """Return the cross-section of a pipe as (radius, height)."""
     return [(inner, 0.0), (0.5, 0.0), (0.5, 1.0), (inner, 1.0)]
 
