@@ -15,10 +15,11 @@ from __future__ import annotations
 
 import argparse
 import io
+import itertools
 import json
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
@@ -56,7 +57,6 @@ MODELS = (
 )  # fmt: skip
 EACH = 25
 """Trials of a file."""
-LOOK = "redyellow"
 VISIBLE = 0.0005
 """Smallest fraction of the first frame that agent and patient cover, as in `physion generate`."""
 SET = "intuition"
@@ -91,16 +91,17 @@ def encoder(name: str, **settings: Any) -> Any:
 
 @dataclass(frozen=True)
 class Kept:
-    """What is kept of trials: features of ``models``."""
+    """What is kept of trials: features of ``models``, seen in the colours of ``look``."""
 
     folder: Path
     models: Sequence[str] = MODELS
+    look: str = "redyellow"
 
 
 def see(motion: Motion, kept: Kept) -> dict[str, NDArray[Any]]:
     """Return the features of a motion by model."""
     name = motion.scene.name
-    motions, looks = {name: cut_motion(motion)}, {name: LOOK}
+    motions, looks = {name: cut_motion(motion)}, {name: kept.look}
     drawn: dict[int, Pictures] = {}
 
     def read(spec: Spec) -> Batch:
@@ -118,24 +119,28 @@ def see(motion: Motion, kept: Kept) -> dict[str, NDArray[Any]]:
             found = model.encode(batch.to("cpu") if is_network(model) else batch)
         return np.asarray(found[0], np.float32)
 
-    return {model: features(encoder(model)) for model in kept.models}
+    cued = {"intuition-pixels": {"cue": True}} if kept.look == "free" else {}
+    return {model: features(encoder(model, **cued.get(model, {}))) for model in kept.models}
 
 
-def own_trial(scenario: str, number: int, kept: Kept) -> Seen:
-    """Return one own trial, the first of its samples that is accepted."""
+def sampled(name: str, scenario: str, number: int) -> Iterator[tuple[Scene, str]]:
+    """Yield samples of one training trial of a set, and their configurations."""
     presets = [p for p in load_presets(scenario).values() if p.official]
-    engine, attempt = make_engine("physion"), -1
-    while True:
-        attempt += 1
+    for attempt in itertools.count():
         preset = presets[(number + attempt // 40) % len(presets)]
-        seed = trial_seed(SET, scenario, "training", number, attempt)
+        seed = trial_seed(name, scenario, "training", number, attempt)
         try:
             scene = sample_scene(scenario, seed, preset.params)
         except BadSceneError:
             continue
-        if split_of(scene.physics_digest()) != "training":
-            continue
-        scene = replace(scene, name=f"{scenario}_training_{number:05d}")
+        if split_of(scene.physics_digest()) == "training":
+            yield replace(scene, name=f"{scenario}_training_{number:05d}"), preset.official or ""
+
+
+def own_trial(scenario: str, number: int, kept: Kept) -> Seen:
+    """Return one own trial, the first of its samples that is accepted."""
+    engine = make_engine("physion")
+    for scene, configuration in sampled(SET, scenario, number):
         trajectory = engine.simulate(scene, until_contact=True)
         labels = label_contact(scene, trajectory)
         if labels.observed or len(trajectory) < OBSERVED_FRAMES:
@@ -143,9 +148,10 @@ def own_trial(scenario: str, number: int, kept: Kept) -> Seen:
         features = see(Motion(scene, trajectory), kept)
         if visible(features["intuition-masks"]):
             return Seen(
-                scene.name, scenario, preset.official or "", labels.contact, False,
-                scene.to_json(), features,
+                scene.name, scenario, configuration, labels.contact, False, scene.to_json(),
+                features,
             )  # fmt: skip
+    raise AssertionError("samples do not end")
 
 
 def visible(tokens: NDArray[np.float32]) -> bool:
@@ -344,6 +350,10 @@ def main() -> None:
     parser.add_argument("--official", action="store_true")
     parser.add_argument("--stored", type=Path, help="dataset whose trials are taken, too")
     parser.add_argument("--models", nargs="*", choices=MODELS, default=list(MODELS))
+    parser.add_argument(
+        "--look", choices=("redyellow", "free"), default="redyellow",
+        help="colours; in free ones intuition-pixels has a cue",
+    )  # fmt: skip
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=math.inf, help="stop after this time")
     options = parser.parse_args()
@@ -352,7 +362,7 @@ def main() -> None:
     parts = range(-(-len(official_scenes()) // EACH)) if options.official else range(0)
     # Masks tell whether agent and patient are visible in own trials; stored ones were chosen so.
     masks = ("intuition-masks",) if options.trials else ()
-    kept = Kept(options.folder, tuple(dict.fromkeys((*options.models, *masks))))
+    kept = Kept(options.folder, tuple(dict.fromkeys((*options.models, *masks))), options.look)
     count = 0
     if options.stored:
         count = len(opened(options.stored)[0])

@@ -4,11 +4,11 @@
         [--depth-error 0.02 | --no-depth] [--own DATASET] [--known] [--against FILES] [--write]
     OMP_NUM_THREADS=1 python benchmarks/models/seeing.py --priors
 
-Official stimuli that people saw, without cloth and without a contact in the observed part: the
-first ``--each`` with a contact and as many without one, of every scenario, by the hash of their
-names. Of each, the observed part is simulated and rendered, scene and state are fitted to masks and
-depth, and both the fitted and the true state are simulated with the default noise. One line per
-trial is appended to FOLDER/seeing.jsonl; an interrupted run continues there, and --known prints
+Official stimuli that people saw, without a contact in the observed part: the first ``--each`` with
+a contact and as many without one, of every one of ``--scenarios`` (the rigid ones), by the hash of
+their names. Of each, the observed part is simulated and rendered, scene and state are fitted to
+masks and depth, and both the fitted and the true state are simulated with the default noise. One
+line per trial is appended to FOLDER/seeing.jsonl; an interrupted run continues there, and --known prints
 what it has measured so far, with --version N by an earlier version of the model. Printed are, by
 scenario:
 
@@ -22,7 +22,8 @@ scenario:
    trials, and without those that were looked at while the fit was written (``LOOKED_AT``).
 4. Likeness to people, by `physion.compare`.
 5. Errors at the last observed frame, median and 90 % quantile: centre of mass and velocity of the
-   agent, centre of the other movable objects; and how many have the right shape.
+   agent, centre of the other movable objects; how many have the right shape; and seconds of
+   processor time of an answer.
 6. What is wrong with trials in which the answer from the fitted state is worse or better than the
    one from the true state, and with the others.
 
@@ -436,7 +437,10 @@ def tables(rows: Sequence[ROW], own: bool) -> str:
         )
         columns = {NAMES[k]: f"{hit[k].mean():.3f}" for k in NAMES if k not in ("fitted", "true")}
         others.append({"scenario": name, **columns})
-        objects = pd.DataFrame([o for listed in part["objects"].dropna() for o in listed])
+        objects = pd.DataFrame(
+            [o for listed in part["objects"].dropna() for o in listed],
+            columns=["agent", "shape", "center", "velocity"],
+        ).astype({"agent": bool})
         agent, rest = objects[objects["agent"]], objects[~objects["agent"]]
         errors.append(
             {
@@ -446,8 +450,11 @@ def tables(rows: Sequence[ROW], own: bool) -> str:
                 "others, centre, cm": _quantiles(100 * rest["center"]),
                 "shape right": f"{int(objects['shape'].sum())} of {len(objects)}",
                 "trials with a note": int((part["note"] != "").sum()),
+                **({"seconds": _quantiles(part["seconds"])} if "seconds" in part else {}),
             }
         )
+    if len(groups) > 2:
+        answers.append(_mean_of_scenarios(table, hits))
     fresh = hits.index[~table["looked at"]]
     chosen = {f"all ({len(hits)})": hits.index}
     if len(fresh) < len(hits):
@@ -465,6 +472,22 @@ def tables(rows: Sequence[ROW], own: bool) -> str:
     people = [] if own else [_people(table)]
     parts = [answers, others, differences, *people, errors, _properties(table)]
     return "\n\n".join(_markdown(rows) for rows in parts if rows) + "\n"
+
+
+def _mean_of_scenarios(table: pd.DataFrame, hits: pd.DataFrame) -> ROW:
+    """Return the row of the mean over scenarios, each with the same weight."""
+    means = hits[["fitted", "true"]].groupby(table["scenario"])
+    errors = means.sem()
+    return {
+        "scenario": "mean of scenarios",
+        "trials": len(table),
+        **{
+            f"{NAMES[k]} (se)": f"{means.mean()[k].mean():.3f} "
+            f"({np.sqrt((errors[k] ** 2).sum()) / len(errors):.3f})"
+            for k in ("fitted", "true")
+        },
+        **dict.fromkeys(("AUC, fitted", "AUC, true", "agreement", "change of P"), "-"),
+    }
 
 
 def _people(table: pd.DataFrame) -> list[ROW]:
@@ -666,6 +689,9 @@ def main() -> None:
         error += f" --version {options.version}" * (options.version != VERSION)
         if options.against:
             error += " --known --write --against " + " ".join(p.name for p in options.against)
+        if tuple(options.scenarios) != RIGID:
+            name += "-" + "-".join(options.scenarios)
+            error += " --scenarios " + " ".join(options.scenarios)
         (RESULTS / f"{name}.md").write_text(
             f"# Seeing by simulation\n\n`python benchmarks/models/seeing.py FOLDER{error}`, "
             f"{len(rows)} trials, {today}, version {options.version} of the model, {SAMPLES} "

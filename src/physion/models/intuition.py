@@ -289,6 +289,8 @@ class IntuitionSettings(SizedSettings):
     - ``noise``: standard deviation of noise on the values of tokens in training, in standard
       deviations of a value.
     - ``members``: networks, trained at the same time, whose probabilities are averaged.
+    - ``cue``: from pixels only: objects may have any colours, and the masks of the first frame say
+      which are agent and patient, as a cue told people. Later masks are not looked at.
     """
 
     model: str = "intuition-masks"
@@ -300,6 +302,7 @@ class IntuitionSettings(SizedSettings):
     dropout: float = 0.1
     noise: float = 0.02
     members: int = 1
+    cue: bool = False
 
     sizes: ClassVar[Sizes] = {"small": {}}
 
@@ -317,6 +320,10 @@ class IntuitionSettings(SizedSettings):
             raise BadInputError(
                 f"{self.model}: image_size must be {SIDE}, since objects are found in pictures of "
                 f"this size only, not {self.image_size}"
+            )
+        if self.cue and self.model != f"intuition-{PIXELS}":
+            raise BadInputError(
+                f"{self.model} knows agent and patient; cue=true is for intuition-{PIXELS}"
             )
         if self.width % self.heads:
             raise BadInputError(
@@ -420,8 +427,8 @@ class Intuition(TorchModel):
         self.kind = settings.model.partition("-")[2]
         self.settings, self.seed, self.window = settings, settings.seed, CONTEXT
         self.spec = Spec(
-            inputs=(INPUTS[self.kind],), image_size=settings.image_size, stride=STRIDE,
-            context=CONTEXT, future=0, framewise=False,
+            inputs=(INPUTS[self.kind], *("ids",) * settings.cue), image_size=settings.image_size,
+            stride=STRIDE, context=CONTEXT, future=0, framewise=False,
         )  # fmt: skip
         self.view = VIEWS[STATE if self.kind == STATE else MASK]
         tracked, places = len(self.view.track), len(self.view.place)
@@ -497,7 +504,8 @@ class Intuition(TorchModel):
         """Return for each trial whether it never shows agent or patient, or too many objects."""
         most, notes = self.settings.objects, []
         ids = None if self.kind == STATE else self._ids(batch)
-        roles = "red agent or yellow patient" if self.kind == PIXELS else "agent or patient"
+        by_color = self.kind == PIXELS and not self.settings.cue
+        roles = "red agent or yellow patient" if by_color else "agent or patient"
         if ids is not None:
             tokens = np.stack([mask_tokens(one, most) for one in ids])
             batch = replace(batch, features=torch.from_numpy(tokens).flatten(2).to(self.device))
@@ -584,7 +592,10 @@ class Intuition(TorchModel):
 
     def _segmentation(self) -> list[str]:
         """Return what the masks depend on that are found in pictures; nothing of other models."""
-        return [segmentation_version(), torch.__version__] if self.kind == PIXELS else []
+        if self.kind != PIXELS:
+            return []
+        look = "free" if self.settings.cue else "redyellow"
+        return [segmentation_version(look), torch.__version__]
 
     def _check_frames(self, batch: Batch) -> None:
         """Raise `BadInputError` for other frames than those that the model learns from."""
@@ -600,20 +611,24 @@ class Intuition(TorchModel):
 
     def _ids(self, batch: Batch) -> NDArray[np.uint8]:
         """Return the objects of pixels (B, T, H, W), true or found, after a check of their size."""
-        size, name = self.settings.image_size, INPUTS[self.kind]
-        given = getattr(batch, name)
-        if given is None or tuple(given.shape[2:4]) != (size, size):
-            found = "none" if given is None else tuple(given.shape[2:4])
-            pixels = self.kind == PIXELS
-            what = "pictures" if pixels else "objects of pixels"
-            raise BadInputError(
-                f"{self.name}: {what} (input {name}) of {size} x {size} are needed, not "
-                f"{found}; give clips of this size" + (", or --option image_size") * (not pixels)
-            )
-        values = np.asarray(given.cpu() if isinstance(given, Tensor) else given)
+        size, seen = self.settings.image_size, {}
+        for name in self.spec.inputs:
+            given = getattr(batch, name)
+            if given is None or tuple(given.shape[2:4]) != (size, size):
+                found = "none" if given is None else tuple(given.shape[2:4])
+                what = "pictures" if name == "rgb" else "objects of pixels"
+                raise BadInputError(
+                    f"{self.name}: {what} (input {name}) of {size} x {size} are needed, not "
+                    f"{found}; give clips of this size"
+                    + ", or --option image_size"
+                    * (self.kind == MASK)
+                )
+            seen[name] = np.asarray(given.cpu() if isinstance(given, Tensor) else given)
         if self.kind == MASK:
-            return values
-        return np.stack([segment(pictures) for pictures in values])
+            return seen["ids"]
+        # Of true masks only those of the first frame are looked at.
+        cues = [of[0] for of in seen["ids"]] if self.settings.cue else [None] * len(seen["rgb"])
+        return np.stack([segment(shown, cue) for shown, cue in zip(seen["rgb"], cues, strict=True)])
 
     def _counts(self, batch: Batch, ids: NDArray[np.uint8] | None) -> Sequence[int]:
         """Return the number of objects of every clip, which may be more than there are tokens."""

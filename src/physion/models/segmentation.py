@@ -12,8 +12,10 @@ an object that was last seen at time s is continued by the one nearest to where 
 with its centre c, velocity v, and size a (square root of the area, halves of width and height);
 pairs are chosen so that the sum of d is least, and none is farther apart than `FAR`.
 
-The network was trained on own pictures in red and yellow, of 96 pixels a side, with true masks
-(``benchmarks/models/train_segmentation.py``).
+The networks were trained on own pictures of 96 pixels a side, with true masks
+(``benchmarks/models/train_segmentation.py``): one in red and yellow, and one in any colours, for
+which everything is another object. With it a cue in the first picture says which are agent and
+patient, and they are followed as the others are.
 """
 
 from __future__ import annotations
@@ -36,8 +38,9 @@ F64 = NDArray[np.float64]
 
 VERSION = 1
 """Counts changes of this code that change what is found."""
-FOLDER, WEIGHTS = "physion.data.segmentation", "segmentation.safetensors"
-"""Package and file of the weights."""
+FOLDER = "physion.data.segmentation"
+WEIGHTS = {"redyellow": "segmentation.safetensors", "free": "segmentation-free.safetensors"}
+"""Package and files of the weights, by the look of the pictures."""
 SIDE = 96
 """Pixels per side of the pictures."""
 CLASSES = (SCENERY_ID, AGENT_ID, PATIENT_ID, FIRST_OTHER_ID)
@@ -118,15 +121,42 @@ def network_input(rgb: NDArray[np.uint8]) -> Tensor:
     return torch.cat([colors, torch.from_numpy(np.stack(color_masks(rgb), 1)).float()], 1)
 
 
-def segment(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the objects of pixels (T, H, W) of the pictures of a trial (T, `SIDE`, `SIDE`, 3).
+def segment(rgb: NDArray[np.uint8], cue: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+    """Return the objects of pixels (T, H, W) of the pictures of a trial.
 
     Numbers are as in ``Batch.ids``: `AGENT_ID`, `PATIENT_ID`, from `FIRST_OTHER_ID` the others,
     each with the same number in all pictures, and `SCENERY_ID`.
+
+    Parameters
+    ----------
+    rgb
+        Pictures (T, `SIDE`, `SIDE`, 3): agent red and patient yellow, or, with a cue, all objects
+        in any colours.
+    cue
+        Which pixels (`SIDE`, `SIDE`) of the first picture are agent and patient, in the numbers of
+        ``Batch.ids``; others count for nothing.
     """
+    look = "redyellow" if cue is None else "free"
     with torch.no_grad():
-        found = _network()(network_input(rgb)).double().numpy()
-    return follow(np.stack([group(of[: len(CLASSES)], of[len(CLASSES) :]) for of in found]))
+        found = _network(look)(network_input(rgb)).double().numpy()
+    ids = np.stack([group(of[: len(CLASSES)], of[len(CLASSES) :]) for of in found])
+    return follow(ids) if cue is None else _cued(ids, cue)
+
+
+def _cued(ids: NDArray[np.uint8], cue: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return followed objects (T, H, W), of which a cue says in the first picture who they are."""
+    # Whatever color says of agent and patient does not count.
+    ids = np.where(ids < FIRST_OTHER_ID, SCENERY_ID, ids)
+    roles = (AGENT_ID, PATIENT_ID)
+    for role in roles:
+        ids[0][cue == role] = np.iinfo(np.uint8).max - role
+    out = follow(ids)
+    followed = out.copy()
+    for role in roles:
+        numbers = followed[0][cue == role]
+        if numbers.any():
+            out[followed == numbers.max()] = role
+    return out
 
 
 def group(logits: F64, offsets: F64) -> NDArray[np.uint8]:
@@ -215,11 +245,11 @@ def _described(mask: NDArray[np.bool_]) -> F64:
 
 
 @cache
-def _network() -> SegmentationNetwork:
+def _network(look: str) -> SegmentationNetwork:
     """Return the network with the weights of the package."""
-    return load_packaged(SegmentationNetwork, FOLDER, WEIGHTS)
+    return load_packaged(SegmentationNetwork, FOLDER, WEIGHTS[look])
 
 
-def segmentation_version() -> str:
+def segmentation_version(look: str = "redyellow") -> str:
     """Return the version of this code, and the start of the SHA-256 of the weights."""
-    return f"{VERSION} {packaged_sha256(FOLDER, WEIGHTS)[:12]}"
+    return f"{VERSION} {packaged_sha256(FOLDER, WEIGHTS[look])[:12]}"

@@ -32,7 +32,6 @@ from scipy.spatial.transform import Rotation
 
 from physion.clips.batch import AGENT_ID, LAST_OBSERVED, PATIENT_ID, SCENERY_ID
 from physion.core.errors import BadInputError
-from physion.core.seeds import generator
 from physion.models.gaps import gap_of_bodies
 from physion.models.noisy_simulation import ObservedTrial
 from physion.models.seeing.bodies import alike, find, follow, moved_with, refine
@@ -92,11 +91,6 @@ CHANGED = 0.004
 """Cost by which a later frame must fit worse before the size is questioned."""
 TOUCHING = 0.003
 """Gap in metres at which objects count as touching."""
-STRETCHED, HIDDEN_BY = ("cube", "cylinder"), (0.9, 1.1)
-"""Shapes whose sides may be hidden, and factors of the length that are not seen then."""
-SPREAD, UNSEEN, OTHERS = 0.3, 0.001, 9
-"""Standard deviation of the logarithm of a hidden length, as of the two widths of boxes in our
-towers; cost by which it may fit worse; and how many other scenes are drawn."""
 FASTEST_SPIN = 7.0
 """Radians per second that the engine allows."""
 RAISED = 0.01
@@ -221,10 +215,7 @@ def see_trial(
     notes += [f"the {word} is never seen" for word in unseen]
     if unseen:
         return SeenTrial(None, tracks, "; ".join(notes))
-    trial = _observed(name, tracks, floor, camera)
-    others = [_observed(name, o, floor, camera) for o in _other_sizes(name, tracks, pictures)]
-    weighted = tuple((one, 1.0) for one in (trial, *others)) if others else ()
-    return SeenTrial(trial, tracks, "; ".join(notes), weighted)
+    return SeenTrial(_observed(name, tracks, floor, camera), tracks, "; ".join(notes))
 
 
 # Objects on others.
@@ -390,60 +381,6 @@ def _followed(
         poses.append(placed)
         means.append(mean)
     return Track(number, tuple(frames), tuple(poses))
-
-
-def _other_sizes(
-    name: str, tracks: Sequence[Track], pictures: Mapping[int, SeenFrame]
-) -> list[list[Track]]:
-    """Return what the objects may have been, too, where sides are hidden; nothing if none is.
-
-    How long an object is towards a hidden side is drawn from a distribution around what was fitted,
-    and taken if it is seen in no frame.
-    """
-    rays = {(t.number, f): pictures[f].rays(t.number) for t in tracks for f in t.frames}
-    seen = {key: value for key, value in rays.items() if value is not None}
-    sides = {
-        track.number: [
-            (axis, side)
-            for axis in range(3)
-            for side in (-1, 1)
-            if track.placed[0].solid.name in STRETCHED
-            and all(_longer(track, axis, side, f, seen) is not None for f in HIDDEN_BY)
-        ]
-        for track in tracks
-    }
-    if not any(sides.values()):
-        return []
-    rng = generator("seeing", "hidden sides", name)
-    result = []
-    for _ in range(OTHERS):
-        other = []
-        for track in tracks:
-            for axis, side in sides[track.number]:
-                factor = math.exp(SPREAD * rng.standard_normal())
-                track = _longer(track, axis, side, factor, seen) or track
-            other.append(track)
-        result.append(other)
-    return result
-
-
-def _longer(
-    track: Track, axis: int, side: int, factor: float, rays: Mapping[tuple[int, int], Rays]
-) -> Track | None:
-    """Return an object that is longer towards a side by a factor; None where that would be seen."""
-    first, scale = track.placed[0], track.placed[0].scale.copy()
-    scale[axis] *= factor
-    shift = side * (factor - 1) * first.size()[axis] / 2
-    placed = []
-    for frame, before in zip(track.frames, track.placed, strict=True):
-        after = replace(before, scale=scale)
-        middle = before.middle() + shift * before.rotation[:, axis]
-        after = moved_with(after, middle - after.middle())
-        known = rays[track.number, frame]
-        if cost_of(after, known, 0.001) > cost_of(before, known, 0.001) + UNSEEN:
-            return None
-        placed.append(after)
-    return Track(track.number, track.frames, tuple(placed))
 
 
 def center_of_mass(placed: Placed) -> F64:
