@@ -253,6 +253,34 @@ def test_pixels_become_the_tokens_of_the_masks_that_are_found() -> None:
     assert model.encoder_digest() != true.encoder_digest()
 
 
+def test_with_a_cue_only_the_masks_of_the_first_frame_count() -> None:
+    made = sample_scene("drop", 7003)
+    seen = Motion(made, simulate(made, frames=45))
+    renderer = MotionRenderer({"new": seen}, ("rgb", "ids"), 96, 1, {"new": "free"})
+    drawn = renderer.read("new", FRAMES)
+    model: Any = build_model("intuition-pixels", cue=True)
+    assert model.spec.inputs == ("rgb", "ids")
+    batch = replace(pictures(drawn["rgb"][None], ["new"]), ids=drawn["ids"][None])
+    tokens = model.encode(batch)
+    assert np.array_equal(
+        tokens[0].reshape(15, 8, -1), mask_tokens(segment(drawn["rgb"], drawn["ids"][0]), 8)
+    )
+    later = drawn["ids"].copy()
+    later[1:] = 0
+    assert torch.equal(model.encode(replace(batch, ids=later[None])), tokens)
+    assert model.notes(batch) == [""]
+    none = replace(batch, ids=np.zeros_like(drawn["ids"])[None])
+    with torch.no_grad():
+        assert model.predict(none).tolist() == [float(model.base_rate)]
+    assert model.notes(none) == ["agent or patient never visible: base rate"]
+    with pytest.raises(BadInputError, match=r"\(input ids\) of 96 x 96 are needed, not none"):
+        model.predict(pictures(drawn["rgb"][None], ["new"]))
+    with pytest.raises(BadInputError, match="cue=true is for intuition-pixels"):
+        build_model("intuition-masks", cue=True)
+    plain = build_model("intuition-pixels")
+    assert plain.digest() != model.digest() and plain.encoder_digest() != model.encoder_digest()
+
+
 def test_pictures_without_red_and_yellow_have_the_base_rate_and_a_note() -> None:
     model: Any = build_model("intuition-pixels", weights="random")
     model.base_rate.fill_(0.25)

@@ -10,7 +10,7 @@ import pytest
 
 from physion.clips.batch import Motion
 from physion.clips.rendered import MotionRenderer
-from physion.models.segmentation import CLASSES, OFFSET, SIDE, follow, group, segment
+from physion.models.segmentation import CLASSES, OFFSET, SIDE, WEIGHTS, follow, group, segment
 from physion.physics.engine import simulate
 from physion.scenes.sampling.sample import sample_scene
 
@@ -132,8 +132,30 @@ def test_the_trained_network_finds_the_objects_of_new_scenes(scenario: str) -> N
     assert min(own, default=3) >= 3 and len(set(own)) >= 0.7 * len(own)
 
 
-def test_weights_have_a_card_and_are_small() -> None:
+@pytest.mark.parametrize("scenario", ["dominoes", "drop", "collide"])
+def test_a_cue_in_the_first_frame_is_enough_in_any_colors(scenario: str) -> None:
+    scene = sample_scene(scenario, 7003)
+    motion = Motion(scene, simulate(scene, frames=45))
+    frames = np.arange(2, 45, 3)
+    reader = MotionRenderer({"new": motion}, ("rgb", "ids"), SIDE, 1, {"new": "free"})
+    drawn = reader.read("new", frames)
+    true = drawn["ids"]
+    found = segment(drawn["rgb"], true[0])
+    for role in (1, 2):
+        for mask, ours in zip(true == role, found == role, strict=True):
+            if mask.sum() >= 30:
+                assert (ours & mask).sum() > 0.5 * (ours | mask).sum()
+    # Without the cue nobody is agent or patient, whatever the colours.
+    assert not np.isin(segment(drawn["rgb"], np.zeros_like(true[0])), (1, 2)).any()
+    # A cue that says the opposite is believed.
+    exchanged = np.select([true[0] == 1, true[0] == 2], [2, 1], 0).astype(np.uint8)
+    other = segment(drawn["rgb"], exchanged)
+    assert ((other == 2) == (found == 1)).mean() > 0.99
+
+
+@pytest.mark.parametrize("name", WEIGHTS.values())
+def test_weights_have_a_card_and_are_small(name: str) -> None:
     folder = files("physion.data.segmentation")
-    assert len(folder.joinpath("segmentation.safetensors").read_bytes()) < 1_000_000
-    card = folder.joinpath("segmentation.md").read_text()
+    assert len(folder.joinpath(name).read_bytes()) < 1_000_000
+    card = folder.joinpath(name.replace(".safetensors", ".md")).read_text()
     assert "train_segmentation.py" in card and "intersection over union" in card
