@@ -8,18 +8,19 @@ touch, and drawn at the observed frames. Of trials with the digest of a training
 contact in the observed part, and with agent and patient visible in the first frame, the features of
 all `MODELS` are written to FOLDER/own, in files of `EACH` trials. With --official the same of the
 stimuli that people saw goes to FOLDER/official; with --stored the training trials of a dataset go
-to FOLDER/own, but for those with the scene of an official one. The same command continues.
+to FOLDER/own, but for those with the scene of an official one. With --look free objects have the
+colours of their scenes, and intuition-pixels has a cue in the first frame. The same command
+continues.
 """
 
 from __future__ import annotations
 
 import argparse
 import io
-import itertools
 import json
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
@@ -119,28 +120,28 @@ def see(motion: Motion, kept: Kept) -> dict[str, NDArray[Any]]:
             found = model.encode(batch.to("cpu") if is_network(model) else batch)
         return np.asarray(found[0], np.float32)
 
-    cued = {"intuition-pixels": {"cue": True}} if kept.look == "free" else {}
-    return {model: features(encoder(model, **cued.get(model, {}))) for model in kept.models}
-
-
-def sampled(name: str, scenario: str, number: int) -> Iterator[tuple[Scene, str]]:
-    """Yield samples of one training trial of a set, and their configurations."""
-    presets = [p for p in load_presets(scenario).values() if p.official]
-    for attempt in itertools.count():
-        preset = presets[(number + attempt // 40) % len(presets)]
-        seed = trial_seed(name, scenario, "training", number, attempt)
-        try:
-            scene = sample_scene(scenario, seed, preset.params)
-        except BadSceneError:
-            continue
-        if split_of(scene.physics_digest()) == "training":
-            yield replace(scene, name=f"{scenario}_training_{number:05d}"), preset.official or ""
+    cue = {"cue": True} if kept.look == "free" else {}
+    return {
+        model: features(encoder(model, **cue if model == "intuition-pixels" else {}))
+        for model in kept.models
+    }
 
 
 def own_trial(scenario: str, number: int, kept: Kept) -> Seen:
     """Return one own trial, the first of its samples that is accepted."""
-    engine = make_engine("physion")
-    for scene, configuration in sampled(SET, scenario, number):
+    presets = [p for p in load_presets(scenario).values() if p.official]
+    engine, attempt = make_engine("physion"), -1
+    while True:
+        attempt += 1
+        preset = presets[(number + attempt // 40) % len(presets)]
+        seed = trial_seed(SET, scenario, "training", number, attempt)
+        try:
+            scene = sample_scene(scenario, seed, preset.params)
+        except BadSceneError:
+            continue
+        if split_of(scene.physics_digest()) != "training":
+            continue
+        scene = replace(scene, name=f"{scenario}_training_{number:05d}")
         trajectory = engine.simulate(scene, until_contact=True)
         labels = label_contact(scene, trajectory)
         if labels.observed or len(trajectory) < OBSERVED_FRAMES:
@@ -148,10 +149,9 @@ def own_trial(scenario: str, number: int, kept: Kept) -> Seen:
         features = see(Motion(scene, trajectory), kept)
         if visible(features["intuition-masks"]):
             return Seen(
-                scene.name, scenario, configuration, labels.contact, False, scene.to_json(),
-                features,
+                scene.name, scenario, preset.official or "", labels.contact, False,
+                scene.to_json(), features,
             )  # fmt: skip
-    raise AssertionError("samples do not end")
 
 
 def visible(tokens: NDArray[np.float32]) -> bool:
@@ -190,12 +190,12 @@ def stored_trial(trial: str, row: Mapping[str, Any], motion: Motion, kept: Kept)
     )  # fmt: skip
 
 
-def write(path: Path, trials: Sequence[Seen]) -> None:
+def write(path: Path, trials: Sequence[Seen], look: str) -> None:
     """Write trials to a file that has all of them or does not exist."""
     arrays = {n: np.stack([t.features[n] for t in trials]) for n in trials[0].features}
     facts = {name: np.array([getattr(trial, name) for trial in trials]) for name in FACTS}
     buffer = io.BytesIO()
-    np.savez(buffer, **facts, **arrays)
+    np.savez(buffer, look=np.array(look), **facts, **arrays)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, buffer.getvalue())
 
@@ -205,8 +205,9 @@ def there(path: Path, kept: Kept) -> bool:
     if not path.exists():
         return False
     with np.load(path) as stored:
-        if any(name not in stored.files for name in kept.models):
-            raise SystemExit(f"{path} was made with other --models; take a new FOLDER")
+        look = str(stored["look"]) if "look" in stored.files else "redyellow"
+        if any(name not in stored.files for name in kept.models) or look != kept.look:
+            raise SystemExit(f"{path} was made with other --models or --look; take a new FOLDER")
     return True
 
 
@@ -217,7 +218,7 @@ def make_own(kept: Kept, task: tuple[str, int]) -> str:
     if not there(path, kept):
         start = time.process_time()
         numbers = range(part * EACH, (part + 1) * EACH)
-        write(path, [own_trial(scenario, number, kept) for number in numbers])
+        write(path, [own_trial(scenario, number, kept) for number in numbers], kept.look)
         return f"{path.stem} {(time.process_time() - start) / EACH:.2f} s a trial"
     return ""
 
@@ -227,7 +228,7 @@ def make_official(kept: Kept, part: int) -> str:
     path = kept.folder / "official" / f"{part:04d}.npz"
     if not there(path, kept):
         scenes = official_scenes()[part * EACH : (part + 1) * EACH]
-        write(path, [official_trial(scene, contact, kept) for scene, contact in scenes])
+        write(path, [official_trial(scene, contact, kept) for scene, contact in scenes], kept.look)
         return f"official {path.stem}"
     return ""
 
@@ -261,6 +262,7 @@ def make_stored(dataset: Path, kept: Kept, part: int) -> str:
                 for trial, row in rows.items()
                 if motions[str(trial)].scene.physics_digest() not in official_digests()
             ],
+            kept.look,
         )
         return path.stem
     return ""

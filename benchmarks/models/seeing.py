@@ -8,9 +8,9 @@ Official stimuli that people saw, without a contact in the observed part: the fi
 a contact and as many without one, of every one of ``--scenarios`` (the rigid ones), by the hash of
 their names. Of each, the observed part is simulated and rendered, scene and state are fitted to
 masks and depth, and both the fitted and the true state are simulated with the default noise. One
-line per trial is appended to FOLDER/seeing.jsonl; an interrupted run continues there, and --known prints
-what it has measured so far, with --version N by an earlier version of the model. Printed are, by
-scenario:
+line per trial is appended to FOLDER/seeing.jsonl; an interrupted run continues there, and --known
+prints what it has measured so far, with --version N by an earlier version of the model. Printed
+are, by scenario:
 
 1. Accuracy by recorded outcomes (P = 1/2 counts half) with standard error, and area under the curve
    (AUC), of the fitted and the true state; agreement with the true state, and the mean absolute

@@ -1,14 +1,13 @@
 """Train the network that finds objects in pictures, on own trials with true masks.
 
-    OMP_NUM_THREADS=1 python benchmarks/models/train_segmentation.py FOLDER [--look free]
-        [--count 15000] [--steps 4000] [--write]
+    physion generate TRIALS --full --no-movies
+    OMP_NUM_THREADS=1 python benchmarks/models/train_segmentation.py FOLDER --trials TRIALS
+        [--count 24000] [--steps 4000] [--write]
 
-Of sampled training trials three observed frames are rendered and stored in FOLDER with their masks,
-1,000 trials a file; the same command resumes. In the training pictures are mirrored, and
-brightness, contrast and noise vary; in half of them also colours (`recolor`), since the red and the
-yellow of other renderers are darker or paler. With --look free objects have the free colours of
-their scenes, agent and patient are other objects, and the training begins from the shipped weights
-for red and yellow. The loss is
+Of training trials three observed frames are rendered, in red and yellow, and stored in FOLDER
+with their masks, 1,000 trials a file; the same command resumes. In the training pictures are
+mirrored, and brightness, contrast and noise vary; in half of them also colours (`recolor`), since
+the red and the yellow of other renderers are darker or paler. The loss is
 
     cross entropy of the class of pixels + SHARE * mean |offset - o|_1 of pixels of objects.
 
@@ -32,23 +31,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from intuition_trials import sampled
+from physion import Dataset
 from physion.clips.batch import AGENT_ID, FIRST_OTHER_ID, PATIENT_ID, SCENERY_ID
 from physion.clips.rendered import object_ids
-from physion.core.names import SCENARIOS
+from physion.clips.states import TrialMotions
 from physion.core.seeds import generator
 from physion.data.official import official
-from physion.models.checkpoint import load_packaged
 from physion.models.segmentation import (
     CLASSES,
-    FOLDER,
     OFFSET,
     SIDE,
     WEIGHTS,
     SegmentationNetwork,
     network_input,
 )
-from physion.physics.engine import make_engine
 from physion.rendering.renderer import Renderer
 from physion.scenes.looks import in_look
 from physion.scenes.scene import OBSERVED_FRAMES
@@ -66,40 +62,41 @@ GAMMA, TINT = (0.7, 1.5), 0.08
 """Range of the exponent of a picture, and standard deviation of the factors of its channels."""
 
 
-def make(folder: Path, look: str, count: int) -> None:
+def make(folder: Path, dataset: Dataset, count: int) -> None:
     """Store pictures and masks of ``count`` trials, one of each scenario in turn."""
     known = {trial.scene.physics_digest() for trial in official().trials}
-    engine = make_engine()
-    for start in range(0, count, PART):
+    index = dataset.index[dataset.index["split"] == "training"]
+    order = index.groupby("scenario").cumcount()
+    names = index.assign(order=order).sort_values(["order", "scenario"])["trial"].tolist()[:count]
+    motions = TrialMotions(dataset.files("trial_file"), observed=True)
+    for start in range(0, len(names), PART):
         path = folder / f"pictures-{start}.npz"
         if path.exists():
             continue
         shown, masks = [], []
-        for number in range(start, min(start + PART, count)):
-            scenario = SCENARIOS[number % len(SCENARIOS)]
-            scene, _ = next(sampled("segmentation", scenario, number // len(SCENARIOS)))
-            if scene.physics_digest() in known:
+        for name in names[start : start + PART]:
+            motion = motions[name]
+            if motion.scene.physics_digest() in known:
                 continue
-            trajectory = engine.simulate(scene, frames=OBSERVED_FRAMES)
-            renderer = Renderer(in_look(scene, look), trajectory, SIDE, SIDE)
-            chosen = generator("segmentation", "frames", scene.name).choice(
+            renderer = Renderer(in_look(motion.scene, "redyellow"), motion.trajectory, SIDE, SIDE)
+            chosen = generator("segmentation", "frames", name).choice(
                 OBSERVED_FRAMES, FRAMES, replace=False
             )
             for frame in chosen.tolist():
                 drawn = renderer.render(frame, ("color", "ids"))
                 shown.append(drawn.color)
-                masks.append(object_ids(scene)[drawn.ids])
+                masks.append(object_ids(motion.scene)[drawn.ids])
         kept = folder / "part.npz"
         np.savez(kept, rgb=np.array(shown), ids=np.array(masks, np.uint8))
         kept.rename(path)
-        print(f"{datetime.datetime.now():%H:%M:%S} {start} of {count}", flush=True)
+        print(f"{datetime.datetime.now():%H:%M:%S} {start} of {len(names)}", flush=True)
 
 
-def targets(ids: Tensor, look: str) -> tuple[Tensor, Tensor]:
+def targets(ids: Tensor) -> tuple[Tensor, Tensor]:
     """Return the class of pixels (N, H, W), and the offset to the centre of their object.
 
     The centre is the mean of the object's pixels in this picture. Offsets (N, 2, H, W) are x and y,
-    in units of 1 / `OFFSET` of a side. In free colours agent and patient are other objects.
+    in units of 1 / `OFFSET` of a side.
     """
     pictures, height, width = ids.shape
     number = (ids.long() + 256 * torch.arange(pictures)[:, None, None]).reshape(-1)
@@ -108,10 +105,7 @@ def targets(ids: Tensor, look: str) -> tuple[Tensor, Tensor]:
     counts = torch.bincount(number).clamp(min=1)
     offsets = [(torch.bincount(number, axis) / counts)[number] - axis for axis in (x, y)]
     by_picture = torch.stack(offsets).view(2, *ids.shape).transpose(0, 1)
-    kinds = ids.long().clamp(max=FIRST_OTHER_ID)
-    if look == "free":
-        kinds = torch.where(kinds == SCENERY_ID, kinds, FIRST_OTHER_ID)
-    return kinds, OFFSET * by_picture.float()
+    return ids.long().clamp(max=FIRST_OTHER_ID), OFFSET * by_picture.float()
 
 
 def recolor(
@@ -140,7 +134,7 @@ def losses(found: Tensor, kinds: Tensor, offsets: Tensor) -> tuple[Tensor, Tenso
     return entropy, (error * objects).sum() / objects.sum().clamp(min=1)
 
 
-def train(folder: Path, look: str, steps: int) -> tuple[SegmentationNetwork, str]:
+def train(folder: Path, steps: int) -> tuple[SegmentationNetwork, str]:
     """Return the trained network, and its errors on held-out trials as text."""
     paths = sorted(folder.glob("pictures-*.npz"), key=lambda path: int(path.stem.split("-")[1]))
     parts = [np.load(path) for path in paths]
@@ -150,8 +144,6 @@ def train(folder: Path, look: str, steps: int) -> tuple[SegmentationNetwork, str
     rng = generator("segmentation", "training")
     torch.manual_seed(0)
     network = SegmentationNetwork()
-    if look == "free":
-        network = load_packaged(SegmentationNetwork, FOLDER, WEIGHTS["redyellow"])
     optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=0.02)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimizer, RATE, steps, pct_start=WARM_UP / steps, cycle_momentum=False
@@ -168,7 +160,7 @@ def train(folder: Path, look: str, steps: int) -> tuple[SegmentationNetwork, str
         seen = network_input(rgb)
         gain, lift = JITTER * torch.randn(2, BATCH, 3, 1, 1)
         seen[:, :3] = seen[:, :3] * (1 + gain) + lift + NOISE * torch.randn(BATCH, 3, SIDE, SIDE)
-        return seen, *targets(torch.from_numpy(ids), look)
+        return seen, *targets(torch.from_numpy(ids))
 
     start = time.process_time()
     for step in range(1, steps + 1):
@@ -180,29 +172,29 @@ def train(folder: Path, look: str, steps: int) -> tuple[SegmentationNetwork, str
         optimizer.step()
         schedule.step()
         if step % 100 == 0:
-            text = score(network, *held, look)
+            text = score(network, *held)
             print(f"{datetime.datetime.now():%H:%M:%S} step {step}: {text}", flush=True)
     seconds = time.process_time() - start
     trials = sum(len(part[0]) for part in fit) // FRAMES
     text = (
         f"{trials} trials, {steps} steps of {BATCH} pictures, {seconds:.0f} s of processor time. "
-        f"On {HELD} pictures of other trials: {score(network, *held, look)}"
+        f"On {HELD} pictures of other trials: {score(network, *held)}"
     )
     return network, text
 
 
 @torch.no_grad()
-def score(network: SegmentationNetwork, rgb: NDArray[Any], ids: NDArray[Any], look: str) -> str:
+def score(network: SegmentationNetwork, rgb: NDArray[Any], ids: NDArray[Any]) -> str:
     """Return intersection over union by class, and the error of the offsets, as text."""
     network.eval()
     found = torch.cat([network(network_input(part)) for part in np.split(rgb[:HELD], HELD // 64)])
     network.train()
-    kinds, offsets = targets(torch.from_numpy(ids[:HELD]), look)
+    kinds, offsets = targets(torch.from_numpy(ids[:HELD]))
     best = found[:, : len(CLASSES)].argmax(1)
     shares = []
     for kind in CLASSES:
         both, either = (best == kind) & (kinds == kind), (best == kind) | (kinds == kind)
-        shares.append(f"{both.sum() / either.sum():.3f}" if (kinds == kind).any() else "-")
+        shares.append(f"{both.sum() / either.sum():.3f}")
     _, error = losses(found, kinds, offsets)
     return (
         "intersection over union of scenery, agent, patient and other objects "
@@ -216,24 +208,24 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--look", choices=list(WEIGHTS), default="redyellow")
+    parser.add_argument("--trials", type=Path, help="folder of own trials; else only those stored")
     parser.add_argument("--count", type=int, default=15000)
     parser.add_argument("--steps", type=int, default=4000)
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(1)
     options.folder.mkdir(parents=True, exist_ok=True)
-    make(options.folder, options.look, options.count)
-    network, text = train(options.folder, options.look, options.steps)
+    if options.trials is not None:
+        make(options.folder, Dataset(options.trials), options.count)
+    network, text = train(options.folder, options.steps)
     print(text)
     if options.write:
         write_network(
-            SHIPPED / WEIGHTS[options.look],
+            SHIPPED / WEIGHTS,
             network,
-            f"# Objects in pictures{' in free colours' * (options.look == 'free')}\n"
-            "Network of `physion.models.segmentation`",
-            f"python benchmarks/models/train_segmentation.py FOLDER --look {options.look} "
-            f"--count {options.count} --steps {options.steps} --write",
+            "# Objects in pictures\nNetwork of `physion.models.segmentation`",
+            "python benchmarks/models/train_segmentation.py FOLDER --trials TRIALS --count "
+            f"{options.count} --steps {options.steps} --write",
             text,
         )
 

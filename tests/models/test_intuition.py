@@ -272,7 +272,7 @@ def test_with_a_cue_only_the_masks_of_the_first_frame_count() -> None:
     none = replace(batch, ids=np.zeros_like(drawn["ids"])[None])
     with torch.no_grad():
         assert model.predict(none).tolist() == [float(model.base_rate)]
-    assert model.notes(none) == ["agent or patient never visible: base rate"]
+    assert model.notes(none) == ["agent or patient not visible in the first frame: base rate"]
     with pytest.raises(BadInputError, match=r"\(input ids\) of 96 x 96 are needed, not none"):
         model.predict(pictures(drawn["rgb"][None], ["new"]))
     with pytest.raises(BadInputError, match="cue=true is for intuition-pixels"):

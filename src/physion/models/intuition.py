@@ -289,8 +289,9 @@ class IntuitionSettings(SizedSettings):
     - ``noise``: standard deviation of noise on the values of tokens in training, in standard
       deviations of a value.
     - ``members``: networks, trained at the same time, whose probabilities are averaged.
-    - ``cue``: from pixels only: objects may have any colours, and the masks of the first frame say
-      which are agent and patient, as a cue told people. Later masks are not looked at.
+    - ``cue``: from pixels only: objects may have any colours, and the masks of the first frame of
+      the clip show which are agent and patient, as a cue showed people. Other masks are not looked
+      at. The weights are the same.
     """
 
     model: str = "intuition-masks"
@@ -305,6 +306,7 @@ class IntuitionSettings(SizedSettings):
     cue: bool = False
 
     sizes: ClassVar[Sizes] = {"small": {}}
+    any_weights: ClassVar[frozenset[str]] = SizedSettings.any_weights | {"cue"}
 
     @classmethod
     def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -456,7 +458,8 @@ class Intuition(TorchModel):
         return Provenance(
             model=self.name,
             init=self.init,
-            encoder_type=f"{self.kind} of up to {self.settings.objects} objects",
+            encoder_type=f"{self.kind} of up to {self.settings.objects} objects"
+            + ", cue in the first frame" * self.settings.cue,
             encoder_training_task="segmentation" if self.kind == PIXELS else "outcomes",
             dynamics_type="none",
             versions=f"torch {torch.__version__}",
@@ -504,13 +507,16 @@ class Intuition(TorchModel):
         """Return for each trial whether it never shows agent or patient, or too many objects."""
         most, notes = self.settings.objects, []
         ids = None if self.kind == STATE else self._ids(batch)
-        by_color = self.kind == PIXELS and not self.settings.cue
-        roles = "red agent or yellow patient" if by_color else "agent or patient"
+        unseen = "agent or patient never visible"
+        if self.kind == PIXELS:
+            unseen = "red agent or yellow patient never visible"
+        if self.settings.cue:
+            unseen = "agent or patient not visible in the first frame"
         if ids is not None:
             tokens = np.stack([mask_tokens(one, most) for one in ids])
             batch = replace(batch, features=torch.from_numpy(tokens).flatten(2).to(self.device))
         for seen, count in zip(self.seen(batch).tolist(), self._counts(batch, ids), strict=True):
-            hidden = "" if seen else f"{roles} never visible: base rate"
+            hidden = "" if seen else f"{unseen}: base rate"
             many = f"{count} objects, only {most} are looked at" if count > most else ""
             notes.append("; ".join(filter(None, (hidden, many))))
         return notes
@@ -592,10 +598,7 @@ class Intuition(TorchModel):
 
     def _segmentation(self) -> list[str]:
         """Return what the masks depend on that are found in pictures; nothing of other models."""
-        if self.kind != PIXELS:
-            return []
-        look = "free" if self.settings.cue else "redyellow"
-        return [segmentation_version(look), torch.__version__]
+        return [segmentation_version(), torch.__version__] if self.kind == PIXELS else []
 
     def _check_frames(self, batch: Batch) -> None:
         """Raise `BadInputError` for other frames than those that the model learns from."""

@@ -12,10 +12,13 @@ an object that was last seen at time s is continued by the one nearest to where 
 with its centre c, velocity v, and size a (square root of the area, halves of width and height);
 pairs are chosen so that the sum of d is least, and none is farther apart than `FAR`.
 
-The networks were trained on own pictures of 96 pixels a side, with true masks
-(``benchmarks/models/train_segmentation.py``): one in red and yellow, and one in any colours, for
-which everything is another object. With it a cue in the first picture says which are agent and
-patient, and they are followed as the others are.
+With a cue objects may have any colours. The first picture then says which colours agent and patient
+have: a pixel of a later one belongs to them if most of the `NEIGHBORS` pixels of the first picture
+with the nearest colours do. They are painted red and yellow, and everything else that is red or
+yellow is painted grey, before the network finds the other objects.
+
+The network was trained on own pictures in red and yellow, of 96 pixels a side, with true masks
+(``benchmarks/models/train_segmentation.py``).
 """
 
 from __future__ import annotations
@@ -27,6 +30,7 @@ import torch
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -38,9 +42,8 @@ F64 = NDArray[np.float64]
 
 VERSION = 1
 """Counts changes of this code that change what is found."""
-FOLDER = "physion.data.segmentation"
-WEIGHTS = {"redyellow": "segmentation.safetensors", "free": "segmentation-free.safetensors"}
-"""Package and files of the weights, by the look of the pictures."""
+FOLDER, WEIGHTS = "physion.data.segmentation", "segmentation.safetensors"
+"""Package and file of the weights."""
 SIDE = 96
 """Pixels per side of the pictures."""
 CLASSES = (SCENERY_ID, AGENT_ID, PATIENT_ID, FIRST_OTHER_ID)
@@ -54,6 +57,10 @@ LEAST_VOTES, LEAST_PIXELS = 0.6, 6
 """Smoothed votes, and pixels, below which there is no object."""
 FAR = 0.12, 0.01
 """Largest d between frames, and by how much it rises with each frame in which nothing was seen."""
+NEIGHBORS = 5
+PAINT = {AGENT_ID: (1.0, 0.05, 0.05), PATIENT_ID: (1.0, 0.95, 0.05)}
+DARKEST = 60
+"""With a cue: pixels that vote, the colours of agent and patient, and their least brightness."""
 MOST = 60
 """Largest number of other objects of a trial."""
 
@@ -130,32 +137,53 @@ def segment(rgb: NDArray[np.uint8], cue: NDArray[np.uint8] | None = None) -> NDA
     Parameters
     ----------
     rgb
-        Pictures (T, `SIDE`, `SIDE`, 3): agent red and patient yellow, or, with a cue, all objects
-        in any colours.
+        Pictures (T, `SIDE`, `SIDE`, 3), with a red agent and a yellow patient.
     cue
-        Which pixels (`SIDE`, `SIDE`) of the first picture are agent and patient, in the numbers of
-        ``Batch.ids``; others count for nothing.
+        Which pixels (`SIDE`, `SIDE`) of the first picture are agent and patient, by their numbers;
+        others mean nothing. With it objects may have any colours.
     """
-    look = "redyellow" if cue is None else "free"
+    if cue is None:
+        return follow(_found(rgb))
+    roles = roles_by_color(rgb, cue)
+    others = follow(_found(painted(rgb, roles)))
+    # The network's own agent and patient are what was painted, at most.
+    others[others < FIRST_OTHER_ID] = SCENERY_ID
+    return np.where(roles == SCENERY_ID, others, roles)
+
+
+def _found(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the objects of pixels (T, H, W) of each picture by itself."""
     with torch.no_grad():
-        found = _network(look)(network_input(rgb)).double().numpy()
-    ids = np.stack([group(of[: len(CLASSES)], of[len(CLASSES) :]) for of in found])
-    return follow(ids) if cue is None else _cued(ids, cue)
+        found = _network()(network_input(rgb)).double().numpy()
+    return np.stack([group(of[: len(CLASSES)], of[len(CLASSES) :]) for of in found])
 
 
-def _cued(ids: NDArray[np.uint8], cue: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return followed objects (T, H, W), of which a cue says in the first picture who they are."""
-    # Whatever color says of agent and patient does not count.
-    ids = np.where(ids < FIRST_OTHER_ID, SCENERY_ID, ids)
-    roles = (AGENT_ID, PATIENT_ID)
-    for role in roles:
-        ids[0][cue == role] = np.iinfo(np.uint8).max - role
-    out = follow(ids)
-    followed = out.copy()
-    for role in roles:
-        numbers = followed[0][cue == role]
-        if numbers.any():
-            out[followed == numbers.max()] = role
+def roles_by_color(rgb: NDArray[np.uint8], cue: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return which pixels (T, H, W) have colours of agent or patient; see the head of the module.
+
+    In the first picture it is the cue.
+    """
+    known = np.where(np.isin(cue, (AGENT_ID, PATIENT_ID)), cue, SCENERY_ID).astype(np.uint8)
+    tree = cKDTree(rgb[0].reshape(-1, 3).astype(np.float64))
+    _, nearest = tree.query(rgb[1:].reshape(-1, 3).astype(np.float64), NEIGHBORS)
+    votes = known.ravel()[nearest]
+    counts = [(votes == role).sum(1) for role in (SCENERY_ID, AGENT_ID, PATIENT_ID)]
+    later = np.argmax(counts, axis=0).astype(np.uint8).reshape(rgb[1:].shape[:3])
+    return np.concatenate([known[None], later])
+
+
+def painted(rgb: NDArray[np.uint8], roles: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return pictures (T, H, W, 3) with a red agent and a yellow patient, and nothing else so.
+
+    ``roles`` (T, H, W) has `AGENT_ID` and `PATIENT_ID`. A painted pixel is as bright as it was.
+    """
+    out = rgb.copy()
+    red, yellow = color_masks(rgb)
+    strange = (red | yellow) & (roles == SCENERY_ID)
+    out[strange] = rgb[strange].mean(-1, keepdims=True)
+    bright = np.maximum(rgb.max(-1), DARKEST)
+    for role, color in PAINT.items():
+        out[roles == role] = bright[roles == role][:, None] * np.array(color)
     return out
 
 
@@ -245,11 +273,11 @@ def _described(mask: NDArray[np.bool_]) -> F64:
 
 
 @cache
-def _network(look: str) -> SegmentationNetwork:
+def _network() -> SegmentationNetwork:
     """Return the network with the weights of the package."""
-    return load_packaged(SegmentationNetwork, FOLDER, WEIGHTS[look])
+    return load_packaged(SegmentationNetwork, FOLDER, WEIGHTS)
 
 
-def segmentation_version(look: str = "redyellow") -> str:
+def segmentation_version() -> str:
     """Return the version of this code, and the start of the SHA-256 of the weights."""
-    return f"{VERSION} {packaged_sha256(FOLDER, WEIGHTS[look])[:12]}"
+    return f"{VERSION} {packaged_sha256(FOLDER, WEIGHTS)[:12]}"
