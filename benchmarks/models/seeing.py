@@ -1,6 +1,6 @@
 """Measure how well `seeing-simulation` recovers scenes, and what it answers.
 
-    OMP_NUM_THREADS=1 python benchmarks/models/seeing.py FOLDER [--each 5]
+    OMP_NUM_THREADS=1 python benchmarks/models/seeing.py FOLDER [--each 5] [--scenarios drape]
         [--depth-error 0.02 | --no-depth] [--own DATASET] [--known] [--against FILES] [--write]
     OMP_NUM_THREADS=1 python benchmarks/models/seeing.py --priors
 
@@ -32,7 +32,7 @@ all frames, and each pixel another one; rows are in FOLDER/seeing-E.jsonl. With 
 the camera are all that is seen; rows are in FOLDER/seeing-masks.jsonl.
 
 --own DATASET measures stored testing trials of our own instead, by their labels, without people.
-Names of files end in the name of the dataset.
+Names of files end in the name of the dataset, and of scenarios that are not all rigid ones.
 
 --against FILE compares with the rows of another run (.jsonl), or with a table of `physion evaluate`
 (.csv, of one model), on the same stimuli.
@@ -689,7 +689,7 @@ def main() -> None:
         error += f" --version {options.version}" * (options.version != VERSION)
         if options.against:
             error += " --known --write --against " + " ".join(p.name for p in options.against)
-        if tuple(options.scenarios) != RIGID:
+        if set(options.scenarios) != set(RIGID):
             name += "-" + "-".join(options.scenarios)
             error += " --scenarios " + " ".join(options.scenarios)
         (RESULTS / f"{name}.md").write_text(

@@ -7,7 +7,8 @@ The trainer is the one of `physion train`; the same command resumes. The last te
 trials of every scenario trains nothing: on them, and on the official stimuli without a contact in
 the observed part, networks are tested, and compared with forests that saw the same training trials,
 where their features are stored. With --start a training begins from other weights, that of pixels
-from those of masks. Predictions of official stimuli go to FOLDER/predictions, where ``intuition.py
+from those of masks; with --steps 0, too, nothing is trained, and these weights are tested on all
+own trials. Predictions of official stimuli go to FOLDER/predictions, where ``intuition.py
 --predictions`` reads them, weights to FOLDER/training. --weights names a folder for the weights of
 all scenarios as float16. Other trainings answer what a network has to have seen: --counts, the
 first trials of each scenario only; --unseen, without the configuration of the tested trial
@@ -95,6 +96,8 @@ class Learner:
         for scenario in np.unique(self.own["scenario"]):
             rows = np.flatnonzero(self.own["scenario"] == scenario)
             self.held[rows[-max(len(rows) // 10, 1) :]] = True
+            if options.steps == 0:
+                self.held[rows] = True
             self.number[rows] = np.arange(len(rows))
 
     def train(
@@ -106,7 +109,7 @@ class Learner:
         """
         model: Any = build_untrained(self.name, **self._options())
         if self.options.start:
-            same = SAME_TOKENS.get(self.name, self.name)
+            same = self.name if self.options.steps == 0 else SAME_TOKENS.get(self.name, self.name)
             weights = str(self.options.start / f"{same}-small.safetensors")
             other: Any = build_untrained(same, **self._options(), weights=weights)
             model.load_state_dict(other.state_dict())
@@ -116,6 +119,8 @@ class Learner:
         trials = [str(trial) for trial in self.own["trial"][fit]]
         source = OwnSource(model.spec, self.own)
         outcomes = dict(zip(trials, self.own["contact"][fit].tolist(), strict=True))
+        if self.options.steps == 0:
+            return self._answers(model)
         settings = ask(model, "training_settings")
         changed = {
             "steps": self.options.steps, "batch": self.options.batch,
@@ -147,6 +152,9 @@ class Learner:
             f"{self.name} {name}: held-out loss {done.validation:.3f}, base rate "
             f"{done.baseline:.3f}, {time.process_time() - start:.0f} s, {done.folder}", flush=True,
         )  # fmt: skip
+        return self._answers(model)
+
+    def _answers(self, model: Any) -> dict[str, NDArray[np.float64]]:
         return {
             "own": self._predict(model, self.own, self.held),
             "official": self._predict(model, self.asked, np.full(len(self.asked["trial"]), True)),
@@ -279,7 +287,7 @@ def main() -> None:
     )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--models", nargs="*", choices=SAME, default=list(SAME))
-    parser.add_argument("--steps", type=int, default=0, help="of the training; 0: the model's own")
+    parser.add_argument("--steps", type=int, help="of the training, by default the model's own")
     parser.add_argument("--batch", type=int, default=0, help="clips a step; 0: the model's own")
     parser.add_argument("--learning-rate", type=float, default=0.0, help="0: the model's own")
     parser.add_argument("--accelerator", default="auto")
@@ -291,6 +299,8 @@ def main() -> None:
     parser.add_argument("--all-but", action="store_true", help="scenarios")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
+    if options.steps == 0 and (options.start is None or options.write):
+        raise SystemExit("--steps 0 tests the weights of --start, and writes no page")
     if options.start and (options.unseen or options.all_but):
         raise SystemExit(
             "weights of --start may have seen all: leave it out for --unseen, --all-but"
@@ -339,7 +349,7 @@ def main() -> None:
             print(rows[-1], flush=True)
     scenarios = [str(s) for s in np.unique(learner.own["scenario"])]
     given = " --start WEIGHTS" * bool(options.start)
-    given += f" --steps {options.steps}" * bool(options.steps)
+    given += f" --steps {options.steps}" * (options.steps is not None)
     given += f" --counts {' '.join(map(str, options.counts))}" * bool(options.counts)
     given += " --unseen" * options.unseen + " --all-but" * options.all_but
     text = "\n".join(

@@ -2,9 +2,13 @@
 
 `find` starts every shape of the library upright, from the box around the points that are seen, with
 some rotations about the vertical. A side of the box along which almost nothing is seen gets a
-fraction of the median side, away from the camera. If no upright shape fits, other rotations follow.
-The best ones are fitted again with all rays: with free scales, with equal scales along x and y, and
-with three equal ones. Among those that fit nearly as well, the simplest is taken.
+fraction of the median side, away from the camera. If no upright shape fits, other rotations follow,
+few and then more, but not for what is flat. The best ones are fitted again with more rays: with
+free scales, with equal scales along x and y, and with three equal ones. Among those that fit nearly
+as well, the simplest is taken; proportions that do not occur in our presets cost something. What
+fits well is fitted once more, to all rays and with small c.
+
+`alike` gives objects of one shape the same scales, where that fits as well.
 
 `follow` moves what was found to where it fits in a later frame. What fits where it was has not
 moved.
@@ -57,8 +61,8 @@ costs below which the simpler solution is taken; a tenth of the cost is added to
 SHARP, EQUAL_WEIGHT = (0.002, 0.001), 0.1
 """First and last c of the last fit of what fits well, and weight of equal scales there."""
 FITS, EXACT = {"bowl": 0.06, "sphere": 0.016}, 0.004
-"""Cost up to which a shape is accepted, and of the others. The collision pieces of bowls and their
-drawn meshes differ by a millimetre, and the ball that is fitted has no corners."""
+"""Cost up to which a shape is accepted, `EXACT` for the others. The collision pieces of bowls and
+their drawn meshes differ by a millimetre, and the ball that is fitted has no corners."""
 TALLEST = {"cube": math.inf, "cylinder": 12.0, "bowl": 1.2, "torus": 0.4}
 TALL, LONGEST = 4.5, 3.5
 """Largest height of a shape in its own frame, over its mean width (`TALL` of shapes that are not
@@ -75,10 +79,10 @@ ALIKE, WORSE = 0.7, 0.001
 """Largest difference of logarithms of the scales of two objects that may be alike, and cost, with
 the last c of `SHARP`, by which one may fit worse with the scales of the other."""
 ROTATIONS = (16, 64)
-"""Random rotations that are tried first, and where none of them fits."""
+"""Random rotations that are tried first, and all that are tried where none of these fits."""
 KEPT = 5
 PER_SHAPE = 2
-"""Solutions that are fitted with all rays, and how many of them have one shape."""
+"""Solutions that are fitted again, and how many of them have one shape."""
 EXPECTED = 0.05
 """Weight of the distance from where an object that is followed is expected."""
 SAME, STILL = 1.3, 0.008
@@ -132,10 +136,11 @@ def find(rays: Rays, prior: Prior, solids: Sequence[Solid] | None = None) -> Pla
             found.append(fit(start, some, FREE, prior, widths=(0.02, 0.004), steps=10))
             if _enough(found[-1]):
                 break
-    # Unlikely ones last, but the best of all among those that are fitted again.
+    # Unlikely ones last, but the best of all among those that are fitted again, each once.
     found.sort(key=lambda placed: placed.cost)
-    likely = [placed for placed in found if _rank(placed) == placed.cost]
-    return refine(_several([*likely, *found], KEPT - 1) + found[:1], rays, prior)
+    likely = [placed for placed in found if not _unlikely(placed)]
+    kept = _several([*likely, *found], KEPT - 1) + found[:1]
+    return refine(list({id(placed): placed for placed in kept}.values()), rays, prior)
 
 
 def refine(starts: Sequence[Placed], rays: Rays, prior: Prior) -> Placed:
@@ -160,7 +165,7 @@ def refine(starts: Sequence[Placed], rays: Rays, prior: Prior) -> Placed:
             tied = _centred(replace(whole, scale=scale), whole.middle())
             tied = fit(tied, many, EQUAL, prior, widths=(0.02, 0.004), steps=10)
             tried.append((tied.cost + rank, tied, EQUAL))
-    _, best, free = min(tried, key=lambda tried: tried[0] + _rank(tried[1]) - tried[1].cost)
+    _, best, free = min(tried, key=lambda one: one[0] + _unlikely(one[1]))
     if best.cost >= GOOD:
         return best
     # Every drawn point fits, so that borders are known better than to the usual width.
@@ -170,31 +175,31 @@ def refine(starts: Sequence[Placed], rays: Rays, prior: Prior) -> Placed:
 
 
 def _covering(placed: Placed, rays: Rays) -> Placed:
-    """Return a solid that is as much longer along its axes as reaches all seen points."""
+    """Return a solid, longer along its axes until it reaches all points that are seen."""
     low, high = _box(placed.rotation, rays, 0.0)
     middle, half = placed.middle() @ placed.rotation, placed.size() / 2
     low, high = np.minimum(low, middle - half), np.maximum(high, middle + half)
     return _filling(placed.solid, placed.rotation, low, high)
 
 
-def _rank(placed: Placed) -> float:
-    """Return the cost, and `UNLIKELY` of what is taller or longer than its shape in our presets."""
+def _unlikely(placed: Placed) -> float:
+    """Return `UNLIKELY` for what is taller, longer or flatter than in our presets; else 0."""
     wide, deep, high = (placed.solid.high - placed.solid.low) * placed.scale
     tallest = TALLEST.get(placed.solid.name, TALL)
     likely = placed.solid.name == "cube" or max(wide, deep) <= LONGEST * min(wide, deep)
     likely = likely and high <= tallest * math.sqrt(wide * deep)
     likely = likely and (placed.solid.name in LEVEL or high >= FLAT * max(wide, deep))
-    return placed.cost + (0.0 if likely else UNLIKELY)
+    return 0.0 if likely else UNLIKELY
 
 
 def _fits(placed: Placed) -> bool:
     """Return whether no other rotation has to be looked for."""
-    return _rank(placed) < FITS.get(placed.solid.name, EXACT)
+    return placed.cost + _unlikely(placed) < FITS.get(placed.solid.name, EXACT)
 
 
 def _enough(placed: Placed) -> bool:
     """Return whether nothing better has to be looked for."""
-    return _rank(placed) < (ROUGH if placed.solid.ball else ENOUGH)
+    return placed.cost + _unlikely(placed) < (ROUGH if placed.solid.ball else ENOUGH)
 
 
 def _squares(placed: Placed) -> Iterator[Placed]:
@@ -213,10 +218,10 @@ def _squares(placed: Placed) -> Iterator[Placed]:
 
 
 def alike(found: Mapping[int, Placed], rays: Mapping[int, Rays], prior: Prior) -> dict[int, Placed]:
-    """Return solids of which those of one shape have the same scales, where that fits as well.
+    """Return solids; those of one shape get the same scales where that fits as well.
 
     What is hidden of one is seen of another. Where all three scales of a solid are equal, nothing
-    is hidden that has to be known.
+    is hidden that has to be known. The scales with which most others fit as well are taken first.
     """
     result = dict(found)
     groups: dict[str, set[int]] = {}
@@ -224,14 +229,14 @@ def alike(found: Mapping[int, Placed], rays: Mapping[int, Rays], prior: Prior) -
         if np.ptp(placed.scale) > 0.01 * placed.scale.max() and placed.cost < GOOD:
             groups.setdefault(placed.solid.name, set()).add(number)
     for left in groups.values():
+        pairs = {
+            (giver, number): _scaled_as(found[giver], found[number], rays[number], prior)
+            for giver, number in itertools.permutations(sorted(left), 2)
+        }
         while len(left) > 1:
             options = []
             for giver in sorted(left):
-                taken = {
-                    number: other
-                    for number in left - {giver}
-                    if (other := _scaled_as(found[giver], found[number], rays[number], prior))
-                }
+                taken = {n: other for n in left - {giver} if (other := pairs[giver, n])}
                 total = sum(cost_of(other, rays[n], SHARP[1]) for n, other in taken.items())
                 options.append((len(taken), -total, giver, taken))
             count, _, giver, taken = max(options, key=lambda option: option[:3])
@@ -243,7 +248,10 @@ def alike(found: Mapping[int, Placed], rays: Mapping[int, Rays], prior: Prior) -
 
 
 def _scaled_as(giver: Placed, placed: Placed, rays: Rays, prior: Prior) -> Placed | None:
-    """Return a solid with the scales of another one; None if it does not fit as well then."""
+    """Return a solid with the scales of another one; None if it does not fit as well then.
+
+    Of boxes the scales along x and y may change places.
+    """
     turned = giver.scale[[1, 0, 2]] if giver.solid.name == "cube" else giver.scale
     scale = min(
         (giver.scale, turned), key=lambda scale: float(np.abs(np.log(scale / placed.scale)).max())
@@ -267,7 +275,7 @@ def _scaled_as(giver: Placed, placed: Placed, rays: Rays, prior: Prior) -> Place
 
 
 def follow(
-    before: Placed, rays: Rays, prior: Prior, guesses: Sequence[Placed] = ()
+    before: Placed, rays: Rays, floor: float, guesses: Sequence[Placed] = ()
 ) -> tuple[Placed, bool]:
     """Return the pose in a later frame, and whether it is another one.
 
@@ -277,19 +285,19 @@ def follow(
         The last known pose.
     rays
         Of the later frame.
-    prior
-        What is expected of its pose.
+    floor
+        Height in metres that nothing is below.
     guesses
         Other poses from which the search starts; the first one is expected.
     """
     some = rays.first(SOME)
-    ahead = (*guesses, before)[0]
-    # Where both ends are hidden, it has moved along itself as before.
-    middle, low = ahead.middle(), ahead.extent_z()[0]
-    center = (float(middle[0]), float(middle[1]))
-    prior = Prior(prior.floor, low, EXPECTED, center, EXPECTED)
     if cost_of(before, some) <= SAME * before.cost + STILL:
         return before, False
+    # Where both ends are hidden, it is taken to move along its axis as before.
+    ahead = (*guesses, before)[0]
+    middle, low = ahead.middle(), ahead.extent_z()[0]
+    center = (float(middle[0]), float(middle[1]))
+    prior = Prior(floor, low, EXPECTED, center, EXPECTED)
     starts = [before, *guesses]
     found = [fit(s, some, POSE, prior, widths=(0.03, 0.004), steps=10) for s in starts]
     best = min(found, key=lambda placed: placed.cost)

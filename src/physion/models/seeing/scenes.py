@@ -3,13 +3,16 @@
 1. Every object is fitted in frame 0, or where most of it is seen (`bodies.find`).
 2. Objects that rest on others are fitted again from the bottom up: their lower end is expected at
    the top of what they stand on, and their centre above and below their neighbours. What rests on
-   nothing that is seen reaches down to the floor.
+   nothing that is seen reaches down to what is below it, or to the floor, and an upper end reaches
+   up to what stands on it, where that is hidden. A fit is kept only if it is nearly as good as
+   before. Then objects of one shape get the same scales where that fits as well (`bodies.alike`).
 3. Every object is followed through the later frames (`bodies.follow`).
 4. Velocities of the centres of mass follow from the last three poses, at the times t1, t2, t3. With
    the differences v12, v23 and a = (v23 - v12) / ((t3 - t1) / 2): if a is within 4 m/s2 of gravity
    g, the object flies, and the velocity is the slope of the line through x + g t^2 / 2 (upwards),
    minus g (t3 - h / 2), with h a frame: the velocity of the engine is the one of its last step.
-   Otherwise it is v23 + a (t3 - t2 - h) / 2, without the second term if a is above 15 m/s2. Angular
+   Otherwise it is v23 + a (t3 - t2 - h) / 2, without the second term if a is above 15 m/s2; for an
+   object that is seen in the last two frames this is v23, the velocity of the last step. Angular
    velocities follow from the last two poses; what turns about an axis of symmetry cannot be seen. A
    ball that is on something has w = min(v / r, 7, 2.5 (v0 - v) / r), with v0 its largest speed:
    friction turns it until it rolls.
@@ -58,7 +61,7 @@ F64 = NDArray[np.float64]
 MOST_OBJECTS = 15
 """Largest number of objects of a trial."""
 RAYS = 1500
-"""Rays to which the shape and the size of an object are fitted; others to its later poses."""
+"""Rays to which the shape and the size of an object are fitted. Its later poses need fewer."""
 CLEAR_PIXELS = 40
 """Pixels in frame 0 with which an object is fitted there."""
 DENSITY, RING_DENSITY = 32.0, 4.0
@@ -88,7 +91,12 @@ POOR_FIT = 0.1
 ON_TOP = 0.3
 """Metres above a support up to which an object may stand on it."""
 CHANGED = 0.004
-"""Cost by which a later frame must fit worse before the size is questioned."""
+"""Cost by which a later frame must fit worse before the size is questioned, and by which an object
+may fit worse that is made to reach the floor."""
+NEARLY = 0.002
+"""Cost by which an object may fit worse on what it stands on, or up to what stands on it."""
+TOO_SHORT = 0.005
+"""Metres that an object lacks below or above, from which on it is made longer."""
 TOUCHING = 0.003
 """Gap in metres at which objects count as touching."""
 FASTEST_SPIN = 7.0
@@ -183,6 +191,7 @@ def see_trial(
     floor = floor_height(pictures[chosen[0]])
     notes: list[str] = []
     found: dict[int, tuple[int, Placed]] = {}
+    rays_of: dict[int, Rays] = {}
     for number in numbers:
         pixels = {frame: picture.pixels(number) for frame, picture in pictures.items()}
         first = chosen[0]
@@ -192,13 +201,12 @@ def see_trial(
             notes.append(f"object {number} has fewer than {LEAST_PIXELS} pixels")
             continue
         placed = find(rays, Prior(floor=floor))
-        found[number] = (base, placed)
+        found[number], rays_of[number] = (base, placed), rays
         if placed.cost > POOR_FIT:
             notes.append(f"object {number} is no known shape, nearest {placed.solid.name}")
         if base != first:
             notes.append(f"object {number} is first fitted in frame {base}")
-    found = _stacked(found, pictures, floor)
-    rays_of = {n: r for n, (base, _) in found.items() if (r := pictures[base].rays(n, RAYS))}
+    found = _stacked(found, rays_of, pictures, floor)
     same = alike({n: placed for n, (_, placed) in found.items()}, rays_of, Prior(floor=floor))
     found = {n: (base, same[n]) for n, (base, _) in found.items()}
     tracks = tuple(_track(number, *found[number], pictures, floor) for number in found)
@@ -222,9 +230,15 @@ def see_trial(
 
 
 def _stacked(
-    fits: Mapping[int, tuple[int, Placed]], pictures: Mapping[int, SeenFrame], floor: float
+    fits: Mapping[int, tuple[int, Placed]],
+    rays_of: Mapping[int, Rays],
+    pictures: Mapping[int, SeenFrame],
+    floor: float,
 ) -> dict[int, tuple[int, Placed]]:
-    """Fit resting objects again, from the bottom up, so that they stand on something."""
+    """Fit resting objects again, from the bottom up, so that they stand on something.
+
+    ``rays_of`` are the rays to which they were fitted.
+    """
     frames = sorted(pictures)
     result = dict(fits)
     first = [n for n in fits if fits[n][0] == frames[0]]
@@ -246,7 +260,7 @@ def _stacked(
             # Also what falls is there in the first frame.
             tops = (result[n][1].extent_z()[1] for n in first if _carries(result[n][1], placed))
             level = max((top for top in tops if top < bottom), default=floor)
-            longer = _grounded(placed, pictures[frames[0]].rays(number, RAYS), level)
+            longer = _grounded(placed, rays_of[number], level)
             if number in resting or _rests(number, longer, pictures):
                 result[number] = (frames[0], longer)
             continue
@@ -256,23 +270,20 @@ def _stacked(
         above = [
             n for n in resting if n != number and _stands_on(result[n][1], placed)
         ]  # so far as known
-        first_rays = pictures[frames[0]].rays(support, RAYS)
-        if first_rays is not None and bottom > top:
+        if bottom > top:
             # Its upper end may be hidden by what stands on it.
             low = result[support][1].extent_z()[0]
             for higher in _reaching(result[support][1], low, bottom):
-                cost = cost_of(higher, first_rays)
-                if cost < result[support][1].cost + CHANGED / 2:
+                cost = cost_of(higher, rays_of[support])
+                if cost < result[support][1].cost + NEARLY:
                     result[support], top = (frames[0], replace(higher, cost=cost)), bottom
         neighbours = [result[support][1], *(result[n][1] for n in above)]
         center = np.mean([each.middle()[:2] for each in neighbours], axis=0)
         prior = Prior(floor, top, 0.3, (float(center[0]), float(center[1])), 0.05)
-        rays = pictures[frames[0]].rays(number, RAYS)
-        if rays is not None:
-            longer_too = _reaching(placed, top, placed.extent_z()[1])
-            again = refine([placed, *longer_too], rays, prior)
-            if again.cost < placed.cost + CHANGED / 2:
-                result[number] = (frames[0], again)
+        longer_too = _reaching(placed, top, placed.extent_z()[1])
+        again = refine([placed, *longer_too], rays_of[number], prior)
+        if again.cost < placed.cost + NEARLY:
+            result[number] = (frames[0], again)
     return result
 
 
@@ -283,27 +294,27 @@ def _carries(lower: Placed, upper: Placed) -> bool:
     return lower is not upper and not through and _overlap(upper, lower)
 
 
-def _grounded(placed: Placed, rays: Rays | None, floor: float) -> Placed:
+def _grounded(placed: Placed, rays: Rays, floor: float) -> Placed:
     """Return a resting object with nothing close below it as one that reaches down to ``floor``.
 
     What hides its lower end hides how long it is. It stays as it is where that does not fit.
     """
     longer = _reaching(placed, floor, placed.extent_z()[1])
-    if rays is None or not longer:
+    if not longer:
         return placed
     found = refine(longer, rays, Prior(floor, floor, 3.0))
     return found if found.cost < placed.cost + CHANGED else placed
 
 
 def _reaching(placed: Placed, low: float, high: float) -> list[Placed]:
-    """Return an upright object as one that reaches from a height to another one.
+    """Return an upright object as one that reaches from a height up to another one.
 
-    Nothing if it does so already, or is not upright.
+    Nothing if it lacks less than `TOO_SHORT` at both ends, or is not upright.
     """
     bottom, top = placed.extent_z()
     axis = int(np.argmax(np.abs(placed.rotation[2])))
     change = max(bottom - low, high - top)
-    if change < RAISED / 2 or abs(placed.rotation[2, axis]) < UPRIGHT:
+    if change < TOO_SHORT or abs(placed.rotation[2, axis]) < UPRIGHT:
         return []
     scale, before = placed.scale.copy(), placed.middle()
     scale[axis] *= (high - low) / (top - bottom)
@@ -360,7 +371,6 @@ def _followed(
 ) -> Track:
     """Return an object of a known size with its poses."""
     frames, poses, means = [base], [start], []
-    prior = Prior(floor=floor)
     rays = pictures[base].rays(number)
     means.append(start.middle() if rays is None else rays.points().mean(axis=0))
     for frame in sorted(f for f in pictures if f > base):
@@ -376,7 +386,7 @@ def _followed(
             turned = Rotation.from_rotvec(turn * passed).as_matrix() @ ahead.rotation
             ahead = replace(ahead, rotation=turned)
             guesses = [ahead, *guesses, moved_with(ahead, guesses[0].middle() - ahead.middle())]
-        placed, _ = follow(poses[-1], rays, prior, guesses)
+        placed, _ = follow(poses[-1], rays, floor, guesses)
         frames.append(frame)
         poses.append(placed)
         means.append(mean)

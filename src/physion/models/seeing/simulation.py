@@ -93,6 +93,7 @@ class SeeingSimulation(Model):
 
     def __init__(self, settings: SeeingSettings) -> None:
         self.settings = settings
+        # Exact depth tells the velocity of the last step, from the last two frames.
         stride = 2 if self._uncertain else 1
         self.spec = Spec(
             inputs=("ids", *("depth",) * settings.depth, "camera"),

@@ -6,8 +6,8 @@ point is x = p + R S u, and its distance in metres from the plane, outside posit
 
     m . x - e,    m = R S^-1 n / |S^-1 n|,    e = d / |S^-1 n| + m . p.
 
-A ball is |u| <= b about its centre, with b the mean radius of the drawn one, which has corners at
-1/2; with w = S^-1 u / |u| its distance is (|u| - b) / |w|, to first order.
+A ball is |u| <= b about its centre. It has the volume of the drawn one, which has corners at 1/2;
+with w = S^-1 u / |u| its distance is (|u| - b) / |w|, to first order.
 
 Residual of a ray o + t v that sees the object at depth D: the distance of the observed point from
 the plane through which the ray enters the first piece that it meets (point to plane). Where that is
@@ -19,8 +19,9 @@ counts.
 The fit minimises the sum of q / (1 + q), q = (r / c)^2 (Geman and McClure), over position, rotation
 vector and logarithms of the scales by the method of Levenberg and Marquardt with weights
 1 / (1 + q)^2 and differences for derivatives, while c falls. Weak priors are further residuals,
-without a limit: 4 mm times ln(sx / sy), 2 mm times ln(sz / sqrt(sx sy)), the depth below the floor,
-the height above what the object stands on, and the distance from where its centre is expected.
+without a limit: 4 mm times ln(sx / sy), 2 mm times ln(sz / sqrt(sx sy)), both times a weight, the
+depth below the floor, the height above what the object stands on, and the distance from where its
+centre is expected.
 """
 
 from __future__ import annotations
@@ -100,8 +101,8 @@ TURNS = {
 def solid(name: str) -> Solid:
     """Return a shape of the library as it is drawn.
 
-    What has no cavity is the convex hull of its mesh. A pipe has a piece for each of its sides: its
-    collision pieces have half as many. Bowls are made of their collision pieces.
+    What is one collision piece is the convex hull of its mesh. A pipe has a piece for each of its
+    drawn sides, twice as many as it has collision pieces; all others are their collision pieces.
     """
     from scipy.spatial import ConvexHull
 
