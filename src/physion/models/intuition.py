@@ -456,7 +456,7 @@ class Intuition(TorchModel):
     def provenance(self) -> Provenance:
         """Return name, size and origin of the weights."""
         return Provenance(
-            model=self.name,
+            model=self.name + "-cue" * self.settings.cue,
             init=self.init,
             encoder_type=f"{self.kind} of up to {self.settings.objects} objects"
             + ", cue in the first frame" * self.settings.cue,
