@@ -629,7 +629,7 @@ class Intuition(TorchModel):
             seen[name] = np.asarray(given.cpu() if isinstance(given, Tensor) else given)
         if self.kind == MASK:
             return seen["ids"]
-        # Of true masks only those of the first frame are looked at.
+        # Of true masks only the first frame is looked at.
         cues = [of[0] for of in seen["ids"]] if self.settings.cue else [None] * len(seen["rgb"])
         return np.stack([segment(shown, cue) for shown, cue in zip(seen["rgb"], cues, strict=True)])
 

@@ -143,15 +143,15 @@ def segment(rgb: NDArray[np.uint8], cue: NDArray[np.uint8] | None = None) -> NDA
         others mean nothing. With it objects may have any colours.
     """
     if cue is None:
-        return follow(_found(rgb))
+        return follow(_objects_of(rgb))
     roles = roles_by_color(rgb, cue)
-    others = follow(_found(painted(rgb, roles)))
+    others = follow(_objects_of(painted(rgb, roles)))
     # The network's own agent and patient are what was painted, at most.
     others[others < FIRST_OTHER_ID] = SCENERY_ID
     return np.where(roles == SCENERY_ID, others, roles)
 
 
-def _found(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _objects_of(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the objects of pixels (T, H, W) of each picture by itself."""
     with torch.no_grad():
         found = _network()(network_input(rgb)).double().numpy()

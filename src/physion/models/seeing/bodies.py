@@ -217,20 +217,20 @@ def _squares(placed: Placed) -> Iterator[Placed]:
         yield _centred(replace(placed, scale=scale), placed.middle() + shift)
 
 
-def alike(found: Mapping[int, Placed], rays: Mapping[int, Rays], prior: Prior) -> dict[int, Placed]:
-    """Return solids; those of one shape get the same scales where that fits as well.
+def alike(fits: Mapping[int, Placed], rays: Mapping[int, Rays], prior: Prior) -> dict[int, Placed]:
+    """Return solids; all of one shape get the same scales where that fits as well.
 
     What is hidden of one is seen of another. Where all three scales of a solid are equal, nothing
     is hidden that has to be known. The scales with which most others fit as well are taken first.
     """
-    result = dict(found)
+    result = dict(fits)
     groups: dict[str, set[int]] = {}
-    for number, placed in found.items():
+    for number, placed in fits.items():
         if np.ptp(placed.scale) > 0.01 * placed.scale.max() and placed.cost < GOOD:
             groups.setdefault(placed.solid.name, set()).add(number)
     for left in groups.values():
         pairs = {
-            (giver, number): _scaled_as(found[giver], found[number], rays[number], prior)
+            (giver, number): _scaled_as(fits[giver], fits[number], rays[number], prior)
             for giver, number in itertools.permutations(sorted(left), 2)
         }
         while len(left) > 1:
