@@ -460,7 +460,7 @@ def tables(rows: Sequence[ROW], own: bool) -> str:
     if len(fresh) < len(hits):
         chosen[f"not looked at before ({len(fresh)})"] = fresh
     compared = [("fitted", name) for name in NAMES if name != "fitted"]
-    compared.append(("fitted, state-trees", "true, state-trees"))
+    compared += [("true, guessed", "true"), ("fitted, state-trees", "true, state-trees")]
     differences = [
         {
             "accuracy of": NAMES[a],
@@ -686,6 +686,7 @@ def main() -> None:
         today = datetime.date.today().isoformat()
         error = f" --depth-error {options.depth_error:g}" if options.depth_error else ""
         error += " --no-depth" * options.no_depth + " --own DATASET" * bool(options.own)
+        error += f" --each {options.each}"
         error += f" --version {options.version}" * (options.version != VERSION)
         if options.against:
             error += " --known --write --against " + " ".join(p.name for p in options.against)

@@ -190,7 +190,7 @@ class Learner:
     def forests(self) -> dict[str, NDArray[np.float64]]:
         """Return P(contact) of forests of each scenario, fitted on the same trials, if possible."""
         name = SAME[self.name]
-        if name not in self.own:
+        if name not in self.own or self.options.steps == 0:
             return {}
         counts = {"own": int(self.held.sum()), "official": len(self.asked["trial"])}
         found = {part: np.full(count, np.nan) for part, count in counts.items()}

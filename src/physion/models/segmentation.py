@@ -13,9 +13,10 @@ with its centre c, velocity v, and size a (square root of the area, halves of wi
 pairs are chosen so that the sum of d is least, and none is farther apart than `FAR`.
 
 With a cue objects may have any colours. The first picture then says which colours agent and patient
-have: a pixel of a later one belongs to them if most of the `NEIGHBORS` pixels of the first picture
-with the nearest colours do. They are painted red and yellow, and everything else that is red or
-yellow is painted grey, before the network finds the other objects.
+have: of the `NEIGHBORS` pixels of the first picture with the colours nearest to a pixel of a later
+one, more belong to the agent (or the patient) than to anything else. Its pixels are painted red and
+yellow, and everything else that is red or yellow is painted grey, before the network finds the
+other objects.
 
 The network was trained on own pictures in red and yellow, of 96 pixels a side, with true masks
 (``benchmarks/models/train_segmentation.py``).
@@ -175,7 +176,8 @@ def roles_by_color(rgb: NDArray[np.uint8], cue: NDArray[np.uint8]) -> NDArray[np
 def painted(rgb: NDArray[np.uint8], roles: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return pictures (T, H, W, 3) with a red agent and a yellow patient, and nothing else so.
 
-    ``roles`` (T, H, W) has `AGENT_ID` and `PATIENT_ID`. A painted pixel is as bright as it was.
+    ``roles`` (T, H, W) has `AGENT_ID` and `PATIENT_ID`. A painted pixel is as bright as it was, but
+    at least `DARKEST`.
     """
     out = rgb.copy()
     red, yellow = color_masks(rgb)
