@@ -260,9 +260,9 @@ def _stacked(
             # Also what falls is there in the first frame.
             tops = (result[n][1].extent_z()[1] for n in first if _carries(result[n][1], placed))
             level = max((top for top in tops if top < bottom), default=floor)
-            longer = _grounded(placed, rays_of[number], level)
-            if number in resting or _rests(number, longer, pictures):
-                result[number] = (frames[0], longer)
+            grounded = _grounded(placed, rays_of[number], level)
+            if number in resting or _rests(number, grounded, pictures):
+                result[number] = (frames[0], grounded)
             continue
         top, support = max(below)
         if result[support][1].solid.name.startswith((*VESSELS, RAMP)):
@@ -272,16 +272,17 @@ def _stacked(
         ]  # so far as known
         if bottom > top:
             # Its upper end may be hidden by what stands on it.
-            low = result[support][1].extent_z()[0]
-            for higher in _reaching(result[support][1], low, bottom):
-                cost = cost_of(higher, rays_of[support])
-                if cost < result[support][1].cost + NEARLY:
-                    result[support], top = (frames[0], replace(higher, cost=cost)), bottom
+            lower = result[support][1]
+            higher = _reaching(lower, lower.extent_z()[0], bottom)
+            cost = math.inf if higher is None else cost_of(higher, rays_of[support])
+            if higher is not None and cost < lower.cost + NEARLY:
+                result[support], top = (frames[0], replace(higher, cost=cost)), bottom
         neighbours = [result[support][1], *(result[n][1] for n in above)]
         center = np.mean([each.middle()[:2] for each in neighbours], axis=0)
         prior = Prior(floor, top, 0.3, (float(center[0]), float(center[1])), 0.05)
-        longer_too = _reaching(placed, top, placed.extent_z()[1])
-        again = refine([placed, *longer_too], rays_of[number], prior)
+        longer = _reaching(placed, top, placed.extent_z()[1])
+        starts = [placed] if longer is None else [placed, longer]
+        again = refine(starts, rays_of[number], prior)
         if again.cost < placed.cost + NEARLY:
             result[number] = (frames[0], again)
     return result
@@ -300,27 +301,27 @@ def _grounded(placed: Placed, rays: Rays, floor: float) -> Placed:
     What hides its lower end hides how long it is. It stays as it is where that does not fit.
     """
     longer = _reaching(placed, floor, placed.extent_z()[1])
-    if not longer:
+    if longer is None:
         return placed
-    found = refine(longer, rays, Prior(floor, floor, 3.0))
+    found = refine([longer], rays, Prior(floor, floor, 3.0))
     return found if found.cost < placed.cost + CHANGED else placed
 
 
-def _reaching(placed: Placed, low: float, high: float) -> list[Placed]:
+def _reaching(placed: Placed, low: float, high: float) -> Placed | None:
     """Return an upright object as one that reaches from a height up to another one.
 
-    Nothing if it lacks less than `TOO_SHORT` at both ends, or is not upright.
+    None if it lacks less than `TOO_SHORT` at both ends, or is not upright.
     """
     bottom, top = placed.extent_z()
     axis = int(np.argmax(np.abs(placed.rotation[2])))
     change = max(bottom - low, high - top)
     if change < TOO_SHORT or abs(placed.rotation[2, axis]) < UPRIGHT:
-        return []
+        return None
     scale, before = placed.scale.copy(), placed.middle()
     scale[axis] *= (high - low) / (top - bottom)
     longer = replace(placed, scale=scale)
     shift = before - longer.middle() + np.array([0, 0, (low + high - bottom - top) / 2])
-    return [moved_with(longer, shift)]
+    return moved_with(longer, shift)
 
 
 def _rests(number: int, placed: Placed, pictures: Mapping[int, SeenFrame]) -> bool:
