@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pandas as pd
 import pytest
 
 from physion.analysis.published.tables import read_published
+from physion.core.errors import BadInputError
 from physion.data.official import official
 
 FOLDER = Path(__file__).parents[1] / "benchmarks" / "models"
@@ -92,15 +94,29 @@ def test_a_tiny_run_is_resumed_and_tests_other_scenarios(
     scale = table.SCALES["tiny"]
     assert table.make_sets(tmp_path, scale, ["collide", "roll"], rendered=True) == 20
     part = table.Part(tmp_path, "cswm", "one", scale, rendered=True)
-    assert not part.finished().predictions
+    assert part.stored() is None
     first = part.train()
     assert [one.name for one in first.trained] == ["collide", "roll"] and not first.failed
     assert all(one.loaded for one in part.train().trained)
     assert not part.evaluate("official").failed
-    done = part.finished()
-    assert list(done.predictions) == ["official"] and len(done.folders) == done.trainings == 2
+    page = importlib.import_module("paper_page")
+    for done in (part, table.Part(tmp_path, "cswm", "only", scale, rendered=True)):
+        done.evaluate("own")
+        done.evaluate("official")
+        done.stored().write(tmp_path / "stored")
+    only, one = page.read_stored(tmp_path / "stored")
+    assert only.protocol == "only" and set(only.predictions["tested"]) == {"official", "own"}
+    assert (
+        set(one.predictions["tested"]) == {"official"} and one.predictions["outcome"].dtype == bool
+    )
+    assert len(only.losses) == 2 and np.isfinite(only.losses).all() and not one.losses
+    page_text = page.write_page([only, one], tmp_path, write=False)
+    assert "| cswm | only | 2 | 2 | 6 |" in page_text and "- *all*: CSWM" in page_text
+    replace(only, scale={**only.scale, "tested": 3}).write(tmp_path / "stored")
+    with pytest.raises(BadInputError, match="not tested on the same trials"):
+        page.read_stored(tmp_path / "stored")
     released = read_published(official().results.parent)
-    tested = claims.tested_of(done.predictions["official"], released, people=True)
+    tested = claims.tested_of(one.predictions, released, people=True)
     pairs = tested.across.runs.groupby("training").size()
     assert pairs.to_dict() == {"only": 2, "another scenario": 2} and tested.tables.runs.empty
     assert set(tested.matrices["trained"]) == {"collide", "roll"} and len(tested.matrices) == 4

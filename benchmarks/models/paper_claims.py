@@ -62,6 +62,8 @@ IMAGENET = ("pEffNetLite0-mlp", "pEffNetLite0-lstm")
 """Encoders with ImageNet weights here, in the place of the paper's."""
 GENERALISED = ("cswm", "rpin", "dpi")
 """Models that are tested on other scenarios than the one of their training."""
+TESTED = ("official", "own")
+"""Sets that are tested: the stimuli that people saw, and own trials."""
 SIMULATED = "observed+simulated"
 LEVEL = 0.05
 NOT_COMPUTED = "not computed"

@@ -1,10 +1,11 @@
 """The page of the paper's claims: tables, figure 4 and matrices, published and own.
 
-    python benchmarks/models/paper_page.py --write   # weights of the package only, in a minute
+    python benchmarks/models/paper_page.py --write
 
-`paper_table` trains models under every protocol, and adds them. The page is
-``docs/results/paper.md``; its figures are those of `physion.report`, with the published models and
-ours as rows or panels of one figure.
+`paper_table` trains models under every protocol, and stores parts in ``results/paper``: predictions
+as ``MODEL_PROTOCOL.csv.gz``, and how they were trained as ``MODEL_PROTOCOL.json``. The page of all
+that are stored, and of the weights of the package, is ``docs/results/paper.md``; its figures are
+those of `physion.report`, with the published models and ours as rows or panels of one figure.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import datetime
 import json
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,10 +26,12 @@ import pandas as pd
 from PIL import Image
 
 from paper_claims import (
+    GENERALISED,
     NAMES,
     NOT_COMPUTED,
     RESULTS,
     SIMULATED,
+    TESTED,
     Tested,
     averaged,
     claims,
@@ -55,6 +58,7 @@ from physion.analysis.published.tables import (
 )
 from physion.analysis.tables import ALL_BUT, MEAN, ONLY
 from physion.compute.tasks import processor
+from physion.core.errors import BadInputError
 from physion.core.names import SCENARIOS
 from physion.core.tables import markdown_table
 from physion.data.official import official
@@ -65,6 +69,11 @@ from physion.report.figures.training import generalization_figure, grouped_figur
 from physion.report.published import published_plots
 
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "paper.md"
+STORED = RESULTS / "paper"
+COLUMNS = ("model", "readout", "protocol", "dynamics_training_dataset", "seed", "stimulus",
+           "scenario", "p_contact", "outcome")  # fmt: skip
+"""Columns of predictions that are stored."""
+PROTOCOLS = ("all", "only", "one", "all-but")
 HELD_OUT = 0.02
 """Relative change of the held-out loss in the last third of a training that counts as none."""
 DIFFERENT = ("opposite", "not shown here", "shown only here")
@@ -82,23 +91,65 @@ SETS = {
 
 
 @dataclass(frozen=True)
-class Finished:
-    """What of a part is finished.
+class Stored:
+    """A model that was trained under a protocol, and its predictions.
 
-    - ``model``, ``protocol``, ``steps``: the part. ``trainings``: number that it needs.
-    - ``shipped``: whether it has the weights of the package.
-    - ``tested``: sets that it tests. ``predictions``: by finished tested set.
-    - ``folders``: of finished trainings.
+    - ``model``, ``protocol``: name here, and all, only, all-but or one.
+    - ``steps``: of a training. ``scale``: fields of `paper_table.Scale`.
+    - ``losses``: of each training, held-out, after two thirds of the steps and at the end.
+    - ``made``: date and processor.
+    - ``predictions``: rows of `physion evaluate`, with ``tested``: the set of the trial.
     """
 
     model: str
     protocol: str
     steps: int
-    shipped: bool
-    tested: Sequence[str]
-    predictions: Mapping[str, pd.DataFrame]
-    folders: Sequence[Path]
-    trainings: int
+    scale: Mapping[str, Any]
+    losses: Sequence[tuple[float, float]]
+    made: str
+    predictions: pd.DataFrame
+
+    @property
+    def steady(self) -> int:
+        """Number of trainings whose held-out loss hardly changed in the last third."""
+        return sum(abs(last / before - 1) <= HELD_OUT for before, last in self.losses)
+
+    def write(self, folder: Path = STORED) -> None:
+        """Write the part, in place of an earlier one of its name."""
+        folder.mkdir(parents=True, exist_ok=True)
+        about = {field.name: getattr(self, field.name) for field in fields(self)[:-1]}
+        name = f"{self.model}_{self.protocol}"
+        columns = [name for name in COLUMNS if name in self.predictions]
+        table = self.predictions[["tested", *columns]]
+        table.to_csv(
+            folder / f"{name}.csv.gz", index=False, float_format="%.6g",
+            compression={"method": "gzip", "mtime": 0},
+        )  # fmt: skip
+        (folder / f"{name}.json").write_text(json.dumps(about, indent=1) + "\n")
+
+
+def read_stored(folder: Path = STORED) -> list[Stored]:
+    """Return all parts in a folder, by protocol and model.
+
+    Raises `BadInputError` if they were not tested on the same trials.
+    """
+    parts = []
+    for path in folder.glob("*.json"):
+        about = json.loads(path.read_text())
+        text = dict.fromkeys(("seed", "protocol", "dynamics_training_dataset"), str)
+        table = pd.read_csv(path.with_suffix(".csv.gz"), dtype=text)
+        table = table.fillna(dict.fromkeys(text, ""))
+        parts.append(Stored(**about, predictions=table))
+    tested = {tuple(part.scale[name] for name in ("readout", "tested", "official")): part.model
+              for part in parts}  # fmt: skip
+    if len(tested) > 1:
+        numbers = ", ".join(f"{model}: {count}" for count, model in tested.items())
+        raise BadInputError(
+            f"parts in {folder} were not tested on the same trials (readout, own and official "
+            f"trials of {numbers}); compute the others again, or remove them"
+        )
+    order = (list(PROTOCOLS), list(NAMES))
+    return sorted(parts, key=lambda p: (order[0].index(p.protocol), order[1].index(p.model)))
 
 
 def figures(released: PublishedTables, tested: Mapping[str, Tested]) -> list[Plot]:
@@ -192,32 +243,20 @@ def generalisation(released: PublishedTables, own: Sequence[pd.DataFrame]) -> pd
     return table.sort_values(["row", "column", "model"], ignore_index=True)
 
 
-# Trainings, and the page.
+# The page.
 
 
-def held_out(folder: Path) -> tuple[float, bool]:
-    """Return the last held-out loss, and whether it hardly changed in the last third."""
-    lines = (folder / "metrics.jsonl").read_text().splitlines()
-    found = [(row["step"], row["validation/loss"]) for row in map(json.loads, lines)
-             if "validation/loss" in row]  # fmt: skip
-    last_step, last = found[-1]
-    before = [loss for step, loss in found if step <= 2 * last_step / 3] or [found[0][1]]
-    return last, abs(last / before[-1] - 1) <= HELD_OUT
-
-
-def trainings(parts: Sequence[Finished]) -> pd.DataFrame:
-    """Return how many trainings of each part are finished, and how many are trained enough."""
+def trainings(parts: Sequence[Stored]) -> pd.DataFrame:
+    """Return how parts were trained."""
     records = []
     for part in parts:
         if part.protocol == "one":
-            continue
-        losses = [held_out(folder) for folder in part.folders]
-        state = ", ".join(part.predictions) or "no"
+            continue  # which has the trainings of *only*
+        count = len(part.losses)
         records.append(
-            {"model": part.model, "protocol": part.protocol, "steps": part.steps,
-             "finished": f"{len(losses)} of {part.trainings}",
-             "held-out loss within 2 %": sum(steady for _, steady in losses),
-             "evaluated": state}
+            {"model": part.model, "protocol": part.protocol, "trials": part.scale["trials"],
+             "trainings": count, "steps": part.steps,
+             "held-out loss within 2 %": f"{part.steady} of {count}", "made": part.made}
         )  # fmt: skip
     return pd.DataFrame(records)
 
@@ -274,20 +313,18 @@ STORED_ABOUT = (
 )
 
 
-def write_page(
-    parts: Sequence[Finished], folder: Path, scale: Mapping[str, Any], command: str, *, write: bool
-) -> str:
-    """Return the page of what is finished; draw the figures into FOLDER/page.
+def write_page(parts: Sequence[Stored], folder: Path, *, write: bool) -> str:
+    """Return the page of what is stored; draw the figures into FOLDER/page.
 
     With ``write`` the page goes to `PAGE` and the pictures to `RESULTS`.
     """
     released = read_published(official().results.parent)
     tested = {"shipped_official": stored_official(released), "shipped_own": stored_own(released)}
-    for name in ("official", "own"):
-        tables = [part.predictions[name] for part in parts if name in part.predictions]
-        if tables:
-            joined = pd.concat(tables, ignore_index=True)
-            tested[name] = tested_of(joined, released, people=name == "official")
+    if parts:
+        joined = pd.concat([part.predictions for part in parts], ignore_index=True)
+        for name in TESTED:
+            rows = joined[joined["tested"] == name].drop(columns="tested")
+            tested[name] = tested_of(rows, released, people=name == "official")
     table = claims(released, tested)
     pictures = prepare_folder(folder / "page")
     write_csv(folder / "page" / "tables" / "claims.csv", table)
@@ -298,16 +335,15 @@ def write_page(
             # Few colours, for a third of the bytes.
             drawn = Image.open(pictures / f"{plot.name}.png").convert("RGB").quantize(256)
             drawn.save(RESULTS / f"paper_{plot.name}.png", optimize=True)
-    text = page_text(parts, scale, command, tested, table, [plot.name for plot in plots])
+    text = page_text(parts, tested, table, [plot.name for plot in plots])
     if write:
         PAGE.write_text(text)
     return text
 
 
 def page_text(
-    parts: Sequence[Finished], scale: Mapping[str, Any], command: str, tested: Mapping[str, Tested],
-    table: pd.DataFrame, drawn: Sequence[str],
-) -> str:  # fmt: skip
+    parts: Sequence[Stored], tested: Mapping[str, Tested], table: pd.DataFrame, drawn: Sequence[str]
+) -> str:
     """Return the page as Markdown."""
     differ = []
     for _, row in table.iterrows():
@@ -327,16 +363,13 @@ def page_text(
             ours if of == NOT_COMPUTED else f"{ours} (**{of}**)"
             for ours, of in zip(table[name], table[f"{name}_verdict"], strict=True)
         ]
-    missing = [
-        f"- {NAMES[part.model]}, *{part.protocol}*: {SETS[name]}"
-        for part in parts for name in part.tested if name not in part.predictions
-    ]  # fmt: skip
-    known = {part.model for part in parts if part.predictions}
-    rest = [paper for name, paper in NAMES.items() if name not in known]
-    if rest:
-        missing.append(f"- every protocol but *all* of {', '.join(rest)}")
-    if not any(part.protocol == "one" and part.predictions for part in parts):
-        missing.append("- *one*, and with it the matrices of generalisation")
+    known = {(part.model, part.protocol) for part in parts}
+    missing = []
+    for protocol in PROTOCOLS:
+        able = [name for name in NAMES if name in GENERALISED or protocol != "one"]
+        rest = [NAMES[name] for name in able if (name, protocol) not in known]
+        if rest:
+            missing.append(f"- *{protocol}*: {', '.join(rest)}")
     missing.append("- pVGG and pDeIT: their ImageNet weights cannot be had here")
     stored = {name: tested[f"shipped_{name}"].trials for name in ("official", "own")}
     lines = [
@@ -346,12 +379,12 @@ def page_text(
         "scenario, readout and training. This page was written by",
         "",
         "```sh",
-        command,
+        "python benchmarks/models/paper_page.py --write",
         "```",
         "",
         f"{datetime.date.today()}, {processor()}. {STORED_ABOUT.format(**stored)}",
         "",
-        _trained(parts, scale, tested),
+        _trained(parts, tested),
         "",
         "## What does not come out the same",
         "Claims whose test has another sign than in the released tables, or is significant "
@@ -405,26 +438,20 @@ def _wrapped(line: str) -> str:
     return textwrap.fill(line, 100, subsequent_indent=rest, break_on_hyphens=False)
 
 
-def _trained(
-    parts: Sequence[Finished], scale: Mapping[str, Any], tested: Mapping[str, Tested]
-) -> str:
+def _trained(parts: Sequence[Stored], tested: Mapping[str, Tested]) -> str:
     """Return what was trained for the page, with the table of trainings."""
-    table = trainings([part for part in parts if not part.shipped])
     about = "**Trained for this page.** "
-    if table.empty or not any(part.folders for part in parts):
-        return (
-            f"{about}Nothing yet: `benchmarks/models/paper_table.py` does it, for days. DPI-Net "
-            "trained only on Collide, and without it, is in [particle models]"
-            "(../reference/particle-models.md#results)."
-        )
-    counts = [f"{tested[name].trials} {name}" for name in ("official", "own") if name in tested]
+    if not parts:
+        return f"{about}Nothing yet: `benchmarks/models/paper_table.py` does it, for days."
+    counts = [f"{tested[name].trials} {name}" for name in TESTED]
     return (
-        f"{about}Size `small`, {scale['trials']} training trials per scenario (the paper: 2000), "
-        f"without labels, {scale['steps']:g} of the default number of steps, {scale['seeds']} "
-        f"seed(s) of *all*; readouts of {scale['readout']} trials per scenario (1000). Tested "
-        f"trials: {', '.join(counts) or 'none'}. Particle models have the decision *end*. The "
-        "held-out loss at the end is compared with the one after two thirds of the steps.\n\n"
-        f"{markdown(table)}"
+        f"{about}By `python benchmarks/models/paper_table.py FOLDER --scale medium --models MODEL "
+        "--protocols PROTOCOL --write`, where the table has no other numbers: size `small`, "
+        "training trials per scenario (the paper: 2000) without labels, readouts of "
+        f"{parts[0].scale['readout']} trials per scenario (1000). Tested trials: "
+        f"{', '.join(counts)}. Particle models have the decision *end*. The held-out loss at the "
+        "end is compared with the one after two thirds of the steps. Predictions: "
+        f"[results/paper](../../benchmarks/results/paper).\n\n{markdown(trainings(parts))}"
     )
 
 
@@ -433,13 +460,12 @@ def _picture(name: str) -> list[str]:
 
 
 def main() -> None:
-    """Make the page of weights that ship only."""
+    """Make the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--write", action="store_true")
     chosen = parser.parse_args()
     with TemporaryDirectory() as folder:
-        command = "python benchmarks/models/paper_page.py --write"
-        print(write_page([], Path(folder), {}, command, write=chosen.write))
+        print(write_page(read_stored(), Path(folder), write=chosen.write))
 
 
 if __name__ == "__main__":

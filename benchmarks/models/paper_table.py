@@ -3,10 +3,10 @@
     export OMP_NUM_THREADS=1
     python benchmarks/models/paper_table.py FOLDER --plan            # what it would do, with times
     python benchmarks/models/paper_table.py FOLDER --write           # everything, for days
-    python benchmarks/models/paper_table.py FOLDER --scale small --models cswm dpi --write
-    python benchmarks/models/paper_table.py FOLDER --page --write    # the page of what is finished
+    python benchmarks/models/paper_table.py FOLDER --scale medium --models cswm dpi --write
+    python benchmarks/models/paper_page.py --write                   # the page of what is stored
 
-One command, which is resumed by the same command:
+The first command is resumed by the same command:
 
 1. Sets in FOLDER: ``fit`` with training trials, which hold no labels, and readout trials; ``own``
    and ``official``, which are tested: sampled trials, and the packaged scenes that people saw.
@@ -16,20 +16,23 @@ One command, which is resumed by the same command:
    the three readouts on both tested sets.
 3. *one* for C-SWM, RPIN and DPI-Net: each model of *only* tested on every scenario of the official
    stimuli, with the readout *observed+simulated*.
-4. The page: claims, figures and matrices next to the published ones (`paper_page`). With --write
-   it is written to ``docs/results/paper.md``, and its figures to ``results``.
+
+With --write the predictions and held-out losses of every finished part, a model under a protocol,
+are stored in ``results/paper``, from which `paper_page` makes claims, figures and matrices next to
+the published ones. So parts can be computed at different times, and on different machines: the same
+seeds make the same trials.
 
 The plan is printed before. Its times come from few trials and steps, measured once and kept in
 FOLDER/speed.json. The processor time of every part, also of interrupted runs, is added up in
 FOLDER/seconds.json. --trials, --readout, --tested, --official and --steps change a scale; larger
-numbers only add trials. --shipped names models that are not trained: their *all* has the weights of
-the package. A part that is not finished is called "not computed" on the page.
+numbers only add trials.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import datetime
 import json
 import time
 from collections.abc import Iterator, Sequence
@@ -41,12 +44,13 @@ from typing import Any
 import pandas as pd
 
 import physion
-from paper_claims import GENERALISED, IMAGENET, NAMES
-from paper_page import Finished, write_page
+from paper_claims import GENERALISED, IMAGENET, NAMES, TESTED
+from paper_page import PROTOCOLS, Stored, trainings
 from physion import Dataset
 from physion.analysis.published.tables import PARTICLES
 from physion.cli.output import text_table
 from physion.compute.local import SerialExecutor
+from physion.compute.tasks import processor
 from physion.core.files import write_atomic
 from physion.core.names import SCENARIOS
 from physion.data.official import PACKAGED, humans_folder
@@ -60,9 +64,6 @@ from physion.trials.making.plan import GenerateSettings, TrialTask
 from ship_readouts import without_motions
 
 MODELS = tuple(name for name in NAMES if name != "gns-ransac")
-PROTOCOLS = ("all", "only", "one", "all-but")
-TESTED = ("official", "own")
-"""Sets that are tested, and names of their folders."""
 FIT, OUT, SPEED = "fit", "models", "speed"
 PIXELS = 64
 """Side of the movies, as of the pictures that most models see."""
@@ -90,6 +91,7 @@ class Scale:
 
 SCALES = {
     "full": Scale(1000, 1000, 150, 0, 0.25, 3),
+    "medium": Scale(200, 120, 40, 60, 0.12, 1),
     "small": Scale(60, 100, 30, 30, 0.1, 1),
     "tiny": Scale(2, 4, 2, 2, 0.001, 1),
 }
@@ -99,7 +101,6 @@ SCALES = {
 class Part:
     """A model under a protocol, with all its seeds, in a folder.
 
-    ``shipped``: whether it is not trained, but has the weights of the package, which saw *all*.
     ``rendered``: whether the sets have no movies.
     """
 
@@ -107,7 +108,6 @@ class Part:
     model: str
     protocol: str
     scale: Scale
-    shipped: bool = False
     rendered: bool = False
 
     @property
@@ -138,8 +138,6 @@ class Part:
 
     def options(self, steps: int = 0) -> dict[str, dict[str, Any]]:
         """Return the model with its options: random weights, steps, and how often it validates."""
-        if self.shipped:
-            return {self.model: {}}
         steps = steps or self.steps
         own: dict[str, Any] = {"steps": steps, "validate_every": max(1, steps // VALIDATIONS)}
         return {self.model: own if self.model in IMAGENET else {"weights": "random", **own}}
@@ -160,8 +158,6 @@ class Part:
 
     def train(self, *, dry_run: bool = False, steps: int = 0) -> Trainings:
         """Train what is missing."""
-        if self.shipped:
-            return Trainings([], [], {})
         return physion.train(
             self.options(steps), self.fit_set(), self.folder / OUT, dry_run=dry_run,
             **self.shared(),
@@ -175,23 +171,33 @@ class Part:
             readouts=readouts, dry_run=dry_run, **self.shared(),
         )  # fmt: skip
 
-    def finished(self) -> Finished:
-        """Return what is finished: predictions by tested set, and folders of trainings."""
-        predictions = {}
+    def stored(self) -> Stored | None:
+        """Return what is stored of this part, or None if it is not finished."""
+        planned = self.train(dry_run=True).planned
+        if not all(one.done for one in planned):
+            return None
+        tables = []
         for tested in self.tested:
             evaluated = self.evaluate(tested, dry_run=True).evaluated
-            tables = [read_table(one.path) for one in evaluated if one.done]
-            if tables:
-                table = pd.concat(tables, ignore_index=True)
-                if self.shipped:
-                    table = table.assign(protocol="all", seed="0")
-                predictions[tested] = table.assign(model=NAMES[self.model])
-        planned = self.train(dry_run=True).planned
-        folders = [one.folder for one in planned if one.done]
-        return Finished(
-            self.model, self.protocol, self.steps, self.shipped, self.tested, predictions, folders,
-            len(planned),
+            if not all(one.done for one in evaluated):
+                return None
+            tables += [read_table(one.path).assign(tested=tested) for one in evaluated]
+        predictions = pd.concat(tables, ignore_index=True).assign(model=NAMES[self.model])
+        losses = [] if self.protocol == "one" else [held_out(one.folder) for one in planned]
+        return Stored(
+            self.model, self.protocol, self.steps, dataclasses.asdict(self.scale), losses,
+            f"{datetime.date.today()}, {processor()}", predictions,
         )  # fmt: skip
+
+
+def held_out(folder: Path) -> tuple[float, float]:
+    """Return the held-out loss of a training after two thirds of its steps, and at the end."""
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    found = [(row["step"], row["validation/loss"]) for row in map(json.loads, lines)
+             if "validation/loss" in row]  # fmt: skip
+    last_step, last = found[-1]
+    before = [loss for step, loss in found if step <= 2 * last_step / 3] or [found[0][1]]
+    return before[-1], last
 
 
 def official_tasks(limit: int, scenarios: Sequence[str]) -> list[TrialTask]:
@@ -279,7 +285,7 @@ def plan(folder: Path, parts: Sequence[Part], scale: Scale, scenarios: Sequence[
     made = (scale.trials + scale.readout + scale.tested) * count + stimuli
     rows = [("sets", 0, 0, 0.0, made, made * speed["trial"])]
     for part in parts:
-        trained = {"all": part.seeds, "one": 0}.get(part.protocol, count) * (not part.shipped)
+        trained = {"all": part.seeds, "one": 0}.get(part.protocol, count)
         seen = part.seeds * ((part.fitted + scale.tested) * count + stimuli)
         if part.protocol == "one":
             seen = count * (part.fitted * count + stimuli)
@@ -298,7 +304,7 @@ def plan(folder: Path, parts: Sequence[Part], scale: Scale, scenarios: Sequence[
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Do all parts, and print or write the page."""
+    """Do all parts, and store them."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -307,15 +313,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for field in dataclasses.fields(Scale):
         parser.add_argument(f"--{field.name}", type=float if field.name == "steps" else int)
     parser.add_argument("--models", nargs="+", choices=NAMES, default=MODELS)
-    parser.add_argument(
-        "--shipped", nargs="*", choices=NAMES, default=(),
-        help="models that are not trained: *all* has the weights of the package",
-    )  # fmt: skip
     parser.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=PROTOCOLS)
     parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=SCENARIOS)
     parser.add_argument("--rendered", action="store_true", help="make no movies")
     parser.add_argument("--plan", action="store_true", help="print the plan only")
-    parser.add_argument("--page", action="store_true", help="compute nothing, only make the page")
     parser.add_argument("--write", action="store_true")
     chosen = parser.parse_args(arguments)
     given = {f.name: getattr(chosen, f.name) for f in dataclasses.fields(Scale)}
@@ -324,38 +325,31 @@ def main(arguments: Sequence[str] | None = None) -> None:
     folder = chosen.folder
     folder.mkdir(parents=True, exist_ok=True)
     parts = [
-        Part(folder, model, protocol, scale, model in chosen.shipped, chosen.rendered)
+        Part(folder, model, protocol, scale, chosen.rendered)
         for protocol in chosen.protocols
         for model in chosen.models
-        if (protocol != "one" or model in GENERALISED)
-        and (protocol == "all" or model not in chosen.shipped)
+        if protocol != "one" or model in GENERALISED
     ]
-    if not chosen.page:
-        print(plan(folder, parts, scale, chosen.scenarios), flush=True)
+    print(plan(folder, parts, scale, chosen.scenarios), flush=True)
     if chosen.plan:
         return
-    if not chosen.page:
-        with timed(folder, "sets"):
-            make_sets(folder, scale, chosen.scenarios, rendered=chosen.rendered)
-        for part in parts:
-            print(f"{time.strftime('%H:%M:%S')} {part.name}", flush=True)
-            with timed(folder, part.name):
-                failed = {**part.train().failed}
-                for tested in part.tested:
-                    failed |= part.evaluate(tested).failed
-            for label, reason in failed.items():
-                print(f"failed: {label}: {reason}", flush=True)
-    command = f"python benchmarks/models/paper_table.py FOLDER --scale {chosen.scale}"
-    command += "".join(f" --{name} {value:g}" for name, value in changed.items())
-    command += f" --models {' '.join(chosen.models)} --protocols {' '.join(chosen.protocols)}"
-    command += " --rendered" * chosen.rendered
-    command += f" --shipped {' '.join(chosen.shipped)}" if chosen.shipped else ""
-    command += " --write"
-    text = write_page(
-        [part.finished() for part in parts], folder, dataclasses.asdict(scale), command,
-        write=chosen.write,
-    )  # fmt: skip
-    print(text)
+    with timed(folder, "sets"):
+        make_sets(folder, scale, chosen.scenarios, rendered=chosen.rendered)
+    finished = []
+    for part in parts:
+        print(f"{time.strftime('%H:%M:%S')} {part.name}", flush=True)
+        with timed(folder, part.name):
+            failed = {**part.train().failed}
+            for tested in part.tested:
+                failed |= part.evaluate(tested).failed
+        for label, reason in failed.items():
+            print(f"failed: {label}: {reason}", flush=True)
+        stored = part.stored()
+        if stored is not None:
+            finished.append(stored)
+            if chosen.write:
+                stored.write()
+    print(text_table(trainings(finished), "Finished parts"))
 
 
 if __name__ == "__main__":
