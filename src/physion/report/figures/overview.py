@@ -13,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
+from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Bbox
 
 from physion.analysis.results import one_row_each
@@ -80,7 +81,7 @@ def overview_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
                                                              strict=True)]  # fmt: skip
         handles = _handles(table, kinds, marks, zone, theme)
         lines = -(-len(handles) // _PER_LINE)
-        axis = figure.add_axes((0.085, 0.105, 0.9, 0.8 - 0.035 * max(lines - 2, 0)))
+        axis = figure.add_axes((0.1, 0.105, 0.885, 0.8 - 0.035 * max(lines - 2, 0)))
         if np.isfinite(zone).all():
             left, right, low, high = zone
             axis.add_patch(Rectangle((left, low), right - left, high - low, linewidth=0,
@@ -137,6 +138,8 @@ def _place_names(
     frame = axis.get_window_extent()
     dots = axis.transData.transform(np.column_stack([x, y]))
     taken = [Bbox.from_bounds(px - 5, py - 5, 10, 10) for px, py in dots]
+    # Bars of other marks cross names.
+    halo: dict[str, Any] = {"path_effects": [withStroke(linewidth=4, foreground=theme.paper)]}
     # People first, then from the rare upper right to the crowd at chance.
     order = sorted(range(len(names)), key=lambda k: (kinds[k] != "people", -y[k], names[k]))
     for k in order:
@@ -145,7 +148,7 @@ def _place_names(
             text = axis.annotate(
                 names[k], (x[k], y[k]), (dx, dy), textcoords="offset points", fontsize=8,
                 ha="left" if dx > 0 else "right" if dx < 0 else "center", va="center", zorder=4,
-                color=theme.faint if kinds[k] == "baseline" else theme.ink,
+                color=theme.faint if kinds[k] == "baseline" else theme.ink, **halo,
                 arrowprops={"arrowstyle": "-", "color": theme.faint, "linewidth": 0.6, "shrinkA": 0,
                             "shrinkB": 3} if max(abs(dx), abs(dy)) >= _LEADER else None,
             )  # fmt: skip
@@ -161,7 +164,7 @@ def _place_names(
             text.remove()
         if best is None:
             axis.annotate(names[k], (x[k], y[k]), (7, 0), textcoords="offset points", fontsize=6,
-                          va="center", color=theme.faint)  # fmt: skip
+                          va="center", color=theme.faint, **halo)  # fmt: skip
 
 
 def _text_box(text: Any, renderer: Any) -> tuple[float, float, float, float]:
