@@ -170,6 +170,8 @@ def test_cards_show_one_readout_of_a_model_and_open_the_rest() -> None:
     assert list(pick_readouts(rows)["model"]) == ["a3"]
     assert list(pick_readouts(rows, named="a2")["model"]) == ["a2"]
     assert list(pick_readouts(rows.iloc[[3]])["model"]) == ["told"]
+    mixed = some_rows(stimulus=["s"] * 2, model=["chance", "a"], base_model=["chance", "a"])
+    assert list(pick_readouts(mixed)["model"]) == ["a", "chance"]
     names = [f"m{k}" for k in range(MOST_ANSWERS + 2)]
     html = answers(some_rows(stimulus=["s"] * len(names), model=names, base_model=names))
     before, after = html.split("<details>")

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis.comparison import Comparison
+from physion.analysis.scores import kind_of
 from physion.analysis.tables import in_order
 from physion.core.html import Markup, joined, macros_of
 from physion.report.html import (
@@ -183,7 +184,7 @@ def card(rows: pd.DataFrame, movie: Markup, links: Mapping[str, str], named: str
 
 def pick_readouts(rows: pd.DataFrame, named: str = "") -> pd.DataFrame:
     """Return the rows of one readout of each model: the readout in ``named``, else by
-    `READOUT_ORDER`.
+    `READOUT_ORDER`. Baselines come last.
 
     Readouts that were shown the outcome (*full*) are left out where another one is there.
     """
@@ -196,6 +197,7 @@ def pick_readouts(rows: pd.DataFrame, named: str = "") -> pd.DataFrame:
             continue
         known = [name for name in READOUT_ORDER if (own["readout"] == name).any()]
         parts.append(own[own["readout"] == known[0]] if known else own)
+    parts.sort(key=lambda own: kind_of(own["model"].iloc[0]) == "baseline")
     return pd.concat(parts)
 
 
