@@ -228,10 +228,12 @@ def fitted_motion(seen: SeenTrial) -> Motion:
 
     Objects move evenly between the frames in which they are seen; what is not seen in the last one
     is where the model takes it to be. The movable object that is the first to move counts as the
-    one that is pushed.
+    one that is pushed. A cloth falls as the model simulates it.
     """
     assert seen.trial is not None
     scene, state = seen.trial.scene, seen.trial.state
+    if scene.cloths:
+        return Motion(scene, simulate(scene, frames=OBSERVED_FRAMES))
     times = np.arange(OBSERVED_FRAMES)
     poses = []
     for i, track in enumerate(seen.tracks):

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from physion import evaluate, sample_scene
-from physion.clips.batch import Batch, Motion, Provenance, Rollout, Spec
+from physion.clips.batch import SCENERY_ID, Batch, Motion, Provenance, Rollout, Spec
 from physion.clips.clips import observed_source
 from physion.clips.rendered import MotionRenderer, object_ids
 from physion.compute.local import SerialExecutor
@@ -22,6 +22,7 @@ from physion.core.errors import BadInputError
 from physion.models.build import build_model
 from physion.models.interface import Model
 from physion.models.seeing.bodies import find, follow
+from physion.models.seeing.cloth import sheet_of
 from physion.models.seeing.hypotheses import _refitted, see_uncertain
 from physion.models.seeing.masks import MaskFit, traced
 from physion.models.seeing.pixels import Rays, SeenFrame, floor_height, picture_of
@@ -35,7 +36,7 @@ from physion.readout.decisions import Decided
 from physion.readout.features import Imagined, imagine_clips, write_features
 from physion.readout.imagined import imagine_with
 from physion.readout.tables import ScenarioPredictions, make_table
-from physion.scenes.scene import Body, Camera, Joint, Push, Roles, Scene
+from physion.scenes.scene import Body, Camera, Joint, Look, Push, Roles, Scene
 from physion.trials.dataset import Dataset
 from physion.trials.official.export_folder import export_official
 from physion.trials.official.import_folder import import_official
@@ -532,6 +533,51 @@ def test_what_hides_the_lower_end_of_an_object_does_not_shorten_it() -> None:
     seen = see_trial("a", batch.frames[0], batch.ids[0], batch.depth[0], batch.camera[0])
     lowest = {track.number: track.placed[0].extent_z() for track in seen.tracks}
     assert lowest[3] == pytest.approx((0.0, 0.8), abs=0.01)
+
+
+@pytest.mark.slow
+def test_a_sheet_of_cloth_falls_over_what_is_under_it() -> None:
+    made = sample_scene("drape", 3)
+    batch = batch_of(made, 256)
+    seen = see_trial("a", batch.frames[0], batch.ids[0], batch.depth[0], batch.camera[0])
+    assert seen.trial is not None and len(seen.tracks) == len(made.bodies)
+    (found,), (true,) = seen.trial.scene.cloths, made.cloths
+    assert found.position == pytest.approx(true.position, abs=0.01)
+    assert found.size == pytest.approx(true.size, abs=0.02)
+    assert all(body.kinematic for body in seen.trial.scene.bodies)
+    shared = seen.shared(20)
+    assert [count for _, count in shared] == [2] * 10
+    assert len({trial.scene.cloths[0].stretch for trial, _ in shared}) == 10
+    falling = simulate(made, frames=45).state(44).cloth_vertices
+    apart = np.abs(seen.trial.state.cloth_vertices - falling)
+    assert np.quantile(apart, 0.9) < 0.02
+
+
+def flat(hidden: bool = False, height: float = 1.0) -> SeenFrame:
+    """Return a sheet of 0.8 m above a floor, from a camera that looks down; 1 is the sheet.
+
+    ``hidden``: something nearer hides its left third, and what is left of it.
+    """
+    x, y = np.meshgrid(np.linspace(-1, 1, 80), np.linspace(-1, 1, 80))
+    vectors = np.stack([x, y, -np.ones_like(x)], axis=-1)
+    on = (np.abs(vectors[..., :2] * (3.0 - height)) < 0.4).all(axis=-1)
+    ids, depth = np.where(on, 1, SCENERY_ID).astype(np.uint8), np.where(on, 3.0 - height, 3.0)
+    if hidden:
+        left = x < -0.13 / (3.0 - height)
+        ids[left], depth[left] = 5, 0.5
+    return SeenFrame(ids, depth, np.array([0.0, 0.0, 3.0]), vectors)
+
+
+def test_a_flat_sheet_is_found_also_where_an_edge_is_hidden() -> None:
+    sheet = sheet_of(1, flat(), 0.0, Look())
+    assert sheet is not None and sheet.size[0] == pytest.approx(0.8, abs=0.05)
+    assert sheet.position == pytest.approx((0.0, 0.0, 1.0), abs=0.01)
+    partly = sheet_of(1, flat(hidden=True), 0.0, Look())
+    assert partly is not None and partly.position == pytest.approx((0.0, 0.0, 1.0), abs=0.03)
+    assert sheet_of(1, flat(height=0.2), 0.0, Look()) is None  # a flat target near the floor
+    tilted = flat()
+    tilted.depth[:40] += 0.02
+    assert sheet_of(1, tilted, 0.0, Look()) is None and sheet_of(7, flat(), 0.0, Look()) is None
 
 
 def test_a_pole_is_joined_to_its_base_until_they_move_apart() -> None:

@@ -1,5 +1,8 @@
 """From the observed frames of a trial to its scene and state at the last of them.
 
+A sheet of cloth, which is flat and level in the first frame (`cloth.sheet_of`), is simulated from
+there with several stiffnesses. Everything else:
+
 1. Every object is fitted in frame 0, or where most of it is seen (`bodies.find`).
 2. Objects that rest on others are fitted again from the bottom up: their lower end is expected at
    the top of what they stand on, and their centre above and below their neighbours. What rests on
@@ -36,18 +39,22 @@ from scipy.spatial.transform import Rotation
 from physion.clips.batch import AGENT_ID, LAST_OBSERVED, PATIENT_ID, SCENERY_ID
 from physion.core.errors import BadInputError
 from physion.models.gaps import gap_of_bodies
-from physion.models.noisy_simulation import ObservedTrial
+from physion.models.noisy_simulation import ObservedTrial, cut_trial
 from physion.models.seeing.bodies import alike, find, follow, moved_with, refine
+from physion.models.seeing.cloth import sheet_of, with_stiffness
 from physion.models.seeing.pixels import LEAST_PIXELS, Rays, SeenFrame, floor_height, picture_of
 from physion.models.seeing.solids import FREE, POSE, Placed, Prior, cost_of, fit
+from physion.physics.engine import DEFAULT_ENGINE, Engine, simulate
 from physion.physics.rigid.bodies import body_mass
 from physion.physics.trajectory import State
 from physion.scenes.scene import (
     FLOORS,
     FRAME_TIME,
     GRAVITY,
+    OBSERVED_FRAMES,
     Body,
     Camera,
+    Cloth,
     Ending,
     Joint,
     Look,
@@ -167,6 +174,7 @@ def see_trial(
     ids: NDArray[np.uint8],
     depth: NDArray[np.floating],
     camera: F64,
+    engine: Engine | str = DEFAULT_ENGINE,
 ) -> SeenTrial:
     """Return scene and state of a trial from its observed frames.
 
@@ -178,6 +186,8 @@ def see_trial(
         (T,) numbers of the frames.
     ids, depth, camera
         (T, H, W), (T, H, W) and (2, 4, 4), as in `physion.clips.batch.Batch`.
+    engine
+        That simulates what a cloth does in the observed frames.
 
     Raises
     ------
@@ -192,7 +202,11 @@ def see_trial(
     notes: list[str] = []
     found: dict[int, tuple[int, Placed]] = {}
     rays_of: dict[int, Rays] = {}
+    sheets = {n: sheet_of(n, pictures[chosen[0]], floor, look_of(n)) for n in numbers}
+    cloths = {n: sheet for n, sheet in sheets.items() if sheet is not None}
     for number in numbers:
+        if number in cloths:
+            continue
         pixels = {frame: picture.pixels(number) for frame, picture in pictures.items()}
         first = chosen[0]
         base = first if pixels[first] >= CLEAR_PIXELS else max(chosen, key=lambda f: pixels[f])
@@ -209,21 +223,32 @@ def see_trial(
     found = _stacked(found, rays_of, pictures, floor)
     same = alike({n: placed for n, (_, placed) in found.items()}, rays_of, Prior(floor=floor))
     found = {n: (base, same[n]) for n, (base, _) in found.items()}
-    tracks = tuple(_track(number, *found[number], pictures, floor) for number in found)
+    if cloths:
+        # Nothing else moves.
+        tracks = tuple(Track(n, (base,), (placed,)) for n, (base, placed) in found.items())
+    else:
+        tracks = tuple(_track(number, *found[number], pictures, floor) for number in found)
     notes += [
         f"object {track.number} is last seen in frame {track.frames[-1]}"
         for track in tracks
-        if track.frames[-1] != LAST_OBSERVED
+        if track.frames[-1] != LAST_OBSERVED and not cloths
     ]
     unseen = [
         word
         for number, word in ((AGENT_ID, "agent"), (PATIENT_ID, "patient"))
-        if number not in found
+        if number not in found and number not in cloths
     ]
     notes += [f"the {word} is never seen" for word in unseen]
     if unseen:
         return SeenTrial(None, tracks, "; ".join(notes))
-    return SeenTrial(_observed(name, tracks, floor, camera), tracks, "; ".join(notes))
+    note = "; ".join(notes)
+    if not cloths:
+        return SeenTrial(_observed(name, tracks, floor, camera), tracks, note)
+    drawn = [
+        _draped(name, tracks, each, floor, camera, engine)
+        for each in with_stiffness(tuple(cloths.values()))
+    ]
+    return SeenTrial(drawn[0], tracks, note, tuple((trial, 1.0) for trial in drawn))
 
 
 # Objects on others.
@@ -489,6 +514,29 @@ def _observed(name: str, tracks: Sequence[Track], seen_floor: float, camera: F64
     return ObservedTrial(scene, state, _touched(tracks))
 
 
+def _draped(
+    name: str, tracks: Sequence[Track], cloths: tuple[Cloth, ...], seen_floor: float, camera: F64,
+    engine: Engine | str,
+) -> ObservedTrial:  # fmt: skip
+    """Return the scene with cloths that fall from the first frame on, and its state at the last.
+
+    In the engine cloth pushes nothing, so that bodies stay where they are.
+    """
+    floor = _resting_floor(tracks, seen_floor)
+    bodies = (body_of(track.number, track.placed[0], floor) for track in tracks)
+    scene = Scene(
+        name,
+        "seen",
+        tuple(replace(body, kinematic=True) for body in bodies),
+        Roles(str(AGENT_ID), str(PATIENT_ID)),
+        camera_of(camera),
+        cloths=cloths,
+        floor=floor,
+        ending=Ending(),
+    )
+    return cut_trial(scene, simulate(scene, engine=engine, frames=OBSERVED_FRAMES))
+
+
 def camera_of(matrices: F64) -> Camera:
     """Return the camera of a view and a projection matrix (2, 4, 4)."""
     view, projection = matrices
@@ -542,7 +590,6 @@ def body_of(number: int, placed: Placed, floor: float) -> Body:
     if ramp:
         surface = SurfaceMaterial(RAMP_FRICTION, RAMP_FRICTION, 0.0)
     density = RING_DENSITY if placed.solid.name == "torus" else DENSITY
-    colors = {AGENT_ID: (1.0, 0.0, 0.0), PATIENT_ID: (1.0, 1.0, 0.0)}
     return Body(
         str(number),
         placed.solid.name,
@@ -552,8 +599,14 @@ def body_of(number: int, placed: Placed, floor: float) -> Body:
         max(1e-3, density * float(np.prod(placed.scale))),
         surface,
         kinematic=bool(flat or ramp or placed.size().max() > LARGE),
-        look=Look(colors.get(number, (0.6, 0.6, 0.6))),
+        look=look_of(number),
     )
+
+
+def look_of(number: int) -> Look:
+    """Return red for the agent, yellow for the patient, and grey."""
+    colors = {AGENT_ID: (1.0, 0.0, 0.0), PATIENT_ID: (1.0, 1.0, 0.0)}
+    return Look(colors.get(number, (0.6, 0.6, 0.6)))
 
 
 def joints_of(tracks: Sequence[Track], bodies: Sequence[Body]) -> tuple[Joint, ...]:

@@ -32,7 +32,7 @@ from physion.models.seeing.scenes import SeenTrial, see_trial
 from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine, simulate
 from physion.rendering.renderer import Renderer
 
-VERSION = 8
+VERSION = 9
 """To be raised with every change of the code that can alter a prediction."""
 KEPT = 16
 """Trials whose scenes are kept in memory, besides the last batch."""
@@ -206,7 +206,7 @@ class SeeingSimulation(Model):
                 error = self.settings.depth_error or EXPECTED_ERROR
                 self._seen[key] = see_uncertain(numbers, ids, depth, camera, error, self.engine)
             else:
-                self._seen[key] = see_trial(name, frames, ids, depth, camera)
+                self._seen[key] = see_trial(name, frames, ids, depth, camera, self.engine)
         return self._seen[key]
 
     def _pictures(self, trial: ObservedTrial | None, steps: int) -> Any:
