@@ -109,12 +109,17 @@ def test_a_tiny_run_is_resumed_and_tests_other_scenarios(
     assert (
         set(one.predictions["tested"]) == {"official"} and one.predictions["outcome"].dtype == bool
     )
-    assert len(only.losses) == 2 and np.isfinite(only.losses).all() and not one.losses
-    page_text = page.write_page([only, one], tmp_path, write=False)
-    assert "| cswm | only | 2 | 2 | 6 |" in page_text and "- *all*: CSWM" in page_text
-    replace(only, scale={**only.scale, "tested": 3}).write(tmp_path / "stored")
-    with pytest.raises(BadInputError, match="not tested on the same trials"):
-        page.read_stored(tmp_path / "stored")
+    assert len(only.losses) == 2 and np.isfinite(only.losses).all()
+    text = page.write_page([only, one], tmp_path, write=False)
+    assert "| cswm | only | 2 | 2 | 6 | 0.001 |" in text and "- *all*: CSWM" in text
+    assert "not computed" in page.write_page([one], tmp_path, write=False)
+    for other in (
+        replace(only, scale={**only.scale, "trials": 3}),
+        replace(only, predictions=only.predictions.iloc[1:]),
+    ):
+        other.write(tmp_path / "stored")
+        with pytest.raises(BadInputError, match="cswm under one and cswm under only"):
+            page.read_stored(tmp_path / "stored")
     released = read_published(official().results.parent)
     tested = claims.tested_of(one.predictions, released, people=True)
     pairs = tested.across.runs.groupby("training").size()

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import gzip
 import json
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -59,6 +60,7 @@ from physion.analysis.published.tables import (
 from physion.analysis.tables import ALL_BUT, MEAN, ONLY
 from physion.compute.tasks import processor
 from physion.core.errors import BadInputError
+from physion.core.files import write_atomic
 from physion.core.names import SCENARIOS
 from physion.core.tables import markdown_table
 from physion.data.official import official
@@ -69,7 +71,7 @@ from physion.report.figures.training import generalization_figure, grouped_figur
 from physion.report.published import published_plots
 
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "paper.md"
-STORED = RESULTS / "paper"
+PARTS = RESULTS / "paper"
 COLUMNS = ("model", "readout", "protocol", "dynamics_training_dataset", "seed", "stimulus",
            "scenario", "p_contact", "outcome")  # fmt: skip
 """Columns of predictions that are stored."""
@@ -95,7 +97,8 @@ class Stored:
     """A model that was trained under a protocol, and its predictions.
 
     - ``model``, ``protocol``: name here, and all, only, all-but or one.
-    - ``steps``: of a training. ``scale``: fields of `paper_table.Scale`.
+    - ``scale``: fields of `paper_table.Scale`. ``steps``: of a training.
+    - ``rendered``: whether pictures were rendered, not read from movies.
     - ``losses``: of each training, held-out, after two thirds of the steps and at the end.
     - ``made``: date and processor.
     - ``predictions``: rows of `physion evaluate`, with ``tested``: the set of the trial.
@@ -103,8 +106,9 @@ class Stored:
 
     model: str
     protocol: str
-    steps: int
     scale: Mapping[str, Any]
+    steps: int
+    rendered: bool
     losses: Sequence[tuple[float, float]]
     made: str
     predictions: pd.DataFrame
@@ -114,24 +118,26 @@ class Stored:
         """Number of trainings whose held-out loss hardly changed in the last third."""
         return sum(abs(last / before - 1) <= HELD_OUT for before, last in self.losses)
 
-    def write(self, folder: Path = STORED) -> None:
+    def trials(self, tested: str) -> frozenset[tuple[str, bool]]:
+        """Return name and outcome of each trial of a tested set."""
+        rows = self.predictions[self.predictions["tested"] == tested]
+        return frozenset(zip(rows["stimulus"], rows["outcome"].astype(bool), strict=True))
+
+    def write(self, folder: Path = PARTS) -> None:
         """Write the part, in place of an earlier one of its name."""
         folder.mkdir(parents=True, exist_ok=True)
         about = {field.name: getattr(self, field.name) for field in fields(self)[:-1]}
         name = f"{self.model}_{self.protocol}"
-        columns = [name for name in COLUMNS if name in self.predictions]
-        table = self.predictions[["tested", *columns]]
-        table.to_csv(
-            folder / f"{name}.csv.gz", index=False, float_format="%.6g",
-            compression={"method": "gzip", "mtime": 0},
-        )  # fmt: skip
-        (folder / f"{name}.json").write_text(json.dumps(about, indent=1) + "\n")
+        text = self.predictions[["tested", *COLUMNS]].to_csv(index=False, float_format="%.6g")
+        write_atomic(folder / f"{name}.csv.gz", gzip.compress(text.encode(), mtime=0))
+        write_atomic(folder / f"{name}.json", f"{json.dumps(about, indent=1)}\n".encode())
 
 
-def read_stored(folder: Path = STORED) -> list[Stored]:
+def read_stored(folder: Path = PARTS) -> list[Stored]:
     """Return all parts in a folder, by protocol and model.
 
-    Raises `BadInputError` if they were not tested on the same trials.
+    Raises `BadInputError` if parts were tested on different trials, or parts of one model were
+    trained differently.
     """
     parts = []
     for path in folder.glob("*.json"):
@@ -140,16 +146,23 @@ def read_stored(folder: Path = STORED) -> list[Stored]:
         table = pd.read_csv(path.with_suffix(".csv.gz"), dtype=text)
         table = table.fillna(dict.fromkeys(text, ""))
         parts.append(Stored(**about, predictions=table))
-    tested = {tuple(part.scale[name] for name in ("readout", "tested", "official")): part.model
-              for part in parts}  # fmt: skip
-    if len(tested) > 1:
-        numbers = ", ".join(f"{model}: {count}" for count, model in tested.items())
-        raise BadInputError(
-            f"parts in {folder} were not tested on the same trials (readout, own and official "
-            f"trials of {numbers}); compute the others again, or remove them"
-        )
     order = (list(PROTOCOLS), list(NAMES))
-    return sorted(parts, key=lambda p: (order[0].index(p.protocol), order[1].index(p.model)))
+    parts.sort(key=lambda p: (order[0].index(p.protocol), order[1].index(p.model)))
+    known: dict[str, tuple[Stored, Any]] = {}
+    for part in parts:
+        facts: dict[str, Any] = {name: part.trials(name) for name in TESTED if part.trials(name)}
+        facts |= {"readout": part.scale["readout"],
+                  f"{part.model}: trials": part.scale["trials"],
+                  f"{part.model}: steps": part.steps}  # fmt: skip
+        for name, fact in facts.items():
+            other, expected = known.setdefault(name, (part, fact))
+            if fact != expected:
+                raise BadInputError(
+                    f"{folder}: {part.model} under {part.protocol} and {other.model} under "
+                    f"{other.protocol} have different {name.rpartition(': ')[2]} trials or steps; "
+                    "compute one of them again at the scale of the other, or remove it"
+                )
+    return parts
 
 
 def figures(released: PublishedTables, tested: Mapping[str, Tested]) -> list[Plot]:
@@ -247,16 +260,15 @@ def generalisation(released: PublishedTables, own: Sequence[pd.DataFrame]) -> pd
 
 
 def trainings(parts: Sequence[Stored]) -> pd.DataFrame:
-    """Return how parts were trained."""
+    """Return how parts were trained; *one* has the trainings of *only*."""
     records = []
     for part in parts:
-        if part.protocol == "one":
-            continue  # which has the trainings of *only*
         count = len(part.losses)
         records.append(
             {"model": part.model, "protocol": part.protocol, "trials": part.scale["trials"],
-             "trainings": count, "steps": part.steps,
-             "held-out loss within 2 %": f"{part.steady} of {count}", "made": part.made}
+             "trainings": count, "steps": part.steps, "of the default": part.scale["steps"],
+             "held-out loss within 2 %": f"{part.steady} of {count}",
+             "pictures": "rendered" if part.rendered else "from movies", "stored": part.made}
         )  # fmt: skip
     return pd.DataFrame(records)
 
@@ -324,7 +336,8 @@ def write_page(parts: Sequence[Stored], folder: Path, *, write: bool) -> str:
         joined = pd.concat([part.predictions for part in parts], ignore_index=True)
         for name in TESTED:
             rows = joined[joined["tested"] == name].drop(columns="tested")
-            tested[name] = tested_of(rows, released, people=name == "official")
+            if len(rows):  # none of own trials if only *one* is there
+                tested[name] = tested_of(rows, released, people=name == "official")
     table = claims(released, tested)
     pictures = prepare_folder(folder / "page")
     write_csv(folder / "page" / "tables" / "claims.csv", table)
@@ -443,15 +456,17 @@ def _trained(parts: Sequence[Stored], tested: Mapping[str, Tested]) -> str:
     about = "**Trained for this page.** "
     if not parts:
         return f"{about}Nothing yet: `benchmarks/models/paper_table.py` does it, for days."
-    counts = [f"{tested[name].trials} {name}" for name in TESTED]
+    counts = [f"{tested[name].trials} {name}" for name in TESTED if name in tested]
     return (
-        f"{about}By `python benchmarks/models/paper_table.py FOLDER --scale medium --models MODEL "
-        "--protocols PROTOCOL --write`, where the table has no other numbers: size `small`, "
-        "training trials per scenario (the paper: 2000) without labels, readouts of "
-        f"{parts[0].scale['readout']} trials per scenario (1000). Tested trials: "
-        f"{', '.join(counts)}. Particle models have the decision *end*. The held-out loss at the "
-        "end is compared with the one after two thirds of the steps. Predictions: "
-        f"[results/paper](../../benchmarks/results/paper).\n\n{markdown(trainings(parts))}"
+        f"{about}`python benchmarks/models/paper_table.py FOLDER --write`, with the scale, models "
+        "and protocols of the table, stored their predictions in "
+        "[results/paper](../../benchmarks/results/paper). The size is `small`. *Trials* are "
+        "training trials per scenario (the paper: 2000), without labels; readouts were fitted on "
+        f"{parts[0].scale['readout']} trials per scenario (the paper: 1000). Tested trials: "
+        f"{', '.join(counts)}. Particle models have the decision *end*. *Held-out loss*: trainings "
+        "in which it differs by at most 2 % from what it was after two thirds of the steps. *Of "
+        "the default*: the fraction of steps that a model has by default. *one* has the trainings "
+        f"of *only*.\n\n{markdown(trainings(parts))}"
     )
 
 

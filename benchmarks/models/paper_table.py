@@ -183,10 +183,10 @@ class Part:
                 return None
             tables += [read_table(one.path).assign(tested=tested) for one in evaluated]
         predictions = pd.concat(tables, ignore_index=True).assign(model=NAMES[self.model])
-        losses = [] if self.protocol == "one" else [held_out(one.folder) for one in planned]
         return Stored(
-            self.model, self.protocol, self.steps, dataclasses.asdict(self.scale), losses,
-            f"{datetime.date.today()}, {processor()}", predictions,
+            self.model, self.protocol, dataclasses.asdict(self.scale), self.steps, self.rendered,
+            [held_out(one.folder) for one in planned], f"{datetime.date.today()}, {processor()}",
+            predictions,
         )  # fmt: skip
 
 

@@ -313,7 +313,8 @@ def _errors(seen: SeenTrial, motion: Motion) -> list[ROW]:
     rows = []
     for index, body in enumerate(scene.bodies):
         name = str(numbers[index])
-        if body.scenery or body.kinematic or name not in seen.trial.scene.names():
+        fitted = {other.name for other in seen.trial.scene.bodies}  # not as cloth
+        if body.scenery or body.kinematic or name not in fitted:
             continue
         other = seen.trial.scene.index(name)
         found, state = seen.trial.scene.bodies[other], seen.trial.state

@@ -21,6 +21,7 @@ from physion.compute.local import SerialExecutor
 from physion.core.errors import BadInputError
 from physion.models.build import build_model
 from physion.models.interface import Model
+from physion.models.noisy_simulation import NoiseLevels, add_noise
 from physion.models.seeing.bodies import find, follow
 from physion.models.seeing.cloth import sheet_of
 from physion.models.seeing.hypotheses import _refitted, see_uncertain
@@ -543,41 +544,58 @@ def test_a_sheet_of_cloth_falls_over_what_is_under_it() -> None:
     assert seen.trial is not None and len(seen.tracks) == len(made.bodies)
     (found,), (true,) = seen.trial.scene.cloths, made.cloths
     assert found.position == pytest.approx(true.position, abs=0.01)
-    assert found.size == pytest.approx(true.size, abs=0.02)
+    assert found.size == pytest.approx(true.size, abs=0.02) and found.stretch == 0.5
     assert all(body.kinematic for body in seen.trial.scene.bodies)
+    assert "object 1 is taken for a sheet of cloth" in seen.note
     shared = seen.shared(20)
     assert [count for _, count in shared] == [2] * 10
     assert len({trial.scene.cloths[0].stretch for trial, _ in shared}) == 10
+    # Each has noise of its own.
+    starts = [add_noise(trial, NoiseLevels(), 1.0, 0, 0)[1] for trial, _ in shared]
+    moved = [
+        (start.cloth_vertices - trial.state.cloth_vertices)[0, 0]
+        for start, (trial, _) in zip(starts, shared, strict=True)
+    ]
+    assert len(set(np.round(moved, 5))) == 10
     falling = simulate(made, frames=45).state(44).cloth_vertices
     apart = np.abs(seen.trial.state.cloth_vertices - falling)
     assert np.quantile(apart, 0.9) < 0.02
 
 
-def flat(hidden: bool = False, height: float = 1.0) -> SeenFrame:
+def flat(height: float = 1.0, hidden: bool = False, narrow: bool = False) -> SeenFrame:
     """Return a sheet of 0.8 m above a floor, from a camera that looks down; 1 is the sheet.
 
-    ``hidden``: something nearer hides its left third, and what is left of it.
+    ``hidden``: something nearer hides its left third, and what is left of it. ``narrow``: only one
+    row of pixels is seen.
     """
     x, y = np.meshgrid(np.linspace(-1, 1, 80), np.linspace(-1, 1, 80))
     vectors = np.stack([x, y, -np.ones_like(x)], axis=-1)
     on = (np.abs(vectors[..., :2] * (3.0 - height)) < 0.4).all(axis=-1)
     ids, depth = np.where(on, 1, SCENERY_ID).astype(np.uint8), np.where(on, 3.0 - height, 3.0)
-    if hidden:
-        left = x < -0.13 / (3.0 - height)
-        ids[left], depth[left] = 5, 0.5
+    covered = x < -0.13 / (3.0 - height) if hidden else np.zeros_like(on)
+    if narrow:
+        covered[np.arange(80) != 40] = True
+    ids[covered], depth[covered] = 5, 0.5
     return SeenFrame(ids, depth, np.array([0.0, 0.0, 3.0]), vectors)
 
 
-def test_a_flat_sheet_is_found_also_where_an_edge_is_hidden() -> None:
-    sheet = sheet_of(1, flat(), 0.0, Look())
+def test_a_flat_sheet_that_falls_is_found_also_where_an_edge_is_hidden() -> None:
+    fallen, look = flat(0.97), Look()
+    sheet = sheet_of(1, flat(), fallen, 0.0, look)
     assert sheet is not None and sheet.size[0] == pytest.approx(0.8, abs=0.05)
     assert sheet.position == pytest.approx((0.0, 0.0, 1.0), abs=0.01)
-    partly = sheet_of(1, flat(hidden=True), 0.0, Look())
+    partly = sheet_of(1, flat(hidden=True), fallen, 0.0, look)
     assert partly is not None and partly.position == pytest.approx((0.0, 0.0, 1.0), abs=0.03)
-    assert sheet_of(1, flat(height=0.2), 0.0, Look()) is None  # a flat target near the floor
+    pierced = flat()
+    pierced.depth[36:44, 36:44] -= 0.1
+    assert sheet_of(1, pierced, fallen, 0.0, look) == sheet
     tilted = flat()
     tilted.depth[:40] += 0.02
-    assert sheet_of(1, tilted, 0.0, Look()) is None and sheet_of(7, flat(), 0.0, Look()) is None
+    for first in (tilted, flat(narrow=True)):
+        assert sheet_of(1, first, fallen, 0.0, look) is None
+    assert sheet_of(1, flat(), flat(), 0.0, look) is None  # a board at rest
+    assert sheet_of(1, flat(0.2), flat(0.17), 0.0, look) is None  # near the floor
+    assert sheet_of(7, flat(), fallen, 0.0, look) is None
 
 
 def test_a_pole_is_joined_to_its_base_until_they_move_apart() -> None:

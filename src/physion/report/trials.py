@@ -197,7 +197,9 @@ def pick_readouts(rows: pd.DataFrame, named: str = "") -> pd.DataFrame:
             continue
         known = [name for name in READOUT_ORDER if (own["readout"] == name).any()]
         parts.append(own[own["readout"] == known[0]] if known else own)
-    parts.sort(key=lambda own: kind_of(own["model"].iloc[0]) == "baseline")
+    parts.sort(
+        key=lambda own: kind_of(name := own["model"].iloc[0]) == "baseline" and name != named
+    )
     return pd.concat(parts)
 
 

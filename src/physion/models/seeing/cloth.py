@@ -1,4 +1,4 @@
-"""A sheet of cloth that is released flat, from the first observed frame.
+"""A sheet of cloth that is released flat in the first frame.
 
 Points of a sheet that is level at height z have that height, however it is seen. A ray o + D v
 meets the plane at D_z = (z - o_z) / v_z: it is on the sheet where the mask is, and passes beside it
@@ -20,35 +20,46 @@ import numpy as np
 
 from physion.core.seeds import generator
 from physion.models.seeing.pixels import LEAST_PIXELS, SeenFrame
+from physion.scenes.scenarios.drape import VERTEX_SPACING
 from physion.scenes.scene import Cloth, Look
 
-LEVEL = 0.004
-"""Metres within which the points of a flat sheet have one height."""
+LEVEL, MOST = 0.004, 0.7
+"""Metres within which points of a flat sheet have one height, and the least fraction of them:
+something may reach through it."""
 ABOVE, WIDE = 0.3, 0.5
-"""Least height of a sheet above the floor, and least side, metres."""
-SPACING = 0.04
-"""Metres between the vertices of a cloth in our presets."""
+"""Least height of a sheet above the floor, and the least extents that are seen, metres."""
+FALLEN = 0.01
+"""Metres by which it has fallen in the second frame."""
 STIFFNESSES = 10
 """Stiffnesses that are drawn."""
 PLACES = 21
 """Places along an axis at which a partly hidden sheet is tried."""
 
 
-def sheet_of(number: int, picture: SeenFrame, floor: float, look: Look) -> Cloth | None:
-    """Return an object of the first frame as a cloth, or None if it is not a flat, level sheet."""
-    mask = picture.ids == number
-    if np.count_nonzero(mask) < LEAST_PIXELS:
+def sheet_of(
+    number: int, first: SeenFrame, second: SeenFrame, floor: float, look: Look
+) -> Cloth | None:
+    """Return an object as a cloth, or None if it is not a level sheet in the air that falls.
+
+    ``first`` and ``second``: the first two frames that are seen.
+    """
+    mask, later = first.ids == number, second.ids == number
+    if min(np.count_nonzero(mask), np.count_nonzero(later)) < LEAST_PIXELS:
         return None
-    points = picture.points(mask)
+    points = first.points(mask)
     height = float(np.median(points[:, 2]))
-    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
-    side = float((high - low).max())
-    if np.ptp(points[:, 2]) > LEVEL or height < floor + ABOVE or side < WIDE:
+    level = np.abs(points[:, 2] - height) < LEVEL
+    if level.mean() < MOST or height < floor + ABOVE:
         return None
-    vectors = picture.vectors.reshape(-1, 3)
-    along = (height - picture.origin[2]) / np.where(vectors[:, 2] == 0, np.nan, vectors[:, 2])
-    beside = (along > 0) & (picture.depth.reshape(-1) > along) & ~mask.reshape(-1)
-    free = (picture.origin + vectors[beside] * along[beside, None])[:, :2]
+    low, high = points[level, :2].min(axis=0), points[level, :2].max(axis=0)
+    fallen = height - float(np.median(second.points(later)[:, 2]))
+    if (high - low).min() < WIDE or fallen < FALLEN:
+        return None
+    side = float((high - low).max())
+    vectors = first.vectors.reshape(-1, 3)
+    along = (height - first.origin[2]) / np.where(vectors[:, 2] == 0, np.nan, vectors[:, 2])
+    beside = (along > 0) & (first.depth.reshape(-1) > along) & ~mask.reshape(-1)
+    free = (first.origin + vectors[beside] * along[beside, None])[:, :2]
     tried = [
         np.linspace(end - side, start, PLACES) + side / 2
         for start, end in zip(low, high, strict=True)
@@ -60,7 +71,7 @@ def sheet_of(number: int, picture: SeenFrame, floor: float, look: Look) -> Cloth
         str(number),
         (float(x), float(y), height),
         (side, side, 0.0),
-        resolution=max(2, round(side / SPACING) + 1),
+        resolution=max(2, round(side / VERTEX_SPACING) + 1),
         look=look,
     )
 

@@ -1,8 +1,5 @@
 """From the observed frames of a trial to its scene and state at the last of them.
 
-A sheet of cloth, which is flat and level in the first frame (`cloth.sheet_of`), is simulated from
-there with several stiffnesses. Everything else:
-
 1. Every object is fitted in frame 0, or where most of it is seen (`bodies.find`).
 2. Objects that rest on others are fitted again from the bottom up: their lower end is expected at
    the top of what they stand on, and their centre above and below their neighbours. What rests on
@@ -24,6 +21,9 @@ there with several stiffnesses. Everything else:
    move. Nothing is concluded from an object that has not moved so far. A pole, an upright cylinder
    that is much higher than wide, is expected to be joined to what it stands on and to what lies on
    it, unless they have moved apart.
+
+With a sheet of cloth (`cloth.sheet_of`) only steps 1 and 2 are done for the other objects, which
+stay: in the engine cloth pushes nothing. The cloth is simulated from frame 0 on.
 """
 
 from __future__ import annotations
@@ -130,9 +130,9 @@ class SeenTrial:
 
     - ``trial``: scene and state at the last observed frame; None if agent or patient was never
       seen. The bodies are called by their numbers in `physion.clips.batch.Batch.ids`.
-    - ``tracks``: the objects. ``note``: what was not seen, or not well; empty for nothing.
-    - ``weighted``: what else it may have been, with positive weights, best first; by default only
-      ``trial``.
+    - ``tracks``: the objects without cloths. ``note``: what was not seen, or not well; empty for
+      nothing.
+    - ``weighted``: what it may have been, with positive weights; by default only ``trial``.
     """
 
     trial: ObservedTrial | None
@@ -193,6 +193,8 @@ def see_trial(
     ------
     BadInputError
         For more than `MOST_OBJECTS` objects, or another camera than a pinhole camera.
+    BadSceneError
+        For a cloth with an engine that simulates none.
     """
     numbers = numbers_of(ids)
     rows = {int(frame): row for row, frame in enumerate(frames)}
@@ -202,8 +204,11 @@ def see_trial(
     notes: list[str] = []
     found: dict[int, tuple[int, Placed]] = {}
     rays_of: dict[int, Rays] = {}
-    sheets = {n: sheet_of(n, pictures[chosen[0]], floor, look_of(n)) for n in numbers}
-    cloths = {n: sheet for n, sheet in sheets.items() if sheet is not None}
+    cloths: dict[int, Cloth] = {}
+    if chosen[0] == 0 and len(chosen) > 1:
+        early = [pictures[frame] for frame in chosen[:2]]
+        sheets = {n: sheet_of(n, early[0], early[1], floor, look_of(n)) for n in numbers}
+        cloths = {n: sheet for n, sheet in sheets.items() if sheet is not None}
     for number in numbers:
         if number in cloths:
             continue
@@ -224,31 +229,38 @@ def see_trial(
     same = alike({n: placed for n, (_, placed) in found.items()}, rays_of, Prior(floor=floor))
     found = {n: (base, same[n]) for n, (base, _) in found.items()}
     if cloths:
-        # Nothing else moves.
         tracks = tuple(Track(n, (base,), (placed,)) for n, (base, placed) in found.items())
+        notes += [f"object {n} is taken for a sheet of cloth" for n in cloths]
+        notes += [
+            f"object {n} is taken to rest, but does not"
+            for n, (_, placed) in found.items()
+            if not _rests(n, placed, pictures)
+        ]
     else:
         tracks = tuple(_track(number, *found[number], pictures, floor) for number in found)
-    notes += [
-        f"object {track.number} is last seen in frame {track.frames[-1]}"
-        for track in tracks
-        if track.frames[-1] != LAST_OBSERVED and not cloths
-    ]
+        notes += [
+            f"object {track.number} is last seen in frame {track.frames[-1]}"
+            for track in tracks
+            if track.frames[-1] != LAST_OBSERVED
+        ]
     unseen = [
         word
         for number, word in ((AGENT_ID, "agent"), (PATIENT_ID, "patient"))
         if number not in found and number not in cloths
     ]
     notes += [f"the {word} is never seen" for word in unseen]
-    if unseen:
-        return SeenTrial(None, tracks, "; ".join(notes))
     note = "; ".join(notes)
+    if unseen:
+        return SeenTrial(None, tracks, note)
     if not cloths:
         return SeenTrial(_observed(name, tracks, floor, camera), tracks, note)
-    drawn = [
-        _draped(name, tracks, each, floor, camera, engine)
-        for each in with_stiffness(tuple(cloths.values()))
-    ]
-    return SeenTrial(drawn[0], tracks, note, tuple((trial, 1.0) for trial in drawn))
+    flat = tuple(cloths.values())
+    trial, *drawn = (
+        # Scenes have different names, so that each gets noise of its own.
+        _draped(f"{name} {rank}", tracks, each, floor, camera, engine)
+        for rank, each in enumerate((flat, *with_stiffness(flat)))
+    )
+    return SeenTrial(trial, tracks, note, tuple((each, 1.0) for each in drawn))
 
 
 # Objects on others.
@@ -520,7 +532,7 @@ def _draped(
 ) -> ObservedTrial:  # fmt: skip
     """Return the scene with cloths that fall from the first frame on, and its state at the last.
 
-    In the engine cloth pushes nothing, so that bodies stay where they are.
+    All bodies stay where they are.
     """
     floor = _resting_floor(tracks, seen_floor)
     bodies = (body_of(track.number, track.placed[0], floor) for track in tracks)

@@ -138,7 +138,7 @@ def _place_names(
     frame = axis.get_window_extent()
     dots = axis.transData.transform(np.column_stack([x, y]))
     taken = [Bbox.from_bounds(px - 5, py - 5, 10, 10) for px, py in dots]
-    # Bars of other marks cross names.
+    # Names are above the bars that cross them, and below the marks.
     halo: dict[str, Any] = {"path_effects": [withStroke(linewidth=4, foreground=theme.paper)]}
     # People first, then from the rare upper right to the crowd at chance.
     order = sorted(range(len(names)), key=lambda k: (kinds[k] != "people", -y[k], names[k]))
@@ -147,7 +147,7 @@ def _place_names(
         for dx, dy in _SPREAD:
             text = axis.annotate(
                 names[k], (x[k], y[k]), (dx, dy), textcoords="offset points", fontsize=8,
-                ha="left" if dx > 0 else "right" if dx < 0 else "center", va="center", zorder=4,
+                ha="left" if dx > 0 else "right" if dx < 0 else "center", va="center", zorder=2.5,
                 color=theme.faint if kinds[k] == "baseline" else theme.ink, **halo,
                 arrowprops={"arrowstyle": "-", "color": theme.faint, "linewidth": 0.6, "shrinkA": 0,
                             "shrinkB": 3} if max(abs(dx), abs(dy)) >= _LEADER else None,
@@ -164,7 +164,7 @@ def _place_names(
             text.remove()
         if best is None:
             axis.annotate(names[k], (x[k], y[k]), (7, 0), textcoords="offset points", fontsize=6,
-                          va="center", color=theme.faint, **halo)  # fmt: skip
+                          va="center", zorder=2.5, color=theme.faint, **halo)  # fmt: skip
 
 
 def _text_box(text: Any, renderer: Any) -> tuple[float, float, float, float]:
