@@ -113,9 +113,10 @@ def test_a_tiny_run_is_resumed_and_tests_other_scenarios(
     text = page.write_page([only, one], tmp_path, write=False)
     assert "| cswm | only | 2 | 2 | 6 | 0.001 |" in text and "- *all*: CSWM" in text
     assert "not computed" in page.write_page([one], tmp_path, write=False)
+    seen = only.predictions
     for other in (
         replace(only, scale={**only.scale, "trials": 3}),
-        replace(only, predictions=only.predictions.iloc[1:]),
+        replace(only, predictions=seen[seen["stimulus"] != seen["stimulus"].iloc[0]]),
     ):
         other.write(tmp_path / "stored")
         with pytest.raises(BadInputError, match="cswm under one and cswm under only"):
