@@ -19,6 +19,8 @@ from physion.clips.clips import observed_source
 from physion.clips.rendered import MotionRenderer, object_ids
 from physion.compute.local import SerialExecutor
 from physion.core.errors import BadInputError
+from physion.core.names import SCENARIOS
+from physion.data.official import official
 from physion.models.build import build_model
 from physion.models.interface import Model
 from physion.models.noisy_simulation import NoiseLevels, add_noise
@@ -596,6 +598,24 @@ def test_a_flat_sheet_that_falls_is_found_also_where_an_edge_is_hidden() -> None
     assert sheet_of(1, flat(), flat(), 0.0, look) is None  # a board at rest
     assert sheet_of(1, flat(0.2), flat(0.17), 0.0, look) is None  # near the floor
     assert sheet_of(7, flat(), fallen, 0.0, look) is None
+
+
+@pytest.mark.slow
+def test_only_the_cloth_of_official_scenes_is_taken_for_cloth() -> None:
+    found = set()
+    for trial in official().trials[::20]:
+        motion = Motion(trial.scene, simulate(trial.scene, frames=45))
+        name, inputs = trial.scene.name, ("ids", "depth", "camera")
+        reader = MotionRenderer({name: motion}, inputs, 256, 15, {name: "redyellow"})
+        read = reader.read(name, np.array((0, 8), np.int64))
+        first, second = (
+            picture_of(read["ids"][i], read["depth"][i], read["camera"]) for i in range(2)
+        )
+        for number in np.unique(first.ids[first.ids != SCENERY_ID]).tolist():
+            sheet = sheet_of(number, first, second, floor_height(first), Look())
+            assert (sheet is not None) == (number == 1 and trial.scene.scenario == "drape"), name
+        found.add(trial.scene.scenario)
+    assert found == set(SCENARIOS)
 
 
 def test_a_pole_is_joined_to_its_base_until_they_move_apart() -> None:
