@@ -1,11 +1,10 @@
 """A sheet of cloth that is released flat in the first frame.
 
 Points of a sheet that is level at height z have that height, however it is seen. A ray o + D v
-meets the plane at D_z = (z - o_z) / v_z: it is on the sheet where the mask is, and passes beside it
-where something farther away is seen. The sheet is a square along x and y, as in our own presets,
-with the larger extent of its points as its side. Where less of the other extent is seen, since
-something hides an edge or the picture ends, it lies where it covers the fewest rays that pass
-beside it.
+meets the plane at D_z = (z - o_z) / v_z: it is on the sheet where the mask is, and misses it where
+something farther away is seen. The sheet is a square along x and y, as in our own presets, with the
+larger extent of its points as its side. Where less of the other extent is seen, since something
+hides an edge or the picture ends, it lies where it covers the fewest rays that miss it.
 
 Stiffness cannot be seen while a sheet falls. It is drawn as in our own presets, from 0 to 1
 (`with_stiffness`).
@@ -58,8 +57,8 @@ def sheet_of(
     side = float((high - low).max())
     vectors = first.vectors.reshape(-1, 3)
     along = (height - first.origin[2]) / np.where(vectors[:, 2] == 0, np.nan, vectors[:, 2])
-    beside = (along > 0) & (first.depth.reshape(-1) > along) & ~mask.reshape(-1)
-    free = (first.origin + vectors[beside] * along[beside, None])[:, :2]
+    missing = (along > 0) & (first.depth.reshape(-1) > along) & ~mask.reshape(-1)
+    free = (first.origin + vectors[missing] * along[missing, None])[:, :2]
     tried = [
         np.linspace(end - side, start, PLACES) + side / 2
         for start, end in zip(low, high, strict=True)
