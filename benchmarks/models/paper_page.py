@@ -75,7 +75,7 @@ PARTS = RESULTS / "paper"
 COLUMNS = ("model", "readout", "protocol", "dynamics_training_dataset", "seed", "stimulus",
            "scenario", "p_contact", "outcome")  # fmt: skip
 """Columns of predictions that are stored."""
-PROTOCOLS = ("all", "only", "one", "all-but")
+PROTOCOLS = ("all", "all-but", "only", "one")
 HELD_OUT = 0.02
 """Relative change of the held-out loss in the last third of a training that counts as none."""
 DIFFERENT = ("opposite", "not shown here", "shown only here")
@@ -466,7 +466,9 @@ def _trained(parts: Sequence[Stored], tested: Mapping[str, Tested]) -> str:
         f"{', '.join(counts)}. Particle models have the decision *end*. *Held-out loss*: trainings "
         "in which it differs by at most 2 % from what it was after two thirds of the steps. *Of "
         "the default*: the fraction of steps that a model has by default. *one* has the trainings "
-        f"of *only*.\n\n{markdown(trainings(parts))}"
+        "of *only*. Another processor rounds sums otherwise, and trains other weights: C-SWM and "
+        "RPIN, trained by the same command on an Intel Xeon, are on this page of commit `511e26b9`."
+        f"\n\n{markdown(trainings(parts))}"
     )
 
 
