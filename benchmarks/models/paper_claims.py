@@ -262,6 +262,8 @@ def fitted(contrast: Contrast, tables: PublishedTables) -> dict[str, Any]:
             complete = tuple(m for m in contrast.models if counts.get(m, 0) == counts.max())
             contrast = replace(contrast, models=complete)
         rows = contrast_rows(contrast, tables, "once")
+        known = set(rows[contrast.column]) if contrast.further else set()
+        contrast = replace(contrast, further=tuple(v for v in contrast.further if v in known))
         groups = tuple(name for name in contrast.groups if rows[name].nunique() > 1)
         if contrast.groups and not groups:
             return {"reason": "one scenario only"}
@@ -341,7 +343,8 @@ def likeness_of(tables: PublishedTables) -> str:
     if rows["model"].nunique() < 3 or rows["kappa"].isna().any():
         return NOT_COMPUTED
     found = accuracy_and_kappa(averaged(tables))["r"]
-    return f"r {found.iloc[0]:.3f} over models, {found.iloc[-1]:.3f} within a scenario"
+    within = f"{found.iloc[-1]:.3f}" if np.isfinite(found.iloc[-1]) else "undefined"
+    return f"r {found.iloc[0]:.3f} over models, {within} within a scenario"
 
 
 def averaged(tables: PublishedTables) -> PublishedTables:
