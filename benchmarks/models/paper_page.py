@@ -136,8 +136,8 @@ class Stored:
 def read_stored(folder: Path = PARTS) -> list[Stored]:
     """Return all parts in a folder, by protocol and model.
 
-    Raises `BadInputError` if parts were tested on different trials, or parts of one model were
-    trained differently.
+    Raises `BadInputError` if parts have different tested or readout trials, or parts of one model
+    different training trials or steps.
     """
     parts = []
     for path in folder.glob("*.json"):
@@ -150,17 +150,19 @@ def read_stored(folder: Path = PARTS) -> list[Stored]:
     parts.sort(key=lambda p: (order[0].index(p.protocol), order[1].index(p.model)))
     known: dict[str, tuple[Stored, Any]] = {}
     for part in parts:
-        facts: dict[str, Any] = {name: part.trials(name) for name in TESTED if part.trials(name)}
-        facts |= {"readout": part.scale["readout"],
-                  f"{part.model}: trials": part.scale["trials"],
-                  f"{part.model}: steps": part.steps}  # fmt: skip
+        facts: dict[str, Any] = {
+            f"tested trials ({name})": part.trials(name) for name in TESTED if part.trials(name)
+        }
+        facts |= {"readout trials": part.scale["readout"],
+                  f"training trials of {part.model}": part.scale["trials"],
+                  f"steps of {part.model}": part.steps}  # fmt: skip
         for name, fact in facts.items():
             other, expected = known.setdefault(name, (part, fact))
             if fact != expected:
                 raise BadInputError(
                     f"{folder}: {part.model} under {part.protocol} and {other.model} under "
-                    f"{other.protocol} have different {name.rpartition(': ')[2]} trials or steps; "
-                    "compute one of them again at the scale of the other, or remove it"
+                    f"{other.protocol} differ in {name}; compute one of them again at the scale of "
+                    "the other, or remove it"
                 )
     return parts
 

@@ -616,7 +616,7 @@ def body_of(number: int, placed: Placed, floor: float) -> Body:
 
 
 def look_of(number: int) -> Look:
-    """Return red for the agent, yellow for the patient, and grey."""
+    """Return red for the agent, yellow for the patient, grey for any other object."""
     colors = {AGENT_ID: (1.0, 0.0, 0.0), PATIENT_ID: (1.0, 1.0, 0.0)}
     return Look(colors.get(number, (0.6, 0.6, 0.6)))
 
