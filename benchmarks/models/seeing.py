@@ -16,7 +16,8 @@ are, by scenario:
    (AUC), of the fitted and the true state; agreement with the true state, and the mean absolute
    change of P.
 2. Accuracy of other predictions from the same states: simulation without noise, or with masses and
-   friction as the model expects them, DPI-Net, `state-trees` with the readouts that ship, constant
+   friction as the model expects them (also with the fitted velocities; and the fitted state with
+   the true ones), DPI-Net, `state-trees` with the readouts that ship, constant
    motion, and the answers for the other fitted trials of the scenario.
 3. Differences between the accuracies of these, with standard errors of paired differences, of all
    trials, and without those that were looked at while the fit was written (``LOOKED_AT``).
@@ -151,9 +152,13 @@ def measure(scene: Scene, contact: bool, looked_at: bool, given: Mapping[str, An
     answered = float(np.mean(model.imagine(batch, SAMPLES, 0).contact))
     seconds = time.process_time() - start
     true = cut_trial(scene, motion.trajectory)
+    expected = guessed(true)
 
     def answer(trial: Any, levels: NoiseLevels, samples: int) -> float:
         return float(np.mean(simulate_contacts(trial, levels, 1.0, samples, 0, engine)))
+
+    def shared(trials: Iterable[tuple[ObservedTrial, int]]) -> float:
+        return sum(n * answer(trial, NoiseLevels(), n) for trial, n in trials) / SAMPLES
 
     row: ROW = {
         "stimulus": scene.name,
@@ -165,7 +170,7 @@ def measure(scene: Scene, contact: bool, looked_at: bool, given: Mapping[str, An
         "fitted": answered,
         "true": answer(true, NoiseLevels(), SAMPLES),
         "true, no noise": answer(true, STILL, 1),
-        "true, guessed": answer(guessed(true), NoiseLevels(), SAMPLES),
+        "true, guessed": answer(expected, NoiseLevels(), SAMPLES),
         "note": seen.note,
     }
     others = {"true": motion}
@@ -175,6 +180,14 @@ def measure(scene: Scene, contact: bool, looked_at: bool, given: Mapping[str, An
         row["fitted, constant motion"] = float(gap <= 0 or seen.trial.observed_contact)
         row["objects"] = _errors(seen, motion)
         others["fitted"] = fitted_motion(seen)
+        fits = seen.shared(SAMPLES)
+        if not scene.cloths and not seen.trial.scene.cloths:
+            row["fitted, true velocities"] = shared(
+                (with_velocities(fit, true), n) for fit, n in fits
+            )
+            row["true, fitted velocities"] = shared(
+                (with_velocities(expected, fit), n) for fit, n in fits
+            )
     for name, observed in others.items():
         row[f"{name}, DPI-Net"] = _dpi(observed)
         row[f"{name}, state-trees"] = _trees(observed, scene.scenario)
@@ -194,6 +207,29 @@ def guessed(trial: ObservedTrial) -> ObservedTrial:
         for body in trial.scene.bodies
     ]
     return replace(trial, scene=replace(trial.scene, bodies=tuple(bodies)))
+
+
+def with_velocities(trial: ObservedTrial, source: ObservedTrial) -> ObservedTrial:
+    """Return a trial with the velocities that the same objects have in a source.
+
+    Either may be fitted, with numbers as names of the bodies.
+    """
+    rows = _rows(source.scene)
+    velocities = trial.state.velocities.copy()
+    spins = trial.state.angular_velocities.copy()
+    for number, row in _rows(trial.scene).items():
+        if number in rows:
+            velocities[row] = source.state.velocities[rows[number]]
+            spins[row] = source.state.angular_velocities[rows[number]]
+    state = replace(trial.state, velocities=velocities, angular_velocities=spins)
+    return replace(trial, state=state)
+
+
+def _rows(scene: Scene) -> dict[int, int]:
+    """Return the rows of the bodies by number in masks."""
+    if all(body.name.isdigit() for body in scene.bodies):
+        return {int(body.name): row for row, body in enumerate(scene.bodies)}
+    return {int(number): row for row, number in enumerate(object_ids(scene)[1:])}
 
 
 def _batch(motion: Motion, spec: Any, every: bool, error: float) -> Batch:
@@ -341,8 +377,10 @@ NAMES = {
     "true": "true state",
     "true, no noise": "true state, no noise",
     "true, guessed": "true state, masses and friction guessed",
+    "true, fitted velocities": "true state, masses and friction guessed, velocities fitted",
     "fitted": "fitted state",
     "fitted, no noise": "fitted state, no noise",
+    "fitted, true velocities": "fitted state, true velocities",
     "true, DPI-Net": "DPI-Net, true states",
     "fitted, DPI-Net": "DPI-Net, fitted states",
     "true, state-trees": "state-trees, true states",
@@ -420,7 +458,8 @@ def _exchanged(table: pd.DataFrame) -> pd.Series:
 def tables(rows: Sequence[ROW], own: bool) -> str:
     """Return all tables as Markdown; nobody has seen ``own`` trials."""
     table = pd.DataFrame(list(rows))
-    hits = pd.DataFrame({name: right(table[name], table["contact"]) for name in list(NAMES)[:-1]})
+    names = [name for name in NAMES if name in table]
+    hits = pd.DataFrame({name: right(table[name], table["contact"]) for name in names})
     hits["exchanged"] = _exchanged(table)
     groups = [*table.groupby("scenario").groups.items(), ("all", table.index)]
     answers, others, errors = [], [], []
@@ -438,7 +477,7 @@ def tables(rows: Sequence[ROW], own: bool) -> str:
                 "change of P": f"{(part['fitted'] - part['true']).abs().mean():.3f}",
             }
         )
-        columns = {NAMES[k]: f"{hit[k].mean():.3f}" for k in NAMES if k not in ("fitted", "true")}
+        columns = {NAMES[k]: f"{hit[k].mean():.3f}" for k in hits if k not in ("fitted", "true")}
         others.append({"scenario": name, **columns})
         objects = pd.DataFrame(
             [o for listed in part["objects"].dropna() for o in listed],
@@ -462,8 +501,11 @@ def tables(rows: Sequence[ROW], own: bool) -> str:
     chosen = {f"all ({len(hits)})": hits.index}
     if len(fresh) < len(hits):
         chosen[f"not looked at before ({len(fresh)})"] = fresh
-    compared = [("fitted", name) for name in NAMES if name != "fitted"]
+    compared = [("fitted", name) for name in hits if name != "fitted"]
     compared += [("true, guessed", "true"), ("fitted, state-trees", "true, state-trees")]
+    if "true, fitted velocities" in hits:
+        compared += [("true, fitted velocities", "true, guessed")]
+        compared += [("fitted, true velocities", "true, guessed")]
     differences = [
         {
             "accuracy of": NAMES[a],
