@@ -167,7 +167,12 @@ class Pictures:
                 (name, objects),
                 MotionRenderer(self._motions, [name], self._size, objects, self._looks),
             )
-            kept |= dict(zip(missing.tolist(), renderer.read(trial, missing)[name], strict=True))
+            drawn = renderer.read(trial, missing)[name]
+            if name == "camera":  # The same in all frames.
+                drawn = np.repeat(drawn[None], len(missing), axis=0)
+            kept |= dict(zip(missing.tolist(), drawn, strict=True))
+        if name == "camera":
+            return kept[int(frames[0])]
         return np.stack([kept[frame] for frame in frames.tolist()])
 
 
