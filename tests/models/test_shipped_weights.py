@@ -18,6 +18,7 @@ from physion.core.names import SCENARIOS
 from physion.models.build import build_model
 from physion.models.checkpoint import shipped_digests
 from physion.models.cswm import ranking
+from physion.models.intuition import INPUTS
 from physion.models.particles.simulator import ParticleSimulator
 from physion.models.vision import empty_scene_error
 from physion.physics.engine import simulate
@@ -29,7 +30,7 @@ from support.moving_squares import with_arrays
 
 NAMES = tuple(sorted(shipped_digests()))
 PARTICLES, VISION = {"dpi", "gns", "gns-ransac"}, {"svg", "op3", "cswm", "rpin"}
-INTUITION = {"intuition-states", "intuition-masks", "intuition-pixels"}
+INTUITION = {f"intuition-{kind}" for kind in INPUTS}
 
 
 def test_all_models_that_must_have_weights_do() -> None:
