@@ -9,8 +9,7 @@ contact in the observed part, and with agent and patient visible in the first fr
 all `MODELS` are written to FOLDER/own, in files of `EACH` trials. With --official the same of the
 stimuli that people saw goes to FOLDER/official; with --stored the training trials of a dataset go
 to FOLDER/own, but for those with the scene of an official one. With --look free objects have the
-colours of their scenes, and intuition-pixels has a cue in the first frame. With --again the trials
-are those that another FOLDER of this kind has, which are not searched for again. The same command
+colours of their scenes, and intuition-pixels has a cue in the first frame. The same command
 continues.
 """
 
@@ -55,7 +54,7 @@ from ship_readouts import Pictures
 
 MODELS = (
     "state-trees", "mask-trees", "blob-trees", "intuition-states", "intuition-masks",
-    "intuition-places", "intuition-pixels",
+    "intuition-pixels",
 )  # fmt: skip
 EACH = 25
 """Trials of a file."""
@@ -189,23 +188,6 @@ def stored_trial(trial: str, row: Mapping[str, Any], motion: Motion, kept: Kept)
         trial, row["scenario"], configuration, bool(row["contact"]), bool(row["observed_contact"]),
         motion.scene.to_json(), see(motion, kept),
     )  # fmt: skip
-
-
-def make_again(kept: Kept, made: Path) -> str:
-    """Make a file of the same trials as another one, if it is not there."""
-    path = kept.folder / made.parent.name / made.name
-    if not there(path, kept):
-        with np.load(made) as stored:
-            columns = [stored[name] for name in FACTS]
-            rows = [dict(zip(FACTS, row, strict=True)) for row in zip(*columns, strict=True)]
-        engine, trials = make_engine("physion"), []
-        for row in rows:
-            scene = Scene.from_json(str(row["scene"]))
-            motion = Motion(scene, engine.simulate(scene, frames=OBSERVED_FRAMES))
-            trials.append(Seen(**row, features=see(motion, kept)))
-        write(path, trials, kept.look)
-        return f"{path.parent.name} {path.stem}"
-    return ""
 
 
 def write(path: Path, trials: Sequence[Seen], look: str) -> None:
@@ -369,7 +351,6 @@ def main() -> None:
     parser.add_argument("--scenarios", nargs="*", choices=SCENARIOS, default=list(RIGID))
     parser.add_argument("--official", action="store_true")
     parser.add_argument("--stored", type=Path, help="dataset whose trials are taken, too")
-    parser.add_argument("--again", type=Path, help="folder whose trials are taken")
     parser.add_argument("--models", nargs="*", choices=MODELS, default=list(MODELS))
     parser.add_argument(
         "--look", choices=("redyellow", "free"), default="redyellow",
@@ -387,11 +368,6 @@ def main() -> None:
     count = 0
     if options.stored:
         count = len(opened(options.stored)[0])
-    again: list[Path] = []
-    if options.again:
-        # Parts in turn, so that what is there is always of all scenarios.
-        again = sorted(options.again.glob("own/*.npz"), key=lambda path: path.stem.split("-")[::-1])
-        again = [*sorted(options.again.glob("official/*.npz")), *again]
     end = time.monotonic() + options.seconds
     with ProcessPoolExecutor(options.workers) as pool:
         made = [pool.submit(make_official, kept, part) for part in parts]
@@ -400,7 +376,6 @@ def main() -> None:
             for part in range(-(-count // EACH))
         ]
         made += [pool.submit(make_own, kept, task) for task in tasks]
-        made += [pool.submit(make_again, kept, path) for path in again]
         for future in made:
             if done := future.result():
                 print(f"{time.strftime('%H:%M:%S')} {done}", flush=True)

@@ -167,12 +167,7 @@ class Pictures:
                 (name, objects),
                 MotionRenderer(self._motions, [name], self._size, objects, self._looks),
             )
-            drawn = renderer.read(trial, missing)[name]
-            if name == "camera":  # The same in all frames.
-                drawn = np.repeat(drawn[None], len(missing), axis=0)
-            kept |= dict(zip(missing.tolist(), drawn, strict=True))
-        if name == "camera":
-            return kept[int(frames[0])]
+            kept |= dict(zip(missing.tolist(), renderer.read(trial, missing)[name], strict=True))
         return np.stack([kept[frame] for frame in frames.tolist()])
 
 

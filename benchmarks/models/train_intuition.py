@@ -7,15 +7,14 @@ The trainer is the one of `physion train`; the same command resumes. The last te
 trials of every scenario trains nothing: on them, and on the official stimuli without a contact in
 the observed part, networks are tested, and compared with forests that saw the same training trials,
 where their features are stored. With --start a training begins from other weights, that of pixels
-from those of masks, that of places from those of states; with --steps 0, too, nothing is trained,
-and these weights are tested on all own trials. Predictions of official stimuli go to
-FOLDER/predictions, where ``intuition.py --predictions`` reads them, weights to FOLDER/training.
---weights names a folder for the weights of all scenarios as float16. Other trainings answer what a
-network has to have seen: --counts, the first trials of each scenario only; --unseen, without the
-configuration of the tested trial (`FOLDS` trainings, each without a part of the configurations);
---all-but, without its scenario. With --write the table is written to
-``results/intuition_networks.md``, with these trainings to ``results/MODEL_unseen.md``, of one model
-at a time.
+from those of masks; with --steps 0, too, nothing is trained, and these weights are tested on all
+own trials. Predictions of official stimuli go to FOLDER/predictions, where ``intuition.py
+--predictions`` reads them, weights to FOLDER/training. --weights names a folder for the weights of
+all scenarios as float16. Other trainings answer what a network has to have seen: --counts, the
+first trials of each scenario only; --unseen, without the configuration of the tested trial
+(`FOLDS` trainings, each without a part of the configurations); --all-but, without its scenario.
+With --write the table is written to ``results/intuition_networks.md``, with these trainings to
+``results/MODEL_unseen.md``, of one model at a time.
 """
 
 from __future__ import annotations
@@ -52,10 +51,10 @@ FOLDS = 5
 """Parts of the configurations of each scenario."""
 SAME = {
     "intuition-states": "state-trees", "intuition-masks": "mask-trees",
-    "intuition-places": "mask-trees", "intuition-pixels": "blob-trees",
+    "intuition-pixels": "blob-trees",
 }  # fmt: skip
 """Forests that see as much as a network."""
-SAME_TOKENS = {"intuition-pixels": "intuition-masks", "intuition-places": "intuition-states"}
+SAME_TOKENS = {"intuition-pixels": "intuition-masks"}
 """Models that may begin from the weights of another one, whose tokens have the same columns."""
 TOGETHER = 64
 """Trials that are predicted at a time."""

@@ -14,7 +14,7 @@ from physion.clips.rendered import MotionRenderer
 from physion.core.errors import BadInputError
 from physion.models.build import build_model
 from physion.models.interface import TrainingSettings
-from physion.models.intuition import VIEWS, mask_tokens, place_tokens, state_tokens
+from physion.models.intuition import VIEWS, mask_tokens, state_tokens
 from physion.models.segmentation import segment
 from physion.physics.engine import simulate
 from physion.physics.trajectory import Contacts, Trajectory
@@ -105,52 +105,6 @@ def test_tokens_of_states_turn_with_agent_and_patient_and_mirror_with_the_world(
     # Bodies that do not turn have other axes than a mirror image.
     compared = [i for name, i in COLUMN.items() if not name.startswith(("axis", "up"))]
     assert mirrored[..., compared] == pytest.approx(image[..., compared], abs=1e-5)
-
-
-def seen_from(motion: Motion, size: int) -> tuple[Any, Any]:
-    """Return masks (T, H, W) and camera of the frames that the models see."""
-    name = motion.scene.name
-    renderer = MotionRenderer({name: motion}, ("ids", "camera"), size, 32, {name: "redyellow"})
-    arrays = renderer.read(name, FRAMES)
-    return arrays["ids"], arrays["camera"]
-
-
-def test_tokens_of_places_are_near_those_of_the_true_state() -> None:
-    made = sample_scene("dominoes", 3)
-    seen = Motion(made, simulate(made, frames=45))
-    ids, camera = seen_from(seen, 256)
-    true = state_tokens(seen, "t", FRAMES, 12)
-    found = place_tokens(FRAMES, ids, camera, 12)
-    assert found.shape == true.shape
-    places = [COLUMN[name] for name in "xyz"]
-    # Agent, patient and probe; the domino that falls is followed, too.
-    assert found[:, :3, 0].all() and true[:, :3, 0].all()
-    assert found[:, :3, places] == pytest.approx(true[:, :3, places], abs=0.08)
-    roles = [COLUMN[name] for name in ("agent", "patient", "probe")]
-    assert (found[:, :3, roles] == true[:, :3, roles]).all()
-    sizes = [COLUMN[name] for name in ("height", "filled")]
-    assert found[0, :2, sizes] == pytest.approx(true[0, :2, sizes], abs=0.1)
-    assert found[0, 0, COLUMN["up z"]] == 1
-    # In the mirror image of the pictures all is on the other side.
-    model: Any = build_model("intuition-places", weights="random")
-    image = model._mirrored(torch.from_numpy(found)).numpy()
-    assert image[..., COLUMN["y"]] == pytest.approx(-found[..., COLUMN["y"]])
-
-
-def test_places_need_the_camera_and_both_agent_and_patient() -> None:
-    made = sample_scene("dominoes", 3)
-    seen = Motion(made, simulate(made, frames=45))
-    ids, camera = seen_from(seen, 256)
-    model: Any = build_model("intuition-places", weights="random")
-    batch = clips(np.stack([ids, np.where(ids == 1, 0, ids)]))
-    with pytest.raises(BadInputError, match="the camera of every trial is needed"):
-        model.predict(batch)
-    batch = replace(batch, camera=torch.from_numpy(np.stack([camera, camera])))
-    answers = model.predict(batch)
-    assert answers[1] == model.base_rate != answers[0]
-    assert model.notes(batch) == ["", "agent or patient never visible: base rate"]
-    with pytest.raises(BadInputError, match="256 x 256 are needed"):
-        model.predict(replace(batch, ids=batch.ids[:, :, :64, :64]))
 
 
 def test_tokens_of_masks_hold_the_largest_objects() -> None:

@@ -18,7 +18,6 @@ from physion.core.names import SCENARIOS
 from physion.models.build import build_model
 from physion.models.checkpoint import shipped_digests
 from physion.models.cswm import ranking
-from physion.models.intuition import INPUTS
 from physion.models.particles.simulator import ParticleSimulator
 from physion.models.vision import empty_scene_error
 from physion.physics.engine import simulate
@@ -30,7 +29,7 @@ from support.moving_squares import with_arrays
 
 NAMES = tuple(sorted(shipped_digests()))
 PARTICLES, VISION = {"dpi", "gns", "gns-ransac"}, {"svg", "op3", "cswm", "rpin"}
-INTUITION = {f"intuition-{kind}" for kind in INPUTS}
+INTUITION = {"intuition-states", "intuition-masks", "intuition-pixels"}
 
 
 def test_all_models_that_must_have_weights_do() -> None:

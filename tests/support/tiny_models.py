@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from physion.models import build_model
-from physion.models.intuition import INPUTS
 
 TINY: dict[str, Any] = {
     "encoder": "test_vit", "image_size": 64, "weights": "random", "hidden": 16,
@@ -24,7 +23,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     **dict.fromkeys(FROZEN, TINY),
     **dict.fromkeys(("VideoMAE", "VideoMAEv2", "V-JEPA2", "V-JEPA2.1"), VIDEO),
     **dict.fromkeys(("svg", "op3", "cswm", "rpin", "gns", "gns-ransac", "dpi"), UNTRAINED),
-    **dict.fromkeys((f"intuition-{kind}" for kind in INPUTS), UNTRAINED),
+    **dict.fromkeys(("intuition-states", "intuition-masks", "intuition-pixels"), UNTRAINED),
     "noisy-simulation": {"samples": 3},
     "seeing-simulation": {"samples": 3, "image_size": 96},
     "noisy-simulation-outcomes": {"samples": 3},

@@ -2,10 +2,8 @@
 
 One network for all scenarios. It simulates nothing and knows no physics: it has seen many trials
 and how they ended. An object is a token, which holds its track over the observed frames 2, 5, ...,
-44, from the true state (`intuition-states`), from its true mask (`intuition-masks`), from the
-place in the world that another network finds by the masks and the camera (`intuition-places`,
-`physion.models.seeing.places`), or from the mask that a network finds in pictures
-(`intuition-pixels`, `physion.models.segmentation`):
+44, from the true state (`intuition-states`), from its true mask (`intuition-masks`), or from the
+mask that a network finds in pictures (`intuition-pixels`, `physion.models.segmentation`):
 
     x_k = f(track_k, track_k - track_agent, track_k - track_patient, constants_k),
 
@@ -55,13 +53,11 @@ from physion.models.interface import (
     Sizes,
     TrainingSettings,
 )
-from physion.models.seeing.expected import FARTHEST, weights_sha256
-from physion.models.seeing.places import SHAPES, seen_places
 from physion.models.segmentation import SIDE, segment, segmentation_version
 from physion.models.torch_model import TorchModel, initial_weights, weights_digest
 from physion.numerics.linear_algebra import norm
 from physion.numerics.rotations import rotate_vectors, rotation_matrices
-from physion.scenes.scene import FRAME_TIME, Scene
+from physion.scenes.scene import Scene
 from physion.scenes.shapes.primitives import shape
 
 VERSION = 1
@@ -69,11 +65,9 @@ VERSION = 1
 # What a token holds. Columns of a track are of every frame, constants of the object. A mirror image
 # of a trial has the same columns in another order, some with the other sign.
 
-STATE, MASK, PLACES, PIXELS = "states", "masks", "places", "pixels"
-INPUTS = {STATE: ("state",), MASK: ("ids",), PLACES: ("ids", "camera"), PIXELS: ("rgb",)}
-"""What is seen, as inputs of a `Spec`."""
-TAUGHT = {PLACES: "places in depth", PIXELS: "segmentation"}
-"""What networks were trained for that find what a model goes on with."""
+STATE, MASK, PIXELS = "states", "masks", "pixels"
+INPUTS = {STATE: "state", MASK: "ids", PIXELS: "rgb"}
+"""What is seen, as an input of a `Spec`."""
 _CORNERS = tuple(f"corner {x}{y}{z}" for x in "-+" for y in "-+" for z in "-+")
 
 
@@ -129,7 +123,7 @@ VIEWS: Mapping[str, TokenColumns] = {
         swapped=(("left", "right"),),
     ),
 }  # fmt: skip
-"""Columns by what is seen; found masks and places have the columns of true masks and states.
+"""Columns by what is seen; found masks have the same columns as true ones.
 
 - ``states``: centre of the bounding box in metres, directions of two axes of the body, velocity
   and angular velocity (asinh of m/s and rad/s); size in metres, fraction of the bounding box that
@@ -158,7 +152,11 @@ def state_tokens(
     now = tracks[-1, :, :3]
     agent, patient = names.index(roles.agent), names.index(roles.patient)
     chosen = _nearest(scene, now, there[-1], objects)
-    origin, axes = _axes(now[agent], now[patient])
+    ahead = now[agent, :2] - now[patient, :2]
+    length = float(norm(ahead))
+    x, y = ahead / length if length > 0 else (1.0, 0.0)
+    axes = np.array([[x, y, 0.0], [-y, x, 0.0], [0.0, 0.0, 1.0]])
+    origin = np.array([*now[patient, :2], 0.0])
     vectors = tracks[:-1, chosen].reshape(len(frames), len(chosen), -1, 3).copy()
     vectors[:, :, 0] -= origin
     turned = (vectors @ axes.T).reshape(len(frames), len(chosen), -1)
@@ -173,22 +171,6 @@ def state_tokens(
     repeated = np.broadcast_to(constants, (len(frames), *constants.shape))
     tokens[:, places] = np.concatenate([tracked, repeated * ever[:, None]], -1)
     return tokens
-
-
-def _axes(agent: F64, patient: F64) -> tuple[F64, F64]:
-    """Return origin (3,) and axes (3, 3) of the tokens, from the places of agent and patient."""
-    ahead = agent[:2] - patient[:2]
-    length = float(norm(ahead))
-    x, y = ahead / length if length > 0 else (1.0, 0.0)
-    axes = np.array([[x, y, 0.0], [-y, x, 0.0], [0.0, 0.0, 1.0]])
-    return np.array([*patient[:2], 0.0]), axes
-
-
-def _aside(places: F64, start: F64, end: F64) -> F64:
-    """Return how far places (N, 3) are from the line from start to end."""
-    way = end - start
-    along = np.clip((places - start) @ way / (float(way @ way) or 1.0), 0, 1)
-    return norm(places - start - along[:, None] * way)
 
 
 def _tracks(seen: Motion, frames: NDArray[np.int64]) -> tuple[F64, NDArray[np.bool_]]:
@@ -228,7 +210,9 @@ def _nearest(scene: Scene, now: F64, there: NDArray[np.bool_], objects: int) -> 
     names = scene.names()
     first = [names.index(scene.roles.agent), names.index(scene.roles.patient)]
     first += [probe] if (probe := _probe(scene)) >= 0 else []
-    aside = _aside(now, now[first[1]], now[first[0]])
+    start, way = now[first[1]], now[first[0]] - now[first[1]]
+    along = np.clip((now - start) @ way / (float(way @ way) or 1.0), 0, 1)
+    aside = norm(now - start - along[:, None] * way)
     scenery = [body.scenery for body in scene.bodies] + [False] * len(scene.cloths)
     others = [i for i in range(len(names)) if there[i] and not scenery[i] and i not in first]
     free = objects - (3 if objects > 2 else 2)
@@ -266,60 +250,6 @@ def _reach(name: str) -> tuple[float, ...]:
     return (float(shape(name).volume / np.prod(high - low)), *(float(c) for c in corners))
 
 
-# Tokens of places.
-
-MOVES = 0.3
-"""Speed in m/s from which an object counts as moving."""
-
-
-def place_tokens(
-    frames: NDArray[np.int64], ids: NDArray[np.uint8], camera: F64, objects: int
-) -> NDArray[np.float32]:
-    """Return tokens (T, K, D) with the columns of states, from masks (T, H, W) and the camera.
-
-    Velocities are differences of places. The first object that moves counts as the probe. What is
-    not known (axes of bodies, angular velocity, what is fixed) is 0. The frame of places is that
-    of the last frames in which agent and patient are seen; without one of them all is 0.
-    """
-    view = VIEWS[STATE]
-    tokens = np.zeros((len(ids), objects, len(view.columns)), np.float32)
-    seen = seen_places(frames.tolist(), ids, camera)
-    ranked = [seen.numbers.index(n) for n in (AGENT_ID, PATIENT_ID) if n in seen.numbers]
-    if len(ranked) < 2 or not seen.there[ranked].any(axis=1).all():
-        return tokens
-    there = seen.there
-    last = len(ids) - 1 - np.argmax(there[:, ::-1], axis=1)
-    now = np.take_along_axis(seen.places, last[:, None, None], axis=1)[:, 0]
-    origin, axes = _axes(now[ranked[0]], now[ranked[1]])
-    places = ((seen.places - origin) @ axes.T).clip(-FARTHEST, FARTHEST)
-    velocities = np.zeros_like(places)
-    steps = np.diff(places, axis=1) / (np.diff(frames) * FRAME_TIME)[:, None]
-    velocities[:, 1:] = steps * (there[:, 1:] & there[:, :-1])[..., None]
-    velocities[:, 0] = velocities[:, 1]
-    moves = there & (norm(velocities) > MOVES)
-    starts = np.where(moves.any(axis=1), moves.argmax(axis=1), len(ids))
-    first = int(np.argmin(starts))
-    probe = first if starts[first] < len(ids) and first not in ranked else -1
-    at = np.take_along_axis(places, last[:, None, None], axis=1)[:, 0]
-    aside = _aside(at, at[ranked[1]], at[ranked[0]])
-    others = [k for k in range(len(at)) if k not in (*ranked, probe) and there[k].any()]
-    order = [*ranked, probe, *sorted(others, key=lambda k: float(aside[k]))]
-    reach = seen.shapes @ np.array([_reach(name) for name in SHAPES])
-    columns = {name: column for column, name in enumerate(view.columns)}
-    for token, k in enumerate(order[:objects]):
-        if k < 0:
-            continue
-        tokens[there[k], token, 0] = 1.0
-        tokens[there[k], token, 1:4] = places[k, there[k]]
-        tokens[there[k], token, columns["up z"]] = 1.0
-        tokens[there[k], token, columns["vx"] : columns["vz"] + 1] = np.arcsinh(
-            velocities[k, there[k]]
-        )
-        roles = [k == ranked[0], k == ranked[1], k == probe, False, False]
-        tokens[:, token, columns["agent"] :] = [*roles, *seen.sizes[k], *reach[k]]
-    return tokens
-
-
 # Tokens of masks.
 
 
@@ -352,7 +282,7 @@ def mask_tokens(ids: NDArray[np.uint8], objects: int) -> NDArray[np.float32]:
 class IntuitionSettings(SizedSettings):
     """Settings of a model of intuition; also see `SizedSettings`.
 
-    - ``image_size``: pixels per side of the masks; from pixels always 96, for places 256.
+    - ``image_size``: pixels per side of the masks; from pixels always 96.
     - ``objects``: tokens K. With more objects the largest masks, or the bodies nearest to the line
       from agent to patient, are kept.
     - ``width``, ``layers``, ``heads``: of the network. ``dropout``: in training.
@@ -380,12 +310,9 @@ class IntuitionSettings(SizedSettings):
 
     @classmethod
     def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the settings of a model: more tokens of states and places than of masks."""
-        kind = model.partition("-")[2]
-        given = {"objects": 12} if kind in (STATE, PLACES) else {"objects": 8}
-        if kind == PLACES:
-            given["image_size"] = 256
-        return {**given, **super().defaults(model, options)}
+        """Return the settings of a model, which has more tokens of states than of masks."""
+        objects = 12 if model == "intuition-states" else 8
+        return {"objects": objects, **super().defaults(model, options)}
 
     def __post_init__(self) -> None:
         self.at_least(1, "image_size", "width", "layers", "heads", "members")
@@ -502,10 +429,10 @@ class Intuition(TorchModel):
         self.kind = settings.model.partition("-")[2]
         self.settings, self.seed, self.window = settings, settings.seed, CONTEXT
         self.spec = Spec(
-            inputs=(*INPUTS[self.kind], *("ids",) * settings.cue), image_size=settings.image_size,
+            inputs=(INPUTS[self.kind], *("ids",) * settings.cue), image_size=settings.image_size,
             stride=STRIDE, context=CONTEXT, future=0, framewise=False,
         )  # fmt: skip
-        self.view = VIEWS[STATE if self.kind in (STATE, PLACES) else MASK]
+        self.view = VIEWS[STATE if self.kind == STATE else MASK]
         tracked, places = len(self.view.track), len(self.view.place)
         inputs = CONTEXT * (tracked + 2 * places) + len(self.view.constants)
         with initial_weights(settings.model, settings.seed):
@@ -533,7 +460,7 @@ class Intuition(TorchModel):
             init=self.init,
             encoder_type=f"{self.kind} of up to {self.settings.objects} objects"
             + ", cue in the first frame" * self.settings.cue,
-            encoder_training_task=TAUGHT.get(self.kind, "outcomes"),
+            encoder_training_task="segmentation" if self.kind == PIXELS else "outcomes",
             dynamics_type="none",
             versions=f"torch {torch.__version__}",
         )
@@ -541,27 +468,30 @@ class Intuition(TorchModel):
     def digest(self) -> str:
         """Return the SHA-256 of code version, settings and weights."""
         settings = {k: v for k, v in asdict(self.settings).items() if k not in ("weights", "seed")}
-        made = [self.name, VERSION, settings, repr(self.spec), *self._found_by()]
+        made = [self.name, VERSION, settings, repr(self.spec), *self._segmentation()]
         return weights_digest([*made, torch.__version__], self.state_dict().items())
 
     def encoder_digest(self) -> str:
         """Return the SHA-256 of what determines the tokens: no weights but of the segmentation."""
         made = [self.kind, VERSION, self.settings.objects, repr(self.spec)]
-        return weights_digest([*made, *self._found_by()])
+        return weights_digest([*made, *self._segmentation()])
 
     def built_as(self) -> dict[str, Any]:
-        """Return what the weights were made for: name, with the size, version, other networks."""
+        """Return what the weights were made for: name, with the size, version, and segmentation."""
         made: dict[str, Any] = {"model": self.name, "version": VERSION}
-        if self.kind == PIXELS:
-            made["segmentation"] = segmentation_version()
-        if self.kind == PLACES:
-            made["places"] = weights_sha256(depth=False)
-        return made
+        return made | ({"segmentation": segmentation_version()} if self.kind == PIXELS else {})
 
     def encode(self, batch: Batch) -> Tensor:
         """Return the tokens of all objects (B, T, K D), which the training does not change."""
         self._check_frames(batch)
-        return self._encoded(batch, None if self.kind == STATE else self._ids(batch))
+        objects = self.settings.objects
+        if self.kind == STATE:
+            shown = batch.frames.cpu().numpy()
+            rows = zip(motions(batch, self.name), batch.trials, shown, strict=True)
+            tokens = [state_tokens(motion, trial, of, objects) for motion, trial, of in rows]
+        else:
+            tokens = [mask_tokens(ids, objects) for ids in self._ids(batch)]
+        return torch.from_numpy(np.stack(tokens)).flatten(2).to(self.device)
 
     def predict(self, batch: Batch) -> Tensor:
         """Return P(contact) (B,), the mean over networks and mirror images.
@@ -583,7 +513,8 @@ class Intuition(TorchModel):
         if self.settings.cue:
             unseen = "agent or patient not visible in the first frame"
         if ids is not None:
-            batch = replace(batch, features=self._encoded(batch, ids))
+            tokens = np.stack([mask_tokens(one, most) for one in ids])
+            batch = replace(batch, features=torch.from_numpy(tokens).flatten(2).to(self.device))
         for seen, count in zip(self.seen(batch).tolist(), self._counts(batch, ids), strict=True):
             hidden = "" if seen else f"{unseen}: base rate"
             many = f"{count} objects, only {most} are looked at" if count > most else ""
@@ -632,20 +563,6 @@ class Intuition(TorchModel):
         loss = functional.binary_cross_entropy_with_logits(answers, contact)
         return {"loss": loss, "accuracy": right}
 
-    def _encoded(self, batch: Batch, ids: NDArray[np.uint8] | None) -> Tensor:
-        """Return the tokens (B, T, K D) of states, or of the objects of pixels (B, T, H, W)."""
-        objects, frames = self.settings.objects, batch.frames.cpu().numpy()
-        if ids is None:
-            rows = zip(motions(batch, self.name), batch.trials, frames, strict=True)
-            tokens = [state_tokens(motion, trial, of, objects) for motion, trial, of in rows]
-        elif self.kind == PLACES:
-            cameras = np.asarray(batch.camera.cpu(), np.float64)
-            seen = zip(frames, ids, cameras, strict=True)
-            tokens = [place_tokens(of, one, camera, objects) for of, one, camera in seen]
-        else:
-            tokens = [mask_tokens(one, objects) for one in ids]
-        return torch.from_numpy(np.stack(tokens)).flatten(2).to(self.device)
-
     def _tokens(self, batch: Batch) -> Tensor:
         """Return tokens (B, T, K, D) from the features of a batch, or made of what it shows."""
         tokens: Tensor = self.encode(batch) if batch.features is None else batch.features
@@ -679,11 +596,9 @@ class Intuition(TorchModel):
         assert values.shape[2] == steps * tracks.shape[3]
         return torch.cat([values, constants], -1), there
 
-    def _found_by(self) -> list[str]:
-        """Return what found masks or places depend on; nothing of models that are given them."""
-        if self.kind == PIXELS:
-            return [segmentation_version(), torch.__version__]
-        return [weights_sha256(depth=False), torch.__version__] if self.kind == PLACES else []
+    def _segmentation(self) -> list[str]:
+        """Return what the masks depend on that are found in pictures; nothing of other models."""
+        return [segmentation_version(), torch.__version__] if self.kind == PIXELS else []
 
     def _check_frames(self, batch: Batch) -> None:
         """Raise `BadInputError` for other frames than those that the model learns from."""
@@ -700,12 +615,8 @@ class Intuition(TorchModel):
     def _ids(self, batch: Batch) -> NDArray[np.uint8]:
         """Return the objects of pixels (B, T, H, W), true or found, after a check of their size."""
         size, seen = self.settings.image_size, {}
-        if self.kind == PLACES and batch.camera is None:
-            raise BadInputError(f"{self.name}: the camera of every trial is needed (input camera)")
         for name in self.spec.inputs:
             given = getattr(batch, name)
-            if name == "camera":
-                continue
             if given is None or tuple(given.shape[2:4]) != (size, size):
                 found = "none" if given is None else tuple(given.shape[2:4])
                 what = "pictures" if name == "rgb" else "objects of pixels"
@@ -713,10 +624,10 @@ class Intuition(TorchModel):
                     f"{self.name}: {what} (input {name}) of {size} x {size} are needed, not "
                     f"{found}; give clips of this size"
                     + ", or --option image_size"
-                    * (self.kind in (MASK, PLACES))
+                    * (self.kind == MASK)
                 )
             seen[name] = np.asarray(given.cpu() if isinstance(given, Tensor) else given)
-        if self.kind in (MASK, PLACES):
+        if self.kind == MASK:
             return seen["ids"]
         # Of true masks only the first frame is looked at.
         cues = [of[0] for of in seen["ids"]] if self.settings.cue else [None] * len(seen["rgb"])
