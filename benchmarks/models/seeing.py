@@ -26,7 +26,8 @@ are, by scenario:
    agent, centre of the other movable objects; how many have the right shape; and seconds of
    processor time of an answer.
 6. What is wrong with trials in which the answer from the fitted state is worse or better than the
-   one from the true state, and with the others.
+   one from the true state, and with the others; and how many answers are right if the velocities,
+   or all but the velocities, are the true ones.
 
 With --depth-error E, the depth of each object has an error of standard deviation E, the same in
 all frames, and each pixel another one; rows are in FOLDER/seeing-E.jsonl. With --no-depth masks and
@@ -423,6 +424,11 @@ PROPERTIES: Mapping[str, Callable[[ROW], bool]] = {
     ),
 }
 """What may be wrong with a fitted trial."""
+MENDED = {
+    "with the true velocities the answer is right": "fitted, true velocities",
+    "with true bodies, masses and friction guessed, it is right": "true, fitted velocities",
+}
+"""Columns of rows in which a part of a fitted trial is replaced by the true one."""
 
 
 def _properties(table: pd.DataFrame) -> list[ROW]:
@@ -433,13 +439,17 @@ def _properties(table: pd.DataFrame) -> list[ROW]:
     table = table[table["objects"].notna()]
     hits = [right(table[name], table["contact"]) for name in ("fitted", "true")]
     groups = {"worse": hits[0] < hits[1], "better": hits[0] > hits[1], "same": hits[0] == hits[1]}
+    properties = dict(PROPERTIES)
+    for title, column in MENDED.items():
+        if column in table:
+            properties[title] = lambda row, column=column: right(row[column], row["contact"]) == 1
     parts = {name: table[chosen].to_dict("records") for name, chosen in groups.items()}
     return [
         {
             "of the trials in which the answer from the fitted state is": name,
             **{f"{kind} ({len(rows)})": sum(map(has, rows)) for kind, rows in parts.items()},
         }
-        for name, has in PROPERTIES.items()
+        for name, has in properties.items()
     ]
 
 
