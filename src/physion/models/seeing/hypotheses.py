@@ -8,17 +8,21 @@ push; it is simulated through the observed frames, and its masks are compared wi
 
 with A its pixels in a picture of `SIZE` pixels a side, B its simulated ones, d the distance of
 their centroids in pixels. Pixels of scenery that may hide objects do not count. The loss is the
-mean over frames and objects; agent and patient count twice.
+mean over frames and objects; agent and patient count twice. `MOVED` is added for an object whose
+mask is in the last frame what it was in the first, and that the hypothesis moves.
 
 1. The scene without errors and without push is simulated. The first object that moves otherwise is
    the one that was pushed; velocity and frame follow from its centroids, taken to the height of
-   its middle.
+   its middle, or, if that explains them better, from a flight. With m its middle at rest, o the
+   camera, u_t the ray to its centroid a time t after the push, and g gravity, the velocity v of a
+   flight is that with the least sum of |u_t x (m + v t - g t^2 / 2 - o)|^2.
 2. Hypotheses are drawn in rounds, each from a normal distribution around the best ones so far:
    first only the push, and the places of what stands on nothing, then everything.
 3. What the masks of the last frame contradict is fitted to them again, with its size, and its
    velocity is that between the last frames. Without depth it stays about as far away as in the
-   hypothesis. So each of the best hypotheses gives a scene and a
-   state at the last observed frame, with a weight that falls with its loss.
+   hypothesis. What has not moved is where it was in the first frame, and at rest. So each of the
+   best hypotheses gives a scene and a state at the last observed frame, with a weight that falls
+   with its loss.
 """
 
 from __future__ import annotations
@@ -53,7 +57,7 @@ from physion.physics.engine import Engine, simulate
 from physion.physics.labels import label_contact
 from physion.physics.trajectory import State, Trajectory
 from physion.rendering.renderer import Renderer
-from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, Ending, Push, Roles, Scene
+from physion.scenes.scene import FRAME_TIME, GRAVITY, OBSERVED_FRAMES, Ending, Push, Roles, Scene
 
 F64 = NDArray[np.float64]
 Ids = NDArray[np.uint8]
@@ -68,6 +72,9 @@ OTHERWISE = 0.12
 """Rise of the mismatch with which an object moves otherwise than simulated."""
 STARTED, FAST = 0.5, 2.0
 """Pixels that it has moved by then, and within four frames, if it was pushed strongly."""
+FLIGHT, RISES, BETTER = 6, 0.5, 0.1
+"""Frames of the clip from which a flight follows, its least velocity upwards, m/s, and how large
+its squares of distances may be, as a part of those of a motion on one level."""
 ROUNDS, DRAWN, BEST = (3, 2), 40, 8
 """Rounds of both stages, hypotheses of a round, and those that the next one is drawn around."""
 NARROWEST = (0.08, 0.4)
@@ -76,6 +83,13 @@ KEPT, TEMPERATURE = 12, 0.01
 """Hypotheses that are kept, and the difference of losses at which the weight falls by 1/e."""
 CONTRADICTED = 0.12
 """Mismatch in the last frame above which an object is fitted there again."""
+UNCHANGED = 0.02
+"""Part of the pixels of an object that may differ between the first and the last frame, if it has
+not moved."""
+SHIFT, SPEED = 0.02, 0.3
+"""Metres from its first place, or metres per second, with which a simulated object has moved."""
+MOVED = 0.2
+"""Loss of moving all objects that have not moved."""
 LAST_FRAMES = (36, 40)
 """Frames from which, to the last one, its velocity follows."""
 POORLY = 0.3
@@ -132,6 +146,27 @@ class Video:
         self.compared = sorted({round(row) for row in every})
         weights = [2.0 if number in (AGENT_ID, PATIENT_ID) else 1.0 for number in self.numbers]
         self.weights = np.array(weights) / sum(weights)
+        counts = ~(self.before[0] | self.before[-1])
+        self.still = np.array([self._unchanged(number, counts) for number in self.numbers])
+
+    def _unchanged(self, number: int, counts: NDArray[np.bool_]) -> bool:
+        """Return whether an object has not moved, by its masks in the first and the last frame.
+
+        What other objects hide in one of them, and pixels that do not count, say nothing.
+        """
+        first, last = self.ids[0], self.ids[-1]
+        then, now = first == number, last == number
+        changed = (then & (last == SCENERY_ID)) | (now & (first == SCENERY_ID))
+        pixels = np.count_nonzero(then) + np.count_nonzero(now)
+        same = np.count_nonzero(changed & counts) <= UNCHANGED * pixels
+        return bool((then & now).any() and same)
+
+    def moved(self, path: Trajectory) -> NDArray[np.bool_]:
+        """Return which objects (K,) a simulation moves that have not moved."""
+        shift = path.positions[LAST_OBSERVED] - path.positions[self.frames[0]]
+        speed = np.linalg.norm(path.velocities[LAST_OBSERVED], axis=1)
+        moved = (np.linalg.norm(shift, axis=1) > SHIFT) | (speed > SPEED)
+        return np.asarray(self.still & moved[: len(self.still)])
 
     def _centroids(self, ids: Ids) -> F64:
         """Return the centroids (T, K, 2), column and row, of objects; NaN of what is not seen."""
@@ -171,19 +206,28 @@ class Video:
 
         Only up to the first frame in which that is not known.
         """
-        view, projection = self.camera
-        origin = -view[:3, :3].T @ view[:3, 3]
         frames, places = [], []
         for row in rows:
-            x = (2 * (self.centroids[row, k, 0] + 0.5) / SIZE - 1) / projection[0, 0]
-            y = (1 - 2 * (self.centroids[row, k, 1] + 0.5) / SIZE) / projection[1, 1]
-            ray = np.array([x, y, 1.0]) @ view[:3, :3]
-            along = (height - origin[2]) / ray[2] if abs(ray[2]) > 1e-3 else -1.0
+            ray = self.ray(k, row)
+            along = (height - self.origin[2]) / ray[2] if abs(ray[2]) > 1e-3 else -1.0
             if not along > 0:
                 break
             frames.append(float(self.frames[row]))
-            places.append((origin + along * ray)[:2])
+            places.append((self.origin + along * ray)[:2])
         return np.array(frames), np.array(places).reshape(-1, 2)
+
+    @property
+    def origin(self) -> F64:
+        """Place (3,) of the camera."""
+        view = self.camera[0]
+        return np.asarray(-view[:3, :3].T @ view[:3, 3])
+
+    def ray(self, k: int, row: int) -> F64:
+        """Return the vector (3,) to depth 1 of a centroid; NaN of what is not seen."""
+        view, projection = self.camera
+        x = (2 * (self.centroids[row, k, 0] + 0.5) / SIZE - 1) / projection[0, 0]
+        y = (1 - 2 * (self.centroids[row, k, 1] + 0.5) / SIZE) / projection[1, 1]
+        return np.asarray(np.array([x, y, 1.0]) @ view[:3, :3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,8 +357,41 @@ def _pushed(video: Video, objects: Mapping[int, Resting], engine: Engine) -> Pus
                 late = shift[min(rows[0] + 2, len(shift) - 1)]
                 found.append((int(rows[0]), -float(late), k))
         for row, _, k in sorted(found)[:1]:
-            return _guess(video, k, row, objects[video.numbers[k]].placed)
+            placed = objects[video.numbers[k]].placed
+            return _flight(video, k, row, placed) or _guess(video, k, row, placed)
     return None
+
+
+def _flight(video: Video, k: int, row: int, placed: Placed) -> PushGuess | None:
+    """Return the push of an object that flies from a row on; None if it stays on its level."""
+    found: dict[bool, list[tuple[float, int, F64]]] = {True: [], False: []}
+    for start in range(max(0, row - 2), row + 1):
+        rows = range(start + 1, min(start + 1 + FLIGHT, len(video.frames)))
+        times = (np.array([video.frames[r] for r in rows]) - video.frames[start]) * FRAME_TIME
+        rays = np.array([video.ray(k, r) for r in rows]).reshape(-1, 3)
+        if len(rows) < 3 or not np.isfinite(rays).all():
+            continue
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        across = np.cross(rays[:, None], np.eye(3)).transpose(0, 2, 1)
+        for flies in (True, False):
+            middle = np.tile(placed.middle() - video.origin, (len(rows), 1))
+            middle[:, 2] -= flies * GRAVITY * times**2 / 2
+            matrix = (across * times[:, None, None])[..., : 2 + flies].reshape(-1, 2 + flies)
+            wanted = -np.einsum("nij,nj->ni", across, middle).ravel()
+            velocity = np.linalg.lstsq(matrix, wanted, rcond=None)[0]
+            apart = float(np.square(matrix @ velocity - wanted).mean())
+            found[flies].append((apart, start, velocity))
+    if not found[True]:
+        return None
+    apart, start, velocity = min(found[True], key=lambda one: one[0])
+    level = min(one[0] for one in found[False])
+    if apart > BETTER * level or velocity[2] < RISES:
+        return None
+    speed = float(np.linalg.norm(velocity))
+    x, y, up = velocity.tolist()
+    mean = np.array([x, y, 0.0, 0.0, video.frames[start], up, 0.0])
+    wide = 0.1 * speed + 0.05
+    return PushGuess(video.numbers[k], mean, np.array([wide, wide, 0.25, 0.12, 1.0, wide, 0.6]))
 
 
 def _guess(video: Video, k: int, row: int, placed: Placed) -> PushGuess | None:
@@ -371,6 +448,7 @@ def _search(
                 mismatches = video.mismatches(scene, path, video.compared)
                 loss = float((mismatches @ video.weights).mean())
                 loss += 0.002 * float(np.mean(values[:scenes] ** 2))
+                loss += MOVED * float(video.weights @ video.moved(path))
                 tried.append(_Tried(values, loss, mismatches, scene, path))
             tried.sort(key=lambda each: each.loss)
             del tried[4 * DRAWN :]
@@ -398,12 +476,18 @@ def _observed(
     Scenes are named by their rank, so that each gets noise of its own.
     """
     scene, path, last = tried.scene, tried.path, video.frames[-1]
-    state = path.state(LAST_OBSERVED)
+    state, first = path.state(LAST_OBSERVED), path.state(video.frames[0])
     positions, rotations = state.positions.copy(), state.rotations.copy()
-    velocities = state.velocities.copy()
-    wrong = tried.mismatches[-1] > CONTRADICTED
+    velocities, spins = state.velocities.copy(), state.angular_velocities.copy()
+    wrong, moved = tried.mismatches[-1] > CONTRADICTED, video.moved(path)
+    positions[moved], rotations[moved] = first.positions[moved], first.rotations[moved]
+    velocities[moved] = spins[moved] = 0.0
+    agent, patient = (video.numbers.index(number) for number in (AGENT_ID, PATIENT_ID))
+    touched = bool(label_contact(scene, path).contact)
+    # An agent that moves a patient that has not moved is elsewhere, too.
+    wrong[agent] |= touched and moved[patient]
     for k, number in enumerate(video.numbers):
-        if not wrong[k] or number == PATIENT_ID:
+        if not wrong[k] or moved[k] or number == PATIENT_ID:
             continue
         one, fits = objects[number], {}
         for frame in (*LAST_FRAMES, last):
@@ -420,10 +504,9 @@ def _observed(
             frame = min(fits)
             passed = (last - frame) * FRAME_TIME
             velocities[k] = (placed.middle() - fits[frame].middle()) / passed
-    agent = video.numbers.index(AGENT_ID)
-    touched = bool(label_contact(scene, path).contact) and not wrong[agent]
+    touched &= not wrong[agent] and not moved[agent]
     corrected = State(
-        LAST_OBSERVED, positions, rotations, velocities, state.angular_velocities,
+        LAST_OBSERVED, positions, rotations, velocities, spins,
         state.cloth_vertices, state.cloth_velocities,
     )  # fmt: skip
     return ObservedTrial(replace(scene, name=f"seen {rank}", pushes=()), corrected, touched)

@@ -32,7 +32,7 @@ from physion.models.seeing.scenes import SeenTrial, see_trial
 from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine, simulate
 from physion.rendering.renderer import Renderer
 
-VERSION = 9
+VERSION = 10
 """To be raised with every change of the code that can alter a prediction."""
 KEPT = 16
 """Trials whose scenes are kept in memory, besides the last batch."""
