@@ -26,7 +26,8 @@ from physion.models.interface import Model
 from physion.models.noisy_simulation import NoiseLevels, add_noise
 from physion.models.seeing.bodies import find, follow
 from physion.models.seeing.cloth import sheet_of
-from physion.models.seeing.hypotheses import _refitted, see_uncertain
+from physion.models.seeing.expected import assumed_depth
+from physion.models.seeing.hypotheses import Video, _flight, _refitted, see_uncertain
 from physion.models.seeing.masks import MaskFit, traced
 from physion.models.seeing.pixels import Rays, SeenFrame, floor_height, picture_of
 from physion.models.seeing.resting import resting_scene, stacked, uncertain_frame
@@ -453,6 +454,46 @@ def test_a_push_is_found_by_simulation() -> None:
     assert only_masks.imagine(replace(batch, depth=None), 8, 0).contact.shape == (1, 8)
     [without] = only_masks.see(replace(batch, depth=None))
     assert without.trial is not None and {"1", "2"} <= set(without.trial.scene.names())
+
+
+def video_of(made: Scene) -> Video:
+    """Return the masks of every second frame of a scene."""
+    batch = batch_of(made, 256)
+    ids, camera = batch.ids[0, ::2], batch.camera[0]  # type: ignore[index]
+    depth = assumed_depth(ids, camera)
+    seen = zip(batch.frames[0, ::2].tolist(), ids, depth, strict=True)
+    pictures = {n: uncertain_frame(picture_of(i, d, camera), ERROR) for n, i, d in seen}
+    return Video(pictures, camera, (1, 2, 3), depth=False)
+
+
+@pytest.mark.parametrize("frame", [0, 5])
+@pytest.mark.parametrize("velocity", [(2.0, 0.5, 3.0), (3.0, -0.4, 1.5), (2.0, 0.0, 0.0)])
+def test_what_is_thrown_is_seen_to_fly_and_what_rolls_is_not(velocity: Any, frame: int) -> None:
+    made = scene()
+    made = replace(made, pushes=(Push("ball", velocity, frame=frame),))
+    ball = made.bodies[0]
+    placed = Placed(
+        solid(ball.shape), np.array(ball.position), np.eye(3), np.array(ball.scale), 0.0
+    )
+    found = _flight(video_of(made), 0, frame // 2 + 1, placed)
+    if velocity[2] == 0:
+        assert found is None
+    else:
+        assert found is not None and found.number == 1
+        # What is least certain is the velocity away from the camera.
+        wrong = np.abs(found.mean[[0, 1, 5]] - velocity)
+        assert (wrong < 3 * found.spread[[0, 1, 5]]).all() and found.mean[4] == frame
+
+
+def test_a_hypothesis_that_moves_what_has_not_moved_is_known() -> None:
+    video = video_of(scene(0.2))
+    assert video.still.tolist() == [False, True, True]
+    # The same scene with a stronger push, in which the ball meets the box before the last frame.
+    ball, box, cylinder = scene(0.2).bodies
+    light = (ball, replace(box, mass=0.2), cylinder)
+    harder = replace(scene(0.2), bodies=light, pushes=(Push("ball", (6.0, 0.0, 0.0), frame=1),))
+    assert video.moved(simulate(scene(0.2), frames=45)).tolist() == [False, False, False]
+    assert video.moved(simulate(harder, frames=45)).tolist() == [False, True, False]
 
 
 def test_samples_are_shared_by_weight() -> None:

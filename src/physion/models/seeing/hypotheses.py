@@ -15,7 +15,8 @@ mask is in the last frame what it was in the first, and that the hypothesis move
    the one that was pushed; velocity and frame follow from its centroids, taken to the height of
    its middle, or, if that explains them better, from a flight. With m its middle at rest, o the
    camera, u_t the ray to its centroid a time t after the push, and g gravity, the velocity v of a
-   flight is that with the least sum of |u_t x (m + v t - g t^2 / 2 - o)|^2.
+   flight is that with the least sum of |u_t x (m + v t - g t^2 / 2 - o)|^2. What the centroid of
+   the first frame is off the ray to m is left out.
 2. Hypotheses are drawn in rounds, each from a normal distribution around the best ones so far:
    first only the push, and the places of what stands on nothing, then everything.
 3. What the masks of the last frame contradict is fitted to them again, with its size, and its
@@ -72,7 +73,7 @@ OTHERWISE = 0.12
 """Rise of the mismatch with which an object moves otherwise than simulated."""
 STARTED, FAST = 0.5, 2.0
 """Pixels that it has moved by then, and within four frames, if it was pushed strongly."""
-FLIGHT, RISES, BETTER = 6, 0.5, 0.1
+FLIGHT, RISES, BETTER = 10, 0.5, 0.1
 """Frames of the clip from which a flight follows, its least velocity upwards, m/s, and how large
 its squares of distances may be, as a part of those of a motion on one level."""
 ROUNDS, DRAWN, BEST = (3, 2), 40, 8
@@ -364,17 +365,19 @@ def _pushed(video: Video, objects: Mapping[int, Resting], engine: Engine) -> Pus
 
 def _flight(video: Video, k: int, row: int, placed: Placed) -> PushGuess | None:
     """Return the push of an object that flies from a row on; None if it stays on its level."""
+    away = float(video.camera[0, 2, :3] @ (placed.middle() - video.origin))
+    rest, frames = video.ray(k, 0) * away, np.array(video.frames)
     found: dict[bool, list[tuple[float, int, F64]]] = {True: [], False: []}
-    for start in range(max(0, row - 2), row + 1):
-        rows = range(start + 1, min(start + 1 + FLIGHT, len(video.frames)))
-        times = (np.array([video.frames[r] for r in rows]) - video.frames[start]) * FRAME_TIME
-        rays = np.array([video.ray(k, r) for r in rows]).reshape(-1, 3)
-        if len(rows) < 3 or not np.isfinite(rays).all():
+    for start in range(video.frames[max(0, row - 2)], video.frames[row] + 1):
+        rows = np.flatnonzero(frames > start)[:FLIGHT]
+        times = (frames[rows] - start) * FRAME_TIME
+        rays = np.array([video.ray(k, r) for r in rows.tolist()]).reshape(-1, 3)
+        if len(rows) < FLIGHT or not np.isfinite(rays).all():
             continue
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         across = np.cross(rays[:, None], np.eye(3)).transpose(0, 2, 1)
         for flies in (True, False):
-            middle = np.tile(placed.middle() - video.origin, (len(rows), 1))
+            middle = np.tile(rest, (FLIGHT, 1))
             middle[:, 2] -= flies * GRAVITY * times**2 / 2
             matrix = (across * times[:, None, None])[..., : 2 + flies].reshape(-1, 2 + flies)
             wanted = -np.einsum("nij,nj->ni", across, middle).ravel()
@@ -384,13 +387,11 @@ def _flight(video: Video, k: int, row: int, placed: Placed) -> PushGuess | None:
     if not found[True]:
         return None
     apart, start, velocity = min(found[True], key=lambda one: one[0])
-    level = min(one[0] for one in found[False])
-    if apart > BETTER * level or velocity[2] < RISES:
+    if apart > BETTER * min(one[0] for one in found[False]) or velocity[2] < RISES:
         return None
-    speed = float(np.linalg.norm(velocity))
     x, y, up = velocity.tolist()
-    mean = np.array([x, y, 0.0, 0.0, video.frames[start], up, 0.0])
-    wide = 0.1 * speed + 0.05
+    mean = np.array([x, y, 0.0, 0.0, start + (start > 0), up, 0.0])
+    wide = 0.1 * float(np.linalg.norm(velocity)) + 0.05
     return PushGuess(video.numbers[k], mean, np.array([wide, wide, 0.25, 0.12, 1.0, wide, 0.6]))
 
 
