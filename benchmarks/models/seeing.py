@@ -27,7 +27,7 @@ are, by scenario:
    processor time of an answer.
 6. What is wrong with trials in which the answer from the fitted state is worse or better than the
    one from the true state, and with the others; and how many answers are right if the velocities,
-   or all but the velocities, are the true ones.
+   or all but velocities, masses and friction, are the true ones.
 
 With --depth-error E, the depth of each object has an error of standard deviation E, the same in
 all frames, and each pixel another one; rows are in FOLDER/seeing-E.jsonl. With --no-depth masks and
@@ -187,7 +187,7 @@ def measure(scene: Scene, contact: bool, looked_at: bool, given: Mapping[str, An
                 (with_velocities(fit, true), n) for fit, n in fits
             )
             row["true, fitted velocities"] = shared(
-                (with_velocities(expected, fit), n) for fit, n in fits
+                (with_velocities(named(expected, fit), fit), n) for fit, n in fits
             )
     for name, observed in others.items():
         row[f"{name}, DPI-Net"] = _dpi(observed)
@@ -224,6 +224,11 @@ def with_velocities(trial: ObservedTrial, source: ObservedTrial) -> ObservedTria
             spins[row] = source.state.angular_velocities[rows[number]]
     state = replace(trial.state, velocities=velocities, angular_velocities=spins)
     return replace(trial, state=state)
+
+
+def named(trial: ObservedTrial, source: ObservedTrial) -> ObservedTrial:
+    """Return a trial with the name of another one's scene, which the noise depends on."""
+    return replace(trial, scene=replace(trial.scene, name=source.scene.name))
 
 
 def _rows(scene: Scene) -> dict[int, int]:
@@ -426,7 +431,7 @@ PROPERTIES: Mapping[str, Callable[[ROW], bool]] = {
 """What may be wrong with a fitted trial."""
 MENDED = {
     "with the true velocities the answer is right": "fitted, true velocities",
-    "with true bodies, masses and friction guessed, it is right": "true, fitted velocities",
+    "with all else true but masses and friction, it is right": "true, fitted velocities",
 }
 """Columns of rows in which a part of a fitted trial is replaced by the true one."""
 

@@ -8,22 +8,23 @@ push; it is simulated through the observed frames, and its masks are compared wi
 
 with A its pixels in a picture of `SIZE` pixels a side, B its simulated ones, d the distance of
 their centroids in pixels. Pixels of scenery that may hide objects do not count. The loss is the
-mean over frames and objects; agent and patient count twice. `MOVED` is added for an object whose
-mask is in the last frame what it was in the first, and that the hypothesis moves.
+mean over frames and objects; agent and patient count twice. Each object whose mask does not change
+between the first and the last frame, but which the hypothesis moves, adds `MOVED` times its weight
+in this mean.
 
 1. The scene without errors and without push is simulated. The first object that moves otherwise is
    the one that was pushed; velocity and frame follow from its centroids, taken to the height of
-   its middle, or, if that explains them better, from a flight. With m its middle at rest, o the
-   camera, u_t the ray to its centroid a time t after the push, and g gravity, the velocity v of a
-   flight is that with the least sum of |u_t x (m + v t - g t^2 / 2 - o)|^2. What the centroid of
-   the first frame is off the ray to m is left out.
+   its middle, or from a flight, if that explains them much better. With o the camera, u_t the unit
+   vector to the centroid a time t after the push, m the place on the ray to the first centroid that
+   is as deep as the middle at rest, and g = (0, 0, 9.81 m/s^2), the velocity v of a flight is that
+   with the least sum of |u_t x (m + v t - g t^2 / 2 - o)|^2.
 2. Hypotheses are drawn in rounds, each from a normal distribution around the best ones so far:
    first only the push, and the places of what stands on nothing, then everything.
 3. What the masks of the last frame contradict is fitted to them again, with its size, and its
    velocity is that between the last frames. Without depth it stays about as far away as in the
-   hypothesis. What has not moved is where it was in the first frame, and at rest. So each of the
-   best hypotheses gives a scene and a state at the last observed frame, with a weight that falls
-   with its loss.
+   hypothesis. What has not moved by its mask is put back where it was in the first frame, at rest.
+   So each of the best hypotheses gives a scene and a state at the last observed frame, with a
+   weight that falls with its loss.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from scipy.spatial.transform import Rotation
 from physion.clips.batch import AGENT_ID, LAST_OBSERVED, PATIENT_ID, SCENERY_ID
 from physion.core.errors import PhysionError
 from physion.core.seeds import generator
-from physion.models.noisy_simulation import ObservedTrial
+from physion.models.noisy_simulation import ObservedTrial, joint_roots
 from physion.models.seeing.bodies import moved_with
 from physion.models.seeing.expected import NEAREST, expect
 from physion.models.seeing.masks import MaskFit, traced
@@ -73,9 +74,9 @@ OTHERWISE = 0.12
 """Rise of the mismatch with which an object moves otherwise than simulated."""
 STARTED, FAST = 0.5, 2.0
 """Pixels that it has moved by then, and within four frames, if it was pushed strongly."""
-FLIGHT, RISES, BETTER = 10, 0.5, 0.1
-"""Frames of the clip from which a flight follows, its least velocity upwards, m/s, and how large
-its squares of distances may be, as a part of those of a motion on one level."""
+FLIGHT, RISES, BETTER = 20, 0.5, 0.1
+"""Frames from which a flight follows, its least velocity upwards, m/s, and how large its squares of
+distances may be, as a part of those of a motion on one level."""
 ROUNDS, DRAWN, BEST = (3, 2), 40, 8
 """Rounds of both stages, hypotheses of a round, and those that the next one is drawn around."""
 NARROWEST = (0.08, 0.4)
@@ -87,8 +88,8 @@ CONTRADICTED = 0.12
 UNCHANGED = 0.02
 """Part of the pixels of an object that may differ between the first and the last frame, if it has
 not moved."""
-SHIFT, SPEED = 0.02, 0.3
-"""Metres from its first place, or metres per second, with which a simulated object has moved."""
+SHIFT = 0.02
+"""Metres from its first place at which a simulated object has moved."""
 MOVED = 0.2
 """Loss of moving all objects that have not moved."""
 LAST_FRAMES = (36, 40)
@@ -102,11 +103,15 @@ depth, about the depth in the hypothesis."""
 
 @dataclass(frozen=True, eq=False)
 class _Tried:
-    """A simulated hypothesis: its ``loss`` and the mismatches (T, K) of frames and objects."""
+    """A simulated hypothesis: its ``loss`` and the mismatches (T, K) of frames and objects.
+
+    ``moved`` (K,): objects that it moves and that have not moved.
+    """
 
     values: F64
     loss: float
     mismatches: F64
+    moved: NDArray[np.bool_]
     scene: Scene
     path: Trajectory
 
@@ -147,27 +152,29 @@ class Video:
         self.compared = sorted({round(row) for row in every})
         weights = [2.0 if number in (AGENT_ID, PATIENT_ID) else 1.0 for number in self.numbers]
         self.weights = np.array(weights) / sum(weights)
-        counts = ~(self.before[0] | self.before[-1])
-        self.still = np.array([self._unchanged(number, counts) for number in self.numbers])
+        self.still = np.array([self._unchanged(number) for number in self.numbers])
 
-    def _unchanged(self, number: int, counts: NDArray[np.bool_]) -> bool:
+    def _unchanged(self, number: int) -> bool:
         """Return whether an object has not moved, by its masks in the first and the last frame.
 
-        What other objects hide in one of them, and pixels that do not count, say nothing.
+        Pixels that another object hides in one of them say nothing.
         """
         first, last = self.ids[0], self.ids[-1]
         then, now = first == number, last == number
         changed = (then & (last == SCENERY_ID)) | (now & (first == SCENERY_ID))
         pixels = np.count_nonzero(then) + np.count_nonzero(now)
-        same = np.count_nonzero(changed & counts) <= UNCHANGED * pixels
-        return bool((then & now).any() and same)
+        common = 2 * np.count_nonzero(then & now) >= np.count_nonzero(then) > 0
+        return bool(common and np.count_nonzero(changed) <= UNCHANGED * pixels)
 
-    def moved(self, path: Trajectory) -> NDArray[np.bool_]:
-        """Return which objects (K,) a simulation moves that have not moved."""
-        shift = path.positions[LAST_OBSERVED] - path.positions[self.frames[0]]
-        speed = np.linalg.norm(path.velocities[LAST_OBSERVED], axis=1)
-        moved = (np.linalg.norm(shift, axis=1) > SHIFT) | (speed > SPEED)
-        return np.asarray(self.still & moved[: len(self.still)])
+    def moved(self, scene: Scene, path: Trajectory) -> NDArray[np.bool_]:
+        """Return which objects (K,) a simulation moves that have not moved.
+
+        With one, all that are joined to it.
+        """
+        shift = path.positions[self.frames[-1]] - path.positions[self.frames[0]]
+        moved = self.still & (np.linalg.norm(shift, axis=1) > SHIFT)
+        roots = joint_roots(scene)
+        return np.asarray(np.isin(roots, roots[moved]))
 
     def _centroids(self, ids: Ids) -> F64:
         """Return the centroids (T, K, 2), column and row, of objects; NaN of what is not seen."""
@@ -364,20 +371,20 @@ def _pushed(video: Video, objects: Mapping[int, Resting], engine: Engine) -> Pus
 
 
 def _flight(video: Video, k: int, row: int, placed: Placed) -> PushGuess | None:
-    """Return the push of an object that flies from a row on; None if it stays on its level."""
+    """Return the push of an object that flies from a row on; None where no flight is seen."""
     away = float(video.camera[0, 2, :3] @ (placed.middle() - video.origin))
     rest, frames = video.ray(k, 0) * away, np.array(video.frames)
     found: dict[bool, list[tuple[float, int, F64]]] = {True: [], False: []}
     for start in range(video.frames[max(0, row - 2)], video.frames[row] + 1):
-        rows = np.flatnonzero(frames > start)[:FLIGHT]
+        rows = np.flatnonzero((frames > start) & (frames <= start + FLIGHT))
         times = (frames[rows] - start) * FRAME_TIME
         rays = np.array([video.ray(k, r) for r in rows.tolist()]).reshape(-1, 3)
-        if len(rows) < FLIGHT or not np.isfinite(rays).all():
+        if start + FLIGHT > frames[-1] or not np.isfinite(rays).all():
             continue
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         across = np.cross(rays[:, None], np.eye(3)).transpose(0, 2, 1)
         for flies in (True, False):
-            middle = np.tile(rest, (FLIGHT, 1))
+            middle = np.tile(rest, (len(rows), 1))
             middle[:, 2] -= flies * GRAVITY * times**2 / 2
             matrix = (across * times[:, None, None])[..., : 2 + flies].reshape(-1, 2 + flies)
             wanted = -np.einsum("nij,nj->ni", across, middle).ravel()
@@ -390,7 +397,8 @@ def _flight(video: Video, k: int, row: int, placed: Placed) -> PushGuess | None:
     if apart > BETTER * min(one[0] for one in found[False]) or velocity[2] < RISES:
         return None
     x, y, up = velocity.tolist()
-    mean = np.array([x, y, 0.0, 0.0, start + (start > 0), up, 0.0])
+    # A push of a frame acts in the step that leads to it.
+    mean = np.array([x, y, 0.0, 0.0, start + 1, up, 0.0])
     wide = 0.1 * float(np.linalg.norm(velocity)) + 0.05
     return PushGuess(video.numbers[k], mean, np.array([wide, wide, 0.25, 0.12, 1.0, wide, 0.6]))
 
@@ -449,8 +457,9 @@ def _search(
                 mismatches = video.mismatches(scene, path, video.compared)
                 loss = float((mismatches @ video.weights).mean())
                 loss += 0.002 * float(np.mean(values[:scenes] ** 2))
-                loss += MOVED * float(video.weights @ video.moved(path))
-                tried.append(_Tried(values, loss, mismatches, scene, path))
+                moved = video.moved(scene, path)
+                loss += MOVED * float(video.weights @ moved)
+                tried.append(_Tried(values, loss, mismatches, moved, scene, path))
             tried.sort(key=lambda each: each.loss)
             del tried[4 * DRAWN :]
             best = np.array([each.values for each in tried[:BEST]])
@@ -480,7 +489,7 @@ def _observed(
     state, first = path.state(LAST_OBSERVED), path.state(video.frames[0])
     positions, rotations = state.positions.copy(), state.rotations.copy()
     velocities, spins = state.velocities.copy(), state.angular_velocities.copy()
-    wrong, moved = tried.mismatches[-1] > CONTRADICTED, video.moved(path)
+    wrong, moved = tried.mismatches[-1] > CONTRADICTED, tried.moved
     positions[moved], rotations[moved] = first.positions[moved], first.rotations[moved]
     velocities[moved] = spins[moved] = 0.0
     agent, patient = (video.numbers.index(number) for number in (AGENT_ID, PATIENT_ID))
@@ -519,7 +528,8 @@ def _tracks(
     """Return the poses of the objects in a hypothesis, the last ones corrected."""
     tracks = []
     for k, number in enumerate(video.numbers):
-        placed = [_placed(objects[number], tried, frame, k) for frame in video.frames]
+        shown = [video.frames[0]] * len(video.frames) if tried.moved[k] else video.frames
+        placed = [_placed(objects[number], tried, frame, k) for frame in shown]
         rotation = rotation_matrices(state.rotations[k : k + 1])[0]
         placed[-1] = replace(placed[-1], position=state.positions[k], rotation=rotation)
         tracks.append(Track(number, tuple(video.frames), tuple(placed)))
