@@ -339,12 +339,12 @@ def _trees(motion: Motion, scenario: str) -> float:
     return float(readout.fitted.probability(features.reshape(1, -1))[0])
 
 
-def read_rows(path: Path, version: int) -> dict[str, ROW]:
-    """Return what is already measured with a version of the model, by stimulus."""
+def read_rows(path: Path, version: int | None) -> dict[str, ROW]:
+    """Return what is already measured with a version of the model, or any, by stimulus."""
     if not path.exists():
         return {}
     rows = [json.loads(line) for line in path.read_text().splitlines()]
-    return {row["stimulus"]: row for row in rows if row["version"] == version}
+    return {row["stimulus"]: row for row in rows if version in (None, row["version"])}
 
 
 def _errors(seen: SeenTrial, motion: Motion) -> list[ROW]:
@@ -598,8 +598,8 @@ def _markdown(rows: Sequence[ROW]) -> str:
     return markdown_table(names, [[row[name] for name in names] for row in rows])
 
 
-def against(rows: Sequence[ROW], paths: Sequence[Path], version: int) -> str:
-    """Return paired differences of right answers from rows of a version, or from predictions."""
+def against(rows: Sequence[ROW], paths: Sequence[Path]) -> str:
+    """Return paired differences of right answers from rows of any version, or from predictions."""
     lines = []
     for path in paths:
         if path.suffix == ".csv":
@@ -608,7 +608,7 @@ def against(rows: Sequence[ROW], paths: Sequence[Path], version: int) -> str:
         else:
             other = {
                 canonical_name(name): row["fitted"]
-                for name, row in read_rows(path, version).items()
+                for name, row in read_rows(path, None).items()
                 if "early" not in row
             }
         inside = [row for row in rows if canonical_name(row["stimulus"]) in other]
@@ -740,7 +740,7 @@ def main() -> None:
         rows.append(known[scene.name])
     text = tables(rows, bool(options.own))
     if options.against:
-        text += f"\n{against(rows, options.against, options.version)}"
+        text += f"\n{against(rows, options.against)}"
     print(text)
     if options.write:
         today = datetime.date.today().isoformat()
