@@ -74,9 +74,9 @@ OTHERWISE = 0.12
 """Rise of the mismatch with which an object moves otherwise than simulated."""
 STARTED, FAST = 0.5, 2.0
 """Pixels that it has moved by then, and within four frames, if it was pushed strongly."""
-FLIGHT, RISES, BETTER = 20, 0.5, 0.1
-"""Frames from which a flight follows, its least velocity upwards, m/s, and how large its squares of
-distances may be, as a part of those of a motion on one level."""
+FLIGHT, RISES, FASTEST, BETTER = 20, 0.5, 12.0, 0.1
+"""Frames from which a flight follows, its least velocity upwards and its largest speed, m/s, and how
+large its squares of distances may be, as a part of those of a motion on one level."""
 ROUNDS, DRAWN, BEST = (3, 2), 40, 8
 """Rounds of both stages, hypotheses of a round, and those that the next one is drawn around."""
 NARROWEST = (0.08, 0.4)
@@ -394,12 +394,13 @@ def _flight(video: Video, k: int, row: int, placed: Placed) -> PushGuess | None:
     if not found[True]:
         return None
     apart, start, velocity = min(found[True], key=lambda one: one[0])
-    if apart > BETTER * min(one[0] for one in found[False]) or velocity[2] < RISES:
+    speed, level = float(np.linalg.norm(velocity)), min(one[0] for one in found[False])
+    if apart > BETTER * level or velocity[2] < RISES or speed > FASTEST:
         return None
     x, y, up = velocity.tolist()
     # A push of a frame acts in the step that leads to it.
     mean = np.array([x, y, 0.0, 0.0, start + 1, up, 0.0])
-    wide = 0.1 * float(np.linalg.norm(velocity)) + 0.05
+    wide = 0.1 * speed + 0.05
     return PushGuess(video.numbers[k], mean, np.array([wide, wide, 0.25, 0.12, 1.0, wide, 0.6]))
 
 
