@@ -75,8 +75,8 @@ OTHERWISE = 0.12
 STARTED, FAST = 0.5, 2.0
 """Pixels that it has moved by then, and within four frames, if it was pushed strongly."""
 FLIGHT, RISES, FASTEST, BETTER = 20, 0.5, 12.0, 0.1
-"""Frames from which a flight follows, its least velocity upwards and largest speed, m/s, and how
-large its squares of distances may be, as a part of those of a motion on one level."""
+"""Frames from which a flight follows, its least velocity upwards and largest speed, m/s, and the
+largest mean square of its distances, as a part of what a level motion has."""
 ROUNDS, DRAWN, BEST = (3, 2), 40, 8
 """Rounds of both stages, hypotheses of a round, and those that the next one is drawn around."""
 NARROWEST = (0.08, 0.4)
