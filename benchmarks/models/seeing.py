@@ -431,7 +431,7 @@ PROPERTIES: Mapping[str, Callable[[ROW], bool]] = {
 """What may be wrong with a fitted trial."""
 MENDED = {
     "with the true velocities the answer is right": "fitted, true velocities",
-    "with all else true but masses and friction, it is right": "true, fitted velocities",
+    "with all true but velocities, masses and friction, it is right": "true, fitted velocities",
 }
 """Columns of rows in which a part of a fitted trial is replaced by the true one."""
 

@@ -141,7 +141,8 @@ class Video:
     ) -> None:
         self.depth = depth
         self.frames, self.camera, self.numbers = sorted(pictures), camera, list(numbers)
-        height, width = pictures[self.frames[0]].seen.ids.shape
+        seen = pictures[self.frames[0]].seen
+        self.origin, (height, width) = seen.origin, seen.ids.shape
         rows = ((np.arange(SIZE) + 0.5) * height / SIZE).astype(np.int64)
         columns = ((np.arange(SIZE) + 0.5) * width / SIZE).astype(np.int64)
         chosen = np.ix_(rows, columns)
@@ -223,12 +224,6 @@ class Video:
             frames.append(float(self.frames[row]))
             places.append((self.origin + along * ray)[:2])
         return np.array(frames), np.array(places).reshape(-1, 2)
-
-    @property
-    def origin(self) -> F64:
-        """Place (3,) of the camera."""
-        view = self.camera[0]
-        return np.asarray(-view[:3, :3].T @ view[:3, 3])
 
     def ray(self, k: int, row: int) -> F64:
         """Return the vector (3,) to depth 1 of a centroid; NaN of what is not seen."""
@@ -371,7 +366,10 @@ def _pushed(video: Video, objects: Mapping[int, Resting], engine: Engine) -> Pus
 
 
 def _flight(video: Video, k: int, row: int, placed: Placed) -> PushGuess | None:
-    """Return the push of an object that flies from a row on; None where no flight is seen."""
+    """Return the push of an object that flies from a row on; None where no flight is seen.
+
+    A motion on the level of its middle is fitted in the same way, to compare.
+    """
     away = float(video.camera[0, 2, :3] @ (placed.middle() - video.origin))
     rest, frames = video.ray(k, 0) * away, np.array(video.frames)
     found: dict[bool, list[tuple[float, int, F64]]] = {True: [], False: []}
