@@ -166,6 +166,9 @@ def test_official_means_the_package_unless_there_is_such_a_folder(
     assert humans_folder(Path("official")) == official().humans
     (tmp_path / "official").mkdir()
     assert humans_folder(Path("official")) == Path("official")
+    # A dataset of trials is no such folder.
+    (tmp_path / "official" / "dataset.json").write_text("{}")
+    assert humans_folder(Path("official")) == official().humans
 
 
 def test_trials_are_chosen_by_scenario_and_limit() -> None:

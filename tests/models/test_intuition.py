@@ -239,7 +239,7 @@ def test_pixels_become_the_tokens_of_the_masks_that_are_found() -> None:
     renderer = MotionRenderer({"new": seen}, ("rgb", "ids"), 96, 1, {"new": "redyellow"})
     drawn = renderer.read("new", FRAMES)
     model: Any = build_model("intuition-pixels", weights="random")
-    true: Any = build_model("intuition-masks", weights="random")
+    true: Any = build_model("intuition-masks", image_size=96, weights="random")
     batch = pictures(drawn["rgb"][None], ["new"])
     tokens = model.encode(batch)
     assert np.array_equal(tokens[0].reshape(15, 8, -1), mask_tokens(segment(drawn["rgb"]), 8))
@@ -251,6 +251,24 @@ def test_pixels_become_the_tokens_of_the_masks_that_are_found() -> None:
         assert torch.equal(model.predict(batch), model.predict(replace(batch, features=tokens)))
     assert model.notes(batch) == [""]
     assert model.encoder_digest() != true.encoder_digest()
+
+
+def test_the_weights_of_masks_read_tokens_of_any_size() -> None:
+    made = sample_scene("drop", 7003)
+    seen = Motion(made, simulate(made, frames=45))
+    answers = []
+    for size in (96, 192):
+        renderer = MotionRenderer({"new": seen}, ("ids",), size, 1, {"new": "redyellow"})
+        model: Any = build_model("intuition-masks", image_size=size)
+        batch = clips(renderer.read("new", FRAMES)["ids"][None])
+        tokens = model.encode(batch)[0].reshape(15, 8, -1)
+        with torch.no_grad():
+            answers.append((tokens[:, :2], float(model.predict(batch))))
+    (coarse, first), (fine, second) = answers
+    # A border of a mask moves by at most a pixel of the coarser picture.
+    assert 0 < (coarse - fine).abs().max() < 1 / 96 and first != second
+    assert abs(first - second) < 0.05
+    assert build_model("intuition-masks").spec.image_size == 192
 
 
 def test_with_a_cue_only_the_masks_of_the_first_frame_count() -> None:

@@ -131,11 +131,14 @@ def official(folder: Path | str | None = None) -> OfficialData:
 
 
 def find_official(folder: Path | str) -> OfficialData | None:
-    """Return the official data of a folder or, for ``official``, of the package; else None."""
+    """Return the official data of a folder or, for ``official``, of the package; else None.
+
+    A dataset of the name ``official`` holds trials, and no data of the study.
+    """
     path = Path(folder)
     if (path / SCENES).is_file():
         return _opened(path)
-    if path == Path(PACKAGED) and not path.exists():
+    if path == Path(PACKAGED) and (not path.exists() or (path / "dataset.json").is_file()):
         return _packaged()
     return None
 

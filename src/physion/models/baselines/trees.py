@@ -69,7 +69,11 @@ def blob_features(blobs: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
 def mask_blob(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return the features called `_OF_BLOB` (T, 10) of the pixels in masks (T, H, W)."""
     _, height, width = mask.shape
+    # What lies outside the box around the pixels of all frames is not counted.
+    across, down = (_extent(mask.any(axis=axes)) for axes in ((0, 1), (0, 2)))
+    mask = mask[:, down, across]
     x, y = ((np.arange(side) + 0.5) / side for side in (width, height))
+    x, y = x[across], y[down]
     rows, columns = mask.sum(axis=2), mask.sum(axis=1)
     counts = rows.sum(axis=1)
     most = np.maximum(counts, 1)
@@ -78,9 +82,10 @@ def mask_blob(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     spread_y = rows @ y**2 / most - center_y**2
     slant = (mask @ x) @ y / most - center_x * center_y
     has_row, has_column = rows > 0, columns > 0
-    left, top = has_column.argmax(axis=1) / width, has_row.argmax(axis=1) / height
-    right = 1 - has_column[:, ::-1].argmax(axis=1) / width
-    bottom = 1 - has_row[:, ::-1].argmax(axis=1) / height
+    left = (across.start + has_column.argmax(axis=1)) / width
+    top = (down.start + has_row.argmax(axis=1)) / height
+    right = (across.stop - has_column[:, ::-1].argmax(axis=1)) / width
+    bottom = (down.stop - has_row[:, ::-1].argmax(axis=1)) / height
     deviations = [np.sqrt(np.maximum(spread, 0)) for spread in (spread_x, spread_y)]
     box = [left, top, right, bottom]
     values = np.column_stack(
@@ -88,6 +93,12 @@ def mask_blob(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     )
     values[counts == 0] = [0, 0.5, 0.5, 0, 0, 0, 0.5, 0.5, 0.5, 0.5]
     return values.astype(np.float32)
+
+
+def _extent(line: NDArray[np.bool_]) -> slice:
+    """Return from the first to the last true value of a line; the first value if none is true."""
+    found = np.flatnonzero(line)
+    return slice(int(found[0]), int(found[-1]) + 1) if len(found) else slice(0, 1)
 
 
 # Baseline `blob-trees`: what red and yellow pixels tell over time.
