@@ -42,6 +42,7 @@ from physion.core.names import RIGID, SCENARIOS, canonical_name
 from physion.core.seeds import trial_seed
 from physion.data.official import official
 from physion.models.build import build_model, build_untrained
+from physion.models.interface import ask
 from physion.physics.engine import make_engine
 from physion.physics.labels import label_contact
 from physion.readout.decisions import fraction_of_futures
@@ -98,6 +99,17 @@ class Kept:
     models: Sequence[str] = MODELS
     look: str = "redyellow"
 
+    def encoders(self) -> dict[str, Any]:
+        """Return the models that make the features, by name."""
+        cue = {"cue": True} if self.look == "free" else {}
+        return {
+            name: encoder(name, **cue if name == "intuition-pixels" else {}) for name in self.models
+        }
+
+    def made(self) -> dict[str, str]:
+        """Return what the features of each model depend on, as a digest."""
+        return {name: ask(model, "encoder_digest")() for name, model in self.encoders().items()}
+
 
 def see(motion: Motion, kept: Kept) -> dict[str, NDArray[Any]]:
     """Return the features of a motion by model."""
@@ -120,11 +132,7 @@ def see(motion: Motion, kept: Kept) -> dict[str, NDArray[Any]]:
             found = model.encode(batch.to("cpu") if is_network(model) else batch)
         return np.asarray(found[0], np.float32)
 
-    cue = {"cue": True} if kept.look == "free" else {}
-    return {
-        model: features(encoder(model, **cue if model == "intuition-pixels" else {}))
-        for model in kept.models
-    }
+    return {name: features(model) for name, model in kept.encoders().items()}
 
 
 def own_trial(scenario: str, number: int, kept: Kept) -> Seen:
@@ -190,12 +198,13 @@ def stored_trial(trial: str, row: Mapping[str, Any], motion: Motion, kept: Kept)
     )  # fmt: skip
 
 
-def write(path: Path, trials: Sequence[Seen], look: str) -> None:
+def write(path: Path, trials: Sequence[Seen], kept: Kept) -> None:
     """Write trials to a file that has all of them or does not exist."""
     arrays = {n: np.stack([t.features[n] for t in trials]) for n in trials[0].features}
     facts = {name: np.array([getattr(trial, name) for trial in trials]) for name in FACTS}
     buffer = io.BytesIO()
-    np.savez(buffer, look=np.array(look), **facts, **arrays)
+    made = np.array(json.dumps(kept.made()))
+    np.savez(buffer, look=np.array(kept.look), made=made, **facts, **arrays)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, buffer.getvalue())
 
@@ -205,9 +214,12 @@ def there(path: Path, kept: Kept) -> bool:
     if not path.exists():
         return False
     with np.load(path) as stored:
-        look = str(stored["look"]) if "look" in stored.files else "redyellow"
-        if any(name not in stored.files for name in kept.models) or look != kept.look:
-            raise SystemExit(f"{path} was made with other --models or --look; take a new FOLDER")
+        same = "made" in stored.files and str(stored["look"]) == kept.look
+        if not same or not kept.made().items() <= json.loads(str(stored["made"])).items():
+            raise SystemExit(
+                f"{path} was made with other --models or --look, or other versions of the models; "
+                "take a new FOLDER"
+            )
     return True
 
 
@@ -218,7 +230,7 @@ def make_own(kept: Kept, task: tuple[str, int]) -> str:
     if not there(path, kept):
         start = time.process_time()
         numbers = range(part * EACH, (part + 1) * EACH)
-        write(path, [own_trial(scenario, number, kept) for number in numbers], kept.look)
+        write(path, [own_trial(scenario, number, kept) for number in numbers], kept)
         return f"{path.stem} {(time.process_time() - start) / EACH:.2f} s a trial"
     return ""
 
@@ -228,7 +240,7 @@ def make_official(kept: Kept, part: int) -> str:
     path = kept.folder / "official" / f"{part:04d}.npz"
     if not there(path, kept):
         scenes = official_scenes()[part * EACH : (part + 1) * EACH]
-        write(path, [official_trial(scene, contact, kept) for scene, contact in scenes], kept.look)
+        write(path, [official_trial(scene, contact, kept) for scene, contact in scenes], kept)
         return f"official {path.stem}"
     return ""
 
@@ -262,7 +274,7 @@ def make_stored(dataset: Path, kept: Kept, part: int) -> str:
                 for trial, row in rows.items()
                 if motions[str(trial)].scene.physics_digest() not in official_digests()
             ],
-            kept.look,
+            kept,
         )
         return path.stem
     return ""

@@ -159,7 +159,7 @@ def test_a_checkout_is_converted_and_read_in_place_of_the_package(
     assert humans_folder(tmp_path / "made") == tmp_path / "made" / "humans"
 
 
-def test_official_means_the_package_unless_there_is_such_a_folder(
+def test_official_means_the_package_unless_a_folder_that_is_no_dataset_has_this_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -13,7 +13,12 @@ from physion.clips.batch import Batch, Motion
 from physion.core.errors import BadInputError, UnknownNameError
 from physion.models import build_model
 from physion.models.baselines.pixels import BlobCentroids, CopyLastFrame, color_masks
-from physion.models.baselines.trees import BLOB_FEATURES, NEAREST, STATE_FEATURES
+from physion.models.baselines.trees import (
+    BLOB_FEATURES,
+    NEAREST,
+    STATE_FEATURES,
+    mask_blob,
+)
 from physion.models.gaps import FAR, TOLERANCE, minimise
 from physion.models.interface import Model, can
 from physion.physics.cloth.simulate import ClothSettings
@@ -468,6 +473,25 @@ def test_blobs_over_time_are_exact() -> None:
     moved["red to yellow gap"] = math.hypot(32, 16) - math.hypot(40, 16)
     assert changes == pytest.approx({n: moved.get(n, 0) / 128 for n in expected}, abs=1e-6)
     assert not values[0, len(BLOB_FEATURES) // 2 :].any()
+
+
+def test_a_mask_is_described_by_the_moments_and_the_box_of_its_pixels() -> None:
+    rng = np.random.default_rng(0)
+    masks = np.zeros((4, 20, 30), bool)
+    masks[0, 3:9, 11:16] = rng.random((6, 5)) < 0.7
+    masks[1, 12:18, 20:29] = rng.random((6, 9)) < 0.7
+    masks[3] = True
+    expected = []
+    for mask in masks:
+        rows, columns = np.nonzero(mask)
+        if not len(rows):
+            expected.append([0, 0.5, 0.5, 0, 0, 0, 0.5, 0.5, 0.5, 0.5])
+            continue
+        x, y = (columns + 0.5) / 30, (rows + 0.5) / 20
+        box = [columns.min() / 30, rows.min() / 20, (columns.max() + 1) / 30, (rows.max() + 1) / 20]
+        slant = np.mean((x - x.mean()) * (y - y.mean()))
+        expected.append([len(x) / 600, x.mean(), y.mean(), x.std(), y.std(), slant, *box])
+    assert np.allclose(mask_blob(masks), expected, atol=1e-6)
 
 
 def test_masks_are_of_agent_patient_and_the_largest_others() -> None:

@@ -109,7 +109,8 @@ def official(folder: Path | str | None = None) -> OfficialData:
     Parameters
     ----------
     folder
-        By default, and for ``official`` where there is no such folder, the folder of the package.
+        By default the folder of the package; so for ``official``, unless there is a folder of that
+        name that is no dataset.
 
     Returns
     -------

@@ -282,8 +282,8 @@ def mask_tokens(ids: NDArray[np.uint8], objects: int) -> NDArray[np.float32]:
 class IntuitionSettings(SizedSettings):
     """Settings of a model of intuition; also see `SizedSettings`.
 
-    - ``image_size``: pixels per side of the masks, by default 192, though the weights that ship
-      learned from 96; from pixels always 96.
+    - ``image_size``: pixels per side of the masks. From true masks by default 192, though the
+      weights that ship learned from 96; from pixels always 96.
     - ``objects``: tokens K. With more objects the largest masks, or the bodies nearest to the line
       from agent to patient, are kept.
     - ``width``, ``layers``, ``heads``: of the network. ``dropout``: in training.
@@ -296,7 +296,7 @@ class IntuitionSettings(SizedSettings):
     """
 
     model: str = "intuition-masks"
-    image_size: int = 192
+    image_size: int = SIDE
     objects: int = 8
     width: int = 96
     layers: int = 3
@@ -307,11 +307,11 @@ class IntuitionSettings(SizedSettings):
     cue: bool = False
 
     sizes: ClassVar[Sizes] = {"small": {}}
-    any_weights: ClassVar[frozenset[str]] = SizedSettings.any_weights | {"cue", "image_size"}
+    any_weights: ClassVar[frozenset[str]] = SizedSettings.any_weights | {"cue"}
 
     @classmethod
     def defaults(cls, model: str, options: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the settings of a model: tokens are more of states, and pixels more of masks."""
+        """Return the settings of a model: more tokens for states, more pixels for masks."""
         own = {
             "objects": 12 if model == "intuition-states" else 8,
             "image_size": 192 if model == "intuition-masks" else SIDE,
