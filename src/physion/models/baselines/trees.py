@@ -70,7 +70,7 @@ def mask_blob(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return the features called `_OF_BLOB` (T, 10) of the pixels in masks (T, H, W)."""
     _, height, width = mask.shape
     # What lies outside the box around the pixels of all frames is not counted.
-    across, down = (_extent(mask.any(axis=axes)) for axes in ((0, 1), (0, 2)))
+    across, down = (_extent(np.asarray(mask.any(axis=axes))) for axes in ((0, 1), (0, 2)))
     mask = mask[:, down, across]
     x, y = ((np.arange(side) + 0.5) / side for side in (width, height))
     x, y = x[across], y[down]
