@@ -209,13 +209,19 @@ def write(path: Path, trials: Sequence[Seen], kept: Kept) -> None:
     write_atomic(path, buffer.getvalue())
 
 
+def made_alike(stored: Any, kept: Kept) -> bool:
+    """Return whether a file has features of the models as they are now, in the same look."""
+    if "made" not in stored.files or str(stored["look"]) != kept.look:
+        return False
+    return kept.made().items() <= json.loads(str(stored["made"])).items()
+
+
 def there(path: Path, kept: Kept) -> bool:
     """Return whether a file was made; exit if it keeps something else."""
     if not path.exists():
         return False
     with np.load(path) as stored:
-        same = "made" in stored.files and str(stored["look"]) == kept.look
-        if not same or not kept.made().items() <= json.loads(str(stored["made"])).items():
+        if not made_alike(stored, kept):
             raise SystemExit(
                 f"{path} was made with other --models or --look, or other versions of the models; "
                 "take a new FOLDER"
@@ -333,7 +339,10 @@ def names_stored(folder: Path) -> list[str]:
 
 
 def load(folder: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Return what is known of all trials in a folder, and the features of some models, joined."""
+    """Return what is known of all trials in a folder, and the features of some models, joined.
+
+    Exits if they were made by other versions of the models.
+    """
     paths = sorted(folder.glob("*.npz"))
     facts: dict[str, list[NDArray[Any]]] = {name: [] for name in FACTS}
     for path in paths:
@@ -344,6 +353,9 @@ def load(folder: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
     start = 0
     for path in paths:
         with np.load(path) as stored:
+            look = str(stored["look"]) if "look" in stored.files else ""
+            if names and not made_alike(stored, Kept(folder, names, look)):
+                raise SystemExit(f"{path} was made by other versions of the models; make it again")
             for name in names:
                 part = stored[name]
                 if name not in out:

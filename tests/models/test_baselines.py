@@ -477,10 +477,9 @@ def test_blobs_over_time_are_exact() -> None:
 
 def test_a_mask_is_described_by_the_moments_and_the_box_of_its_pixels() -> None:
     rng = np.random.default_rng(0)
-    masks = np.zeros((4, 20, 30), bool)
+    masks = np.zeros((3, 20, 30), bool)
     masks[0, 3:9, 11:16] = rng.random((6, 5)) < 0.7
     masks[1, 12:18, 20:29] = rng.random((6, 9)) < 0.7
-    masks[3] = True
     expected = []
     for mask in masks:
         rows, columns = np.nonzero(mask)
@@ -492,6 +491,9 @@ def test_a_mask_is_described_by_the_moments_and_the_box_of_its_pixels() -> None:
         slant = np.mean((x - x.mean()) * (y - y.mean()))
         expected.append([len(x) / 600, x.mean(), y.mean(), x.std(), y.std(), slant, *box])
     assert np.allclose(mask_blob(masks), expected, atol=1e-6)
+    full = [1, 0.5, 0.5, *np.sqrt((1 - np.array([30.0, 20]) ** -2) / 12), 0, 0, 0, 1, 1]
+    assert np.allclose(mask_blob(np.ones((2, 20, 30), bool)), full, atol=1e-6)
+    assert np.allclose(mask_blob(masks[2:]), expected[2:])
 
 
 def test_masks_are_of_agent_patient_and_the_largest_others() -> None:

@@ -109,8 +109,8 @@ def official(folder: Path | str | None = None) -> OfficialData:
     Parameters
     ----------
     folder
-        By default the folder of the package; so for ``official``, unless there is a folder of that
-        name that is no dataset.
+        By default the folder of the package. ``official`` means the package, too, unless a folder
+        has this name; a dataset of this name does not count.
 
     Returns
     -------

@@ -627,8 +627,6 @@ class Intuition(TorchModel):
                 raise BadInputError(
                     f"{self.name}: {what} (input {name}) of {size} x {size} are needed, not "
                     f"{found}; give clips of this size"
-                    + ", or --option image_size"
-                    * (self.kind == MASK)
                 )
             seen[name] = np.asarray(given.cpu() if isinstance(given, Tensor) else given)
         if self.kind == MASK:
