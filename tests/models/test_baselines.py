@@ -491,6 +491,7 @@ def test_a_mask_is_described_by_the_moments_and_the_box_of_its_pixels() -> None:
         slant = np.mean((x - x.mean()) * (y - y.mean()))
         expected.append([len(x) / 600, x.mean(), y.mean(), x.std(), y.std(), slant, *box])
     assert np.allclose(mask_blob(masks), expected, atol=1e-6)
+    # The variance of n equally spaced values over 1 is (1 - 1 / n^2) / 12.
     full = [1, 0.5, 0.5, *np.sqrt((1 - np.array([30.0, 20]) ** -2) / 12), 0, 0, 0, 1, 1]
     assert np.allclose(mask_blob(np.ones((2, 20, 30), bool)), full, atol=1e-6)
     assert np.allclose(mask_blob(masks[2:]), expected[2:])

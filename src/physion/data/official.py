@@ -139,7 +139,9 @@ def find_official(folder: Path | str) -> OfficialData | None:
     path = Path(folder)
     if (path / SCENES).is_file():
         return _opened(path)
-    if path == Path(PACKAGED) and (not path.exists() or (path / "dataset.json").is_file()):
+    # A dataset has this file (physion.trials.files, which is above this package).
+    dataset = (path / "dataset.json").is_file()
+    if path == Path(PACKAGED) and (dataset or not path.exists()):
         return _packaged()
     return None
 
